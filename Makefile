@@ -1,0 +1,71 @@
+# `make help` lists the targets. All of them work in .venv, which is made when it is missing.
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+INSTALLED_BENCH := $(VENV)/.installed-bench
+
+# The pins in constraints.txt are for Python 3.11; a newer one is taken where there is no 3.11.
+ifeq ($(origin PYTHON),undefined)
+PYTHON := $(shell for p in python3.11 python3; do $$p -c '' 2>/dev/null && echo $$p && break; done)
+endif
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export MPLBACKEND := Agg
+
+# Bytecode is left to the first import: compiling all of it doubles the time of an installation.
+PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: demo test lint format-check types bench soak clean help
+
+demo: $(INSTALLED)  ## the paper's comparison, from rest and started on the reference
+	$(BIN)/stewart-drake compare paper --out out/demo/rest
+	$(BIN)/stewart-drake compare paper --set start=on_reference --set queue=reference \
+		--out out/demo/on_reference
+	@echo "figures:"; find out/demo -name '*.png' -o -name '*.svg' -o -name '*.pdf' | sort | sed 's/^/  /'
+
+# Two workers with one thread each, so that they do not fight over the processor.
+test soak bench: export OMP_NUM_THREADS := 1
+test soak bench: export OPENBLAS_NUM_THREADS := 1
+
+test: $(INSTALLED)  ## the tests; ARGS="..." is handed to pytest
+	$(BIN)/pytest -n 2 $(ARGS)
+
+soak: $(INSTALLED)  ## the endurance runs, which `make test` leaves out
+	$(BIN)/pytest -n 2 -m soak $(ARGS)
+
+lint: $(INSTALLED)  ## ruff's rules
+	$(BIN)/ruff check .
+
+format-check: $(INSTALLED)  ## ruff's format, without changing a file
+	$(BIN)/ruff format --check .
+
+types: $(INSTALLED)  ## mypy, strict
+	$(BIN)/mypy
+
+bench: $(INSTALLED_BENCH)  ## every script in benchmarks/, one after the other
+	@set -e; for script in $(sort $(wildcard benchmarks/[a-z]*.py)); do \
+		echo "== $$script"; $(BIN)/python $$script; \
+	done
+
+clean:  ## removes builds, caches and the demo's output, keeps .venv
+	rm -rf build dist out/demo .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	find . -path ./$(VENV) -prune -o -type d -name __pycache__ -exec rm -rf {} +
+
+help:  ## this list
+	@awk 'BEGIN {FS = ":.*  ## "} /^[a-z-]+:.*  ## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "no Python found: set PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "$(PYTHON) is too old: set PYTHON to a Python 3.11 or newer"; exit 1; }
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
+	@echo "installing stewart-drake and its dependencies into $(VENV) (a few minutes the first time)"
+	@$(PIP_INSTALL) -e '.[train,dev]'
+	@touch $@
+
+$(INSTALLED_BENCH): $(INSTALLED)
+	@echo "installing what only the benchmarks need"
+	@$(PIP_INSTALL) -e '.[bench]'
+	@touch $@

@@ -1,0 +1,300 @@
+"""Error against computing time of the exact plant, Drake's SAP and MuJoCo on two open-loop motions.
+
+All start at home, at rest, under torques amplitude * sin(frequency t + phase). The error is that of
+the pose at the end, its worst coordinate in rad or m, against an integration to 1e-13. The time is
+that of the stepping alone, per simulated second, the least of several interleaved repeats.
+"""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from timeit import timeit
+from typing import Any, NamedTuple
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import matplotlib.pyplot as plt
+import mujoco
+import numpy as np
+from matplotlib.figure import Figure
+from mujoco_model import Closure, MujocoStewart, largest_difference
+from numpy.typing import NDArray
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import Sine
+from scipy.integrate import solve_ivp
+
+import stewart_drake as sd
+from stewart_drake.diagram import MultibodyStewart
+from stewart_drake.plant.exact import ExactPlant
+from stewart_drake.report.style import figure_style, write_figure
+from stewart_drake.results import versions
+from stewart_drake.signals import POSE, RATES
+
+Array = NDArray[np.float64]
+
+RESULTS = Path(__file__).parent / "results"
+ROUNDS, BUDGET = 25, 2.0
+"""Repeats of each candidate, and the seconds after which it gets no more (but two at least)."""
+MECHANISM = sd.load_mechanism("paper")
+START = np.concatenate([MECHANISM.home, np.zeros(6)])
+
+
+class Motion(NamedTuple):
+    """What drives the motors: amplitude (6,) N m * sin(frequency t + phase (6,)), in rad/s."""
+
+    title: str
+    gravity: bool
+    duration: float
+    amplitude: Array
+    frequency: float
+    phase: Array
+
+    def torque(self, t: float) -> Array:
+        return self.amplitude * np.sin(self.frequency * t + self.phase)
+
+
+Run = Callable[[], tuple[float, Array]]
+"""Simulates once: seconds of stepping and final state (12,)."""
+
+
+def motions() -> tuple[Motion, Motion]:
+    """Two percent off the equilibrium under gravity; a sine without."""
+    hold = sd.StewartDynamics(MECHANISM, gravity=True).equilibrium_torque(MECHANISM.home)
+    push = 0.02 * np.abs(hold) * [1.0, 0.6, -0.4, 0.8, -0.2, 0.5]
+    quarter = np.full(6, np.pi / 2)
+    return (
+        Motion("constant torque, gravity", True, 0.5, hold + push, 0.0, quarter),
+        Motion("sinusoidal torque", False, 1.0, np.full(6, 0.02), 2 * np.pi, np.arange(6) + 1.5),
+    )
+
+
+def reference(motion: Motion) -> Array:
+    """Final state (12,) by scipy's eighth-order method."""
+    dynamics = sd.StewartDynamics(MECHANISM, motion.gravity)
+
+    def change(t: float, x: Array) -> Array:
+        return np.concatenate(
+            [x[RATES], dynamics.accelerations(x[POSE], x[RATES], motion.torque(t))]
+        )
+
+    span = (0.0, motion.duration)
+    return solve_ivp(change, span, START, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+
+
+def drake_run(motion: Motion, plant: Any, scheme: str | None, accuracy: float) -> Run:
+    """Drake's Simulator on a plant; `scheme` None leaves a discrete plant to its own steps."""
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    source = builder.AddSystem(Sine(motion.amplitude, np.full(6, motion.frequency), motion.phase))
+    builder.Connect(source.get_output_port(0), plant.GetInputPort("torque"))
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    simulator = Simulator(diagram, context)
+    if scheme is not None:
+        config = SimulatorConfig(
+            integration_scheme=scheme, accuracy=accuracy, use_error_control=True
+        )
+        ApplySimulatorConfig(config, simulator)
+        context.SetAccuracy(accuracy)
+
+    def run() -> tuple[float, Array]:
+        context.SetTime(0.0)
+        plant.set_state(own, START)
+        simulator.Initialize()
+        started = time.perf_counter()
+        simulator.AdvanceTo(motion.duration)
+        return time.perf_counter() - started, np.array(plant.GetOutputPort("state").Eval(own))
+
+    return run
+
+
+def mujoco_run(motion: Motion, time_step: float, closure: Closure) -> Run:
+    """MuJoCo's RK4; all steps in one call, the sine by a callback in each of the four stages."""
+    plant = MujocoStewart(MECHANISM, motion.gravity, closure)
+    plant.model.opt.timestep = time_step
+    ctrl = plant.data.ctrl
+
+    def drive(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        ctrl[:] = motion.torque(data.time)
+
+    def run() -> tuple[float, Array]:
+        plant.set_state(START)
+        ctrl[:] = motion.torque(0.0)
+        mujoco.set_mjcb_control(drive if motion.frequency else None)
+        started = time.perf_counter()
+        mujoco.mj_step(plant.model, plant.data, nstep=round(motion.duration / time_step))
+        seconds = time.perf_counter() - started
+        mujoco.set_mjcb_control(None)
+        return seconds, plant.state()
+
+    return run
+
+
+def candidates(motion: Motion) -> dict[tuple[str, str], Run]:
+    """All runs of a motion, by family and setting.
+
+    MuJoCo's springs, in time steps, are the best of those from 0.5 to 10 (hardened: 4 to 100).
+    """
+    runs: dict[tuple[str, str], Run] = {}
+    for scheme, digits in (("runge_kutta5", range(4, 12)), ("runge_kutta3", range(4, 9))):
+        for digit in digits:
+            plant = ExactPlant(sd.StewartDynamics(MECHANISM, motion.gravity))
+            setting = f"accuracy 1e-{digit:02d}"
+            runs[f"exact, {scheme}", setting] = drake_run(motion, plant, scheme, 10.0**-digit)
+    for step in (2e-3, 1e-3, 5e-4, 2e-4, 1e-4):
+        plant = MultibodyStewart(MECHANISM, step, gravity=motion.gravity)
+        runs["SAP", f"step {1e3 * step:g} ms"] = drake_run(motion, plant, None, 0.0)
+    spring = 1.0 if motion.gravity else 2.0
+    for name, closure, steps in (
+        ("MuJoCo RK4", Closure(spring), (5e-3, 2.5e-3, 1e-3, 5e-4, 2.5e-4, 1e-4)),
+        ("MuJoCo RK4, hardened", Closure(30.0, 1e6, 2), (5e-3, 2.5e-3, 1e-3, 5e-4)),
+    ):
+        for step in steps:
+            scaled = closure._replace(time_constant=closure.time_constant * step)
+            setting = f"step {1e3 * step:g} ms, spring {1e3 * scaled.time_constant:g} ms"
+            runs[name, setting] = mujoco_run(motion, step, scaled)
+    return runs
+
+
+class Curve(NamedTuple):
+    """What the settings of a family reach: errors in rad or m, times in ms per simulated second."""
+
+    settings: list[str]
+    error: Array
+    time: Array
+
+    def time_at(self, error: float) -> float:
+        """Time that an error takes, by log-log interpolation; NaN where it is not reached."""
+        order = np.argsort(self.error)
+        logs = np.log(self.error[order]), np.log(self.time[order])
+        reached = self.error.min() <= error
+        return float(np.exp(np.interp(np.log(error), *logs))) if reached else float("nan")
+
+    def order(self) -> float:
+        """Of convergence, from the coarsest and the finest step; time grows with their number."""
+        ratio = np.log(self.error[0] / self.error[-1]) / np.log(self.time[-1] / self.time[0])
+        return float(ratio)
+
+
+def measure(motion: Motion) -> dict[str, Curve]:
+    """The curve of each family."""
+    expected, runs = reference(motion), candidates(motion)
+    errors: dict[tuple[str, str], float] = {}
+    times: dict[tuple[str, str], list[float]] = {key: [] for key in runs}
+    for turn in range(ROUNDS):
+        for key, run in runs.items():
+            if turn < 2 or sum(times[key]) < BUDGET:
+                seconds, state = run()
+                times[key].append(1e3 * seconds / motion.duration)
+                errors[key] = float(np.abs(state - expected)[POSE].max())
+    curves = {}
+    for family in dict.fromkeys(key[0] for key in runs):
+        keys = [key for key in runs if key[0] == family]
+        curves[family] = Curve(
+            [key[1] for key in keys],
+            np.array([errors[key] for key in keys]),
+            np.array([min(times[key]) for key in keys]),
+        )
+    return curves
+
+
+def evaluation_us() -> dict[str, float]:
+    """Least time of one evaluation of the accelerations, in us, by three ways."""
+    dynamics = sd.StewartDynamics(MECHANISM)
+    x, torque = START, np.ones(6)
+    dynamics.accelerations(x[POSE], x[RATES], torque)
+    compiled, gravity = dynamics._functions.accelerations, dynamics.gravity
+    calls: dict[str, Callable[[], object]] = {
+        "CasADi alone": compiled._evaluate,
+        "Compiled": lambda: compiled(x[POSE], x[RATES], torque, dynamics.parameters, gravity),
+        "StewartDynamics.accelerations": lambda: dynamics.accelerations(x[POSE], x[RATES], torque),
+    }
+    least = dict.fromkeys(calls, np.inf)
+    for _ in range(200):
+        for name, call in calls.items():
+            least[name] = min(least[name], timeit(call, number=50) / 50 * 1e6)
+    return least
+
+
+def start_up_s() -> float:
+    """Least time of five fresh processes from a mechanism to its first accelerations, in s."""
+    code = (
+        "import time, numpy, stewart_drake as sd; m = sd.load_mechanism('paper'); "
+        "t = time.perf_counter(); z = numpy.zeros(6); "
+        "sd.StewartDynamics(m).accelerations(m.home, z, z); print(time.perf_counter() - t)"
+    )
+    return min(float(subprocess.check_output([sys.executable, "-c", code])) for _ in range(5))
+
+
+def claims(curves: Sequence[dict[str, Curve]]) -> list[list[str]]:
+    """What the README says about the plants."""
+    rows = []
+    for motion, families in zip(motions(), curves, strict=True):
+        exact, sap = families["exact, runge_kutta5"], families["SAP"]
+        best = float(sap.error.min())
+        ratio = sap.time[sap.error.argmin()] / exact.time_at(best)
+        rows += [
+            ["exact against SAP's smallest step, at SAP's error", motion.title, f"{ratio:.3g}"],
+            ["order of SAP", motion.title, f"{sap.order():.2f}"],
+            ["exact, ms per simulated s at 1e-9", motion.title, f"{exact.time_at(1e-9):.3g}"],
+        ]
+        for name in ("exact, runge_kutta3", "MuJoCo RK4", "MuJoCo RK4, hardened"):
+            ratio = families[name].time_at(1e-9) / exact.time_at(1e-9)
+            rows.append(
+                [f"exact, runge_kutta5 against {name}, at 1e-9", motion.title, f"{ratio:.3g}"]
+            )
+    rows += [[f"accelerations, us: {name}", "", f"{t:.3g}"] for name, t in evaluation_us().items()]
+    rows.append(["start-up to the first accelerations, s", "", f"{start_up_s():.3g}"])
+    apart = largest_difference(MECHANISM, 1e6)
+    rows.append(["accelerations of MuJoCo, hardened, differ by", "relative", f"{apart:.0e}"])
+    return rows
+
+
+def figure(curves: Sequence[dict[str, Curve]]) -> Figure:
+    """Error against time, a panel per motion."""
+    styles = dict(zip(curves[0], ("ok-", "sk:", "^r-", "vb-", "Db:"), strict=True))
+    drawn, panels = plt.subplots(1, 2, figsize=(7.4, 3.4), sharey=True, layout="constrained")
+    for panel, motion, families in zip(panels, motions(), curves, strict=True):
+        for family, curve in families.items():
+            panel.loglog(curve.time, curve.error, styles[family], ms=3.5, lw=1.2, label=family)
+        panel.set(title=motion.title, xlabel="computing time, ms per simulated s")
+    panels[0].set_ylabel("pose error at the end, rad or m")
+    panels[1].legend(fontsize=7)
+    return drawn
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [" | ".join(header), " | ".join("---" for _ in header), *map(" | ".join, rows)]
+    return "\n".join(f"| {line} |" for line in lines) + "\n"
+
+
+def main() -> None:
+    """Measure, print, and write table and figure."""
+    packages = versions() | {"mujoco": mujoco.__version__}
+    text = "# Error against computing time\n\nMade by `python benchmarks/plants.py` with "
+    parts = [text + ", ".join(f"{name} {number}" for name, number in packages.items()) + ".\n"]
+    curves = [measure(motion) for motion in motions()]
+    parts.append("## Claims\n\n" + table(["what", "motion", "value"], claims(curves)))
+    for motion, families in zip(motions(), curves, strict=True):
+        rows = [
+            [family, setting, f"{error:.1e}", f"{t:.3g}"]
+            for family, curve in families.items()
+            for setting, error, t in zip(*curve, strict=True)
+        ]
+        header = ["family", "setting", "error, rad or m", "ms per simulated s"]
+        parts.append(f"## {motion.title.capitalize()}\n\n" + table(header, rows))
+    print("\n".join(parts))
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "plants.md").write_text("\n".join(parts))
+    with figure_style():
+        write_figure(figure(curves), RESULTS, "plants")
+
+
+if __name__ == "__main__":
+    main()

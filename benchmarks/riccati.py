@@ -1,0 +1,131 @@
+"""The Riccati gain of the whole delay chain against the same gain by the delay reduction.
+
+The paper's model at home, sampled at 0.1 s, identity weights. Times are the least of several
+interleaved repeats. Writes benchmarks/results/riccati.md.
+"""
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import DiscreteAlgebraicRiccatiEquation
+from scipy.linalg import solve_discrete_are
+
+import stewart_drake as sd
+from stewart_drake.design.delay_model import ChainModel, DelayedModel, chain, delayed_model
+from stewart_drake.design.error_model import double_integrators
+from stewart_drake.design.riccati import augmented_gain, full_gain, reduced_gain
+from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.results import versions
+
+Array = NDArray[np.float64]
+
+RESULTS = Path(__file__).parent / "results"
+PERIOD = 0.1
+STEPS = (0, 1, 5, 8, 10, 20, 30)
+FRACTIONS = (0.0, 0.5)
+Q, R = np.eye(12), np.eye(6)
+
+
+def model(steps: int, fraction: float) -> DelayedModel:
+    """The paper's model at home, with integral states."""
+    mechanism = sd.load_mechanism("paper")
+    continuous = double_integrators(torque_map(mechanism, mechanism.home, "virtual_work"))
+    return delayed_model(continuous, PERIOD, steps, fraction, integral=True)
+
+
+def least_ms(calls: Sequence[Callable[[], object]], budget: float) -> list[float]:
+    """Least time of each call, in ms; they take turns for `budget` seconds, three at least."""
+    least, started, turns = [np.inf] * len(calls), time.perf_counter(), 0
+    while turns < 3 or time.perf_counter() - started < budget:
+        turns += 1
+        for i, call in enumerate(calls):
+            begun = time.perf_counter()
+            call()
+            least[i] = min(least[i], time.perf_counter() - begun)
+    return [1e3 * seconds for seconds in least]
+
+
+def drake_only(system: ChainModel) -> Callable[[], Array]:
+    """Drake's solver on a chain, without the checks of its arguments and its result."""
+    matrices = (system.A, system.B, system.C.T @ Q @ system.C, R)
+    A, B, Q_x, R_x = (np.asfortranarray(matrix) for matrix in matrices)
+    return lambda: DiscreteAlgebraicRiccatiEquation(A, B, Q_x, R_x)
+
+
+def gain(system: ChainModel, P: Array) -> Array:
+    """(44)."""
+    return np.linalg.solve(R + system.B.T @ P @ system.B, system.B.T @ P @ system.A)
+
+
+def difference(K: Array, expected: Array) -> float:
+    """The largest, relative to the largest entry."""
+    return float(np.abs(K - expected).max() / np.abs(expected).max())
+
+
+def comparison(fraction: float) -> tuple[list[str], list[list[str]]]:
+    """The gain of the whole chain, by our checked call and by scipy, against the reduced one."""
+    header = ["mu", "states", "full, ms", "scipy, ms", "reduced, ms", "full / reduced",
+              "gains differ by", "scipy's by"]  # fmt: skip
+    rows = []
+    for steps in STEPS:
+        delayed = model(steps, fraction)
+        system = chain(delayed)
+        weight = system.C.T @ Q @ system.C
+
+        def by_scipy(system: ChainModel = system, weight: Array = weight) -> Array:
+            return gain(system, solve_discrete_are(system.A, system.B, weight, R))
+
+        def full(delayed: DelayedModel = delayed) -> Array:
+            return full_gain(delayed, Q, R)[0]
+
+        def reduced(delayed: DelayedModel = delayed) -> Array:
+            return augmented_gain(delayed, Q, R)
+
+        times = least_ms([full, by_scipy, reduced], 2.0)
+        K = full()
+        rows.append(
+            [str(steps), str(len(system.A)), *(f"{t:.3g}" for t in times)]
+            + [f"{times[0] / times[2]:.3g}"]
+            + [f"{difference(other, K):.0e}" for other in (reduced(), by_scipy())]
+        )
+    return header, rows
+
+
+def checks(fraction: float) -> list[str]:
+    """What the checks add to Drake's solver in `reduced_gain`."""
+    delayed = replace(model(8, fraction), steps=0)
+    bare, checked = least_ms(
+        [drake_only(chain(delayed)), lambda: reduced_gain(delayed, Q, R)], 2.0
+    )
+    return [f"{fraction:g}", f"{bare:.3g}", f"{checked:.3g}", f"{checked / bare:.3g}"]
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [" | ".join(header), " | ".join("---:" for _ in header), *map(" | ".join, rows)]
+    return "\n".join(f"| {line} |" for line in lines) + "\n"
+
+
+def main() -> None:
+    """Print the tables and write them."""
+    packages = ", ".join(f"{package} {number}" for package, number in versions().items())
+    parts = [f"# The delay reduction\n\nMade by `python benchmarks/riccati.py` with {packages}.\n"]
+    for fraction in FRACTIONS:
+        parts.append(f"## eta0 = {fraction:g} dt\n\n{table(*comparison(fraction))}")
+        print(parts[-1], flush=True)
+    header = ["eta0 / dt", "Drake's solver, ms", "reduced_gain, ms", "ratio"]
+    parts.append(f"## Cost of the checks\n\n{table(header, [checks(f) for f in FRACTIONS])}")
+    print(parts[-1])
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "riccati.md").write_text("\n".join(parts))
+
+
+if __name__ == "__main__":
+    main()

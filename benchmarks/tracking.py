@@ -1,0 +1,248 @@
+"""Every tracking figure of the README: `python benchmarks/tracking.py [section ...]`.
+
+Writes benchmarks/results/tracking.md. Sections: faithful, starts, limit, unknown, coverage,
+gravity, integral, delay, noise. All runs use `predictor_lqi` unless the row says otherwise.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+from joblib import Parallel, delayed
+
+import stewart_drake as sd
+from stewart_drake.results import SimulationResult, versions
+from stewart_drake.signals import PARAMETERS
+
+RESULTS = Path(__file__).parent / "results"
+EXACT = "plant.kind=exact"
+ON_REFERENCE = ("start=on_reference", "queue=reference")
+BIAS = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
+PAYLOAD = "plant.payload_mass=0.4"
+NONE = "controller.estimator=none"
+AMPLITUDES = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
+
+
+def noise(share: float, seed: int = 0) -> tuple[str, str]:
+    """Settings for sensor noise of a share of the amplitudes (per second, for the rates)."""
+    std = ",".join(f"{share * a:.10g}" for a in np.tile(AMPLITUDES, 2))
+    return f"sensor.noise_std=[{std}]", f"sensor.seed={seed}"
+
+
+def run(scenario: str, settings: Sequence[str], controller: str | None = None) -> SimulationResult:
+    """One run."""
+    return sd.simulate(sd.load_scenario(scenario, controller=controller, settings=settings))
+
+
+def runs(cases: Sequence[tuple[Any, ...]]) -> list[SimulationResult]:
+    """Runs on all cores, in order."""
+    return Parallel(n_jobs=-1)(delayed(run)(*case) for case in cases)
+
+
+def outcome(result: SimulationResult) -> str:
+    """E_ac, or when and why there is none."""
+    if result.status == "completed":
+        return f"{result.accumulated_error:.3g}"
+    assert result.stopped is not None
+    where = "parallel singularity" if result.stopped.leg is None else f"leg {result.stopped.leg}"
+    return f"left at {result.stopped.time:.2f} s ({where})"
+
+
+def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table under a heading."""
+    lines = [" | ".join(header), " | ".join("---" for _ in header), *(" | ".join(r) for r in rows)]
+    return f"## {title}\n\n" + "\n".join(f"| {line} |" for line in lines) + "\n"
+
+
+def faithful() -> str:
+    """The paper's four controllers, without and with the delay, and what stops them."""
+    variants = {
+        "no delay, from rest": ("delay.steps=0",),
+        "no delay, on the reference": ("delay.steps=0", *ON_REFERENCE),
+        "no delay, from rest, w_R = 0.01": ("delay.steps=0", "controller.w_R=0.01"),
+        "0.8 s, from rest": (),
+        "0.8 s, on the reference": ON_REFERENCE,
+        "0.8 s, from rest, true dynamics in the model": ("controller.model=multibody",),
+        "0.8 s, amplitudes / 10, true dynamics": (
+            "controller.model=multibody",
+            "reference.amplitude=[0.02618,0.02618,0.02618,0.002,0.002,0.008]",
+        ),
+    }
+    rows = []
+    names = ("lqr", "lqi", "delay_lqr", "delay_lqi")
+    results = iter(runs([("paper", v, name) for v in variants.values() for name in names]))
+    for variant in variants:
+        for name in names:
+            r = next(results)
+            numbers = (r.summary[key] for key in ("cost", "peak_torque", "torque_variation"))
+            rows.append([variant, name, outcome(r), *(f"{x:.3g}" for x in numbers)])
+    header = ["condition", "controller", "E_ac", "cost (40)", "peak N m", "variation N m"]
+    return table("The paper's four controllers, multibody plant", header, rows)
+
+
+def starts() -> str:
+    """The paper's experiment on both plants and from both starts, against the time step."""
+    plants = [(EXACT, "exact")]
+    plants += [(f"plant.time_step={h}", f"multibody, {h} s") for h in (2e-3, 1e-3, 5e-4, 2e-4)]
+    cases = [("paper", (p, *start)) for p, _ in plants for start in ((), ON_REFERENCE)]
+    results = runs(cases)
+    rows = [
+        [
+            name,
+            outcome(rest),
+            f"{rest.summary['peak_torque']:.3f}",
+            outcome(moving),
+            f"{moving.summary['peak_torque']:.4f}",
+        ]
+        for (_, name), rest, moving in zip(plants, results[::2], results[1::2], strict=True)
+    ]
+    header = ["plant", "E_ac from rest", "peak N m", "E_ac on the reference", "peak N m"]
+    return table("The paper's experiment, E_ac in % s (floor from rest: 15.17)", header, rows)
+
+
+def limit() -> str:
+    """E_ac against the torque limit, catch-up chosen automatically."""
+    limits = (0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0, 1.8, 3.0)
+    results = runs([("paper", (EXACT, f"actuator.torque_limit={x}")) for x in limits])
+    rows = [
+        [f"{x:g}", outcome(r), f"{r.summary['peak_torque']:.3f}"]
+        for x, r in zip(limits, results, strict=True)
+    ]
+    return table(
+        "From rest with limited torque, exact plant",
+        ["limit N m", "E_ac", "peak N m"],
+        rows,
+    )
+
+
+def unknown() -> str:
+    """A plant that the controller has not been told about."""
+    plants = {
+        "nothing": (),
+        "torque bias 3e-4 N m, alternating": (BIAS,),
+        "payload +10 %": (PAYLOAD,),
+        "joint damping 1e-3 N m s/rad": ("plant.joint_damping=1e-3",),
+        "bias, payload and 3e-4 damping": (BIAS, PAYLOAD, "plant.joint_damping=3e-4"),
+        "bias, and noise of 0.1 % of the amplitudes": (BIAS, *noise(1e-3)),
+    }
+    variants = ((EXACT,), (EXACT, NONE), ("plant.kind=multibody",), ("plant.kind=multibody", NONE))
+    cases = [("paper", (*v, *ON_REFERENCE, *extra)) for extra in plants.values() for v in variants]
+    results = iter(runs(cases))
+    rows = [[name, *(outcome(next(results)) for _ in variants)] for name in plants]
+    header = ["unknown", "exact", "exact, no estimator", "multibody", "multibody, no estimator"]
+    return table("Unknown plant, started on the reference: E_ac", header, rows)
+
+
+def coverage() -> str:
+    """How often the final 2-sigma bands hold the truth, over 100 noisy runs."""
+    truth = np.array([3e-4, -3e-4] * 3 + [0.4, 3e-4])
+    extra = (EXACT, *ON_REFERENCE, BIAS, PAYLOAD, "plant.joint_damping=3e-4")
+    results = runs([("paper", (*extra, *noise(1e-3, seed))) for seed in range(100)])
+    done = [r for r in results if r.status == "completed"]
+    error = np.array([r.signals.parameters.values[-1] - truth for r in done])
+    std = np.array([r.signals.parameter_std.values[-1] for r in done])
+    inside = np.abs(error) <= 2 * std
+    rows = [
+        [name, f"{100 * inside[:, i].mean():.0f} %", f"{np.sqrt(np.mean(error[:, i] ** 2)):.2e}"]
+        for i, name in enumerate(PARAMETERS)
+    ]
+    rows.append(["all eight", f"{100 * inside.all(axis=1).mean():.0f} %", "-"])
+    title = f"Final 2-sigma bands over 100 noisy runs ({len(done)} completed), exact plant"
+    return table(title, ["parameter", "truth inside", "rms error"], rows)
+
+
+def gravity() -> str:
+    """Full amplitude under gravity, 10 ms samples, 0.16 s delay."""
+    variants = {
+        "exact": (EXACT,),
+        "multibody, 1 ms": (),
+        "multibody, 1 ms, no estimator": (NONE,),
+        "multibody, 0.1 ms": ("plant.time_step=1e-4",),
+    }
+    results = runs([("gravity", settings) for settings in variants.values()])
+    rows = [
+        [name, outcome(r), f"{r.summary['peak_torque']:.3g}"]
+        for name, r in zip(variants, results, strict=True)
+    ]
+    return table("Scenario `gravity`, on the reference", ["plant", "E_ac", "peak N m"], rows)
+
+
+def integral() -> str:
+    """Integral action against none under a constant disturbance, no estimator."""
+    cases = [
+        ("paper", (EXACT, *ON_REFERENCE, BIAS, NONE, f"controller.integral={flag}"))
+        for flag in ("true", "false")
+    ]
+    with_integral, without = runs(cases)
+    gain = 100 * (1 - with_integral.accumulated_error / without.accumulated_error)
+    rows = [[outcome(with_integral), outcome(without), f"{gain:.0f} %"]]
+    return table(
+        "Integral action under the constant torque bias, no estimator, exact plant",
+        ["with", "without", "improvement"],
+        rows,
+    )
+
+
+def delay() -> str:
+    """A controller that is told the wrong delay (true: 8 periods)."""
+    told = (6, 7, 8, 9, 10)
+    variants = (
+        (EXACT, *ON_REFERENCE),
+        (EXACT, *ON_REFERENCE, NONE),
+        (EXACT, *ON_REFERENCE, NONE, "controller.w_R=1000"),
+    )
+    cases = [("paper", (*v, f"controller.delay_steps={n}")) for n in told for v in variants]
+    results = iter(runs(cases))
+    rows = [[str(n), *(outcome(next(results)) for _ in variants)] for n in told]
+    header = ["told", "as shipped", "no estimator", "no estimator, w_R = 1000"]
+    return table("Wrong delay, exact plant, on the reference: E_ac", header, rows)
+
+
+def sensor_noise() -> str:
+    """Noise on pose and rates."""
+    shares = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
+    cases = [
+        ("paper", (EXACT, *ON_REFERENCE, *noise(share), *extra))
+        for share in shares
+        for extra in ((), (NONE,))
+    ]
+    results = iter(runs(cases))
+    rows = [[f"{100 * share:g} %", *(outcome(next(results)) for _ in range(2))] for share in shares]
+    header = ["noise / amplitude", "as shipped", "no estimator"]
+    return table("Sensor noise, exact plant, on the reference: E_ac", header, rows)
+
+
+SECTIONS: dict[str, Callable[[], str]] = {
+    "faithful": faithful,
+    "starts": starts,
+    "limit": limit,
+    "unknown": unknown,
+    "coverage": coverage,
+    "gravity": gravity,
+    "integral": integral,
+    "delay": delay,
+    "noise": sensor_noise,
+}
+
+
+def main(names: Sequence[str]) -> None:
+    """Run the named sections, or all, and write or print the tables."""
+    parts = []
+    for name in names or SECTIONS:
+        parts.append(SECTIONS[name]())
+        print(parts[-1], flush=True)
+    if not names:
+        head = "# Tracking\n\nMade by `python benchmarks/tracking.py` with " + ", ".join(
+            f"{package} {number}" for package, number in versions().items()
+        )
+        RESULTS.mkdir(exist_ok=True)
+        (RESULTS / "tracking.md").write_text("\n\n".join([head + ".", *parts]))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

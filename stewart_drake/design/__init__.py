@@ -1,0 +1,1 @@
+"""Design of the delayed LQI controller: pure functions of matrices, no LeafSystem."""

@@ -1,0 +1,271 @@
+"""Extended Kalman filter over the state and eight constant parameters of the plant.
+
+The parameters theta (torque bias, payload, joint damping; `signals.PARAMETERS`) never change, the
+state obeys the exact dynamics under the torques that are known to act:
+
+    [x_{k+1}; theta] = [f(x_k, T, theta); theta] + noise,       y_k = x_k + measurement noise.
+
+Linearised, F = [[Phi, S], [0, 1]] with Phi = df/dx and S = df/dtheta. One-step prediction errors
+drive the filter; a measurement without noise makes x_k = y_k and leaves the textbook filter over
+theta alone.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from scipy.stats import chi2
+
+from stewart_drake.design.holds import GAUSS_NODES
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.signals import (
+    BIAS,
+    DAMPING,
+    NUM_PARAMETERS,
+    NUM_STATE,
+    PAYLOAD,
+    POSE,
+    RATES,
+)
+
+Array = NDArray[np.float64]
+THETA = slice(NUM_STATE, NUM_STATE + NUM_PARAMETERS)
+
+GATE = float(chi2.ppf(1 - 1e-6, NUM_STATE))
+"""Squared innovation, in units of its covariance, above which a measurement is an outlier."""
+ITERATIONS = 4
+"""At the most; one does once the parameters are roughly known."""
+PATIENCE = 3
+"""After so many outliers in a row the model must be wrong, and the measurement is believed."""
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """What the filter assumes; standard deviations in SI units.
+
+    Attributes:
+        noise_std: (12,) of the measurement.
+        prior_std: (8,) of the parameters before any measurement.
+        lower, upper: (8,) physical bounds of the parameters.
+        model_std: (12,) by which one step of the model may be off; without it a noiseless sensor
+            would let the filter explain integration errors by parameters.
+    """
+
+    noise_std: Array
+    prior_std: Array
+    lower: Array
+    upper: Array
+    model_std: Array
+
+
+MODEL_ERROR = 2e-4
+"""Share of the motion by which one step of the model may be off: what a 1 ms engine deviates."""
+
+
+def filter_settings(
+    noise_std: Array,
+    motion_scale: Array,
+    plate_mass: float,
+    torque_scale: float,
+    torque_limit: float | None,
+) -> FilterSettings:
+    """Settings for a machine: a payload up to ten plates, friction and bias by its torques.
+
+    Args:
+        noise_std: (12,) of the measurement.
+        motion_scale: (6,) how far each coordinate moves, rad and m; the same per s for the rates.
+        plate_mass: kg.
+        torque_scale: torque that the motion takes, N m.
+        torque_limit: of the motors in N m, or None.
+    """
+    prior, lower, upper = (np.empty(NUM_PARAMETERS) for _ in range(3))
+    bias_bound = 100 * torque_scale if torque_limit is None else torque_limit
+    prior[BIAS], lower[BIAS], upper[BIAS] = 0.3 * torque_scale, -bias_bound, bias_bound
+    prior[PAYLOAD], lower[PAYLOAD], upper[PAYLOAD] = 0.25 * plate_mass, 0.0, 10 * plate_mass
+    prior[DAMPING], lower[DAMPING], upper[DAMPING] = 0.1 * torque_scale, 0.0, 100 * torque_scale
+    model_std = MODEL_ERROR * np.concatenate([motion_scale, motion_scale])
+    return FilterSettings(np.asarray(noise_std), prior, lower, upper, model_std)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Mean (20,) and covariance (20, 20) of [state; parameters]; outliers seen in a row."""
+
+    mean: Array
+    covariance: Array
+    outliers: int = 0
+
+    @property
+    def state(self) -> Array:
+        """(12,)."""
+        return self.mean[:NUM_STATE]
+
+    @property
+    def parameters(self) -> Array:
+        """(8,)."""
+        return self.mean[THETA]
+
+    @property
+    def parameter_std(self) -> Array:
+        """(8,)."""
+        return np.sqrt(np.diag(self.covariance)[THETA])
+
+
+def start(measurement: Array, settings: FilterSettings) -> Estimate:
+    """The estimate from the first measurement (12,) alone."""
+    variance = np.concatenate([settings.noise_std**2, settings.prior_std**2])
+    mean = np.concatenate([measurement, np.zeros(NUM_PARAMETERS)])
+    return Estimate(mean, np.diag(variance))
+
+
+def advance(
+    estimate: Estimate,
+    dynamics: StewartDynamics,
+    torques: Array,
+    durations: Array,
+    substeps: int,
+    measurement: Array | None,
+    settings: FilterSettings,
+) -> Estimate:
+    """One period: torques (n, 6) acted for `durations` (n,) s; then a measurement (12,), or none.
+
+    The first steps move the parameters far, so that linearising once is not enough. The mean xi of
+    [previous state; parameters] is found by Gauss-Newton iterations of
+
+        min (xi - mean)' P^-1 (xi - mean) + (y - f(xi))' R^-1 (y - f(xi)),
+
+    the iterated filter over one transition; one iteration is the extended Kalman filter. A
+    measurement that does not fit (an outlier, iterations that diverge) is left out and the model
+    goes on alone; after PATIENCE of them, or where the model cannot go on, the measurement does.
+    """
+    outliers = 0 if measurement is None else estimate.outliers + 1
+    if measurement is not None:
+        after = _attempt(estimate, dynamics, torques, durations, substeps, measurement, settings)
+        if after is not None:
+            return after
+    after = _attempt(estimate, dynamics, torques, durations, substeps, None, settings)
+    if after is not None and outliers < PATIENCE:
+        return replace(after, outliers=outliers)
+    if measurement is None:
+        return estimate
+    mean = np.concatenate([measurement, estimate.parameters])
+    return Estimate(mean, start(measurement, settings).covariance)
+
+
+def _attempt(
+    estimate: Estimate,
+    dynamics: StewartDynamics,
+    torques: Array,
+    durations: Array,
+    substeps: int,
+    measurement: Array | None,
+    settings: FilterSettings,
+) -> Estimate | None:
+    """`advance` for a measurement that fits; None for an outlier, or without a finite result."""
+    try:
+        with np.errstate(all="ignore"):
+            after = _filter(estimate, dynamics, torques, durations, substeps, measurement, settings)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    if after is None or not np.all(np.isfinite(after.covariance)):
+        return None
+    return after if np.all(np.isfinite(after.mean)) else None
+
+
+def _filter(
+    estimate: Estimate,
+    dynamics: StewartDynamics,
+    torques: Array,
+    durations: Array,
+    substeps: int,
+    measurement: Array | None,
+    settings: FilterSettings,
+) -> Estimate | None:
+    prior, P = estimate.mean, estimate.covariance
+    drift = settings.model_std**2
+    R = np.diag(settings.noise_std**2 + drift)
+    xi = prior
+    after, F = _transition(dynamics, xi, torques, durations, substeps)
+    if measurement is not None:
+        for _ in range(ITERATIONS):
+            H = F[:NUM_STATE]
+            innovation = measurement - after - H @ (prior - xi)
+            S = H @ P @ H.T + R
+            gain = np.linalg.solve(S, H @ P).T
+            keep = np.eye(len(xi)) - gain @ H
+            posterior = keep @ P @ keep.T + gain @ R @ gain.T  # Joseph's form stays positive
+            moved = _within_bounds(prior + gain @ innovation, posterior, settings)
+            linear = after + H @ (moved - xi)
+            xi = moved
+            after = _integrate(dynamics, xi, torques, durations, substeps)
+            if np.all(np.abs(after - linear) <= 0.1 * np.sqrt(np.diag(R))):
+                break
+            after, F = _transition(dynamics, xi, torques, durations, substeps)
+        if not innovation @ np.linalg.solve(S, innovation) <= GATE:  # or NaN
+            return None
+        P = posterior
+    P = F @ P @ F.T
+    P[np.diag_indices(NUM_STATE)] += drift
+    return Estimate(np.concatenate([after, xi[THETA]]), (P + P.T) / 2)
+
+
+def _integrate(
+    dynamics: StewartDynamics, xi: Array, torques: Array, durations: Array, substeps: int
+) -> Array:
+    """State (12,) after the torques, from [state; parameters] (20,)."""
+    return dynamics.predict(xi[:NUM_STATE], torques, durations, substeps, xi[THETA])[-1]
+
+
+def _transition(
+    dynamics: StewartDynamics, xi: Array, torques: Array, durations: Array, substeps: int
+) -> tuple[Array, Array]:
+    """State (12,) after the torques, and F (20, 20) of [state; parameters].
+
+    F = exp(Omega) solves F_dot = [[A, G], [0, 0]] F to fourth order with A and G at the two Gauss
+    nodes: Omega = h/2 (L_1 + L_2) + sqrt(3)/12 h^2 [L_2, L_1] (Magnus). The filter divides tiny
+    innovations by F; an error of second order would already look like a disturbance.
+    """
+    x, theta = xi[:NUM_STATE], xi[THETA]
+    total = np.eye(NUM_STATE + NUM_PARAMETERS)
+    for torque, h in zip(torques, durations, strict=True):
+        cuts = h * np.diff(GAUSS_NODES, prepend=0.0, append=1.0)
+        *nodes, x = dynamics.predict(x, np.tile(torque, (3, 1)), cuts, substeps, theta)
+        L = np.zeros((2, *total.shape))
+        for place, node in zip(L, nodes, strict=True):
+            derivatives = dynamics.derivatives(node[POSE], node[RATES], torque, theta)
+            place[:NUM_STATE, :NUM_STATE], place[:NUM_STATE, THETA] = derivatives.A, derivatives.G
+        omega = h / 2 * (L[0] + L[1]) + np.sqrt(3) / 12 * h**2 * (L[1] @ L[0] - L[0] @ L[1])
+        total = expm(omega) @ total
+    return x, total
+
+
+def _within_bounds(mean: Array, covariance: Array, settings: FilterSettings) -> Array:
+    """The mean nearest to `mean`, as the covariance measures it, with each parameter in bounds.
+
+    Fixing components at bounds moves all that is correlated with them along their columns of P, so
+    that what the measurements have told about combinations of parameters is kept. Which ones are
+    fixed is found by adding the one furthest out and freeing those that are held back from inside.
+    The covariance stays: a parameter at its bound may leave it again.
+    """
+    fixed: dict[int, float] = {}
+    moved = mean
+    for _ in range(4 * NUM_PARAMETERS):
+        within = np.clip(moved[THETA], settings.lower, settings.upper)
+        excess = (moved[THETA] - within) / np.sqrt(np.diag(covariance)[THETA])
+        worst = int(np.argmax(np.abs(excess)))
+        if np.abs(excess[worst]) <= 1e-9:
+            break
+        fixed[NUM_STATE + worst] = within[worst]
+        while True:
+            at = list(fixed)
+            push = np.linalg.solve(covariance[np.ix_(at, at)], mean[at] - list(fixed.values()))
+            upper = np.array([fixed[i] == settings.upper[i - NUM_STATE] for i in at])
+            inwards = np.where(upper, push, -push)
+            if inwards.min() >= 0:
+                break
+            del fixed[at[int(inwards.argmin())]]
+        moved = mean - covariance[:, at] @ push
+    moved = moved.copy()
+    moved[THETA] = np.clip(moved[THETA], settings.lower, settings.upper)
+    return moved

@@ -1,0 +1,102 @@
+"""What is fixed before the loop starts: torques in flight, weights, steps of the prediction."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.trajectories import Trajectory
+
+from stewart_drake.design.holds import mean_torques
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.signals import ACCELERATIONS, NUM_TORQUES, POSE, RATES, queue_length
+from stewart_drake.trajectories import evaluate
+
+Array = NDArray[np.float64]
+
+PREDICTION_BUDGET = 2e-5
+"""rad and m by which integrating over the delay may move the predicted pose."""
+LEAST_TORQUE_SCALE = 0.01
+"""N m."""
+TOLERANCE = 0.03
+"""Pose error that is tolerable, as a share of half the reference's peak to peak.
+
+It sets the bandwidth of the loop, about (peak acceleration / tolerance)^(1/2): see docs/theory.md.
+"""
+
+
+def initial_queue(
+    kind: Literal["zero", "equilibrium", "reference"],
+    dynamics: StewartDynamics,
+    reference: Trajectory,
+    period: float,
+    steps: int,
+    fraction: float,
+) -> Array:
+    """Torques (L, 6) in flight at t = 0, oldest first: nothing, what holds still, what follows."""
+    length = queue_length(steps, fraction)
+    if kind == "zero" or length == 0:
+        return np.zeros((length, NUM_TORQUES))
+    if kind == "equilibrium":
+        return np.tile(dynamics.equilibrium_torque(evaluate(reference, 0.0)[POSE]), (length, 1))
+    ends = (steps + fraction) * period - period * np.arange(length - 1, -1, -1)
+    return mean_torques(dynamics, reference, np.maximum(ends - period, 0.0), ends)
+
+
+def weight_scales(
+    kind: Literal["bryson", "identity"],
+    dynamics: StewartDynamics,
+    reference: Trajectory,
+    peak_to_peak: Array,
+    duration: float,
+) -> tuple[Array, Array, Array]:
+    """Weights (6,) of the pose error, its integral and the torques in the cost, before w_Q, w_R.
+
+    Bryson's rule, one over the square of what is tolerable: of the error TOLERANCE times half the
+    reference's peak to peak (1 where it is constant), that for 1 s of the integral, and the
+    reference's peak torque.
+    """
+    if kind == "identity":
+        return np.ones(6), np.ones(6), np.ones(6)
+    moving = peak_to_peak != 1.0
+    tolerable = TOLERANCE * np.where(moving, peak_to_peak / 2, 1.0)
+    peak = max(LEAST_TORQUE_SCALE, reference_torque(dynamics, reference, duration))
+    return 1 / tolerable**2, 1 / tolerable**2, np.full(NUM_TORQUES, 1 / peak**2)
+
+
+def reference_torque(dynamics: StewartDynamics, reference: Trajectory, duration: float) -> float:
+    """Largest motor torque in N m that following the reference takes."""
+    times = np.linspace(0.0, duration, 201)
+    states = (evaluate(reference, t) for t in times)
+    return max(
+        float(np.abs(dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])).max())
+        for x in states
+    )
+
+
+def choose_substeps(
+    dynamics: StewartDynamics, reference: Trajectory, period: float, steps: int, duration: float
+) -> int:
+    """Least number of Runge-Kutta steps per period that keeps the prediction within its budget.
+
+    Along the reference, the pose predicted over the delay with n steps per period is compared with
+    that of 2 n steps; their difference is 15/16 of the error with n.
+    """
+    horizon = max(steps, 1)
+    holds = period * np.arange(horizon)
+    cases = []
+    for t in np.linspace(0.0, duration, 8, endpoint=False):
+        start = evaluate(reference, t)[:12]
+        cases.append((start, mean_torques(dynamics, reference, t + holds, t + holds + period)))
+    substeps = 1
+    while substeps < 64:
+        worst = max(
+            np.abs(
+                dynamics.predict(start, torques, period, substeps)[-1, POSE]
+                - dynamics.predict(start, torques, period, 2 * substeps)[-1, POSE]
+            ).max()
+            for start, torques in cases
+        )
+        if worst <= PREDICTION_BUDGET:
+            break
+        substeps *= 2
+    return substeps

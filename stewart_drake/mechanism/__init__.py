@@ -1,0 +1,1 @@
+"""The mechanism: geometry and inertia, kinematics, the paper's torque map, SDFormat."""

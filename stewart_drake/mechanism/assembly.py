@@ -1,0 +1,104 @@
+"""Where every body of the mechanism is: crank and rod frames, and the tree's joint angles.
+
+Link frames: crank link C at the shaft centre with x along the crank and z along the motor axis; rod
+link D at the crank tip with x along the rod and y along the universal joint's second axis, which is
+perpendicular to motor axis and rod. The tree is base - crank (revolute) - rod (universal), and the
+plate on its own; the joint angles are zero at the mechanism's home pose.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
+from stewart_drake.signals import ANGLES, NUM_LEGS, POSITION
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """Link frames of the six legs and of the plate in W; arrays with a leading axis of six."""
+
+    crank_angles: Array
+    R_WC: Array
+    p_WT: Array
+    R_WD: Array
+    R_WP: Array
+
+
+def assemble(mechanism: Mechanism, pose: Array) -> Assembly:
+    """Link frames at a pose (6,).
+
+    Raises:
+        UnreachablePoseError: the pose is out of reach.
+    """
+    legs = leg_geometry(mechanism, pose)
+    axes = mechanism.R_WS[:, :, 2]
+    second = np.cross(axes, legs.rod)
+    second /= np.linalg.norm(second, axis=1, keepdims=True)
+    return Assembly(
+        crank_angles=legs.crank_angles,
+        R_WC=np.stack([legs.crank, legs.tangent, axes], axis=2),
+        p_WT=mechanism.p_WS + mechanism.crank_lengths[:, None] * legs.crank,
+        R_WD=np.stack([legs.rod, second, np.cross(legs.rod, second)], axis=2),
+        R_WP=rotation(np.asarray(pose)[ANGLES]),
+    )
+
+
+@dataclass(frozen=True)
+class JointState:
+    """Angles in rad, from the home pose, and their rates: cranks (6,), universal joints (6, 2)."""
+
+    crank: Array
+    universal: Array
+    crank_rate: Array
+    universal_rate: Array
+
+
+def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
+    """Joint angles and rates of the tree that close all loops at a pose (6,) with rates (6,).
+
+    Raises:
+        UnreachablePoseError: the pose is out of reach.
+    """
+    home, now = assemble(mechanism, mechanism.home), assemble(mechanism, pose)
+    axes = mechanism.R_WS[:, :, 2]
+    # The cross-piece turns about the motor axis n with the crank and by theta_1 against it; its
+    # axis y then carries the rod, at the angle atan2(x.n, x.(n x y)) about y.
+    first, second = np.zeros(NUM_LEGS), np.zeros(NUM_LEGS)
+    for leg in range(NUM_LEGS):
+        n = axes[leg]
+        y_of_crank = now.R_WC[leg] @ home.R_WC[leg].T @ home.R_WD[leg][:, 1]
+        y = now.R_WD[leg][:, 1]
+        first[leg] = np.arctan2(np.cross(y_of_crank, y) @ n, y_of_crank @ y)
+        second[leg] = _elevation(now.R_WD[leg], n) - _elevation(home.R_WD[leg], n)
+    turn = (now.crank_angles - home.crank_angles + np.pi) % (2 * np.pi) - np.pi
+
+    # Rates: alpha_dot from the rod's length; the rod's angular velocity without spin r x d / l,
+    # plus the spin that leaves no component along n x (n x r).
+    legs = leg_geometry(mechanism, pose)
+    w_WP = angle_rate_map(pose[ANGLES]) @ rates[ANGLES]
+    v_WQ = rates[POSITION] + np.cross(w_WP, legs.p_PQ_W)
+    alpha_dot = np.einsum("li,li->l", legs.rod, v_WQ) / (
+        mechanism.crank_lengths * legs.transmission
+    )
+    v_WT = (mechanism.crank_lengths * alpha_dot)[:, None] * legs.tangent
+    swing = np.cross(legs.rod, v_WQ - v_WT) / mechanism.rod_lengths[:, None]
+    swing_n, rod_n = np.einsum("li,li->l", swing, axes), np.einsum("li,li->l", legs.rod, axes)
+    w_WD = swing + (swing_n * rod_n / (1 - rod_n**2))[:, None] * legs.rod
+    first_rate = np.einsum("li,li->l", w_WD, axes) - alpha_dot
+    second_rate = np.einsum("li,li->l", w_WD, now.R_WD[:, :, 1])
+    return JointState(
+        crank=turn,
+        universal=np.column_stack([first, second]),
+        crank_rate=alpha_dot,
+        universal_rate=np.column_stack([first_rate, second_rate]),
+    )
+
+
+def _elevation(R_WD: Array, axis: Array) -> float:
+    x, y = R_WD[:, 0], R_WD[:, 1]
+    return float(np.arctan2(x @ axis, x @ np.cross(axis, y)))

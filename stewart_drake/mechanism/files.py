@@ -1,0 +1,231 @@
+"""Mechanism YAML files: the schema, and how a `pattern` of anchors becomes six legs."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, PlainValidator
+from pydantic.dataclasses import dataclass
+
+from stewart_drake.errors import ConfigError
+from stewart_drake.mechanism.geometry import Body, Link, Mechanism
+from stewart_drake.mechanism.kinematics import UnreachablePoseError
+from stewart_drake.resources import resolve
+from stewart_drake.signals import LEGS
+from stewart_drake.yamlio import load_yaml, validate
+
+Array = NDArray[np.float64]
+_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
+Six = Annotated[list[float], Field(min_length=6, max_length=6)]
+Positive = Annotated[float, Field(gt=0)]
+_LARGEST = float(np.finfo(np.float64).max)
+Branch = Literal[-1, 1]
+Branches = Annotated[list[Branch], Field(min_length=6, max_length=6)]
+Indices = Annotated[list[Annotated[int, Field(ge=0, le=5)]], Field(min_length=6, max_length=6)]
+
+
+def _one_or_six(value: object) -> object:
+    # A union of number and list would name its alternatives in the error instead of the field.
+    numbers = value if isinstance(value, list) else [value] * 6
+    if len(numbers) != 6 or not all(_is_positive(v) for v in numbers):
+        raise ValueError("a positive number, or a list of six")
+    return value
+
+
+def _is_positive(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= _LARGEST
+
+
+Length = Annotated[float | list[float], PlainValidator(_one_or_six)]
+
+
+@dataclass(config=_STRICT)
+class BodySpec:
+    """`mass` in kg, `inertia`: principal moments about the COM in kg m^2."""
+
+    mass: Annotated[float, Field(ge=0)]
+    inertia: Vector3
+
+
+@dataclass(config=_STRICT)
+class LinkSpec:
+    """`length` in m (one, or one per leg), `center`: where along it the COM lies (0 to 1)."""
+
+    length: Length
+    mass: float
+    inertia: Vector3
+    center: float = 0.5
+
+
+@dataclass(config=_STRICT)
+class MotorSpec:
+    """`effort_limit`: N m, as written to SDFormat; null: none."""
+
+    effort_limit: float | None = None
+
+
+@dataclass(config=_STRICT)
+class PatternSpec:
+    """Anchors of a platform with threefold symmetry; lengths in m, angles in degrees.
+
+    Pair k (0, 1, 2) sits at rotation + 120 k, its legs half a separation to either side. The plate
+    joints t_0 ... t_5 follow the same rule about rotation + plate_offset; leg i takes joint
+    plate_order[i]. `installation` (beta): by how much the motor's y axis dips under the horizon.
+    """
+
+    rotation_deg: float
+    base_radius: Positive
+    base_separation_deg: float
+    plate_radius: Positive
+    plate_separation_deg: float
+    plate_offset_deg: float
+    plate_order: Indices
+    shaft_height: float
+    installation_deg: float
+    branches: Branches
+    plate_height: float = 0.0
+
+
+@dataclass(config=_STRICT)
+class LegSpec:
+    """One leg: points in m, W for the shaft, P for the plate joint; directions need no unit length.
+
+    `crank_zero` is the direction of the crank at angle zero, perpendicular to `motor_axis`, about
+    which the angle grows right-handed. `branch` (-1 or 1): which of the two crank solutions.
+    """
+
+    shaft: Vector3
+    motor_axis: Vector3
+    crank_zero: Vector3
+    plate_joint: Vector3
+    branch: Branch
+
+
+@dataclass(config=_STRICT)
+class MechanismSpec:
+    """A mechanism file: bodies, and anchors as a `pattern` or explicitly as six `legs`."""
+
+    name: str
+    home: Six
+    base: BodySpec
+    plate: BodySpec
+    crank: LinkSpec
+    rod: LinkSpec
+    motor: MotorSpec = Field(default_factory=MotorSpec)
+    pattern: PatternSpec | None = None
+    legs: Annotated[list[LegSpec], Field(min_length=6, max_length=6)] | None = None
+
+
+def load_mechanism(name_or_path: str | Path) -> Mechanism:
+    """A shipped mechanism by name, or one from a YAML file (anything with a slash or `.yaml`).
+
+    Raises:
+        ConfigError: one line naming the file, the field, its value and what is allowed.
+    """
+    path = resolve("mechanism", name_or_path)
+    spec = validate(MechanismSpec, load_yaml(path), str(path))
+    try:
+        return build_mechanism(spec)
+    except UnreachablePoseError as error:
+        raise ConfigError(f"{path}: {error}; expected a home pose within reach") from None
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def build_mechanism(spec: MechanismSpec) -> Mechanism:
+    """The checked `Mechanism` of a file's contents.
+
+    Raises:
+        ConfigError, UnreachablePoseError: as `Mechanism` does.
+    """
+    if (spec.pattern is None) == (spec.legs is None):
+        given = "neither" if spec.pattern is None else "both"
+        raise ConfigError(f"pattern, legs: got {given}; expected exactly one of the two")
+    if spec.pattern is not None:
+        p_WS, R_WS, p_PQ, branches = _pattern_anchors(spec.pattern)
+    else:
+        assert spec.legs is not None
+        p_WS, R_WS, p_PQ, branches = _explicit_anchors(spec.legs)
+    return Mechanism(
+        name=spec.name,
+        home=np.array(spec.home),
+        p_WS=p_WS,
+        R_WS=R_WS,
+        p_PQ=p_PQ,
+        crank_lengths=np.broadcast_to(np.array(spec.crank.length), 6),
+        rod_lengths=np.broadcast_to(np.array(spec.rod.length), 6),
+        branches=branches,
+        base=Body(spec.base.mass, np.array(spec.base.inertia)),
+        plate=Body(spec.plate.mass, np.array(spec.plate.inertia)),
+        crank=_link(spec.crank),
+        rod=_link(spec.rod),
+        effort_limit=spec.motor.effort_limit,
+    )
+
+
+def _link(spec: LinkSpec) -> Link:
+    return Link(spec.mass, np.array(spec.inertia), spec.center)
+
+
+def _pairs(first_deg: float, separation_deg: float) -> Array:
+    """Azimuths (6,) in rad of three pairs."""
+    pairs = np.repeat([0.0, 120.0, 240.0], 2) + np.tile([-0.5, 0.5], 3) * separation_deg
+    return np.deg2rad(first_deg + pairs)
+
+
+def _pattern_anchors(pattern: PatternSpec) -> tuple[Array, Array, Array, Array]:
+    if sorted(pattern.plate_order) != list(range(6)):
+        raise ConfigError(
+            f"pattern.plate_order: got {pattern.plate_order}; expected each of 0 to 5 once"
+        )
+    azimuth = _pairs(pattern.rotation_deg, pattern.base_separation_deg)
+    cos, sin, zero = np.cos(azimuth), np.sin(azimuth), np.zeros(6)
+    p_WS = np.column_stack(
+        [pattern.base_radius * cos, pattern.base_radius * sin, zero + pattern.shaft_height]
+    )
+    beta = np.deg2rad(pattern.installation_deg)
+    x = np.column_stack([sin, -cos, zero])
+    y = np.column_stack([np.cos(beta) * cos, np.cos(beta) * sin, zero - np.sin(beta)])
+    R_WS = np.stack([x, y, np.cross(x, y)], axis=2)
+    first_pair = pattern.rotation_deg + pattern.plate_offset_deg
+    joints = _pairs(first_pair, pattern.plate_separation_deg)[pattern.plate_order]
+    p_PQ = np.column_stack(
+        [
+            pattern.plate_radius * np.cos(joints),
+            pattern.plate_radius * np.sin(joints),
+            zero + pattern.plate_height,
+        ]
+    )
+    return p_WS, R_WS, p_PQ, np.array(pattern.branches, dtype=np.float64)
+
+
+def _explicit_anchors(legs: list[LegSpec]) -> tuple[Array, Array, Array, Array]:
+    frames = []
+    for leg, spec in zip(LEGS, legs, strict=True):
+        axis, zero = np.array(spec.motor_axis), np.array(spec.crank_zero)
+        lengths = np.linalg.norm(axis), np.linalg.norm(zero)
+        for field, direction, length in zip(
+            ("motor_axis", "crank_zero"), (spec.motor_axis, spec.crank_zero), lengths, strict=True
+        ):
+            if length == 0:
+                raise ConfigError(
+                    f"legs[{leg - 1}].{field}: got {direction}; expected a direction, not zero"
+                )
+        n, x = axis / lengths[0], zero / lengths[1]
+        if abs(n @ x) > 1e-6:
+            raise ConfigError(
+                f"legs[{leg - 1}].crank_zero: got {np.rad2deg(np.arccos(n @ x)):.6g} degrees to "
+                "motor_axis; expected a perpendicular direction"
+            )
+        x = x - (n @ x) * n
+        x /= np.linalg.norm(x)
+        frames.append(np.column_stack([x, np.cross(n, x), n]))
+    return (
+        np.array([spec.shaft for spec in legs]),
+        np.array(frames),
+        np.array([spec.plate_joint for spec in legs]),
+        np.array([spec.branch for spec in legs], dtype=np.float64),
+    )

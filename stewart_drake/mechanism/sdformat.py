@@ -1,0 +1,219 @@
+"""Writes a `Mechanism` as SDFormat for Drake: links, joints, visuals, a ball constraint per leg."""
+
+from collections.abc import Iterable
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.mechanism.assembly import Assembly, assemble
+from stewart_drake.mechanism.geometry import Body, Mechanism
+from stewart_drake.signals import LEGS
+
+Array = NDArray[np.float64]
+
+BASE_COLOR = (0.60, 0.63, 0.67, 1.0)
+MOTOR_COLOR = (0.16, 0.18, 0.21, 1.0)
+CRANK_COLOR = (0.90, 0.45, 0.10, 1.0)
+ROD_COLOR = (0.52, 0.55, 0.60, 1.0)
+JOINT_COLOR = (0.30, 0.32, 0.36, 1.0)
+PLATE_COLOR = (0.13, 0.42, 0.70, 1.0)
+
+
+def to_sdformat(mechanism: Mechanism) -> str:
+    """The mechanism as an SDFormat 1.9 document, assembled at its home pose.
+
+    Links: `base`, `plate`, `crank_i`, `rod_i`; joints: `base_weld`, `motor_i` (revolute, actuated),
+    `universal_i`; a frame at every joint: `shaft_i`, `tip_i`, `rod_end_i`, `plate_joint_i`. Legs i
+    count from 1.
+    The loops are closed by `drake:ball_constraint` between `rod_i` and `plate`.
+    """
+    home = assemble(mechanism, mechanism.home)
+    sdf = ET.Element("sdf", {"version": "1.9", "xmlns:drake": "http://drake.mit.edu"})
+    model = _add(sdf, "model", name=mechanism.name)
+    _base(model, mechanism)
+    _plate(model, mechanism, home)
+    for leg in LEGS:
+        _leg(model, mechanism, home, leg)
+    ET.indent(sdf, " " * 2)
+    return '<?xml version="1.0"?>\n' + ET.tostring(sdf, encoding="unicode") + "\n"
+
+
+def _base(model: ET.Element, mechanism: Mechanism) -> None:
+    link = _add(model, "link", name="base")
+    if mechanism.base.mass > 0:
+        _inertial(link, mechanism.base, np.zeros(3))
+    size = _sizes(mechanism)
+    radius = 1.2 * np.hypot(mechanism.p_WS[:, 0], mechanism.p_WS[:, 1]).max()
+    axes = mechanism.R_WS[:, :, 2]
+    # The motors sit behind the planes in which their cranks turn, sunk into the disc they stand on.
+    centres = mechanism.p_WS - axes * (size["motor_length"] / 2 + size["crank"])
+    tilt = np.hypot(axes[:, 0], axes[:, 1])
+    reach = np.abs(axes[:, 2]) * size["motor_length"] / 2 + tilt * size["motor_radius"]
+    bottom = (centres[:, 2] - reach).min() - 0.2 * size["motor_radius"]
+    top = bottom + 0.6 * size["motor_radius"]
+    disc = _cylinder(radius, top - bottom)
+    _visual(link, "disc", _pose([0, 0, (top + bottom) / 2]), disc, BASE_COLOR)
+    for leg, p_WS, R_WS, centre in zip(LEGS, mechanism.p_WS, mechanism.R_WS, centres, strict=True):
+        motor = _cylinder(size["motor_radius"], size["motor_length"])
+        _visual(link, f"motor_{leg}", _pose(centre, R_WS), motor, MOTOR_COLOR)
+        height = centre[2] - top
+        post = _cylinder(0.7 * size["motor_radius"], height)
+        foot = [centre[0], centre[1], top + height / 2]
+        _visual(link, f"post_{leg}", _pose(foot), post, BASE_COLOR)
+        _frame(model, f"shaft_{leg}", "base", _pose(p_WS, R_WS))
+    weld = _add(model, "joint", name="base_weld", type="fixed")
+    _add(weld, "parent", "world")
+    _add(weld, "child", "base")
+
+
+def _plate(model: ET.Element, mechanism: Mechanism, home: Assembly) -> None:
+    link = _add(model, "link", name="plate")
+    _add(link, "pose", _pose(mechanism.home[3:], home.R_WP))
+    _inertial(link, mechanism.plate, np.zeros(3))
+    size = _sizes(mechanism)
+    radius = 1.08 * np.hypot(mechanism.p_PQ[:, 0], mechanism.p_PQ[:, 1]).max()
+    disc = _cylinder(radius, size["plate"])
+    _visual(link, "disc", _pose([0, 0, size["plate"]]), disc, PLATE_COLOR)
+    # A pointer along x shows the yaw that a disc would hide.
+    bar = _box([0.85 * radius, 0.06 * radius, 0.4 * size["plate"]])
+    above = 1.6 * size["plate"]
+    _visual(link, "x_axis", _pose([0.425 * radius, 0, above]), bar, CRANK_COLOR)
+    tip = _cylinder(0.09 * radius, 0.4 * size["plate"])
+    _visual(link, "x_axis_tip", _pose([0.85 * radius, 0, above]), tip, CRANK_COLOR)
+    for leg, p_PQ in zip(LEGS, mechanism.p_PQ, strict=True):
+        _visual(link, f"joint_{leg}", _pose(p_PQ), _sphere(1.6 * size["rod"]), JOINT_COLOR)
+        _frame(model, f"plate_joint_{leg}", "plate", _pose(p_PQ))
+
+
+def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> None:
+    i = leg - 1
+    u, length = mechanism.crank_lengths[i], mechanism.rod_lengths[i]
+    size = _sizes(mechanism)
+    crank = _add(model, "link", name=f"crank_{leg}")
+    _add(crank, "pose", _pose(mechanism.p_WS[i], home.R_WC[i]))
+    _inertial(crank, mechanism.crank, np.array([mechanism.crank.center * u, 0, 0]))
+    arm = _box([u, 1.6 * size["crank"], size["crank"]])
+    _visual(crank, "arm", _pose([u / 2, 0, 0]), arm, CRANK_COLOR)
+    hub = _cylinder(1.2 * size["crank"], 1.5 * size["crank"])
+    _visual(crank, "hub", _pose([0, 0, 0]), hub, CRANK_COLOR)
+    _visual(crank, "tip", _pose([u, 0, 0]), _sphere(1.6 * size["rod"]), JOINT_COLOR)
+    _frame(model, f"tip_{leg}", f"crank_{leg}", _pose([u, 0, 0]))
+
+    rod = _add(model, "link", name=f"rod_{leg}")
+    _add(rod, "pose", _pose(home.p_WT[i], home.R_WD[i]))
+    _inertial(rod, mechanism.rod, np.array([mechanism.rod.center * length, 0, 0]))
+    along_x = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    tube = _cylinder(size["rod"], length)
+    _visual(rod, "tube", _pose([length / 2, 0, 0], along_x), tube, ROD_COLOR)
+    _frame(model, f"rod_end_{leg}", f"rod_{leg}", _pose([length, 0, 0]))
+
+    motor = _add(model, "joint", name=f"motor_{leg}", type="revolute")
+    _add(motor, "parent", "base")
+    _add(motor, "child", f"crank_{leg}")
+    axis = _axis(motor, "axis", np.array([0.0, 0, 1]))
+    if mechanism.effort_limit is not None:
+        _add(_add(axis, "limit"), "effort", f"{mechanism.effort_limit:.17g}")
+
+    universal = _add(model, "joint", name=f"universal_{leg}", type="universal")
+    _add(universal, "parent", f"crank_{leg}")
+    _add(universal, "child", f"rod_{leg}")
+    for tag, direction in (
+        ("axis", home.R_WD[i].T @ mechanism.R_WS[i][:, 2]),
+        ("axis2", np.array([0.0, 1, 0])),
+    ):
+        passive = _add(_axis(universal, tag, direction), "limit")
+        _add(passive, "effort", "0")
+
+    ball = _add(model, "drake:ball_constraint")
+    for name, value in (
+        ("body_A", f"rod_{leg}"),
+        ("body_B", "plate"),
+        ("p_AP", _numbers([length, 0, 0])),
+        ("p_BQ", _numbers(mechanism.p_PQ[i])),
+    ):
+        _add(ball, f"drake:ball_constraint_{name}", value)
+
+
+def _sizes(mechanism: Mechanism) -> dict[str, float]:
+    """Dimensions of what is only drawn, in m, proportioned to the machine."""
+    u, rod = float(mechanism.crank_lengths.min()), float(mechanism.rod_lengths.min())
+    return {
+        "crank": 0.10 * u,
+        "motor_radius": 0.22 * u,
+        "motor_length": 0.40 * u,
+        "rod": 0.012 * rod,
+        "plate": 0.03 * rod,
+    }
+
+
+def _add(parent: ET.Element, tag: str, text: str | None = None, **attributes: str) -> ET.Element:
+    element = ET.SubElement(parent, tag, attributes)
+    element.text = text
+    return element
+
+
+def _numbers(values: Iterable[float]) -> str:
+    # Adding 0.0 turns -0 into 0, which platforms disagree about.
+    return " ".join(f"{float(value) + 0.0:.15g}" for value in values)
+
+
+def _pose(p: Iterable[float], R: Array | None = None) -> str:
+    if R is None:
+        return f"{_numbers(p)} 0 0 0"
+    # Roll and pitch are read after undoing the yaw. At a pitch of 90 degrees, that of a vertical
+    # crank, yaw is arbitrary, and only so does roll take up what rounding made of it.
+    yaw = np.arctan2(R[1, 0], R[0, 0])
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    pitch = np.arctan2(-R[2, 0], cos * R[0, 0] + sin * R[1, 0])
+    roll = np.arctan2(sin * R[0, 2] - cos * R[1, 2], cos * R[1, 1] - sin * R[0, 1])
+    return f"{_numbers(p)} {_numbers([roll, pitch, yaw])}"
+
+
+def _frame(model: ET.Element, name: str, attached_to: str, pose: str) -> None:
+    frame = _add(model, "frame", name=name, attached_to=attached_to)
+    _add(frame, "pose", pose)
+
+
+def _inertial(link: ET.Element, body: Body, com: Array) -> None:
+    inertial = _add(link, "inertial")
+    _add(inertial, "pose", _pose(com))
+    _add(inertial, "mass", _numbers([body.mass]))
+    inertia = _add(inertial, "inertia")
+    moments = dict(zip(("ixx", "iyy", "izz"), body.inertia, strict=True))
+    for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"):
+        _add(inertia, name, _numbers([moments.get(name, 0.0)]))
+
+
+def _axis(joint: ET.Element, tag: str, xyz: Array) -> ET.Element:
+    axis = _add(joint, tag)
+    _add(axis, "xyz", _numbers(xyz))
+    return axis
+
+
+def _visual(
+    link: ET.Element, name: str, pose: str, geometry: ET.Element, color: tuple[float, ...]
+) -> None:
+    visual = _add(link, "visual", name=name)
+    _add(visual, "pose", pose)
+    _add(visual, "geometry").append(geometry)
+    _add(_add(visual, "material"), "diffuse", _numbers(color))
+
+
+def _cylinder(radius: float, length: float) -> ET.Element:
+    cylinder = ET.Element("cylinder")
+    _add(cylinder, "radius", _numbers([radius]))
+    _add(cylinder, "length", _numbers([length]))
+    return cylinder
+
+
+def _sphere(radius: float) -> ET.Element:
+    sphere = ET.Element("sphere")
+    _add(sphere, "radius", _numbers([radius]))
+    return sphere
+
+
+def _box(size: Iterable[float]) -> ET.Element:
+    box = ET.Element("box")
+    _add(box, "size", _numbers(size))
+    return box

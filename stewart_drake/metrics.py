@@ -1,0 +1,59 @@
+"""How well a run went: equation (47) and what stands beside it."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def accumulated_error(time: Array, error: Array, scale: Array) -> float:
+    """E_ac in % s, equation (47): mean over the coordinates of integral |e_i| / A_i * 100 dt.
+
+    Args:
+        time: (n,) s; the trapezoid rule runs on it.
+        error: (n, 6) pose error against the true reference.
+        scale: (6,) A_i, peak to peak of the reference, 1 where it is constant.
+    """
+    return float(np.mean(np.trapezoid(np.abs(error) / scale * 100, time, axis=0)))
+
+
+def quadratic_cost(
+    error: Array, torque: Array, period: float, w_Q: float, w_R: float, integral: bool
+) -> float:
+    """Equation (40) on samples: sum of w_Q (|e|^2 + |z|^2) + w_R |T|^2, unscaled as in (41).
+
+    Args:
+        error: (n, 6) pose error at the controller's samples.
+        torque: (n, 6) commanded there, N m.
+        period: s; z follows from the errors by the trapezoid rule.
+        w_Q, w_R: the weights.
+        integral: whether the cost sees z, (28).
+    """
+    cost = w_Q * float(np.sum(error**2)) + w_R * float(np.sum(torque**2))
+    if integral:
+        z = np.vstack([np.zeros(6), np.cumsum((error[1:] + error[:-1]) * period / 2, axis=0)])
+        cost += w_Q * float(np.sum(z**2))
+    return cost
+
+
+def total_variation(torque: Array) -> float:
+    """Mean over the motors of sum |T_{k+1} - T_k| in N m: the paper's trembling."""
+    return float(np.mean(np.abs(np.diff(torque, axis=0)).sum(axis=0)))
+
+
+def peak_error(error: Array, scale: Array) -> Array:
+    """(6,) largest |error| in percent of peak to peak."""
+    return 100 * np.abs(error).max(axis=0) / scale
+
+
+def delay_floor(time: Array, reference: Array, scale: Array, eta: float) -> float:
+    """E_ac in % s that a plate at rest with nothing in flight collects before any torque acts.
+
+    Args:
+        time: (n,) s.
+        reference: (n, 6) poses; the plate stays at the first one until eta.
+        scale: (6,) as in `accumulated_error`.
+        eta: total delay in s.
+    """
+    waiting = time <= eta + 1e-9
+    return accumulated_error(time[waiting], (reference - reference[0])[waiting], scale)

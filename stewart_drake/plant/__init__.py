@@ -1,0 +1,1 @@
+"""Two plants with the same ports: Drake's multibody engine, and the loops closed exactly."""

@@ -1,0 +1,133 @@
+"""Where a mechanism may be: off dead centres and parallel singularities, angles distinct."""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.plant import equations
+from stewart_drake.plant.compiled import Compiled
+from stewart_drake.plant.equations import DEAD_CENTRE_SINE
+from stewart_drake.signals import LEGS, NUM_LEGS
+
+Array = NDArray[np.float64]
+
+PITCH_LIMIT = np.deg2rad(85.0)
+"""Roll and yaw become one rotation at a pitch of 90 degrees."""
+SINGULARITY_LIMIT = 1e-3
+"""Least |det| of the dimensionless wrenches of the six rods, see `parallel_measure`."""
+
+
+class Failure(NamedTuple):
+    """Why a run stopped: time in s, leg (from 1, or None), margin and the reason in words.
+
+    `margin` is the reach margin of that leg in m, or the measure that the reason names.
+    """
+
+    time: float
+    leg: int | None
+    margin: float
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.reason} at t = {self.time:.3f} s (margin {self.margin:.2g})"
+
+
+class Standing(NamedTuple):
+    """`sines` (6,): of the cranks' angles off dead centre, negative on the other branch.
+    `parallel`: signed measure of parallel singularity, 0 where cranks no longer hold the plate.
+    `pitch`: rad."""
+
+    sines: Array
+    parallel: float
+    pitch: float
+
+    def margin(self, home_sign: float) -> float:
+        """Positive inside the permitted region, zero on its boundary, dimensionless."""
+        return min(
+            float(self.sines.min()) - DEAD_CENTRE_SINE,
+            home_sign * self.parallel - SINGULARITY_LIMIT,
+            float(PITCH_LIMIT - abs(self.pitch)),
+        )
+
+
+def standing(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> Standing:
+    """Where a pose (6,) is in the workspace; defined everywhere, also out of reach.
+
+    With the crank angles (6,) of a simulated tree given, a crank that has passed its dead centre
+    shows as a negative sine; from the pose alone it cannot be seen.
+    """
+    functions = _functions(mechanism)
+    if crank_angles is None:
+        sines, wrenches = functions.of_pose(pose)
+    else:
+        sines, wrenches = functions.of_tree(pose, crank_angles)
+    return Standing(sines, float(np.linalg.det(wrenches)), float(pose[1]))
+
+
+class _Functions(NamedTuple):
+    """Sines (6,) and wrenches (6, 6), from a pose or from a pose and crank angles."""
+
+    of_pose: Compiled
+    of_tree: Compiled
+
+
+@lru_cache(maxsize=64)
+def _functions(mechanism: Mechanism) -> _Functions:
+    """Compiled, because every integration step asks; one thread at a time, see `Compiled`."""
+    pose, angles = ca.SX.sym("pose", 6), ca.SX.sym("angles", 6)
+    R_WP = equations.rotation(pose[:3])
+    # Forces along the rods, and their moments over the plate's mean radius, as unit-free columns.
+    radius = float(np.linalg.norm(mechanism.p_PQ, axis=1).mean())
+    results: dict[str, list[tuple[ca.SX, ca.SX]]] = {"pose": [], "tree": []}
+    for leg in range(NUM_LEGS):
+        u, length = float(mechanism.crank_lengths[leg]), float(mechanism.rod_lengths[leg])
+        branch, R_WS = float(mechanism.branches[leg]), ca.DM(mechanism.R_WS[leg])
+        b = ca.mtimes(R_WP, ca.DM(mechanism.p_PQ[leg]))
+        q = ca.mtimes(R_WS.T, pose[3:] + b - ca.DM(mechanism.p_WS[leg]))
+        azimuth = ca.atan2(q[1], q[0])
+        cosine = equations.swing_cosine(q, u, length)
+        square = 1 - cosine**2
+        swing = ca.acos(ca.fmin(ca.fmax(cosine, -1.0), 1.0))
+        for kind, alpha, sine in (
+            ("pose", azimuth + branch * swing, ca.sign(square) * ca.sqrt(ca.fabs(square))),
+            ("tree", angles[leg], branch * ca.sin(angles[leg] - azimuth)),
+        ):
+            rod = (q - u * ca.vertcat(ca.cos(alpha), ca.sin(alpha), 0)) / length
+            e = ca.mtimes(R_WS, rod)
+            results[kind].append((sine, ca.vertcat(ca.cross(b, e) / radius, e)))
+    functions = []
+    for kind, arguments in (("pose", [pose]), ("tree", [pose, angles])):
+        sines, wrenches = zip(*results[kind], strict=True)
+        outputs = [ca.vertcat(*sines), ca.densify(ca.horzcat(*wrenches))]
+        functions.append(Compiled(ca.Function(kind, arguments, outputs, {"cse": True})))
+    return _Functions(*functions)
+
+
+@lru_cache(maxsize=64)
+def home_sign(mechanism: Mechanism) -> float:
+    """Sign of `Standing.parallel` at home, which a continuous motion can only change at zero."""
+    return float(np.sign(standing(mechanism, mechanism.home).parallel))
+
+
+def diagnose(
+    mechanism: Mechanism, time: float, pose: Array, crank_angles: Array | None = None
+) -> Failure | None:
+    """The failure at a pose that has left the permitted region, or None inside it."""
+    if not np.all(np.isfinite(pose)):
+        return Failure(time, None, np.nan, "the simulated state is not finite")
+    now, sign = standing(mechanism, pose, crank_angles), home_sign(mechanism)
+    if now.margin(sign) > 0:
+        return None
+    leg = int(now.sines.argmin())
+    if now.sines[leg] <= DEAD_CENTRE_SINE:
+        margin = float(mechanism.reach_margins(pose)[leg])
+        return Failure(time, LEGS[leg], margin, f"leg {LEGS[leg]} reached the end of its reach")
+    if abs(now.pitch) >= PITCH_LIMIT:
+        return Failure(time, None, PITCH_LIMIT - abs(now.pitch), "the pitch passed 85 degrees")
+    return Failure(
+        time, None, sign * now.parallel, "parallel singularity: the cranks do not hold the plate"
+    )

@@ -1,0 +1,251 @@
+"""Figures of one run, and of a comparison in the manner of the paper's figures 5 and 7.
+
+Angles are shown in degrees, positions in mm. A run that ended early ends with a cross at that time.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from stewart_drake.report import style
+from stewart_drake.report.style import figure_style, write_figure
+from stewart_drake.results import SimulationResult
+from stewart_drake.signals import COORDINATES, LEGS, PARAMETERS
+from stewart_drake.studies.compare import LABELS
+
+Array = NDArray[np.float64]
+
+TORQUE_CONTROLLERS: Final = ("delay_lqr", "delay_lqi", "predictor_lqi")
+"""Those whose torques a comparison shows: they know of the delay."""
+
+_UNITS: Final = ("deg",) * 3 + ("mm",) * 3
+_FACTORS: Final = np.array([180 / np.pi] * 3 + [1e3] * 3)
+_SYMBOLS: Final = dict(zip(COORDINATES, ("roll φ", "pitch θ", "yaw ψ", "x", "y", "z"), strict=True))
+_PARAMETER_UNITS: Final = ("mN m",) * 6 + ("kg", "mN m s/rad")
+_PARAMETER_FACTORS: Final = np.array([1e3] * 6 + [1.0, 1e3])
+_CROSS: Final = "x"
+_AFTER_END: Final = 1.1
+"""Where all runs ended early, the time axis goes on for this factor."""
+_STATE_REACH: Final = 0.3
+_ERROR_REACH: Final = 0.5
+"""How far a diverging run may widen an axis, as a share of the reference's peak to peak."""
+_LEAST_SIGMAS: Final = 0.02
+"""A parameter's axis shows at least this share of its largest standard deviation to either side:
+the band narrows by orders of magnitude, and the estimate counts."""
+_MARGIN: Final = 0.06
+"""Empty share of an axis beyond the data."""
+
+
+def comparison_figures(
+    results: Mapping[str, SimulationResult], directory: str | Path
+) -> list[Path]:
+    """Write states, errors, and torques of each delay-aware controller, as PNG and SVG.
+
+    Args:
+        results: by controller, as `compare` returns them.
+        directory: that exists.
+
+    Returns:
+        The paths written; none without results.
+
+    Raises:
+        OSError: the directory cannot be written to.
+    """
+    if not results:
+        return []
+    lines = {LABELS[name]: style.CONTROLLER_LINES[name] for name in results}
+    runs = {LABELS[name]: result for name, result in results.items()}
+    with figure_style():
+        figures = {"states": _states(runs, lines), "errors": _errors(runs, lines)}
+        for name in TORQUE_CONTROLLERS:
+            if name in results:
+                line = style.CONTROLLER_LINES[name]
+                figures[f"torques_{name}"] = _torques(results[name], LABELS[name], line)
+        return _write(figures, directory)
+
+
+def run_figures(result: SimulationResult, directory: str | Path) -> list[Path]:
+    """Write states, errors, torques and, with an estimator, the parameters, as PNG and SVG.
+
+    Args:
+        result: of one run.
+        directory: that exists.
+
+    Returns:
+        The paths written.
+
+    Raises:
+        OSError: the directory cannot be written to.
+    """
+    runs, lines = {"plate": result}, {"plate": style.RUN}
+    with figure_style():
+        figures = {
+            "states": _states(runs, lines),
+            "errors": _errors(runs, lines),
+            "torques": _torques(result, "applied", style.RUN, commanded=True),
+        }
+        if np.isfinite(result.signals.parameter_std.values).any():
+            figures["parameters"] = _parameters(result)
+        return _write(figures, directory)
+
+
+def _write(figures: Mapping[str, Figure], directory: str | Path) -> list[Path]:
+    return [
+        path
+        for name, figure in figures.items()
+        for path in write_figure(figure, Path(directory), name)
+    ]
+
+
+def _states(runs: Mapping[str, SimulationResult], lines: Mapping[str, style.Line]) -> Figure:
+    figure, axes = _grid(runs.values())
+    wanted = max((run.signals for run in runs.values()), key=lambda s: s.sizes["time"])
+    for k, ax in enumerate(axes):
+        reference = _FACTORS[k] * wanted.reference.values[:, k]
+        ax.plot(wanted.time.values, reference, label="reference", **style.REFERENCE._asdict())
+        data = {label: _FACTORS[k] * run.signals.pose.values[:, k] for label, run in runs.items()}
+        _limit(ax, [reference, *_trusted(runs, data)], data, _STATE_REACH * _span(reference))
+        _plot(ax, runs, lines, data)
+        ax.set_ylabel(f"{_SYMBOLS[COORDINATES[k]]}  [{_UNITS[k]}]")
+    return _with_legend(figure, axes)
+
+
+def _errors(runs: Mapping[str, SimulationResult], lines: Mapping[str, style.Line]) -> Figure:
+    figure, axes = _grid(runs.values())
+    for k, ax in enumerate(axes):
+        data = {label: _FACTORS[k] * run.signals.error.values[:, k] for label, run in runs.items()}
+        motion = _FACTORS[k] * max(
+            (_span(run.signals.reference.values[:, k]) for run in runs.values()), default=0.0
+        )
+        _limit(ax, _trusted(runs, data), data, _ERROR_REACH * motion)
+        _plot(ax, runs, lines, data)
+        ax.set_ylabel(f"{_SYMBOLS[COORDINATES[k]]} error  [{_UNITS[k]}]")
+    return _with_legend(figure, axes)
+
+
+def _torques(
+    run: SimulationResult, label: str, line: style.Line, commanded: bool = False
+) -> Figure:
+    figure, axes = _grid([run], sharey=True)
+    steps: dict[str, Any] = {"drawstyle": "steps-post"}
+    for k, ax in enumerate(axes):
+        time = run.signals.time.values
+        if commanded:
+            values = run.signals.torque_commanded.values[:, k]
+            ax.plot(time, values, label="commanded", **steps, **style.COMMANDED._asdict())
+        values = run.signals.torque_applied.values[:, k]
+        _plot(ax, {label: run}, {label: line}, {label: values}, **steps)
+        ax.set_ylabel(f"motor {LEGS[k]}  [N m]")
+    return _with_legend(figure, axes)
+
+
+def _parameters(run: SimulationResult) -> Figure:
+    figure, axes = _grid([run], rows=4)
+    plant, time = run.scenario.plant, run.signals.time.values
+    true = np.array([*plant.torque_bias, plant.payload_mass, plant.joint_damping])
+    true, values, widths = (
+        _PARAMETER_FACTORS * data
+        for data in (true, run.signals.parameters.values, 2 * run.signals.parameter_std.values)
+    )
+    for k, ax in enumerate(axes):
+        value, width = values[:, k], widths[:, k]
+        least = _LEAST_SIGMAS * np.nanmax(width) / 2
+        _limit(ax, [value, np.array([true[k] - least, true[k] + least])], {}, 0.0)
+        ax.axhline(true[k], label="true value", **style.TRUTH._asdict())
+        ax.plot(time, value, label="estimate", **style.RUN._asdict())
+        ax.fill_between(
+            time,
+            value - width,
+            value + width,
+            color=style.RUN.color,
+            alpha=style.BAND_ALPHA,
+            linewidth=0,
+            label="± 2 σ",
+        )
+        name = PARAMETERS[k].replace("_", " ")
+        ax.set_ylabel(f"{name}  [{_PARAMETER_UNITS[k]}]")
+    return _with_legend(figure, axes)
+
+
+def _grid(
+    runs: Iterable[SimulationResult], rows: int = 3, sharey: bool = False
+) -> tuple[Figure, list[Axes]]:
+    """Two columns of axes over one time axis, filled column by column."""
+    height = 1.5 + 1.8 * rows
+    # Fixed margins, in inches over the height: a layout engine takes most of the drawing time.
+    room = {"left": 0.09, "right": 0.985, "wspace": 0.24, "hspace": 0.12}
+    figure = Figure(figsize=(10, height))
+    figure.subplots_adjust(bottom=0.5 / height, top=1 - 0.45 / height, **room)
+    axes = figure.subplots(rows, 2, sharex=True, sharey=sharey)
+    for ax in axes.ravel():
+        ax.yaxis.set_label_coords(-0.14, 0.5)
+    for ax in axes[-1]:
+        ax.set_xlabel("time  [s]")
+    axes[0, 0].set_xlim(0, max(_end(run) for run in runs))
+    return figure, list(axes.T.ravel())
+
+
+def _end(run: SimulationResult) -> float:
+    """s, what the time axis shows of a run."""
+    end = run.scenario.duration
+    return end if run.stopped is None else min(end, _AFTER_END * run.stopped.time) or end
+
+
+def _with_legend(figure: Figure, axes: list[Axes]) -> Figure:
+    # A run's cross has a line of its own, for which one entry stands.
+    handles, labels = axes[0].get_legend_handles_labels()
+    if any(line.get_marker() == _CROSS for ax in axes for line in ax.lines):
+        handles.append(Line2D([], [], ls="", marker=_CROSS, color="#666666", ms=7, mew=2))
+        labels.append("run ended")
+    figure.legend(handles, labels, loc="upper center", ncols=len(labels))
+    return figure
+
+
+def _plot(
+    ax: Axes,
+    runs: Mapping[str, SimulationResult],
+    lines: Mapping[str, style.Line],
+    data: Mapping[str, Array],
+    **how: Any,
+) -> None:
+    for label, run in runs.items():
+        line, values = lines[label], data[label]
+        ax.plot(run.signals.time.values, values, label=label, **line._asdict(), **how)
+        if len(values) and run.stopped is not None and run.status != "interrupted":
+            low, high = ax.get_ylim()
+            end = np.clip(values[-1], low, high)
+            ax.plot(run.stopped.time, end, _CROSS, color=line.color, ms=7, mew=2, clip_on=False)
+
+
+def _trusted(runs: Mapping[str, SimulationResult], data: Mapping[str, Array]) -> list[Array]:
+    """Data of the runs that completed, or of all where none did: nothing is to be squashed then."""
+    done = [values for label, values in data.items() if runs[label].status == "completed"]
+    return done or list(data.values())
+
+
+def _finite(parts: Iterable[Array]) -> Array:
+    values = np.concatenate(list(parts))
+    return values[np.isfinite(values)]
+
+
+def _span(values: Array) -> float:
+    return float(np.ptp(values)) if len(values) else 0.0
+
+
+def _limit(ax: Axes, core: list[Array], data: Mapping[str, Array], reach: float) -> None:
+    """Limits that show `core` whole, and of all the data what is not further than `reach` off."""
+    inside = _finite(core)
+    if not len(inside):
+        return
+    everything = _finite([inside, *data.values()])
+    low = max(everything.min(), inside.min() - reach)
+    high = min(everything.max(), inside.max() + reach)
+    margin = _MARGIN * (high - low)
+    if margin > 0:
+        ax.set_ylim(low - margin, high + margin)

@@ -1,0 +1,132 @@
+"""Tables for a person at a terminal of 80 columns."""
+
+import math
+import re
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.plant.workspace import SINGULARITY_LIMIT, standing
+from stewart_drake.resources import Kind, resolve, shipped
+from stewart_drake.results import SimulationResult
+from stewart_drake.signals import COORDINATES
+from stewart_drake.studies.compare import LABELS, PAPER_ERRORS
+
+WIDTH: Final = 80
+_COLUMNS: Final = "{:<16}{:>5}{:>11}{:>11}{:>11}{:>7}{:>7}{:>7}{:>5}"
+_NOTE: Final = "floor: of E_ac, from the delay alone; var.: total variation of a motor's torque"
+
+
+def wrap(text: str, first: str = "", rest: str = "  ") -> str:
+    """One paragraph of at most WIDTH columns, its first line and the others opened as given."""
+    return textwrap.fill(
+        text, WIDTH, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
+    )
+
+
+def rows(entries: Mapping[str, str]) -> str:
+    """Names and texts in two columns, long texts wrapped."""
+    indent = " " * (max(map(len, entries)) + 2)
+    return "\n".join(wrap(text, name.ljust(len(indent)), indent) for name, text in entries.items())
+
+
+def run_table(result: SimulationResult) -> str:
+    """How one run ended, its errors, torques and computing times."""
+    s = result.summary
+    step, floor = s["controller_step_ms"], f"delay floor {number(s['delay_floor'])} % s"
+    peaks = zip(COORDINATES, s["peak_error"], strict=True)
+    entries = {"status": result.status.replace("_", " ")}
+    if result.stopped is not None:
+        entries["status"] += f" at {result.stopped.time:.3f} s"
+        if result.status != "interrupted":
+            entries["reason"] = result.stopped.reason
+    entries |= {
+        "E_ac": f"{number(s['accumulated_error'])} % s, {floor}"
+        if result.status == "completed"
+        else f"none, {floor}",
+        "peak error": ", ".join(f"{name} {number(value)}" for name, value in peaks)
+        + " % of peak to peak",
+        "torque": f"peak {number(s['peak_torque'])}, rms {number(s['rms_torque'])} N m",
+        "controller step": f"median {number(step['median'])}, worst {number(step['worst'])} ms",
+        "wall time": f"{s['wall_s']:.1f} s",
+    }
+    counts = {name.replace("_", " "): str(n) for name, n in s["counts"].items() if n}
+    return rows(entries | counts)
+
+
+def comparison_table(results: Mapping[str, SimulationResult]) -> str:
+    """Table II: one row per controller, with the paper's own numbers."""
+    lines = [
+        _COLUMNS.format("", "paper", "E_ac", "floor", "cost", "peak", "rms", "var.", "step"),
+        _COLUMNS.format("controller", "% s", "% s", "% s", "(40)", "N m", "N m", "N m", "ms"),
+    ]
+    for name, result in results.items():
+        s = result.summary
+        if result.stopped is None:
+            values = (s["accumulated_error"], s["delay_floor"], s["cost"])
+            outcome = "".join(f"{number(value):>11}" for value in values)
+        else:
+            leg = "" if result.stopped.leg is None else f", leg {result.stopped.leg}"
+            status = result.status.replace("_", " ")
+            outcome = f"{f'{status} at {result.stopped.time:.2f} s{leg}':>33}"
+        torques = (s["peak_torque"], s["rms_torque"], s["torque_variation"])
+        lines.append(
+            f"{LABELS[name]:<16}{_paper(name):>5}{outcome}"
+            + "".join(f"{number(value, 2):>7}" for value in torques)
+            + f"{number(s['controller_step_ms']['median'], 2):>5}"
+        )
+    return "\n".join([*lines, _NOTE])
+
+
+def mechanism_table(mechanism: Mechanism) -> str:
+    """A mechanism at its home pose, held there under gravity."""
+    home = mechanism.home
+    dynamics = StewartDynamics(mechanism, gravity=True)
+    poles = np.linalg.eigvals(dynamics.linearize(home)[0])
+    margins, torque = mechanism.reach_margins(home), dynamics.equilibrium_torque(home)
+    singularity = number(abs(standing(mechanism, home).parallel))
+    per_leg = {
+        "reach margin": ", ".join(number(1e3 * margin) for margin in margins) + " mm",
+        "torque": ", ".join(number(value) for value in torque) + " N m",
+    }
+    return rows(
+        {
+            "name": mechanism.name,
+            **{f"{name}, legs 1 to 6": values for name, values in per_leg.items()},
+            "fastest open-loop pole": f"{number(poles.real.max())} /s",
+            "singularity measure": f"{singularity} (a simulation stops at {SINGULARITY_LIMIT:g})",
+        }
+    )
+
+
+def shipped_table(kind: Kind) -> str:
+    """The shipped files of a kind, each with the first sentence of the comment that opens it."""
+    return rows({f"  {name}": _description(resolve(kind, name)) for name in shipped(kind)})
+
+
+def _description(path: Path) -> str:
+    comment = re.match(r"(#.*\n)*", path.read_text(encoding="utf-8"))
+    text = " ".join(line.strip("# ") for line in comment[0].splitlines()) if comment else ""
+    return text.partition(". ")[0].rstrip(".")
+
+
+def number(value: float, digits: int = 3) -> str:
+    """So many significant digits; a dash where there is no number."""
+    if not math.isfinite(value):
+        return "-"
+    if value != 0 and not 1e-4 <= abs(value) < 1e5:
+        return f"{value:.0e}"
+    decimals = digits - 1 - math.floor(math.log10(abs(value))) if value else 0
+    return f"{value:.{max(0, decimals)}f}"
+
+
+def _paper(name: str) -> str:
+    if name not in PAPER_ERRORS:
+        return "-"
+    error = PAPER_ERRORS[name]
+    return "NaN" if error is None else f"{error:.0f}"

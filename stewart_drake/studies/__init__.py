@@ -1,0 +1,1 @@
+"""What runs or judges many simulations."""

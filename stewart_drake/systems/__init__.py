@@ -1,0 +1,1 @@
+"""LeafSystems of the loop, in loop order: reference, sensor, controller, delay chain."""

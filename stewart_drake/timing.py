@@ -1,0 +1,81 @@
+"""Which steps, periods and delays fit each other."""
+
+from typing import Final
+
+METRIC_PERIOD: Final = 0.02
+"""s; the grid of the accumulated error, which the steps of a discrete plant have to hit."""
+
+_EARLY: Final = 1 - 1e-14
+_LOOK: Final = 1 - 5e-15
+
+
+def event_time(nominal: float) -> float:
+    """Period or offset of an event that must precede a discrete plant's step of the same instant.
+
+    Drake takes the k-th event at offset + k * period, rounded: 3 * 0.1 is one ulp later than
+    300 * 0.001, so that a 1 ms plant would have stepped to t + 1 ms before a controller of 0.1 s
+    reads it and sends a torque. Some fifty ulp earlier, at any t, the order is never in doubt.
+    """
+    return nominal * _EARLY
+
+
+def look_time(nominal: float) -> float:
+    """When to look at a running loop so as to see t = `nominal`.
+
+    After the events of that instant, before a discrete plant's step out of it.
+    """
+    return nominal * _LOOK
+
+
+def step_problem(time_step: float, period: float, fraction: float) -> str | None:
+    """What is wrong with the steps of a discrete plant, which sees events on its own steps only.
+
+    Args:
+        time_step: of the plant, s.
+        period: of the controller, s.
+        fraction: of a period, by which the delay exceeds a whole number of periods.
+
+    Returns:
+        None where the metric's grid, the period and the fraction are whole numbers of steps (to
+        1e-9, relative); else the scenario field to change, its value, and the nearest that fits.
+    """
+    if not _is_whole(METRIC_PERIOD / time_step):
+        nearest = _nearest_step(time_step, period)
+        return (
+            f"plant.time_step: got {time_step!r}; expected {METRIC_PERIOD} s divided by a whole "
+            f"number, nearest {nearest!r}"
+        )
+    rule = f"a whole number of plant.time_step ({time_step!r} s)"
+    steps = period / time_step
+    if not _is_whole(steps):
+        nearest = _tidy(max(1, round(steps)) * time_step)
+        return f"controller.period: got {period!r}; expected {rule}, nearest {nearest!r}"
+    delayed = fraction * steps
+    if not _is_whole(delayed):
+        nearest = min(round(delayed), round(steps) - 1) / round(steps)
+        return (
+            f"delay.fraction: got {fraction!r}, {delayed:.6g} steps; expected {rule} within the "
+            f"period, nearest {nearest!r}"
+        )
+    return None
+
+
+def _nearest_step(time_step: float, period: float) -> float:
+    """The nearest step that divides the metric's grid and, if one close by does, the period."""
+    parts = max(1, round(METRIC_PERIOD / time_step))
+    nearby = sorted(
+        range(max(1, parts - 1000), parts + 1000),
+        key=lambda n: abs(METRIC_PERIOD / n - time_step),
+    )
+    fitting = (n for n in nearby if _is_whole(period * n / METRIC_PERIOD))
+    return METRIC_PERIOD / next(fitting, parts)
+
+
+def _is_whole(ratio: float) -> bool:
+    # A ratio that rounds to zero is no step at all, unless it is zero.
+    return abs(ratio - round(ratio)) <= 1e-9 * abs(ratio)
+
+
+def _tidy(value: float) -> float:
+    """`value` without the last digits that a product of decimals carries."""
+    return float(f"{value:.12g}")

@@ -1,0 +1,230 @@
+"""Strict YAML in front of typed configuration: nothing is guessed, nothing is executed.
+
+`load_yaml` turns a file into plain dicts, lists, strings, numbers and booleans; `validate` turns
+these into a pydantic dataclass. Both report the first problem as a one-line `ConfigError`.
+"""
+
+import dataclasses
+import difflib
+import json
+import re
+import types
+import typing
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import pydantic
+from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer
+from ruamel.yaml.constructor import SafeConstructor
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import AliasEvent
+from ruamel.yaml.nodes import ScalarNode
+
+from stewart_drake.errors import ConfigError
+
+_MAX_BYTES: Final = 1_000_000
+_MAX_DEPTH: Final = 20
+_STR_TAG: Final = "tag:yaml.org,2002:str"
+
+_T = TypeVar("_T")
+
+
+class _StrictComposer(Composer):
+    """Refuses what makes a short file large (anchors), typed (tags) or irregular (odd keys)."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event = self.parser.peek_event()
+        if isinstance(event, AliasEvent) or event.anchor is not None:
+            _refuse(f"anchors and aliases ({event.anchor}) are not accepted", event)
+        if event.tag is not None:
+            _refuse(f"tags ({event.tag}) are not accepted", event)
+        return super().compose_node(parent, index)
+
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        node = super().compose_mapping_node(anchor)
+        for key, _ in node.value:
+            if not (isinstance(key, ScalarNode) and str(key.tag) == _STR_TAG):
+                _refuse("a key must be a word", key)
+        return node
+
+
+class _PlainConstructor(SafeConstructor):
+    """Leaves dates as the text they were written as."""
+
+
+_PlainConstructor.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
+
+
+def _refuse(problem: str, at: Any) -> typing.NoReturn:
+    raise MarkedYAMLError(problem=problem, problem_mark=at.start_mark)
+
+
+def load_yaml(path: str | Path) -> dict[str, Any]:
+    """Reads one YAML mapping from a file.
+
+    Args:
+        path: a UTF-8 file of at most 1 MB.
+
+    Returns:
+        The mapping, of plain dicts, lists, strings, numbers, booleans and None.
+
+    Raises:
+        ConfigError: the file cannot be read or decoded; it is empty, is not a mapping, holds
+            several documents, duplicate keys, anchors or tags, or is not YAML. The message names
+            the file, and the line where there is one.
+    """
+    path = Path(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise ConfigError(f"{path}: is not a file; expected a YAML file")
+        with path.open("rb") as stream:
+            raw = stream.read(_MAX_BYTES + 1)
+        if len(raw) > _MAX_BYTES:
+            raise ConfigError(f"{path}: is larger than 1 MB; expected a small YAML file")
+        text = raw.decode("utf-8-sig")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise ConfigError(f"{path}: line {line}: is not UTF-8 text") from None
+    data = parse_yaml(text, str(path))
+    if data is None:
+        raise ConfigError(f"{path}: is empty; expected a YAML mapping")
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: holds {brief(data)}; expected a YAML mapping")
+    return data
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """Parses one YAML value under the rules of `load_yaml`.
+
+    Args:
+        text: the YAML text; it may be a mapping, a list or a single value.
+        where: what the text is, opening every message.
+
+    Raises:
+        ConfigError: the text breaks one of the rules.
+    """
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = _MAX_DEPTH
+    yaml.Composer = _StrictComposer
+    yaml.Constructor = _PlainConstructor
+    try:
+        return yaml.load(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f"line {mark.line + 1}: " if mark else ""
+        problem = str(error.problem or error.context).strip().splitlines()[0]
+        problem = problem.partition(", if necessary")[0]  # advice to programmers
+        raise ConfigError(f"{where}: {line}{_cut(problem, 160)}") from None
+    # Numbers of thousands of digits end in ValueError, deep nesting in RecursionError, and some
+    # malformed directives in whatever the parser trips over.
+    except (YAMLError, ValueError, RecursionError, AssertionError, LookupError) as error:
+        problem = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ConfigError(f"{where}: is not readable as YAML ({_cut(problem, 160)})") from None
+
+
+def validate(type_: type[_T], data: dict[str, Any], where: str) -> _T:
+    """Builds a pydantic dataclass, sections nested to any depth, from plain data.
+
+    Args:
+        type_: the dataclass.
+        data: as `load_yaml` returns it.
+        where: the file (or other origin) that opens the message.
+
+    Raises:
+        ConfigError: `<where>: <section.field>: got <value>; expected <what is accepted>` for the
+            first problem; unknown keys come first and name the nearest known key.
+    """
+    try:
+        # JSON mode is the one in which strict pydantic lets a mapping become a nested dataclass.
+        return pydantic.TypeAdapter(type_).validate_json(json.dumps(data))
+    except pydantic.ValidationError as caught:
+        errors = caught.errors(include_url=False)
+        unknown = [e for e in errors if e["type"].startswith("unexpected_")]
+        first = (unknown or errors)[0]
+        if first["type"] != "json_invalid":  # half a surrogate pair is no JSON text
+            raise ConfigError(f"{where}: {_explain(type_, first)}") from None
+    except (TypeError, ValueError, RecursionError):
+        pass
+    raise ConfigError(f"{where}: got {brief(data)}; expected plain numbers, text and lists")
+
+
+def brief(value: object) -> str:
+    """`repr(value)`, cut to 60 characters."""
+    return _cut(repr(value), 60)
+
+
+def _cut(text: str, length: int) -> str:
+    return text if len(text) <= length else f"{text[: length - 3]}..."
+
+
+_EXPECTED: Final = {
+    "bool_type": "true or false",
+    "dataclass_type": "a mapping",
+    "dict_type": "a mapping",
+    "finite_number": "a finite number",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "list_type": "a list",
+    "string_type": "text",
+}
+_BOUNDS: Final = {
+    "greater_than": ("above", "gt"),
+    "greater_than_equal": ("of at least", "ge"),
+    "less_than": ("below", "lt"),
+    "less_than_equal": ("of at most", "le"),
+}
+
+
+def _explain(type_: type, error: Any) -> str:
+    loc: tuple[int | str, ...] = error["loc"]
+    field = _dotted(loc)
+    if error["type"].startswith("unexpected_"):
+        name = str(loc[-1])
+        owner = _alternative(_hint_at(type_, loc[:-1]), dataclasses.is_dataclass)
+        known = [f.name for f in dataclasses.fields(owner)] if owner else []
+        alike = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {_dotted((*loc[:-1], alike[0]))}?" if alike else ""
+        expected = hint or f"expected one of {', '.join(known)}"
+        return f"{_cut(field, 60)}: unknown key; {expected}"
+    if error["type"].startswith("missing"):
+        return f"{field}: is missing"
+    if error["type"] in _EXPECTED:
+        expected = _EXPECTED[error["type"]]
+    elif error["type"] in _BOUNDS:
+        words, key = _BOUNDS[error["type"]]
+        expected = f"a number {words} {error['ctx'][key]:.12g}"
+    else:
+        expected = re.sub(r"^(\w+ should (be|have) |Value error, )", "", error["msg"])
+        expected = expected.replace(" after validation", "")
+    if types.NoneType in typing.get_args(_hint_at(type_, loc)):
+        expected += ", or null"
+    return f"{field}: got {brief(error['input'])}; expected {expected}"
+
+
+def _dotted(loc: tuple[int | str, ...]) -> str:
+    """`("reference", "poses", 2, 0)` as `reference.poses[2][0]`."""
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
+    return "".join(parts).removeprefix(".")
+
+
+def _hint_at(type_: Any, loc: tuple[int | str, ...]) -> Any:
+    """The annotation of the field at `loc`, for a path through dataclasses and their lists."""
+    hint = type_
+    for part in loc:
+        if isinstance(part, int):  # the items of a list
+            owner = _alternative(hint, lambda a: typing.get_origin(a) is list)
+            hint = typing.get_args(owner)[0] if owner else None
+        else:
+            owner = _alternative(hint, dataclasses.is_dataclass)
+            hint = typing.get_type_hints(owner).get(part) if owner else None
+    return hint
+
+
+def _alternative(hint: Any, wanted: Callable[[Any], bool]) -> Any:
+    """The member of the union `hint` that is `wanted`; a plain type is a union of one."""
+    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    return next((a for a in (typing.get_args(hint) if union else (hint,)) if wanted(a)), None)

@@ -1,0 +1,283 @@
+"""`PartitionedTree`: the dynamics of a mechanism by Drake's tree algorithms, closed generically.
+
+The machine cut open at its spherical joints is a tree, which Drake knows how to treat: base - crank
+- rod, six times, and the floating plate, with velocities v (24,). Closing the loops demands that
+every rod end moves with its plate joint,
+
+    Phi(q) v = 0,    Phi v_dot + b(q, v) = 0,
+
+b the acceleration bias of the rod end seen from the joint. Coordinate partitioning (Wehage & Haug,
+1982) takes the plate's velocities nu (6,) as independent and solves for the legs' (18,), with
+Phi = [Phi_l, Phi_p]:
+
+    v = Gamma nu,   Gamma = [-Phi_l^-1 Phi_p; 1],   Gamma_dot nu = [-Phi_l^-1 b; 0].
+
+Reactions at the cut joints do no work on Gamma's columns, hence
+
+    M_r nu_dot + h_r = Gamma' S torque,   M_r = Gamma' M Gamma,
+    h_r = Gamma' (M Gamma_dot nu + C v - tau_applied).
+
+Nothing of the closed-form equations is used: only the SDFormat file is common to both.
+"""
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    JacobianWrtVariable,
+    MultibodyForces,
+    RpyFloatingJoint,
+    SpatialInertia,
+    UnitInertia,
+)
+from scipy.integrate import solve_ivp
+
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import UnreachablePoseError, leg_geometry
+from stewart_drake.mechanism.sdformat import to_sdformat
+from stewart_drake.signals import ANGLES, BIAS, DAMPING, LEGS, PAYLOAD, POSITION
+
+Array = NDArray[np.float64]
+
+NO_PARAMETERS = np.zeros(8)
+CLOSURE_TOLERANCE = 1e-14
+"""Largest gap in m between rod end and plate joint at which Newton's method stops."""
+ORIGIN = np.zeros((3, 1))
+
+
+class PartitionedTree:
+    """Reference dynamics in pose coordinates; the methods mirror `StewartDynamics`.
+
+    Args:
+        mechanism: the machine.
+        gravity: whether Drake's default gravity acts.
+    """
+
+    def __init__(self, mechanism: Mechanism, gravity: bool = True) -> None:
+        ball = re.compile(r"<drake:ball_constraint>.*?</drake:ball_constraint>", re.DOTALL)
+        plant = MultibodyPlant(0.0)
+        Parser(plant).AddModelsFromString(ball.sub("", to_sdformat(mechanism)), "sdf")
+        plate = plant.GetBodyByName("plate").body_frame()
+        self._floating = plant.AddJoint(RpyFloatingJoint("plate", plant.world_frame(), plate))
+        massless = SpatialInertia(0.0, np.zeros(3), UnitInertia(0, 0, 0))
+        self._payload = plant.AddRigidBody(
+            "payload", plant.GetModelInstanceByName(mechanism.name), massless
+        )
+        plant.WeldFrames(plate, self._payload.body_frame())
+        if not gravity:
+            plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
+        plant.Finalize()
+        self.plant, self.context = plant, plant.CreateDefaultContext()
+        self._forces = MultibodyForces(plant)
+        self._actuation = plant.MakeActuationMatrix()
+        self._cranks = [plant.GetJointByName(f"motor_{leg}") for leg in LEGS]
+        self._pairs = [
+            (plant.GetFrameByName(f"rod_end_{leg}"), plant.GetFrameByName(f"plate_joint_{leg}"))
+            for leg in LEGS
+        ]
+        start = self._floating.velocity_start()
+        self._plate = np.arange(start, start + 6)
+        self._legs = np.array([self._leg_indices(leg) for leg in LEGS])
+        assert plant.num_constraints() == 0
+        self._home, self._closed_at = mechanism.home, np.full(6, np.nan)
+        _, self._phi = self._newton(np.zeros(plant.num_positions()), mechanism.home)
+        self._branches = np.sign(np.linalg.det(self._leg_blocks(self._phi)))
+
+    def _leg_indices(self, leg: int) -> list[int]:
+        """Of crank and universal joint in v, and in q, where these joints have q_dot = v."""
+        crank = self.plant.GetJointByName(f"motor_{leg}")
+        universal = self.plant.GetJointByName(f"universal_{leg}")
+        assert all(j.position_start() == j.velocity_start() for j in (crank, universal))
+        first = universal.velocity_start()
+        return [crank.velocity_start(), first, first + 1]
+
+    # Positions and velocities that close the loops.
+
+    def _closure(self) -> tuple[Array, Array]:
+        """Rod ends seen from their plate joints (6, 3), zero when closed, and Phi (6, 3, 24)."""
+        gaps, phi = np.empty((6, 3)), np.empty((6, 3, 24))
+        for leg, (end, joint) in enumerate(self._pairs):
+            gaps[leg] = self.plant.CalcPointsPositions(self.context, end, ORIGIN, joint)[:, 0]
+            phi[leg] = self.plant.CalcJacobianTranslationalVelocity(
+                self.context, JacobianWrtVariable.kV, end, ORIGIN, joint, joint
+            )
+        return gaps, phi
+
+    def _leg_blocks(self, phi: Array) -> Array:
+        """Phi_l (6, 3, 3): a leg's gap depends on no other leg."""
+        return np.array([phi[i][:, self._legs[i]] for i in range(6)])
+
+    def _newton(self, q: Array, pose: Array) -> tuple[Array | None, Array]:
+        """Positions with all loops closed at a pose, legs starting from q; None without success."""
+        q = q.copy()
+        self.plant.SetPositions(self.context, q)
+        self._floating.set_angles(self.context, pose[ANGLES])
+        self._floating.SetTranslation(self.context, pose[POSITION])
+        q[self._plate] = self.plant.GetPositions(self.context)[self._plate]
+        last = np.inf
+        for _ in range(12):
+            gaps, phi = self._closure()
+            gap = np.abs(gaps).max()
+            # A second step from within ten tolerances only moves the rounding errors about.
+            if gap < CLOSURE_TOLERANCE or last < 10 * CLOSURE_TOLERANCE:
+                return q, phi
+            last = gap
+            q[self._legs] -= np.linalg.solve(self._leg_blocks(phi), gaps[..., None])[..., 0]
+            self.plant.SetPositions(self.context, q)
+        return None, phi
+
+    def _close(self, pose: Array) -> Array:
+        """Set positions with all loops closed; Phi (6, 3, 24) there.
+
+        The legs' angles are followed from home, where they are zero, in as few steps along the
+        straight line as keep every leg in its branch: det(Phi_l) changes sign in the other one.
+        """
+        if np.array_equal(pose, self._closed_at):
+            return self._phi
+        self._closed_at = np.full(6, np.nan)
+        q = np.zeros(self.plant.num_positions())
+        done, step = 0.0, 1.0
+        while done < 1.0:
+            target = min(1.0, done + step)
+            closed, phi = self._newton(q, self._home + target * (pose - self._home))
+            signs = np.sign(np.linalg.det(self._leg_blocks(phi)))
+            if closed is not None and np.array_equal(signs, self._branches):
+                q, done = closed, target
+            else:
+                step /= 2
+            if step < 1e-3:
+                raise ValueError(f"loops cannot be closed on the way from home to {pose}")
+        self._closed_at, self._phi = pose.copy(), phi
+        return phi
+
+    def _reduce(self, pose: Array, rates: Array, parameters: Array) -> tuple[Array, Array, Array]:
+        """M_r (6, 6), h_r (6,) and Gamma' S (6, 6) at a state."""
+        plant, context = self.plant, self.context
+        phi = self._close(pose)
+        phi_l = self._leg_blocks(phi)
+        gamma = np.zeros((24, 6))
+        gamma[self._plate] = np.eye(6)
+        gamma[self._legs] = -np.linalg.solve(phi_l, phi[:, :, self._plate])
+        rpy = RollPitchYaw(pose[ANGLES])
+        w_WP = rpy.CalcAngularVelocityInParentFromRpyDt(rates[ANGLES])
+        plant.SetVelocities(context, gamma @ np.concatenate([w_WP, rates[POSITION]]))
+        bias = np.array(
+            [
+                plant.CalcBiasTranslationalAcceleration(
+                    context, JacobianWrtVariable.kV, end, ORIGIN, joint, joint
+                )[:, 0]
+                for end, joint in self._pairs
+            ]
+        )
+        gamma_dot_nu = np.zeros(24)
+        gamma_dot_nu[self._legs] = -np.linalg.solve(phi_l, bias[..., None])[..., 0]
+
+        self._payload.SetMass(context, parameters[PAYLOAD])
+        for crank in self._cranks:
+            crank.SetDamping(context, parameters[DAMPING])
+        plant.CalcForceElementsContribution(context, self._forces)  # gravity and joint damping
+        M = plant.CalcMassMatrix(context)
+        h = plant.CalcInverseDynamics(context, gamma_dot_nu, self._forces)
+        return gamma.T @ M @ gamma, gamma.T @ h, gamma.T @ self._actuation
+
+    # The answers, in pose coordinates.
+
+    def accelerations(
+        self, pose: Array, rates: Array, torque: Array, parameters: Array = NO_PARAMETERS
+    ) -> Array:
+        """Second derivative (6,) of the pose."""
+        M, h, B = self._reduce(pose, rates, parameters)
+        nu_dot = np.linalg.solve(M, B @ (torque + parameters[BIAS]) - h)
+        rpy_dd = RollPitchYaw(pose[ANGLES]).CalcRpyDDtFromRpyDtAndAngularAccelInParent(
+            rates[ANGLES], nu_dot[:3]
+        )
+        return np.concatenate([rpy_dd, nu_dot[3:]])
+
+    def inverse_dynamics(
+        self, pose: Array, rates: Array, accelerations: Array, parameters: Array = NO_PARAMETERS
+    ) -> Array:
+        """Motor torques (6,) in N m that give these accelerations (6,)."""
+        M, h, B = self._reduce(pose, rates, parameters)
+        rpy = RollPitchYaw(pose[ANGLES])
+        # The second derivatives are affine in the angular acceleration, with the map of the rates.
+        rest = rpy.CalcRpyDDtFromRpyDtAndAngularAccelInParent(rates[ANGLES], np.zeros(3))
+        w_dot = rpy.CalcAngularVelocityInParentFromRpyDt(accelerations[ANGLES] - rest)
+        nu_dot = np.concatenate([w_dot, accelerations[POSITION]])
+        return np.linalg.solve(B, M @ nu_dot + h) - parameters[BIAS]
+
+    def equilibrium_torque(self, pose: Array, parameters: Array = NO_PARAMETERS) -> Array:
+        """Motor torques (6,) in N m that hold the plate still."""
+        return self.inverse_dynamics(pose, np.zeros(6), np.zeros(6), parameters)
+
+    def energy(self, pose: Array, rates: Array, parameters: Array = NO_PARAMETERS) -> float:
+        """Kinetic plus potential energy in J; the zero of the latter is Drake's."""
+        self._reduce(pose, rates, parameters)
+        return float(
+            self.plant.CalcKineticEnergy(self.context)
+            + self.plant.CalcPotentialEnergy(self.context)
+        )
+
+
+def off_dead_centre(mechanism: Mechanism, pose: Array) -> float:
+    """Least sine of a crank's angle off the plane of motor axis and plate joint; < 0 beyond."""
+    try:
+        legs = leg_geometry(mechanism, pose)
+    except UnreachablePoseError:
+        return -1.0
+    p_SQ_W = pose[3:] + legs.p_PQ_W - mechanism.p_WS
+    across, along = (np.einsum("li,li->l", p_SQ_W, e) for e in (legs.tangent, legs.crank))
+    return float((np.abs(across) / np.hypot(across, along)).min())
+
+
+def relative(value: Array, expected: Array) -> float:
+    """Norm of the deviation by the norm of what is expected."""
+    return float(np.linalg.norm(value - expected) / np.linalg.norm(expected))
+
+
+def field(accelerations: Callable[..., Array], *inputs: Array) -> Callable[[Array], Array]:
+    """x = [pose; rates] -> x_dot (12,) under inputs, which are a torque and maybe parameters."""
+    return lambda x: np.concatenate([x[6:], accelerations(x[:6], x[6:], *inputs)])
+
+
+def size(mechanism: Mechanism) -> Array:
+    """Scale (6,) of pose coordinates: 1 for angles, for lengths that of the plate's height."""
+    return np.repeat([1.0, mechanism.home[5] / 0.38], 3)
+
+
+def integrate(derivative: Callable[[Array], Array], start: Array, duration: float) -> Array:
+    """States (n, ...) on the way from `start`, integrated to nearly rounding."""
+    tight = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
+    return solve_ivp(lambda t, x: derivative(x), (0, duration), start, **tight).y.T
+
+
+def central_difference(
+    function: Callable[[Array], Array], point: ArrayLike, step: float = 1e-4
+) -> Array:
+    """Jacobian of `function` at `point` by the five-point formula, whose error is O(step^4)."""
+    point = np.asarray(point, dtype=np.float64)
+    columns = []
+    for direction in step * np.eye(len(point)):
+        near = function(point + direction) - function(point - direction)
+        far = function(point + 2 * direction) - function(point - 2 * direction)
+        columns.append((8 * near - far) / (12 * step))
+    return np.column_stack(columns)
+
+
+def central_difference_linearization(
+    tree: PartitionedTree,
+    state: Array,
+    torque: Array,
+    parameters: Array = NO_PARAMETERS,
+    step: float = 1e-4,
+) -> tuple[Array, Array]:
+    """A (12, 12) and B (12, 6) of d state / dt."""
+    a = tree.accelerations
+    return (
+        central_difference(field(a, torque, parameters), state, step),
+        central_difference(lambda u: field(a, u, parameters)(state), torque, step),
+    )

@@ -1,0 +1,266 @@
+"""The command: what it prints and writes, and how it refuses bad input."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import joblib
+import numpy as np
+import pytest
+import xarray as xr
+
+from stewart_drake.cli import main
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.sdformat import to_sdformat
+from stewart_drake.resources import shipped
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.simulation import simulate
+from stewart_drake.studies.compare import CONTROLLERS, LABELS
+
+EXACT = ("--set", "plant.kind=exact")
+SHORT = (*EXACT, "--set", "duration=0.5")
+RUN_FILES = {
+    *(f"{name}.{suffix}" for name in ("states", "errors", "torques") for suffix in ("png", "svg")),
+    "signals.nc",
+    "summary.json",
+}
+
+
+def command(*arguments: str) -> list[str]:
+    code = "import sys; from stewart_drake.cli import main; sys.exit(main())"
+    return [sys.executable, "-c", code, *arguments]
+
+
+def files(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+# ---------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["simulate", "--set", "plant.knd=exact"], ["plant.knd", "did you mean plant.kind?"]),
+        (["simulate", "--set", "delay.steps=-1"], ["delay.steps", "-1", "at least 0"]),
+        (["simulate", "--set", "controller.period=0"], ["controller.period", "got 0", "at least"]),
+        (["simulate", "--set", "plant.time_step=0.003"], ["plant.time_step", "0.003", "whole"]),
+        (["simulate", "--set", "nonsense"], ["'nonsense'", "section.field=value"]),
+        (["simulate", "missing.yaml"], ["missing.yaml", "paper"]),
+        (["simulate", "papper"], ["papper", "paper"]),
+        (["simulate", "--controller", "lqj"], ["lqj", "lqi"]),
+        (["simulate", "--controller", "./lqi"], ["lqi", "no file"]),
+        (
+            ["simulate", "--set", "reference.amplitude=[0.3, 0.3, 0.3, 0.2, 0.2, 0.3]"],
+            ["reference", "leg", "t = 0.30 s", "smaller amplitude"],
+        ),
+        (["simulate", *EXACT, "--meshcat"], ["--meshcat", "'exact'", "'multibody'"]),
+        (["simulate", "--contoller", "lqi"], ["--contoller", "did you mean --controller?"]),
+        (["simulate", "--out"], ["--out", "requires"]),
+        (["simulate", "paper", "twice"], ["twice"]),
+        (["compare", "--set", "delay.steps=-1"], ["delay.steps", "-1"]),
+        (["compar"], ["compar"]),
+        (["model"], ["Missing command"]),
+        (["model", "check", "papr"], ["papr", "paper"]),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(arguments, said, capsys):
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ") and err.count("\n") == 1 and err.endswith("\n")
+    for words in said:
+        assert words in err
+
+
+@pytest.mark.parametrize("name", ["simulate", "compare"])
+def test_an_unwritable_directory_is_refused_before_the_run(name, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main([name, "--out", str(tmp_path / "file" / "folder")]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1
+    assert "--out" in err and "expected a directory that can be written" in err
+
+
+def test_sdf_is_not_written_over_a_directory(tmp_path, capsys):
+    assert main(["model", "sdf", "paper", "--out", str(tmp_path)]) == 2
+    assert "expected a file" in capsys.readouterr().err
+    assert not files(tmp_path)
+
+
+# ---------------------------------------------------------------- simulate and compare
+
+
+def test_simulate_prints_a_verdict_and_a_table_and_writes_everything(tmp_path, capsys):
+    assert main(["simulate", *SHORT, "--out", str(tmp_path)]) == 0
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert err == ""
+    assert lines[0].startswith("delay 0.8 s, beatable: yes")
+    assert all(len(line) <= 80 for line in lines[:-1])  # the last one names the folder
+    for word in ("completed", "E_ac", "floor", "peak error", "torque", "controller step", "wall"):
+        assert word in out
+    assert files(tmp_path) == RUN_FILES | {"parameters.png", "parameters.svg"}
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["status"] == "completed"
+    with xr.open_dataset(tmp_path / "signals.nc") as signals:
+        assert signals.time.values[-1] == 0.5
+
+
+def test_json_is_all_there_is_on_stdout(capsys):
+    assert main(["simulate", "--controller", "lqr", *EXACT, "--json"]) == 0
+    out, err = capsys.readouterr()
+    summary = json.loads(out)
+    assert err == ""
+    assert summary["status"] == "left_workspace" and summary["accumulated_error"] is None
+    assert summary["failure"]["leg"] in range(1, 7) and 0.8 < summary["failure"]["time"] < 2.0
+
+
+def test_quiet_prints_nothing(capsys):
+    assert main(["simulate", "--controller", "lqr", *SHORT, "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_the_same_scenario_gives_the_same_bytes(tmp_path):
+    noise = f"sensor.noise_std={[1e-5] * 12}"
+    scenario = load_scenario("paper", "lqi", ("plant.kind=exact", "duration=0.5", noise))
+    for name in ("first", "again"):
+        simulate(scenario).save(tmp_path / name)
+        time.sleep(1.1)  # what is stamped with the time shows
+    first, again = (tmp_path / name / "signals.nc" for name in ("first", "again"))
+    assert first.read_bytes() == again.read_bytes()
+
+
+def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
+    (tmp_path / "summary.json").write_text("of an earlier run")
+    duration = ("--set", "duration=1.4")
+    assert main(["compare", *EXACT, *duration, "--out", str(tmp_path)]) == 0
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert err == ""
+    assert all(len(line) <= 80 for line in lines[:-1])
+    rows = [next(line for line in lines if line.startswith(LABELS[n])) for n in CONTROLLERS]
+    assert "left workspace at 1.36 s, leg 2" in rows[0]
+    assert [row.split()[2] for row in rows] == ["NaN", "NaN", "225", "80", "-"]
+    assert rows[-1].split()[4] == "15.2", "the delay floor stands beside E_ac"
+    torques = {f"torques_{name}" for name in ("delay_lqr", "delay_lqi", "predictor_lqi")}
+    assert files(tmp_path) == {
+        *(f"{n}.{s}" for n in {"states", "errors", *torques} for s in ("png", "svg")),
+        *(f"{name}.nc" for name in CONTROLLERS),
+        "summary.json",
+    }
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert list(summary["controllers"]) == list(CONTROLLERS)
+    assert summary["controllers"]["lqr"]["failure"]["leg"] == 2
+
+
+# ---------------------------------------------------------------- Ctrl-C
+
+
+def interrupted(arguments: list[str], wait: float, group: bool) -> tuple[int, str]:
+    """Exit status and stderr of a command that gets Ctrl-C some time after its first line."""
+    process = subprocess.Popen(
+        command(*arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    assert "beatable" in process.stdout.readline()
+    time.sleep(wait)
+    # A terminal sends it to the whole group, `kill -INT` to one process.
+    (os.killpg if group else os.kill)(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    return process.returncode, err
+
+
+def test_ctrl_c_in_simulate_keeps_what_was_computed(tmp_path):
+    arguments = ["simulate", *EXACT, "--set", "duration=40", "--set", "controller.period=0.02"]
+    arguments += ["--set", "delay.steps=40", "--out", str(tmp_path)]
+    assert interrupted(arguments, wait=2.0, group=False) == (130, "")
+    assert files(tmp_path) >= RUN_FILES
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["status"] == "interrupted"
+    assert summary["failure"]["reason"] == "interrupted"
+    with xr.open_dataset(tmp_path / "signals.nc") as signals:
+        assert 0 < signals.sizes["time"] < 2001
+        assert np.isfinite(signals.pose.values).all()
+
+
+def test_ctrl_c_in_compare_reaches_the_processes_in_an_orderly_way(tmp_path):
+    # Early, when they are still importing: there a signal of their own would break them.
+    arguments = ["compare", *EXACT, "--set", "duration=40", "--out", str(tmp_path)]
+    assert interrupted(arguments, wait=1.0, group=True) == (130, "")
+    summary = json.loads((tmp_path / "summary.json").read_text())["controllers"]
+    for name, run in summary.items():
+        assert run["status"] in ("interrupted", "left_workspace")
+        assert f"{name}.nc" in files(tmp_path)
+    assert not [name for name in files(tmp_path) if name.endswith(".part")]
+
+
+# ---------------------------------------------------------------- the rest
+
+
+def test_help_comes_without_drake():
+    code = (
+        "import sys; from stewart_drake.cli import main; main(['--help']);"
+        "sys.exit(any(name in sys.modules for name in ('pydrake', 'numpy', 'matplotlib')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for name in ("simulate", "compare", "list", "model"):
+        assert name in done.stdout
+
+
+def test_version_and_no_arguments(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("stewart-drake ")
+    assert main([]) == 0
+    assert capsys.readouterr().out.startswith("Usage: stewart-drake")
+
+
+def test_list_describes_everything_shipped(capsys):
+    assert main(["list"]) == 0
+    out = capsys.readouterr().out
+    assert all(len(line) <= 80 for line in out.splitlines())
+    for kind in ("mechanism", "scenario", "controller"):
+        for name in shipped(kind):
+            assert any(line.split()[:1] == [name] for line in out.splitlines())
+    assert "LQR that knows of no delay" in out
+
+
+def test_model_sdf_is_the_models(tmp_path, capsys):
+    text = to_sdformat(load_mechanism("paper"))
+    assert main(["model", "sdf", "paper"]) == 0
+    assert capsys.readouterr().out == text
+    assert main(["model", "sdf", "paper", "--out", str(tmp_path / "new" / "paper.sdf")]) == 0
+    assert (tmp_path / "new" / "paper.sdf").read_text() == text
+
+
+def test_model_check_describes_the_home_pose(capsys):
+    assert main(["model", "check", "paper"]) == 0
+    out = capsys.readouterr().out
+    for word in ("paper", "reach margin", "0.983, -0.983", "5.00 /s", "singularity measure"):
+        assert word in out
+
+
+def test_a_reader_that_leaves_early_is_no_error():
+    reader = f"{' '.join(map(repr, command('model', 'sdf', 'paper')))} | head -1"
+    done = subprocess.run(["bash", "-o", "pipefail", "-c", reader], capture_output=True, text=True)
+    assert done.stdout.startswith("<?xml") and done.stderr == ""
+
+
+def test_colours_only_where_they_are_wanted(monkeypatch, capsys):
+    from stewart_drake.report import terminal
+
+    monkeypatch.setattr(terminal.sys.stdout, "isatty", lambda: True, raising=False)
+    for no_color, expected in (("", True), ("1", False)):
+        monkeypatch.setenv("NO_COLOR", no_color)
+        terminal.echo("status completed")
+        assert ("\x1b[32m" in capsys.readouterr().out) is expected

@@ -1,0 +1,598 @@
+"""Scenarios: defaults, layers, and one line for everything that is wrong with them."""
+
+import copy
+import dataclasses
+import json
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from ruamel.yaml import YAML
+
+from stewart_drake.config import (
+    ControllerConfig,
+    DelayConfig,
+    PlantConfig,
+    ReferenceConfig,
+    Scenario,
+    TunerConfig,
+)
+from stewart_drake.errors import ConfigError
+from stewart_drake.resources import resolve, shipped
+from stewart_drake.scenario_loading import load_controller, load_scenario, scenario_to_dict
+from stewart_drake.timing import step_problem
+from stewart_drake.yamlio import load_yaml
+
+SINE = [0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]
+
+
+def write(folder: Path, text: str, name: str = "mine.yaml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def one_line(caught: pytest.ExceptionInfo[ConfigError]) -> str:
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    return message
+
+
+# Defaults and shipped files
+
+
+def test_the_defaults_are_the_papers_experiment() -> None:
+    assert scenario_to_dict(Scenario()) == {
+        "mechanism": "paper",
+        "duration": 10.0,
+        "start": "rest",
+        "queue": "zero",
+        "reference": {
+            "kind": "sine",
+            "amplitude": SINE,
+            "offset": [0, 0, 0, 0, 0, 0.38],
+            "frequency": 1.0,
+            "frequency_unit": "rad/s",
+        },
+        "plant": {
+            "kind": "multibody",
+            "gravity": False,
+            "time_step": 0.001,
+            "accuracy": 1e-8,
+            "payload_mass": 0.0,
+            "torque_bias": [0] * 6,
+            "joint_damping": 0.0,
+        },
+        "delay": {"steps": 8, "fraction": 0.0},
+        "controller": {
+            "period": 0.1,
+            "integral": True,
+            "delay_steps": None,
+            "delay_fraction": None,
+            "prediction": "nonlinear",
+            "feedforward": "inverse_dynamics",
+            "model": "multibody",
+            "torque_map": "virtual_work",
+            "estimator": "parameters",
+            "w_Q": 1.0,
+            "w_R": 1.0,
+            "weight_scaling": "bryson",
+            "catch_up": None,
+        },
+        "actuator": {"torque_limit": None},
+        "sensor": {"noise_std": [0] * 12, "seed": 0},
+        "tuner": {"kind": "fixed"},
+    }
+
+
+def test_the_paper_scenario_spells_the_defaults_out() -> None:
+    assert load_scenario("paper") == Scenario()
+
+
+def test_the_paper_scenario_lists_every_field_of_its_kinds() -> None:
+    data = load_yaml(resolve("scenario", "paper"))
+    for section, fields in scenario_to_dict(Scenario()).items():
+        if isinstance(fields, dict):
+            assert set(fields) <= set(data[section])
+        assert section in data
+
+
+def test_the_gravity_scenario_is_short_delayed_and_starts_on_the_reference() -> None:
+    scenario = load_scenario("gravity")
+    assert scenario.plant == PlantConfig(gravity=True)
+    assert scenario.delay == DelayConfig(steps=16)
+    assert scenario.controller == ControllerConfig(period=0.01)
+    assert (scenario.start, scenario.queue) == ("on_reference", "reference")
+
+
+@pytest.mark.parametrize("scenario", shipped("scenario"))
+@pytest.mark.parametrize("controller", shipped("controller"))
+def test_every_shipped_controller_fits_every_shipped_scenario(
+    scenario: str, controller: str
+) -> None:
+    plain = load_scenario(scenario)
+    laid_over = load_scenario(scenario, controller=controller)
+    assert laid_over.controller.period == plain.controller.period
+    laid_over.controller = plain.controller
+    assert laid_over == plain
+
+
+@pytest.mark.parametrize(
+    ("name", "integral", "delay_steps"),
+    [("lqr", False, 0), ("lqi", True, 0), ("delay_lqr", False, None), ("delay_lqi", True, None)],
+)
+def test_the_papers_controllers(name: str, integral: bool, delay_steps: int | None) -> None:
+    assert load_scenario("paper", controller=name).controller == ControllerConfig(
+        integral=integral,
+        delay_steps=delay_steps,
+        prediction="linear",
+        feedforward="none",
+        model="paper",
+        estimator="none",
+        weight_scaling="identity",
+        catch_up=0,
+    )
+
+
+def test_the_predictor_is_the_default_controller() -> None:
+    assert load_scenario("paper", controller="predictor_lqi") == Scenario()
+
+
+# Layers
+
+
+def test_a_file_sets_only_what_it_lists(tmp_path: Path) -> None:
+    path = write(tmp_path, "delay: {steps: 3}\nplant: {accuracy: 1e-9, gravity: true}\n")
+    expected = Scenario(delay=DelayConfig(steps=3), plant=PlantConfig(accuracy=1e-9, gravity=True))
+    assert load_scenario(path) == expected
+    assert load_scenario(write(tmp_path, "{}")) == Scenario()
+
+
+def test_settings_beat_the_controller_which_beats_the_scenario(tmp_path: Path) -> None:
+    path = write(tmp_path, "controller: {period: 0.05, w_Q: 2.0, w_R: 3.0, model: multibody}")
+    overlay = write(tmp_path, "w_R: 5.0\nmodel: paper\n", "overlay.yaml")
+    scenario = load_scenario(path, overlay, ["controller.model=multibody", "duration=1e1"])
+    assert scenario.controller == ControllerConfig(period=0.05, w_Q=2.0, w_R=5.0)
+    assert scenario.duration == 10.0
+
+
+def test_a_setting_is_yaml_and_the_last_one_counts() -> None:
+    scenario = load_scenario(
+        "paper",
+        settings=[
+            "plant.torque_bias=[1e-3, -1e-3, 0, 0, 0, 0]",
+            "actuator.torque_limit=2",
+            "actuator.torque_limit=null",
+            "plant.gravity=true",
+        ],
+    )
+    assert scenario.plant.torque_bias[:2] == [1e-3, -1e-3]
+    assert scenario.actuator.torque_limit is None
+    assert scenario.plant.gravity
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_new_kind_drops_what_the_file_says_for_the_old_one(order: int, tmp_path: Path) -> None:
+    changes = ["reference.kind=csv", f"reference.file={tmp_path}/a.csv"][::order]
+    scenario = load_scenario("paper", settings=changes)
+    assert scenario.reference == ReferenceConfig(kind="csv", file=f"{tmp_path}/a.csv")
+    hold = load_scenario("paper", settings=["reference.kind=hold"])
+    assert hold.reference.offset == [0, 0, 0, 0, 0, 0.38]
+
+
+def test_paths_start_where_they_were_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    path = write(
+        tmp_path,
+        "mechanism: ./m.yaml\nreference: {kind: csv, file: a.csv}\n"
+        "tuner: {kind: ann, weights: w.json}\n",
+    )
+    scenario = load_scenario(path)
+    assert scenario.mechanism == str(tmp_path / "m.yaml")
+    assert scenario.reference.file == str(tmp_path / "a.csv")
+    assert scenario.tuner.weights == str(tmp_path / "w.json")
+    moved = load_scenario(path, settings=["reference.file=a.csv", "tuner.weights=paper"])
+    assert moved.reference.file == str(tmp_path / "elsewhere" / "a.csv")
+    assert moved.tuner.weights == "paper"
+
+
+# What is refused: (YAML text, what the one line must hold)
+
+BAD_FILES = {
+    "empty": ("", ["is empty", "a YAML mapping"]),
+    "only a comment": ("# nothing\n", ["is empty"]),
+    "a list": ("- 1\n", ["[1]", "a YAML mapping"]),
+    "duplicate key": ("delay: {steps: 1}\nduration: 1\nduration: 2\n", ["line 3", "duration"]),
+    "duplicate nested key": ("delay:\n  steps: 1\n  steps: 2\n", ["line 3", "steps"]),
+    "two documents": ("duration: 1\n---\nduration: 2\n", ["line 2", "document"]),
+    "alias": ("duration: &a 1\nsensor: {seed: *a}\n", ["line 1", "anchors"]),
+    "python tag": ("duration: !!python/object/apply:os.getcwd []\n", ["line 1", "tags"]),
+    "plain tag": ("mechanism: !mine paper\n", ["line 1", "tags"]),
+    "odd key": ("? [1, 2]\n: 3\n", ["line 1", "a key must be a word"]),
+    "number as key": ("1: 2\n", ["line 1", "a key must be a word"]),
+    "merge key": ("<<: {duration: 1}\n", ["line 1", "a key must be a word"]),
+    "deep": ("[" * 5000, ["depth"]),
+    "many digits": ("duration: " + "9" * 5000, ["YAML"]),
+    "unclosed": ("delay: {steps: 1\n", ["line"]),
+    "nul": ("duration: 1\0\n", ["YAML"]),
+    "unknown section": ("contoller: {period: 1}", ["contoller: unknown key", "controller"]),
+    "unknown field": ("controller: {perod: 1}", ["controller.perod", "controller.period"]),
+    "nothing near": ("zzz: 1", ["zzz", "mechanism", "tuner"]),
+    "empty section": ("delay:\n", ["delay: got None", "a mapping"]),
+    "list as section": ("delay: [1]\n", ["delay: got [1]", "a mapping"]),
+    "text for a number": ("duration: ten", ["duration: got 'ten'", "a number"]),
+    "nan": ("duration: .nan", ["duration: got nan", "finite"]),
+    "inf": ("controller: {w_Q: .inf}", ["controller.w_Q: got inf", "finite"]),
+    "overflow": ("controller: {w_Q: 1e999}", ["controller.w_Q: got inf", "finite"]),
+    "boolean for a number": ("duration: true", ["duration: got True", "a number"]),
+    "yes for a boolean": ("plant: {gravity: yes}", ["plant.gravity: got 'yes'", "true or false"]),
+    "number for a boolean": ("plant: {gravity: 1}", ["plant.gravity: got 1", "true or false"]),
+    "float for an integer": ("delay: {steps: 8.5}", ["delay.steps: got 8.5", "whole number"]),
+    "date for text": ("duration: 2021-05-30", ["duration: got '2021-05-30'", "a number"]),
+    "five numbers": ("reference: {offset: [0, 0, 0, 0, 0]}", ["reference.offset", "6 items"]),
+    "seven numbers": ("plant: {torque_bias: [0, 0, 0, 0, 0, 0, 0]}", ["plant.torque_bias", "6"]),
+    "text in a list": ("reference: {offset: [0, 0, 0, a, 0, 0]}", ["reference.offset[3]", "'a'"]),
+    "negative noise": (
+        "sensor: {noise_std: [0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 0]}",
+        ["sensor.noise_std[5]: got -1", "a number of at least 0"],
+    ),
+    "unknown kind": ("reference: {kind: square}", ["reference.kind: got 'square'", "'sine'"]),
+    "unknown start": ("start: now", ["start: got 'now'", "'rest' or 'on_reference'"]),
+    "no duration": ("duration: 0", ["duration: got 0", "a number above 0"]),
+    "negative delay": ("delay: {steps: -1}", ["delay.steps: got -1"]),
+    "whole fraction": ("delay: {fraction: 1.0}", ["delay.fraction: got 1.0", "a number below 1"]),
+    "no period": ("controller: {period: 0}", ["controller.period: got 0"]),
+    "negative step": ("plant: {time_step: -0.001}", ["plant.time_step: got -0.001"]),
+    "coarse accuracy": ("plant: {accuracy: 0.1}", ["plant.accuracy: got 0.1", "0.01"]),
+    "fine accuracy": ("plant: {accuracy: 1e-13}", ["plant.accuracy: got 1e-13", "1e-12"]),
+    "negative payload": ("plant: {payload_mass: -1}", ["plant.payload_mass: got -1"]),
+    "negative damping": ("plant: {joint_damping: -1}", ["plant.joint_damping: got -1"]),
+    "no w_Q": ("controller: {w_Q: 0}", ["controller.w_Q: got 0", "a number above 0"]),
+    "negative w_R": ("controller: {w_R: -2}", ["controller.w_R: got -2", "a number above 0"]),
+    "no torque": ("actuator: {torque_limit: 0}", ["actuator.torque_limit: got 0", "or null"]),
+    "negative blend": ("controller: {catch_up: -1}", ["controller.catch_up: got -1", "or null"]),
+    "negative seed": ("sensor: {seed: -1}", ["sensor.seed: got -1"]),
+    "no frequency": ("reference: {frequency: 0}", ["reference.frequency: got 0"]),
+    "unknown unit": ("reference: {frequency_unit: rpm}", ["frequency_unit: got 'rpm'", "'Hz'"]),
+    "no mechanism": ("mechanism: ''", ["mechanism: got ''"]),
+    "foreign field": (
+        "reference: {kind: hold, amplitude: [0, 0, 0, 0, 0, 0]}",
+        ["reference.amplitude", "kind 'hold' does not use", "offset"],
+    ),
+    "foreign to the default kind": ("reference: {file: a.csv}", ["reference.file", "kind 'sine'"]),
+    "weights nobody uses": ("tuner: {weights: paper}", ["tuner.weights", "kind 'fixed'"]),
+    "csv without file": ("reference: {kind: csv}", ["reference.file: got None", "CSV"]),
+    "waypoints without poses": (
+        "reference: {kind: waypoints, times: [0, 1]}",
+        ["reference.poses: got None", "a file"],
+    ),
+    "waypoints twice": (
+        "reference: {kind: waypoints, times: [0, 1], file: a.yaml}",
+        ["reference.file: got both"],
+    ),
+    "poses for other times": (
+        "reference: {kind: waypoints, times: [0, 1, 2], "
+        "poses: [[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0]]}",
+        ["reference.poses: got 2 poses", "expected 3"],
+    ),
+    "one waypoint": (
+        "reference: {kind: waypoints, times: [0], poses: [[0, 0, 0, 0, 0, 0]]}",
+        ["reference.times", "at least 2 items"],
+    ),
+    "pitch of the sine": (
+        "reference: {amplitude: [0, 1, 0, 0, 0, 0], offset: [0, -0.6, 0, 0, 0, 0.38]}",
+        ["reference.offset", "1.6 rad", "pi/2"],
+    ),
+    "pitch of the hold": (
+        "reference: {kind: hold, offset: [0, 1.6, 0, 0, 0, 0.38]}",
+        ["reference.offset", "1.6 rad"],
+    ),
+    "half a belief": (
+        "controller: {delay_fraction: 0.5}",
+        ["controller.delay_fraction: got 0.5", "delay_steps"],
+    ),
+    "a blend too short": ("controller: {catch_up: 1e-9}", ["controller.catch_up: got 1e-09"]),
+    "a map of no model": (
+        "controller: {torque_map: printed}",
+        ["controller.torque_map: got 'printed'", "model 'paper'"],
+    ),
+    "a step beside the grid": (
+        "plant: {time_step: 0.003}",
+        ["plant.time_step: got 0.003", "0.02 s divided by a whole number", "0.0028571"],
+    ),
+    "a period between steps": (
+        "controller: {period: 0.1004}",
+        ["controller.period: got 0.1004", "plant.time_step (0.001 s)", "nearest 0.1"],
+    ),
+    "a fraction between steps": (
+        "delay: {fraction: 0.123}",
+        ["delay.fraction: got 0.123", "12.3 steps", "nearest 0.12"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_a_bad_file_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
+    text, parts = BAD_FILES[case]
+    path = write(tmp_path, text)
+    with pytest.raises(ConfigError) as caught:
+        load_scenario(path)
+    message = one_line(caught)
+    assert message.startswith(f"{path}: ")
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("setting", "parts"),
+    [
+        ("duration", ["'duration'", "section.field=value"]),
+        ("=1", ["'=1'", "section.field=value"]),
+        ("a.b.c=1", ["'a.b.c=1'", "section.field=value"]),
+        ("duration=", ["duration: got None", "a number"]),
+        ("duration=[1", ["duration: line 1"]),
+        ("duration=&a 1", ["anchors"]),
+        ("duraton=1", ["duraton: unknown key", "duration"]),
+        ("controler.period=1", ["controler: unknown key", "controller"]),
+        ("controller.perid=1", ["controller.perid: unknown key", "controller.period"]),
+        ("controller=5", ["controller: got 5", "a mapping"]),
+        ("duration.x=5", ["duration: got {'x': 5}"]),
+        ("plant.gravity=on", ["plant.gravity: got 'on'", "true or false"]),
+        ("reference.times=[0, 1]", ["reference.times", "kind 'sine'"]),
+        ("reference.kind=csv", ["reference.file: got None"]),
+        ("tuner.weights=paper", ["tuner.weights", "kind 'fixed'"]),
+        ("controller.period=0.1234567", ["with settings", "controller.period", "nearest 0.123"]),
+    ],
+)
+def test_a_bad_setting_is_refused_in_one_line(setting: str, parts: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_scenario("paper", settings=[setting])
+    message = one_line(caught)
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("period: 0.1", ["period: got 0.1", "the scenario's controller.period"]),
+        ("integrl: true", ["integrl: unknown key", "integral"]),
+        ("model: pape", ["model: got 'pape'", "'paper' or 'multibody'"]),
+        ("controller: {integral: true}", ["controller: unknown key"]),
+        ("", ["is empty"]),
+    ],
+)
+def test_a_bad_controller_is_refused_in_one_line(
+    text: str, parts: list[str], tmp_path: Path
+) -> None:
+    path = write(tmp_path, text)
+    for load in (load_controller, lambda p: load_scenario("paper", controller=p)):
+        with pytest.raises(ConfigError) as caught:
+            load(path)
+        message = one_line(caught)
+        assert message.startswith(f"{path}: ")
+        for part in parts:
+            assert part in message
+
+
+def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.yaml"
+    binary.write_bytes(b"duration: 1\nmechanism: \xff\xfe")
+    large = write(tmp_path, "# " + "x" * 1_000_000, "large.yaml")
+    pipe = tmp_path / "pipe.yaml"
+    os.mkfifo(pipe)
+    for path, part in [
+        (binary, "line 2: is not UTF-8"),
+        (large, "larger than 1 MB"),
+        (tmp_path, "is not a file"),
+        (pipe, "is not a file"),
+        (tmp_path / "none.yaml", "no file"),
+    ]:
+        with pytest.raises(ConfigError, match=part) as caught:
+            load_scenario(path)
+        one_line(caught)
+
+
+def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "bom.yaml"
+    path.write_bytes(b"\xef\xbb\xbfduration: 3\n")
+    assert load_scenario(path).duration == 3
+
+
+# Changes in memory
+
+
+def test_an_assignment_is_checked() -> None:
+    scenario = Scenario()
+    scenario.duration = 5.0
+    scenario.delay.steps = 3
+    scenario.reference = ReferenceConfig(kind="hold")
+    scenario.check()
+    for bad in (-1.0, float("nan"), "5"):
+        with pytest.raises(ValidationError):
+            scenario.duration = bad  # type: ignore[assignment]
+    with pytest.raises(ValidationError):
+        scenario.plant.mass = 1.0  # type: ignore[attr-defined]
+    assert scenario.duration == 5.0
+
+
+def test_check_sees_changes_that_assignment_does_not() -> None:
+    scenario = Scenario()
+    scenario.check()
+    scenario.plant.torque_bias[2] = float("nan")
+    with pytest.raises(ConfigError, match=r"^scenario: plant.torque_bias\[2\]: got nan"):
+        scenario.check()
+    scenario.plant.torque_bias[2] = np.float64(0.5)
+    scenario.check("mine")
+    scenario.controller.period = 0.1005
+    with pytest.raises(ConfigError, match=r"^mine: controller\.period: got 0\.1005"):
+        scenario.check("mine")
+    scenario.plant.kind = "exact"
+    scenario.check()
+
+
+def test_a_scenario_can_be_copied_and_sent_to_another_process() -> None:
+    scenario = load_scenario("gravity")
+    assert pickle.loads(pickle.dumps(scenario)) == scenario
+    twin = copy.deepcopy(scenario)
+    twin.delay.steps = 1
+    assert scenario.delay.steps == 16
+    assert dataclasses.replace(scenario, duration=3.0).duration == 3.0
+
+
+def test_two_scenarios_share_no_list() -> None:
+    first, second = Scenario(), Scenario()
+    first.reference.amplitude[0] = 9.0
+    assert second.reference.amplitude == SINE
+
+
+# Properties
+
+
+small = st.floats(-1, 1)
+six = st.lists(small, min_size=6, max_size=6)
+references = st.one_of(
+    st.builds(
+        ReferenceConfig,
+        kind=st.just("sine"),
+        amplitude=st.lists(st.floats(-0.7, 0.7), min_size=6, max_size=6),
+        offset=st.lists(st.floats(-0.7, 0.7), min_size=6, max_size=6),
+        frequency=st.floats(1e-3, 1e3),
+        frequency_unit=st.sampled_from(["rad/s", "Hz"]),
+    ),
+    st.builds(ReferenceConfig, kind=st.just("hold"), offset=six),
+    st.builds(
+        ReferenceConfig,
+        kind=st.just("waypoints"),
+        times=st.just([0.0, 1.0]),
+        poses=st.lists(six, min_size=2, max_size=2),
+    ),
+    st.builds(ReferenceConfig, kind=st.just("csv"), file=st.just("/some/motion.csv")),
+)
+scenarios = st.builds(
+    Scenario,
+    mechanism=st.sampled_from(["paper", "/some/mechanism.yaml"]),
+    duration=st.floats(1e-3, 1e3),
+    start=st.sampled_from(["rest", "on_reference"]),
+    reference=references,
+    plant=st.builds(
+        PlantConfig,
+        gravity=st.booleans(),
+        accuracy=st.floats(1e-12, 1e-2),
+        torque_bias=six,
+        payload_mass=st.floats(0, 1e3),
+    ),
+    delay=st.builds(
+        DelayConfig, steps=st.integers(0, 100), fraction=st.integers(0, 99).map(lambda n: n / 100)
+    ),
+    controller=st.builds(
+        ControllerConfig,
+        delay_steps=st.none() | st.integers(0, 100),
+        w_Q=st.floats(1e-6, 1e6),
+        catch_up=st.none() | st.just(0.0) | st.floats(1e-3, 10),
+        model=st.sampled_from(["paper", "multibody"]),
+    ),
+    tuner=st.sampled_from([TunerConfig(), TunerConfig(kind="ann", weights="paper")]),
+)
+
+
+@settings(
+    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(scenario=scenarios)
+def test_a_scenario_survives_json_and_yaml(scenario: Scenario, tmp_path: Path) -> None:
+    plain = json.loads(json.dumps(scenario_to_dict(scenario)))
+    path = tmp_path / "again.yaml"
+    YAML(typ="safe").dump(plain, path)
+    assert load_scenario(path) == scenario
+
+
+KEYS = st.sampled_from(
+    ["duration", "delay", "steps", "reference", "kind", "offset", "controller", "period", "x"]
+)
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=7) | st.dictionaries(KEYS, inner, max_size=4),
+    max_leaves=10,
+)
+YAML_LIKE = st.text(
+    alphabet="abdeurtions:0123456789.[]{}-,&*!<>|%?#'\"\\\n\t ~\0\u2028é", max_size=60
+)
+
+
+def loads_or_is_refused(path: Path) -> None:
+    try:
+        assert isinstance(load_scenario(path), Scenario)
+    except ConfigError as error:
+        assert len(str(error).splitlines()) == 1
+
+
+@settings(
+    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(text=YAML_LIKE | st.binary(max_size=40))
+def test_any_text_is_a_scenario_or_is_refused(text: str | bytes, tmp_path: Path) -> None:
+    path = tmp_path / "any.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    loads_or_is_refused(path)
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.dictionaries(KEYS, VALUES, max_size=5))
+def test_any_mapping_is_a_scenario_or_is_refused(data: dict[str, object], tmp_path: Path) -> None:
+    path = tmp_path / "any.yaml"
+    path.write_text(json.dumps(data))  # JSON is YAML
+    loads_or_is_refused(path)
+
+
+@settings(max_examples=200, deadline=None)
+@given(setting=YAML_LIKE | st.builds("{}={}".format, KEYS, YAML_LIKE))
+def test_any_setting_is_taken_or_is_refused(setting: str) -> None:
+    try:
+        assert isinstance(load_scenario("gravity", settings=[setting]), Scenario)
+    except ConfigError as error:
+        assert len(str(error).splitlines()) == 1
+
+
+@given(
+    time_step=st.floats(1e-6, 0.02),
+    period=st.sampled_from([0.1, 0.05, 0.01, 0.02, 0.003, 0.25]),
+)
+def test_the_step_that_a_message_suggests_is_accepted(time_step: float, period: float) -> None:
+    problem = step_problem(time_step, period, 0.0)
+    if problem and problem.startswith("plant.time_step"):
+        suggested = float(problem.rpartition("nearest ")[2])
+        assert step_problem(suggested, period, 0.0) is None
+
+
+@given(
+    steps=st.integers(1, 400),
+    period=st.floats(1e-4, 10),
+    fraction=st.floats(0, 1, exclude_max=True),
+)
+def test_the_period_and_fraction_that_messages_suggest_are_accepted(
+    steps: int, period: float, fraction: float
+) -> None:
+    time_step = 0.02 / steps
+    problem = step_problem(time_step, period, 0.0)
+    if problem:
+        assert problem.startswith("controller.period")
+        period = float(problem.rpartition("nearest ")[2])
+        assert step_problem(time_step, period, 0.0) is None
+    problem = step_problem(time_step, period, fraction)
+    if problem:
+        assert problem.startswith("delay.fraction")
+        suggested = float(problem.rpartition("nearest ")[2])
+        assert 0 <= suggested < 1
+        assert abs(suggested - fraction) <= time_step / period
+        assert step_problem(time_step, period, suggested) is None

@@ -1,0 +1,299 @@
+"""`StewartDynamics` against Drake's tree closed by coordinate partitioning, and against physics."""
+
+import functools
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from stewart_drake.mechanism.kinematics import UnreachablePoseError
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.plant.equations import DEAD_CENTRE_SINE, STANDARD_GRAVITY
+from stewart_drake.signals import BIAS, DAMPING
+from tests.mechanisms import PAPER, SPREAD, random_mechanism, random_pose
+from tests.oracles import (
+    PartitionedTree,
+    central_difference,
+    central_difference_linearization,
+    field,
+    integrate,
+    off_dead_centre,
+    relative,
+    size,
+)
+
+Array = NDArray[np.float64]
+State = tuple[StewartDynamics, Array, Array]
+
+AMPLITUDE = np.array([np.pi / 12] * 3 + [0.02, 0.02, 0.08])
+TIMES = (0.0, 0.4, 1.2, 1.6, 4.7)
+"""Instants of the trajectory (46), s: at home, ..., next to its top, next to its bottom."""
+ALTERNATING = np.array([1.0, -1, 1, -1, 1, -1])
+AT_REST = np.zeros(6)
+
+
+def random_parameters(rng: np.random.Generator) -> Array:
+    """Torque bias, payload and damping (8,)."""
+    return np.concatenate([rng.normal(0, 0.1, 6), rng.uniform([0.1, 0.0], [2.0, 0.1])])
+
+
+@functools.cache
+def shared(index: int) -> StewartDynamics:
+    """Dynamics with gravity of the paper's mechanism (-1) or of a random one (0, 1, ...)."""
+    rng = np.random.default_rng(abs(index))
+    return StewartDynamics(PAPER if index < 0 else random_mechanism(rng))
+
+
+def trajectory(t: float) -> tuple[Array, Array, Array]:
+    """Pose, rates and accelerations of the trajectory (46)."""
+    sine, cosine = AMPLITUDE * np.sin(t), AMPLITUDE * np.cos(t)
+    return np.array([0, 0, 0, 0, 0, 0.38]) + sine, cosine, -sine
+
+
+def assert_agrees(
+    dynamics: StewartDynamics, tree: PartitionedTree, rng: np.random.Generator, poses: int
+) -> None:
+    """Accelerations, inverse dynamics, equilibrium and energy agree with the oracle's to 1e-9."""
+    mechanism = dynamics.mechanism
+    for _ in range(poses):
+        pose, rates = random_pose(rng, mechanism), rng.normal(0, 1, 6) * size(mechanism)
+        torque, parameters = rng.normal(0, 1, 6), random_parameters(rng)
+        calls = {
+            "accelerations": (pose, rates, torque, parameters),
+            "inverse_dynamics": (pose, rates, 10 * torque, parameters),
+            "equilibrium_torque": (pose, parameters),
+        }
+        for name, arguments in calls.items():
+            value, expected = (getattr(m, name)(*arguments) for m in (dynamics, tree))
+            assert relative(value, expected) < 1e-9
+        gained, expected = (
+            m.energy(pose, rates, parameters) - m.energy(mechanism.home, AT_REST, parameters)
+            for m in (dynamics, tree)
+        )
+        assert gained == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+def test_agrees_with_the_oracle_for_the_paper(gravity: bool) -> None:
+    rng = np.random.default_rng(46)
+    assert_agrees(StewartDynamics(PAPER, gravity), PartitionedTree(PAPER, gravity), rng, 500)
+
+
+@pytest.mark.parametrize("index", range(50))
+def test_agrees_with_the_oracle_for_random_mechanisms(index: int) -> None:
+    rng = np.random.default_rng(index)
+    dynamics = StewartDynamics(random_mechanism(rng))
+    for gravity in (True, False):
+        # An argument of the compiled functions: nothing is built a second time.
+        dynamics.gravity = STANDARD_GRAVITY * gravity
+        assert_agrees(dynamics, PartitionedTree(dynamics.mechanism, gravity), rng, 4)
+
+
+def test_gravity_is_a_switch_or_a_number() -> None:
+    given_as = (True, np.True_, False, np.False_, 1.62)
+    assert [StewartDynamics(PAPER, g).gravity for g in given_as] == [9.81, 9.81, 0.0, 0.0, 1.62]
+
+
+# Conservation laws.
+
+
+@pytest.mark.parametrize("index", range(-1, 5))
+def test_energy_is_kept_without_torque_and_gravity(index: int) -> None:
+    mechanism, rng = shared(index).mechanism, np.random.default_rng(index + 1)
+    dynamics = StewartDynamics(mechanism, False)
+    rates = rng.normal(0, 1, 6) * size(mechanism) * ([0.1] * 3 + [0.03] * 3)
+    start = np.concatenate([mechanism.home, rates])
+    motion = integrate(field(dynamics.accelerations, AT_REST), start, 1.0)
+    assert all(off_dead_centre(mechanism, x[:6]) > 0.2 for x in motion)
+    energy = np.array([dynamics.energy(x[:6], x[6:]) for x in motion])
+    assert np.ptp(energy) < 1e-9 * energy[0]
+
+
+@pytest.mark.parametrize("index", range(-1, 3))
+def test_energy_changes_by_the_work_of_torque_bias_and_damping(index: int) -> None:
+    dynamics, rng = shared(index), np.random.default_rng(index + 1)
+    mechanism = dynamics.mechanism
+    parameters = np.concatenate([rng.normal(0, 0.05, 6), [0.5, 0.05]])
+    span = size(mechanism) * (1.0 if mechanism is PAPER else 0.3)
+
+    def with_work(x: Array) -> Array:
+        """x = [pose; rates; work; time]; the torque pulls the plate after the trajectory (46)."""
+        pose, rates, target = x[:6], x[6:12], mechanism.home + span * AMPLITUDE * np.sin(x[13])
+        accelerations = 100 * (target - pose) - 20 * rates
+        torque = dynamics.inverse_dynamics(pose, rates, accelerations, parameters)
+        crank_rates = mechanism.jacobian(pose) @ rates
+        power = (torque + parameters[BIAS] - parameters[DAMPING] * crank_rates) @ crank_rates
+        x_dot = field(dynamics.accelerations, torque, parameters)(x[:12])
+        return np.concatenate([x_dot, [power, 1.0]])
+
+    motion = integrate(with_work, np.concatenate([mechanism.home, np.zeros(8)]), 1.5)
+    assert all(off_dead_centre(mechanism, x[:6]) > 0.2 for x in motion)
+    energy = np.array([dynamics.energy(x[:6], x[6:12], parameters) for x in motion])
+    gained = energy - energy[0]
+    assert np.abs(gained - motion[:, 12]).max() < 1e-9 * np.abs(gained).max()
+
+
+@st.composite
+def states(draw: st.DrawFn) -> State:
+    """Dynamics with a pose well within reach, and rates."""
+    dynamics = shared(draw(st.integers(-1, 4)))
+    mechanism, unit = dynamics.mechanism, st.floats(-1, 1)
+    pose, rates = (np.array(draw(st.tuples(*[unit] * 6))) for _ in range(2))
+    pose = mechanism.home + pose * SPREAD * size(mechanism)
+    assume(off_dead_centre(mechanism, pose) > 0.2)
+    return dynamics, pose, rates * size(mechanism)
+
+
+@settings(max_examples=200, deadline=None)
+@given(states(), st.floats(0, 5))
+def test_mass_matrix_is_symmetric_positive_definite(state: State, payload: float) -> None:
+    dynamics, pose, rates = state
+    parameters = np.array([0.0] * 6 + [payload, 0.0])
+    mass = dynamics.mass_matrix(pose, parameters)
+    assert relative(mass.T, mass) < 1e-14
+    assert np.linalg.eigvalsh(mass).min() > 0
+    kinetic = dynamics.energy(pose, rates, parameters) - dynamics.energy(pose, AT_REST, parameters)
+    assert kinetic == pytest.approx(rates @ mass @ rates / 2, rel=1e-10, abs=1e-10)
+
+
+@settings(max_examples=200, deadline=None)
+@given(states(), st.integers(0, 2**32 - 1))
+def test_inverse_dynamics_inverts_accelerations(state: State, seed: int) -> None:
+    (dynamics, pose, rates), rng = state, np.random.default_rng(seed)
+    torque, parameters = rng.normal(0, 1, 6), random_parameters(rng)
+    accelerations = dynamics.accelerations(pose, rates, torque, parameters)
+    found = dynamics.inverse_dynamics(pose, rates, accelerations, parameters)
+    assert relative(found, torque) < 1e-10
+    again = dynamics.accelerations(pose, rates, found, parameters)
+    assert relative(again, accelerations) < 1e-10
+    jacobian = dynamics.mechanism.jacobian(pose)
+    assert relative(dynamics.actuation_map(pose), jacobian.T) < 1e-11
+    shaft = torque + parameters[BIAS] - parameters[DAMPING] * (jacobian @ rates)
+    left = dynamics.mass_matrix(pose, parameters) @ accelerations
+    assert relative(left, jacobian.T @ shaft - dynamics.bias(pose, rates, parameters)) < 1e-9
+
+
+# Linearisation and prediction.
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+@pytest.mark.parametrize("t", TIMES)
+def test_derivatives_equal_central_differences_of_the_oracle(t: float, gravity: bool) -> None:
+    dynamics, tree = StewartDynamics(PAPER, gravity), PartitionedTree(PAPER, gravity)
+    parameters = np.array([0.01, -0.02, 0.03, 0.01, 0, 0.02, 0.5, 0.01])
+    pose, rates, accelerations = trajectory(t)
+    torque = tree.inverse_dynamics(pose, rates, accelerations, parameters) + 0.1 * ALTERNATING
+    state = np.concatenate([pose, rates])
+    A, B = central_difference_linearization(tree, state, torque, parameters)
+    G = central_difference(lambda p: field(tree.accelerations, torque, p)(state), parameters)
+    found = dynamics.derivatives(pose, rates, torque, parameters)
+    for value, expected in zip(found, (A, B, G), strict=True):
+        assert relative(value, expected) < 1e-6
+
+
+def test_poles_under_gravity() -> None:
+    dynamics, tree, fastest = shared(-1), PartitionedTree(PAPER), []
+    for t in TIMES:
+        pose = trajectory(t)[0]
+        state, torque = np.concatenate([pose, AT_REST]), tree.equilibrium_torque(pose)
+        found = dynamics.linearize(pose)
+        expected = central_difference_linearization(tree, state, torque)
+        assert all(relative(*pair) < 1e-6 for pair in zip(found, expected, strict=True))
+        poles, reference = (np.sort(np.linalg.eigvals(m[0]).real) for m in (found, expected))
+        assert relative(poles, reference) < 1e-6
+        fastest.append(poles[-1])
+    assert fastest[0] == pytest.approx(5.0, abs=0.05)
+    assert fastest[TIMES.index(1.6)] > 30
+    held = dynamics.equilibrium_torque(PAPER.home)
+    assert held == pytest.approx(0.983 * ALTERNATING, abs=5e-4)
+
+
+@pytest.mark.parametrize("index", [-1, 0])
+def test_prediction_converges_at_fourth_order(index: int) -> None:
+    dynamics, rng = shared(index), np.random.default_rng(5)
+    home = dynamics.mechanism.home
+    torques = dynamics.equilibrium_torque(home) + rng.normal(0, 0.1, (4, 6))
+    durations, parameters = np.array([0.04, 0.05, 0.03, 0.06]), random_parameters(rng) * 0.1
+    state = np.concatenate([home, rng.normal(0, 0.1, 6) * size(dynamics.mechanism)])
+    exact, now = [], state
+    for torque, duration in zip(torques, durations, strict=True):
+        now = integrate(field(dynamics.accelerations, torque, parameters), now, duration)[-1]
+        exact.append(now)
+    substeps = (2, 4, 8, 16)
+    found = [dynamics.predict(state, torques, durations, n, parameters) for n in substeps]
+    errors = [relative(states, np.array(exact)) for states in found]
+    order = -np.polyfit(np.log(substeps), np.log(errors), 1)[0]
+    assert order == pytest.approx(4.0, abs=0.2)
+
+    at_once = dynamics.predict(state, torques, durations, 3, parameters)
+    for torque, duration, expected in zip(torques, durations, at_once, strict=True):
+        state = dynamics.predict(state, torque, duration, 3, parameters)[0]
+        assert relative(state, expected) < 1e-14
+
+
+def test_prediction_of_nothing() -> None:
+    state = np.concatenate([PAPER.home, np.full(6, 0.1)])
+    assert shared(-1).predict(state, [], []).shape == (0, 12)
+    assert np.array_equal(shared(-1).predict(state, np.ones((2, 6)), 0.0), [state, state])
+
+
+# Outside the workspace.
+
+
+@pytest.mark.parametrize("index", range(-1, 6))
+def test_continuation_across_the_boundary_is_smooth(index: int) -> None:
+    dynamics, rng = shared(index), np.random.default_rng(index + 1)
+    mechanism = dynamics.mechanism
+    direction = rng.normal(0, 1, 6) * size(mechanism) * ([1.0] * 3 + [0.2] * 3)
+    rates, torque = rng.normal(0, 0.3, 6) * size(mechanism), rng.normal(0, 1, 6)
+
+    def furthest(sine: float) -> float:
+        """How far along the direction no leg is closer to its dead centre."""
+        low, high = 0.0, 0.01
+        while off_dead_centre(mechanism, mechanism.home + high * direction) > sine:
+            low, high = high, high + 0.01
+        while low < (middle := (low + high) / 2) < high:
+            inside = off_dead_centre(mechanism, mechanism.home + middle * direction) > sine
+            low, high = (middle, high) if inside else (low, middle)
+        return low
+
+    held, edge = furthest(DEAD_CENTRE_SINE), furthest(0.0)
+    pose = mechanism.home + held * direction
+    # Rounding of the model file grows with the inverse square of the sine.
+    expected = PartitionedTree(mechanism).accelerations(pose, rates, torque)
+    assert relative(dynamics.accelerations(pose, rates, torque), expected) < 1e-8
+
+    def roughness(cells: int) -> float:
+        """Largest jump of the slope between cells, which shrinks with the cells unless it kinks."""
+        along = np.linspace(2 * held - edge, 2 * edge - held, cells + 1)
+        poses = mechanism.home + along[:, None] * direction
+        values = np.array([dynamics.accelerations(pose, rates, torque) for pose in poses])
+        slopes = np.diff(values, axis=0) / (along[1] - along[0])
+        return float(np.linalg.norm(np.diff(slopes, axis=0), axis=1).max())
+
+    assert roughness(800) < 0.3 * roughness(200)
+
+
+@pytest.mark.parametrize("index", range(-1, 6))
+def test_derivatives_stay_finite_far_out_of_reach(index: int) -> None:
+    dynamics, rng = shared(index), np.random.default_rng(index + 1)
+    for distance in np.repeat([0.1, 0.3, 1, 10, 1e3, 1e6], 100):
+        pose = dynamics.mechanism.home + rng.normal(0, 1, 6) * ([1.0] * 3 + [distance] * 3)
+        rates, torque = rng.normal(0, 1, (2, 6))
+        assert np.all(np.isfinite(dynamics.accelerations(pose, rates, torque)))
+        assert np.all(np.isfinite(dynamics.derivatives(pose, rates, torque).A))
+    with pytest.raises(UnreachablePoseError, match="out of reach"):
+        dynamics.equilibrium_torque(pose)
+
+
+def test_start_up_needs_no_torch() -> None:
+    code = """if True:
+        import sys, stewart_drake.mechanism.files as files, stewart_drake.plant.dynamics as plant
+        paper = files.load_mechanism("paper")
+        plant.StewartDynamics(paper).accelerations(paper.home, 0.0, 0.0)
+        assert "torch" not in sys.modules"""
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,164 @@
+"""Figures: which there are, what they show, that they are whole and always the same."""
+
+import dataclasses
+import itertools
+from xml.etree import ElementTree
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from stewart_drake.plant.workspace import Failure
+from stewart_drake.report import figures
+from stewart_drake.report.figures import comparison_figures, run_figures
+from stewart_drake.report.style import CONTROLLER_LINES
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.simulation import simulate
+from stewart_drake.studies.compare import CONTROLLERS, LABELS
+
+
+@pytest.fixture(scope="module")
+def run():
+    settings = ("plant.kind=exact", "duration=1.0", "plant.payload_mass=0.2")
+    return simulate(load_scenario("paper", settings=settings))
+
+
+@pytest.fixture(scope="module")
+def comparison(run):
+    """All controllers, one of which goes far off and leaves the workspace at 0.42 s."""
+    early = run.signals.isel(time=slice(0, 22))
+    early["pose"] = early.pose + np.geomspace(1e-3, 100.0, 22)[:, None]
+    early["error"] = early.pose - early.reference
+    failed = dataclasses.replace(
+        run,
+        status="left_workspace",
+        stopped=Failure(0.43, 2, 0.0, "leg 2 reached the end of its reach"),
+        signals=early,
+    )
+    return {name: failed if name == "lqr" else run for name in CONTROLLERS}
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures by name, instead of their files."""
+    kept = {}
+    monkeypatch.setattr(
+        figures, "write_figure", lambda figure, _, name: kept.update({name: figure}) or []
+    )
+    return kept
+
+
+def limits(ax):
+    return np.array(ax.get_ylim())
+
+
+@pytest.fixture(scope="module")
+def written(run, tmp_path_factory):
+    """The folder of one run's figures."""
+    before = dict(plt.rcParams)
+    folder = tmp_path_factory.mktemp("figures")
+    paths = run_figures(run, folder)
+    assert dict(plt.rcParams) == before, "the user's settings were changed"
+    assert not plt.get_fignums(), "a window could open"
+    return folder, paths
+
+
+def test_files_of_a_run(written):
+    folder, paths = written
+    names = ("states", "errors", "torques", "parameters")
+    expected = [f"{name}.{suffix}" for name in names for suffix in ("png", "svg")]
+    assert [path.name for path in paths] == expected
+    assert sorted(path.name for path in folder.iterdir()) == sorted(expected)
+    for path in paths:
+        if path.suffix == ".png":
+            height, width, _ = imread(path).shape
+            assert width == 1500 and height > 900
+        else:
+            assert ElementTree.parse(path).getroot().tag.endswith("svg")
+
+
+def test_the_same_run_gives_the_same_bytes(run, written, tmp_path):
+    run_figures(run, tmp_path)
+    for path in written[1]:
+        assert path.read_bytes() == (tmp_path / path.name).read_bytes(), path.name
+
+
+def test_figures_of_a_comparison(comparison, drawn):
+    comparison_figures(comparison, "unused")
+    torques = ["torques_delay_lqr", "torques_delay_lqi", "torques_predictor_lqi"]
+    assert list(drawn) == ["states", "errors", *torques]
+
+
+def test_a_controller_without_estimator_has_no_parameters_to_show(drawn):
+    settings = ("plant.kind=exact", "duration=0.1")
+    run_figures(simulate(load_scenario("paper", "lqr", settings)), "unused")
+    assert list(drawn) == ["states", "errors", "torques"]
+
+
+def test_axes_name_their_units(run, drawn):
+    run_figures(run, "unused")
+    for name, units in {
+        "states": ["deg"] * 3 + ["mm"] * 3,
+        "errors": ["deg"] * 3 + ["mm"] * 3,
+        "torques": ["N m"] * 6,
+        "parameters": ["mN m"] * 6 + ["kg", "mN m s/rad"],
+    }.items():
+        labels = sorted(ax.get_ylabel() for ax in drawn[name].axes)
+        assert sorted(label.partition("[")[2].rstrip("]") for label in labels) == sorted(units)
+        assert {ax.get_xlabel() for ax in drawn[name].axes} == {"", "time  [s]"}
+        assert {ax.get_xlim() for ax in drawn[name].axes} == {(0.0, 1.0)}
+
+
+def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(comparison, drawn):
+    comparison_figures(comparison, "unused")
+    run = comparison["lqi"].signals
+    shown = drawn["states"].axes[0]
+    motion = np.rad2deg(np.ptp(run.reference.values[:, 0]))
+    assert np.ptp(limits(shown)) < 2 * motion
+    crosses = [line for line in shown.lines if line.get_marker() == "x"]
+    assert [line.get_xdata()[0] for line in crosses] == [0.43]
+    assert limits(shown)[0] <= crosses[0].get_ydata()[0] <= limits(shown)[1]
+    legend = [text.get_text() for text in drawn["states"].legends[0].get_texts()]
+    assert legend == ["reference", *LABELS.values(), "run ended"]
+
+
+def test_where_all_runs_diverge_they_are_shown_whole(comparison, drawn):
+    run_figures(comparison["lqr"], "unused")
+    for name, signal in (("states", "pose"), ("errors", "error")):
+        ax = drawn[name].axes[0]
+        values = np.rad2deg(comparison["lqr"].signals[signal].values[:, 0])
+        assert limits(ax)[0] < values.min() and values.max() < limits(ax)[1]
+        assert 0.43 < ax.get_xlim()[1] < 0.6
+
+
+def test_legends_stay_on_the_figure_and_off_the_axes(comparison, drawn):
+    comparison_figures(comparison, "unused")
+    for figure in drawn.values():
+        figure.canvas.draw()
+        box = figure.legends[0].get_window_extent()
+        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
+        assert box.y0 >= max(ax.get_window_extent().y1 for ax in figure.axes)
+
+
+def test_lines_of_controllers_differ_in_colour_and_in_grey_print():
+    for one, other in itertools.combinations(CONTROLLER_LINES.values(), 2):
+        assert one.color != other.color
+        assert one.linestyle != other.linestyle
+    assert tuple(CONTROLLER_LINES) == CONTROLLERS
+
+
+def test_a_run_stopped_before_its_first_sample_can_be_drawn(run, tmp_path):
+    nothing = dataclasses.replace(
+        run,
+        status="interrupted",
+        stopped=Failure(0.0, None, np.nan, "interrupted"),
+        signals=run.signals.isel(time=slice(0, 0)),
+    )
+    assert len(run_figures(nothing, tmp_path)) == 6
+    assert comparison_figures({}, tmp_path) == []
+
+
+def test_an_unwritable_directory_is_reported(run, tmp_path):
+    with pytest.raises(OSError):
+        run_figures(run, tmp_path / "missing")

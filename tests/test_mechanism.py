@@ -1,0 +1,289 @@
+"""Mechanism files: what is refused and how, what the paper's file describes, what is protected."""
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from stewart_drake.errors import ConfigError
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import Body, Mechanism
+from stewart_drake.resources import data_root
+from tests.mechanisms import PAPER
+
+Loader = Callable[[dict[str, Any]], Mechanism]
+FILE = data_root() / "models" / "paper.yaml"
+ABSENT = object()
+LEG = {
+    "shaft": [0.2, 0.0, 0.01],
+    "motor_axis": [1.0, 0.0, 0.0],
+    "crank_zero": [0.0, 1.0, 0.0],
+    "plate_joint": [0.12, 0.0, 0.0],
+    "branch": 1,
+}
+
+
+@pytest.fixture
+def load(tmp_path: Path) -> Loader:
+    """Writes a mechanism file and loads it."""
+
+    def write_and_load(contents: dict[str, Any]) -> Mechanism:
+        yaml = YAML()
+        yaml.representer.ignore_aliases = lambda *_: True
+        with (tmp_path / "mine.yaml").open("w") as stream:
+            yaml.dump(contents, stream)
+        return load_mechanism(tmp_path / "mine.yaml")
+
+    return write_and_load
+
+
+def paper_with(edits: dict[str, Any]) -> dict[str, Any]:
+    """The paper's file with fields, dots between their sections, replaced or taken out."""
+    contents = YAML(typ="safe").load(FILE.read_text())
+    for name, value in edits.items():
+        section = contents
+        *above, field = name.split(".")
+        for key in above:
+            section = section[key]
+        if value is ABSENT:
+            del section[field]
+        else:
+            section[field] = value
+    return contents
+
+
+def third_leg(**changes: Any) -> dict[str, Any]:
+    """Edits that put six explicit legs in place of the pattern, the third of them changed."""
+    legs = [copy.deepcopy(LEG) for _ in range(6)]
+    legs[2].update(changes)
+    return {"pattern": ABSENT, "legs": legs}
+
+
+# edits, how the message names field and value, what it says is allowed
+INVALID = [
+    ({"crank.length": -0.11}, "crank.length: got -0.11", "a positive number, or a list of six"),
+    ({"crank.length": 0}, "crank.length: got 0", "positive"),
+    ({"rod.length": "long"}, "rod.length: got 'long'", "positive"),
+    ({"rod.length": True}, "rod.length: got True", "positive"),
+    ({"rod.length": 10**400}, "rod.length: got 1000", "positive"),
+    ({"rod.length": [0.4] * 5}, "rod.length: got [0.4, 0.4, 0.4, 0.4, 0.4]", "list of six"),
+    ({"rod.length": [-0.4] + [0.4] * 5}, "rod.length: got [-0.4, 0.4,", "positive"),
+    ({"rod.length": 0.11}, "rod.length: got 0.11 m for leg 1", "longer than its crank"),
+    ({"rod.length": [0.404] * 5 + [0.1]}, "rod.length: got 0.1 m for leg 6", "longer than its"),
+    ({"crank.mass": -0.04}, "crank.mass: got -0.04 kg", "positive"),
+    ({"rod.mass": 0}, "rod.mass: got 0 kg", "positive"),
+    ({"plate.mass": 0}, "plate.mass: got 0 kg", "positive"),
+    ({"plate.mass": -4.0}, "plate.mass: got -4.0", "at least 0"),
+    ({"plate.mass": "4 kg"}, "plate.mass: got '4 kg'", "number"),
+    ({"plate.mass": float("inf")}, "plate.mass: got inf", "finite"),
+    ({"base.mass": -7.0}, "base.mass: got -7.0", "at least 0"),
+    ({"plate.inertia": [0, 30e-4, 30e-4]}, "plate.inertia: got [0, 0.003, 0.003]", "positive"),
+    ({"rod.inertia": [-1e-6, 1e-4, 1e-4]}, "rod.inertia: got [-1e-06, 0.0001,", "positive"),
+    ({"rod.inertia": [1e-6, 1e-4]}, "rod.inertia: got [1e-06, 0.0001]", "3 items"),
+    (
+        {"crank.inertia": [0.01e-4, 0.58e-4, 0.60e-4]},  # as printed in Table I
+        "crank.inertia: got [1e-06, 5.8e-05, 6e-05] kg m^2, which violates the triangle inequality",
+        "at most the sum of the other two",
+    ),
+    ({"base.inertia": [1.0, 1.0, 3.0]}, "base.inertia: got [1, 1, 3]", "sum of the other two"),
+    ({"rod.center": 1.2}, "rod.center: got 1.2", "between 0 and 1"),
+    ({"motor.effort_limit": 0}, "motor.effort_limit: got 0 N m", "positive torque or null"),
+    ({"motor.effort_limit": -10.0}, "motor.effort_limit: got -10 N m", "positive torque or null"),
+    ({"pattern.branches": [-1, 1, -1, 0, -1, 1]}, "pattern.branches[3]: got 0", "-1 or 1"),
+    ({"pattern.branches": [2, 1, -1, 1, -1, 1]}, "pattern.branches[0]: got 2", "-1 or 1"),
+    ({"pattern.branches": [1] * 5}, "pattern.branches: got [1, 1, 1, 1, 1]", "6 items"),
+    (
+        {"pattern.plate_order": [0, 0, 1, 2, 3, 4]},
+        "pattern.plate_order: got [0, 0, 1, 2, 3, 4]",
+        "each of 0 to 5 once",
+    ),
+    ({"pattern.plate_order": [6, 0, 1, 2, 3, 4]}, "pattern.plate_order[0]: got 6", "at most 5"),
+    ({"pattern.base_radius": -0.22}, "pattern.base_radius: got -0.22", "above 0"),
+    ({"pattern.plate_radius": 0}, "pattern.plate_radius: got 0", "above 0"),
+    ({"pattern.rotation_deg": float("nan")}, "pattern.rotation_deg: got nan", "finite"),
+    (
+        {"home": [0, 0, 0, 0, 0, 0.6]},
+        "home: got [0, 0, 0, 0, 0, 0.6], out of reach",
+        "within reach",
+    ),
+    ({"home": [0, 0, 0, 0, 0.38]}, "home: got [0, 0, 0, 0, 0.38]", "6 items"),
+    ({"home": [0, 0, 0, 0, 0, float("nan")]}, "home[5]: got nan", "finite"),
+    ({"home": [0, np.pi / 2, 0, 0, 0, 0.38]}, "home: got a pitch of 1.5708", "less than pi/2"),
+    ({"pattern": ABSENT}, "pattern, legs: got neither", "exactly one of the two"),
+    ({"legs": [LEG] * 6}, "pattern, legs: got both", "exactly one of the two"),
+    ({"pattern": ABSENT, "legs": [LEG] * 5}, "legs: got [{'shaft'", "6 items"),
+    ({"pattern": ABSENT, "legs": LEG}, "legs: got {'shaft'", "a list"),
+    (third_leg(motor_axis=[0, 0, 0]), "legs[2].motor_axis: got [0.0, 0.0, 0.0]", "not zero"),
+    (third_leg(crank_zero=[0, 0, 0]), "legs[2].crank_zero: got [0.0, 0.0, 0.0]", "not zero"),
+    (third_leg(crank_zero=[1, 1, 0]), "legs[2].crank_zero: got 45 degrees", "perpendicular"),
+    (third_leg(crank_zero=[2, 0, 0]), "legs[2].crank_zero: got 0 degrees", "perpendicular"),
+    (third_leg(branch=0), "legs[2].branch: got 0", "-1 or 1"),
+    (third_leg(branch=0.5), "legs[2].branch: got 0.5", "-1 or 1"),
+    (third_leg(plate_joint=[0.1, 0]), "legs[2].plate_joint: got [0.1, 0]", "3 items"),
+    ({"name": "world"}, "name: got 'world'", "none of world, "),
+    ({"name": "DefaultModelInstance"}, "name: got 'DefaultModelInstance'", "none of "),
+    ({"name": "my robot"}, "name: got 'my robot'", "letters, digits"),
+    ({"name": "a::b"}, "name: got 'a::b'", "letters, digits"),
+    ({"name": "ab\n"}, r"name: got 'ab\n'", "letters, digits"),
+    ({"name": ""}, "name: got ''", "letters, digits"),
+    ({"name": 3}, "name: got 3", "text"),
+]
+
+
+@pytest.mark.parametrize(("edits", "got", "allowed"), INVALID, ids=[got for _, got, _ in INVALID])
+def test_invalid_fields_are_refused_in_one_line(
+    edits: dict[str, Any], got: str, allowed: str, load: Loader
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(paper_with(edits))
+    message = str(caught.value)
+    assert "\n" not in message
+    file, _, problem = message.partition(": ")
+    assert file.endswith("mine.yaml")
+    assert problem.startswith(got)
+    assert allowed in problem.partition("expected ")[2]
+
+
+@pytest.mark.parametrize(
+    ("edits", "problem"),
+    [
+        ({"plat": 1}, "plat: unknown key; did you mean plate?"),
+        ({"crank.lenght": 1}, "crank.lenght: unknown key; did you mean crank.length?"),
+        (third_leg(shft=[0]), "legs[2].shft: unknown key; did you mean legs[2].shaft?"),
+        ({"rod": ABSENT}, "rod: is missing"),
+        ({"crank.mass": ABSENT}, "crank.mass: is missing"),
+        ({"home": ABSENT}, "home: is missing"),
+    ],
+)
+def test_unknown_and_missing_keys_are_named(
+    edits: dict[str, Any], problem: str, load: Loader
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(paper_with(edits))
+    assert str(caught.value).endswith(f"mine.yaml: {problem}")
+
+
+# ------------------------------------------------------------------ built in Python
+
+REFUSED = [
+    ({"p_WS": np.zeros((5, 3))}, "p_WS: got shape (5, 3); expected (6, 3)"),
+    ({"rod_lengths": 0.4}, "rod_lengths: got shape (); expected (6,)"),
+    ({"home": [0, 0, 0, 0, 0, np.inf]}, "home: got [0, 0, 0, 0, 0, inf]; expected finite"),
+    ({"R_WS": 1.01 * PAPER.R_WS}, "motor frames: off a rotation by 2.0e-02"),
+    ({"R_WS": -PAPER.R_WS}, "motor frames: off a rotation by"),
+    ({"branches": np.zeros(6)}, "branches: got [0, 0, 0, 0, 0, 0]; expected -1 or 1"),
+    ({"plate": Body(4.0, np.eye(3))}, "plate.inertia: got shape (3, 3); expected (3,)"),
+    ({"plate": Body(4.0, [1, 1, np.nan])}, "plate: got mass 4 kg, inertia [1, 1, nan]"),
+    ({"base": Body(np.inf, [1, 1, 1])}, "base: got mass inf kg"),
+    ({"name": "a b"}, "name: got 'a b'"),
+]
+
+
+@pytest.mark.parametrize(("changes", "problem"), REFUSED, ids=[problem for _, problem in REFUSED])
+def test_constructor_refuses_what_no_mechanism_has(changes: dict[str, Any], problem: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        dataclasses.replace(PAPER, **changes)
+    assert str(caught.value).startswith(problem)
+    assert "\n" not in str(caught.value)
+
+
+def test_arrays_are_copies_and_read_only() -> None:
+    shafts, moments = PAPER.p_WS.copy(), np.array([30e-4, 30e-4, 60e-4])
+    mechanism = dataclasses.replace(PAPER, p_WS=shafts, plate=Body(4.0, moments))
+    shafts += 1
+    moments += 1
+    np.testing.assert_array_equal(mechanism.p_WS, PAPER.p_WS)
+    np.testing.assert_array_equal(mechanism.plate.inertia, PAPER.plate.inertia)
+
+    bodies = [mechanism, *(getattr(mechanism, name) for name in ("base", "plate", "crank", "rod"))]
+    arrays = [value for body in bodies for value in vars(body).values() if np.ndim(value)]
+    assert len(arrays) == 11
+    for array in arrays:
+        assert array.dtype == np.float64
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+
+
+# ------------------------------------------------------------------ what files describe
+
+
+def test_paper_geometry_is_the_tabulated_one() -> None:
+    """Pairs 15 and 5 degrees apart on circles of 0.22 and 0.12 m, installed at 70 degrees."""
+    base_deg = 24 + np.array([-7.5, 7.5, 112.5, 127.5, 232.5, 247.5])
+    t = 24 + 60 + np.array([-2.5, 2.5, 117.5, 122.5, 237.5, 242.5])
+    plate_deg = t[[5, 0, 1, 2, 3, 4]]
+    beta = np.radians(70)
+    for leg in range(6):
+        b, p = np.radians(base_deg[leg]), np.radians(plate_deg[leg])
+        shaft = [0.22 * np.cos(b), 0.22 * np.sin(b), 0.010]
+        joint = [0.12 * np.cos(p), 0.12 * np.sin(p), 0]
+        x = [np.sin(b), -np.cos(b), 0]
+        y = [np.cos(beta) * np.cos(b), np.cos(beta) * np.sin(b), -np.sin(beta)]
+        axis = [np.sin(beta) * np.cos(b), np.sin(beta) * np.sin(b), np.cos(beta)]  # x cross y
+        np.testing.assert_allclose(PAPER.p_WS[leg], shaft, atol=1e-15)
+        np.testing.assert_allclose(PAPER.p_PQ[leg], joint, atol=1e-15)
+        np.testing.assert_allclose(PAPER.R_WS[leg], np.transpose([x, y, axis]), atol=1e-15)
+    np.testing.assert_array_equal(PAPER.branches, [-1, 1, -1, 1, -1, 1])
+    np.testing.assert_array_equal(PAPER.crank_lengths, 0.11)
+    np.testing.assert_array_equal(PAPER.rod_lengths, 0.404)
+    np.testing.assert_array_equal(PAPER.home, [0, 0, 0, 0, 0, 0.38])
+
+
+@pytest.mark.parametrize(
+    ("body", "mass", "inertia"),
+    [
+        ("base", 7, [270, 270, 540]),
+        ("plate", 4, [30, 30, 60]),
+        ("crank", 0.04, [0.01, 0.58, 0.59]),
+        ("rod", 0.08, [0.01, 16, 16]),
+    ],
+)
+def test_paper_bodies_are_those_of_table_1(body: str, mass: float, inertia: list[float]) -> None:
+    assert getattr(PAPER, body).mass == mass
+    np.testing.assert_allclose(getattr(PAPER, body).inertia, np.multiply(inertia, 1e-4), rtol=1e-15)
+    assert PAPER.crank.center == PAPER.rod.center == 0.5
+
+
+def test_explicit_legs_give_the_geometry_of_the_pattern(load: Loader) -> None:
+    """Directions may have any length; the crank's may lean a rounding error off the right angle."""
+    legs = [
+        {
+            "shaft": PAPER.p_WS[i].tolist(),
+            "motor_axis": (3.0 * PAPER.R_WS[i][:, 2]).tolist(),
+            "crank_zero": (0.1 * PAPER.R_WS[i][:, 0] + 1e-9 * PAPER.R_WS[i][:, 2]).tolist(),
+            "plate_joint": PAPER.p_PQ[i].tolist(),
+            "branch": int(PAPER.branches[i]),
+        }
+        for i in range(6)
+    ]
+    explicit = load(paper_with({"pattern": ABSENT, "legs": legs}))
+    for field in dataclasses.fields(Mechanism):
+        given, expected = getattr(explicit, field.name), getattr(PAPER, field.name)
+        if isinstance(expected, np.ndarray):
+            np.testing.assert_allclose(given, expected, atol=1e-14, err_msg=field.name)
+    pose = PAPER.home + [0.1, 0.05, -0.1, 0.01, 0, 0.02]
+    np.testing.assert_allclose(explicit.crank_angles(pose), PAPER.crank_angles(pose), atol=1e-12)
+
+
+def test_lengths_may_differ_from_leg_to_leg(load: Loader) -> None:
+    cranks = [0.10, 0.11, 0.12, 0.13, 0.14, 0.15]
+    rods = [0.40, 0.41, 0.42, 0.43, 0.44, 0.45]
+    mechanism = load(paper_with({"crank.length": cranks, "rod.length": rods}))
+    np.testing.assert_array_equal(mechanism.crank_lengths, cranks)
+    np.testing.assert_array_equal(mechanism.rod_lengths, rods)
+    alike = load(paper_with({"crank.length": [0.11] * 6}))
+    np.testing.assert_array_equal(alike.crank_lengths, PAPER.crank_lengths)
+
+
+def test_optional_fields_have_defaults(load: Loader) -> None:
+    massless = {"mass": 0, "inertia": [0, 0, 0]}
+    mechanism = load(paper_with({"motor": ABSENT, "base": massless}))
+    assert mechanism.effort_limit is None
+    assert mechanism.base.mass == 0
+    assert load(paper_with({"motor.effort_limit": None})).effort_limit is None
+    assert load(paper_with({"rod.center": 0.25})).rod.center == 0.25

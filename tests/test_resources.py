@@ -1,0 +1,85 @@
+"""Shipped data are found by name in a checkout and in a wheel, everything else by path."""
+
+from pathlib import Path
+
+import pytest
+
+from stewart_drake import resources
+from stewart_drake.errors import ConfigError
+
+
+def test_the_shipped_names_of_each_kind() -> None:
+    assert "paper" in resources.shipped("mechanism")
+    assert {"gravity", "paper"} <= set(resources.shipped("scenario"))
+    assert {"delay_lqi", "delay_lqr", "lqi", "lqr", "predictor_lqi"} <= set(
+        resources.shipped("controller")
+    )
+
+
+@pytest.mark.parametrize("kind", ["mechanism", "scenario", "controller", "weights"])
+def test_every_shipped_name_resolves_to_a_file(kind: resources.Kind) -> None:
+    for name in resources.shipped(kind):
+        path = resources.resolve(kind, name)
+        assert path.is_absolute()
+        assert path.is_file()
+        assert path.stem == name
+
+
+def test_a_wheel_carries_the_data_inside_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "site-packages" / "stewart_drake"
+    wanted = package / "_data" / "models" / "mine.yaml"
+    wanted.parent.mkdir(parents=True)
+    wanted.touch()
+    (package.parent / "models").mkdir()
+    (package.parent / "models" / "somebody_elses.yaml").touch()
+    monkeypatch.setattr(resources, "_PACKAGE", package)
+
+    assert resources.shipped("mechanism") == ["mine"]
+    assert resources.resolve("mechanism", "mine") == wanted
+
+
+def test_a_path_starts_from_the_given_folder_or_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "sub" / "mine.yaml"
+    file.parent.mkdir()
+    file.touch()
+    assert resources.resolve("scenario", "sub/mine.yaml", relative_to=tmp_path) == file
+    assert resources.resolve("scenario", "mine.yaml", relative_to=file.parent) == file
+    assert resources.resolve("scenario", file) == file
+    monkeypatch.chdir(tmp_path)
+    assert resources.resolve("scenario", "./sub/mine.yaml") == file
+    assert resources.resolve("scenario", Path("sub/mine.yaml")) == file
+
+
+def test_a_word_never_means_a_file_in_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "paper").write_text("not this one")
+    monkeypatch.chdir(tmp_path)
+    assert resources.resolve("scenario", "paper").parent != tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("gravty", ["'gravty'", "expected one of gravity, ", "paper"]),
+        ("", ["''", "gravity", "a path"]),
+        ("..", ["'..'", "paper"]),
+        ("./paper", ["no file", "/paper'", "gravity", "paper"]),
+        ("missing.yaml", ["no file", "/missing.yaml'"]),
+        ("nul\0/x", ["no file"]),
+        ("two\nlines/x", ["no file"]),
+        ("long" * 5000 + "/x", ["no file"]),
+    ],
+)
+def test_what_is_missing_is_named_in_one_line(name: str, parts: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        resources.resolve("scenario", name)
+    message = str(caught.value)
+    assert message.startswith("scenario: ")
+    assert "\n" not in message
+    for part in parts:
+        assert part in message

@@ -1,0 +1,281 @@
+"""The SDFormat that is written, as Drake reads it back."""
+
+import dataclasses
+import logging
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context
+
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.sdformat import to_sdformat
+from stewart_drake.plant.multibody import add_mechanism, set_pose
+from stewart_drake.resources import data_root
+from tests.mechanisms import PAPER, random_mechanism, random_pose
+
+Array = NDArray[np.float64]
+MODELS = data_root() / "models"
+LEGS = range(1, 7)
+
+
+def parse(mechanism: Mechanism) -> tuple[MultibodyPlant, Context]:
+    """The document alone, at the positions it gives."""
+    plant = MultibodyPlant(time_step=1e-3)
+    Parser(plant).AddModelsFromString(to_sdformat(mechanism), "sdf")
+    plant.Finalize()
+    return plant, plant.CreateDefaultContext()
+
+
+def any_machine(seed: int) -> Mechanism:
+    """The paper's mechanism for seed 0, else a random one that uses either crank branch."""
+    rng = np.random.default_rng(seed)
+    if seed == 0:
+        return PAPER
+    return dataclasses.replace(random_mechanism(rng), branches=rng.choice([-1, 1], 6))
+
+
+def with_vertical(link: str) -> Mechanism:
+    """All cranks, or all rods, vertical at home: a pitch of 90 degrees. Crank angles are zero."""
+    azimuth = np.arange(6) * np.pi / 3
+    out = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(6)])
+    up, across = np.array([0.0, 0.0, 1.0]), np.cross([0.0, 0.0, 1.0], out)
+    p_PQ = 0.12 * out + 0.06 * across
+    if link == "crank":
+        crank = np.tile(up, (6, 1))
+        p_WS = 0.2 * out
+    else:
+        crank = across
+        p_WS = PAPER.home[3:] + p_PQ - 0.35 * up - 0.1 * crank
+    R_WS = np.stack([crank, np.cross(out, crank), out], axis=2)
+    p_SQ = PAPER.home[3:] + p_PQ - p_WS
+    return dataclasses.replace(
+        PAPER,
+        p_WS=p_WS,
+        R_WS=R_WS,
+        p_PQ=p_PQ,
+        crank_lengths=np.full(6, 0.1),
+        rod_lengths=np.linalg.norm(p_SQ - 0.1 * crank, axis=1),
+        branches=-np.sign(np.einsum("li,li->l", p_SQ, R_WS[:, :, 1])),
+    )
+
+
+def gaps(mechanism: Mechanism, plant: MultibodyPlant, context: Context) -> tuple[float, float]:
+    """Largest distance and relative velocity between a rod's end and its plate joint."""
+    distance, velocity = [], []
+    for leg in LEGS:
+        rod_end = plant.GetFrameByName(f"rod_end_{leg}")
+        joint = plant.GetFrameByName(f"plate_joint_{leg}")
+        distance.append(
+            rod_end.CalcPoseInWorld(context).translation()
+            - joint.CalcPoseInWorld(context).translation()
+        )
+        velocity.append(
+            rod_end.CalcSpatialVelocityInWorld(context).translational()
+            - joint.CalcSpatialVelocityInWorld(context).translational()
+        )
+    return float(np.abs(distance).max()), float(np.abs(velocity).max())
+
+
+# ------------------------------------------------------------------ the document
+
+
+def test_committed_file_is_what_the_writer_writes() -> None:
+    """Up to the last digit, in which platforms may differ."""
+    number = re.compile(r"-?\d+(\.\d+)?(e[+-]\d+)?")
+    committed, written = (MODELS / "paper.sdf").read_text(), to_sdformat(PAPER)
+    assert number.sub("#", committed) == number.sub("#", written)
+    values = [[float(n.group()) for n in number.finditer(text)] for text in (committed, written)]
+    np.testing.assert_allclose(*values, rtol=1e-13, atol=1e-15)
+
+
+def test_package_url_resolves() -> None:
+    plant = MultibodyPlant(time_step=1e-3)
+    parser = Parser(plant)
+    parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
+    parser.AddModelsFromUrl("package://stewart_drake_models/paper.sdf")
+    assert plant.HasModelInstanceNamed("paper")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_parser_has_nothing_to_warn_of(seed: int, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING, logger="drake"):
+        parse(any_machine(seed))
+    assert caplog.messages == []
+
+
+def test_parser_only_warns_of_the_inertia_that_the_paper_prints(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Hence the mechanism's own check; and the warnings that the test above looks for do arrive."""
+    printed = to_sdformat(PAPER).replace("5.9e-05", "6e-05")
+    plant = MultibodyPlant(time_step=1e-3)
+    with caplog.at_level(logging.WARNING, logger="drake"):
+        Parser(plant).AddModelsFromString(printed, "sdf")
+    assert sum("triangle inequality" in message for message in caplog.messages) == 6
+
+
+@pytest.mark.parametrize("name", ["base", "plate", "crank_1", "model", "static", "my-robot_2"])
+def test_names_do_not_collide_with_those_inside(name: str) -> None:
+    plant, _ = parse(dataclasses.replace(PAPER, name=name))
+    assert plant.HasModelInstanceNamed(name)
+    assert plant.num_actuated_dofs() == 6
+
+
+def test_two_machines_fit_into_one_plant() -> None:
+    plant = MultibodyPlant(time_step=1e-3)
+    for name in ("left", "right"):
+        document = to_sdformat(dataclasses.replace(PAPER, name=name))
+        Parser(plant).AddModelsFromString(document, "sdf")
+    plant.Finalize()
+    assert plant.num_constraints() == plant.num_actuated_dofs() == 12
+
+
+# ------------------------------------------------------------------ what it says
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bodies_have_the_mechanism_s_mass_inertia_and_centre(seed: int) -> None:
+    mechanism = any_machine(seed)
+    plant, context = parse(mechanism)
+    expected = {"base": (mechanism.base, 0.0), "plate": (mechanism.plate, 0.0)}
+    for i, leg in enumerate(LEGS):
+        crank, rod = mechanism.crank, mechanism.rod
+        expected[f"crank_{leg}"] = (crank, crank.center * mechanism.crank_lengths[i])
+        expected[f"rod_{leg}"] = (rod, rod.center * mechanism.rod_lengths[i])
+    for name, (body, along_x) in expected.items():
+        link = plant.GetBodyByName(name)
+        M_BBo_B = link.CalcSpatialInertiaInBodyFrame(context)
+        about_com = M_BBo_B.Shift(M_BBo_B.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
+        np.testing.assert_allclose(link.get_mass(context), body.mass, rtol=1e-14)
+        np.testing.assert_allclose(M_BBo_B.get_com(), [along_x, 0, 0], atol=1e-15)
+        np.testing.assert_allclose(
+            about_com, np.diag(body.inertia), atol=1e-12 * body.inertia.max() + 1e-15
+        )
+    assert plant.num_bodies() == 1 + len(expected)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_joints_turn_about_the_mechanism_s_axes(seed: int) -> None:
+    """Second axis of the universal joint: perpendicular to the motor axis and to the rod."""
+    mechanism = any_machine(seed)
+    plant, context = parse(mechanism)
+
+    def origin(frame: str) -> Array:
+        return plant.GetFrameByName(frame).CalcPoseInWorld(context).translation()
+
+    for i, leg in enumerate(LEGS):
+        axis = mechanism.R_WS[i][:, 2]
+        motor = plant.GetJointByName(f"motor_{leg}")
+        R_WF = motor.frame_on_parent().CalcRotationMatrixInWorld(context)
+        np.testing.assert_allclose(R_WF.multiply(motor.revolute_axis()), axis, atol=1e-14)
+        universal = plant.GetJointByName(f"universal_{leg}")
+        first, second, _ = universal.frame_on_parent().CalcRotationMatrixInWorld(context).matrix().T
+        rod = origin(f"rod_end_{leg}") - origin(f"tip_{leg}")
+        np.testing.assert_allclose(first, axis, atol=1e-13)
+        np.testing.assert_allclose([second @ axis, second @ rod], 0, atol=1e-13)
+        np.testing.assert_allclose(np.linalg.norm(rod), mechanism.rod_lengths[i], rtol=1e-13)
+
+
+@pytest.mark.parametrize("limit", [None, 2.5])
+def test_motors_are_the_only_actuators_in_the_order_of_the_legs(limit: float | None) -> None:
+    plant, _ = parse(dataclasses.replace(PAPER, effort_limit=limit))
+    actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+    assert [actuator.joint().name() for actuator in actuators] == [f"motor_{leg}" for leg in LEGS]
+    assert [actuator.input_start() for actuator in actuators] == list(range(6))
+    assert {actuator.effort_limit() for actuator in actuators} == {limit or np.inf}
+
+
+@pytest.mark.parametrize(
+    "mechanism",
+    [*map(any_machine, range(4)), with_vertical("crank"), with_vertical("rod")],
+    ids=["paper", "random 1", "random 2", "random 3", "vertical cranks", "vertical rods"],
+)
+def test_frames_stand_where_the_mechanism_has_its_joints(mechanism: Mechanism) -> None:
+    plant, context = parse(mechanism)
+
+    def pose(frame: str) -> tuple[Array, Array]:
+        X_WF = plant.GetFrameByName(frame).CalcPoseInWorld(context)
+        return X_WF.translation(), X_WF.rotation().matrix()
+
+    p_WP, R_WP = pose("plate")
+    np.testing.assert_allclose(p_WP, mechanism.home[3:], atol=1e-14)
+    for i, leg in enumerate(LEGS):
+        p_WS, R_WS = pose(f"shaft_{leg}")
+        np.testing.assert_allclose(p_WS, mechanism.p_WS[i], atol=1e-14)
+        np.testing.assert_allclose(R_WS, mechanism.R_WS[i], atol=1e-13)
+        alpha = mechanism.crank_angles(mechanism.home)[i]
+        crank = R_WS @ [np.cos(alpha), np.sin(alpha), 0]
+        tip = mechanism.p_WS[i] + mechanism.crank_lengths[i] * crank
+        p_WT, R_WT = pose(f"tip_{leg}")
+        np.testing.assert_allclose(p_WT, tip, atol=1e-12)
+        np.testing.assert_allclose(R_WT[:, 0], crank, atol=1e-13)
+        p_WQ, _ = pose(f"plate_joint_{leg}")
+        np.testing.assert_allclose(p_WQ, p_WP + R_WP @ mechanism.p_PQ[i], atol=1e-13)
+    assert gaps(mechanism, plant, context)[0] < 1e-12
+
+
+@pytest.mark.parametrize("link", ["crank", "rod"])
+def test_links_that_should_be_vertical_are(link: str) -> None:
+    plant, context = parse(with_vertical(link))
+    for leg in LEGS:
+        X_WL = plant.GetBodyByName(f"{link}_{leg}").EvalPoseInWorld(context)
+        np.testing.assert_allclose(X_WL.rotation().matrix()[:, 0], [0, 0, 1], atol=1e-14)
+
+
+# ------------------------------------------------------------------ the loops
+
+
+def test_each_loop_is_closed_by_one_constraint() -> None:
+    plant, _ = parse(PAPER)
+    assert plant.num_constraints() == 6
+    assert len(plant.GetConstraintIds()) == 6
+    # 6 cranks, 6 universal joints and a free plate, less three per ball: six degrees of freedom.
+    assert plant.num_velocities() - 3 * plant.num_constraints() == 6
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_loops_close_at_any_pose_and_rates(seed: int) -> None:
+    mechanism = any_machine(seed)
+    rng = np.random.default_rng(seed)
+    plant = MultibodyPlant(time_step=1e-3)
+    add_mechanism(plant, mechanism)
+    context = plant.CreateDefaultContext()
+    plate = plant.GetBodyByName("plate")
+    for _ in range(4):
+        pose, rates = random_pose(rng, mechanism), rng.normal(size=6)
+        set_pose(plant, context, mechanism, pose, rates)
+        distance, velocity = gaps(mechanism, plant, context)
+        assert distance < 1e-13 * mechanism.rod_lengths.max()
+        assert velocity < 1e-12
+
+        rpy = RollPitchYaw(pose[:3])
+        X_WP, V_WP = plate.EvalPoseInWorld(context), plate.EvalSpatialVelocityInWorld(context)
+        assert X_WP.IsNearlyEqualTo(RigidTransform(rpy, pose[3:]), 1e-14)
+        w_WP = rpy.CalcAngularVelocityInParentFromRpyDt(rates[:3])
+        np.testing.assert_allclose(V_WP.rotational(), w_WP, atol=1e-13)
+        np.testing.assert_allclose(V_WP.translational(), rates[3:], atol=1e-14)
+        motors = [plant.GetJointByName(f"motor_{leg}") for leg in LEGS]
+        turned = mechanism.crank_angles(pose) - mechanism.crank_angles(mechanism.home)
+        found = [motor.get_angle(context) for motor in motors]
+        np.testing.assert_allclose(np.exp(1j * np.array(found)), np.exp(1j * turned), atol=1e-13)
+        alpha_dot = [motor.get_angular_rate(context) for motor in motors]
+        np.testing.assert_allclose(alpha_dot, mechanism.jacobian(pose) @ rates, atol=1e-12)
+
+
+# ------------------------------------------------------------------ Drake's viewer
+
+
+def test_drake_s_own_viewer_opens_the_file() -> None:
+    command = [sys.executable, "-m", "pydrake.visualization.model_visualizer", "--loop_once"]
+    shown = subprocess.run(
+        [*command, str(MODELS / "paper.sdf")], capture_output=True, text=True, timeout=60
+    )
+    assert shown.returncode == 0, shown.stderr
+    assert "warn" not in (shown.stdout + shown.stderr).lower()

@@ -1,0 +1,387 @@
+"""References: exact derivatives, smooth joints, defined for all time, honest about bad files."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from pydrake.trajectories import PiecewisePolynomial, Trajectory
+
+from stewart_drake.config import ReferenceConfig
+from stewart_drake.errors import ConfigError
+from stewart_drake.signals import ACCELERATIONS, POSE, RATES
+from stewart_drake.trajectories import (
+    angular_frequency,
+    catch_up,
+    evaluate,
+    make_reference,
+    peak_to_peak,
+)
+
+Array = NDArray[np.float64]
+
+HOME = [0.0, 0.0, 0.0, 0.0, 0.0, 0.38]
+HEADER = "time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]"
+WAYPOINTS = ReferenceConfig(
+    kind="waypoints",
+    times=[0.5, 1.0, 2.5, 3.0],
+    poses=[HOME, [0.1, 0.2, -0.1, 0.01, 0, 0.4], [0, 0.1, 0, 0, 0.02, 0.38], HOME],
+)
+
+
+def sample_csv(path: Path, times: Array, motion: Callable[[float], Array]) -> ReferenceConfig:
+    rows = [",".join(repr(float(v)) for v in [t, *motion(t)]) for t in times]
+    path.write_text("\n".join([HEADER, *rows, ""]))
+    return ReferenceConfig(kind="csv", file=str(path))
+
+
+def assert_derivatives_agree(trajectory: Trajectory, t: float) -> None:
+    """Central differences of the pose give the rates, those of the rates the accelerations."""
+    h = 1e-5
+    before, at, after = (evaluate(trajectory, s) for s in (t - h, t, t + h))
+    for low, high in ((POSE, RATES), (RATES, ACCELERATIONS)):
+        scale = 1 + np.abs(at).max()
+        np.testing.assert_allclose(
+            (after[low] - before[low]) / (2 * h), at[high], atol=1e-4 * scale
+        )
+
+
+def assert_smooth(trajectory: Trajectory, knots: list[float], atol: float = 1e-4) -> None:
+    """Pose, rates and accelerations have no jump at the knots."""
+    for t in knots:
+        np.testing.assert_allclose(
+            evaluate(trajectory, t + 1e-9), evaluate(trajectory, t - 1e-9), atol=atol
+        )
+
+
+# Sine and hold
+
+
+def test_the_sine_is_the_papers_equation_46() -> None:
+    trajectory = make_reference(ReferenceConfig(), 10.0)
+    amplitude = np.array([0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08])
+    for t in (0.0, 0.7, math.pi / 2, 123.4):
+        expected = [
+            amplitude * math.sin(t) + HOME,
+            amplitude * math.cos(t),
+            -amplitude * math.sin(t),
+        ]
+        np.testing.assert_allclose(evaluate(trajectory, t), np.concatenate(expected), atol=1e-15)
+
+
+@given(
+    frequency=st.floats(0.01, 5),
+    unit=st.sampled_from(["rad/s", "Hz"]),
+    amplitude=st.lists(st.floats(-0.5, 0.5), min_size=6, max_size=6),
+    t=st.floats(0.1, 20),
+)
+@settings(deadline=None)
+def test_the_derivatives_of_a_sine_are_exact(
+    frequency: float, unit: str, amplitude: list[float], t: float
+) -> None:
+    config = ReferenceConfig(amplitude=amplitude, frequency=frequency, frequency_unit=unit)  # type: ignore[arg-type]
+    trajectory = make_reference(config, 10.0)
+    assert_derivatives_agree(trajectory, t)
+    omega = angular_frequency(config)
+    assert omega == pytest.approx(frequency * (2 * math.pi if unit == "Hz" else 1))
+    third = trajectory.MakeDerivative(3).value(t)[:, 0]
+    np.testing.assert_allclose(
+        third, -(omega**2) * evaluate(trajectory, t)[RATES], atol=1e-9 * (1 + omega**3)
+    )
+
+
+def test_a_hold_stands_still_for_ever() -> None:
+    trajectory = make_reference(ReferenceConfig(kind="hold", offset=HOME), 10.0)
+    for t in (0.0, 3.0, 1e6):
+        np.testing.assert_array_equal(evaluate(trajectory, t), HOME + [0.0] * 12)
+
+
+# Waypoints
+
+
+def test_waypoints_are_met_and_held_before_and_after() -> None:
+    assert WAYPOINTS.times is not None and WAYPOINTS.poses is not None
+    trajectory = make_reference(WAYPOINTS, 10.0)
+    for t, pose in zip(WAYPOINTS.times, WAYPOINTS.poses, strict=True):
+        np.testing.assert_allclose(evaluate(trajectory, t)[POSE], pose, atol=1e-14)
+    for t in (0.0, 0.3, 3.1, 100.0):
+        np.testing.assert_array_equal(evaluate(trajectory, t), HOME + [0.0] * 12)
+
+
+@given(
+    gaps=st.lists(st.floats(0.2, 3), min_size=1, max_size=6),
+    values=st.lists(st.floats(-0.5, 0.5), min_size=7, max_size=7),
+    start=st.floats(0, 1),
+)
+@settings(deadline=None)
+def test_waypoints_are_joined_with_continuous_acceleration(
+    gaps: list[float], values: list[float], start: float
+) -> None:
+    times = [float(t) for t in start + np.cumsum([0.0, *gaps])]
+    poses = [[v, -v, v, v / 10, 0.0, 0.38] for v in values[: len(times)]]
+    config = ReferenceConfig(kind="waypoints", times=times, poses=poses)
+    trajectory = make_reference(config, 10.0)
+    assert_smooth(trajectory, [t for t in times if t > 0])
+    for middle in (np.array(times[1:]) + times[:-1]) / 2:
+        assert_derivatives_agree(trajectory, middle)
+
+
+def test_two_waypoints_are_the_minimum_jerk_motion() -> None:
+    config = ReferenceConfig(kind="waypoints", times=[0.0, 2.0], poses=[[0.0] * 6, [0.4] * 6])
+    trajectory = make_reference(config, 2.0)
+    for s in np.linspace(0, 1, 11):
+        expected = 0.4 * (10 * s**3 - 15 * s**4 + 6 * s**5)
+        np.testing.assert_allclose(evaluate(trajectory, 2 * s)[POSE], expected, atol=1e-15)
+
+
+def test_the_plate_dwells_between_two_equal_waypoints() -> None:
+    there = [0.1, 0.0, 0.0, 0.0, 0.0, 0.4]
+    config = ReferenceConfig(
+        kind="waypoints", times=[0.0, 1.0, 2.0, 3.0], poses=[HOME, there, there, HOME]
+    )
+    trajectory = make_reference(config, 3.0)
+    for t in (1.0, 1.3, 1.9, 2.0):
+        np.testing.assert_allclose(evaluate(trajectory, t), there + [0.0] * 12, atol=1e-13)
+
+
+def test_waypoints_from_a_file_are_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "poses.yaml"
+    path.write_text(f"times: {WAYPOINTS.times}\nposes: {WAYPOINTS.poses}\n")
+    inline = make_reference(WAYPOINTS, 10.0)
+    from_file = make_reference(ReferenceConfig(kind="waypoints", file=str(path)), 10.0)
+    for t in np.linspace(0, 4, 41):
+        np.testing.assert_array_equal(evaluate(from_file, t), evaluate(inline, t))
+
+
+@pytest.mark.parametrize(
+    ("times", "poses", "parts"),
+    [
+        ([0, 1, 1], [HOME] * 3, ["times[2]: got 1.0 after 1.0", "increasing"]),
+        ([0, 1], [HOME] * 3, ["poses: got 3 poses", "expected 2"]),
+        ([0, 1], [HOME, [0, 1.6, 0, 0, 0, 0]], ["poses[1][1]: got 1.6 rad", "90 degrees"]),
+        ([0, 1], [HOME, [0, 0, 3.5, 0, 0, 0]], ["poses[1][2]: got 3.5 rad", "unwrap"]),
+        ([0, 1], [HOME, [0, 0, 0, 2e3, 0, 0]], ["poses[1][3]: got 2000.0", "1000"]),
+    ],
+)
+def test_bad_waypoints_are_refused(
+    times: list[float], poses: list[list[float]], parts: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "poses.yaml"
+    path.write_text(f"times: {times}\nposes: {poses}\n")
+    for config, where in [
+        (ReferenceConfig(kind="waypoints", times=times, poses=poses), "reference."),
+        (ReferenceConfig(kind="waypoints", file=str(path)), f"{path}: "),
+    ]:
+        with pytest.raises(ConfigError) as caught:
+            make_reference(config, 10.0)
+        message = str(caught.value)
+        assert message.startswith(where)
+        for part in parts:
+            assert part in message
+
+
+# CSV
+
+
+def sine_pose(t: float) -> Array:
+    return evaluate(make_reference(ReferenceConfig(), 10.0), t)[POSE]
+
+
+def test_a_sampled_sine_is_the_sine(tmp_path: Path) -> None:
+    """Also at t = 0, where it moves already."""
+    config = sample_csv(tmp_path / "a.csv", np.linspace(0, 10, 1001), sine_pose)
+    sampled = make_reference(config, 10.0)
+    exact = make_reference(ReferenceConfig(), 10.0)
+    for t in np.linspace(0, 9.999, 301):
+        error = np.abs(evaluate(sampled, t) - evaluate(exact, t))
+        assert error[POSE].max() < 1e-9
+        assert error[RATES].max() < 1e-6
+        assert error[ACCELERATIONS].max() < 1e-4
+
+
+def test_a_csv_motion_is_smooth_at_its_samples_and_held_after(tmp_path: Path) -> None:
+    def bump(t: float) -> Array:  # comes to rest at t = 2
+        return np.array(HOME) + 0.05 * (1 - math.cos(math.pi * t))
+
+    times = np.concatenate([np.linspace(0, 1, 21), np.linspace(1.1, 2, 10)])
+    trajectory = make_reference(sample_csv(tmp_path / "a.csv", times, bump), 10.0)
+    assert_smooth(trajectory, [float(t) for t in times[1:-1]])
+    for t in (0.33, 1.07, 1.52):
+        assert_derivatives_agree(trajectory, t)
+    for t in (2.0, 2.5, 100.0):
+        np.testing.assert_allclose(evaluate(trajectory, t), [*bump(2.0)] + [0.0] * 12, atol=1e-12)
+
+
+def test_units_and_the_order_of_columns_are_read_from_the_header(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    rows = [f"{380 + t},{t},0,10,20,30,{t}" for t in range(5)]
+    header = "\ufeff Z [mm], Time[s],roll[deg],pitch[deg],yaw[deg],x[mm],y[m]"
+    path.write_text("\n".join([header, *rows, "", " , ", ""]), encoding="utf-8")
+    trajectory = make_reference(ReferenceConfig(kind="csv", file=str(path)), 4.0)
+    expected = [0, math.radians(10), math.radians(20), 0.03, 2, 0.382]
+    np.testing.assert_allclose(evaluate(trajectory, 2.0)[POSE], expected, atol=1e-12)
+
+
+GOOD_ROWS = [f"{t / 10},0,0,0,0,0,0.38" for t in range(6)]
+
+
+def changed(row: int, text: str) -> str:
+    rows = list(GOOD_ROWS)
+    rows[row] = text
+    return "\n".join([HEADER, *rows])
+
+
+BAD_CSV = {
+    "empty": ("", ["is empty", "time[s]"]),
+    "no header": ("\n".join(GOOD_ROWS), ["row 1", "unknown column '0.0'", "time[s]"]),
+    "header only": (HEADER, ["got 0 samples", "at least 4"]),
+    "three rows": ("\n".join([HEADER, *GOOD_ROWS[:3]]), ["got 3 samples", "at least 4"]),
+    "semicolons": (HEADER.replace(",", ";"), ["row 1", "unknown column"]),
+    "no units": ("time,roll,pitch,yaw,x,y,z", ["row 1", "unknown column 'time'"]),
+    "odd unit": (HEADER.replace("x[m]", "x[ft]"), ["row 1", "'x[ft]'", "x in m or mm"]),
+    "odd time unit": (HEADER.replace("[s]", "[ms]"), ["row 1", "'time[ms]'", "time in s"]),
+    "missing column": (HEADER.replace(",z[m]", ""), ["row 1", "column z is missing"]),
+    "column twice": (HEADER.replace("y[m]", "x[mm]"), ["row 1", "a second column 'x[mm]'"]),
+    "extra column": (HEADER + ",w[m]", ["row 1", "unknown column 'w[m]'"]),
+    "short row": (changed(2, "0.2,0,0"), ["row 4", "got 3 cells", "7"]),
+    "long row": (changed(2, "0.2,0,0,0,0,0,0.38,"), ["row 4", "got 8 cells"]),
+    "text": (changed(2, "0.2,0,abc,0,0,0,0.38"), ["row 4", "pitch[rad]", "'abc'", "a number"]),
+    "empty cell": (changed(2, "0.2,0,,0,0,0,0.38"), ["row 4", "pitch[rad]", "''"]),
+    "nan": (changed(3, "0.3,0,0,nan,0,0,0.38"), ["row 5", "yaw[rad]", "nan", "finite"]),
+    "inf": (changed(3, "0.3,0,0,0,0,0,-inf"), ["row 5", "z[m]", "-inf", "finite"]),
+    "nan time": (changed(3, "nan,0,0,0,0,0,0.38"), ["row 5", "time[s]", "nan", "finite"]),
+    "late start": (changed(0, "0.05,0,0,0,0,0,0.38"), ["row 2", "time[s]", "0.05", "subtract"]),
+    "time twice": (changed(2, "0.1,0,0,0,0,0,0.38"), ["row 4", "time[s]", "0.1 after 0.1"]),
+    "time back": (changed(2, "-1,0,0,0,0,0,0.38"), ["row 4", "time[s]", "-1.0 after 0.1"]),
+    "gap": (changed(5, "9,0,0,0,0,0,0.38"), ["row 7", "time[s]", "8.6 s", "resampling"]),
+    "pitch in degrees": (changed(1, "0.1,0,5,0,0,0,0.38"), ["row 3", "pitch[rad]", "90 degrees"]),
+    "yaw jumps": (changed(1, "0.1,0,0,6.2,0,0,0.38"), ["row 3", "yaw[rad]", "unwrap"]),
+    "open quote": (changed(1, '"0.1,0,0,0,0,0,0.38'), ["row 7", "is not CSV"]),
+    "moving end": (changed(5, "0.5,0,0,0,0.1,0,0.38"), ["last row", " x at 0.5 s", "duration"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CSV)
+def test_a_bad_csv_file_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
+    text, parts = BAD_CSV[case]
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        make_reference(ReferenceConfig(kind="csv", file=str(path)), 10.0)
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    assert message.startswith(f"{path}: ")
+    for part in parts:
+        assert part in message
+
+
+def test_what_is_no_csv_file_is_refused(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.csv"
+    binary.write_bytes(b"\xff\xfe\x00")
+    for path in (binary, tmp_path, tmp_path / "none.csv"):
+        with pytest.raises(ConfigError, match=f"^{path}: "):
+            make_reference(ReferenceConfig(kind="csv", file=str(path)), 10.0)
+
+
+@given(text=st.text(alphabet='0123456789.,-enaif"\n\r\0 ', max_size=200) | st.binary(max_size=60))
+@settings(max_examples=200, deadline=None)
+def test_any_samples_are_a_reference_or_are_refused(
+    text: str | bytes, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.csv"
+    body = text if isinstance(text, bytes) else text.encode()
+    path.write_bytes(HEADER.encode() + b"\n" + body)
+    try:
+        trajectory = make_reference(ReferenceConfig(kind="csv", file=str(path)), 10.0)
+    except ConfigError as error:
+        assert len(str(error).splitlines()) == 1
+    else:
+        assert np.isfinite(evaluate(trajectory, 0.1)).all()
+
+
+# Peak to peak
+
+
+def test_the_peak_to_peak_of_a_sine_is_twice_its_amplitude_however_short_the_run() -> None:
+    config = ReferenceConfig(amplitude=[0.1, -0.2, 0.0, 0.01, 0.0, 0.02], frequency=1e-3)
+    span = peak_to_peak(config, make_reference(config, 0.1), 0.1)
+    np.testing.assert_allclose(span, [0.2, 0.4, 1.0, 0.02, 1.0, 0.04])
+
+
+def test_the_peak_to_peak_of_a_constant_is_one() -> None:
+    config = ReferenceConfig(kind="hold")
+    np.testing.assert_array_equal(peak_to_peak(config, make_reference(config, 5.0), 5.0), [1] * 6)
+    still = ReferenceConfig(kind="waypoints", times=[0, 1, 3], poses=[[0.3] * 6] * 3)
+    np.testing.assert_array_equal(peak_to_peak(still, make_reference(still, 5.0), 5.0), [1] * 6)
+
+
+def test_the_peak_to_peak_of_samples_is_their_range_within_the_run(tmp_path: Path) -> None:
+    config = sample_csv(tmp_path / "a.csv", np.linspace(0, 10, 501), sine_pose)
+    whole = peak_to_peak(config, make_reference(config, 10.0), 10.0)
+    np.testing.assert_allclose(
+        whole, 2 * np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08]), rtol=1e-6
+    )
+    first_quarter = peak_to_peak(config, make_reference(config, 1.5), 1.5)
+    np.testing.assert_allclose(first_quarter, whole / 2 * math.sin(1.5), rtol=1e-6)
+
+
+# Catch-up
+
+
+@given(
+    t_start=st.just(0.0) | st.floats(1e-3, 2),
+    duration=st.floats(0.1, 2),
+    start=st.lists(st.floats(-0.3, 0.3), min_size=12, max_size=12),
+)
+@settings(deadline=None)
+def test_a_catch_up_leaves_the_start_and_joins_the_reference_smoothly(
+    t_start: float, duration: float, start: list[float]
+) -> None:
+    pose, rates = np.array(start[:6]), np.array(start[6:])
+    reference = make_reference(ReferenceConfig(), 10.0)
+    blend = catch_up(pose, rates, reference, t_start, duration)
+    t_end = t_start + duration
+    for t in (0.0, t_start / 2, t_start):
+        expected = np.concatenate([pose + rates * t, rates, np.zeros(6)])
+        np.testing.assert_allclose(evaluate(blend, t), expected, atol=1e-9)
+    for t in (t_end, t_end + 0.1, t_end + 50):
+        np.testing.assert_allclose(evaluate(blend, t), evaluate(reference, t), atol=1e-12)
+    assert_smooth(blend, [t for t in (t_start, t_end) if t > 1e-6])
+    assert_derivatives_agree(blend, t_start + duration / 2)
+
+
+def test_a_catch_up_from_the_first_microsecond_is_one_from_zero() -> None:
+    reference = make_reference(ReferenceConfig(), 10.0)
+    at_zero, late = (catch_up(HOME, [0.1] * 6, reference, t, 0.5) for t in (0.0, 1e-300))
+    for t in (0.0, 0.2, 0.6):
+        np.testing.assert_array_equal(evaluate(late, t), evaluate(at_zero, t))
+
+
+def test_a_catch_up_onto_itself_is_the_reference() -> None:
+    """A start on a straight line that the reference follows anyway needs no blend."""
+    line = PiecewisePolynomial.FirstOrderHold([0.0, 10.0], np.array([[0.0, 1.0]] * 6))
+    blend = catch_up([0.0] * 6, [0.1] * 6, line, 1.0, 0.5)
+    for t in (0.0, 0.9, 1.2, 1.5, 5.0):
+        np.testing.assert_allclose(evaluate(blend, t)[POSE], t / 10, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("pose", "t_start", "duration"),
+    [
+        ([0.0] * 5, 0.0, 1.0),
+        ([0.0] * 6, -0.1, 1.0),
+        ([0.0] * 6, 0.0, 0.0),
+        ([0.0] * 6, 1.0, 1e-17),
+        ([0.0] * 6, 0.0, math.nan),
+        ([0.0] * 6, math.inf, 1.0),
+    ],
+)
+def test_a_catch_up_refuses_what_has_no_blend(
+    pose: list[float], t_start: float, duration: float
+) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        catch_up(pose, [0.0] * 6, make_reference(ReferenceConfig(), 1.0), t_start, duration)
