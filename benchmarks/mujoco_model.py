@@ -9,6 +9,8 @@ Run as a script, it compares the accelerations with those of `StewartDynamics`: 
 falls with 1 - d down to rounding errors, so that nothing but that softness keeps the models apart.
 """
 
+import time
+from collections.abc import Callable
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
@@ -24,6 +26,7 @@ from stewart_drake.plant.equations import STANDARD_GRAVITY
 from stewart_drake.signals import LEGS, POSE, RATES
 
 Array = NDArray[np.float64]
+Torque = Callable[[float], Array]
 
 HIGHEST_IMPEDANCE = 0.9999
 """d; MuJoCo takes any higher value in an MJCF document for this one."""
@@ -141,6 +144,30 @@ class MujocoStewart:
         self.data.ctrl[:] = torque
         mujoco.mj_forward(self.model, self.data)
         return self.data.qacc[self._plate].copy()
+
+    def simulate(
+        self, start: Array, torque: Array | Torque, duration: float, time_step: float
+    ) -> tuple[float, Array]:
+        """Seconds of stepping, and the state at the end.
+
+        All steps are one call; a torque (6,) that depends on time is asked for in every stage.
+        """
+        ctrl = self.data.ctrl
+
+        def drive(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+            ctrl[:] = torque(data.time)
+
+        self.set_state(start)
+        self.model.opt.timestep = time_step
+        if callable(torque):
+            mujoco.set_mjcb_control(drive)
+        else:
+            ctrl[:] = torque
+        started = time.perf_counter()
+        mujoco.mj_step(self.model, self.data, nstep=round(duration / time_step))
+        seconds = time.perf_counter() - started
+        mujoco.set_mjcb_control(None)
+        return seconds, self.state()
 
 
 def largest_difference(mechanism: Mechanism, hardening: float) -> float:

@@ -101,9 +101,7 @@ def comparison(fraction: float) -> tuple[list[str], list[list[str]]]:
 def checks(fraction: float) -> list[str]:
     """What the checks add to Drake's solver in `reduced_gain`."""
     delayed = replace(model(8, fraction), steps=0)
-    bare, checked = least_ms(
-        [drake_only(chain(delayed)), lambda: reduced_gain(delayed, Q, R)], 2.0
-    )
+    bare, checked = least_ms([drake_only(chain(delayed)), lambda: reduced_gain(delayed, Q, R)], 2.0)
     return [f"{fraction:g}", f"{bare:.3g}", f"{checked:.3g}", f"{checked / bare:.3g}"]
 
 

@@ -1,6 +1,6 @@
 """The exact plant on its own: constant torques under gravity, any Drake integrator.
 
-    python diagrams/exact_plant.py [runge_kutta5 | radau3 | ...]
+python diagrams/exact_plant.py [runge_kutta5 | radau3 | ...]
 """
 
 import sys

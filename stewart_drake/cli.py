@@ -79,7 +79,9 @@ def simulate(
     out: _Out = None,
     quiet: _Quiet = False,
     as_json: _Json = False,
-    meshcat: Annotated[bool, typer.Option("--meshcat", help="Show it in a browser.")] = False,
+    meshcat: Annotated[
+        bool, typer.Option("--meshcat", help="Show it in a browser, live and as a replay.")
+    ] = False,
 ) -> int:
     """Run one scenario."""
     from stewart_drake.experiment import prepare
@@ -91,7 +93,7 @@ def simulate(
     say = _silence if quiet or as_json else echo
     experiment = prepare(load_scenario(scenario, controller, settings or ()))
     _check_writable(out)
-    viewer = _open_meshcat(experiment.scenario.plant.kind) if meshcat else None
+    viewer = _open_meshcat() if meshcat else None
     say(wrap(str(delay_verdict(experiment))))
     if viewer is not None:
         say(f"showing it at {viewer.web_url()}")
@@ -110,8 +112,12 @@ def simulate(
     if as_json:
         _print_json(result.summary)
     if viewer is not None:
-        viewer.StopRecording()
-        viewer.PublishRecording()
+        from stewart_drake.report.replay import replay
+
+        replay(result.signals, experiment.mechanism, viewer)
+        if out is not None:
+            (out / "replay.html").write_text(viewer.StaticHtml())
+            say(f"written to {out}: replay.html")
         if sys.stdin.isatty():
             input(f"replay at {viewer.web_url()}, Enter ends")
     return INTERRUPTED if result.status == "interrupted" else 0
@@ -247,11 +253,7 @@ def _remove(directory: Path, names: Iterable[str]) -> None:
         (directory / name).unlink(missing_ok=True)
 
 
-def _open_meshcat(kind: str) -> Any:
+def _open_meshcat() -> Any:
     from pydrake.geometry import Meshcat
 
-    if kind != "multibody":
-        raise ConfigError(f"--meshcat: got plant.kind {kind!r}; expected 'multibody'")
-    viewer = Meshcat()
-    viewer.StartRecording()
-    return viewer
+    return Meshcat()

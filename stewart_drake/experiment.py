@@ -53,6 +53,10 @@ def prepare(scenario: Scenario) -> Experiment:
         ConfigError: one line; also where the reference leaves the workspace, with time and leg.
     """
     scenario.check()
+    if scenario.tuner.kind != "fixed":
+        raise ConfigError(
+            f"tuner.kind: got {scenario.tuner.kind!r}, which is not built yet; expected 'fixed'"
+        )
     mechanism = load_mechanism(scenario.mechanism)
     reference = make_reference(scenario.reference, scenario.duration)
     for t in np.arange(0.0, scenario.duration + REACH_CHECK_PERIOD, REACH_CHECK_PERIOD):

@@ -53,6 +53,9 @@ def plan_catch_up(
 ) -> tuple[Trajectory, float]:
     """The planned motion, then the reference; and how long the plan takes, in s.
 
+    Where no plan of up to LONGEST_CATCH_UP is possible (a plate that falls out of its workspace
+    before the first torque acts), it is the reference alone, and 0 s.
+
     Args:
         dynamics: the nominal plant.
         reference: the motion to reach.
@@ -64,7 +67,7 @@ def plan_catch_up(
         torque_limit: N m, or None.
 
     Raises:
-        ConfigError: no plan stays in the workspace, or within the torque limit.
+        ConfigError: with the given duration the plate would leave its workspace.
     """
     wanted = DEFAULT_CATCH_UP if duration is None else duration
     fewest = 2 if torque_limit is not None and duration is None else _periods(wanted, period)
@@ -79,8 +82,13 @@ def plan_catch_up(
     while motion is None and holds < most:
         failed, holds = holds, min(2 * holds, most)
         motion = attempt(holds)
+    if motion is None and duration is None:
+        return reference, 0.0
     if motion is None:
-        raise ConfigError(_no_plan(duration, torque_limit))
+        raise ConfigError(
+            f"controller.catch_up: got {duration:g} s, with which the plate would leave its "
+            "workspace; expected a longer time, or null for the shortest possible"
+        )
     while holds - failed > 1:
         middle = (failed + holds) // 2
         shorter = attempt(middle)
@@ -93,20 +101,6 @@ def plan_catch_up(
 
 def _periods(duration: float, period: float) -> int:
     return max(2, math.ceil(duration / period - 1e-9))
-
-
-def _no_plan(duration: float | None, torque_limit: float | None) -> str:
-    if duration is not None:
-        return (
-            f"controller.catch_up: got {duration:g} s, with which the plate would leave its "
-            "workspace; expected a longer time, or null for the shortest possible"
-        )
-    limit = "" if torque_limit is None else f" and below {HEADROOM * torque_limit:g} N m"
-    return (
-        f"controller.catch_up: no way onto the reference within {LONGEST_CATCH_UP:g} s stays in "
-        f"the workspace{limit}; expected a slower reference, a larger actuator.torque_limit, or "
-        "start: on_reference"
-    )
 
 
 def _plan(

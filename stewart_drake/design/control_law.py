@@ -111,7 +111,7 @@ class DelayLqi:
             The new memory; its torque (6,) is finite and within the limit.
         """
         started = time.perf_counter()
-        estimate, x, bad = self._observe(memory, measurement)
+        estimate, x, bad = self._observe(memory, measurement, preview[0, :NUM_STATE])
         theta = self.dynamics.parameters if estimate is None else estimate.parameters
         error = x[POSE] - preview[0, POSE]
         integral = self._integrate(memory, error)
@@ -165,14 +165,15 @@ class DelayLqi:
     def _per_period(self) -> int:
         return 1 if self.options.fraction == 0 else 2
 
-    def _observe(self, memory: Memory, measurement: Array) -> tuple[Estimate | None, Array, bool]:
+    def _observe(
+        self, memory: Memory, measurement: Array, planned: Array
+    ) -> tuple[Estimate | None, Array, bool]:
         """Estimate, state (12,) and whether the measurement was unusable and the model stood in."""
         o, bad = self.options, not np.all(np.isfinite(measurement))
         first = not np.all(np.isfinite(memory.state))
         if first:
-            if bad:  # nothing to go on with: at rest at home
-                x = np.concatenate([self.dynamics.mechanism.home, np.zeros(NUM_COORDINATES)])
-                return None, x, True
+            if bad:  # nothing else to go on with
+                return None, planned.copy(), True
             if o.filter is None:
                 return None, measurement, False
             return estimator.start(measurement, o.filter), measurement, False

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from stewart_drake.design.holds import GAUSS_NODES
 from stewart_drake.plant.dynamics import StewartDynamics
@@ -32,7 +32,7 @@ from stewart_drake.signals import (
 Array = NDArray[np.float64]
 THETA = slice(NUM_STATE, NUM_STATE + NUM_PARAMETERS)
 
-GATE = float(chi2.ppf(1 - 1e-6, NUM_STATE))
+GATE = float(chdtri(NUM_STATE, 1e-6))
 """Squared innovation, in units of its covariance, above which a measurement is an outlier."""
 ITERATIONS = 4
 """At the most; one does once the parameters are roughly known."""

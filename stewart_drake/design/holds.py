@@ -89,4 +89,6 @@ def state_within_hold(change: Array, B: Array, period: float, passed: float) -> 
     """
     left = passed * (1 - passed)
     push = -period * B @ change
-    return np.concatenate([period * left * (1 - 2 * passed) / 12 * push, (1 / 12 - left / 2) * push])
+    return np.concatenate(
+        [period * left * (1 - 2 * passed) / 12 * push, (1 / 12 - left / 2) * push]
+    )

@@ -12,7 +12,7 @@ from stewart_drake.signals import queue_length
 
 Array = NDArray[np.float64]
 
-VIGOROUS = 4
+VIGOROUS = 2
 
 
 @dataclass(frozen=True)

@@ -85,15 +85,17 @@ def prediction_matrix(model: DelayedModel) -> Array:
     Without a fraction this is [A^mu, A^(mu-1) B, ..., B], ordered as the queue.
     """
     n, m = model.B_new.shape
-    length, extra = model.queue_length, model.queue_length - model.steps
-    matrix = np.eye(n, n + m * length)
-    for step in range(model.steps):
-        matrix = model.A @ matrix
-        # At step j the queue's places j (where eta0 > 0) and j + extra act.
-        for place, B in ((step, model.B_old), (step + extra, model.B_new)):
-            matrix[:, n + m * place : n + m * (place + 1)] += B
-    newest = np.eye(n + m * length)[n + m * (length - extra) :]
-    return np.vstack([matrix, newest])
+    extra = model.queue_length - model.steps
+    # Read backwards: T_{k-1} acts last, its predecessors one factor A earlier each.
+    power, both = np.eye(n), np.hstack([model.B_new, model.B_old])
+    torques = np.zeros((n, m * model.queue_length))
+    for place in reversed(range(model.steps)):
+        torques[:, m * (place + extra) : m * (place + extra + 1)] += both[:, :m]
+        torques[:, m * place : m * (place + 1)] += both[:, m:]
+        power, both = model.A @ power, model.A @ both
+    newest = np.zeros((m * extra, n + m * model.queue_length))
+    newest[:, n + m * (model.queue_length - extra) :] = np.eye(m * extra)
+    return np.vstack([np.hstack([power, torques]), newest])
 
 
 def augmented_gain(model: DelayedModel, Q: Array, R: Array) -> Array:

@@ -19,7 +19,7 @@ from stewart_drake.studies.compare import LABELS, PAPER_ERRORS
 
 WIDTH: Final = 80
 _COLUMNS: Final = "{:<16}{:>5}{:>11}{:>11}{:>11}{:>7}{:>7}{:>7}{:>5}"
-_NOTE: Final = "floor: of E_ac, from the delay alone; var.: total variation of a motor's torque"
+_NOTE: Final = "floor: from the delay alone; torques as commanded, var.: their total variation"
 
 
 def wrap(text: str, first: str = "", rest: str = "  ") -> str:
@@ -51,7 +51,7 @@ def run_table(result: SimulationResult) -> str:
         else f"none, {floor}",
         "peak error": ", ".join(f"{name} {number(value)}" for name, value in peaks)
         + " % of peak to peak",
-        "torque": f"peak {number(s['peak_torque'])}, rms {number(s['rms_torque'])} N m",
+        "torque": f"commanded peak {number(s['peak_torque'])}, rms {number(s['rms_torque'])} N m",
         "controller step": f"median {number(step['median'])}, worst {number(step['worst'])} ms",
         "wall time": f"{s['wall_s']:.1f} s",
     }

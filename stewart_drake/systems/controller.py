@@ -10,6 +10,7 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
     Context,
+    EventStatus,
     LeafSystem,
     State,
     ValueProducer,
@@ -86,9 +87,10 @@ class DelayLqiController(LeafSystem):
                 partial(self._held, part),
                 {memory_ticket},
             )
-        self.DeclarePeriodicUnrestrictedUpdateEvent(
-            event_time(law.options.period), 0.0, self._update
-        )
+        # The first sample before all periodic events, as `DelayChain` does.
+        self.DeclareInitializationUnrestrictedUpdateEvent(self._update_first)
+        early = event_time(law.options.period)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, self._update)
 
     def memory(self, context: Context) -> Memory:
         """The memory in a context of this system."""
@@ -108,6 +110,10 @@ class DelayLqiController(LeafSystem):
     def _torque(self, context: Context, output: BasicVector) -> None:
         memory: Any = self._step.Eval(context)
         output.SetFromVector(memory.torque)
+
+    def _update_first(self, context: Context, state: State) -> EventStatus:
+        self._update(context, state)
+        return EventStatus.Succeeded()
 
     def _update(self, context: Context, state: State) -> None:
         state.get_mutable_abstract_state(int(self._memory)).set_value(self._step.Eval(context))

@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
 from stewart_drake.signals import NUM_TORQUES, queue_length
 from stewart_drake.timing import event_time
@@ -21,9 +21,9 @@ class DelayChain(LeafSystem):
                 at k dt + eta0 applied <- T_{k-mu}.
     Output:     torque = applied, hence T_k during [(k + mu) dt + eta0, (k + 1 + mu) dt + eta0).
 
-    Both updates are unrestricted ones. All of them at one instant read what was there before, and
-    Drake carries them out before the discrete updates of that instant: a discrete plant that
-    steps at t already feels the torque released at t.
+    Updates of one instant all read what was there before, and a multibody plant's step is one of
+    them. So these come slightly earlier (`timing.event_time`), the first at initialisation: a plant
+    that steps at t feels the torque released at t.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
@@ -49,10 +49,8 @@ class DelayChain(LeafSystem):
         # `line` is [applied; waiting ...]: T_{k-mu} ... T_k after the update at k dt, with the
         # applied torque kept apart because it changes eta0 later than the rest.
         self._fraction = fraction
-        if fraction > 0:
-            applied, waiting = queue[0], queue[1:]
-        else:
-            applied, waiting = np.zeros(NUM_TORQUES), queue
+        applied = queue[0] if length > 0 else np.zeros(NUM_TORQUES)
+        waiting = queue[1:] if fraction > 0 else queue
         self._applied = self.DeclareDiscreteState(applied)
         self._waiting = self.DeclareDiscreteState(
             np.vstack([np.zeros(NUM_TORQUES), waiting]).ravel()
@@ -61,11 +59,18 @@ class DelayChain(LeafSystem):
         self.DeclareVectorOutputPort(
             "torque", NUM_TORQUES, self._output, {self.discrete_state_ticket(self._applied)}
         )
-        self.DeclarePeriodicUnrestrictedUpdateEvent(event_time(period), 0.0, self._take)
+        # At t = 0 ahead of all periodic events: nothing is earlier than a plant's first step.
+        self.DeclareInitializationUnrestrictedUpdateEvent(self._take_first)
+        early = event_time(period)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, self._take)
         if fraction > 0:
             self.DeclarePeriodicUnrestrictedUpdateEvent(
-                event_time(period), event_time(fraction * period), self._release
+                early, event_time(fraction * period), self._release
             )
+
+    def _take_first(self, context: Context, state: State) -> EventStatus:
+        self._take(context, state)
+        return EventStatus.Succeeded()
 
     def _take(self, context: Context, state: State) -> None:
         waiting = context.get_discrete_state(self._waiting).value()

@@ -1,0 +1,183 @@
+"""Where the computing time of a closed loop goes: one controller step, one run, one process.
+
+Times of steps are medians over a run and its worst step, each the least of several runs. Writes
+benchmarks/results/controller_step.md.
+"""
+
+import os
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from timeit import timeit
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+import stewart_drake as sd
+from stewart_drake.design import control_law
+from stewart_drake.design.control_law import DelayLqi
+from stewart_drake.results import versions
+
+RESULTS = Path(__file__).parent / "results"
+RUNS = 7
+SCENARIOS = {"paper": (), "gravity": ("duration=2.0",)}
+ESTIMATORS = ("parameters", "none")
+PARTS = {
+    "observe, estimate": (DelayLqi, "_observe"),
+    "predict": (DelayLqi, "_ahead"),
+    "linear model": (DelayLqi, "_model"),
+    "sample": (control_law, "delayed_model"),
+    "Riccati gain": (control_law, "reduced_gain"),
+    "feedforward": (DelayLqi, "_feedforward"),
+    "whole step": (DelayLqi, "step"),
+}
+"""What a step calls, in order; the rest of it is arithmetic on short vectors."""
+
+
+@contextmanager
+def timed_parts() -> Iterator[dict[str, list[float]]]:
+    """Within it, every call of PARTS appends its milliseconds under the part's name."""
+    spent: dict[str, list[float]] = defaultdict(list)
+    originals = {name: getattr(*place) for name, place in PARTS.items()}
+
+    def timed(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            started = time.perf_counter()
+            try:
+                return original(*args, **kwargs)
+            finally:
+                spent[name].append(1e3 * (time.perf_counter() - started))
+
+        return call
+
+    for name, place in PARTS.items():
+        setattr(*place, timed(name, originals[name]))
+    try:
+        yield spent
+    finally:
+        for name, place in PARTS.items():
+            setattr(*place, originals[name])
+
+
+def steps() -> tuple[list[list[str]], list[list[str]]]:
+    """Rows of the step times as `summary` reports them, and of their parts' medians."""
+    totals, parts = [], []
+    for name, settings in SCENARIOS.items():
+        for estimator in ESTIMATORS:
+            scenario = sd.load_scenario(
+                name, settings=["plant.kind=exact", f"controller.estimator={estimator}", *settings]
+            )
+            sd.simulate(scenario)
+            reported = [sd.simulate(scenario).summary["controller_step_ms"] for _ in range(RUNS)]
+            least = {key: min(run[key] for run in reported) for key in ("median", "worst")}
+            totals.append([name, estimator, f"{least['median']:.2f}", f"{least['worst']:.2f}"])
+            medians: dict[str, list[float]] = defaultdict(list)
+            for _ in range(RUNS):
+                with timed_parts() as spent:
+                    sd.simulate(scenario)
+                for part, milliseconds in spent.items():
+                    medians[part].append(float(np.median(milliseconds)))
+            parts.append([name, estimator, *(f"{min(medians[part]):.3f}" for part in PARTS)])
+    return totals, parts
+
+
+def in_fresh_processes(code: str, times: int = 5) -> list[float]:
+    """The numbers that `code` prints, least of several processes each."""
+    runs = [
+        [float(word) for word in subprocess.check_output([sys.executable, "-c", code]).split()]
+        for _ in range(times)
+    ]
+    return [min(column) for column in zip(*runs, strict=True)]
+
+
+def walls() -> list[list[str]]:
+    """Wall time of ten simulated seconds of `paper`."""
+    rows = []
+    for kind in ("exact", "multibody"):
+        code = f"""
+import time, stewart_drake as sd
+scenario = sd.load_scenario("paper", settings=["plant.kind={kind}"])
+for _ in range(4):
+    started = time.perf_counter()
+    sd.simulate(scenario)
+    print(time.perf_counter() - started)
+"""
+        first, *others = in_fresh_processes(code, 3)
+        rows.append([f"simulate, {kind}, first in its process", f"{first:.2f}"])
+        rows.append([f"simulate, {kind}, again", f"{min(others):.2f}"])
+    command = Path(sys.executable).with_name("stewart-drake")
+    arguments = [str(command), "simulate", "paper", "--set", "plant.kind=exact"]
+    if command.exists():
+        call = f"import subprocess; subprocess.run({arguments!r}, capture_output=True, check=True)"
+        code = f"import time; t = time.perf_counter(); {call}; print(time.perf_counter() - t)"
+        title = "process `" + " ".join(["stewart-drake", *arguments[1:]]) + "`"
+        rows.append([title, f"{in_fresh_processes(code)[0]:.2f}"])
+    code = (
+        "import time; t = time.perf_counter(); import stewart_drake; print(time.perf_counter() - t)"
+    )
+    rows.append(["`import stewart_drake`", f"{in_fresh_processes(code)[0]:.2f}"])
+    return rows
+
+
+def evaluations() -> list[list[str]]:
+    """One evaluation of the accelerations, and how long the first one takes."""
+    mechanism = sd.load_mechanism("paper")
+    dynamics, pose, rates, torque = sd.StewartDynamics(mechanism), mechanism.home, *np.ones((2, 6))
+    dynamics.accelerations(pose, rates, torque)
+    compiled, theta = dynamics._functions.accelerations, dynamics.parameters
+    calls: dict[str, Callable[[], object]] = {
+        "CasADi's virtual machine alone": compiled._evaluate,
+        "behind `Compiled`": lambda: compiled(pose, rates, torque, theta, dynamics.gravity),
+        "`StewartDynamics.accelerations`": lambda: dynamics.accelerations(pose, rates, torque),
+    }
+    least = dict.fromkeys(calls, np.inf)
+    for _ in range(300):
+        for name, call in calls.items():
+            least[name] = min(least[name], timeit(call, number=40) / 40)
+    rows = [[name, f"{1e6 * seconds:.1f} us"] for name, seconds in least.items()]
+    code = """
+import time, numpy, stewart_drake as sd
+mechanism, zero = sd.load_mechanism("paper"), numpy.zeros(6)
+started = time.perf_counter()
+sd.StewartDynamics(mechanism).accelerations(mechanism.home, zero, zero)
+print(time.perf_counter() - started)
+"""
+    return [*rows, ["first one in a process", f"{in_fresh_processes(code)[0]:.3f} s"]]
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [" | ".join(header), " | ".join("---" for _ in header), *map(" | ".join, rows)]
+    return "\n".join(f"| {line} |" for line in lines) + "\n"
+
+
+def main() -> None:
+    """Measure, print and write."""
+    packages = ", ".join(f"{package} {number}" for package, number in versions().items())
+    totals, parts = steps()
+    text = "\n".join(
+        [
+            f"# Time\n\nMade by `python benchmarks/controller_step.py` with {packages}.\n",
+            "## One step of `predictor_lqi` in the running loop, exact plant, ms\n",
+            table(["scenario", "estimator", "median", "worst"], totals),
+            "## Medians of its parts, ms\n",
+            table(["scenario", "estimator", *PARTS], parts),
+            "## Ten simulated seconds of `paper`, s\n",
+            table(["what", "s"], walls()),
+            "## One evaluation of the accelerations\n",
+            table(["what", "time"], evaluations()),
+        ]
+    )
+    print(text)
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "controller_step.md").write_text(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""The comparison of controllers, and the verdict on the delay."""
+
+import json
+import math
+
+import joblib
+import numpy as np
+import pytest
+import xarray as xr
+
+from stewart_drake.errors import ConfigError
+from stewart_drake.experiment import prepare
+from stewart_drake.resources import shipped
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.simulation import simulate
+from stewart_drake.studies.compare import CONTROLLERS, LABELS, compare, save_comparison
+from stewart_drake.studies.verdict import Verdict, delay_verdict
+
+SHORT = ("plant.kind=exact", "duration=1.0")
+
+
+@pytest.fixture(scope="module")
+def results():
+    return compare("paper", SHORT)
+
+
+def test_every_shipped_controller_takes_part():
+    assert sorted(CONTROLLERS) == shipped("controller")
+    assert tuple(LABELS) == CONTROLLERS
+
+
+def test_the_order_is_kept_and_each_run_is_that_of_its_controller(results):
+    assert tuple(results) == CONTROLLERS
+    for name, result in results.items():
+        assert result.scenario == load_scenario("paper", name, SHORT)
+        assert result.status == "completed"
+
+
+def test_processes_give_what_one_run_gives(results):
+    alone = simulate(load_scenario("paper", "delay_lqi", SHORT))
+    xr.testing.assert_identical(alone.signals, results["delay_lqi"].signals)
+
+
+def test_saved_files_are_complete(results, tmp_path):
+    save_comparison(results, tmp_path / "new" / "folder")
+    folder = tmp_path / "new" / "folder"
+    assert {path.name for path in folder.iterdir()} == {
+        "summary.json",
+        *(f"{name}.nc" for name in CONTROLLERS),
+    }
+    summary = json.loads((folder / "summary.json").read_text())["controllers"]
+    assert list(summary) == list(CONTROLLERS)
+    assert summary["lqr"]["accumulated_error"] == results["lqr"].accumulated_error
+    with xr.open_dataset(folder / "lqr.nc") as read:
+        np.testing.assert_array_equal(read.pose, results["lqr"].signals.pose)
+
+
+def test_one_core_needs_no_processes_and_ctrl_c_keeps_what_there_is(monkeypatch):
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
+    seen = []
+
+    def press(name, time, error):
+        seen.append((name, time, error))
+        if name == "predictor_lqi":
+            raise KeyboardInterrupt
+
+    results = compare("paper", ("plant.kind=exact", "duration=5"), press)
+    assert tuple(results) == CONTROLLERS
+    assert results["lqr"].status == "left_workspace"
+    assert results["predictor_lqi"].status == "interrupted"
+    assert results["predictor_lqi"].signals.sizes["time"] > 1
+    assert all(0 < time < 5 and error >= 0 for _, time, error in seen)
+
+
+def test_bad_input_is_refused_before_anything_runs():
+    with pytest.raises(ConfigError, match=r"delay\.steps"):
+        compare("paper", ("delay.steps=-1",))
+
+
+def test_a_refused_controller_is_named(monkeypatch):
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
+    settings = (*SHORT, "actuator.torque_limit=1e-5")
+    with pytest.raises(ConfigError, match=r"predictor_lqi: controller\.catch_up"):
+        compare("paper", settings)
+
+
+# ---------------------------------------------------------------- the verdict
+
+
+def verdict(*settings: str, scenario: str = "paper") -> Verdict:
+    return delay_verdict(prepare(load_scenario(scenario, settings=settings)))
+
+
+def test_a_counterbalanced_plate_at_rest_has_no_unstable_pole():
+    at_rest = verdict("reference.kind=hold")
+    assert at_rest.pole == 0 and at_rest.amplification == 1
+    assert str(at_rest) == ("delay 0.8 s, beatable: yes, prediction errors grow by a factor of 1.0")
+
+
+def test_the_papers_delay_is_beatable_without_gravity_and_not_with_it():
+    assert verdict().beatable == "yes"
+    hopeless = verdict("plant.gravity=true")
+    assert hopeless.beatable == "no"
+    assert hopeless.pole > 30 and hopeless.amplification > 1e10
+    assert hopeless.amplification == pytest.approx(math.exp(hopeless.pole * 0.8))
+
+
+def test_at_home_under_gravity_the_fastest_pole_is_about_5():
+    at_home = verdict("plant.gravity=true", "reference.kind=hold")
+    assert at_home.pole == pytest.approx(5.0, abs=0.1)
+    assert at_home.beatable == "hardly"
+    assert "= 55 fold at t = 0.0 s (pole 5 /s)" in str(at_home)
+
+
+def test_the_true_delay_counts_with_its_fraction():
+    settings = ("delay.steps=3", "delay.fraction=0.5", "controller.delay_steps=0")
+    assert verdict(*settings).eta == pytest.approx(0.35)
+
+
+def test_a_delay_beyond_all_numbers_still_has_a_verdict():
+    text = str(Verdict(eta=1000.0, pole=5.0, time=2.0))
+    assert "beatable: no" in text and "3.0e2171 fold" in text

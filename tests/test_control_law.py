@@ -1,0 +1,549 @@
+"""`DelayLqi.step` without Drake: prediction, feedforward, saturation, and bad days."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stewart_drake.design import control_law as control_law_module
+from stewart_drake.design.control_law import DelayLqi
+from stewart_drake.design.delay_model import delayed_model
+from stewart_drake.design.error_model import double_integrators, linear_model
+from stewart_drake.design.holds import (
+    GAUSS_NODES,
+    held_torques,
+    means_and_changes,
+    rates_at_samples,
+    state_within_hold,
+)
+from stewart_drake.design.law_types import Memory
+from stewart_drake.design.riccati import RiccatiError, full_gain
+from stewart_drake.experiment import control_law, prepare
+from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.trajectories import evaluate, make_reference
+from tests.mechanisms import PAPER
+from tests.oracles import relative
+
+Array = NDArray[np.float64]
+
+WEIGHTS = np.array([1.0, 1.0])
+HOME = np.concatenate([PAPER.home, np.zeros(12)])
+PLAIN = (
+    "controller.estimator=none",
+    "controller.feedforward=none",
+    "controller.weight_scaling=identity",
+)
+LINEAR = (*PLAIN, "controller.prediction=linear")
+
+
+def law_of(*settings: str, controller: str | None = None, **changes: Any) -> DelayLqi:
+    """The law of the paper's scenario, started on the reference, with settings and options."""
+    law = _law(settings, controller)
+    return DelayLqi(dataclasses.replace(law.options, **changes), law.dynamics)
+
+
+@functools.cache
+def _law(settings: tuple[str, ...], controller: str | None) -> DelayLqi:
+    usual = ["start=on_reference", "duration=2.0"]
+    return control_law(prepare(load_scenario("paper", controller, [*usual, *settings])))[0]
+
+
+def at_home(law: DelayLqi) -> Array:
+    """A preview that asks to stay at home."""
+    return np.tile(HOME, (len(law.preview_times), 1))
+
+
+def sampled(law: DelayLqi, **parts: Any) -> Memory:
+    """A memory after some sample, with random parts where none are given."""
+    rng = np.random.default_rng(1)
+    o = law.options
+    some = {
+        "in_flight": 0.1 * rng.normal(0, 1, (o.queue_length + 1, 6)),
+        "state": np.concatenate([PAPER.home, np.zeros(6)]),
+        "error": 1e-2 * rng.normal(0, 1, 6),
+        "integral": 1e-2 * rng.normal(0, 1, 6) if o.integral else np.zeros(6),
+    }
+    return dataclasses.replace(law.initial_memory(np.zeros((o.queue_length, 6))), **some | parts)
+
+
+class Loop:
+    """A plant that is the model, with its own bookkeeping of who acts when.
+
+    The torque of sample k acts from k + mu + fraction periods on, for one period.
+    """
+
+    def __init__(
+        self,
+        law: DelayLqi,
+        reference: Callable[[float], Array],
+        truth: Array | None = None,
+        queue: Array | None = None,
+    ) -> None:
+        self.law, self.reference = law, reference
+        o = law.options
+        self.truth = np.zeros(8) if truth is None else truth
+        zeros = np.zeros((o.queue_length, 6))
+        queue = zeros if queue is None else queue
+        self.torques = {k - len(queue): torque for k, torque in enumerate(queue)}
+        self.memory = law.initial_memory(queue)
+        self.states = [reference(0.0)[:12]]
+        self.memories: list[Memory] = []
+
+    def acting(self, k: int) -> tuple[Array, Array]:
+        """Torques and durations in the period after sample k."""
+        o, nothing = self.law.options, np.zeros(6)
+        newer = self.torques.get(k - o.steps, nothing)
+        if o.fraction == 0:
+            return newer[None], np.array([o.period])
+        older = self.torques.get(k - o.steps - 1, nothing)
+        return np.array([older, newer]), o.period * np.array([o.fraction, 1 - o.fraction])
+
+    def run(self, samples: int, seen: Callable[[int, Array], Array] = lambda k, x: x) -> "Loop":
+        """Go on; `seen` makes the measurement of the state."""
+        o = self.law.options
+        for _ in range(samples):
+            k, x = len(self.memories), self.states[-1]
+            t = k * o.period + self.law.preview_times
+            preview = np.array([self.reference(max(0.0, at)) for at in t])
+            self.memory = self.law.step(self.memory, seen(k, x), preview, WEIGHTS)
+            self.torques[k] = self.memory.torque
+            self.memories.append(self.memory)
+            torques, durations = self.acting(k)
+            dynamics = self.law.dynamics
+            self.states.append(dynamics.predict(x, torques, durations, o.substeps, self.truth)[-1])
+        return self
+
+
+PAPERS = make_reference(load_scenario("paper").reference, 10.0)
+
+
+def sine(size: float = 1.0) -> Callable[[float], Array]:
+    """The trajectory (46) at a share of its amplitude."""
+    rest = evaluate(PAPERS, 0.0) * np.repeat([1.0, 0, 0], 6)
+    return lambda t: rest + size * (evaluate(PAPERS, t) - rest)
+
+
+def nominal_queue(law: DelayLqi, reference: Callable[[float], Array]) -> Array:
+    """Mean torques along the reference for all that are in flight at the start."""
+    o = law.options
+    ends = (o.steps + o.fraction) * o.period - o.period * np.arange(o.queue_length)[::-1]
+    nodes = [[reference(max(0.0, t - o.period * (1 - g))) for g in GAUSS_NODES] for t in ends]
+    torque = law.dynamics.inverse_dynamics
+    return np.array(
+        [np.mean([torque(*np.split(x, 3)) for x in two], axis=0) for two in nodes]
+    ).reshape(-1, 6)
+
+
+# Linear prediction is the paper's gain.
+
+
+@pytest.mark.parametrize("integral", [True, False])
+@pytest.mark.parametrize("model", ["paper", "multibody"])
+@pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (8, 0.0), (3, 0.5), (0, 0.3)])
+def test_linear_law_is_the_full_gain_times_the_augmented_error(
+    steps: int, fraction: float, model: str, integral: bool
+) -> None:
+    law = law_of(
+        *LINEAR,
+        f"controller.model={model}",
+        f"controller.integral={str(integral).lower()}",
+        f"delay.steps={steps}",
+        f"delay.fraction={fraction}",
+    )
+    rng, o = np.random.default_rng(steps), law.options
+    memory, preview = sampled(law), at_home(law)
+    for _ in range(5):
+        x = HOME[:12] + 1e-2 * rng.normal(0, 1, 12)
+        weights = 10 ** rng.uniform(-1, 1, 2)
+        error = x - HOME[:12]
+        z = memory.integral + o.period / 2 * (memory.error + error[:6]) if integral else []
+        if model == "paper":
+            continuous = double_integrators(torque_map(PAPER, x[:6]))
+        else:
+            zero = np.zeros(6)
+            continuous = linear_model(*law.dynamics.derivatives(x[:6], x[6:], zero)[:2])
+        delayed = delayed_model(continuous, o.period, steps, fraction, integral=integral)
+        size = 12 if integral else 6
+        K, _ = full_gain(delayed, weights[0] * np.eye(size), weights[1] * np.eye(6))
+        expected = -K @ np.concatenate([error, z, memory.in_flight[1:].ravel()])
+        memory = law.step(memory, x, preview, weights)
+        assert relative(memory.torque, expected) < 1e-8
+        assert np.array_equal(memory.in_flight[-1], memory.torque)
+        assert np.array_equal(memory.weights, weights)
+
+
+# Nonlinear prediction.
+
+
+@pytest.mark.parametrize("gravity", [False, True])
+@pytest.mark.parametrize(("steps", "fraction"), [(4, 0.0), (4, 0.5), (1, 0.3)])
+def test_nonlinear_law_is_the_linear_one_where_errors_are_small(
+    steps: int, fraction: float, gravity: bool
+) -> None:
+    """Their torques differ in the second order of the error's size."""
+    settings = (
+        f"plant.gravity={str(gravity).lower()}",
+        "controller.period=0.05",
+        "reference.kind=hold",
+        f"delay.steps={steps}",
+        f"delay.fraction={fraction}",
+        "controller.estimator=none",
+        "controller.feedforward=equilibrium",
+    )
+    nonlinear = law_of(*settings, substeps=16)
+    linear = DelayLqi(
+        dataclasses.replace(nonlinear.options, prediction="linear"), nonlinear.dynamics
+    )
+    rng = np.random.default_rng(2)
+    held = nonlinear.dynamics.equilibrium_torque(PAPER.home)
+    random = rng.normal(0, 0.02, (steps + 2, 6))
+    error, z, dx = rng.normal(0, 0.1, 6), rng.normal(0, 0.1, 6), rng.normal(0, 0.1, 12)
+
+    def torque(law: DelayLqi, size: float) -> Array:
+        in_flight = held + size * random[: law.options.queue_length + 1]
+        memory = sampled(law, in_flight=in_flight, error=size * error, integral=size * z)
+        return law.step(memory, HOME[:12] + size * dx, at_home(law), WEIGHTS).torque - held
+
+    sizes = np.array([0.1, 0.05, 0.025, 0.0125])
+    differences = [np.linalg.norm(torque(nonlinear, s) - torque(linear, s)) for s in sizes]
+    order = np.polyfit(np.log(sizes), np.log(differences), 1)[0]
+    assert order == pytest.approx(2.0, abs=0.2)
+    assert differences[-1] < 0.05 * np.linalg.norm(torque(linear, sizes[-1]))
+
+
+@pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (8, 0.0), (3, 0.5), (1, 0.3), (0, 0.3)])
+def test_state_is_predicted_through_the_torques_in_flight(
+    steps: int, fraction: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the gain is designed for at sample k is where the plant is at sample k + mu."""
+    law = law_of(f"delay.steps={steps}", f"delay.fraction={fraction}", "controller.estimator=none")
+    points: list[Array] = []
+    model = law._model
+
+    def spy(point: Array, *rest: Array) -> Any:
+        points.append(point)
+        return model(point, *rest)
+
+    monkeypatch.setattr(law, "_model", spy)
+    reference = sine(0.6)
+    queue = nominal_queue(law, reference) + 1e-3 * np.random.default_rng(3).normal(
+        0, 1, (law.options.queue_length, 6)
+    )
+    loop = Loop(law, reference, queue=queue).run(12 + steps)
+    assert len(points) == 12 + steps
+    for k in range(12):
+        assert np.abs(points[k] - loop.states[k + steps]).max() < 1e-9
+
+
+# Feedforward: torques that are held, and what they make of a motion.
+
+
+@pytest.mark.parametrize("passed", [0.0, 0.3, 0.5, 0.8])
+def test_held_torques_meet_a_sine_at_fourth_order(passed: float) -> None:
+    """Double integrators under held torques, integrated by hand.
+
+    With (hold), and rates that start by (rates), the pose at the samples is off by O(dt^4), and
+    rates there by O(dt^3) after subtracting their offset; holding plain means leaves O(dt^2). The
+    offset is looked at when the share `passed` of each hold is over.
+    """
+    B = np.diag([0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
+    omega, phase = np.array([1.0, 1.5, 2.0, 0.7, 1.2, 1.0]), np.arange(6.0)
+
+    def motion(t: float, order: int) -> Array:
+        return omega**order * np.sin(omega * t + phase + order * np.pi / 2)
+
+    def worst(dt: float, corrected: bool) -> tuple[float, float]:
+        starts = dt * np.arange(-1, round(3.0 / dt) + 1)
+        nodes = [[motion(s + dt * g, 2) / np.diag(B) for g in GAUSS_NODES] for s in starts]
+        means, changes = means_and_changes(np.array(nodes))
+        torques = held_torques(means, changes) if corrected else means[1:-1]
+        x, v = motion(0.0, 0), motion(0.0, 1)
+        if corrected:
+            v = v + rates_at_samples(changes[:2], B, dt)
+        pose, rates = 0.0, 0.0
+        for k, torque in enumerate(torques):
+            now, part = k * dt, passed * dt
+            x_in, v_in = x + part * v + part**2 / 2 * B @ torque, v + part * B @ torque
+            offset = np.zeros(12)
+            if corrected and passed == 0:
+                offset[6:] = rates_at_samples(changes[k : k + 2], B, dt)
+            elif corrected:
+                offset = state_within_hold(changes[k + 1], B, dt, passed)
+            pose = max(pose, np.abs(x_in - offset[:6] - motion(now + part, 0)).max())
+            rates = max(rates, np.abs(v_in - offset[6:] - motion(now + part, 1)).max())
+            x, v = x + dt * v + dt**2 / 2 * B @ torque, v + dt * B @ torque
+        return pose, rates
+
+    periods = np.array([0.1, 0.05, 0.025, 0.0125])
+    plain = np.array([worst(dt, False) for dt in periods])
+    held = np.array([worst(dt, True) for dt in periods])
+
+    def order(errors: Array) -> float:
+        return float(np.polyfit(np.log(periods), np.log(errors), 1)[0])
+
+    assert order(plain[:, 0]) == pytest.approx(2.0, abs=0.15)
+    if passed in (0.0, 0.5):
+        assert order(held[:, 0]) == pytest.approx(4.0, abs=0.3)
+    else:
+        assert order(held[:, 0]) > 3.7 or held[0, 0] < 1e-2 * plain[0, 0]
+    assert order(held[:, 1]) > 2.7
+    assert held[0, 0] < 0.02 * plain[0, 0]
+
+
+@pytest.mark.parametrize("prediction", ["nonlinear", "linear"])
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.5])
+def test_a_known_reference_is_followed_at_a_high_order_of_the_period(
+    fraction: float, prediction: str
+) -> None:
+    """On the reference, with its torques in flight, feedback has next to nothing to do."""
+
+    def worst(period: float) -> float:
+        law = law_of(
+            f"controller.period={period}",
+            f"controller.prediction={prediction}",
+            "controller.estimator=none",
+            "delay.steps=2",
+            f"delay.fraction={fraction}",
+            substeps=4,
+        )
+        reference = sine(0.5)
+        loop = Loop(law, reference, queue=nominal_queue(law, reference))
+        samples = round(3.0 / period)
+        loop.run(samples)
+        half = samples // 2  # what the start with plain means leaves has settled by then
+        return max(
+            float(np.abs(loop.states[k][:6] - reference(k * period)[:6]).max())
+            for k in range(half, samples)
+        )
+
+    errors = [worst(0.1), worst(0.05)]
+    assert errors[0] < 5e-6
+    assert errors[1] < errors[0] / 5
+
+
+# Saturation.
+
+
+@pytest.mark.parametrize("prediction", ["nonlinear", "linear"])
+def test_torque_keeps_its_limit_and_saturated_steps_are_counted(prediction: str) -> None:
+    law = law_of(
+        f"controller.prediction={prediction}", "controller.estimator=none", torque_limit=0.02
+    )
+    rng, memory, preview = np.random.default_rng(4), sampled(law), at_home(law)
+    free = DelayLqi(dataclasses.replace(law.options, torque_limit=None), law.dynamics)
+    expected = 0
+    for size in (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.1):
+        memory = dataclasses.replace(
+            sampled(law, in_flight=np.zeros((9, 6)), integral=np.zeros(6), error=np.zeros(6)),
+            counts=memory.counts,
+        )
+        x = HOME[:12] + size * rng.normal(0, 1, 12)
+        unlimited = free.step(memory, x, preview, WEIGHTS).torque
+        memory = law.step(memory, x, preview, WEIGHTS)
+        expected += bool(np.abs(unlimited).max() > 0.02)
+        assert np.array_equal(memory.torque, np.clip(unlimited, -0.02, 0.02))
+        assert memory.counts.saturated_steps == expected
+    assert 0 < expected < 6
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.5])
+def test_integral_waits_while_a_motor_is_at_its_limit(fraction: float) -> None:
+    """The torque that acted during the last period decides, or the two that did."""
+    law = law_of(*PLAIN, "delay.steps=3", f"delay.fraction={fraction}", torque_limit=0.1)
+    o = law.options
+    x = HOME[:12] + np.repeat([1e-3, 0.0], 6)
+    below = np.full((o.queue_length + 1, 6), 0.05)
+    acted = 1 if fraction == 0 else 2
+    for place in range(len(below)):
+        for leg, value in ((0, 0.1), (5, -0.1)):
+            in_flight = below.copy()
+            in_flight[place, leg] = value
+            memory = sampled(law, in_flight=in_flight)
+            after = law.step(memory, x, at_home(law), WEIGHTS)
+            trapezoid = o.period / 2 * (memory.error + x[:6] - HOME[:6])
+            expected = memory.integral + (0.0 if place < acted else trapezoid)
+            assert np.allclose(after.integral, expected, rtol=0, atol=1e-16)
+            assert np.array_equal(after.error, x[:6] - HOME[:6])
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.5])
+def test_predicted_integral_waits_in_the_same_periods(fraction: float) -> None:
+    """What the law predicts now is what it will have integrated when the torque acts."""
+    law = law_of(
+        *PLAIN,
+        "delay.steps=3",
+        f"delay.fraction={fraction}",
+        torque_limit=5e-4,
+    )
+    predicted: list[Array] = []
+    ahead = law._ahead
+
+    def spy(*arguments: Any) -> Any:
+        result = ahead(*arguments)
+        predicted.append(result[2])
+        return result
+
+    law._ahead = spy  # type: ignore[method-assign]
+    loop = Loop(law, lambda t: HOME)
+    loop.states[0] = HOME[:12] + np.concatenate([np.full(6, 2e-3), np.zeros(6)])
+    loop.run(25)
+    limited = [bool(np.abs(m.torque).max() >= 5e-4) for m in loop.memories]
+    assert 3 < sum(limited) < 22
+    for k in range(20):
+        assert np.allclose(predicted[k], loop.memories[k + 3].integral, rtol=0, atol=1e-10)
+
+
+# Bad days.
+
+FILTERS = ["controller.estimator=parameters", "controller.estimator=none"]
+
+
+@pytest.mark.parametrize("estimator", FILTERS)
+@pytest.mark.parametrize("prediction", ["nonlinear", "linear"])
+@pytest.mark.parametrize(
+    "bad",
+    [(0,), (0, 1, 2), (5,), (3, 4, 5, 6, 7), (0, 4, 5, 9), tuple(range(12))],
+    ids=["first", "first three", "one", "five", "some", "all"],
+)
+def test_torque_is_finite_whatever_the_sensor_says(
+    bad: Sequence[int], prediction: str, estimator: str
+) -> None:
+    law = law_of(estimator, f"controller.prediction={prediction}", "delay.steps=2")
+    reference = sine(0.3)
+    nonsense = [np.nan, np.inf, -np.inf]
+
+    def seen(k: int, x: Array) -> Array:
+        y = x.copy()
+        if k in bad:
+            y[k % 12 if k % 2 else slice(None)] = nonsense[k % 3]
+        return y
+
+    loop = Loop(law, reference, queue=nominal_queue(law, reference)).run(12, seen)
+    for k, memory in enumerate(loop.memories):
+        assert np.all(np.isfinite(memory.torque))
+        assert np.all(np.isfinite(memory.state))
+        assert memory.counts.bad_measurements == sum(b <= k for b in bad)
+        assert np.abs(memory.torque).max() < 1.0
+    if len(bad) < 12:
+        well = Loop(law, reference, queue=nominal_queue(law, reference)).run(12)
+        assert np.abs(loop.states[-1] - well.states[-1])[:6].max() < 1e-3
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.3])
+@pytest.mark.parametrize("steps", [0, 1, 4])
+def test_without_a_measurement_the_state_goes_on_by_the_model(steps: int, fraction: float) -> None:
+    """The right torques act in the right periods: the state is the plant's to rounding."""
+    law = law_of(f"delay.steps={steps}", f"delay.fraction={fraction}", "controller.estimator=none")
+    reference = sine(0.5)
+    rng = np.random.default_rng(5)
+    queue = nominal_queue(law, reference) + 2e-3 * rng.normal(0, 1, (law.options.queue_length, 6))
+    loop = Loop(law, reference, queue=queue)
+    loop.run(15, lambda k, x: np.full(12, np.nan) if 4 <= k < 9 else x)
+    for memory, state in zip(loop.memories, loop.states, strict=False):
+        assert np.abs(memory.state - state).max() < 1e-12
+
+
+@pytest.mark.parametrize("size", [1.0, 1e6, 1e300])
+@pytest.mark.parametrize("channel", [0, 3, 5, 11, slice(None)])
+def test_a_finite_but_absurd_measurement_does_no_lasting_harm(
+    channel: int | slice, size: float
+) -> None:
+    law = law_of("delay.steps=2", "controller.estimator=parameters", torque_limit=1.0)
+    reference = sine(0.3)
+
+    def seen(k: int, x: Array) -> Array:
+        y = x.copy()
+        if k == 6:
+            y[channel] = y[channel] + size
+        return y
+
+    queue = nominal_queue(law, reference)
+    loop, well = (Loop(law, reference, queue=queue).run(14, s) for s in (seen, lambda k, x: x))
+    assert all(np.all(np.isfinite(m.torque)) for m in loop.memories)
+    assert np.abs(loop.states[-1] - well.states[-1]).max() < 1e-4
+
+
+def test_a_plate_out_of_reach_gets_the_feedforward_alone() -> None:
+    law = law_of("controller.estimator=none", "delay.steps=0")
+    preview = at_home(law)
+    memory = sampled(law, gain=np.full((6, 18), 1e3))
+    x = HOME[:12] + np.eye(12)[5] * 0.3
+    after = law.step(memory, x, preview, WEIGHTS)
+    assert np.abs(after.torque).max() < 1e-9  # at home without gravity
+    assert after.counts.riccati_failures == 1
+    assert after.gain is memory.gain
+
+
+def test_a_failed_riccati_equation_keeps_the_last_good_gain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    law = law_of("delay.steps=2")
+    reference = sine(0.3)
+    queue = nominal_queue(law, reference)
+    solve = control_law_module.reduced_gain
+    calls = 0
+
+    def fails_sometimes(*arguments: Any) -> Array:
+        nonlocal calls
+        calls += 1
+        if calls in (1, 5, 6, 7):
+            raise RiccatiError("by the test")
+        return solve(*arguments)
+
+    monkeypatch.setattr(control_law_module, "reduced_gain", fails_sometimes)
+    loop = Loop(law, reference, queue=queue).run(10)
+    failures = [m.counts.riccati_failures for m in loop.memories]
+    assert failures == [1, 1, 1, 1, 2, 3, 4, 4, 4, 4]
+    gains = [m.gain for m in loop.memories]
+    assert gains[0] is None
+    assert all(gain is gains[3] for gain in gains[4:7])
+    assert gains[7] is not gains[3]
+    assert all(np.all(np.isfinite(m.torque)) for m in loop.memories)
+    assert np.abs(loop.states[-1][:6] - reference(1.0)[:6]).max() < 1e-3
+
+
+@pytest.mark.parametrize("weights", [[np.nan, 1.0], [1.0, 0.0], [-1.0, 1.0], [np.inf, 1.0]])
+def test_bad_weights_keep_the_last_good_gain(weights: list[float]) -> None:
+    law = law_of("delay.steps=2", "controller.estimator=none")
+    good = law.step(sampled(law), HOME[:12], at_home(law), WEIGHTS)
+    after = law.step(good, HOME[:12], at_home(law), np.array(weights))
+    assert after.gain is good.gain
+    assert after.counts.riccati_failures == 1
+    assert np.all(np.isfinite(after.torque))
+
+
+@pytest.mark.parametrize("controller", ["lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi"])
+def test_the_same_inputs_give_the_same_bytes(controller: str) -> None:
+    reference = sine(0.3)
+
+    def outcome() -> list[Memory]:
+        law = law_of(controller=controller)
+        queue = np.zeros((law.options.queue_length, 6))
+        return Loop(law, reference, queue=queue).run(6).memories
+
+    for one, other in zip(outcome(), outcome(), strict=True):
+        for name in ("torque", "state", "integral", "in_flight", "gain"):
+            assert np.array_equal(getattr(one, name), getattr(other, name))
+        assert one.counts == other.counts
+
+
+def test_a_step_changes_nothing_it_was_given() -> None:
+    law = law_of("delay.steps=2")
+    memory, preview = sampled(law), at_home(law)
+    x, weights = HOME[:12] + 1e-3, WEIGHTS.copy()
+    inputs = [memory.in_flight, memory.state, memory.error, memory.integral, x, preview, weights]
+    before = [value.copy() for value in inputs]
+    law.step(memory, x, preview, weights)
+    assert all(np.array_equal(a, b) for a, b in zip(inputs, before, strict=True))
+
+
+def test_the_nominal_plant_of_the_law_is_the_scenarios() -> None:
+    assert isinstance(law_of().dynamics, StewartDynamics)
+    assert law_of("plant.gravity=true", "delay.steps=0").dynamics.gravity == 9.81
+    assert not law_of("plant.payload_mass=1.0").dynamics.parameters.any()
