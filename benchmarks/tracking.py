@@ -102,7 +102,7 @@ def starts() -> str:
         for (_, name), rest, moving in zip(plants, results[::2], results[1::2], strict=True)
     ]
     header = ["plant", "E_ac from rest", "peak N m", "E_ac on the reference", "peak N m"]
-    return table("The paper's experiment, E_ac in % s (floor from rest: 15.17)", header, rows)
+    return table("The paper's experiment, E_ac in % s (floor from rest: 15.16)", header, rows)
 
 
 def limit() -> str:

@@ -36,6 +36,9 @@ GATE = float(chdtri(NUM_STATE, 1e-6))
 """Squared innovation, in units of its covariance, above which a measurement is an outlier."""
 ITERATIONS = 4
 """At the most; one does once the parameters are roughly known."""
+MIDPOINT = np.array([0.5])
+KNOWN = 0.01
+"""A parameter counts as known when its standard deviation is this share of the prior's."""
 PATIENCE = 3
 """After so many outliers in a row the model must be wrong, and the measurement is believed."""
 
@@ -186,7 +189,10 @@ def _filter(
     drift = settings.model_std**2
     R = np.diag(settings.noise_std**2 + drift)
     xi = prior
-    after, F = _transition(dynamics, xi, torques, durations, substeps)
+    # Corrections of parameters that are known already are too small to need F to fourth order.
+    known = np.all(estimate.parameter_std <= KNOWN * settings.prior_std)
+    nodes = MIDPOINT if known else GAUSS_NODES
+    after, F = _transition(dynamics, xi, torques, durations, substeps, nodes)
     if measurement is not None:
         for _ in range(ITERATIONS):
             H = F[:NUM_STATE]
@@ -201,7 +207,7 @@ def _filter(
             after = _integrate(dynamics, xi, torques, durations, substeps)
             if np.all(np.abs(after - linear) <= 0.1 * np.sqrt(np.diag(R))):
                 break
-            after, F = _transition(dynamics, xi, torques, durations, substeps)
+            after, F = _transition(dynamics, xi, torques, durations, substeps, nodes)
         if not innovation @ np.linalg.solve(S, innovation) <= GATE:  # or NaN
             return None
         P = posterior
@@ -218,24 +224,32 @@ def _integrate(
 
 
 def _transition(
-    dynamics: StewartDynamics, xi: Array, torques: Array, durations: Array, substeps: int
+    dynamics: StewartDynamics,
+    xi: Array,
+    torques: Array,
+    durations: Array,
+    substeps: int,
+    nodes: Array = GAUSS_NODES,
 ) -> tuple[Array, Array]:
     """State (12,) after the torques, and F (20, 20) of [state; parameters].
 
     F = exp(Omega) solves F_dot = [[A, G], [0, 0]] F to fourth order with A and G at the two Gauss
     nodes: Omega = h/2 (L_1 + L_2) + sqrt(3)/12 h^2 [L_2, L_1] (Magnus). The filter divides tiny
-    innovations by F; an error of second order would already look like a disturbance.
+    innovations by F; an error of second order would already look like a disturbance. One node,
+    MIDPOINT, is of second order.
     """
     x, theta = xi[:NUM_STATE], xi[THETA]
     total = np.eye(NUM_STATE + NUM_PARAMETERS)
     for torque, h in zip(torques, durations, strict=True):
-        cuts = h * np.diff(GAUSS_NODES, prepend=0.0, append=1.0)
-        *nodes, x = dynamics.predict(x, np.tile(torque, (3, 1)), cuts, substeps, theta)
-        L = np.zeros((2, *total.shape))
-        for place, node in zip(L, nodes, strict=True):
-            derivatives = dynamics.derivatives(node[POSE], node[RATES], torque, theta)
+        cuts = h * np.diff(nodes, prepend=0.0, append=1.0)
+        *states, x = dynamics.predict(x, np.tile(torque, (len(cuts), 1)), cuts, substeps, theta)
+        L = np.zeros((len(nodes), *total.shape))
+        for place, state in zip(L, states, strict=True):
+            derivatives = dynamics.derivatives(state[POSE], state[RATES], torque, theta)
             place[:NUM_STATE, :NUM_STATE], place[:NUM_STATE, THETA] = derivatives.A, derivatives.G
-        omega = h / 2 * (L[0] + L[1]) + np.sqrt(3) / 12 * h**2 * (L[1] @ L[0] - L[0] @ L[1])
+        omega = h * L.mean(axis=0)
+        if len(nodes) == 2:
+            omega += np.sqrt(3) / 12 * h**2 * (L[1] @ L[0] - L[0] @ L[1])
         total = expm(omega) @ total
     return x, total
 

@@ -1,0 +1,432 @@
+"""The systems of the loop, each from its ports up to a simulation; who acts when on the plants."""
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    Diagram,
+    DiagramBuilder,
+    LeafSystem,
+    State,
+    System,
+)
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+
+from stewart_drake.design.control_law import DelayLqi
+from stewart_drake.diagram import ClosedLoop, MultibodyStewart, build_closed_loop
+from stewart_drake.experiment import control_law, prepare
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.plant.exact import ExactPlant
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.simulation import make_simulator
+from stewart_drake.systems.controller import DelayLqiController
+from stewart_drake.systems.delay_chain import DelayChain
+from stewart_drake.systems.reference import Reference
+from stewart_drake.systems.sensor import Sensor
+from stewart_drake.timing import look_time
+from stewart_drake.trajectories import evaluate, make_reference
+from tests.mechanisms import PAPER
+
+Array = NDArray[np.float64]
+
+DELAYS = [(steps, fraction) for steps in (0, 1, 8) for fraction in (0.0, 0.3)]
+MOTION = make_reference(load_scenario("paper").reference, 10.0)
+AT_REST = np.concatenate([PAPER.home, np.zeros(6)])
+
+
+def ports(system: System) -> tuple[dict[str, int], dict[str, int]]:
+    """Sizes of the input and output ports by name."""
+    inputs = map(system.get_input_port, range(system.num_input_ports()))
+    outputs = map(system.get_output_port, range(system.num_output_ports()))
+    return {p.get_name(): p.size() for p in inputs}, {p.get_name(): p.size() for p in outputs}
+
+
+def queue(steps: int, fraction: float) -> Array:
+    """Distinct torques in flight, the oldest first."""
+    length = steps + (fraction > 0)
+    return -np.arange(length, 0, -1.0)[:, None] * np.ones(6)
+
+
+# Reference.
+
+
+def test_reference_shows_the_true_motion_now_and_the_planned_one_ahead() -> None:
+    faster = load_scenario("paper", settings=["reference.frequency=2"])
+    planned = make_reference(faster.reference, 1.0)
+    ahead = np.array([0.0, 0.25, -0.5])
+    system = Reference(MOTION, planned, ahead)
+    assert ports(system) == ({}, {"reference": 18, "preview": 54})
+    context = system.CreateDefaultContext()
+    assert context.num_continuous_states() == context.num_discrete_state_groups() == 0
+    for t in (0.0, 0.3, 2.0):
+        context.SetTime(t)
+        now = system.GetOutputPort("reference").Eval(context)
+        assert np.array_equal(now, evaluate(MOTION, t))
+        preview = system.GetOutputPort("preview").Eval(context).reshape(3, 18)
+        expected = [evaluate(planned, max(0.0, t + dt)) for dt in ahead]
+        assert np.array_equal(preview, expected)
+
+
+# Sensor.
+
+
+def measure(sensor: Sensor, state: Array, time: float) -> Array:
+    context = sensor.CreateDefaultContext()
+    context.SetTime(time)
+    sensor.get_input_port().FixValue(context, state)
+    return sensor.get_output_port().Eval(context)
+
+
+def test_sensor_without_noise_passes_the_state_through() -> None:
+    sensor, state = Sensor(np.zeros(12), 0, 0.1), np.random.default_rng(0).normal(0, 1, 12)
+    assert ports(sensor) == ({"state": 12}, {"measurement": 12})
+    assert sensor.CreateDefaultContext().num_total_states() == 0
+    assert np.array_equal(measure(sensor, state, 0.7), state)
+    partly = Sensor(np.eye(12)[3], 0, 0.1)
+    same = np.arange(12) != 3
+    assert np.array_equal(measure(partly, state, 0.7)[same], state[same])
+    assert measure(partly, state, 0.7)[3] != state[3]
+
+
+def test_sensor_noise_is_a_function_of_seed_and_sample() -> None:
+    std = np.linspace(1, 2, 12)
+    one, again, other = (Sensor(std, seed, 0.1) for seed in (5, 5, 6))
+    for k in (7, 0, 3):  # in any order
+        y = measure(one, AT_REST, 0.1 * k)
+        assert np.array_equal(y, AT_REST + one.noise(k))
+        assert np.array_equal(y, measure(again, AT_REST, 0.1 * k * (1 - 1e-14)))
+        assert not np.any(y == measure(other, AT_REST, 0.1 * k))
+        assert not np.any(y == measure(one, AT_REST, 0.1 * (k + 1)))
+
+
+def test_sensor_noise_is_white_and_as_large_as_asked_for() -> None:
+    n, std = 20_000, np.linspace(1e-4, 2.0, 12)
+    sensor = Sensor(std, 1, 0.1)
+    normal = np.array([sensor.noise(k) for k in range(n)]) / std
+    five_sigma = 5 / np.sqrt(n)
+    assert np.abs(normal.mean(axis=0)).max() < five_sigma
+    assert np.abs(np.cov(normal.T) - np.eye(12)).max() < np.sqrt(2) * five_sigma
+    lagged = normal[1:].T @ normal[:-1] / n
+    assert np.abs(lagged).max() < five_sigma
+    assert abs((normal**4).mean() - 3) < 0.1
+
+
+# Delay chain.
+
+
+class Counter(LeafSystem):
+    """Torque of sample k: `torque(k)`, at t = k dt."""
+
+    def __init__(self, period: float, torque: Callable[[int], Array]) -> None:
+        super().__init__()
+        self._period, self._torque = period, torque
+        self.DeclareVectorOutputPort("torque", 6, self._output, {self.time_ticket()})
+
+    def _output(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._torque(round(context.get_time() / self._period)))
+
+
+def test_delay_chain_topology_and_initial_state() -> None:
+    for steps, fraction in DELAYS:
+        chain = DelayChain(0.1, steps, fraction, queue(steps, fraction))
+        assert ports(chain) == ({"commanded": 6}, {"torque": 6})
+        assert not chain.HasAnyDirectFeedthrough()
+        context = chain.CreateDefaultContext()
+        # The oldest acts from the start.
+        first = [*queue(steps, fraction), np.zeros(6)][0]
+        assert np.array_equal(chain.get_output_port().Eval(context), first)
+    with pytest.raises(ValueError, match="queue: got shape"):
+        DelayChain(0.1, 2, 0.0, queue(2, 0.5))
+    with pytest.raises(ValueError, match="queue: got shape"):
+        DelayChain(0.1, 2, 0.5, queue(2, 0.0))
+
+
+Update = Callable[[Context, State], None]
+
+
+def carry_out(update: Update, context: Context) -> None:
+    """What a simulator does with an unrestricted update."""
+    after = context.Clone()
+    update(context, after.get_mutable_state())
+    context.SetTimeStateAndParametersFrom(after)
+
+
+@pytest.mark.parametrize(("steps", "fraction"), DELAYS)
+def test_delay_chain_forced_updates_shift_the_queue(steps: int, fraction: float) -> None:
+    chain = DelayChain(0.1, steps, fraction, queue(steps, fraction))
+    context = chain.CreateDefaultContext()
+    order = [*queue(steps, fraction), *(np.full(6, 10.0 + k) for k in range(12))]
+    for k in range(12):
+        chain.get_input_port().FixValue(context, np.full(6, 10.0 + k))
+        carry_out(chain._take, context)
+        assert np.array_equal(chain.get_output_port().Eval(context), order[k])
+        if fraction > 0:
+            carry_out(chain._release, context)
+            assert np.array_equal(chain.get_output_port().Eval(context), order[k + 1])
+
+
+@pytest.mark.parametrize("period", [0.1, 0.01, 1 / 30])
+@pytest.mark.parametrize(("steps", "fraction"), DELAYS)
+def test_torque_leaves_the_bare_chain_in_its_own_interval(
+    steps: int, fraction: float, period: float
+) -> None:
+    """Looked at next to every instant at which it may change, and by a logger in between."""
+    builder = DiagramBuilder()
+    source = builder.AddSystem(Counter(period, lambda k: np.full(6, float(k))))
+    chain = builder.AddSystem(DelayChain(period, steps, fraction, queue(steps, fraction)))
+    builder.Connect(source.get_output_port(), chain.get_input_port())
+    logger = LogVectorOutput(chain.get_output_port(), builder, period / 8)
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = chain.GetMyContextFromRoot(simulator.get_context())
+    output = chain.get_output_port()
+    eta = (steps + fraction) * period
+    near = 1e-9 * period
+    for k in range(-steps, 30):
+        starts = k * period + eta
+        if starts - near > 0:
+            simulator.AdvanceTo(starts - near)
+            assert np.array_equal(output.Eval(context), np.full(6, k - 1.0))
+        simulator.AdvanceTo(starts + near)
+        assert np.array_equal(output.Eval(context), np.full(6, float(k)))
+    log = logger.FindLog(simulator.get_context())
+    phase = (log.sample_times() - eta) / period
+    clear = np.abs(phase - np.round(phase)) > 1e-6
+    assert clear.sum() > 100
+    assert np.array_equal(log.data()[0, clear], np.floor(phase[clear]))
+
+
+def chained(plant: System, period: float, steps: int, fraction: float, torque) -> Diagram:  # type: ignore[no-untyped-def]
+    """Counter, delay chain with nothing in flight, plant."""
+    builder = DiagramBuilder()
+    source = builder.AddSystem(Counter(period, torque))
+    empty = np.zeros((steps + (fraction > 0), 6))
+    chain = builder.AddSystem(DelayChain(period, steps, fraction, empty))
+    builder.AddSystem(plant)
+    builder.Connect(source.get_output_port(), chain.get_input_port())
+    builder.Connect(chain.get_output_port(), plant.GetInputPort("torque"))
+    builder.ExportOutput(plant.GetOutputPort("state"), "state")
+    return builder.Build()
+
+
+def state_at(simulator: Simulator, time: float) -> Array:
+    """State of the plant at a nominal time, before a discrete plant steps out of it."""
+    if time > 0:
+        simulator.AdvanceTo(look_time(time))
+    else:
+        simulator.Initialize()
+    return simulator.get_system().GetOutputPort("state").Eval(simulator.get_context()).copy()
+
+
+@pytest.mark.parametrize(("steps", "fraction"), DELAYS)
+def test_an_impulse_reaches_the_exact_plant_in_its_own_interval(
+    steps: int, fraction: float
+) -> None:
+    """At rest until the release, then on the way that the dynamics alone predict."""
+    period, k0, push = 0.1, 2, 0.05 * np.array([1.0, -1, 0.5, 1, -0.5, 2])
+    dynamics = StewartDynamics(PAPER, gravity=False)
+    plant = ExactPlant(dynamics)
+    diagram = chained(plant, period, steps, fraction, lambda k: push * (k == k0))
+    simulator = Simulator(diagram)
+    integrator = simulator.get_mutable_integrator()
+    integrator.set_maximum_step_size(0.02)
+    integrator.set_target_accuracy(1e-12)
+    released = (k0 + steps + fraction) * period
+    assert np.abs(state_at(simulator, released) - AT_REST).max() < 1e-12
+    acceleration = dynamics.accelerations(PAPER.home, np.zeros(6), push)
+    for after in (1e-6, 1e-3, 0.04, period, period + 0.05):
+        torques = [push, np.zeros(6)]
+        durations = [min(after, period), max(0.0, after - period)]
+        expected = dynamics.predict(AT_REST, torques, durations, 50)[-1]
+        found = state_at(simulator, released + after)
+        assert np.abs(found - expected).max() < 1e-9 * max(1.0, after / 1e-3)
+        if after < 1e-5:
+            assert found[6:] == pytest.approx(after * acceleration, rel=1e-4)
+
+
+@pytest.mark.parametrize(("steps", "fraction"), DELAYS)
+def test_torques_reach_the_multibody_plant_in_their_own_steps(steps: int, fraction: float) -> None:
+    """The step that starts at the release is the first to feel a torque; none is late or early.
+
+    Torques that all differ push along one direction, so that the change of the rates over each
+    step of 1 ms tells which of them acted.
+    """
+    period, h, samples = 0.1, 1e-3, 16
+    rng = np.random.default_rng(0)
+    sizes = rng.permutation(np.arange(1, samples + 1)) * np.resize([1, -1], samples)
+    direction = 2e-4 * np.array([1.0, 1, 1, 1, 1, 1]) * np.array([1, -1, 1, -1, 1, -1])
+    plant = MultibodyStewart(PAPER, h, gravity=False)
+    diagram = chained(
+        plant, period, steps, fraction, lambda k: direction * (sizes[k] if k < samples else 0)
+    )
+    simulator = Simulator(diagram)
+    plant.set_state(plant.GetMyMutableContextFromRoot(simulator.get_mutable_context()), AT_REST)
+    count = round(samples * period / h)
+    states = np.array([state_at(simulator, n * h) for n in range(count + 1)])
+    dynamics = StewartDynamics(PAPER, gravity=False)
+    accelerations = np.diff(states[:, 6:], axis=0) / h
+    torques = [
+        dynamics.inverse_dynamics(x[:6], x[6:], a)
+        for x, a in zip(states, accelerations, strict=False)
+    ]
+    felt = np.array(torques) @ direction / (direction @ direction)
+    delay = round((steps + fraction) * period / h)
+    computed = (np.arange(count) - delay) // round(period / h)
+    expected = np.where(computed >= 0, sizes[np.maximum(computed, 0)], 0)
+    assert np.abs(felt - expected).max() < 0.3
+    assert np.array_equal(np.round(felt), expected)
+
+
+# Controller.
+
+
+@functools.cache
+def law() -> DelayLqi:
+    settings = ["start=on_reference", "duration=1.0", "delay.steps=2"]
+    return control_law(prepare(load_scenario("paper", settings=settings)))[0]
+
+
+def test_controller_topology_and_initial_state() -> None:
+    in_flight = 1e-3 * np.arange(12.0).reshape(2, 6)
+    controller = DelayLqiController(law(), in_flight)
+    inputs, outputs = ports(controller)
+    assert inputs == {"measurement": 12, "preview": 18 * len(law().preview_times), "weights": 2}
+    assert outputs == {
+        "torque": 6,
+        "torque_commanded": 6,
+        "integral": 6,
+        "weights_used": 2,
+        "parameters": 8,
+        "parameter_std": 8,
+    }
+    for name in outputs:
+        port = controller.GetOutputPort(name).get_index()
+        through = any(
+            controller.HasDirectFeedthrough(i, port) for i in range(controller.num_input_ports())
+        )
+        assert through == (name == "torque")
+    context = controller.CreateDefaultContext()
+    memory = controller.memory(context)
+    assert np.array_equal(memory.in_flight[1:], in_flight)
+
+    def shown(name: str) -> Array:
+        return controller.GetOutputPort(name).Eval(context)
+
+    assert not shown("integral").any()
+    assert np.isnan(shown("weights_used")).all()
+    assert not shown("parameters").any()
+    assert np.isnan(shown("parameter_std")).all()
+    assert np.array_equal(shown("torque_commanded"), in_flight[-1])
+
+
+def fixed(controller: DelayLqiController, context: Context) -> dict[str, Array]:
+    """Constant inputs, off the reference."""
+    preview = np.array([evaluate(MOTION, max(0.0, t)) for t in law().preview_times])
+    values = {
+        "measurement": preview[0, :12] + 1e-3,
+        "preview": preview.ravel(),
+        "weights": np.array([1.0, 2.0]),
+    }
+    for name, value in values.items():
+        controller.GetInputPort(name).FixValue(context, value)
+    return values
+
+
+def test_controller_output_and_forced_update_are_steps_of_the_law() -> None:
+    controller = DelayLqiController(law(), np.zeros((2, 6)))
+    context = controller.CreateDefaultContext()
+    inputs = fixed(controller, context)
+    expected = law().initial_memory(np.zeros((2, 6)))
+    for _ in range(3):
+        expected = law().step(
+            expected, inputs["measurement"], inputs["preview"].reshape(-1, 18), inputs["weights"]
+        )
+        held = controller.GetOutputPort("torque_commanded").Eval(context).copy()
+        torque = controller.GetOutputPort("torque").Eval(context)
+        assert np.array_equal(torque, expected.torque)
+        assert not np.array_equal(torque, held)
+        carry_out(controller._update, context)
+        for name, value in (
+            ("torque_commanded", expected.torque),
+            ("integral", expected.integral),
+            ("weights_used", inputs["weights"]),
+            ("parameters", expected.estimate.parameters),
+            ("parameter_std", expected.estimate.parameter_std),
+        ):
+            assert np.array_equal(controller.GetOutputPort(name).Eval(context), value)
+
+
+def short_loop(plant: str, *settings: str) -> ClosedLoop:
+    usual = ["duration=1.0", f"plant.kind={plant}", "start=on_reference", "queue=reference"]
+    return build_closed_loop(load_scenario("paper", settings=[*usual, *settings]))
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+@pytest.mark.parametrize("fraction", [0.0, 0.3])
+def test_the_law_is_evaluated_once_per_sample(
+    fraction: float, plant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, calls = DelayLqi.step, []
+
+    def counted(self, memory, *inputs):  # type: ignore[no-untyped-def]
+        calls.append(memory)
+        return step(self, memory, *inputs)
+
+    loop = short_loop(plant, f"delay.fraction={fraction}", "delay.steps=1")
+    simulator = make_simulator(loop)
+    monkeypatch.setattr(DelayLqi, "step", counted)
+    for samples, until in ((1, 0.05), (2, 0.15), (6, 0.55)):
+        simulator.AdvanceTo(until)
+        for name in ("torque_commanded", "torque_applied", "integral", "parameters"):
+            loop.GetOutputPort(name).Eval(simulator.get_context())
+        assert len(calls) == samples
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+def test_two_contexts_of_one_diagram_do_not_know_of_each_other(plant: str) -> None:
+    """Nothing lives on the systems: interrupting a run by another leaves no trace."""
+    noise = "sensor.noise_std=[" + ", ".join(["1e-4"] * 12) + "]"
+    loop = short_loop(plant, "delay.steps=2", "delay.fraction=0.3", noise)
+
+    def outcome(simulator: Simulator) -> list[Array]:
+        context = simulator.get_context()
+        names = ("state", "torque_commanded", "torque_applied", "integral", "parameters")
+        return [loop.GetOutputPort(name).Eval(context).copy() for name in names]
+
+    whole = make_simulator(loop)
+    whole.AdvanceTo(0.25)
+    whole.AdvanceTo(0.5)
+    interrupted, other = make_simulator(loop), make_simulator(loop)
+    interrupted.AdvanceTo(0.25)
+    other.AdvanceTo(0.4)
+    interrupted.AdvanceTo(0.5)
+    for expected, found in zip(outcome(whole), outcome(interrupted), strict=True):
+        assert np.array_equal(expected, found)
+
+
+def test_weights_may_change_from_sample_to_sample() -> None:
+    """The controller takes the weights that stand at its port."""
+    builder = DiagramBuilder()
+    controller = builder.AddSystem(DelayLqiController(law(), np.zeros((2, 6))))
+    weights = builder.AddSystem(ConstantVectorSource(np.array([1.0, 1.0])))
+    builder.Connect(weights.get_output_port(), controller.GetInputPort("weights"))
+    for name in ("measurement", "preview"):
+        builder.ExportInput(controller.GetInputPort(name), name)
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    root = simulator.get_mutable_context()
+    preview = np.array([evaluate(MOTION, max(0.0, t)) for t in law().preview_times])
+    diagram.GetInputPort("measurement").FixValue(root, preview[0, :12] + 1e-3)
+    diagram.GetInputPort("preview").FixValue(root, preview.ravel())
+    context = controller.GetMyContextFromRoot(root)
+    for k, value in enumerate(([1.0, 1.0], [4.0, 0.1])):
+        source = weights.GetMyMutableContextFromRoot(root)
+        weights.get_mutable_source_value(source).set_value(np.array(value))
+        simulator.AdvanceTo(0.1 * k + 0.05)
+        assert np.array_equal(controller.GetOutputPort("weights_used").Eval(context), value)
