@@ -37,6 +37,7 @@ LAYERS = (
     ("simulation",),
     ("studies",),
     ("report",),
+    ("commands",),
     ("cli",),
     ("__main__",),
 )

@@ -1,134 +1,418 @@
-"""The exact plant in Drake's simulator: convergence, linearisation, and how it ends."""
+"""The exact plant: energy, agreement with the multibody engine, linearisation, its ends."""
+
+import functools
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
-from pydrake.systems.primitives import Linearize
+from pydrake.systems.analysis import (
+    ApplySimulatorConfig,
+    Simulator,
+    SimulatorConfig,
+    SimulatorStatus,
+)
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem, System
+from pydrake.systems.primitives import FirstOrderTaylorApproximation, Linearize
 
 from stewart_drake.diagram import MultibodyStewart
+from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.plant.equations import DEAD_CENTRE_SINE
 from stewart_drake.plant.exact import ExactPlant
-from stewart_drake.plant.workspace import diagnose, standing
-from stewart_drake.signals import POSE
+from stewart_drake.plant.workspace import (
+    PITCH_LIMIT,
+    SINGULARITY_LIMIT,
+    Failure,
+    diagnose,
+    home_sign,
+    standing,
+)
 from stewart_drake.timing import look_time
-from tests.mechanisms import PAPER
+from tests.mechanisms import PAPER, random_mechanism, random_pose
+from tests.oracles import relative, size
 
 Array = NDArray[np.float64]
-AT_HOME = np.concatenate([PAPER.home, np.zeros(6)])
+Scheme = tuple[str, float, float, bool]
+"""Integrator, accuracy, largest step in s, error control."""
+
+TIGHT: Scheme = ("runge_kutta5", 1e-10, 0.005, True)
+USUAL: Scheme = ("runge_kutta5", 1e-8, 0.02, True)
+ENDED = SimulatorStatus.ReturnReason.kReachedTerminationCondition
+FREE = StewartDynamics(PAPER, gravity=False)
 
 
-def simulated(
-    plant: ExactPlant,
-    state: Array,
-    torque: Array,
-    end: float,
-    scheme: str = "runge_kutta5",
-    accuracy: float = 1e-10,
-    longest_step: float = 0.1,
-) -> tuple[float, Array, int]:
-    """Time and state where the simulation ended, and the number of derivative evaluations."""
-    context = plant.CreateDefaultContext()
+def simulator_of(
+    plant: System, state: Array, torque: Array, scheme: Scheme
+) -> tuple[Simulator, Context]:
+    """A simulator of one plant from a state, under a constant torque."""
+    simulator = Simulator(plant)
+    context = simulator.get_mutable_context()
     plant.set_state(context, state)
     plant.GetInputPort("torque").FixValue(context, torque)
-    simulator = Simulator(plant, context)
+    name, accuracy, step, controlled = scheme
     config = SimulatorConfig(
-        integration_scheme=scheme,
+        integration_scheme=name,
+        max_step_size=step,
         accuracy=accuracy,
-        max_step_size=longest_step,
-        use_error_control=True,
+        use_error_control=controlled,
     )
     ApplySimulatorConfig(config, simulator)
-    context.SetAccuracy(accuracy)
-    simulator.AdvanceTo(end)
-    evaluations = simulator.get_integrator().get_num_derivative_evaluations()
-    return context.get_time(), context.get_continuous_state_vector().CopyToVector(), evaluations
+    if controlled:
+        context.SetAccuracy(accuracy)
+    return simulator, context
 
 
-def test_multibody_plant_approaches_it_at_first_order() -> None:
-    """Slope of the pose error over the engine's step, 0.3 s of a constant torque near home."""
-    torque = 0.02 * np.array([1.0, -0.5, 0.3, 0.8, -1.0, 0.4])
-    plant = ExactPlant(StewartDynamics(PAPER, gravity=False))
-    _, truth, _ = simulated(plant, AT_HOME, torque, 0.3)
-    steps, errors = np.array([2e-3, 1e-3, 5e-4, 2e-4, 1e-4]), []
-    for step in steps:
-        engine = MultibodyStewart(PAPER, step, gravity=False)
-        context = engine.CreateDefaultContext()
-        engine.set_state(context, AT_HOME)
-        engine.GetInputPort("torque").FixValue(context, torque)
-        Simulator(engine, context).AdvanceTo(look_time(0.3))
-        state = engine.GetOutputPort("state").Eval(context)
-        errors.append(np.abs(state[POSE] - truth[POSE]).max())
-    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
-    assert 0.9 < slope < 1.1
+def state_of(plant: System, context: Context) -> Array:
+    return plant.GetOutputPort("state").Eval(context).copy()
 
 
-@pytest.mark.parametrize("t", [0.0, 1.0, 2.5, 4.0, 5.5])
-def test_drakes_linearize_is_the_exact_one(t: float) -> None:
-    dynamics = StewartDynamics(PAPER)
-    pose = PAPER.home + np.array([np.pi / 12] * 3 + [0.02, 0.02, 0.08]) * np.sin(t)
-    plant = ExactPlant(dynamics, np.concatenate([pose, np.zeros(6)]))
+# Ports and energy.
+
+
+def test_topology() -> None:
+    plant = ExactPlant(FREE)
+    assert plant.GetInputPort("torque").size() == 6
+    assert plant.GetOutputPort("state").size() == 12
+    assert (plant.num_input_ports(), plant.num_output_ports()) == (1, 1)
+    assert not plant.HasAnyDirectFeedthrough()
     context = plant.CreateDefaultContext()
-    plant.GetInputPort("torque").FixValue(context, dynamics.equilibrium_torque(pose))
-    linear = Linearize(plant, context, equilibrium_check_tolerance=1e-6)
-    A, B = dynamics.linearize(pose)
-    np.testing.assert_allclose(linear.A(), A, atol=1e-12 * np.abs(A).max())
-    np.testing.assert_allclose(linear.B(), B, atol=1e-12 * np.abs(B).max())
+    assert context.num_continuous_states() == 12
+    assert context.has_only_continuous_state()
+    assert np.array_equal(state_of(plant, context), [*PAPER.home, *np.zeros(6)])
+    elsewhere = ExactPlant(FREE, np.arange(12.0))
+    assert np.array_equal(state_of(elsewhere, elsewhere.CreateDefaultContext()), np.arange(12.0))
+
+
+@pytest.mark.parametrize("gravity", [False, True])
+def test_energy_is_kept(gravity: bool) -> None:
+    """Half a second from moderate rates; constant torques, their work known by the crank angles."""
+    for mechanism in (PAPER, random_mechanism(np.random.default_rng(1))):
+        dynamics, rng = StewartDynamics(mechanism, gravity), np.random.default_rng(0)
+        rates = 0.1 * rng.normal(0, 1, 6) * size(mechanism) * ([1.0] * 3 + [0.2] * 3)
+        plant = ExactPlant(dynamics)
+        torque = dynamics.equilibrium_torque(mechanism.home) + rng.normal(0, 0.005, 6)
+        start = np.concatenate([mechanism.home, rates])
+        simulator, context = simulator_of(plant, start, torque, TIGHT)
+        before = None
+        for t in np.arange(0.1, 0.51, 0.1):
+            x = state_of(plant, context)
+            total = dynamics.energy(x[:6], x[6:])
+            kinetic = total - dynamics.energy(x[:6], np.zeros(6))
+            now = total - torque @ mechanism.crank_angles(x[:6])
+            before = now if before is None else before
+            assert abs(now - before) < 1e-8 * kinetic
+            simulator.AdvanceTo(t)
+
+
+# The two plants.
+
+
+class Sine(LeafSystem):
+    """Torque amplitude * sin(omega t + phase)."""
+
+    def __init__(self, amplitude: Array, omega: float, phase: Array) -> None:
+        super().__init__()
+
+        def output(context: Context, result: BasicVector) -> None:
+            result.SetFromVector(amplitude * np.sin(omega * context.get_time() + phase))
+
+        self.DeclareVectorOutputPort("torque", 6, output, {self.time_ticket()})
+
+
+@pytest.mark.parametrize("gravity", [False, True])
+def test_multibody_plant_converges_to_it_at_first_order(gravity: bool) -> None:
+    """0.3 s of a sinusoidal torque with bias, payload and damping: the slope is 0.996."""
+    rng = np.random.default_rng(3)
+    held = StewartDynamics(PAPER, gravity).equilibrium_torque(PAPER.home)
+    source = (0.05 * rng.normal(0, 1, 6), 20.0, rng.uniform(0, 6, 6))
+    start = np.concatenate([PAPER.home, rng.normal(0, [0.2] * 3 + [0.02] * 3)])
+    parameters = np.concatenate([held, [0.3, 2e-3]])  # the holding torque comes as a bias
+
+    def motion(plant: System) -> Array:
+        builder = DiagramBuilder()
+        builder.AddSystem(plant)
+        torque = builder.AddSystem(Sine(*source))
+        builder.Connect(torque.get_output_port(), plant.GetInputPort("torque"))
+        diagram = builder.Build()
+        simulator = Simulator(diagram)
+        context = plant.GetMyContextFromRoot(simulator.get_mutable_context())
+        plant.set_state(plant.GetMyMutableContextFromRoot(simulator.get_mutable_context()), start)
+        simulator.get_mutable_integrator().set_target_accuracy(1e-11)
+        simulator.get_mutable_integrator().set_maximum_step_size(0.01)
+        simulator.AdvanceTo(look_time(0.3))
+        return state_of(plant, context)
+
+    expected = motion(ExactPlant(StewartDynamics(PAPER, gravity, parameters)))
+    assert np.abs(expected - start)[:6].max() > 0.02
+
+    def error(step: float) -> float:
+        other = {"torque_bias": held, "payload_mass": 0.3, "joint_damping": 2e-3}
+        found = motion(MultibodyStewart(PAPER, step, gravity=gravity, **other))
+        return float(np.abs(found - expected)[:6].max())
+
+    steps = [2e-3, 1e-3, 5e-4, 2e-4, 1e-4]
+    errors = [error(step) for step in steps]
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert 0.9 <= slope <= 1.1
+    assert errors[-1] < 1e-2 * np.abs(expected - start)[:6].max()
+
+
+# Linearisation.
+
+
+@pytest.mark.parametrize("gravity", [False, True])
+@pytest.mark.parametrize("index", range(-1, 2))
+def test_drake_linearises_it_exactly(index: int, gravity: bool) -> None:
+    """At rest in equilibrium and on the move, by automatic differentiation of the plant."""
+    rng = np.random.default_rng(index + 1)
+    mechanism = PAPER if index < 0 else random_mechanism(rng)
+    dynamics = StewartDynamics(mechanism, gravity)
+    plant = ExactPlant(dynamics)
+    pose = random_pose(rng, mechanism)
+    held = dynamics.equilibrium_torque(pose)
+    moving = np.concatenate([pose, rng.normal(0, 0.3, 6) * size(mechanism)])
+    pushed = held + rng.normal(0, 0.1, 6)
+    for state, torque, derive in (
+        (np.concatenate([pose, np.zeros(6)]), held, Linearize),
+        (moving, pushed, FirstOrderTaylorApproximation),
+    ):
+        context = plant.CreateDefaultContext()
+        plant.set_state(context, state)
+        plant.GetInputPort("torque").FixValue(context, torque)
+        found = derive(plant, context)
+        A, B = dynamics.linearize(state[:6], state[6:], torque)
+        assert relative(found.A(), A) < 1e-13
+        assert relative(found.B(), B) < 1e-13
+        assert np.array_equal(found.C(), np.eye(12))
+        assert not found.D().any()
+    assert relative(found.A(), dynamics.linearize(pose)[0]) > 1e-3  # it matters where
+
+
+# The ends of its reach.
+
+
+def approach(seed: int) -> Array:
+    """From home in a random direction, at a random speed, on to some dead centre within 2 s."""
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(0, 1, 6)
+    scale = np.array([1, 1, 1, 0.1, 0.1, 0.1])
+    speed = 10 ** rng.uniform(0, 1.3)
+    return np.concatenate([PAPER.home, speed * scale * direction / np.linalg.norm(direction)])
+
+
+class Counting(StewartDynamics):
+    """Counts the evaluations of the accelerations, and refuses to go on without end."""
+
+    def __init__(self, limit: int, gravity: bool = False) -> None:
+        super().__init__(PAPER, gravity)
+        self.count, self.limit = 0, limit
+
+    def accelerations(self, *arguments, **keywords):  # type: ignore[no-untyped-def]
+        self.count += 1
+        if self.count > self.limit:
+            raise AssertionError("the integration does not come to an end")
+        return super().accelerations(*arguments, **keywords)
+
+
+def end_of(
+    start: Array, scheme: Scheme, limit: int, torque: Array, gravity: bool = False
+) -> tuple[Failure, Array, str]:
+    """Failure, state and message where a simulation of at most 20 s ended."""
+    plant = ExactPlant(Counting(limit, gravity))
+    simulator, context = simulator_of(plant, start, torque, scheme)
+    status = simulator.AdvanceTo(20.0)
+    assert status.reason() == ENDED
+    assert status.system() is plant
+    x = state_of(plant, context)
+    failure = diagnose(PAPER, context.get_time(), x[:6])
+    assert failure is not None
+    return failure, x, status.message()
+
+
+NO_TORQUE, PRESSING = np.zeros(6), 0.5 * np.array([1.0, -1, 1, -1, 1, -1])
+
+
+@functools.cache
+def true_end(seed: int) -> Failure:
+    """Of `approach`, every second one under torque."""
+    return end_of(approach(seed), TIGHT, 20_000, (NO_TORQUE, PRESSING)[seed % 2])[0]
 
 
 @pytest.mark.parametrize(
-    ("scheme", "accuracy", "longest_step"),
+    "scheme",
     [
-        ("runge_kutta5", 1e-2, 1.0),
-        ("runge_kutta3", 1e-2, 1.0),
-        ("runge_kutta5", 1e-8, 0.1),
-        ("radau3", 1e-3, 0.1),
+        USUAL,
+        ("runge_kutta5", 1e-2, 0.02, True),
+        ("runge_kutta5", 1e-2, 0.5, True),
+        ("runge_kutta3", 1e-6, 0.1, True),
+        ("runge_kutta3", 1e-4, 0.5, True),
+        ("radau3", 1e-4, 0.1, True),
     ],
+    ids=lambda s: f"{s[0]}-{s[1]:g}-{s[2]:g}",
 )
+def test_at_a_dead_centre_the_simulation_ends_in_time_and_names_the_leg(scheme: Scheme) -> None:
+    """Each run against one with 1e-10 and 5 ms: there the same leg, then the same instant."""
+    legs = set()
+    for seed in range(12):
+        expected = true_end(seed)
+        found, x, message = end_of(approach(seed), scheme, 5_000, (NO_TORQUE, PRESSING)[seed % 2])
+        assert message == "the plate left its workspace"
+        assert np.all(np.isfinite(x))
+        assert found.time == pytest.approx(expected.time, rel=0.02, abs=1e-3)
+        assert "end of its reach" in found.reason
+        assert abs(found.margin) < 1e-3
+        now = standing(PAPER, x[:6])
+        assert now.sines[found.leg - 1] == now.sines.min() <= DEAD_CENTRE_SINE
+        legs.add(found.leg)
+        if np.partition(now.sines, 1)[1] > 0.1:  # only one leg is near its end
+            assert found.leg == expected.leg
+    assert len(legs) > 2
+
+
 @pytest.mark.parametrize("seed", range(6))
-def test_a_run_to_the_boundary_ends_with_time_leg_and_margin(
-    scheme: str, accuracy: float, longest_step: float, seed: int
-) -> None:
-    """Pushed hard in a random direction, whatever the integrator: no NaN, no endless halving."""
+def test_under_gravity_and_strong_torques_the_simulation_ends_too(seed: int) -> None:
+    """Where motors press a leg into its dead centre, whatever the integrator."""
     rng = np.random.default_rng(seed)
-    dynamics = StewartDynamics(PAPER)
     start = np.concatenate([PAPER.home, rng.normal(0, [1, 1, 1, 0.2, 0.2, 0.2])])
-    torque = dynamics.equilibrium_torque(PAPER.home) + rng.normal(0, 0.7, 6)
-    time, state, evaluations = simulated(
-        ExactPlant(dynamics), start, torque, 20.0, scheme, accuracy, longest_step
+    held = StewartDynamics(PAPER).equilibrium_torque(PAPER.home)
+    torque = held + rng.normal(0, 0.7, 6)
+    for scheme in (
+        USUAL,
+        ("runge_kutta5", 1e-2, 1.0, True),
+        ("runge_kutta3", 1e-2, 1.0, True),
+        ("radau3", 1e-3, 0.1, True),
+    ):
+        failure, x, _ = end_of(start, scheme, 20_000, torque, gravity=True)
+        assert np.all(np.isfinite(x))
+        assert 0 < failure.time < 20
+        if failure.leg is not None:
+            assert standing(PAPER, x[:6]).sines[failure.leg - 1] <= DEAD_CENTRE_SINE
+
+
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        ("runge_kutta2", 0.0, 0.05, False),
+        ("explicit_euler", 0.0, 0.05, False),
+        ("runge_kutta3", 0.0, 0.05, False),
+        ("bogacki_shampine3", 1e-1, 0.5, True),
+        ("implicit_euler", 1e-2, 0.5, True),
+        ("radau3", 1e-2, 0.5, True),
+    ],
+    ids=lambda s: f"{s[0]}-{s[1]:g}-{s[2]:g}",
+)
+def test_coarse_integration_stays_finite_and_comes_to_an_end(scheme: Scheme) -> None:
+    """Whatever else: no NaN, no endless halving of steps, and a reason where it ended.
+
+    That it ends at the first dead centre is not shown, nor true: a step may go over it, see
+    `test_a_step_over_a_dead_centre_does_not_go_unnoticed`.
+    """
+    for seed in range(12):
+        plant = ExactPlant(Counting(20_000))
+        torque = (NO_TORQUE, PRESSING)[seed % 2]
+        simulator, context = simulator_of(plant, approach(seed), torque, scheme)
+        status = simulator.AdvanceTo(2.0)
+        x = state_of(plant, context)
+        assert np.all(np.isfinite(x))
+        failure = diagnose(PAPER, context.get_time(), x[:6])
+        assert (status.reason() == ENDED) == (failure is not None)
+
+
+@pytest.mark.xfail(reason="witnesses are looked at between steps only", strict=True)
+@pytest.mark.parametrize(
+    ("scheme", "seed"),
+    [(("runge_kutta2", 0.0, 0.05, False), 5), (("runge_kutta3", 1e-2, 0.1, True), 7)],
+    ids=["fixed", "loose"],
+)
+def test_a_step_over_a_dead_centre_does_not_go_unnoticed(scheme: Scheme, seed: int) -> None:
+    """What is known not to hold. In pose coordinates a plate touches the end of its reach and turns
+    back, on the other branch of the crank; when both ends of a step are within reach, and no stage
+    was bad enough for the error control, that looks like a motion on the same branch.
+    """
+    expected, _, _ = end_of(approach(seed), TIGHT, 20_000, NO_TORQUE)
+    found, _, _ = end_of(approach(seed), scheme, 5_000, NO_TORQUE)
+    assert found.time < expected.time + scheme[2]
+
+
+def test_absurd_speeds_end_in_the_first_step() -> None:
+    """A hundred thousand radians per second."""
+    for scheme in (USUAL, ("explicit_euler", 0.0, 0.05, False)):
+        for seed in range(5):
+            start = approach(seed)
+            start[6:] *= 1e4
+            failure, x, _ = end_of(start, scheme, 5_000, NO_TORQUE)
+            assert failure.time <= 0.05
+            assert np.all(np.isfinite(x))
+
+
+def crossing(mechanism: Mechanism, seed: int) -> tuple[Array, Array]:
+    """A pose on a parallel singularity well off dead centres, and a direction across it."""
+    rng, sign = np.random.default_rng(seed), home_sign(mechanism)
+    scale = np.array([1, 1, 1, 0.3, 0.3, 0.3])
+
+    def parallel(distance: float) -> float:
+        return sign * standing(mechanism, mechanism.home + distance * direction).parallel
+
+    while True:
+        direction = rng.normal(0, 1, 6) * scale
+        direction /= np.linalg.norm(direction / scale)
+        low = 0.0
+        for high in np.linspace(0.02, 2, 100):
+            now = standing(mechanism, mechanism.home + high * direction)
+            if now.sines.min() < 0.1 or abs(now.pitch) > 1.3:
+                break
+            if parallel(high) < 0:
+                while low < (middle := (low + high) / 2) < high:
+                    low, high = (middle, high) if parallel(middle) > 0 else (low, middle)
+                return mechanism.home + low * direction, direction
+            low = high
+
+
+@pytest.mark.parametrize("index", [-1, 0, 1])
+def test_at_a_parallel_singularity_the_simulation_ends(index: int) -> None:
+    """Where the determinant of the rods' wrenches changes sign, cranks no longer hold the plate."""
+    mechanism = PAPER if index < 0 else random_mechanism(np.random.default_rng(index))
+    pose, direction = crossing(mechanism, 2)
+    sign = home_sign(mechanism)
+    before, after = (
+        sign * standing(mechanism, pose + s * 1e-3 * direction).parallel for s in (-1, 1)
     )
-    assert np.all(np.isfinite(state))
-    assert evaluations < 20_000
-    failure = diagnose(PAPER, time, state[POSE])
-    assert failure is not None and 0 < failure.time == time < 20
-    assert f"{time:.3f} s" in str(failure)
-    if failure.leg is not None:
-        assert standing(PAPER, state[POSE]).sines[failure.leg - 1] <= 0.0101
-        assert abs(failure.margin) < 1e-3
+    assert before > 0 > after
+    start = np.concatenate([pose - 0.1 * direction, direction])
+    plant = ExactPlant(StewartDynamics(mechanism, gravity=False))
+    simulator, context = simulator_of(plant, start, np.zeros(6), USUAL)
+    status = simulator.AdvanceTo(2.0)
+    assert status.reason() == ENDED
+    x = state_of(plant, context)
+    failure = diagnose(mechanism, context.get_time(), x[:6])
+    assert failure is not None
+    assert failure.leg is None
+    assert "parallel singularity" in failure.reason
+    assert 0 < failure.time < 1
+    # Before the sign changes, and not by far.
+    assert sign * standing(mechanism, x[:6]).parallel == pytest.approx(SINGULARITY_LIMIT, rel=0.1)
 
 
-def test_no_crank_changes_its_branch_unseen() -> None:
-    """Loose integration with large steps ends at the same leg and time as a fine one."""
-    dynamics = StewartDynamics(PAPER)
-    torque = 1.2 * dynamics.equilibrium_torque(PAPER.home)
-    plant = ExactPlant(dynamics)
-    fine = simulated(plant, AT_HOME, torque, 20.0, longest_step=0.01)
-    loose = simulated(plant, AT_HOME, torque, 20.0, accuracy=1e-2, longest_step=1.0)
-    ends = [diagnose(PAPER, time, state[POSE]) for time, state, _ in (fine, loose)]
-    assert ends[0] is not None and ends[1] is not None
-    assert ends[0].leg == ends[1].leg is not None
-    assert fine[0] == pytest.approx(loose[0], rel=1e-2)
+def test_at_the_limit_of_the_pitch_the_simulation_ends() -> None:
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        pose = PAPER.home + rng.normal(0, [0.3, 0, 0.3, 0.05, 0.05, 0.05])
+        pose[1] = PITCH_LIMIT - 0.05
+        if standing(PAPER, pose).margin(home_sign(PAPER)) > 0.04:
+            break
+    start = np.concatenate([pose, 2.0 * np.eye(6)[1]])
+    plant = ExactPlant(FREE)
+    simulator, context = simulator_of(plant, start, np.zeros(6), USUAL)
+    assert simulator.AdvanceTo(1.0).reason() == ENDED
+    failure = diagnose(PAPER, context.get_time(), state_of(plant, context)[:6])
+    assert failure is not None
+    assert "pitch" in failure.reason
 
 
-def test_a_parallel_singularity_ends_the_run() -> None:
-    """Rolled far over, the six rods come to lie in a linear complex and hold the plate no more."""
-    direction = np.array([-0.8776, -0.0826, -0.4703, -0.0276, -0.0205, -0.0239])
-    sign = np.sign(standing(PAPER, PAPER.home).parallel)
-    start = np.concatenate([PAPER.home + 1.25 * direction, 3 * direction])
-    assert standing(PAPER, start[POSE]).parallel * sign > 0
-    plant = ExactPlant(StewartDynamics(PAPER, gravity=False))
-    time, state, _ = simulated(plant, start, np.zeros(6), 1.0, accuracy=1e-8)
-    failure = diagnose(PAPER, time, state[POSE])
-    assert failure is not None and failure.leg is None
-    assert failure.reason.startswith("parallel singularity")
-    assert standing(PAPER, state[POSE]).sines.min() > 0.05  # every leg still reaches
+def test_a_state_without_numbers_is_named_as_such() -> None:
+    for value in (np.nan, np.inf):
+        pose = PAPER.home.copy()
+        pose[4] = value
+        failure = diagnose(PAPER, 1.0, pose)
+        assert failure is not None
+        assert failure.reason == "the simulated state is not finite"

@@ -1,0 +1,370 @@
+"""The closed loop: its ports, what its log says, how runs begin and end, and that joints hold."""
+
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.typing import NDArray
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context
+from scipy.integrate import quad_vec
+
+from stewart_drake import metrics
+from stewart_drake.config import Scenario
+from stewart_drake.diagram import build_closed_loop
+from stewart_drake.mechanism.kinematics import leg_geometry, rotation
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.plant.multibody import add_mechanism, set_pose
+from stewart_drake.results import SimulationResult
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.signals import LEGS
+from stewart_drake.simulation import make_simulator, simulate
+from stewart_drake.trajectories import evaluate, make_reference
+from tests.mechanisms import PAPER
+
+Array = NDArray[np.float64]
+
+GRID = 0.02
+ON_REFERENCE = ("start=on_reference", "queue=reference")
+AMPLITUDE = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
+
+
+def scenario(*settings: str, controller: str | None = None, plant: str = "exact") -> Scenario:
+    return load_scenario("paper", controller, [f"plant.kind={plant}", *settings])
+
+
+@functools.cache
+def result(*settings: str, controller: str | None = None, plant: str = "exact") -> SimulationResult:
+    return simulate(scenario(*settings, controller=controller, plant=plant))
+
+
+# What is there.
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+def test_closed_loop_has_named_ports_and_systems(plant: str) -> None:
+    loop = build_closed_loop(scenario(plant=plant))
+    sizes = {
+        "state": 12,
+        "reference": 18,
+        "torque_applied": 6,
+        "torque_commanded": 6,
+        "integral": 6,
+        "weights_used": 2,
+        "parameters": 8,
+        "parameter_std": 8,
+    }
+    found = [loop.get_output_port(i) for i in range(loop.num_output_ports())]
+    assert {port.get_name(): port.size() for port in found} == sizes
+    assert loop.num_input_ports() == 0
+    names = ("reference", "sensor", "weights", "controller", "saturation", "delay_chain", "plant")
+    assert {system.get_name() for system in loop.GetSystems()} == set(names)
+
+
+def test_log_is_on_the_metrics_grid_with_named_coordinates() -> None:
+    run = result("duration=0.93", *ON_REFERENCE)
+    expected = [*(GRID * np.arange(47)), 0.93]
+    assert run.status == "completed"
+    assert run.signals.time.values == pytest.approx(expected, abs=1e-12)
+    assert run.signals.time.attrs["units"] == "s"
+    assert list(run.signals.coordinate.values) == ["phi", "theta", "psi", "x", "y", "z"]
+    assert list(run.signals.leg.values) == list(LEGS)
+    for name in ("pose", "rates", "reference", "torque_commanded", "weights", "parameters"):
+        assert np.all(np.isfinite(run.signals[name].values))
+    reference = make_reference(run.scenario.reference, 1.0)
+    poses = [reference.value(t)[:, 0] for t in run.signals.time.values]
+    assert np.allclose(run.signals.reference.values, poses, rtol=0, atol=1e-14)
+    error = run.signals.pose.values - run.signals.reference.values
+    assert np.array_equal(run.signals.error.values, error)
+
+
+# Who acts when.
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+@pytest.mark.parametrize("controller", ["predictor_lqi", "delay_lqi", "lqr"])
+@pytest.mark.parametrize(("steps", "fraction"), [(2, 0.0), (1, 0.2), (0, 0.0), (0, 0.6)])
+def test_applied_torque_is_the_commanded_one_a_delay_ago(
+    steps: int, fraction: float, controller: str, plant: str
+) -> None:
+    """At every logged instant, bit by bit; before that, what was in flight at the start."""
+    run = result(
+        "duration=0.6",
+        f"delay.steps={steps}",
+        f"delay.fraction={fraction}",
+        *ON_REFERENCE,
+        controller=controller,
+        plant=plant,
+    )
+    commanded, applied = run.signals.torque_commanded.values, run.signals.torque_applied.values
+    behind = round((steps + fraction) * 0.1 / GRID)
+    assert run.status == "completed"
+    assert np.array_equal(applied[behind:], commanded[: len(commanded) - behind])
+    assert len(np.unique(commanded[:, 0])) >= 6
+    assert behind == 0 or np.all(applied[0] != 0)
+
+
+def test_torque_is_limited_before_the_chain() -> None:
+    run = result("duration=1.2", "actuator.torque_limit=0.5", "delay.steps=2")
+    assert run.summary["peak_torque"] <= 0.5
+    assert np.abs(run.signals.torque_applied.values).max() <= 0.5
+    limited = result("duration=0.6", "delay.steps=2", "actuator.torque_limit=0.004", *ON_REFERENCE)
+    assert np.abs(limited.signals.torque_applied.values).max() == 0.004
+    assert limited.summary["counts"]["saturated_steps"] > 0
+
+
+# How it begins.
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+@pytest.mark.parametrize("start", ["rest", "on_reference"])
+def test_runs_start_at_rest_or_on_the_reference(start: str, plant: str) -> None:
+    settings = ("duration=0.2", f"start={start}", "delay.steps=3", "controller.catch_up=0")
+    run = result(*settings, plant=plant)
+    reference = evaluate(make_reference(run.scenario.reference, 1.0), 0.0)
+    assert run.signals.pose.values[0] == pytest.approx(reference[:6], abs=1e-12)
+    rates = reference[6:12] if start == "on_reference" else np.zeros(6)
+    assert run.signals.rates.values[0] == pytest.approx(rates, abs=1e-9)
+    if start == "rest":  # nothing can act within the delay
+        assert np.abs(run.signals.pose.values - PAPER.home).max() < 1e-9
+
+
+@pytest.mark.parametrize(("steps", "fraction"), [(3, 0.0), (2, 0.4)])
+def test_torques_in_flight_at_the_start(steps: int, fraction: float) -> None:
+    """None, those that hold still, or the reference's averaged over the period that they act in."""
+    settings = (
+        "duration=0.4",
+        "plant.gravity=true",
+        f"delay.steps={steps}",
+        f"delay.fraction={fraction}",
+        "start=on_reference",
+        "controller.catch_up=0",
+    )
+    dynamics = StewartDynamics(PAPER, gravity=True)
+    motion = make_reference(scenario().reference, 10.0)
+    eta = (steps + fraction) * 0.1
+    waiting = slice(0, round(eta / GRID))
+
+    def nominal(t: float) -> Array:
+        return dynamics.inverse_dynamics(*np.split(evaluate(motion, t), 3))
+
+    def mean(start: float, end: float) -> Array:
+        return quad_vec(nominal, start, end)[0] / (end - start)
+
+    ends = eta - 0.1 * np.arange(steps + (fraction > 0))[::-1]
+    for kind in ("zero", "equilibrium", "reference"):
+        run = result(*settings, f"queue={kind}")
+        applied = run.signals.torque_applied.values[waiting]
+        times = run.signals.time.values[waiting]
+        for t, torque in zip(times, applied, strict=True):
+            end = ends[np.argmax(ends > t + 1e-9)]
+            expected = {
+                "zero": lambda end: np.zeros(6),
+                "equilibrium": lambda end: dynamics.equilibrium_torque(PAPER.home),
+                "reference": lambda end: mean(max(0.0, end - 0.1), end),
+            }[kind](end)
+            assert torque == pytest.approx(expected, abs=2e-6)
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+def test_torques_in_flight_hold_the_plate_from_the_first_instant(plant: str) -> None:
+    """Under gravity one step of 1 ms without them would leave it falling at 10 mm/s."""
+    run = result(
+        "duration=0.3",
+        "plant.gravity=true",
+        "reference.kind=hold",
+        "queue=equilibrium",
+        "delay.steps=2",
+        plant=plant,
+    )
+    assert np.abs(run.signals.rates.values).max() < 1e-5
+    assert np.abs(run.signals.error.values).max() < 1e-6
+
+
+# Metrics.
+
+
+def test_accumulated_error_of_a_signal_made_by_hand() -> None:
+    """Triangles of two percent of peak to peak over two seconds, and one constant coordinate."""
+    time = np.linspace(0, 2, 101)
+    triangle = 1 - np.abs(time - 1)
+    scale = np.array([0.5, 0.5, 1, 0.04, 0.04, 0.16])
+    error = np.outer(triangle, 0.02 * scale * [1, -1, 1, -1, 1, -1])
+    assert metrics.accumulated_error(time, error, scale) == pytest.approx(2.0, rel=1e-12)
+    assert metrics.peak_error(error, scale) == pytest.approx(np.full(6, 2.0), rel=1e-12)
+    one = np.zeros((101, 6))
+    one[:, 3] = 0.04
+    assert metrics.accumulated_error(time, one, scale) == pytest.approx(2 * 100 / 6, rel=1e-12)
+
+
+def test_cost_and_variation_in_closed_form() -> None:
+    n, period = 51, 0.1
+    error, torque = np.full((n, 6), 2.0), np.outer((-1.0) ** np.arange(n), np.arange(1, 7))
+    z = 2.0 * period * np.arange(n)
+    errors, torques = 6 * n * 4.0, n * 91.0
+    plain = metrics.quadratic_cost(error, torque, period, 3.0, 0.5, False)
+    assert plain == pytest.approx(3 * errors + 0.5 * torques, rel=1e-12)
+    errors += 6 * (z**2).sum()
+    with_integral = metrics.quadratic_cost(error, torque, period, 3.0, 0.5, True)
+    assert with_integral == pytest.approx(3 * errors + 0.5 * torques, rel=1e-12)
+    assert metrics.total_variation(torque) == pytest.approx(2 * (n - 1) * 3.5, rel=1e-12)
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+def test_delay_floor_is_what_a_plate_that_cannot_move_collects(plant: str) -> None:
+    """100/2 (1 - cos 0.8) = 15.165 % s for the paper's motion, by trapezoids of 20 ms 15.164."""
+    floor = 50 * (1 - np.cos(0.8))
+    run = result("duration=0.9", plant=plant)
+    assert run.summary["delay_floor"] == pytest.approx(floor, rel=GRID**2 / 10)
+    waiting = run.signals.time.values <= 0.8 + 1e-9
+    scale = 2 * AMPLITUDE
+    collected = metrics.accumulated_error(
+        run.signals.time.values[waiting], run.signals.error.values[waiting], scale
+    )
+    assert collected == pytest.approx(run.summary["delay_floor"], rel=1e-9)
+    assert result("duration=0.3", *ON_REFERENCE).summary["delay_floor"] == 0
+
+
+def test_summary_is_what_the_signals_say() -> None:
+    run = result("duration=1.5", *ON_REFERENCE, "delay.steps=2")
+    s, time = run.signals, run.signals.time.values
+    error = s.error.values
+    area = 100 * np.trapezoid(np.abs(error) / (2 * AMPLITUDE), dx=GRID, axis=0)
+    assert run.accumulated_error == pytest.approx(area.mean(), rel=1e-9)
+    assert run.summary["peak_error"] == pytest.approx(
+        100 * np.abs(error).max(axis=0) / (2 * AMPLITUDE), rel=1e-9
+    )
+    samples = np.isclose(time / 0.1, np.round(time / 0.1))
+    torques = s.torque_commanded.values[samples]
+    assert run.summary["peak_torque"] == np.abs(torques).max()
+    assert run.summary["rms_torque"] == pytest.approx(np.sqrt(np.mean(torques**2)), rel=1e-9)
+    assert run.summary["cost"] == pytest.approx(
+        metrics.quadratic_cost(error[samples], torques, 0.1, 1.0, 1.0, True), rel=1e-9
+    )
+    assert set(run.summary["counts"]) == {"riccati_failures", "bad_measurements", "saturated_steps"}
+    assert run.summary["failure"] is None
+    assert run.failure is None
+
+
+# Repeatability.
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+def test_the_same_seed_gives_the_same_bytes(plant: str, tmp_path: Path) -> None:
+    noise = "sensor.noise_std=[" + ", ".join(["1e-4"] * 12) + "]"
+
+    def saved(seed: int, folder: str) -> tuple[bytes, xr.Dataset]:
+        run = simulate(
+            scenario("duration=0.5", *ON_REFERENCE, noise, f"sensor.seed={seed}", plant=plant)
+        )
+        run.save(tmp_path / folder)
+        return (tmp_path / folder / "signals.nc").read_bytes(), run.signals
+
+    one, again, other = saved(1, "one"), saved(1, "again"), saved(2, "other")
+    assert one[0] == again[0]
+    assert one[1].identical(again[1])
+    assert not np.array_equal(one[1].torque_commanded, other[1].torque_commanded)
+    summary = json.loads((tmp_path / "one" / "summary.json").read_text())
+    assert summary["status"] == "completed"
+    read = xr.load_dataset(tmp_path / "one" / "signals.nc")
+    assert np.array_equal(read.pose.values, one[1].pose.values)
+
+
+def test_ctrl_c_keeps_what_there_is() -> None:
+    seen: list[float] = []
+
+    def interrupt(time: float, error: float) -> None:
+        seen.append(time)
+        assert error >= 0
+        if time > 0.31:
+            raise KeyboardInterrupt
+
+    run = simulate(scenario("duration=2.0", *ON_REFERENCE), progress=interrupt)
+    assert run.status == "interrupted"
+    assert run.signals.time.values == pytest.approx(GRID * np.arange(17), abs=1e-12)
+    assert np.isnan(run.accumulated_error)
+    assert seen == pytest.approx(GRID * np.arange(17), abs=1e-12)
+
+
+# How it ends early.
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+@pytest.mark.parametrize("controller", ["lqr", "lqi"])
+def test_leaving_the_workspace_ends_the_run_with_time_leg_and_margin(
+    controller: str, plant: str
+) -> None:
+    """And that leg is at its dead centre: rod and crank lie in one plane with the motor axis."""
+    settings = ("duration=3.0", "delay.steps=8")
+    run = result(*settings, controller=controller, plant=plant)
+    assert run.status == "left_workspace"
+    assert np.isnan(run.accumulated_error)
+    stopped = run.stopped
+    assert stopped is not None
+    assert stopped.leg in LEGS
+    assert 0.8 < stopped.time < 3.0
+    assert f"leg {stopped.leg}" in run.failure
+    assert f"t = {stopped.time:.3f} s" in run.failure
+    assert run.summary["failure"]["leg"] == stopped.leg
+    assert run.signals.time.values[-1] <= stopped.time
+    assert np.all(np.isfinite(run.signals.pose.values))
+
+    loop = build_closed_loop(scenario(*settings, controller=controller, plant=plant))
+    simulator = make_simulator(loop)
+    simulator.AdvanceTo(3.0)
+    context = simulator.get_context()
+    assert context.get_time() == pytest.approx(stopped.time, abs=2e-3)
+    pose = loop.GetOutputPort("state").Eval(context)[:6]
+    sines = np.abs(transmissions(loop, context, pose))
+    assert sines[stopped.leg - 1] == sines.min()
+    assert sines.min() < 0.02
+    assert abs(stopped.margin) < 1e-3
+
+
+def transmissions(loop, context: Context, pose: Array) -> Array:  # type: ignore[no-untyped-def]
+    """Rod along the crank tip's tangent (6,): from the simulated cranks, or from the pose."""
+    plant = loop.GetSubsystemByName("plant")
+    if not plant.HasOutputPort("crank_angles"):
+        return leg_geometry(PAPER, pose).transmission
+    angles = plant.GetOutputPort("crank_angles").Eval(plant.GetMyContextFromRoot(context))
+    x, y = PAPER.R_WS[:, :, 0], PAPER.R_WS[:, :, 1]
+    cos, sin = np.cos(angles)[:, None], np.sin(angles)[:, None]
+    tips = PAPER.p_WS + PAPER.crank_lengths[:, None] * (cos * x + sin * y)
+    rods = pose[3:] + PAPER.p_PQ @ rotation(pose[:3]).T - tips
+    tangents = cos * y - sin * x
+    return np.sum(rods * tangents, axis=1) / np.linalg.norm(rods, axis=1)
+
+
+# What holds together.
+
+
+def test_a_run_with_a_delay_that_is_no_whole_number_of_periods() -> None:
+    """Held torques are known within a hold too: a fraction costs nothing in accuracy."""
+    for fraction in (0.0, 0.2, 0.6):
+        run = result("duration=3.0", f"delay.fraction={fraction}", "delay.steps=8", *ON_REFERENCE)
+        assert run.status == "completed"
+        assert run.accumulated_error < 0.03
+        assert run.summary["counts"]["riccati_failures"] == 0
+
+
+def test_joints_of_an_exact_run_fit_the_sdformat_model() -> None:
+    """Its poses, put into the multibody model: the loops are closed to rounding."""
+    run = result("duration=10.0")
+    plant = MultibodyPlant(0.0)
+    add_mechanism(plant, PAPER)
+    context = plant.CreateDefaultContext()
+    pairs = [
+        (plant.GetFrameByName(f"rod_end_{leg}"), plant.GetFrameByName(f"plate_joint_{leg}"))
+        for leg in LEGS
+    ]
+    worst = 0.0
+    for pose, rates in zip(run.signals.pose.values, run.signals.rates.values, strict=True):
+        set_pose(plant, context, PAPER, pose, rates)
+        gaps = [plant.CalcPointsPositions(context, a, np.zeros(3), b) for a, b in pairs]
+        worst = max(worst, float(np.abs(gaps).max()))
+    assert run.status == "completed"
+    assert len(run.signals.time) == 501
+    assert worst < 1e-12
