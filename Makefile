@@ -17,7 +17,7 @@ export MPLBACKEND := Agg
 PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: demo test lint format-check types bench soak clean help
+.PHONY: demo test lint format-check types wheel newest bench soak clean help
 
 demo: $(INSTALLED)  ## the paper's comparison, from rest and started on the reference
 	$(BIN)/stewart-drake compare paper --out out/demo/rest
@@ -43,6 +43,12 @@ format-check: $(INSTALLED)  ## ruff's format, without changing a file
 
 types: $(INSTALLED)  ## mypy, strict
 	$(BIN)/mypy
+
+wheel:  ## builds the wheel and tries it in a clean environment, from an empty folder
+	@PYTHON=$(PYTHON) bash .ci/wheel
+
+newest:  ## the tests with the newest Drake, on Python 3.12 or later, without torch
+	@bash .ci/newest $(ARGS)
 
 bench: $(INSTALLED_BENCH)  ## every script in benchmarks/, one after the other
 	@set -e; for script in $(sort $(wildcard benchmarks/[a-z]*.py)); do \

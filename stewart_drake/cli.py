@@ -6,7 +6,9 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from stewart_drake.commands import model, run
+from stewart_drake.commands import analyze, model, report, run, tune
+from stewart_drake.commands.common import INTERRUPTED, release
+from stewart_drake.commands.examples import add_examples
 from stewart_drake.errors import ConfigError
 from stewart_drake.report.terminal import echo
 
@@ -14,10 +16,14 @@ _BAD_INPUT: Final = 2
 # Releases of typer keep their usage errors in different places; all derive from this class.
 _UsageError: Final[Any] = typer.BadParameter.__mro__[1]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = typer.Typer(rich_markup_mode=None)
 app.command()(run.simulate)
 app.command()(run.compare)
+app.command()(run.export)
+app.command()(report.report)
 app.add_typer(model.app, name="model")
+app.add_typer(analyze.app, name="analyze")
+app.add_typer(tune.app, name="tune")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,16 +35,24 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         The exit status: 0; 2 for bad input, with one line on stderr; 130 for Ctrl-C.
     """
+    for argument in sys.argv[1:] if arguments is None else arguments:
+        if any("\ud800" <= letter <= "\udfff" for letter in argument):  # an undecodable byte
+            return _complain(f"{argument!r}: is not UTF-8 text; expected names in UTF-8")
+    add_examples(app)
     command = typer.main.get_command(app)
     try:
         return command.main(arguments, "stewart-drake", standalone_mode=False) or 0
     except _UsageError as error:
         return _complain(_usage_message(error))
+    except typer.Abort:  # Ctrl-C in a command that has nothing to keep
+        return INTERRUPTED
     except BrokenPipeError:  # whoever read the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except _bad_input() as error:
         return _complain(str(error))
+    finally:
+        release()
 
 
 @app.callback(invoke_without_command=True)
@@ -58,18 +72,20 @@ def _root(
 
 @app.command("list")
 def list_shipped() -> None:
-    """List the shipped mechanisms, scenarios and controllers."""
+    """List the shipped models, scenarios and so on."""
     from stewart_drake.report.tables import shipped_table
+    from stewart_drake.resources import KINDS, shipped
 
-    for kind in ("mechanism", "scenario", "controller"):
-        typer.echo(f"{kind}s")
-        typer.echo(shipped_table(kind))
+    for kind, heading in KINDS.items():
+        if shipped(kind):
+            typer.echo(heading)
+            typer.echo(shipped_table(kind))
 
 
 def _bad_input() -> tuple[type[Exception], ...]:
-    from stewart_drake.mechanism.kinematics import UnreachablePoseError
+    from stewart_drake.mechanism.kinematics import SingularPoseError, UnreachablePoseError
 
-    return ConfigError, UnreachablePoseError, OSError
+    return ConfigError, UnreachablePoseError, SingularPoseError, OSError
 
 
 def _complain(message: str) -> int:

@@ -31,11 +31,15 @@ _STRICT: Final = ConfigDict(
     extra="forbid", strict=True, allow_inf_nan=False, validate_assignment=True
 )
 
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
+# Limits far beyond any platform keep squares and products of what a file says finite.
+Positive = Annotated[float, Field(gt=0, le=1e6)]
+Weight = Annotated[float, Field(gt=0, le=1e12)]
+Seconds = Annotated[float, Field(ge=0, le=1e5)]
+Deviation = Annotated[float, Field(ge=0, le=1e3)]
 Fraction = Annotated[float, Field(ge=0, lt=1)]
 Steps = Annotated[int, Field(ge=0, le=10_000)]
-Six = Annotated[list[float], Field(min_length=6, max_length=6)]
+Row = Annotated[list[float], Field(min_length=6, max_length=6)]
+Six = Annotated[list[Annotated[float, Field(ge=-1e3, le=1e3)]], Field(min_length=6, max_length=6)]
 Name = Annotated[str, Field(min_length=1)]
 
 
@@ -61,10 +65,10 @@ class ReferenceConfig:
         default_factory=lambda: [0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]
     )
     offset: Six = field(default_factory=lambda: [0.0, 0.0, 0.0, 0.0, 0.0, 0.38])
-    frequency: Positive = 1.0
+    frequency: Annotated[float, Field(gt=0, le=1e4)] = 1.0
     frequency_unit: Literal["rad/s", "Hz"] = "rad/s"
-    times: Annotated[list[NonNegative], Field(min_length=2)] | None = None
-    poses: Annotated[list[Six], Field(min_length=2)] | None = None
+    times: Annotated[list[Seconds], Field(min_length=2)] | None = None
+    poses: Annotated[list[Row], Field(min_length=2)] | None = None
     file: Name | None = None
 
 
@@ -87,9 +91,9 @@ class PlantConfig:
     gravity: bool = False
     time_step: Annotated[float, Field(ge=1e-6, le=METRIC_PERIOD)] = 0.001
     accuracy: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-8
-    payload_mass: NonNegative = 0.0
+    payload_mass: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     torque_bias: Six = field(default_factory=lambda: [0.0] * 6)
-    joint_damping: NonNegative = 0.0
+    joint_damping: Annotated[float, Field(ge=0, le=1e3)] = 0.0
 
 
 @dataclass(config=_STRICT)
@@ -138,10 +142,10 @@ class ControllerConfig:
     model: Literal["paper", "multibody"] = "multibody"
     torque_map: Literal["virtual_work", "printed"] = "virtual_work"
     estimator: Literal["none", "parameters"] = "parameters"
-    w_Q: Positive = 1.0
-    w_R: Positive = 1.0
+    w_Q: Weight = 1.0
+    w_R: Weight = 1.0
     weight_scaling: Literal["bryson", "identity"] = "bryson"
-    catch_up: NonNegative | None = None
+    catch_up: Annotated[float, Field(ge=0, le=10)] | None = None
 
 
 @dataclass(config=_STRICT)
@@ -164,7 +168,7 @@ class SensorConfig:
         seed: of the noise; the same seed gives the same run.
     """
 
-    noise_std: Annotated[list[NonNegative], Field(min_length=12, max_length=12)] = field(
+    noise_std: Annotated[list[Deviation], Field(min_length=12, max_length=12)] = field(
         default_factory=lambda: [0.0] * 12
     )
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
@@ -175,8 +179,9 @@ class TunerConfig:
     """Who sets w_Q and w_R while the controller runs.
 
     Attributes:
-        kind: `fixed` (nobody) or `ann` (a neural network).
-        weights: of the network, a shipped name or a file; null is the shipped one.
+        kind: `fixed` (nobody) or `ann` (a neural network, which starts from the controller's w_Q
+            and w_R and goes back to them where it fails).
+        weights: the network, a shipped name or a JSON file; null is the shipped `tuner`.
     """
 
     kind: Literal["fixed", "ann"] = "fixed"

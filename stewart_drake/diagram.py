@@ -31,8 +31,10 @@ from stewart_drake.signals import (
 )
 from stewart_drake.systems.controller import DelayLqiController
 from stewart_drake.systems.delay_chain import DelayChain
+from stewart_drake.systems.density import DensityWindow
 from stewart_drake.systems.reference import Reference
 from stewart_drake.systems.sensor import Sensor
+from stewart_drake.systems.tuner import AnnTuner
 
 Array = NDArray[np.float64]
 
@@ -119,9 +121,9 @@ def build_viewer(
 class ClosedLoop(Diagram):
     """The whole loop; output ports are named after the signals.
 
-    Subsystems: `reference`, `sensor`, `weights`, `controller`, `saturation`, `delay_chain`,
-    `plant`. Output ports: `state`, `reference`, `torque_commanded`, `torque_applied`, `integral`,
-    `weights_used`, `parameters`, `parameter_std`.
+    Subsystems: `reference`, `sensor`, `weights` or `tuner`, `controller`, `saturation`,
+    `delay_chain`, `plant`, `density`. Output ports: `state`, `reference`, `torque_commanded`,
+    `torque_applied`, `integral`, `weights_used`, `parameters`, `parameter_std`, `density`.
 
     Attributes:
         experiment: what it was built from.
@@ -164,9 +166,7 @@ def build_closed_loop(
     sensor = builder.AddNamedSystem(
         "sensor", Sensor(np.array(sc.sensor.noise_std), sc.sensor.seed, sc.controller.period)
     )
-    weights = builder.AddNamedSystem(
-        "weights", ConstantVectorSource(np.array([sc.controller.w_Q, sc.controller.w_R]))
-    )
+    weights = _weights(builder, experiment)
     controller = builder.AddNamedSystem(
         "controller", DelayLqiController(law, believed_queue(experiment, law.options))
     )
@@ -190,6 +190,8 @@ def build_closed_loop(
         DelayChain(sc.controller.period, sc.delay.steps, sc.delay.fraction, true_queue),
     )
     plant = builder.AddNamedSystem("plant", _plant(experiment, meshcat))
+    kind = "magnitude" if experiment.network is None else experiment.network.density
+    density = builder.AddNamedSystem("density", DensityWindow(sc.controller.period, kind))
 
     def connect(source, out: str, target, into: str) -> None:  # type: ignore[no-untyped-def]
         builder.Connect(source.GetOutputPort(out), target.GetInputPort(into))
@@ -201,10 +203,16 @@ def build_closed_loop(
     connect(delay, "torque", plant, "torque")
     connect(plant, "state", sensor, "state")
     connect(sensor, "measurement", controller, "measurement")
+    connect(sensor, "measurement", density, "measurement")
+    connect(reference, "reference", density, "reference")
+    connect(controller, "torque", density, "torque")
+    if experiment.network is not None:
+        connect(density, "density", weights, "density")
 
     builder.ExportOutput(plant.GetOutputPort("state"), "state")
     builder.ExportOutput(reference.GetOutputPort("reference"), "reference")
     builder.ExportOutput(delay.GetOutputPort("torque"), "torque_applied")
+    builder.ExportOutput(density.GetOutputPort("density"), "density")
     for name in ("torque_commanded", "integral", "weights_used", "parameters", "parameter_std"):
         builder.ExportOutput(controller.GetOutputPort(name), name)
     loop = ClosedLoop()
@@ -214,11 +222,19 @@ def build_closed_loop(
     return loop
 
 
+def _weights(builder: DiagramBuilder, experiment: Experiment) -> ConstantVectorSource | AnnTuner:
+    c = experiment.scenario.controller
+    fixed = np.array([c.w_Q, c.w_R])
+    if experiment.network is None:
+        return builder.AddNamedSystem("weights", ConstantVectorSource(fixed))
+    return builder.AddNamedSystem("tuner", AnnTuner(experiment.network, fixed, c.period))
+
+
 def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | MultibodyStewart:
     plant = experiment.scenario.plant
     if plant.kind == "multibody":
         return MultibodyStewart(
-            experiment.mechanism,
+            experiment.truth,
             plant.time_step,
             gravity=plant.gravity,
             torque_bias=plant.torque_bias,
@@ -229,5 +245,5 @@ def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | Mult
     parameters = np.empty(NUM_PARAMETERS)
     parameters[BIAS], parameters[PAYLOAD] = plant.torque_bias, plant.payload_mass
     parameters[DAMPING] = plant.joint_damping
-    truth = StewartDynamics(experiment.mechanism, plant.gravity, parameters)
+    truth = StewartDynamics(experiment.truth, plant.gravity, parameters)
     return ExactPlant(truth, experiment.start)

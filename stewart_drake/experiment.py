@@ -21,14 +21,16 @@ from stewart_drake.errors import ConfigError
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.workspace import diagnose
+from stewart_drake.plant.workspace import Failure, diagnose
+from stewart_drake.resources import resolve
 from stewart_drake.trajectories import evaluate, make_reference, peak_to_peak
+from stewart_drake.tuner.network import DEFAULT, Network, load_network
 
 Array = NDArray[np.float64]
 
 GENTLE = 3.0
 """Torques up to so many times the reference's are predicted with the usual steps."""
-REACH_CHECK_PERIOD = 0.01
+REACH_CHECK_PERIOD = 0.02
 """s between the instants at which a reference is checked against the workspace."""
 
 
@@ -37,6 +39,9 @@ class Experiment(NamedTuple):
 
     scenario: Scenario
     mechanism: Mechanism
+    """As the controller knows it."""
+    truth: Mechanism
+    """The machine that is simulated."""
     reference: Trajectory
     scale: Array
     """(6,) peak to peak of the reference, 1 where it is constant."""
@@ -44,40 +49,74 @@ class Experiment(NamedTuple):
     """The plant as the controller knows it."""
     start: Array
     """(12,) state at t = 0."""
+    network: Network | None
+    """What sets the weights, or None."""
 
 
-def prepare(scenario: Scenario) -> Experiment:
+def prepare(scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
     """Check a scenario against its mechanism.
+
+    Args:
+        scenario: what to run.
+        truth: the machine to simulate where it is not the one that the controller knows.
 
     Raises:
         ConfigError: one line; also where the reference leaves the workspace, with time and leg.
     """
-    scenario.check()
-    if scenario.tuner.kind != "fixed":
+    experiment = assemble(scenario, truth)
+    failure = reference_failure(experiment)
+    if failure is not None:
         raise ConfigError(
-            f"tuner.kind: got {scenario.tuner.kind!r}, which is not built yet; expected 'fixed'"
+            f"reference: {failure.reason} at t = {failure.time:.2f} s"
+            + (f", short by {-1e3 * failure.margin:.3g} mm" if failure.margin < 0 else "")
+            + "; expected a motion within reach, such as one of smaller amplitude"
         )
+    return experiment
+
+
+def reference_failure(experiment: Experiment) -> Failure | None:
+    """Where and why the reference first leaves the workspace, or None."""
+    duration = experiment.scenario.duration
+    for t in np.arange(0.0, duration + REACH_CHECK_PERIOD, REACH_CHECK_PERIOD):
+        failure = diagnose(experiment.mechanism, t, experiment.reference.value(t)[:, 0])
+        if failure is not None:
+            return failure
+    return None
+
+
+def assemble(scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
+    """What `prepare` returns, whether or not the reference stays in the workspace.
+
+    Raises:
+        ConfigError: one line.
+    """
+    scenario.check()
+    network = _network(scenario)
     mechanism = load_mechanism(scenario.mechanism)
     reference = make_reference(scenario.reference, scenario.duration)
-    for t in np.arange(0.0, scenario.duration + REACH_CHECK_PERIOD, REACH_CHECK_PERIOD):
-        failure = diagnose(mechanism, t, reference.value(t)[:, 0])
-        if failure is not None:
-            raise ConfigError(
-                f"reference: {failure.reason} at t = {t:.2f} s"
-                + (f", short by {-1e3 * failure.margin:.3g} mm" if failure.margin < 0 else "")
-                + "; expected a motion within reach, such as one of smaller amplitude"
-            )
     start = evaluate(reference, 0.0)[:12]
     if scenario.start == "rest":
         start[6:] = 0.0
     return Experiment(
         scenario=scenario,
         mechanism=mechanism,
+        truth=mechanism if truth is None else truth,
         reference=reference,
         scale=peak_to_peak(scenario.reference, reference, scenario.duration),
         nominal=StewartDynamics(mechanism, gravity=scenario.plant.gravity),
         start=start,
+        network=network,
     )
+
+
+def _network(scenario: Scenario) -> Network | None:
+    if scenario.tuner.kind == "fixed":
+        return None
+    try:
+        path = resolve("weights", scenario.tuner.weights or DEFAULT)
+    except ConfigError as error:
+        raise ConfigError(f"tuner.{error}") from None
+    return load_network(path)
 
 
 def believed_delay(scenario: Scenario) -> tuple[int, float]:
@@ -113,9 +152,10 @@ def control_law(experiment: Experiment) -> tuple[DelayLqi, Trajectory, float]:
     c = sc.controller
     steps, fraction = believed_delay(sc)
     substeps = choose_substeps(nominal, experiment.reference, c.period, steps, sc.duration)
-    torque_scale = max(0.1, reference_torque(nominal, experiment.reference, sc.duration))
+    peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
+    torque_scale = max(0.1, peak_torque)
     error_weights, integral_weights, torque_weights = weight_scales(
-        c.weight_scaling, nominal, experiment.reference, experiment.scale, sc.duration
+        c.weight_scaling, experiment.scale, peak_torque
     )
     options = LawOptions(
         period=c.period,

@@ -14,7 +14,15 @@ from stewart_drake.diagram import ClosedLoop
 from stewart_drake.experiment import Experiment
 from stewart_drake.plant.workspace import Failure
 from stewart_drake.results import versions
-from stewart_drake.signals import COORDINATES, LEGS, PARAMETERS, POSE, RATES, WEIGHTS
+from stewart_drake.signals import (
+    COORDINATES,
+    LEGS,
+    PARAMETERS,
+    POSE,
+    RATES,
+    TUNER_INPUTS,
+    WEIGHTS,
+)
 
 Array = NDArray[np.float64]
 
@@ -30,6 +38,7 @@ _DIMENSIONS = {
     "weights": "weight",
     "parameters": "parameter",
     "parameter_std": "parameter",
+    "density": "tuner_input",
 }
 _HELD = (
     "integral",
@@ -37,8 +46,15 @@ _HELD = (
     "torque_applied",
     "parameters",
     "parameter_std",
+    "density",
 )
-_LABELS = {"coordinate": COORDINATES, "leg": LEGS, "weight": WEIGHTS, "parameter": PARAMETERS}
+_LABELS = {
+    "coordinate": COORDINATES,
+    "leg": LEGS,
+    "weight": WEIGHTS,
+    "parameter": PARAMETERS,
+    "tuner_input": TUNER_INPUTS,
+}
 
 
 class Recorder:
@@ -46,7 +62,11 @@ class Recorder:
 
     def __init__(self, loop: ClosedLoop) -> None:
         self._loop = loop
+        self._ports: dict[str, Any] = {}
         self._controller: Any = loop.GetSubsystemByName("controller")
+        self._tuner: Any = (
+            loop.GetSubsystemByName("tuner") if loop.HasSubsystemNamed("tuner") else None
+        )
         self._scale = loop.experiment.scale
         self._now: dict[str, Array] = {}
         self._instant = 0.0
@@ -55,9 +75,13 @@ class Recorder:
         self.samples: list[tuple[Array, Array, float]] = []
         """Pose error, torque and computing time at each of the controller's samples."""
         self.counts = Counts()
+        self.tuner_fallbacks = 0
+        """Samples at which the tuner passed its network over."""
 
     def _port(self, context: Context, name: str) -> Array:
-        return np.array(self._loop.GetOutputPort(name).Eval(context))
+        if name not in self._ports:
+            self._ports[name] = self._loop.GetOutputPort(name)
+        return np.array(self._ports[name].Eval(context))
 
     def look(self, context: Context, time: float) -> None:
         """Read plant and reference at the nominal time in s."""
@@ -76,6 +100,9 @@ class Recorder:
         if sampled:
             memory = self._controller.memory(self._controller.GetMyContextFromRoot(context))
             self.counts = memory.counts
+            if self._tuner is not None:
+                tuner_context = self._tuner.GetMyContextFromRoot(context)
+                self.tuner_fallbacks = self._tuner.fallbacks(tuner_context)
             self.samples.append((self._now["error"], memory.torque, memory.seconds))
         if logged:
             held = {name: self._port(context, name) for name in _HELD}
@@ -141,7 +168,7 @@ def summarize(
             "worst": 1e3 * seconds.max() if some else nan,
         },
         "wall_s": wall,
-        "counts": recorder.counts._asdict(),
+        "counts": recorder.counts._asdict() | {"tuner_fallbacks": recorder.tuner_fallbacks},
         "scenario": dataclasses.asdict(sc),
         "versions": versions(),
     }

@@ -12,6 +12,14 @@ from stewart_drake.errors import ConfigError
 
 Kind = Literal["mechanism", "scenario", "controller", "weights"]
 
+KINDS: Final[dict[Kind, str]] = {
+    "mechanism": "mechanisms",
+    "scenario": "scenarios",
+    "controller": "controllers",
+    "weights": "tuner weights",
+}
+"""What there is of shipped data, and its plural."""
+
 _PACKAGE: Final = Path(__file__).resolve().parent
 _PLACES: Final[dict[Kind, tuple[str, str]]] = {
     "mechanism": ("models", ".yaml"),

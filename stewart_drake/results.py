@@ -1,7 +1,6 @@
 """What a run leaves behind, in memory and on disk."""
 
 import json
-import os
 import platform
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -12,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from stewart_drake.config import Scenario
+from stewart_drake.fileio import replacing
 from stewart_drake.plant.workspace import Failure
 
 
@@ -24,8 +24,8 @@ class SimulationResult:
         status: `completed`, `left_workspace`, `solver_failed` or `interrupted`.
         stopped: when and why a run did not complete, or None.
         signals: over `time` (20 ms): pose, rates, reference, reference_rates, error, integral,
-            torque_commanded, torque_applied, weights, parameters and parameter_std (estimated).
-            Held signals show the value from that instant on.
+            torque_commanded, torque_applied, weights, parameters and parameter_std (estimated),
+            density (45). Held signals show the value from that instant on.
         summary: what `summary.json` holds.
     """
 
@@ -59,16 +59,17 @@ class SimulationResult:
 
 def write_signals(path: Path, signals: xr.Dataset) -> None:
     """Write NetCDF by way of a temporary file, so that no half file remains."""
-    partial = path.with_name(f".{path.name}.part")
-    signals.to_netcdf(partial, engine="h5netcdf")
-    os.replace(partial, path)
+    # Made in memory: HDF5 ends the process where a disk is full.
+    content: Any = signals.to_netcdf(engine="h5netcdf")
+    with replacing(path) as partial:
+        partial.write_bytes(content)
 
 
 def write_json(path: Path, data: Any) -> None:
     """Write JSON with NaN as null, by way of a temporary file, so that no half file remains."""
-    partial = path.with_name(f".{path.name}.part")
-    partial.write_text(json.dumps(jsonable(data), indent=2, allow_nan=False) + "\n")
-    os.replace(partial, path)
+    text = json.dumps(jsonable(data), indent=2, allow_nan=False)
+    with replacing(path) as partial:
+        partial.write_text(text + "\n")
 
 
 def jsonable(data: Any) -> Any:

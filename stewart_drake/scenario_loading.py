@@ -5,9 +5,14 @@ is checked on its own, so that a message names the place to mend.
 """
 
 import dataclasses
+import io
+import typing
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.representer import RoundTripRepresenter
 
 from stewart_drake.config import KIND_FIELDS, ControllerConfig, Scenario
 from stewart_drake.errors import ConfigError
@@ -88,6 +93,50 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
         meant = ("kind", *kinds[data[section]["kind"]])
         data[section] = {k: v for k, v in data[section].items() if k in meant}
     return data
+
+
+def scenario_yaml(scenario: Scenario) -> str:
+    """The scenario as the text of a file that `load_scenario` reads back."""
+    yaml, text = YAML(), io.StringIO()
+    yaml.width, yaml.Representer = 96, _Representer
+    yaml.dump(scenario_to_dict(scenario), text)
+    return text.getvalue()
+
+
+class _Representer(RoundTripRepresenter):
+    """Lists on one line, and null by its name."""
+
+    def flat(self, values: list[Any]) -> Any:
+        return self.represent_sequence("tag:yaml.org,2002:seq", values, flow_style=True)
+
+    def null(self, _: None) -> Any:
+        return self.represent_scalar("tag:yaml.org,2002:null", "null")
+
+
+_Representer.add_representer(list, _Representer.flat)
+_Representer.add_representer(type(None), _Representer.null)
+
+
+def setting_choices() -> list[str]:
+    """The beginning of every setting, `plant.time_step=`; whole where values can be counted."""
+    hints: dict[str, Any] = {}
+    for field in dataclasses.fields(Scenario):
+        section = getattr(Scenario(), field.name)
+        if dataclasses.is_dataclass(section):
+            hints |= {
+                f"{field.name}.{leaf.name}": leaf.type for leaf in dataclasses.fields(section)
+            }
+        else:
+            hints[field.name] = field.type
+    choices = []
+    for name, hint in hints.items():
+        values: tuple[Any, ...] = ("",)
+        if hint is bool:
+            values = ("true", "false")
+        elif typing.get_origin(hint) is typing.Literal:
+            values = typing.get_args(hint)
+        choices += [f"{name}={value}" for value in values]
+    return choices
 
 
 def _parse_settings(settings: Iterable[str]) -> dict[str, Any]:

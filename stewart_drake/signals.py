@@ -40,6 +40,13 @@ DAMPING: Final = 7
 
 WEIGHTS: Final = ("w_Q", "w_R")
 
+TUNER_INPUTS: Final = (
+    *(f"error_{name}" for name in COORDINATES),
+    *(f"rate_error_{name}" for name in COORDINATES),
+    *(f"torque_{leg}" for leg in LEGS),
+)
+"""What densities are taken of: `sample` = [state error(12); commanded torque(6)]."""
+
 
 def queue_length(steps: int, fraction: float) -> int:
     """Number of torques in flight at a sampling instant: mu, and one more when eta0 > 0."""

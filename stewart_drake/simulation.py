@@ -19,6 +19,8 @@ from threadpoolctl import threadpool_limits
 from stewart_drake.config import Scenario
 from stewart_drake.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.experiment import prepare
+from stewart_drake.lifetime import let_go
+from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.plant.workspace import Failure, diagnose
 from stewart_drake.recording import Recorder, summarize
 from stewart_drake.results import SimulationResult
@@ -31,7 +33,11 @@ Progress = Callable[[float, float], None]
 
 
 def simulate(
-    scenario: Scenario, *, progress: Progress | None = None, meshcat: Meshcat | None = None
+    scenario: Scenario,
+    *,
+    progress: Progress | None = None,
+    meshcat: Meshcat | None = None,
+    truth: Mechanism | None = None,
 ) -> SimulationResult:
     """Run a scenario from t = 0 to its duration, or until the plate leaves its workspace.
 
@@ -41,20 +47,24 @@ def simulate(
         scenario: what to run.
         progress: called at every logged instant.
         meshcat: where the multibody plant is shown live, or None.
+        truth: the machine to simulate where it is not the one that the controller knows.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
     """
     # Matrices of twenty rows are slower on several threads, fifty times so where cores are busy.
     with threadpool_limits(limits=1):
-        return _run(scenario, progress, meshcat)
+        return _run(scenario, truth, progress, meshcat)
 
 
 def _run(
-    scenario: Scenario, progress: Progress | None, meshcat: Meshcat | None
+    scenario: Scenario,
+    truth: Mechanism | None,
+    progress: Progress | None,
+    meshcat: Meshcat | None,
 ) -> SimulationResult:
     started = clock.perf_counter()
-    experiment = prepare(scenario)
+    experiment = prepare(scenario, truth)
     loop = build_closed_loop(experiment, meshcat=meshcat)
     simulator = make_simulator(loop)
     recorder = Recorder(loop)
@@ -83,6 +93,7 @@ def _run(
         stopped = Failure(context.get_time(), None, np.nan, _one_line(error))
     wall = clock.perf_counter() - started
     signals = recorder.dataset()
+    let_go(loop)
     return SimulationResult(
         scenario=scenario,
         status=status,
@@ -128,7 +139,7 @@ def _failure(loop: ClosedLoop, context: Context) -> Failure:
     if plant.HasOutputPort("crank_angles"):
         cranks = plant.GetOutputPort("crank_angles").Eval(plant_context)
     pose = plant.GetOutputPort("state").Eval(plant_context)[POSE]
-    failure = diagnose(loop.experiment.mechanism, context.get_time(), pose, cranks)
+    failure = diagnose(loop.experiment.truth, context.get_time(), pose, cranks)
     assert failure is not None, "the simulation ended inside the workspace"
     return failure
 

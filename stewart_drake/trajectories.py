@@ -17,7 +17,6 @@ from pydrake.trajectories import (
     PiecewisePolynomial,
     Trajectory,
 )
-from scipy.interpolate import CubicSpline
 
 from stewart_drake.config import ReferenceConfig
 from stewart_drake.errors import ConfigError
@@ -196,6 +195,8 @@ def _sine(config: ReferenceConfig) -> Trajectory:
 
 def _through_waypoints(times: Array, poses: Array) -> Trajectory:
     """Quintics with the knot rates and accelerations of a clamped cubic spline."""
+    from scipy.interpolate import CubicSpline  # slow to import; other references go without
+
     same = np.all(np.diff(poses, axis=0) == 0, axis=1)
     rest = np.zeros(len(times), dtype=bool)
     rest[[0, -1]] = True

@@ -23,8 +23,9 @@ from ruamel.yaml.events import AliasEvent
 from ruamel.yaml.nodes import ScalarNode
 
 from stewart_drake.errors import ConfigError
+from stewart_drake.fileio import read_bytes
 
-_MAX_BYTES: Final = 1_000_000
+_MAX_BYTES: Final = 100_000
 _MAX_DEPTH: Final = 20
 _STR_TAG: Final = "tag:yaml.org,2002:str"
 
@@ -65,7 +66,7 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
     """Reads one YAML mapping from a file.
 
     Args:
-        path: a UTF-8 file of at most 1 MB.
+        path: a UTF-8 file of at most 100 kB.
 
     Returns:
         The mapping, of plain dicts, lists, strings, numbers, booleans and None.
@@ -76,19 +77,12 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
             the file, and the line where there is one.
     """
     path = Path(path)
+    raw = read_bytes(path, _MAX_BYTES, "a small YAML file")
     try:
-        if path.exists() and not path.is_file():
-            raise ConfigError(f"{path}: is not a file; expected a YAML file")
-        with path.open("rb") as stream:
-            raw = stream.read(_MAX_BYTES + 1)
-        if len(raw) > _MAX_BYTES:
-            raise ConfigError(f"{path}: is larger than 1 MB; expected a small YAML file")
         text = raw.decode("utf-8-sig")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
-        raise ConfigError(f"{path}: line {line}: is not UTF-8 text") from None
+        raise ConfigError(f"{path}: line {line}: is not UTF-8 text; expected YAML") from None
     data = parse_yaml(text, str(path))
     if data is None:
         raise ConfigError(f"{path}: is empty; expected a YAML mapping")
@@ -118,12 +112,12 @@ def parse_yaml(text: str, where: str) -> Any:
         line = f"line {mark.line + 1}: " if mark else ""
         problem = str(error.problem or error.context).strip().splitlines()[0]
         problem = problem.partition(", if necessary")[0]  # advice to programmers
-        raise ConfigError(f"{where}: {line}{_cut(problem, 160)}") from None
+        raise ConfigError(f"{where}: {line}{_cut(problem, 160)}; expected plain YAML") from None
     # Numbers of thousands of digits end in ValueError, deep nesting in RecursionError, and some
     # malformed directives in whatever the parser trips over.
     except (YAMLError, ValueError, RecursionError, AssertionError, LookupError) as error:
-        problem = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise ConfigError(f"{where}: is not readable as YAML ({_cut(problem, 160)})") from None
+        problem = _cut((str(error).strip() or type(error).__name__).splitlines()[0], 160)
+        raise ConfigError(f"{where}: is not YAML ({problem}); expected plain YAML") from None
 
 
 def validate(type_: type[_T], data: dict[str, Any], where: str) -> _T:

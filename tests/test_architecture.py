@@ -20,8 +20,8 @@ MAX_LINES = 300
 
 # Imports go one way: a module sees its own line and the lines above it.
 LAYERS = (
-    ("signals", "errors", "timing"),
-    ("yamlio", "resources"),
+    ("signals", "errors", "lifetime", "timing"),
+    ("fileio", "yamlio", "resources"),
     ("config", "scenario_loading"),
     ("trajectories", "reference_files"),
     ("mechanism",),

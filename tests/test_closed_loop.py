@@ -114,5 +114,5 @@ def test_full_amplitude_under_gravity_on_the_exact_plant() -> None:
 
 
 def test_a_tuner_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(sd.ConfigError, match=r"tuner\.kind: got 'ann'"):
-        run("tuner.kind=ann")
+    with pytest.raises(sd.ConfigError, match=r"tuner\.weights: got 'nobody'"):
+        run("tuner.kind=ann", "tuner.weights=nobody")

@@ -391,7 +391,7 @@ def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     for path, part in [
         (binary, "line 2: is not UTF-8"),
-        (large, "larger than 1 MB"),
+        (large, "larger than 100 kB"),
         (tmp_path, "is not a file"),
         (pipe, "is not a file"),
         (tmp_path / "none.yaml", "no file"),

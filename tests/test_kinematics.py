@@ -11,14 +11,17 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.optimize import minimize_scalar
 
+from stewart_drake.mechanism.assembly import joint_state
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import (
     ForwardKinematicsError,
+    SingularPoseError,
     UnreachablePoseError,
     angle_rate_map,
     leg_geometry,
     rotation,
 )
+from tests import singular
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
 Array = NDArray[np.float64]
@@ -297,18 +300,8 @@ def test_error_names_the_legs_and_how_far_each_is_out_of_reach(leg: int, beyond:
 
 @pytest.fixture
 def stretched() -> Mechanism:
-    """Leg 1 exactly at its dead centre at home: numbers without rounding, crank and rod in line."""
-    p_WS, R_WS, p_PQ = PAPER.p_WS.copy(), PAPER.R_WS.copy(), PAPER.p_PQ.copy()
-    p_WS[0], R_WS[0], p_PQ[0] = [-0.375, 0, 0.375], np.eye(3), [0.125, 0, 0]
-    return dataclasses.replace(
-        PAPER,
-        home=[0, 0, 0, 0, 0, 0.375],
-        p_WS=p_WS,
-        R_WS=R_WS,
-        p_PQ=p_PQ,
-        crank_lengths=[0.125, *PAPER.crank_lengths[1:]],
-        rod_lengths=[0.375, *PAPER.rod_lengths[1:]],
-    )
+    """Leg 1 exactly at its dead centre at home."""
+    return singular.stretched()
 
 
 def test_dead_centre_is_the_edge_of_reach(stretched: Mechanism) -> None:
@@ -325,11 +318,21 @@ def test_dead_centre_is_the_edge_of_reach(stretched: Mechanism) -> None:
     np.testing.assert_allclose(angle, np.sqrt(2e-9 * rod / (u * (u + rod))), rtol=1e-6)
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_jacobian_at_a_dead_centre_is_infinite_only_for_that_leg(stretched: Mechanism) -> None:
-    jacobian = stretched.jacobian(stretched.home)
-    assert not np.isfinite(jacobian[0, 3])
-    assert np.all(np.isfinite(jacobian[1:]))
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_jacobian_at_a_dead_centre_names_the_leg(stretched: Mechanism) -> None:
+    """A millimetre inside it is there, and large: the crank's angle goes with the square root."""
+    with pytest.raises(SingularPoseError, match="dead centre of leg 1") as caught:
+        stretched.jacobian(stretched.home)
+    assert caught.value.legs == (1,)
+    with pytest.raises(SingularPoseError):
+        joint_state(stretched, stretched.home, np.array([0, 0, 0, 1.0, 0, 0]))
+    at_rest = joint_state(stretched, stretched.home, np.zeros(6))
+    assert not at_rest.crank_rate.any() and np.isfinite(at_rest.universal).all()
+    # From sqrt(2 x l / (u (u + l))): half of it over x.
+    u, rod, x = 0.125, 0.375, 1e-6
+    inside = stretched.home - [0, 0, 0, x, 0, 0]
+    expected = np.sqrt(2 * rod / (u * (u + rod) * x)) / 2
+    np.testing.assert_allclose(abs(stretched.jacobian(inside)[0, 3]), expected, rtol=1e-4)
 
 
 def test_forward_kinematics_passes_through_a_dead_centre(stretched: Mechanism) -> None:

@@ -56,12 +56,13 @@ def test_closed_loop_has_named_ports_and_systems(plant: str) -> None:
         "weights_used": 2,
         "parameters": 8,
         "parameter_std": 8,
+        "density": 18,
     }
     found = [loop.get_output_port(i) for i in range(loop.num_output_ports())]
     assert {port.get_name(): port.size() for port in found} == sizes
     assert loop.num_input_ports() == 0
-    names = ("reference", "sensor", "weights", "controller", "saturation", "delay_chain", "plant")
-    assert {system.get_name() for system in loop.GetSystems()} == set(names)
+    names = "reference sensor weights controller saturation delay_chain plant density"
+    assert {system.get_name() for system in loop.GetSystems()} == set(names.split())
 
 
 def test_log_is_on_the_metrics_grid_with_named_coordinates() -> None:
@@ -244,7 +245,12 @@ def test_summary_is_what_the_signals_say() -> None:
     assert run.summary["cost"] == pytest.approx(
         metrics.quadratic_cost(error[samples], torques, 0.1, 1.0, 1.0, True), rel=1e-9
     )
-    assert set(run.summary["counts"]) == {"riccati_failures", "bad_measurements", "saturated_steps"}
+    assert set(run.summary["counts"]) == {
+        "riccati_failures",
+        "bad_measurements",
+        "saturated_steps",
+        "tuner_fallbacks",
+    }
     assert run.summary["failure"] is None
     assert run.failure is None
 

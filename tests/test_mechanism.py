@@ -103,8 +103,8 @@ INVALID = [
         "each of 0 to 5 once",
     ),
     ({"pattern.plate_order": [6, 0, 1, 2, 3, 4]}, "pattern.plate_order[0]: got 6", "at most 5"),
-    ({"pattern.base_radius": -0.22}, "pattern.base_radius: got -0.22", "above 0"),
-    ({"pattern.plate_radius": 0}, "pattern.plate_radius: got 0", "above 0"),
+    ({"pattern.base_radius": -0.22}, "pattern.base_radius: got -0.22", "at least 1e-06"),
+    ({"pattern.plate_radius": 0}, "pattern.plate_radius: got 0", "at least 1e-06"),
     ({"pattern.rotation_deg": float("nan")}, "pattern.rotation_deg: got nan", "finite"),
     (
         {"home": [0, 0, 0, 0, 0, 0.6]},

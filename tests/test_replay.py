@@ -1,12 +1,25 @@
-"""Runs are shown again through the SDFormat model."""
+"""Runs are shown again through the SDFormat model, beside their reference."""
+
+import dataclasses
+import json
+import logging
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.geometry import Meshcat, MeshcatParams
 
 import stewart_drake as sd
 from stewart_drake.diagram import build_viewer
+from stewart_drake.plant.workspace import Failure
 from stewart_drake.report import replay as replay_module
+from stewart_drake.report.replay import CRANK_PARTS, replay_html, write_replay
+from stewart_drake.report.replay_shapes import pointer, ring
+from stewart_drake.resources import shipped
 from stewart_drake.signals import LEGS
+
+PAPER = sd.load_mechanism("paper")
 
 
 @pytest.fixture(scope="module")
@@ -15,13 +28,16 @@ def run() -> sd.SimulationResult:
     return sd.simulate(sd.load_scenario("paper", settings=settings))
 
 
-def test_every_frame_of_an_exact_run_closes_the_loops_of_the_model(
-    run: sd.SimulationResult, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def data_of(html: str) -> dict:
+    """What the page's own script works with."""
+    return json.loads(re.search(r"const run = (\{.*\});", html)[1])
+
+
+def test_every_frame_of_an_exact_run_closes_the_loops_of_the_model(run, monkeypatch):
     gaps = []
     original = replay_module.set_pose
 
-    def watched(plant, tree, *args):  # type: ignore[no-untyped-def]
+    def watched(plant, tree, *args):
         original(plant, tree, *args)
         for leg in LEGS:
             ends = (
@@ -31,15 +47,98 @@ def test_every_frame_of_an_exact_run_closes_the_loops_of_the_model(
             gaps.append(np.abs(next(ends) - next(ends)).max())
 
     monkeypatch.setattr(replay_module, "set_pose", watched)
-    meshcat = replay_module.replay(run.signals, sd.load_mechanism("paper"))
+    meshcat = replay_module.replay(run.signals, PAPER)
     assert len(gaps) == 6 * len(run.signals.time)
     assert max(gaps) < 1e-12
     html = meshcat.StaticHtml()
     assert "<html" in html.lower() and len(html) > 100_000
 
 
-def test_the_viewer_knows_the_model(run: sd.SimulationResult) -> None:
-    meshcat = replay_module.replay(run.signals, sd.load_mechanism("paper"))
-    assert meshcat.HasPath("/drake/visualizer/paper/plate")
-    _, plant, _ = build_viewer(sd.load_mechanism("paper"), meshcat)
-    assert plant.num_actuators() == 6
+@pytest.mark.parametrize("name", shipped("mechanism"))
+def test_the_viewer_has_what_the_page_colours(name):
+    mechanism = sd.load_mechanism(name)
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    diagram, plant, _ = build_viewer(mechanism, meshcat)
+    diagram.ForcedPublish(diagram.CreateDefaultContext())
+    paths = replay_module._crank_paths(mechanism.name)
+    assert plant.num_actuators() == len(paths) == 6
+    for parts in paths:
+        assert [part[-1] for part in parts] == list(CRANK_PARTS)
+        assert all(meshcat.HasPath("/" + "/".join(part)) for part in parts)
+
+
+def test_the_reference_is_shown_as_a_ghost_and_as_a_path(run):
+    meshcat = replay_module.replay(run.signals, PAPER)
+    for path in ("/reference/ring", "/reference/pointer", "/paths/reference", "/paths/plate"):
+        assert meshcat.HasPath(path)
+
+
+def test_the_page_holds_what_the_run_was_like(run):
+    data = data_of(replay_html(run, PAPER, "a <run>"))
+    e = run.signals.error.values
+    assert np.allclose(data["time"], run.signals.time.values, atol=1e-4)
+    assert np.allclose(data["position"], 1e3 * np.linalg.norm(e[:, 3:], axis=1), atol=1e-4)
+    # For small errors of small angles the turn is about as large as the angles' errors.
+    assert np.allclose(data["angle"], np.rad2deg(np.linalg.norm(e[:, :3], axis=1)), rtol=0.2)
+    torque = run.signals.torque_applied.values
+    shares = np.array(data["share"])
+    assert np.abs(shares).max() == 1 and (np.sign(shares) == np.sign(torque))[shares != 0].all()
+
+
+def test_the_angle_of_the_page_is_that_of_one_turn(run):
+    """Known by construction: the plate is turned about z against its reference."""
+    signals = run.signals.copy(deep=True)
+    signals["reference"] = 0 * signals.reference + PAPER.home
+    signals["pose"] = signals.reference.copy(deep=True)
+    signals.pose.values[:, 2] += np.deg2rad(3.0)
+    signals["error"] = signals.pose - signals.reference
+    data = data_of(replay_html(dataclasses.replace(run, signals=signals), PAPER, "turned"))
+    assert np.allclose(data["angle"], 3.0, atol=1e-4) and np.allclose(data["position"], 0.0)
+
+
+def test_names_are_escaped_and_the_outcome_is_told(run):
+    failed = dataclasses.replace(
+        run, status="left_workspace", stopped=Failure(0.4, 2, 0.0, "leg 2 was too short")
+    )
+    html = replay_html(failed, PAPER, "<script>alert(1)</script>")
+    assert "<script>alert(1)" not in html and "&lt;script&gt;alert(1)" in html
+    assert "left workspace at 0.40 s" in html
+
+
+def test_runs_of_one_instant_or_none_can_be_shown(run):
+    for rows in (0, 1):
+        short = dataclasses.replace(run, signals=run.signals.isel(time=slice(0, rows)))
+        assert len(data_of(replay_html(short, PAPER, "short"))["time"]) == rows
+
+
+def test_a_long_run_is_thinned_out(run, monkeypatch):
+    monkeypatch.setattr(replay_module, "_MAX_FRAMES", 7)
+    data = data_of(replay_html(run, PAPER, "long"))
+    assert 5 <= len(data["time"]) <= 7
+    assert np.allclose(np.diff(data["time"]), data["time"][1])
+
+
+def test_a_run_that_ends_outside_is_shown_up_to_there(run):
+    signals = run.signals.copy(deep=True)
+    signals.pose.values[-3:, 5] += 1.0
+    outside = dataclasses.replace(run, signals=signals)
+    assert "off by" in replay_html(outside, PAPER, "outside")
+
+
+def test_writing_is_whole_or_not_at_all_and_says_nothing(run, tmp_path, caplog, capfd):
+    with caplog.at_level(logging.INFO):
+        path = write_replay(run, PAPER, tmp_path / "replay.html", "run")
+    assert [file.name for file in tmp_path.iterdir()] == ["replay.html"]
+    assert path.stat().st_size < 8e6, "somebody may want to send it"
+    assert not caplog.records and capfd.readouterr() == ("", "")
+    with pytest.raises(OSError):
+        write_replay(run, PAPER, Path(tmp_path / "missing" / "replay.html"), "run")
+
+
+def test_the_ring_is_a_closed_surface_around_the_plate():
+    for vertices, faces in (ring(0.1), pointer(0.1)):
+        edges = np.sort(np.hstack([faces[[0, 1]], faces[[1, 2]], faces[[2, 0]]]), axis=0)
+        _, counts = np.unique(edges, axis=1, return_counts=True)
+        assert (counts == 2).all(), "every edge belongs to two triangles"
+        assert np.hypot(*vertices[:2]).min() > 0.1, "the plate stays visible"
+        assert set(np.unique(faces)) == set(range(vertices.shape[1]))

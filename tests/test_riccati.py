@@ -323,3 +323,21 @@ def test_a_solver_that_answers_nonsense_or_ends_the_process_is_caught(
         monkeypatch.setattr(riccati, "DiscreteAlgebraicRiccatiEquation", answer)
         with pytest.raises(RiccatiError, match=message):
             lqr(A, B, Q, R)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    size=st.integers(1, 12),
+    radius=st.sampled_from([0.0, 0.3, 0.99, 1 - 1e-6, 1 + 1e-6, 1.5, 1e3]),
+    shear=st.sampled_from([0.0, 1.0, 1e3]),
+)
+@settings(deadline=None)
+def test_contraction_is_decided_as_by_the_eigenvalues(
+    seed: int, size: int, radius: float, shear: float
+) -> None:
+    """Also where the first powers grow because the eigenvectors are nearly parallel."""
+    generator = np.random.default_rng(seed)
+    eigenvalues = radius * generator.uniform(-1, 1, size)
+    eigenvalues[0] = radius
+    triangle = np.diag(eigenvalues) + shear * np.triu(generator.uniform(-1, 1, (size, size)), 1)
+    assert riccati.is_contracting(triangle) == (radius < 1)

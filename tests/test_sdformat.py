@@ -5,6 +5,7 @@ import logging
 import re
 import subprocess
 import sys
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -14,10 +15,11 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
+from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
 from stewart_drake.plant.multibody import add_mechanism, set_pose
-from stewart_drake.resources import data_root
+from stewart_drake.resources import data_root, shipped
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
 Array = NDArray[np.float64]
@@ -86,21 +88,36 @@ def gaps(mechanism: Mechanism, plant: MultibodyPlant, context: Context) -> tuple
 # ------------------------------------------------------------------ the document
 
 
-def test_committed_file_is_what_the_writer_writes() -> None:
+@pytest.mark.parametrize("name", shipped("mechanism"))
+def test_committed_file_is_what_the_writer_writes(name: str) -> None:
     """Up to the last digit, in which platforms may differ."""
     number = re.compile(r"-?\d+(\.\d+)?(e[+-]\d+)?")
-    committed, written = (MODELS / "paper.sdf").read_text(), to_sdformat(PAPER)
+    committed = (MODELS / f"{name}.sdf").read_text()
+    written = to_sdformat(load_mechanism(name))
     assert number.sub("#", committed) == number.sub("#", written)
     values = [[float(n.group()) for n in number.finditer(text)] for text in (committed, written)]
     np.testing.assert_allclose(*values, rtol=1e-13, atol=1e-15)
 
 
-def test_package_url_resolves() -> None:
+@pytest.mark.parametrize("name", shipped("mechanism"))
+def test_package_url_resolves(name: str) -> None:
     plant = MultibodyPlant(time_step=1e-3)
     parser = Parser(plant)
     parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
-    parser.AddModelsFromUrl("package://stewart_drake_models/paper.sdf")
-    assert plant.HasModelInstanceNamed("paper")
+    parser.AddModelsFromUrl(f"package://stewart_drake_models/{name}.sdf")
+    assert plant.HasModelInstanceNamed(name)
+
+
+def test_the_plate_is_drawn_at_its_joints() -> None:
+    """Also where its centre of mass, the frame's origin, is elsewhere."""
+    mechanism = load_mechanism("motion_base")
+    deck = mechanism.p_PQ[0, 2]
+    plate = ElementTree.fromstring(to_sdformat(mechanism)).find(".//link[@name='plate']")
+    assert plate is not None
+    for name in ("disc", "x_axis", "x_axis_tip"):
+        pose = plate.findtext(f"visual[@name='{name}']/pose")
+        assert pose is not None
+        assert 0 < float(pose.split()[2]) - deck < 0.1 * mechanism.rod_lengths[0]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -229,6 +229,9 @@ def test_units_and_the_order_of_columns_are_read_from_the_header(tmp_path: Path)
 GOOD_ROWS = [f"{t / 10},0,0,0,0,0,0.38" for t in range(6)]
 
 
+MOVING = "\n".join([HEADER, *(f"{t / 10},0,0,0,{t / 100},0,0.38" for t in range(6))])
+
+
 def changed(row: int, text: str) -> str:
     rows = list(GOOD_ROWS)
     rows[row] = text
@@ -261,7 +264,19 @@ BAD_CSV = {
     "pitch in degrees": (changed(1, "0.1,0,5,0,0,0,0.38"), ["row 3", "pitch[rad]", "90 degrees"]),
     "yaw jumps": (changed(1, "0.1,0,0,6.2,0,0,0.38"), ["row 3", "yaw[rad]", "unwrap"]),
     "open quote": (changed(1, '"0.1,0,0,0,0,0,0.38'), ["row 7", "is not CSV"]),
-    "moving end": (changed(5, "0.5,0,0,0,0.1,0,0.38"), ["last row", " x at 0.5 s", "duration"]),
+    "moving end": (MOVING, ["last row", " x at 0.5 s", "duration"]),
+    "glitch": (
+        f"{MOVING}\n0.6,0,0,0,0.06,0,0.40\n0.7,0,0,0,0.07,0,0.38\n0.8,0,0,0,0.08,0,0.38",
+        ["row 8", "z[m]", "0.02 m off", "resample"],
+    ),
+    "jump": (
+        "\n".join([HEADER, *(f"{t / 10},0,{0.2 * (t > 5)},0,0,0,0.38" for t in range(12))]),
+        ["pitch[rad]", "0.1 rad off", "smooth"],
+    ),
+    "too few samples": (
+        "\n".join([HEADER, *(f"{t},0,0,0,{math.sin(1.5 * t)},0,0" for t in range(20))]),
+        ["x[m]", "ten samples per swing"],
+    ),
 }
 
 
@@ -277,6 +292,28 @@ def test_a_bad_csv_file_is_refused_in_one_line(case: str, tmp_path: Path) -> Non
     assert message.startswith(f"{path}: ")
     for part in parts:
         assert part in message
+
+
+@given(noise=st.floats(0, 2.5e-4), seed=st.integers(0, 2**32 - 1), jitter=st.floats(0, 0.3))
+@settings(deadline=None, max_examples=50)
+def test_a_measured_motion_with_noise_and_uneven_steps_is_accepted(
+    noise: float, seed: int, jitter: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Ten samples per period; angles and two positions are still but for the noise.
+
+    On an even grid noise shows by at most 1 + 4/3 + 1/3 times itself, two thirds of the bound.
+    """
+    rng = np.random.default_rng(seed)
+    times = np.arange(60) / 10 + jitter * rng.uniform(-0.05, 0.05, 60)
+    times[0] = 0.0
+
+    def motion(t: float) -> Array:
+        pose = np.array(HOME) + rng.uniform(-noise, noise, 6)
+        return pose + [0, 0, 0, 0, 0, 0.08 * math.sin(2 * math.pi * t)]
+
+    path = tmp_path_factory.getbasetemp() / "measured.csv"
+    trajectory = make_reference(sample_csv(path, times, motion), 5.0)
+    assert abs(evaluate(trajectory, 2.25)[5] - 0.46) < 0.01
 
 
 def test_what_is_no_csv_file_is_refused(tmp_path: Path) -> None:

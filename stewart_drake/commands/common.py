@@ -1,23 +1,66 @@
 """What the commands share: their usual options, and how they answer."""
 
+import contextlib
+import fcntl
 import json
+import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from stewart_drake.errors import ConfigError
 
+if TYPE_CHECKING:
+    from stewart_drake.resources import Kind
+
 INTERRUPTED: Final = 130
 """Exit status after Ctrl-C."""
 
-ScenarioName = Annotated[str, typer.Argument(metavar="SCENARIO", help="Shipped name or file.")]
-MechanismName = Annotated[str, typer.Argument(metavar="MECHANISM", help="Shipped name or file.")]
+_held: Final = contextlib.ExitStack()
+"""What is to be undone when the running command ends."""
+
+
+def _shipped(kind: "Kind") -> Callable[[str], list[str]]:
+    """What a shell offers for an argument: the shipped names that go on from what is typed."""
+
+    def complete(incomplete: str) -> list[str]:
+        from stewart_drake.resources import shipped
+
+        return [name for name in shipped(kind) if name.startswith(incomplete)]
+
+    return complete
+
+
+def complete_setting(incomplete: str) -> list[str]:
+    """What a shell offers for `--set`: fields, and where a field has few values, these."""
+    from stewart_drake.scenario_loading import setting_choices
+
+    return [text for text in setting_choices() if text.startswith(incomplete)]
+
+
+ScenarioName = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENARIO", help="Shipped name or file.", autocompletion=_shipped("scenario")
+    ),
+]
+MechanismName = Annotated[
+    str,
+    typer.Argument(
+        metavar="MECHANISM", help="Shipped name or file.", autocompletion=_shipped("mechanism")
+    ),
+]
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="FIELD=VALUE", help="E.g. plant.gravity=true; repeatable."),
+    typer.Option(
+        "--set",
+        metavar="FIELD=VALUE",
+        help="E.g. plant.gravity=true; repeatable.",
+        autocompletion=complete_setting,
+    ),
 ]
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="For summary, signals, figures.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
@@ -35,23 +78,50 @@ def print_json(summary: dict[str, Any]) -> None:
     typer.echo(json.dumps(jsonable(summary), indent=2, allow_nan=False))
 
 
-def check_writable(directory: Path | None) -> None:
-    """Make the directory of `--out` if there is none.
+def check_writable(directory: Path | None, *, alone: bool = True) -> None:
+    """Make the directory of `--out` if there is none; see also `release`.
+
+    Args:
+        directory: or None.
+        alone: whether no other command may write there until this one ends.
 
     Raises:
-        ConfigError: it cannot be written to.
+        ConfigError: it cannot be written to, or another command is writing there.
     """
     if directory is None:
         return
     try:
+        made = [path for path in (directory, *directory.parents) if not path.exists()]
         directory.mkdir(parents=True, exist_ok=True)
+        _held.callback(_remove_empty, made)
         with tempfile.TemporaryFile(dir=directory):
             pass
-    except OSError as error:
+        if alone:
+            # A lock on the directory itself leaves no file, and ends with the process in any case.
+            lock = os.open(directory, os.O_RDONLY)
+            _held.callback(os.close, lock)
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise ConfigError(
+            f"--out: got {str(directory)!r}, where another command is writing; wait for it to end, "
+            "or choose another directory"
+        ) from None
+    except (OSError, ValueError) as error:  # a ValueError for a zero byte in the name
         raise ConfigError(
             f"--out: got {str(directory)!r}; expected a directory that can be written "
-            f"({error.strerror})"
+            f"({getattr(error, 'strerror', None) or error})"
         ) from None
+
+
+def release() -> None:
+    """End what `check_writable` has begun: unlock, remove made directories that stayed empty."""
+    _held.close()
+
+
+def _remove_empty(directories: list[Path]) -> None:
+    with contextlib.suppress(OSError):
+        for path in directories:
+            path.rmdir()
 
 
 def remove(directory: Path, names: Iterable[str]) -> None:

@@ -1,13 +1,23 @@
-"""Looking at mechanisms: model check, model sdf."""
+"""Looking at mechanisms: model check, model sdf, model view."""
 
-import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stewart_drake.commands.common import MechanismName, check_writable
+from stewart_drake.commands.common import (
+    AsJson,
+    MechanismName,
+    Quiet,
+    check_writable,
+    open_meshcat,
+    print_json,
+    remove,
+    silence,
+)
 from stewart_drake.errors import ConfigError
+from stewart_drake.fileio import replacing
+from stewart_drake.report.terminal import echo
 
 app = typer.Typer(rich_markup_mode=None, help="Look at a mechanism.")
 
@@ -29,16 +39,62 @@ def sdf(
         return
     if out.is_dir():
         raise ConfigError(f"--out: got {str(out)!r}, a directory; expected a file")
-    check_writable(out.parent)
-    partial = out.with_name(f".{out.name}.part")
-    partial.write_text(text)
-    os.replace(partial, out)
+    check_writable(out.parent, alone=False)
+    with replacing(out) as partial:
+        partial.write_text(text)
 
 
 @app.command()
-def check(mechanism: MechanismName) -> None:
+def check(
+    mechanism: MechanismName,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="For summary and a drawing.")
+    ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
     """Check a mechanism and describe it at its home pose, under gravity."""
     from stewart_drake.mechanism.files import load_mechanism
-    from stewart_drake.report.tables import mechanism_table
+    from stewart_drake.report.mechanism_table import mechanism_table
+    from stewart_drake.studies.mechanism_check import check_mechanism
 
-    typer.echo(mechanism_table(load_mechanism(mechanism)))
+    check_writable(out)
+    say = silence if quiet or as_json else echo
+    found = check_mechanism(load_mechanism(mechanism))
+    say(mechanism_table(found))
+    if out is not None:
+        from stewart_drake.report.mechanism_figures import write_mechanism_figure
+        from stewart_drake.results import write_json
+
+        remove(out, ["summary.json"])
+        write_mechanism_figure(found.mechanism, out)
+        write_json(out / "summary.json", found.summary)
+        say(f"written to {out}: summary.json, mechanism.png, mechanism.svg")
+    if as_json:
+        print_json(found.summary)
+
+
+@app.command()
+def view(
+    mechanism: MechanismName,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="For a page of the home pose; then end.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Show a mechanism in a browser, with sliders for its pose and its reach margins."""
+    from stewart_drake.mechanism.files import load_mechanism
+    from stewart_drake.report.viewer import STOP, PoseViewer
+
+    check_writable(out)
+    say = silence if quiet else echo
+    viewer = PoseViewer(load_mechanism(mechanism), open_meshcat())
+    if out is not None:
+        text = viewer.meshcat.StaticHtml()
+        with replacing(out / "view.html") as partial:
+            partial.write_text(text)
+        say(f"written to {out}: view.html")
+        return
+    # A reader needs the address even when everything else is quiet.
+    echo(f"showing it at {viewer.meshcat.web_url()}, ends with {STOP!r} there or Ctrl-C")
+    viewer.run(say)

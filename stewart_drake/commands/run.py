@@ -1,8 +1,8 @@
-"""Running scenarios: simulate, compare."""
+"""Running scenarios: simulate, compare, export."""
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -19,7 +19,15 @@ from stewart_drake.commands.common import (
     remove,
     silence,
 )
+from stewart_drake.errors import ConfigError
 from stewart_drake.report.terminal import echo, progress_bars
+
+if TYPE_CHECKING:
+    from stewart_drake.mechanism.geometry import Mechanism
+    from stewart_drake.results import SimulationResult
+
+CSV: Final = "signals.csv"
+REPLAY: Final = "replay.html"
 
 
 def simulate(
@@ -29,6 +37,10 @@ def simulate(
     ] = None,
     settings: Settings = None,
     out: Out = None,
+    csv: Annotated[bool, typer.Option("--csv", help="Write signals.csv too; needs --out.")] = False,
+    replay: Annotated[
+        bool, typer.Option("--replay", help="Write replay.html, a 3-D animation; needs --out.")
+    ] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
     meshcat: Annotated[
@@ -42,6 +54,9 @@ def simulate(
     from stewart_drake.simulation import simulate as run
     from stewart_drake.studies.verdict import delay_verdict
 
+    for option, given in (("--csv", csv), ("--replay", replay)):
+        if given and out is None:
+            raise ConfigError(f"{option}: got it without --out; expected --out DIR to write into")
     say = silence if quiet or as_json else echo
     experiment = prepare(load_scenario(scenario, controller, settings or ()))
     check_writable(out)
@@ -54,25 +69,68 @@ def simulate(
         result = run(experiment.scenario, progress=progress[name], meshcat=viewer)
     say(run_table(result))
     if out is not None:
-        from stewart_drake.report.figures import run_figures
-
-        # The summary comes last: where there is one, everything beside it is of the same run.
-        remove(out, ["summary.json"])
-        figures = run_figures(result, out)
-        result.save(out)
-        say(f"written to {out}: summary.json, signals.nc, {len(figures)} figures")
+        written = _write_run(result, experiment.mechanism, out, name, csv, replay or meshcat)
+        say(f"written to {out}: {', '.join(written)}")
     if as_json:
         print_json(result.summary)
     if viewer is not None:
-        from stewart_drake.report.replay import replay
+        from stewart_drake.report.replay import replay as play
 
-        replay(result.signals, experiment.mechanism, viewer)
-        if out is not None:
-            (out / "replay.html").write_text(viewer.StaticHtml())
-            say(f"written to {out}: replay.html")
+        play(result.signals, experiment.mechanism, viewer)
         if sys.stdin.isatty():
             input(f"replay at {viewer.web_url()}, Enter ends")
     return INTERRUPTED if result.status == "interrupted" else 0
+
+
+def _write_run(
+    result: "SimulationResult",
+    mechanism: "Mechanism",
+    out: Path,
+    name: str,
+    csv: bool,
+    replay: bool,
+) -> list[str]:
+    """Write what a run leaves behind; what was written, in words."""
+    from stewart_drake.report.figures import run_figures
+
+    # The summary comes last: where there is one, everything beside it is of the same run.
+    remove(out, ["summary.json", CSV, REPLAY])
+    figures = run_figures(result, out)
+    written = ["summary.json", "signals.nc", f"{len(figures)} figures"]
+    if csv:
+        from stewart_drake.report.csv_file import write_csv
+
+        write_csv(result.signals, out / CSV)
+        written.insert(2, ".csv")
+    if replay:
+        from stewart_drake.report.replay import write_replay
+
+        write_replay(result, mechanism, out / REPLAY, name)
+        written.append(REPLAY)
+    result.save(out)
+    return written
+
+
+def export(
+    signals: Annotated[Path, typer.Argument(metavar="FILE.nc", help="Saved by a simulation.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Instead of standard output.")
+    ] = None,
+) -> None:
+    """Convert saved signals to CSV.
+
+    A line per instant; the header names each column's unit.
+    """
+    from stewart_drake.report.csv_file import read_signals, signals_csv, write_csv
+
+    dataset = read_signals(signals)
+    if out is None:
+        typer.echo(signals_csv(dataset), nl=False)
+        return
+    if out.is_dir():
+        raise ConfigError(f"--out: got {str(out)!r}, a directory; expected a file")
+    check_writable(out.parent, alone=False)
+    write_csv(dataset, out)
 
 
 def compare(

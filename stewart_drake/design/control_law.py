@@ -69,6 +69,8 @@ class DelayLqi:
         nodes = (self._holds[:, None] + o.period * GAUSS_NODES).ravel()
         self.preview_times: Array = np.concatenate([[0.0], self._samples, nodes])
         """Times from now, s, at which the reference must be known; some may be negative."""
+        scale = [o.error_weights, o.integral_weights] if o.integral else [o.error_weights]
+        self._Q, self._R = np.diag(np.concatenate(scale)), np.diag(o.torque_weights)
         self._compile()
 
     def _compile(self) -> None:
@@ -98,6 +100,7 @@ class DelayLqi:
             seconds=0.0,
         )
 
+    @np.errstate(over="ignore", invalid="ignore")  # its outcome is checked and counted instead
     def step(self, memory: Memory, measurement: Array, preview: Array, weights: Array) -> Memory:
         """One sample.
 
@@ -250,9 +253,9 @@ class DelayLqi:
         states = np.vstack([x, ends])
         errors = states - preview[: o.steps + 1, :NUM_STATE]
         if o.integral:
-            for j in range(o.steps):
-                if not self._at_limit(torques[each * j : each * (j + 1)]):
-                    integral = integral + o.period / 2 * (errors[j, POSE] + errors[j + 1, POSE])
+            added = o.period / 2 * (errors[:-1, POSE] + errors[1:, POSE])
+            held = [self._at_limit(t) for t in torques.reshape(o.steps, -1)]
+            integral = integral + added[~np.array(held)].sum(axis=0)
         return states[-1], errors[-1], integral
 
     def _model(self, point: Array, torque: Array, theta: Array) -> ContinuousModel:
@@ -273,10 +276,10 @@ class DelayLqi:
     def _gain(self, model: ContinuousModel, weights: Array) -> Array:
         """What the vector [error; integral; pending torques] is multiplied with."""
         o = self.options
+        if not np.all(np.isfinite(weights)):
+            raise ValueError(f"weights: got {weights}; expected finite numbers")
         delayed = delayed_model(model, o.period, o.steps, o.fraction, integral=o.integral)
-        scale = [o.error_weights, o.integral_weights] if o.integral else [o.error_weights]
-        Q = weights[0] * np.diag(np.concatenate(scale))
-        K = reduced_gain(delayed, Q, weights[1] * np.diag(o.torque_weights))
+        K = reduced_gain(delayed, weights[0] * self._Q, weights[1] * self._R)
         return K @ prediction_matrix(delayed) if o.prediction == "linear" else K
 
     def _limit(self, torque: Array) -> Array:

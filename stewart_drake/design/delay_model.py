@@ -103,9 +103,11 @@ def delayed_model(
         n, p = A.shape[0], C.shape[0]
         half = period / 2 * C
         # z_{k+1} = z_k + dt/2 C (e_k + A e_k + B_old T_{k-mu-1} + B_new T_{k-mu})
-        A = np.block([[A, np.zeros((n, p))], [half @ (np.eye(n) + A), np.eye(p)]])
-        B_old, B_new = (np.vstack([B, half @ B]) for B in (B_old, B_new))
-        C = np.block([[C, np.zeros((p, p))], [np.zeros((p, n)), np.eye(p)]])
+        sampled, A = A, np.eye(n + p)
+        A[:n, :n], A[n:, :n] = sampled, half + half @ sampled
+        C = np.zeros((2 * p, n + p))
+        C[:p, :n], C[p:, n:] = model.C, np.eye(p)
+        B_old, B_new = (np.concatenate([B, half @ B]) for B in (B_old, B_new))
     return DelayedModel(A, B_old, B_new, C, steps, fraction)
 
 
@@ -119,6 +121,8 @@ def chain(model: DelayedModel, *, always_extra: bool = False) -> ChainModel:
     n, m = model.B_new.shape
     extra = always_extra or model.fraction > 0
     length = model.steps + int(extra)
+    if length == 0:
+        return ChainModel(model.A, model.B_new, model.C)
     A = np.zeros((n + m * length, n + m * length))
     B = np.zeros((n + m * length, m))
     A[:n, :n] = model.A
@@ -126,8 +130,7 @@ def chain(model: DelayedModel, *, always_extra: bool = False) -> ChainModel:
     for place, column in enumerate(torques):
         target = A[:n, n + m * place :] if place < length else B[:n]
         target[:, :m] += column
-    if length > 0:
-        A[n : n + m * (length - 1), n + m :] = np.eye(m * (length - 1))
-        B[n + m * (length - 1) :] = np.eye(m)
+    A[n : n + m * (length - 1), n + m :] = np.eye(m * (length - 1))
+    B[n + m * (length - 1) :] = np.eye(m)
     C = np.hstack([model.C, np.zeros((model.C.shape[0], m * length))])
     return ChainModel(A, B, C)

@@ -31,14 +31,15 @@ from stewart_drake.signals import (
 
 Array = NDArray[np.float64]
 THETA = slice(NUM_STATE, NUM_STATE + NUM_PARAMETERS)
-
 GATE = float(chdtri(NUM_STATE, 1e-6))
 """Squared innovation, in units of its covariance, above which a measurement is an outlier."""
 ITERATIONS = 4
 """At the most; one does once the parameters are roughly known."""
 MIDPOINT = np.array([0.5])
+SMALL = 0.1
+"""A correction so many standard deviations long needs no second look."""
 KNOWN = 0.01
-"""A parameter counts as known when its standard deviation is this share of the prior's."""
+"""A parameter is known when its standard deviation is this share of the prior's."""
 PATIENCE = 3
 """After so many outliers in a row the model must be wrong, and the measurement is believed."""
 
@@ -85,7 +86,8 @@ def filter_settings(
     prior, lower, upper = (np.empty(NUM_PARAMETERS) for _ in range(3))
     bias_bound = 100 * torque_scale if torque_limit is None else torque_limit
     prior[BIAS], lower[BIAS], upper[BIAS] = 0.3 * torque_scale, -bias_bound, bias_bound
-    prior[PAYLOAD], lower[PAYLOAD], upper[PAYLOAD] = 0.25 * plate_mass, 0.0, 10 * plate_mass
+    prior[PAYLOAD], upper[PAYLOAD] = 0.25 * plate_mass, 10 * plate_mass
+    lower[PAYLOAD] = -0.5 * plate_mass  # a plate that is lighter than believed
     prior[DAMPING], lower[DAMPING], upper[DAMPING] = 0.1 * torque_scale, 0.0, 100 * torque_scale
     model_std = MODEL_ERROR * np.concatenate([motion_scale, motion_scale])
     return FilterSettings(np.asarray(noise_std), prior, lower, upper, model_std)
@@ -133,7 +135,7 @@ def advance(
 ) -> Estimate:
     """One period: torques (n, 6) acted for `durations` (n,) s; then a measurement (12,), or none.
 
-    The first steps move the parameters far, so that linearising once is not enough. The mean xi of
+    The first steps move the parameters far: linearising once is not enough. The mean xi of
     [previous state; parameters] is found by Gauss-Newton iterations of
 
         min (xi - mean)' P^-1 (xi - mean) + (y - f(xi))' R^-1 (y - f(xi)),
@@ -202,10 +204,15 @@ def _filter(
             keep = np.eye(len(xi)) - gain @ H
             posterior = keep @ P @ keep.T + gain @ R @ gain.T  # Joseph's form stays positive
             moved = _within_bounds(prior + gain @ innovation, posterior, settings)
-            linear = after + H @ (moved - xi)
-            xi = moved
-            after = _integrate(dynamics, xi, torques, durations, substeps)
-            if np.all(np.abs(after - linear) <= 0.1 * np.sqrt(np.diag(R))):
+            shift, xi = H @ (moved - xi), moved
+            small = SMALL * np.sqrt(np.diag(R))
+            linear = after + shift
+            # What linearising leaves out is of second order: nothing beside a small correction.
+            if np.all(np.abs(shift) <= small):
+                after = linear
+                break
+            after = _integrate(dynamics, xi, torques, durations, substeps)[-1]
+            if np.all(np.abs(after - linear) <= small):
                 break
             after, F = _transition(dynamics, xi, torques, durations, substeps, nodes)
         if not innovation @ np.linalg.solve(S, innovation) <= GATE:  # or NaN
@@ -219,8 +226,8 @@ def _filter(
 def _integrate(
     dynamics: StewartDynamics, xi: Array, torques: Array, durations: Array, substeps: int
 ) -> Array:
-    """State (12,) after the torques, from [state; parameters] (20,)."""
-    return dynamics.predict(xi[:NUM_STATE], torques, durations, substeps, xi[THETA])[-1]
+    """States (n, 12) after each of n torques, from [state; parameters] (20,)."""
+    return dynamics.predict(xi[:NUM_STATE], torques, durations, substeps, xi[THETA])
 
 
 def _transition(
@@ -234,24 +241,32 @@ def _transition(
     """State (12,) after the torques, and F (20, 20) of [state; parameters].
 
     F = exp(Omega) solves F_dot = [[A, G], [0, 0]] F to fourth order with A and G at the two Gauss
-    nodes: Omega = h/2 (L_1 + L_2) + sqrt(3)/12 h^2 [L_2, L_1] (Magnus). The filter divides tiny
-    innovations by F; an error of second order would already look like a disturbance. One node,
-    MIDPOINT, is of second order.
+    nodes: Omega = h/2 (L_1 + L_2) + sqrt(3)/12 h^2 [L_2, L_1] (Magnus); MIDPOINT is of second. The
+    filter divides tiny innovations by F: such an error would already look like a disturbance.
     """
     x, theta = xi[:NUM_STATE], xi[THETA]
     total = np.eye(NUM_STATE + NUM_PARAMETERS)
-    for torque, h in zip(torques, durations, strict=True):
-        cuts = h * np.diff(nodes, prepend=0.0, append=1.0)
-        *states, x = dynamics.predict(x, np.tile(torque, (len(cuts), 1)), cuts, substeps, theta)
+    ends = _integrate(dynamics, xi, torques, durations, substeps)
+    for torque, h, end in zip(torques, durations, ends, strict=True):
         L = np.zeros((len(nodes), *total.shape))
-        for place, state in zip(L, states, strict=True):
-            derivatives = dynamics.derivatives(state[POSE], state[RATES], torque, theta)
+        for place, node in zip(L, nodes, strict=True):
+            pose, rates = _within_hold(x, end, h, node)
+            derivatives = dynamics.derivatives(pose, rates, torque, theta)
             place[:NUM_STATE, :NUM_STATE], place[:NUM_STATE, THETA] = derivatives.A, derivatives.G
         omega = h * L.mean(axis=0)
         if len(nodes) == 2:
             omega += np.sqrt(3) / 12 * h**2 * (L[1] @ L[0] - L[0] @ L[1])
-        total = expm(omega) @ total
+        x, total = end, expm(omega) @ total
     return x, total
+
+
+def _within_hold(start: Array, end: Array, h: float, s: float) -> tuple[Array, Array]:
+    """Pose and rates (6,) when the share s of h seconds is over: the cubic through both states."""
+    rise, v_0, v_1 = (end[POSE] - start[POSE]) / h, start[RATES], end[RATES]
+    a, b = v_0 - rise, v_1 - rise
+    left = 1 - s
+    pose = left * start[POSE] + s * end[POSE] + h * s * left * (left * a - s * b)
+    return pose, rise + left * (1 - 3 * s) * a + s * (3 * s - 2) * b
 
 
 def _within_bounds(mean: Array, covariance: Array, settings: FilterSettings) -> Array:

@@ -3,29 +3,198 @@
 (A, B) is controllable if and only if [lambda I - A, B] has full row rank for every eigenvalue
 lambda of A; stabilisable, if for every one on or outside the stability boundary. The smallest
 singular value tells how far a pair is from failing, which powers of A (the controllability matrix)
-cannot: they lose all digits beyond a few states.
+cannot: they lose all digits beyond a few states. By transposition (A, C) is observable, detectable.
+
+A left null vector w of the pencil, w' A = lambda w', w' B = 0, is a combination of states that goes
+its own way whatever the input does. Its transposed counterpart is a motion no output shows.
 """
 
+from dataclasses import dataclass
+from typing import Final
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+TOLERANCE: Final = 1e-10
+"""Singular values below this share of ||[A, B]|| count as zero: rounding leaves some 1e-14."""
+BOUNDARY: Final = 1e-6
+"""Distance from the stability boundary, relative to the spectral radius (1 in discrete time), up to
+which a mode counts as not decaying."""
+CLUSTER: Final = 1e-3
+"""Eigenvalues as close as this share of the spectral radius are one mode, see `cluster`."""
+_SAME: Final = 1e-7
+"""The same for eigenvalues that fail, which are known better."""
 
 
-def pbh_margins(A: Array, B: Array, eigenvalues: NDArray[np.complex128]) -> Array:
+@dataclass(frozen=True)
+class Mode:
+    """One eigenvalue and its test.
+
+    Attributes:
+        eigenvalue: where the pencil fails, else the mean of its cluster; of a conjugate pair that
+            with imaginary part > 0.
+        multiplicity: eigenvalues in its cluster (conjugates not counted).
+        decays: whether it is inside the stability boundary.
+        margin: smallest singular value of the pencil over ||[A, B]||.
+        directions: (n, d) orthonormal, spanning what the input does not reach or the output does
+            not show; d = 0 for a mode that passes.
+    """
+
+    eigenvalue: complex
+    multiplicity: int
+    decays: bool
+    margin: float
+    directions: Complex
+
+
+@dataclass(frozen=True)
+class Hautus:
+    """The test of one pair.
+
+    Attributes:
+        modes: every distinct eigenvalue, least margin first.
+        tolerance: below which a margin is a failure.
+    """
+
+    modes: tuple[Mode, ...]
+    tolerance: float
+
+    @property
+    def complete(self) -> bool:
+        """Controllable; of the dual, observable."""
+        return not self.deficient
+
+    @property
+    def harmless(self) -> bool:
+        """Stabilisable; of the dual, detectable: what fails decays by itself."""
+        return all(mode.decays for mode in self.deficient)
+
+    @property
+    def margin(self) -> float:
+        """Least margin of all modes."""
+        return min((mode.margin for mode in self.modes), default=np.inf)
+
+    @property
+    def lasting_margin(self) -> float:
+        """Least margin of the modes that do not decay, infinite without one."""
+        return min((mode.margin for mode in self.modes if not mode.decays), default=np.inf)
+
+    @property
+    def deficient(self) -> tuple[Mode, ...]:
+        """The modes that fail."""
+        return tuple(mode for mode in self.modes if mode.margin < self.tolerance)
+
+
+def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool, tolerance: float = TOLERANCE) -> Hautus:
+    """Test (A, B) for controllability and stabilisability, mode by mode.
+
+    Observability and detectability of (A, C) are `hautus(A.T, C.T)`. Margins depend on units:
+    scale states and inputs first, see `scaled`.
+
+    Args:
+        A: (n, n).
+        B: (n, m).
+        discrete: whether x_{k+1} = A x_k + B u_k, instead of the differential equation.
+        tolerance: relative, below which a margin is a failure.
+
+    Raises:
+        ValueError: wrong shapes or entries that are not finite.
+    """
+    A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
+    if A.ndim != 2 or A.shape[0] != A.shape[1] or A.size == 0:
+        raise ValueError(f"A: got shape {A.shape}; expected a square matrix")
+    if B.ndim != 2 or B.shape[0] != A.shape[0]:
+        raise ValueError(f"B: got shape {B.shape}; expected ({A.shape[0]}, m)")
+    if not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
+        raise ValueError("A, B: have entries that are not finite")
+    eigenvalues = np.linalg.eigvals(A).astype(np.complex128)
+    radius = float(np.abs(eigenvalues).max()) or 1.0
+    size = float(np.linalg.norm(np.hstack([A, B]), 2)) or 1.0
+    modes: list[Mode] = []
+    for members in cluster(eigenvalues, CLUSTER * radius):
+        center = complex(members.mean())
+        if abs(center.imag) < CLUSTER * radius:
+            center = complex(center.real)
+        if center.imag < 0:
+            continue  # as its conjugate
+        # A point that is no eigenvalue never fails, so looking at more of them does no harm.
+        points = np.unique(np.append(members, center))
+        margins = pbh_margins(A, B, points) / size
+        failing = margins < tolerance
+        if not failing.any():
+            found = [(center, float(margins.min()))]
+        elif failing[points == center].any():  # as of a defective eigenvalue
+            found = [(center, float(margins[points == center][0]))]
+        else:
+            groups = cluster(points[failing], _SAME * radius)
+            least = [group[pbh_margins(A, B, group).argmin()] for group in groups]
+            found = [(complex(at), float(margins[points == at][0])) for at in least]
+        for value, margin in found:
+            decays = abs(value) < 1 - BOUNDARY if discrete else value.real < -BOUNDARY * radius
+            directions = np.empty((len(A), 0), dtype=np.complex128)
+            if margin < tolerance:
+                directions = _null_space(A, B, value, tolerance * size)
+            modes.append(Mode(value, len(members), bool(decays), margin, directions))
+    return Hautus(tuple(sorted(modes, key=lambda mode: mode.margin)), tolerance)
+
+
+def scaled(
+    A: Array, B: Array, C: Array, states: Array, inputs: Array, outputs: Array
+) -> tuple[Array, Array, Array]:
+    """The same system in units in which 1 is a usual size of every state (n,), input (m,), output.
+
+    With x = S x', u = U u', y = Y y' it is S^-1 A S, S^-1 B U and Y^-1 C S.
+    """
+    return (
+        A * states / states[:, None],
+        B * inputs / states[:, None],
+        C * states / outputs[:, None],
+    )
+
+
+def cluster(values: Complex, distance: float) -> list[Complex]:
+    """Groups of values, each linked to another of its group by at most `distance`.
+
+    A defective eigenvalue of multiplicity p comes out spread over a circle of radius eps^(1/p),
+    but the mean of the circle is good to eps. So the mean is where the pencil must be looked at.
+    """
+    remaining, groups = list(np.argsort(values.real, kind="stable")), []
+    while remaining:
+        group = [remaining.pop(0)]
+        for member in group:  # grows while it is walked through
+            near = [k for k in remaining if abs(values[k] - values[member]) <= distance]
+            group += near
+            remaining = [k for k in remaining if k not in near]
+        groups.append(values[group])
+    return groups
+
+
+def pbh_margins(A: Array, B: Array, eigenvalues: Complex) -> Array:
     """Smallest singular value of [lambda I - A, B] (n, n + m) for each of the eigenvalues (k,)."""
-    n = A.shape[0]
     if eigenvalues.size == 0:
         return np.empty(0)
     real = np.all(np.abs(eigenvalues.imag) <= 1e-12 * np.abs(eigenvalues))
     # Real arithmetic takes half the time.
-    shifted = (eigenvalues.real if real else eigenvalues)[:, None, None] * np.eye(n) - A
-    pencil = np.concatenate([shifted, np.broadcast_to(B, (len(eigenvalues), *B.shape))], axis=2)
-    return np.linalg.svd(pencil, compute_uv=False)[:, -1]
+    pencils = _pencils(A, B, eigenvalues.real if real else eigenvalues)
+    return np.linalg.svd(pencils, compute_uv=False)[:, -1]
 
 
-def distinct(values: NDArray[np.complex128], resolution: float) -> NDArray[np.complex128]:
+def distinct(values: Complex, resolution: float) -> Complex:
     """One of each group that agrees to `resolution`, as far as defective eigenvalues spread."""
     grid = np.round(values / resolution)
     _, first = np.unique(grid, return_index=True)
     return values[first]
+
+
+def _pencils(A: Array, B: Array, points: NDArray[np.inexact]) -> NDArray[np.inexact]:
+    shifted = points[:, None, None] * np.eye(len(A)) - A
+    return np.concatenate([shifted, np.broadcast_to(B, (len(points), *B.shape))], axis=2)
+
+
+def _null_space(A: Array, B: Array, point: complex, threshold: float) -> Complex:
+    """Orthonormal w (n, d) with w' [point I - A, B] = 0, the prime without conjugation."""
+    left, values, _ = np.linalg.svd(_pencils(A, B, np.array([point]))[0], full_matrices=False)
+    return left[:, values < threshold].conj()

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
+from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, levers, rotation
 from stewart_drake.signals import ANGLES, NUM_LEGS, POSITION
 
 Array = NDArray[np.float64]
@@ -63,6 +63,7 @@ def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
 
     Raises:
         UnreachablePoseError: the pose is out of reach.
+        SingularPoseError: the plate moves at the dead centre of a leg.
     """
     home, now = assemble(mechanism, mechanism.home), assemble(mechanism, pose)
     axes = mechanism.R_WS[:, :, 2]
@@ -82,9 +83,9 @@ def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
     legs = leg_geometry(mechanism, pose)
     w_WP = angle_rate_map(pose[ANGLES]) @ rates[ANGLES]
     v_WQ = rates[POSITION] + np.cross(w_WP, legs.p_PQ_W)
-    alpha_dot = np.einsum("li,li->l", legs.rod, v_WQ) / (
-        mechanism.crank_lengths * legs.transmission
-    )
+    along = np.einsum("li,li->l", legs.rod, v_WQ)
+    # At rest a dead centre is a pose like any other; moving, it takes levers that are not zero.
+    alpha_dot = along / levers(mechanism, legs) if along.any() else along
     v_WT = (mechanism.crank_lengths * alpha_dot)[:, None] * legs.tangent
     swing = np.cross(legs.rod, v_WQ - v_WT) / mechanism.rod_lengths[:, None]
     swing_n, rod_n = np.einsum("li,li->l", swing, axes), np.einsum("li,li->l", legs.rod, axes)

@@ -1,7 +1,7 @@
 """Mechanism YAML files: the schema, and how a `pattern` of anchors becomes six legs."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,27 +18,41 @@ from stewart_drake.yamlio import load_yaml, validate
 Array = NDArray[np.float64]
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
-Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
-Six = Annotated[list[float], Field(min_length=6, max_length=6)]
-Positive = Annotated[float, Field(gt=0)]
-_LARGEST = float(np.finfo(np.float64).max)
-Branch = Literal[-1, 1]
-Branches = Annotated[list[Branch], Field(min_length=6, max_length=6)]
+# Limits far beyond any platform keep squares and products of what a file says finite.
+_SHORTEST, _LONGEST = 1e-6, 1e3
+Coordinate = Annotated[float, Field(ge=-_LONGEST, le=_LONGEST)]
+Degrees = Annotated[float, Field(ge=-360, le=360)]
+Radius = Annotated[float, Field(ge=_SHORTEST, le=_LONGEST)]
+Mass = Annotated[float, Field(le=1e6)]
+Point = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+Moments = Annotated[list[Mass], Field(min_length=3, max_length=3)]
+Six = Annotated[list[Coordinate], Field(min_length=6, max_length=6)]
 Indices = Annotated[list[Annotated[int, Field(ge=0, le=5)]], Field(min_length=6, max_length=6)]
 
 
 def _one_or_six(value: object) -> object:
     # A union of number and list would name its alternatives in the error instead of the field.
     numbers = value if isinstance(value, list) else [value] * 6
-    if len(numbers) != 6 or not all(_is_positive(v) for v in numbers):
-        raise ValueError("a positive number, or a list of six")
+    if len(numbers) != 6 or not all(_is_length(v) for v in numbers):
+        raise ValueError(f"a positive number, or a list of six, {_SHORTEST:g} to {_LONGEST:g} m")
     return value
 
 
-def _is_positive(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= _LARGEST
+def _is_length(value: object) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return _SHORTEST <= value <= _LONGEST
 
 
+def _minus_one_or_one(value: object) -> object:
+    # A Literal would take true for 1.
+    if isinstance(value, bool) or value not in (-1, 1):
+        raise ValueError("-1 or 1")
+    return value
+
+
+Branch = Annotated[int, PlainValidator(_minus_one_or_one)]
+Branches = Annotated[list[Branch], Field(min_length=6, max_length=6)]
 Length = Annotated[float | list[float], PlainValidator(_one_or_six)]
 
 
@@ -46,8 +60,8 @@ Length = Annotated[float | list[float], PlainValidator(_one_or_six)]
 class BodySpec:
     """`mass` in kg, `inertia`: principal moments about the COM in kg m^2."""
 
-    mass: Annotated[float, Field(ge=0)]
-    inertia: Vector3
+    mass: Annotated[float, Field(ge=0, le=1e6)]
+    inertia: Moments
 
 
 @dataclass(config=_STRICT)
@@ -55,8 +69,8 @@ class LinkSpec:
     """`length` in m (one, or one per leg), `center`: where along it the COM lies (0 to 1)."""
 
     length: Length
-    mass: float
-    inertia: Vector3
+    mass: Mass
+    inertia: Moments
     center: float = 0.5
 
 
@@ -64,7 +78,7 @@ class LinkSpec:
 class MotorSpec:
     """`effort_limit`: N m, as written to SDFormat; null: none."""
 
-    effort_limit: float | None = None
+    effort_limit: Annotated[float, Field(le=1e6)] | None = None
 
 
 @dataclass(config=_STRICT)
@@ -76,17 +90,17 @@ class PatternSpec:
     plate_order[i]. `installation` (beta): by how much the motor's y axis dips under the horizon.
     """
 
-    rotation_deg: float
-    base_radius: Positive
-    base_separation_deg: float
-    plate_radius: Positive
-    plate_separation_deg: float
-    plate_offset_deg: float
+    rotation_deg: Degrees
+    base_radius: Radius
+    base_separation_deg: Degrees
+    plate_radius: Radius
+    plate_separation_deg: Degrees
+    plate_offset_deg: Degrees
     plate_order: Indices
-    shaft_height: float
-    installation_deg: float
+    shaft_height: Coordinate
+    installation_deg: Degrees
     branches: Branches
-    plate_height: float = 0.0
+    plate_height: Coordinate = 0.0
 
 
 @dataclass(config=_STRICT)
@@ -97,10 +111,10 @@ class LegSpec:
     which the angle grows right-handed. `branch` (-1 or 1): which of the two crank solutions.
     """
 
-    shaft: Vector3
-    motor_axis: Vector3
-    crank_zero: Vector3
-    plate_joint: Vector3
+    shaft: Point
+    motor_axis: Point
+    crank_zero: Point
+    plate_joint: Point
     branch: Branch
 
 
@@ -108,7 +122,7 @@ class LegSpec:
 class MechanismSpec:
     """A mechanism file: bodies, and anchors as a `pattern` or explicitly as six `legs`."""
 
-    name: str
+    name: Annotated[str, Field(max_length=100)]
     home: Six
     base: BodySpec
     plate: BodySpec

@@ -220,6 +220,7 @@ class Mechanism:
 
         Raises:
             UnreachablePoseError: the pose is out of reach.
+            SingularPoseError: a leg is at its dead centre, where the derivative does not exist.
         """
         return kinematics.jacobian(self, pose)
 

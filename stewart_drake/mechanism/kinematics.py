@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 
 FORWARD_KINEMATICS_TOLERANCE = 1e-13
 """Largest rod-length residual, relative to the rod, at which Newton's method stops."""
+DEAD_CENTRE_TRANSMISSION = 1e-7
+"""|rod . tangent| that counts as zero. Next to a dead centre acos resolves the crank angle to the
+square root of the rounding, 1.5e-8 rad: quotients by less than this have no correct digit."""
 
 
 class UnreachablePoseError(ValueError):
@@ -37,6 +40,18 @@ class UnreachablePoseError(ValueError):
             if not m >= 0
         )
         super().__init__(f"{prefix}: {short}")
+
+
+class SingularPoseError(ValueError):
+    """A pose at the dead centre of `legs` (from one), where crank rates are not defined."""
+
+    def __init__(self, legs: tuple[int, ...]) -> None:
+        self.legs = legs
+        names = ", ".join(str(leg) for leg in legs)
+        super().__init__(
+            f"pose at the dead centre of leg {names}: no crank rate moves the rod's end along the "
+            "rod; expected a pose off the edge of the workspace"
+        )
 
 
 class ForwardKinematicsError(ValueError):
@@ -148,8 +163,19 @@ def jacobian(mechanism: "Mechanism", pose: Array) -> Array:
     """
     legs = leg_geometry(mechanism, pose)
     moment = np.cross(legs.p_PQ_W, legs.rod) @ angle_rate_map(np.asarray(pose)[ANGLES])
-    lever = mechanism.crank_lengths * legs.transmission
-    return np.hstack([moment, legs.rod]) / lever[:, None]
+    return np.hstack([moment, legs.rod]) / levers(mechanism, legs)[:, None]
+
+
+def levers(mechanism: "Mechanism", legs: LegGeometry) -> Array:
+    """u rod . tangent (6,) in m: speed of the plate joint along the rod per crank rate.
+
+    Raises:
+        SingularPoseError: a leg is at its dead centre, where a crank rate divides by zero.
+    """
+    dead = np.abs(legs.transmission) < DEAD_CENTRE_TRANSMISSION
+    if dead.any():
+        raise SingularPoseError(tuple(np.compress(dead, LEGS).tolist()))
+    return mechanism.crank_lengths * legs.transmission
 
 
 def forward_kinematics(

@@ -74,10 +74,11 @@ def _plate(model: ET.Element, mechanism: Mechanism, home: Assembly) -> None:
     size = _sizes(mechanism)
     radius = 1.08 * np.hypot(mechanism.p_PQ[:, 0], mechanism.p_PQ[:, 1]).max()
     disc = _cylinder(radius, size["plate"])
-    _visual(link, "disc", _pose([0, 0, size["plate"]]), disc, PLATE_COLOR)
+    deck = float(mechanism.p_PQ[:, 2].mean())
+    _visual(link, "disc", _pose([0, 0, deck + size["plate"]]), disc, PLATE_COLOR)
     # A pointer along x shows the yaw that a disc would hide.
     bar = _box([0.85 * radius, 0.06 * radius, 0.4 * size["plate"]])
-    above = 1.6 * size["plate"]
+    above = deck + 1.6 * size["plate"]
     _visual(link, "x_axis", _pose([0.425 * radius, 0, above]), bar, CRANK_COLOR)
     tip = _cylinder(0.09 * radius, 0.4 * size["plate"])
     _visual(link, "x_axis_tip", _pose([0.85 * radius, 0, above]), tip, CRANK_COLOR)

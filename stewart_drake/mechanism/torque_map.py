@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
+from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, levers, rotation
 from stewart_drake.signals import ANGLES
 
 Array = NDArray[np.float64]
@@ -30,6 +30,7 @@ def torque_map(mechanism: Mechanism, pose: Array, form: TorqueMap = "virtual_wor
 
     Raises:
         UnreachablePoseError: the pose (6,) is out of reach.
+        SingularPoseError: `virtual_work` at the dead centre of a leg.
     """
     legs = leg_geometry(mechanism, pose)
     tau_1 = np.vstack([np.cross(legs.p_PQ_W, legs.rod).T, legs.rod.T])
@@ -37,7 +38,7 @@ def torque_map(mechanism: Mechanism, pose: Array, form: TorqueMap = "virtual_wor
         tau_2 = legs.transmission / mechanism.crank_lengths
         angular = np.diag(1 / mechanism.plate.inertia)
     else:
-        tau_2 = 1 / (mechanism.crank_lengths * legs.transmission)
+        tau_2 = 1 / levers(mechanism, legs)
         R_WP = rotation(pose[ANGLES])
         I_W = R_WP @ np.diag(mechanism.plate.inertia) @ R_WP.T
         angular = np.asarray(np.linalg.inv(I_W @ angle_rate_map(pose[ANGLES])), dtype=np.float64)

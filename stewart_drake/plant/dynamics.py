@@ -153,13 +153,11 @@ class StewartDynamics:
             pose, rates, accelerations, torque, parameters, self.gravity
         )
         # Results come transposed (column order); `arm`' s transpose is B.
-        solved = np.linalg.solve(MN.T, np.hstack([-dF_dx.T, arm, -dF_dp.T]))
-        A = np.zeros((NUM_STATE, NUM_STATE))
-        A[POSE, RATES] = np.eye(NUM_COORDINATES)
-        A[RATES] = solved[:, :12]
-        B = np.vstack([np.zeros((6, 6)), solved[:, 12:18]])
-        G = np.vstack([np.zeros((6, NUM_PARAMETERS)), solved[:, 18:]])
-        return Linearization(A, B, G)
+        right = np.concatenate([-dF_dx, arm.T, -dF_dp]).T
+        both = np.zeros((NUM_STATE, right.shape[1]))
+        both[POSE, RATES] = np.eye(NUM_COORDINATES)
+        both[RATES] = np.linalg.solve(MN.T, right)
+        return Linearization(*np.split(both, [NUM_STATE, NUM_STATE + NUM_TORQUES], axis=1))
 
     def predict(
         self,

@@ -14,6 +14,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.scalar_conversion import TemplateSystem
 
+from stewart_drake.lifetime import weak
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.workspace import home_sign, standing
 from stewart_drake.signals import NUM_STATE, NUM_TORQUES, POSE, RATES
@@ -66,8 +67,8 @@ def ExactPlant_(T):
                 self._witness = self.MakeWitnessFunction(
                     "workspace margin",
                     WitnessFunctionDirection.kPositiveThenNonPositive,
-                    self.margin,
-                    PublishEvent(system_callback=self._leave),
+                    weak(self.margin),
+                    PublishEvent(system_callback=weak(self._leave)),
                 )
 
         def _construct_copy(self, other, converter=None) -> None:

@@ -20,6 +20,7 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
+from stewart_drake.lifetime import weak
 from stewart_drake.mechanism.assembly import joint_state
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map
@@ -116,9 +117,9 @@ class PlateState(LeafSystem):
         self._cranks = [motor.position_start() for motor in motors]
         size = plant.num_multibody_states()
         self._tree = self.DeclareVectorInputPort("tree_state", size)
-        self.DeclareVectorOutputPort("state", NUM_STATE, self._state)
-        self.DeclareVectorOutputPort("crank_angles", NUM_TORQUES, self._angles)
-        self.DeclarePerStepPublishEvent(self._watch)
+        self.DeclareVectorOutputPort("state", NUM_STATE, weak(self._state))
+        self.DeclareVectorOutputPort("crank_angles", NUM_TORQUES, weak(self._angles))
+        self.DeclarePerStepPublishEvent(weak(self._watch))
 
     def _state(self, context: Context, output: BasicVector) -> None:
         tree = np.asarray(self._tree.Eval(context))

@@ -65,7 +65,10 @@ def standing(mechanism: Mechanism, pose: Array, crank_angles: Array | None = Non
         sines, wrenches = functions.of_pose(pose)
     else:
         sines, wrenches = functions.of_tree(pose, crank_angles)
-    return Standing(sines, float(np.linalg.det(wrenches)), float(pose[1]))
+    # A state that is not finite has no standing: NaN.
+    with np.errstate(over="ignore", invalid="ignore"):
+        parallel = float(np.linalg.det(wrenches))
+    return Standing(sines, parallel, float(pose[1]))
 
 
 class _Functions(NamedTuple):

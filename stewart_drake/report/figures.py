@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.report import style
 from stewart_drake.report.style import figure_style, write_figure
+from stewart_drake.report.tuner_figures import weights_figure
 from stewart_drake.results import SimulationResult
 from stewart_drake.signals import COORDINATES, LEGS, PARAMETERS
 from stewart_drake.studies.compare import LABELS
@@ -47,6 +48,8 @@ def comparison_figures(
 ) -> list[Path]:
     """Write states, errors, and torques of each delay-aware controller, as PNG and SVG.
 
+    With the neural tuner, also the weights that it set for these controllers.
+
     Args:
         results: by controller, as `compare` returns them.
         directory: that exists.
@@ -57,21 +60,32 @@ def comparison_figures(
     Raises:
         OSError: the directory cannot be written to.
     """
+    with figure_style():
+        return _write(draw_comparison(results), directory)
+
+
+def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure]:
+    """The figures that `comparison_figures` writes, by name; none without results."""
     if not results:
-        return []
+        return {}
     lines = {LABELS[name]: style.CONTROLLER_LINES[name] for name in results}
     runs = {LABELS[name]: result for name, result in results.items()}
+    aware = {name: results[name] for name in TORQUE_CONTROLLERS if name in results}
     with figure_style():
         figures = {"states": _states(runs, lines), "errors": _errors(runs, lines)}
-        for name in TORQUE_CONTROLLERS:
-            if name in results:
-                line = style.CONTROLLER_LINES[name]
-                figures[f"torques_{name}"] = _torques(results[name], LABELS[name], line)
-        return _write(figures, directory)
+        for name, result in aware.items():
+            line = style.CONTROLLER_LINES[name]
+            figures[f"torques_{name}"] = _torques(result, LABELS[name], line)
+        tuned = {LABELS[n]: run for n, run in aware.items() if run.scenario.tuner.kind == "ann"}
+        if tuned:
+            figures["weights"] = weights_figure(tuned)
+        return figures
 
 
 def run_figures(result: SimulationResult, directory: str | Path) -> list[Path]:
     """Write states, errors, torques and, with an estimator, the parameters, as PNG and SVG.
+
+    With the neural tuner, also the weights that it set.
 
     Args:
         result: of one run.
@@ -83,6 +97,12 @@ def run_figures(result: SimulationResult, directory: str | Path) -> list[Path]:
     Raises:
         OSError: the directory cannot be written to.
     """
+    with figure_style():
+        return _write(draw_run(result), directory)
+
+
+def draw_run(result: SimulationResult) -> dict[str, Figure]:
+    """The figures that `run_figures` writes, by name."""
     runs, lines = {"plate": result}, {"plate": style.RUN}
     with figure_style():
         figures = {
@@ -92,7 +112,9 @@ def run_figures(result: SimulationResult, directory: str | Path) -> list[Path]:
         }
         if np.isfinite(result.signals.parameter_std.values).any():
             figures["parameters"] = _parameters(result)
-        return _write(figures, directory)
+        if result.scenario.tuner.kind == "ann":
+            figures["weights"] = weights_figure({"weights that the tuner set": result})
+        return figures
 
 
 def _write(figures: Mapping[str, Figure], directory: str | Path) -> list[Path]:

@@ -1,6 +1,5 @@
 """How every figure looks: one line per controller, also told apart in grey print."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,6 +7,8 @@ from typing import Any, Final, NamedTuple
 
 import matplotlib
 from matplotlib.figure import Figure
+
+from stewart_drake.fileio import replacing
 
 
 class Line(NamedTuple):
@@ -77,9 +78,8 @@ def write_figure(figure: Figure, directory: Path, name: str) -> list[Path]:
     paths = []
     for suffix in FORMATS:
         path = directory / f"{name}.{suffix}"
-        partial = path.with_name(f".{path.name}.part")
         metadata = {"Date": None} if suffix == "svg" else None
-        figure.savefig(partial, format=suffix, metadata=metadata)
-        os.replace(partial, path)
+        with replacing(path) as partial:
+            figure.savefig(partial, format=suffix, metadata=metadata)
         paths.append(path)
     return paths

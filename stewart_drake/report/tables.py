@@ -7,15 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
-from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.workspace import SINGULARITY_LIMIT, standing
 from stewart_drake.resources import Kind, resolve, shipped
 from stewart_drake.results import SimulationResult
 from stewart_drake.signals import COORDINATES
 from stewart_drake.studies.compare import LABELS, PAPER_ERRORS
+from stewart_drake.tuner.density import NUM_INPUTS
+from stewart_drake.tuner.network import NUM_OUTPUTS, load_network
 
 WIDTH: Final = 80
 _COLUMNS: Final = "{:<16}{:>5}{:>11}{:>11}{:>11}{:>7}{:>7}{:>7}{:>5}"
@@ -83,33 +80,22 @@ def comparison_table(results: Mapping[str, SimulationResult]) -> str:
     return "\n".join([*lines, _NOTE])
 
 
-def mechanism_table(mechanism: Mechanism) -> str:
-    """A mechanism at its home pose, held there under gravity."""
-    home = mechanism.home
-    dynamics = StewartDynamics(mechanism, gravity=True)
-    poles = np.linalg.eigvals(dynamics.linearize(home)[0])
-    margins, torque = mechanism.reach_margins(home), dynamics.equilibrium_torque(home)
-    singularity = number(abs(standing(mechanism, home).parallel))
-    per_leg = {
-        "reach margin": ", ".join(number(1e3 * margin) for margin in margins) + " mm",
-        "torque": ", ".join(number(value) for value in torque) + " N m",
-    }
-    return rows(
-        {
-            "name": mechanism.name,
-            **{f"{name}, legs 1 to 6": values for name, values in per_leg.items()},
-            "fastest open-loop pole": f"{number(poles.real.max())} /s",
-            "singularity measure": f"{singularity} (a simulation stops at {SINGULARITY_LIMIT:g})",
-        }
-    )
-
-
 def shipped_table(kind: Kind) -> str:
-    """The shipped files of a kind, each with the first sentence of the comment that opens it."""
+    """The shipped files of a kind, each with the first sentence of the comment that opens it.
+
+    A network, whose format has no comments, is described by what it is.
+    """
     return rows({f"  {name}": _description(resolve(kind, name)) for name in shipped(kind)})
 
 
 def _description(path: Path) -> str:
+    if path.suffix == ".json":
+        network = load_network(path)
+        low, high = network.bounds.min(), network.bounds.max()
+        return (
+            f"A network of {NUM_INPUTS} densities ({network.density}), {network.hidden} hidden "
+            f"neurons and {NUM_OUTPUTS} weights from {low:g} to {high:g}"
+        )
     comment = re.match(r"(#.*\n)*", path.read_text(encoding="utf-8"))
     text = " ".join(line.strip("# ") for line in comment[0].splitlines()) if comment else ""
     return text.partition(". ")[0].rstrip(".")

@@ -66,6 +66,30 @@ def progress_bars(
             bar.close()
 
 
+@contextmanager
+def count_bar(name: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """One bar on stderr, if that is a terminal, until the context ends.
+
+    Args:
+        name: of what is counted.
+        quiet: whether to draw nothing.
+
+    Yields:
+        A function of the number done and the number of all.
+    """
+    from tqdm import tqdm
+
+    form = "{desc:<14}{bar} {n_fmt} of {total_fmt}"
+    hidden = quiet or not sys.stderr.isatty()
+    with tqdm(total=0, desc=name, leave=False, disable=hidden, bar_format=form) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
+
+
 def _advance(bar: "tqdm[Any]", time: float, error: float) -> None:
     bar.set_postfix_str(f"error {error:7.3f} %", refresh=False)
     bar.update(time - bar.n)

@@ -1,1 +1,1 @@
-"""LeafSystems of the loop, in loop order: reference, sensor, controller, delay chain."""
+"""LeafSystems of the loop: reference, sensor, density, tuner, controller, delay chain."""

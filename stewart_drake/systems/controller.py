@@ -1,7 +1,6 @@
 """The control law as a Drake system."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from pydrake.systems.framework import (
 
 from stewart_drake.design.control_law import DelayLqi
 from stewart_drake.design.law_types import Memory
+from stewart_drake.lifetime import weak
 from stewart_drake.signals import (
     NUM_COORDINATES,
     NUM_PARAMETERS,
@@ -70,10 +70,14 @@ class DelayLqiController(LeafSystem):
         memory_ticket = self.abstract_state_ticket(self._memory)
         self._step = self.DeclareCacheEntry(
             "step",
-            ValueProducer(allocate=lambda: Value(law.initial_memory(queue)), calc=self._calc_step),
+            ValueProducer(
+                allocate=lambda: Value(law.initial_memory(queue)), calc=weak(self._calc_step)
+            ),
             {self.all_input_ports_ticket(), memory_ticket},
         )
-        self.DeclareVectorOutputPort("torque", NUM_TORQUES, self._torque, {self._step.ticket()})
+        self.DeclareVectorOutputPort(
+            "torque", NUM_TORQUES, weak(self._torque), {self._step.ticket()}
+        )
         for name, size, part in (
             ("torque_commanded", NUM_TORQUES, lambda m: m.torque),
             ("integral", NUM_COORDINATES, lambda m: m.integral),
@@ -84,13 +88,13 @@ class DelayLqiController(LeafSystem):
             self.DeclareVectorOutputPort(
                 name,
                 size,
-                partial(self._held, part),
+                weak(self._held, part),
                 {memory_ticket},
             )
         # The first sample before all periodic events, as `DelayChain` does.
-        self.DeclareInitializationUnrestrictedUpdateEvent(self._update_first)
+        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._update_first))
         early = event_time(law.options.period)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._update))
 
     def memory(self, context: Context) -> Memory:
         """The memory in a context of this system."""

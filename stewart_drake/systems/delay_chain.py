@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
+from stewart_drake.lifetime import weak
 from stewart_drake.signals import NUM_TORQUES, queue_length
 from stewart_drake.timing import event_time
 
@@ -57,15 +58,15 @@ class DelayChain(LeafSystem):
         )
         self._commanded = self.DeclareVectorInputPort("commanded", NUM_TORQUES)
         self.DeclareVectorOutputPort(
-            "torque", NUM_TORQUES, self._output, {self.discrete_state_ticket(self._applied)}
+            "torque", NUM_TORQUES, weak(self._output), {self.discrete_state_ticket(self._applied)}
         )
         # At t = 0 ahead of all periodic events: nothing is earlier than a plant's first step.
-        self.DeclareInitializationUnrestrictedUpdateEvent(self._take_first)
+        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._take_first))
         early = event_time(period)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, self._take)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._take))
         if fraction > 0:
             self.DeclarePeriodicUnrestrictedUpdateEvent(
-                early, event_time(fraction * period), self._release
+                early, event_time(fraction * period), weak(self._release)
             )
 
     def _take_first(self, context: Context, state: State) -> EventStatus:

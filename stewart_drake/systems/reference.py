@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.lifetime import weak
 from stewart_drake.signals import NUM_REFERENCE
 from stewart_drake.trajectories import evaluate
 
@@ -35,9 +36,9 @@ class Reference(LeafSystem):
         self._true, self._planned = true_motion, planned_motion
         self._times = np.array(preview_times)
         time_only = {self.time_ticket()}
-        self.DeclareVectorOutputPort("reference", NUM_REFERENCE, self._now, time_only)
+        self.DeclareVectorOutputPort("reference", NUM_REFERENCE, weak(self._now), time_only)
         size = NUM_REFERENCE * len(self._times)
-        self.DeclareVectorOutputPort("preview", size, self._ahead, time_only)
+        self.DeclareVectorOutputPort("preview", size, weak(self._ahead), time_only)
 
     def _now(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(evaluate(self._true, context.get_time()))

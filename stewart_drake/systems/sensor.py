@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from stewart_drake.lifetime import weak
 from stewart_drake.signals import NUM_STATE
 
 Array = NDArray[np.float64]
@@ -32,7 +33,7 @@ class Sensor(LeafSystem):
         super().__init__()
         self._std, self._seed, self._period = np.array(noise_std), seed, period
         self._state = self.DeclareVectorInputPort("state", NUM_STATE)
-        self.DeclareVectorOutputPort("measurement", NUM_STATE, self._measure)
+        self.DeclareVectorOutputPort("measurement", NUM_STATE, weak(self._measure))
 
     def noise(self, k: int) -> Array:
         """The noise (12,) of sample k."""

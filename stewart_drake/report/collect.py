@@ -1,0 +1,144 @@
+"""What a report is made of: the scenario's run, the comparison, the tuner's runs, the analyses."""
+
+import pickle
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final, NamedTuple
+
+from stewart_drake.config import Scenario
+from stewart_drake.errors import ConfigError
+from stewart_drake.experiment import assemble, reference_failure
+from stewart_drake.plant.workspace import Failure
+from stewart_drake.report import delay_page, hautus_page, workspace_page
+from stewart_drake.report.figures import TORQUE_CONTROLLERS
+from stewart_drake.report.page import Page, Provenance, Tone
+from stewart_drake.resources import resolve
+from stewart_drake.results import SimulationResult
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.simulation import simulate
+from stewart_drake.studies.compare import CONTROLLERS
+from stewart_drake.studies.delay_limits import study_delay
+from stewart_drake.studies.hautus import study_hautus
+from stewart_drake.studies.jobs import Job, run_jobs
+from stewart_drake.studies.workspace import study_workspace
+from stewart_drake.tuner.network import DEFAULT
+
+ANALYSES: Final = ("delay", "hautus", "workspace")
+"""In the order in which they are read."""
+_OWN: Final = "run"
+_TUNED: Final = "tuned-"
+
+Progress = Callable[[int, int], None]
+"""Called with the number of finished pieces and of all pieces."""
+
+
+class Analysis(NamedTuple):
+    """An analysis: its answer, how good that is, its page, and what its summary.json holds."""
+
+    verdict: str
+    tone: Tone
+    page: Page
+    summary: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Collected:
+    """Everything in a report.
+
+    Attributes:
+        scenario: as asked for.
+        failure: where the reference leaves the workspace, so that nothing was simulated, or None.
+        run: of the scenario as it stands; None with a `failure`.
+        comparison: the shipped controllers on it, by name.
+        tuned: those that know of the delay, with the tuner's weights; empty without a network.
+        analyses: by name, in the order of ANALYSES.
+    """
+
+    scenario: Scenario
+    failure: Failure | None
+    run: SimulationResult | None = None
+    comparison: dict[str, SimulationResult] = field(default_factory=dict)
+    tuned: dict[str, SimulationResult] = field(default_factory=dict)
+    analyses: dict[str, Analysis] = field(default_factory=dict)
+
+
+def collect(
+    scenario_name: str | Path, settings: Iterable[str] = (), progress: Progress | None = None
+) -> Collected:
+    """Run and analyse a scenario, on all cores. A reference out of reach is analysed only.
+
+    Args:
+        scenario_name: a shipped name or a path.
+        settings: as `load_scenario` takes them.
+        progress: called for every finished run or analysis.
+
+    Raises:
+        ConfigError: bad input.
+        ChildProcessError: a worker process died.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    settings = tuple(settings)
+    scenario = load_scenario(scenario_name, settings=settings)
+    failure = reference_failure(assemble(scenario))
+    scenarios: dict[str, Scenario] = {}
+    if failure is None:
+        scenarios = {name: load_scenario(scenario_name, name, settings) for name in CONTROLLERS}
+        if scenario not in scenarios.values():
+            scenarios[_OWN] = scenario
+        if has_network(scenario):
+            tuned = (*settings, "tuner.kind=ann")
+            for name in TORQUE_CONTROLLERS:
+                scenarios[_TUNED + name] = load_scenario(scenario_name, name, tuned)
+    done = _work(scenario, scenarios, progress)
+    return Collected(
+        scenario=scenario,
+        failure=failure,
+        run=next((done[key] for key, sc in scenarios.items() if sc == scenario), None),
+        comparison={name: done[name] for name in CONTROLLERS if name in done},
+        tuned={name: done[_TUNED + name] for name in TORQUE_CONTROLLERS if _TUNED + name in done},
+        analyses={name: done[name] for name in ANALYSES},
+    )
+
+
+def has_network(scenario: Scenario) -> bool:
+    """Whether there is a network whose weights can be shown beside the scenario's fixed ones."""
+    if scenario.tuner.kind == "ann":
+        return False  # the comparison itself has them
+    try:
+        resolve("weights", scenario.tuner.weights or DEFAULT)
+    except ConfigError:
+        return False
+    return True
+
+
+def _work(
+    scenario: Scenario, scenarios: dict[str, Scenario], progress: Progress | None
+) -> dict[str, Any]:
+    # The analyses first: they take longest.
+    jobs: dict[str, Job] = {name: (name, scenario) for name in ANALYSES}
+    jobs |= {name: ("simulate", sc) for name, sc in scenarios.items()}
+    with TemporaryDirectory() as folder:
+        paths = run_jobs(jobs, _piece, folder, settings={}, suffix=".pickle", progress=progress)
+        # Written by our own workers a moment ago, into a folder that nobody else can write to.
+        return {key: pickle.loads(path.read_bytes()) for key, path in paths.items()}
+
+
+def _piece(what: str, scenario: Scenario) -> bytes:
+    return pickle.dumps(simulate(scenario) if what == "simulate" else _analyse(what, scenario))
+
+
+def _analyse(name: str, scenario: Scenario) -> Analysis:
+    made = Provenance(f"stewart-drake analyze {name}")
+    if name == "delay":
+        delay = study_delay(scenario, simulations=False)
+        text, tone = delay_page.verdict(delay)
+        return Analysis(text, tone, delay_page.delay_page(delay, made), delay.summary)
+    if name == "hautus":
+        hautus = study_hautus(scenario)
+        text, tone = hautus_page.verdict(hautus)
+        return Analysis(text, tone, hautus_page.hautus_page(hautus, made), hautus.summary)
+    work = study_workspace(scenario)
+    page = workspace_page.workspace_page(work, made)
+    return Analysis(page.verdict, page.tone, page, work.summary)

@@ -1,0 +1,60 @@
+"""What `model check` prints."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.plant.workspace import SINGULARITY_LIMIT
+from stewart_drake.report.tables import number, rows, wrap
+from stewart_drake.report.workspace_page import travel_text
+from stewart_drake.studies.mechanism_check import MechanismCheck
+
+Array = NDArray[np.float64]
+
+
+def mechanism_table(check: MechanismCheck) -> str:
+    """A mechanism at its home pose, held there under gravity; 80 columns."""
+    mechanism, measures = check.mechanism, check.measures
+    cranks, rods = _lengths(mechanism.crank_lengths), _lengths(mechanism.rod_lengths)
+    entries = {
+        "name": mechanism.name,
+        "lengths": f"cranks {cranks} mm, rods {rods} mm",
+        "crank angles": _six(np.rad2deg(check.crank_angles), "deg"),
+        "reach margin": _six(1e3 * measures.reach, "mm"),
+        "sine off dead centre": _six(measures.sines, ""),
+        "singularity measure": f"{number(measures.parallel)} (parallel; a simulation stops at "
+        f"{SINGULARITY_LIMIT:g})",
+    }
+    if check.failure is None:
+        limit = mechanism.effort_limit
+        entries |= {
+            "condition number": f"{number(measures.condition)}; 1 mrad of crank error moves the "
+            f"plate by {number(1e3 * measures.play * 1e-3)} mm at most",
+            "torque to hold": _six(check.torque, "N m")
+            + ("" if limit is None else f" (limit {limit:g})"),
+            "open-loop poles": _poles(check.poles),
+            "from home alone": travel_text(check.travel),
+        }
+    return "\n".join([wrap(check.verdict), rows(entries)])
+
+
+def _six(values: Array, unit: str) -> str:
+    return (", ".join(number(value) for value in values) + f" {unit}").rstrip()
+
+
+def _lengths(values: Array) -> str:
+    """One number where all are alike."""
+    alike = bool(np.ptp(values) < 1e-12)
+    return ", ".join(number(1e3 * value) for value in (values[:1] if alike else values))
+
+
+def _poles(poles: NDArray[np.complex128]) -> str:
+    """Growing, oscillating and resting ones; a frictionless machine has each with its mirror."""
+    fastest = np.abs(poles).max()
+    grow = [pole.real for pole in poles if pole.real > 1e-6 * fastest]
+    swing = [pole.imag for pole in poles if abs(pole.real) <= 1e-6 * fastest < pole.imag]
+    parts = []
+    if grow:
+        parts.append("unstable " + ", ".join(number(pole) for pole in grow) + " /s")
+    if swing:
+        parts.append("oscillating " + ", ".join(number(pole) for pole in swing) + " rad/s")
+    return "; ".join(parts) or "all zero"

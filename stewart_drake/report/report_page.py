@@ -1,0 +1,247 @@
+"""The report on a scenario: one page that can be shown to somebody else.
+
+How its own run went, the shipped controllers in the manner of the paper's Table II and figures 5, 6
+and 7, what the analyses say beforehand, and the scenario itself.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from stewart_drake.config import Scenario
+from stewart_drake.report.collect import ANALYSES, Analysis, Collected
+from stewart_drake.report.figures import draw_comparison, draw_run
+from stewart_drake.report.page import Page, Picture, Provenance, Section, Table, Tone
+from stewart_drake.report.tables import number
+from stewart_drake.report.tuner_figures import weights_figure
+from stewart_drake.results import SimulationResult
+from stewart_drake.scenario_loading import scenario_yaml
+from stewart_drake.signals import COORDINATES
+from stewart_drake.studies.compare import LABELS, PAPER_ERRORS
+
+GOOD: Final = 5.0
+"""% of peak to peak: a mean error up to here, once torques can act, is called good."""
+
+_QUESTIONS: Final = {
+    "delay": "Can the delay be beaten?",
+    "hautus": "Can the models be controlled and observed?",
+    "workspace": "Does the motion fit the machine?",
+}
+_CAPTIONS: Final = {
+    "states": "As figure 5(a) of the paper: the plate's six coordinates.",
+    "errors": "As figure 5(b) of the paper: their errors.",
+    "torques_delay_lqr": "As figure 7(a) of the paper: torques without integral action.",
+    "torques_delay_lqi": "As figure 7(b) of the paper: torques with integral action.",
+    "torques_predictor_lqi": "The same for the controller that this project adds.",
+    "weights": "As figure 6 of the paper: the weights that the tuner's network sets online.",
+}
+_RUN_CAPTIONS: Final = {
+    "states": "Where the plate was, and where it should have been.",
+    "errors": "The difference.",
+    "torques": "Torques as computed, and as they acted after the delay.",
+    "parameters": "What the controller found out about the plant, which nobody told it.",
+    "weights": "The weights that the tuner set.",
+}
+_COLUMNS: Final = (
+    "controller",
+    "paper [%\u00a0s]",  # a head is broken before its unit only
+    "E_ac [%\u00a0s]",
+    "floor [%\u00a0s]",
+    "outcome",
+    "cost (40)",
+    "peak [N\u00a0m]",
+    "rms [N\u00a0m]",
+    "variation [N\u00a0m]",
+    "step [ms]",
+)
+_NO_NETWORK: Final = (
+    "There is no network for the tuner here, so that there is no figure 6; stewart-drake tune "
+    "makes one."
+)
+
+
+def report_page(found: Collected, name: str, made: Provenance, replay: str = "") -> Page:
+    """The report as a page.
+
+    Args:
+        found: what it is about.
+        name: of the scenario.
+        made: how.
+        replay: the replay's page, to be shown inside, or empty.
+    """
+    text, tone = verdict(found)
+    sections = list(_run_sections(found, replay))
+    if found.comparison:
+        sections.append(_comparison(found))
+    for key in ANALYSES:
+        sections.append(_answer(_QUESTIONS[key], found.analyses[key]))
+    sections += [_details(_QUESTIONS[key], found.analyses[key]) for key in ANALYSES]
+    sections.append(
+        Section(
+            "The scenario",
+            ("Every field, in the format of a scenario file: saved as one it runs again.",),
+            folded=True,
+            listing=scenario_yaml(found.scenario),
+        )
+    )
+    facts = _facts(found.scenario)
+    return Page(f"Report on the scenario {name}", text, sections, made, tone, facts)
+
+
+def report_summary(found: Collected) -> dict[str, Any]:
+    """What summary.json holds; each part as the command of its own writes it."""
+    text, tone = verdict(found)
+    return {
+        "verdict": text,
+        "tone": tone,
+        "failure": None if found.failure is None else found.failure._asdict(),
+        "run": None if found.run is None else found.run.summary,
+        "controllers": {name: run.summary for name, run in found.comparison.items()},
+        "tuned": {name: run.summary for name, run in found.tuned.items()},
+        "analyses": {
+            name: {"verdict": a.verdict, "tone": a.tone, **a.summary}
+            for name, a in found.analyses.items()
+        },
+    }
+
+
+def verdict(found: Collected) -> tuple[str, Tone]:
+    """How the scenario went in a few sentences, and how good that is."""
+    if found.run is None:
+        return sentence(found.analyses["workspace"].verdict), "bad"
+    run, s = found.run, found.run.summary
+    if run.stopped is not None:
+        return (
+            f"The run ended after {run.stopped.time:.2f} of {run.scenario.duration:g} s: "
+            f"{run.stopped.reason}.",
+            "bad",
+        )
+    error, floor, mean = s["accumulated_error"], s["delay_floor"], mean_error(run)
+    text = f"The plate follows its reference for all of {run.scenario.duration:g} s: E_ac is "
+    average = f"{number(mean, 2)} % of peak to peak on average"
+    if floor > 0:
+        text += (
+            f"{number(error)} % s, of which {number(floor)} pass before any torque can act. The "
+            f"rest is {average}."
+        )
+    else:
+        text += f"{number(error)} % s, {average}."
+    return text, "good" if mean <= GOOD else "fair"
+
+
+def mean_error(run: SimulationResult) -> float:
+    """% of peak to peak, over the time in which torques can act; NaN if the run ended early."""
+    s, sc = run.summary, run.scenario
+    blind = (sc.delay.steps + sc.delay.fraction) * sc.controller.period if s["delay_floor"] else 0.0
+    left = sc.duration - blind
+    return float((s["accumulated_error"] - s["delay_floor"]) / left) if left > 0 else np.nan
+
+
+def comparison_rows(found: Collected) -> list[tuple[str, ...]]:
+    """Table II: a row per controller, the tuner's after those with fixed weights."""
+    runs = [(LABELS[name], name, run) for name, run in found.comparison.items()]
+    runs += [(f"{LABELS[name]}, tuned", name, run) for name, run in found.tuned.items()]
+    return [_row(label, name, run) for label, name, run in runs]
+
+
+def _run_sections(found: Collected, replay: str) -> Iterator[Section]:
+    if found.run is None:
+        text = "The reference leaves the workspace, so that nothing was simulated."
+        yield Section("The run", (text,))
+        return
+    s = found.run.summary
+    entries = [
+        ("E_ac", f"{number(s['accumulated_error'])} % s"),
+        ("floor, from the delay alone", f"{number(s['delay_floor'])} % s"),
+        *(
+            (f"peak error, {name}", f"{number(value)} % of peak to peak")
+            for name, value in zip(COORDINATES, s["peak_error"], strict=True)
+        ),
+        ("torque, peak and rms", f"{number(s['peak_torque'])} and {number(s['rms_torque'])} N m"),
+        ("controller step, median", f"{number(s['controller_step_ms']['median'])} ms"),
+    ]
+    if replay:
+        text = "Drag to look around. The ring is where the plate should be."
+        yield Section("Replay", (text,), frame=replay)
+    pictures = _pictures(draw_run(found.run), _RUN_CAPTIONS)
+    yield Section("The run", (), [Table(("", "value"), entries)], pictures)
+
+
+def _comparison(found: Collected) -> Section:
+    text = [
+        "The same scenario under each of the shipped controllers. E_ac is the accumulated error "
+        "(47), the floor what the delay alone costs; torques are as commanded, their variation "
+        "tells trembling. The paper's numbers are those of its Table II, for its own "
+        "experiment; its delay-aware controllers had the tuner.",
+    ]
+    figures = draw_comparison(found.comparison)
+    if found.tuned:
+        figures["weights"] = weights_figure({LABELS[n]: run for n, run in found.tuned.items()})
+    elif "weights" not in figures:
+        text.append(_NO_NETWORK)
+    order = [name for name in _CAPTIONS if name in figures]
+    pictures = _pictures({name: figures[name] for name in order}, _CAPTIONS)
+    table = Table(
+        _COLUMNS, comparison_rows(found), "Table II of the paper, and what comes out here"
+    )
+    return Section("The controllers compared", text, [table], pictures)
+
+
+def _row(label: str, name: str, run: SimulationResult) -> tuple[str, ...]:
+    s, paper = run.summary, "-"
+    if name in PAPER_ERRORS:
+        error = PAPER_ERRORS[name]
+        paper = "NaN" if error is None else f"{error:.0f}"
+    outcome = run.status.replace("_", " ")
+    if run.stopped is not None:
+        leg = "" if run.stopped.leg is None else f", leg {run.stopped.leg}"
+        outcome += f" at {run.stopped.time:.2f} s{leg}"
+    torques = (s["peak_torque"], s["rms_torque"], s["torque_variation"])
+    return (
+        label,
+        paper,
+        number(s["accumulated_error"]),
+        number(s["delay_floor"]),
+        outcome,
+        number(s["cost"]),
+        *(number(value, 2) for value in torques),
+        number(s["controller_step_ms"]["median"], 2),
+    )
+
+
+def _answer(question: str, analysis: Analysis) -> Section:
+    pictures = [picture for section in analysis.page.sections for picture in section.pictures]
+    return Section(question, (sentence(analysis.verdict),), pictures=pictures)
+
+
+def _details(question: str, analysis: Analysis) -> Section:
+    """What the analysis' own page says and tabulates, in one folded section."""
+    parts = analysis.page.sections
+    text = [f"{part.heading}. {paragraph}" for part in parts for paragraph in part.text]
+    tables = [table for part in parts for table in part.tables]
+    return Section(f"Details: {question}", text, tables, folded=True)
+
+
+def _pictures(figures: Mapping[str, Any], captions: Mapping[str, str]) -> list[Picture]:
+    return [Picture(figure, captions[name]) for name, figure in figures.items()]
+
+
+def _facts(scenario: Scenario) -> dict[str, str]:
+    c, delay, plant = scenario.controller, scenario.delay, scenario.plant
+    eta = (delay.steps + delay.fraction) * c.period
+    return {
+        "mechanism": Path(scenario.mechanism).stem,
+        "reference": f"{scenario.reference.kind}, {scenario.duration:g} s",
+        "delay": f"{eta:.4g} s, {delay.steps + delay.fraction:g} periods of {c.period:g} s",
+        "plant": f"{plant.kind}, {'with' if plant.gravity else 'without'} gravity",
+        "controller": f"{c.prediction} prediction, feedforward {c.feedforward}, "
+        f"estimator {c.estimator}".replace("_", " "),
+        "start": f"{scenario.start.replace('_', ' ')}, torques in flight: {scenario.queue}",
+    }
+
+
+def sentence(text: str) -> str:
+    """With a capital letter and a full stop."""
+    return text[:1].upper() + text[1:].removesuffix(".") + "."

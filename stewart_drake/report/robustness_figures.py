@@ -1,0 +1,167 @@
+"""Figures of a robustness study: distribution of E_ac, what matters, every run, when it failed."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from stewart_drake.report.style import BAND_ALPHA, RUN, TRUTH, Line, figure_style
+from stewart_drake.studies.robustness_result import (
+    FACTORS,
+    Influence,
+    RobustnessStudy,
+    factor_values,
+)
+from stewart_drake.studies.statistics import Correlation, wilson_interval
+
+Array = NDArray[np.float64]
+
+TITLES: Final = {
+    "payload": "payload",
+    "torque_bias": "torque bias, rms",
+    "noise": "noise of the sensor",
+    "torque_limit": "torque limit",
+    "damping": "joint damping",
+    "delay": "delay error",
+    "lengths": "lengths, rms",
+    "anchors": "anchors, rms",
+}
+SIGNIFICANT: Final = 0.05
+"""Adjusted p-value below which an influence counts as found."""
+LIMIT: Final = Line("#8A2B0B", "-", 0.9)
+_SOFT: Final = "#666666"
+_WIDTH: Final = 9.0
+"""Inches."""
+
+
+def title(factor: str) -> str:
+    """A factor in words; |factor| is its size."""
+    name = TITLES[factor.strip("|")]
+    return f"|{name}|" if factor.startswith("|") else name
+
+
+def distribution_figure(study: RobustnessStudy) -> Figure:
+    """Share of all runs with E_ac at most so large, with its interval point by point."""
+    with figure_style():
+        figure, (ax,) = _panels(1, 3.4)
+        errors, number = np.sort(study.errors[np.isfinite(study.errors)]), len(study.outcomes)
+        counts = np.arange(1, len(errors) + 1)
+        bounds = [wilson_interval(int(n), number) for n in counts]
+        low, high = ([100 * getattr(b, end) for b in bounds] for end in ("low", "high"))
+        label = "95 % interval"
+        ax.fill_between(errors, low, high, step="post", color=RUN.color, alpha=BAND_ALPHA, lw=0,
+                        label=label)  # fmt: skip
+        ax.step(errors, 100 * counts / number, where="post", label="all runs", **RUN._asdict())
+        if len(errors) < number:
+            share = 100 * len(errors) / number
+            ax.axhline(share, color=LIMIT.color, lw=LIMIT.linewidth)
+            text = f"{number - len(errors)} of {number} runs did not complete"
+            below = share > 50  # where there is room for the words
+            ax.annotate(text, (0.01, share), xycoords=("axes fraction", "data"), fontsize=8,
+                        xytext=(0, -4 if below else 4), textcoords="offset points",
+                        va="top" if below else "bottom", color=LIMIT.color, zorder=5,
+                        bbox={"fc": "white", "ec": "none", "pad": 0.6})  # fmt: skip
+        if np.isfinite(study.undisturbed.error):
+            ax.axvline(study.undisturbed.error, label="undisturbed run", **TRUTH._asdict())
+        if study.limit is not None:
+            ax.axvline(study.limit, color=LIMIT.color, ls=":", label="limit")
+        ax.set(xscale="log", ylim=(0, 103))
+        ax.set(xlabel="accumulated error E_ac  [% s]", ylabel="share of all runs  [%]")
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+        return figure
+
+
+def influence_figure(influences: Sequence[Influence]) -> Figure:
+    """Rank correlations with their intervals; hollow where chance explains them."""
+    with figure_style():
+        figure, axes = _panels(2, 1.2 + 0.27 * len(influences), sharey=True)
+        names = [title(one.factor) for one in influences]
+        errors = [(one.error, one.error_p) for one in influences]
+        failures = [(one.failure, one.failure_p) for one in influences]
+        _dots(axes[0], errors, "rank correlation with E_ac, completed runs")
+        _dots(axes[1], failures, "rank correlation with failing, all runs")
+        axes[0].set_yticks(range(len(names)), names)
+        axes[0].set_ylim(len(names) - 0.5, -0.5)
+        return figure
+
+
+def runs_figure(study: RobustnessStudy) -> Figure:
+    """E_ac of every run over every drawn quantity, failures in a strip of their own on top."""
+    with figure_style():
+        figure = Figure(figsize=(_WIDTH, 5.2), layout="constrained")
+        axes = figure.subplots(2, 4, sharey=True)
+        values, done = factor_values(study.draws), np.isfinite(study.errors)
+        for ax, (name, unit) in zip(axes.ravel(), FACTORS.items(), strict=True):
+            x = values[name]
+            kept = done & ~study.failed
+            _scatter(ax, x[kept], study.errors[kept], "o", RUN.color, "success")
+            above = done & study.failed
+            if above.any():
+                _scatter(ax, x[above], study.errors[above], "s", "#E69F00", "above the limit")
+            ax.set(yscale="log", xlabel=f"{TITLES[name]}  [{unit}]")
+            if not np.isfinite(x).all():
+                ax.text(0.5, 0.5, "none", transform=ax.transAxes, ha="center", color=_SOFT)
+        low, high = _log_range(study.errors[done])
+        strip = high * (high / low) ** 0.06
+        top = high * (high / low) ** 0.18
+        for ax, name in zip(axes.ravel(), FACTORS, strict=True):
+            ax.set_ylim(low, top)
+            ax.axhspan(strip, top, color="#F1EAE6", zorder=0)
+            # Spread over the strip by the number of the run, so that marks do not hide each other.
+            spread = (np.arange(len(done)) * 0.618034) % 1 * 0.8 + 0.1
+            y = strip * (top / strip) ** spread[~done]
+            _scatter(ax, values[name][~done], y, "x", LIMIT.color, "did not complete")
+        for ax in axes[:, 0]:
+            ax.set_ylabel("E_ac  [% s]")
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        return figure
+
+
+def times_figure(study: RobustnessStudy) -> Figure:
+    """When runs ended early."""
+    with figure_style():
+        figure, (ax,) = _panels(1, 2.2)
+        times = [one.time for one in study.outcomes if one.status != "completed"]
+        end = study.experiment.scenario.duration
+        ax.hist(times, bins=np.linspace(0, end, 41).tolist(), color=RUN.color, ec="white", lw=0.5)
+        ax.set(xlim=(0, end), xlabel="time at which a run ended early  [s]", ylabel="runs")
+        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+        return figure
+
+
+def _panels(number: int, height: float, sharey: bool = False) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+    return figure, list(np.atleast_1d(figure.subplots(1, number, sharey=sharey)))
+
+
+def _dots(ax: Axes, found: Sequence[tuple[Correlation, float]], label: str) -> None:
+    ax.axvline(0, color=_SOFT, lw=0.8)
+    for row, (one, p) in enumerate(found):
+        if np.isnan(one.rho):
+            ax.text(0.02, row, "not asked", va="center", fontsize=8, color=_SOFT)
+            continue
+        sure = p < SIGNIFICANT
+        color = RUN.color if sure else _SOFT
+        ax.plot([one.low, one.high], [row, row], color=color, lw=1.8 if sure else 1.0)
+        ax.plot(one.rho, row, "o", ms=6, mec=color, mfc=color if sure else "white")
+    ax.set(xlim=(-1, 1), xlabel=label)
+
+
+def _scatter(ax: Axes, x: Array, y: Array, marker: str, color: str, label: str) -> None:
+    style = {"linewidths": 0.9} if marker == "x" else {"edgecolors": "none"}
+    ax.scatter(x, y, s=11, marker=marker, color=color, alpha=0.75, label=label, **style)
+
+
+def _log_range(errors: Array) -> tuple[float, float]:
+    """Ends of a logarithmic axis around the errors that there are."""
+    positive = errors[errors > 0]
+    if not len(positive):
+        return 0.1, 10.0
+    low, high = float(positive.min()), float(positive.max())
+    room = max((high / low) ** 0.05, 1.2)
+    return low / room, high * room

@@ -1,0 +1,249 @@
+"""How much delay a scenario can bear: open loop, closed loop, and in simulations."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from stewart_drake.config import Scenario
+from stewart_drake.design.limits import amplification, fastest_pole, largest_delay
+from stewart_drake.design.riccati import RiccatiError
+from stewart_drake.metrics import delay_floor
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.plant.workspace import diagnose
+from stewart_drake.signals import ACCELERATIONS, POSE, RATES
+from stewart_drake.studies.basis import Basis, basis
+from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
+from stewart_drake.studies.delay_map import Cell, Progress, delay_map, map_delays
+from stewart_drake.studies.verdict import Verdict
+from stewart_drake.trajectories import evaluate
+
+Array = NDArray[np.float64]
+
+INSTANTS: Final = 61
+"""Poles are looked at this often along the reference."""
+TOLERABLE: Final = (2.0, 10.0, 100.0, 1000.0)
+"""Growths of prediction errors for which the largest delay is given."""
+_CHECKS: Final = 5
+"""Poses at which growth is also simulated."""
+_LARGEST_GROWTH: Final = 1e5
+"""Growth that a simulation can show: rounding must not grow to what is measured."""
+_PERTURBATION: Final = 1e-5
+"""Of the usual motion, what a perturbation has grown to in the end."""
+_STEP: Final = 1e-3
+"""s, of the Runge-Kutta method in it."""
+
+
+class PolePoint(NamedTuple):
+    """The open loop at one instant of the reference."""
+
+    time: float
+    """s."""
+    moving: float
+    """Fastest unstable pole, 1/s, linearised about the moving reference; 0 without one."""
+    held: float
+    """The same with the plate held still at that pose; NaN where no torque holds it."""
+
+
+class Growth(NamedTuple):
+    """A perturbation of the plate held still, along its fastest mode, in a simulation."""
+
+    time: float
+    """s, along the reference."""
+    seconds: float
+    """How long it grew."""
+    expected: float
+    """e^(p seconds)."""
+    simulated: float
+
+
+@dataclass(frozen=True)
+class DelayStudy:
+    """Everything there is to say about the delay.
+
+    Attributes:
+        basis: what was analysed.
+        eta: total delay, s.
+        poles: along the reference, as far as it can be followed.
+        growths: e^(p eta) checked by simulation; none where nothing grows.
+        floors: E_ac in % s of a plate at rest with nothing in flight, by whole periods of delay.
+        loops: the closed loop by delay; empty with a reason in `loop_problem`.
+        loop_problem: why there is no closed loop to judge, or empty.
+        cells: simulations by delay and amplitude.
+        interrupted: whether Ctrl-C ended those early.
+    """
+
+    basis: Basis
+    eta: float
+    poles: tuple[PolePoint, ...]
+    growths: tuple[Growth, ...]
+    floors: dict[int, float]
+    loops: tuple[LoopMargins, ...]
+    loop_problem: str
+    cells: tuple[Cell, ...]
+    interrupted: bool
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Whether the delay can be beaten; None where the motion has no first instant."""
+        if not self.poles:
+            return None
+        worst = max(self.poles, key=lambda point: point.moving)
+        return Verdict(self.eta, worst.moving, worst.time)
+
+    @property
+    def loop(self) -> LoopMargins | None:
+        """The closed loop at the scenario's own delay."""
+        own = self.basis.experiment.scenario.delay.steps
+        return next((loop for loop in self.loops if loop.steps == own), None)
+
+    @property
+    def floor_applies(self) -> bool:
+        """Whether the scenario starts at rest with nothing in flight, as the floor supposes."""
+        sc = self.basis.experiment.scenario
+        return sc.start == "rest" and sc.queue == "zero"
+
+    @property
+    def limits(self) -> list[tuple[float, float, float]]:
+        """Tolerable growth, largest delay in s, and when on the reference it is the least, s."""
+        if not self.poles:
+            return []
+        worst = max(self.poles, key=lambda point: point.moving)
+        return [(a, largest_delay(worst.moving, a), worst.time) for a in TOLERABLE]
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What summary.json holds."""
+        own = self.basis.experiment.scenario.delay.steps
+        return {
+            "eta": self.eta,
+            "obstacles": self.basis.obstacles,
+            "verdict": None if self.verdict is None else str(self.verdict),
+            "beatable": None if self.verdict is None else self.verdict.beatable,
+            "poses": [
+                {
+                    "t": point.time,
+                    "fastest_pole": point.moving,
+                    "amplification": amplification(point.moving, self.eta),
+                    "fastest_pole_held": point.held,
+                }
+                for point in self.poles
+            ],
+            "growth_checks": [growth._asdict() for growth in self.growths],
+            "largest_delay": [
+                {"amplification": a, "delay": delay, "t": t} for a, delay, t in self.limits
+            ],
+            "error_floor": self.floors[own],
+            "error_floor_applies": self.floor_applies,
+            "loop": [loop.summary for loop in self.loops],
+            "loop_problem": self.loop_problem or None,
+            "map": [
+                {**cell._asdict(), "floor": self.floors[cell.steps] if self.floor_applies else 0.0}
+                for cell in self.cells
+            ],
+            "interrupted": self.interrupted,
+        }
+
+
+def study_delay(
+    scenario: Scenario, progress: Progress | None = None, *, simulations: bool = True
+) -> DelayStudy:
+    """Analyse a scenario's delay.
+
+    Args:
+        scenario: what to analyse.
+        progress: called for each finished simulation.
+        simulations: whether to simulate over delay and amplitude, which takes longest.
+
+    Raises:
+        ConfigError: one line. A motion or a home pose outside the workspace is no error, see
+            `Basis.obstacles`.
+    """
+    with threadpool_limits(limits=1):
+        found = basis(scenario)
+        period, fraction = scenario.controller.period, scenario.delay.fraction
+        poles = _poles(found)
+        loops, problem = _loops(found)
+        cells, interrupted = (
+            delay_map(scenario, progress) if simulations and not problem else ([], False)
+        )
+        wanted = {scenario.delay.steps, *map_delays(scenario.delay.steps)}
+        return DelayStudy(
+            basis=found,
+            eta=(scenario.delay.steps + fraction) * period,
+            poles=tuple(poles),
+            growths=tuple(_growths(found, poles, (scenario.delay.steps + fraction) * period)),
+            floors={steps: error_floor(found, (steps + fraction) * period) for steps in wanted},
+            loops=tuple(loops),
+            loop_problem=problem,
+            cells=tuple(cells),
+            interrupted=interrupted,
+        )
+
+
+def error_floor(found: Basis, eta: float) -> float:
+    """E_ac in % s that a plate at rest at the first pose collects in `eta` s without any torque."""
+    reference, duration = found.experiment.reference, found.experiment.scenario.duration
+    time: Array = np.linspace(0.0, min(eta, duration), 2001, dtype=np.float64)
+    poses = np.array([reference.value(t)[:, 0] for t in time])
+    return delay_floor(time, poses, found.experiment.scale, eta)
+
+
+def simulated_growth(
+    dynamics: StewartDynamics, pose: Array, seconds: float, size: float
+) -> tuple[float, float]:
+    """e^(p seconds), and what becomes of a perturbation of the plate held still at a pose (6,).
+
+    It starts along the mode of the fastest pole p, so small that it ends at about `size` (rad, m),
+    and the nonlinear equations are integrated with the torque that holds the plate.
+    """
+    torque = dynamics.equilibrium_torque(pose)
+    values, vectors = np.linalg.eig(dynamics.linearize(pose, torque=torque)[0])
+    at = int(values.real.argmax())
+    mode = vectors[:, at].real / np.abs(vectors[POSE, at].real).max()
+    expected = amplification(float(values[at].real), seconds)
+    start = np.concatenate([pose, np.zeros(6)]) + size / expected * mode
+    number = max(1, math.ceil(seconds / _STEP))
+    states = dynamics.predict(start, np.tile(torque, (number, 1)), seconds / number)
+    moved = np.linalg.norm(states[-1, POSE] - pose) / np.linalg.norm(start[POSE] - pose)
+    return expected, float(moved)
+
+
+def _poles(found: Basis) -> list[PolePoint]:
+    experiment, points = found.experiment, []
+    end = found.followed_until
+    for t in np.linspace(0.0, end, INSTANTS) if end > 0 else ():
+        x = evaluate(experiment.reference, t)
+        pose, rates = x[POSE], x[RATES]
+        torque = experiment.nominal.inverse_dynamics(pose, rates, x[ACCELERATIONS])
+        moving = fastest_pole(experiment.nominal.derivatives(pose, rates, torque).A)
+        held = fastest_pole(experiment.nominal.linearize(pose)[0])
+        points.append(PolePoint(float(t), moving, held))
+    return points
+
+
+def _growths(found: Basis, poles: list[PolePoint], eta: float) -> list[Growth]:
+    experiment, growths = found.experiment, []
+    for point in poles[:: max(1, len(poles) // _CHECKS)][:_CHECKS]:
+        if point.held == 0 or eta == 0:
+            continue
+        seconds = min(eta, largest_delay(point.held, _LARGEST_GROWTH))
+        pose = experiment.reference.value(point.time)[:, 0]
+        size = _PERTURBATION * float(found.motion.min())
+        pair = simulated_growth(experiment.nominal, pose, seconds, size)
+        growths.append(Growth(point.time, seconds, *pair))
+    return growths
+
+
+def _loops(found: Basis) -> tuple[list[LoopMargins], str]:
+    pose = found.experiment.reference.value(0.0)[:, 0]
+    failure = diagnose(found.experiment.mechanism, 0.0, pose)
+    if failure is not None:
+        return [], f"at the reference's first pose: {failure.reason}"
+    try:
+        return loop_margins(found), ""
+    except (RiccatiError, np.linalg.LinAlgError) as error:
+        return [], f"no gain at the reference's first pose: {error}"

@@ -1,0 +1,177 @@
+"""What the delayed LQI loop of a scenario bears, for every delay: peaks, gain, phase, delay."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.config import Scenario
+from stewart_drake.design.delay_model import DelayedModel, delayed_model
+from stewart_drake.design.error_model import ContinuousModel, double_integrators, linear_model
+from stewart_drake.design.limits import (
+    Peak,
+    closed_loop,
+    first_instability,
+    frequency_grid,
+    loop_gain,
+    peaks,
+    sensitivity,
+    spectral_radius,
+)
+from stewart_drake.design.riccati import augmented_gain
+from stewart_drake.design.startup import weight_scales
+from stewart_drake.experiment import believed_delay
+from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.signals import POSE
+from stewart_drake.studies.basis import Basis
+from stewart_drake.trajectories import evaluate
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+DELAYS: Final = (0, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 25, 30)
+"""Whole periods of delay for which the loop is designed and judged, beside the scenario's own."""
+_LONGEST_ERROR: Final = 30
+"""Periods; a true delay longer than believed by more than this is not looked at."""
+_GAIN_LIMIT: Final = 100.0
+"""Motors stronger by more than this factor are not looked at."""
+_POINTS: Final = 800
+"""Frequencies at which a motor's loop is handed to python-control, beside some low ones."""
+_BEYOND: Final = 1.1
+"""The grid goes on to so many Nyquist frequencies, so that a crossing right there is seen."""
+
+
+class MotorMargins(NamedTuple):
+    """One motor's loop cut while the other five stay closed; of all six the worst."""
+
+    gain_up: float
+    """Factor by which the motor may be stronger, > 1."""
+    gain_down: float
+    """Factor by which it may be weaker, < 1, 0 where it may fail."""
+    phase: float
+    """Degrees."""
+
+
+@dataclass(frozen=True)
+class LoopMargins:
+    """The loop of one delay.
+
+    Attributes:
+        steps: mu.
+        radius: spectral radius of the closed loop, 1 or more where it is unstable.
+        S, T: peaks of sensitivity and complementary sensitivity at the motors.
+        gain_up, gain_down: factors by which all motors together may be stronger, weaker.
+        motor: the classical margins, one motor at a time; None where it is unstable.
+        later, earlier: s, by which the true delay may exceed, or fall short of, the one believed.
+    """
+
+    steps: int
+    radius: float
+    S: Peak
+    T: Peak
+    gain_up: float
+    gain_down: float
+    motor: MotorMargins | None
+    later: float
+    earlier: float
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Plain data."""
+        return {
+            "mu": self.steps,
+            "spectral_radius": self.radius,
+            "sensitivity_peak": self.S.value,
+            "sensitivity_frequency": self.S.frequency,
+            "complementary_peak": self.T.value,
+            "complementary_frequency": self.T.frequency,
+            "gain_margin": [self.gain_down, self.gain_up],
+            "motor_gain_margin": self.motor and [self.motor.gain_down, self.motor.gain_up],
+            "motor_phase_margin_deg": self.motor and self.motor.phase,
+            "delay_margin_later": self.later,
+            "delay_margin_earlier": self.earlier,
+        }
+
+
+def loop_margins(found: Basis, delays: Iterable[int] = DELAYS) -> list[LoopMargins]:
+    """The loop linearised at the reference's first pose, held still, over the delay.
+
+    For some delays mu, the scenario's own among them. Designed as the scenario's controller is
+    (model, weights, what it believes of the delay), closed around the true plant. The estimator
+    and the feedforward have no part in it.
+
+    Raises:
+        RiccatiError: there is no gain.
+        numpy.linalg.LinAlgError: no torques hold the plate at that pose.
+    """
+    sc, mechanism = found.experiment.scenario, found.experiment.mechanism
+    c, pose = sc.controller, evaluate(found.experiment.reference, 0.0)[POSE]
+    plant = linear_model(*found.experiment.nominal.linearize(pose))
+    design = plant
+    if c.model == "paper":
+        design = double_integrators(torque_map(mechanism, pose, c.torque_map))
+    errors, integrals, torques = weight_scales(
+        c.weight_scaling, found.experiment.scale, found.torque
+    )
+    Q = c.w_Q * np.diag(np.concatenate([errors, integrals] if c.integral else [errors]))
+    R = c.w_R * np.diag(torques)
+    return [_judge(sc, plant, design, Q, R, steps) for steps in sorted({*delays, sc.delay.steps})]
+
+
+def _judge(
+    sc: Scenario, plant: ContinuousModel, design: ContinuousModel, Q: Array, R: Array, steps: int
+) -> LoopMargins:
+    c, fraction = sc.controller, sc.delay.fraction
+    believed = believed_delay(replace(sc, delay=replace(sc.delay, steps=steps)))
+    K = augmented_gain(delayed_model(design, c.period, *believed, integral=c.integral), Q, R)
+    true = delayed_model(plant, c.period, steps, fraction, integral=c.integral)
+
+    def late(by: float) -> Array:
+        """The closed loop with the delay longer by so many s."""
+        periods = max(0.0, steps + fraction + by / c.period)
+        whole = int(periods + 1e-9)
+        share = max(0.0, periods - whole)
+        model = delayed_model(plant, c.period, whole, share, integral=c.integral)
+        return closed_loop(model, K)
+
+    radius = spectral_radius(closed_loop(true, K))
+    unknown = Peak(math.nan, math.nan)
+    S, T = peaks(true, K, c.period) if radius < 1 else (unknown, unknown)
+    up = first_instability(lambda by: closed_loop(true, K, 1 + by), 1e-3, _GAIN_LIMIT)
+    down = first_instability(lambda by: closed_loop(true, K, 1 - by), 1e-3, 1.0)
+    eta, finest = (steps + fraction) * c.period, 1e-4 * c.period
+    return LoopMargins(
+        steps=steps,
+        radius=radius,
+        S=S,
+        T=T,
+        gain_up=1 + up,
+        gain_down=max(0.0, 1 - down),
+        motor=_motor_margins(true, K, c.period) if radius < 1 else None,
+        later=first_instability(late, finest, _LONGEST_ERROR * c.period),
+        earlier=first_instability(lambda by: late(-by), finest, eta) if eta > 0 else math.inf,
+    )
+
+
+def _motor_margins(plant: DelayedModel, K: Array, period: float) -> MotorMargins:
+    """Worst margins of six single loops, by python-control from their frequency responses.
+
+    With the other five closed, the loop of motor i is L_i = 1 / S_ii - 1.
+    """
+    import control
+
+    nyquist = np.pi / period
+    evenly = np.linspace(0.0, _BEYOND * nyquist, _POINTS)[1:]
+    grid = np.union1d(frequency_grid(period, _POINTS // 8), evenly)
+    S = sensitivity(loop_gain(plant, K, np.exp(1j * grid * period)))
+    up, down, phase = math.inf, 0.0, math.inf
+    for motor in range(S.shape[1]):
+        response = control.frd(1 / S[:, motor, motor] - 1, grid, smooth=True)
+        gains, phases, *_ = control.stability_margins(response, returnall=True)
+        up = min([up, *gains[gains > 1]])
+        down = max([down, *gains[gains < 1]])
+        phase = min([phase, *np.abs(phases)])
+    return MotorMargins(float(up), float(down), float(phase))

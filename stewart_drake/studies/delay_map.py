@@ -1,0 +1,121 @@
+"""What is achieved at other delays and amplitudes: a scenario simulated over a grid of both."""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from stewart_drake.config import ReferenceConfig, Scenario
+from stewart_drake.experiment import assemble, reference_failure
+from stewart_drake.reference_files import read_waypoints
+from stewart_drake.results import jsonable
+from stewart_drake.scenario_loading import scenario_to_dict
+from stewart_drake.simulation import simulate
+from stewart_drake.studies.jobs import finished, run_jobs
+
+FACTORS: Final = (0.5, 0.75, 1.0, 1.25)
+"""Of the reference's amplitude."""
+
+Progress = Callable[[int, int], None]
+"""Called with the number of finished simulations and of all."""
+
+
+class Cell(NamedTuple):
+    """One simulation of the map."""
+
+    steps: int
+    """Whole periods of delay."""
+    factor: float
+    """Of the reference's amplitude."""
+    status: str
+    """As of a simulation, or `out_of_reach` where the reference leaves the workspace, or
+    `not_run` after Ctrl-C."""
+    error: float
+    """E_ac in % s, NaN where the run did not complete."""
+    time: float
+    """s, when it ended early, or the reference leaves the workspace; else NaN."""
+
+
+def map_delays(steps: int) -> list[int]:
+    """Delays to look at around a scenario's own."""
+    return sorted({0, steps // 2, steps, 3 * steps // 2, 2 * steps}) if steps > 1 else [0, 1, 2, 4]
+
+
+def scaled_motion(reference: ReferenceConfig, factor: float) -> ReferenceConfig | None:
+    """The motion with its amplitude, or its way from the first waypoint, times `factor`.
+
+    None where it has no amplitude to scale: a constant pose, or a file of samples.
+    """
+    if factor == 1:
+        return reference
+    if reference.kind == "sine":
+        return replace(reference, amplitude=[factor * a for a in reference.amplitude])
+    if reference.kind != "waypoints":
+        return None
+    if reference.file is not None:
+        times, poses = read_waypoints(reference.file)
+    else:
+        times, poses = np.array(reference.times), np.array(reference.poses)
+    way = poses[0] + factor * (poses - poses[0])
+    return replace(reference, file=None, times=times.tolist(), poses=way.tolist())
+
+
+def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[list[Cell], bool]:
+    """Simulate a scenario on the exact plant over delays and amplitudes, on all cores.
+
+    Everything else stays as it is, what the controller believes of the delay included.
+
+    Returns:
+        Cells by delay, then factor, and whether Ctrl-C ended it early.
+    """
+    cells: dict[str, Cell] = {}
+    jobs: dict[str, tuple[Scenario]] = {}
+    for steps in map_delays(scenario.delay.steps):
+        for factor in FACTORS:
+            motion = scaled_motion(scenario.reference, factor)
+            if motion is None:
+                continue
+            variant = replace(
+                scenario,
+                reference=motion,
+                plant=replace(scenario.plant, kind="exact"),
+                delay=replace(scenario.delay, steps=steps),
+            )
+            key = f"mu{steps}-x{factor}"
+            failure = reference_failure(assemble(variant))
+            if failure is None:
+                jobs[key] = (variant,)
+                cells[key] = Cell(steps, factor, "not_run", math.nan, math.nan)
+            else:
+                cells[key] = Cell(steps, factor, "out_of_reach", math.nan, float(failure.time))
+    interrupted = False
+    with TemporaryDirectory() as folder:
+        try:
+            settings = scenario_to_dict(scenario)
+            paths = run_jobs(jobs, run_cell, folder, settings=settings, progress=progress)
+        except KeyboardInterrupt:
+            paths, interrupted = finished(jobs, folder), True
+        for key, path in paths.items():
+            cells[key] = _with_outcome(cells[key], path)
+    return list(cells.values()), interrupted
+
+
+def run_cell(scenario: Scenario) -> bytes:
+    """Status, E_ac in % s and time of the end in s of one simulation, as JSON."""
+    result = simulate(scenario)
+    if result.status == "interrupted":
+        raise KeyboardInterrupt
+    time = math.nan if result.stopped is None else result.stopped.time
+    found = {"status": result.status, "error": result.accumulated_error, "time": time}
+    return json.dumps(jsonable(found)).encode()
+
+
+def _with_outcome(cell: Cell, path: Path) -> Cell:
+    data = json.loads(path.read_text(encoding="utf-8"))
+    error, time = (math.nan if data[key] is None else data[key] for key in ("error", "time"))
+    return cell._replace(status=data["status"], error=error, time=time)

@@ -1,0 +1,281 @@
+"""The Hautus test on every model that a controller of the platform is designed with.
+
+Three families: the paper's error model (20)-(28), continuous; the same sampled and with the torques
+in flight, for every delay, as the minimal chain and as the paper's (37)-(39), which carries one
+torque more; and the true plant, linearised where it is held still. All in units in which the
+motion, and the torques it takes, are of size 1, see `basis`.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.primitives import (
+    IsControllable,
+    IsDetectable,
+    IsObservable,
+    IsStabilizable,
+    LinearSystem,
+)
+from threadpoolctl import threadpool_limits
+
+from stewart_drake.config import Scenario
+from stewart_drake.design.delay_model import chain, delayed_model
+from stewart_drake.design.error_model import (
+    ContinuousModel,
+    double_integrators,
+    linear_model,
+    with_integral,
+)
+from stewart_drake.design.hautus import TOLERANCE, Hautus, hautus, scaled
+from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.plant.workspace import SINGULARITY_LIMIT, Failure, diagnose, standing
+from stewart_drake.signals import NUM_TORQUES
+from stewart_drake.studies.basis import Basis, basis
+from stewart_drake.studies.mode_words import mode_words, state_labels
+
+Array = NDArray[np.float64]
+
+LONGEST: Final = 30
+"""Whole periods of delay up to which the delayed models are tested."""
+POSES: Final = 9
+"""Instants at which the plant is linearised along the reference."""
+QUESTIONS: Final = ("controllable", "stabilizable", "observable", "detectable")
+
+
+@dataclass(frozen=True)
+class System:
+    """One system and what the tests say of it.
+
+    Attributes:
+        name: unique.
+        family: `error model`, `minimal chain`, `paper's chain`, `chain under gravity` or `plant`.
+        steps: of delay, None where there is none.
+        time: s along the reference, None for home.
+        n, m: states and inputs.
+        reach, view: tests of (A, B), and of (A', C').
+        drake: Drake's answers to QUESTIONS.
+        words: what is not reached or not seen, a sentence for each mode that fails.
+        note: why Drake disagrees, empty where it does not.
+    """
+
+    name: str
+    family: str
+    steps: int | None
+    time: float | None
+    n: int
+    m: int
+    reach: Hautus
+    view: Hautus
+    drake: dict[str, bool]
+    words: tuple[str, ...]
+    note: str
+
+    @property
+    def answers(self) -> dict[str, bool]:
+        """Ours to QUESTIONS."""
+        return _answers(self.reach, self.view)
+
+    @property
+    def margins(self) -> dict[str, float]:
+        """Least relative singular value behind each answer, infinite where no mode is asked."""
+        tests = (self.reach, self.view)
+        values = [margin for test in tests for margin in (test.margin, test.lasting_margin)]
+        return dict(zip(QUESTIONS, values, strict=True))
+
+
+@dataclass(frozen=True)
+class HautusStudy:
+    """All systems, and the poses that could not be looked at.
+
+    Attributes:
+        basis: what was analysed.
+        systems: in the order of the families.
+        skipped: name and reason.
+    """
+
+    basis: Basis
+    systems: tuple[System, ...]
+    skipped: tuple[tuple[str, str], ...]
+
+    def family(self, name: str) -> list[System]:
+        """The systems of one family."""
+        return [system for system in self.systems if system.family == name]
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What summary.json holds."""
+        return {
+            "tolerance": TOLERANCE,
+            "units": {"pose": self.basis.motion, "torque": self.basis.torque},
+            "obstacles": self.basis.obstacles,
+            "systems": [_system_summary(system) for system in self.systems],
+            "skipped": [{"name": name, "reason": reason} for name, reason in self.skipped],
+        }
+
+
+def study_hautus(scenario: Scenario) -> HautusStudy:
+    """Test every model of a scenario.
+
+    Raises:
+        ConfigError: one line. A motion or a home pose outside the workspace is no error, see
+            `Basis.obstacles`.
+    """
+    with threadpool_limits(limits=1):
+        found = basis(scenario)
+        systems, skipped = [], []
+        home = found.experiment.mechanism.home
+        reason = _unusable(found.home_failure)
+        if reason is None:
+            tau = torque_map(found.experiment.mechanism, home)
+            systems += _error_models(found, double_integrators(tau))
+        else:
+            skipped.append(("error model and delay chains", reason))
+        plants, without = _plants(found)
+        return HautusStudy(found, (*systems, *plants), (*skipped, *without))
+
+
+def _error_models(found: Basis, model: ContinuousModel) -> list[System]:
+    """The continuous model, and with it, and with the plant under gravity, all delay chains."""
+    delay, period = found.experiment.scenario.delay, found.experiment.scenario.controller.period
+    systems = [_test(found, "error model, continuous", "error model", with_integral(model))]
+    heavy = _linearized(found, True, found.experiment.mechanism.home)
+    families: list[tuple[str, ContinuousModel | str, bool]] = [
+        ("minimal chain", model, False),
+        ("paper's chain", model, True),
+        ("chain under gravity", heavy, False),
+    ]
+    for family, continuous, extra in families:
+        if isinstance(continuous, str):
+            continue  # the plant's own entry says why
+        for steps in range(LONGEST + 1):
+            sampled = delayed_model(continuous, period, steps, delay.fraction, integral=True)
+            augmented = chain(sampled, always_extra=extra)
+            discrete = ContinuousModel(augmented.A, augmented.B, augmented.C)
+            systems.append(
+                _test(found, f"{family}, mu = {steps}", family, discrete, steps, period=period)
+            )
+    return systems
+
+
+def _plants(found: Basis) -> tuple[list[System], list[tuple[str, str]]]:
+    sc, reference = found.experiment.scenario, found.experiment.reference
+    places: list[tuple[str, float | None, Array]] = [
+        ("home", None, found.experiment.mechanism.home),
+        *(
+            (f"t = {t:.2f} s", float(t), reference.value(t)[:, 0])
+            for t in np.linspace(0.0, sc.duration, POSES)
+        ),
+    ]
+    systems, skipped = [], []
+    for gravity in (False, True):
+        for place, time, pose in places:
+            name = f"plant {'under' if gravity else 'without'} gravity, {place}"
+            model = _linearized(found, gravity, pose)
+            if isinstance(model, str):
+                skipped.append((name, model))
+            else:
+                systems.append(_test(found, name, "plant", model, time=time))
+    return systems, skipped
+
+
+def _linearized(found: Basis, gravity: bool, pose: Array) -> ContinuousModel | str:
+    """The plant held still at a pose (6,), or why it cannot be."""
+    mechanism = found.experiment.mechanism
+    reason = _unusable(diagnose(mechanism, 0.0, pose))
+    if reason is not None:
+        return reason
+    dynamics = StewartDynamics(mechanism, gravity=gravity)
+    if not gravity:
+        return linear_model(*dynamics.linearize(pose, torque=np.zeros(NUM_TORQUES)))
+    if abs(standing(mechanism, pose).parallel) < SINGULARITY_LIMIT:
+        return "next to a parallel singularity there is no bound on torques that hold the plate"
+    return linear_model(*dynamics.linearize(pose))
+
+
+def _unusable(failure: Failure | None) -> str | None:
+    """Why nothing can be linearised; next to a parallel singularity something can."""
+    if failure is None or (failure.leg is None and "parallel" in failure.reason):
+        return None
+    return failure.reason
+
+
+def _test(
+    found: Basis,
+    name: str,
+    family: str,
+    model: ContinuousModel,
+    steps: int | None = None,
+    time: float | None = None,
+    period: float = 0.0,
+) -> System:
+    n, m = model.B.shape
+    p = len(found.motion)
+    labels = state_labels(n)
+    states = np.concatenate([np.tile(found.motion, 3), np.full(max(0, n - 3 * p), found.torque)])
+    inputs, outputs = np.full(m, found.torque), np.tile(found.motion, len(model.C) // p)
+    A, B, C = scaled(*model, states[:n], inputs, outputs)
+    reach, view = hautus(A, B, discrete=period > 0), hautus(A.T, C.T, discrete=period > 0)
+    system = LinearSystem(A, B, C, np.zeros((len(C), m)), period)
+    asked = (IsControllable, IsStabilizable, IsObservable, IsDetectable)
+    drake = {word: bool(ask(system)) for word, ask in zip(QUESTIONS, asked, strict=True)}
+    words = [f"no torque reaches {mode_words(mode, labels)}" for mode in reach.deficient] + [
+        f"no output shows {mode_words(mode, labels)}" for mode in view.deficient
+    ]
+    radius = float(np.abs(np.linalg.eigvals(A)).max())
+    note = _disagreement(_answers(reach, view), drake, n, radius)
+    return System(name, family, steps, time, n, m, reach, view, drake, tuple(words), note)
+
+
+def _answers(reach: Hautus, view: Hautus) -> dict[str, bool]:
+    values = (reach.complete, reach.harmless, view.complete, view.harmless)
+    return dict(zip(QUESTIONS, values, strict=True))
+
+
+def _disagreement(ours: dict[str, bool], drake: dict[str, bool], n: int, radius: float) -> str:
+    missed = [word for word in QUESTIONS if ours[word] and not drake[word]]
+    passed = [word for word in QUESTIONS if drake[word] and not ours[word]]
+    parts = []
+    if missed:
+        decades = (n - 1) * abs(np.log10(max(radius, 1e-300)))
+        parts.append(
+            f"not {' and not '.join(missed)}, from the rank of powers up to the {n - 1}th of a "
+            f"matrix with spectral radius {radius:.3g}, which span {decades:.0f} decades, where a "
+            "double holds 16"
+        )
+    if passed:
+        parts.append(f"{' and '.join(passed)}, taking anything above rounding for full rank")
+    return f"Drake says {'; '.join(parts)}" if parts else ""
+
+
+def _system_summary(system: System) -> dict[str, Any]:
+    return {
+        "name": system.name,
+        "family": system.family,
+        "n": system.n,
+        "m": system.m,
+        "mu": system.steps,
+        "t": system.time,
+        **system.answers,
+        **{f"{word}_margin": margin for word, margin in system.margins.items()},
+        "deficient": list(system.words),
+        "controllable_modes": _modes_summary(system.reach),
+        "observable_modes": _modes_summary(system.view),
+        "drake": system.drake,
+        "note": system.note or None,
+    }
+
+
+def _modes_summary(test: Hautus) -> list[dict[str, Any]]:
+    return [
+        {
+            "eigenvalue": [mode.eigenvalue.real, mode.eigenvalue.imag],
+            "multiplicity": mode.multiplicity,
+            "decays": mode.decays,
+            "margin": mode.margin,
+            "deficient_directions": mode.directions.shape[1],
+        }
+        for mode in test.modes
+    ]

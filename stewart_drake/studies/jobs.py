@@ -1,0 +1,239 @@
+"""Many independent runs, in parallel on this machine or a Dask cluster, each kept once it is done.
+
+A job is a named call of a function that returns the bytes of a file. Whatever stops the others,
+Ctrl-C, kill -9, a dead worker, a full disk, loses only the jobs in flight: the next start in the
+same folder does what is missing. Only this process writes, so workers need no common file system.
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+import re
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, closing, contextmanager
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import Any, Final
+
+import joblib
+
+from stewart_drake.errors import ConfigError
+from stewart_drake.fileio import replacing
+from stewart_drake.results import jsonable
+from stewart_drake.studies.cluster import dask_backend
+from stewart_drake.yamlio import brief
+
+MANIFEST: Final = "manifest.json"
+"""The settings that all jobs of a folder share, and their hash."""
+
+Job = tuple[Any, ...]
+"""Arguments of one call; they are pickled."""
+Progress = Callable[[int, int], None]
+"""Called with the number of finished jobs and of all jobs."""
+
+_LOCK: Final = ".lock"
+_KEY: Final = re.compile(r"[A-Za-z0-9_+-][A-Za-z0-9_.+-]{0,199}")
+_WATCH: Final = 0.5
+"""s between two looks of a worker whether the process that started it is still there."""
+
+
+def run_jobs(
+    jobs: Mapping[str, Job],
+    function: Callable[..., bytes],
+    folder: str | Path,
+    *,
+    settings: Mapping[str, Any],
+    suffix: str = ".json",
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Path]:
+    """Call `function(*jobs[key])` for every key whose file is not there yet.
+
+    Ctrl-C stops the jobs in flight and raises KeyboardInterrupt; `function` must let it through.
+
+    Args:
+        jobs: by key; a key is a file name without its suffix, of letters, digits and `_.+-`.
+        function: of a module, so that workers can import it. The same arguments must give the same
+            bytes if a resumed folder shall equal an uninterrupted one.
+        folder: where KEY + suffix go; made if there is none.
+        settings: what all jobs depend on, plain data. A folder that was begun with others is
+            refused.
+        suffix: of the files.
+        workers: processes on this machine, with one numerical thread each; all cores by default.
+        scheduler: address of a Dask scheduler, whose workers are used instead.
+        progress: called at the start and for each finished job.
+
+    Returns:
+        The file of every job, in the order of `jobs`.
+
+    Raises:
+        ConfigError: the folder belongs to other settings or another process is working in it; the
+            scheduler cannot be reached or its workers cannot be used; too few workers.
+        ChildProcessError: a worker process died, e.g. for want of memory.
+        OSError: a file cannot be written, e.g. because the disk is full.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    for key in jobs:
+        if not _KEY.fullmatch(key):
+            raise ValueError(f"{key!r} is no file name; expected letters, digits and _.+-")
+    if workers is not None and workers < 1:
+        raise ConfigError(f"--workers: got {workers}; expected 1 or more processes")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {key: folder / f"{key}{suffix}" for key in jobs}
+    with _locked(folder):
+        for partial in folder.glob(".*.part"):
+            partial.unlink()
+        _check_manifest(folder, settings, suffix)
+        missing = {key: job for key, job in jobs.items() if not paths[key].exists()}
+        done = len(jobs) - len(missing)
+        if progress is not None:
+            progress(done, len(jobs))
+        calls = [joblib.delayed(_named)(key, function, job) for key, job in missing.items()]
+        with _backend(scheduler), _outcomes(calls, workers, scheduler) as outcomes:
+            for key, data in outcomes:
+                write_atomically(paths[key], data)
+                done += 1
+                if progress is not None:
+                    progress(done, len(jobs))
+    return paths
+
+
+def finished(jobs: Mapping[str, Job], folder: str | Path, suffix: str = ".json") -> dict[str, Path]:
+    """The files that are there already, in the order of `jobs`."""
+    paths = {key: Path(folder) / f"{key}{suffix}" for key in jobs}
+    return {key: path for key, path in paths.items() if path.exists()}
+
+
+def settings_hash(settings: Mapping[str, Any]) -> str:
+    """SHA-256 over the settings as canonical JSON: keys sorted, numbers by their shortest text."""
+    return hashlib.sha256(_canonical(settings).encode()).hexdigest()
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file so that it is there whole or not at all, also after a loss of power.
+
+    Raises:
+        OSError: it cannot be written; nothing is left behind.
+    """
+    with replacing(path) as partial, partial.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _named(key: str, function: Callable[..., bytes], job: Job) -> tuple[str, bytes]:
+    try:
+        return key, function(*job)
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {error}") from None
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes out; the lock ends with this process, however that ends."""
+    with (folder / _LOCK).open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(
+                f"{folder}: another process is working in this folder; wait for it to end, or "
+                "choose another folder"
+            ) from None
+        yield
+
+
+def _check_manifest(folder: Path, settings: Mapping[str, Any], suffix: str) -> None:
+    path, mine = folder / MANIFEST, json.loads(_canonical(settings))
+    if not path.exists():
+        if any(not p.name.startswith(".") for p in folder.glob(f"*{suffix}")):
+            raise ConfigError(
+                f"{folder}: has {suffix} files but no {MANIFEST}; expected an empty folder, or one "
+                "that an earlier start has made"
+            )
+        text = json.dumps({"hash": settings_hash(settings), "settings": mine}, indent=2)
+        write_atomically(path, (text + "\n").encode())
+        return
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        found, theirs = manifest["hash"], manifest["settings"]
+    except (ValueError, TypeError, KeyError):
+        raise ConfigError(
+            f"{path}: is damaged; expected the manifest of the runs beside it (choose another "
+            "folder, or delete this one)"
+        ) from None
+    if found != settings_hash(settings):
+        raise ConfigError(
+            f"{folder}: belongs to other settings ({_difference(theirs, mine)}); expected the same "
+            "settings as before, or another folder"
+        )
+
+
+def _canonical(settings: Mapping[str, Any]) -> str:
+    return json.dumps(jsonable(settings), sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def _difference(theirs: Any, mine: Any, name: str = "") -> str:
+    """The first field in which two sets of plain settings differ."""
+    if isinstance(theirs, dict) and isinstance(mine, dict):
+        for key in sorted(theirs.keys() | mine.keys()):
+            if theirs.get(key) != mine.get(key):
+                return _difference(theirs.get(key), mine.get(key), f"{name}.{key}".strip("."))
+    return f"{name or 'settings'}: {brief(theirs)} there, {brief(mine)} now"
+
+
+# Ctrl-C is for this process. Workers inherit the signal mask of the thread that starts them, and
+# the threads of the executor that of the thread that starts the executor; in a worker the signal
+# would break imports in the middle. The resource tracker comes first, because some Pythons
+# unblock the signal when they start it.
+@contextmanager
+def _outcomes(
+    calls: list[Any], workers: int | None, scheduler: str | None
+) -> Iterator[Iterator[tuple[str, bytes]]]:
+    """Key and bytes of each call, as they finish; leaving early ends the workers."""
+    number = min(workers or joblib.cpu_count(), max(1, len(calls)))
+    parallel = joblib.Parallel(
+        n_jobs=-1 if scheduler else number, batch_size=1, return_as="generator_unordered"
+    )
+    resource_tracker.ensure_running()
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        outcomes = parallel(calls)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    try:
+        with warnings.catch_warnings(), closing(outcomes):
+            # On leaving early joblib warns that not all results were fetched: that is meant.
+            warnings.filterwarnings("ignore", category=UserWarning, module="joblib")
+            yield outcomes
+    except BrokenProcessPool:
+        raise ChildProcessError(
+            "a worker process was killed, perhaps for want of memory; what had finished is kept "
+            "and the same command goes on from there"
+        ) from None
+
+
+def _backend(scheduler: str | None) -> AbstractContextManager[Any]:
+    if scheduler is not None:
+        return dask_backend(scheduler)
+    return joblib.parallel_config(
+        backend="loky", inner_max_num_threads=1, initializer=_end_with, initargs=(os.getpid(),)
+    )
+
+
+def _end_with(parent: int) -> None:
+    """Let a worker process end with the one that started it, which kill -9 gives no time to."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_WATCH)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,118 @@
+"""A reference against the workspace: margins along it, its first exit, its largest amplitude."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.trajectories import Trajectory
+
+from stewart_drake.experiment import REACH_CHECK_PERIOD
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.plant.workspace import Failure, diagnose, home_sign, standing
+from stewart_drake.studies.singularity import measure
+
+Array = NDArray[np.float64]
+
+LARGEST_FACTOR: Final = 3.0
+"""Amplitudes are not scaled up by more."""
+FACTOR_STEP: Final = 0.05
+"""Of the scan that finds the first amplitude that does not fit."""
+_TIME_TOLERANCE: Final = 1e-9
+_FACTOR_TOLERANCE: Final = 1e-6
+
+
+class Margins(NamedTuple):
+    """Along a motion at n instants; see `singularity.Measures`, NaN outside the workspace."""
+
+    time: Array
+    pose: Array
+    """(n, 6) rad and m."""
+    reach: Array
+    """(n, 6) m."""
+    sines: Array
+    """(n, 6)"""
+    parallel: Array
+    transmission: Array
+    """(n, 6)"""
+    held: Array
+    condition: Array
+    play: Array
+    """m per rad."""
+
+
+class Factor(NamedTuple):
+    """By what the motion can be scaled about its first pose.
+
+    `value` is NaN where nothing moves; 0 where not even the first pose is in the workspace;
+    `LARGEST_FACTOR` where that much fits, which `limited` False tells.
+    """
+
+    value: float
+    limited: bool
+
+
+def instants(duration: float) -> Array:
+    """Where `experiment.prepare` looks at a reference, s."""
+    return np.arange(0.0, duration + REACH_CHECK_PERIOD, REACH_CHECK_PERIOD)
+
+
+def margins_along(mechanism: Mechanism, reference: Trajectory, time: Array) -> Margins:
+    """All margins of a reference at the instants (n,) in s."""
+    poses = np.array([reference.value(t)[:, 0] for t in time])
+    rows = [measure(mechanism, pose) for pose in poses]
+    columns = {
+        name: np.array([getattr(row, name) for row in rows])
+        for name in Margins._fields
+        if name not in ("time", "pose")
+    }
+    return Margins(time=time, pose=poses, **columns)
+
+
+def first_exit(mechanism: Mechanism, reference: Trajectory, time: Array) -> Failure | None:
+    """Why a reference leaves the workspace, and when to 1e-9 s; None if it never does.
+
+    An excursion that is shorter than the spacing of `time` (n,) can go unseen.
+    """
+
+    def failure(t: float) -> Failure | None:
+        return diagnose(mechanism, t, reference.value(t)[:, 0])
+
+    for k, t in enumerate(time):
+        found = failure(float(t))
+        if found is None:
+            continue
+        low, high = (float(time[k - 1]), float(t)) if k else (float(t), float(t))
+        while high - low > _TIME_TOLERANCE:
+            middle = (low + high) / 2
+            closer = failure(middle)
+            low, high, found = (middle, high, found) if closer is None else (low, middle, closer)
+        return found
+    return None
+
+
+def largest_factor(mechanism: Mechanism, reference: Trajectory, time: Array) -> Factor:
+    """The largest f for which X(0) + f (X(t) - X(0)) stays in the workspace at all of `time` (n,).
+
+    For a sine, f scales its amplitude. Workspaces are not convex: a motion that does not fit may
+    fit again when it is larger. So f is the end of the first range that fits, found by a scan in
+    steps of `FACTOR_STEP` and bisection; a gap narrower than a step can go unseen.
+    """
+    poses = np.array([reference.value(t)[:, 0] for t in time])
+    change, sign = poses - poses[0], home_sign(mechanism)
+
+    def fits(factor: float) -> bool:
+        return all(standing(mechanism, poses[0] + factor * row).margin(sign) > 0 for row in change)
+
+    if not fits(0.0):
+        return Factor(0.0, True)
+    if not change.any():
+        return Factor(np.nan, False)
+    number = round(LARGEST_FACTOR / FACTOR_STEP)
+    last = next((k for k in range(number) if not fits((k + 1) * FACTOR_STEP)), None)
+    if last is None:
+        return Factor(LARGEST_FACTOR, False)
+    low, high = last * FACTOR_STEP, (last + 1) * FACTOR_STEP
+    while high - low > _FACTOR_TOLERANCE:
+        middle = (low + high) / 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return Factor(low, True)

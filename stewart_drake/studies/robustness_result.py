@@ -1,0 +1,208 @@
+"""What a Monte Carlo study of a scenario has found: shares, quantiles, and what mattered."""
+
+import csv
+import io
+import math
+import re
+from collections import Counter
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.experiment import Experiment
+from stewart_drake.results import versions
+from stewart_drake.scenario_loading import scenario_to_dict
+from stewart_drake.studies.sizing import rms
+from stewart_drake.studies.statistics import (
+    Correlation,
+    Interval,
+    holm,
+    quantile_interval,
+    rank_correlation,
+    wilson_interval,
+)
+from stewart_drake.studies.uncertainty import Draw, Ranges, Scales
+
+Array = NDArray[np.float64]
+
+QUANTILES: Final = (0.5, 0.75, 0.9, 0.95, 0.99)
+FACTORS: Final = {
+    "payload": "kg",
+    "torque_bias": "mN m",
+    "noise": "%",
+    "torque_limit": "N m",
+    "damping": "mN m s/rad",
+    "delay": "ms",
+    "lengths": "mm",
+    "anchors": "mm",
+}
+"""What is ranked, with its unit; payload and delay have a sign, what has six parts or more its rms.
+"""
+SIGNED: Final = ("payload", "delay")
+"""Either direction may hurt: these are ranked by their size too, as |payload| and |delay|."""
+
+
+class Outcome(NamedTuple):
+    """How a run ended."""
+
+    status: str
+    """As of a simulation; `not_assembled` where the drawn parts do not fit together, `refused`
+    where the scenario cannot be prepared with what was drawn."""
+    reason: str
+    """Why it failed, or nothing."""
+    leg: int | None
+    time: float
+    """s, when it failed, else NaN."""
+    error: float
+    """E_ac in % s, NaN for a run that did not complete."""
+    peak_torque: float
+    """N m, as commanded, NaN where nothing ran."""
+
+
+class Influence(NamedTuple):
+    """What a quantity has to do with the outcome. Adjusted p-values are Holm's, over all asked."""
+
+    factor: str
+    unit: str
+    error: Correlation
+    """With E_ac among the runs that completed."""
+    error_p: float
+    """Adjusted."""
+    failure: Correlation
+    """With failing (1 or 0) among all runs."""
+    failure_p: float
+    """Adjusted."""
+
+
+class RobustnessStudy(NamedTuple):
+    """A Monte Carlo study; the i-th draw belongs to the i-th outcome."""
+
+    experiment: Experiment
+    ranges: Ranges
+    scales: Scales
+    seed: int
+    limit: float | None
+    """E_ac in % s above which a run counts as failed although it completed, or None."""
+    undisturbed: Outcome
+    draws: list[Draw]
+    outcomes: list[Outcome]
+
+    @property
+    def failed(self) -> NDArray[np.bool_]:
+        """(n,) whether a run left the workspace, or ended above the limit."""
+        return np.array([self.reason_of(one) != "" for one in self.outcomes], dtype=bool)
+
+    @property
+    def errors(self) -> Array:
+        """(n,) E_ac in % s, NaN where a run did not complete."""
+        return np.array([one.error for one in self.outcomes])
+
+    @property
+    def success(self) -> Interval:
+        """Share of runs that did not fail."""
+        return wilson_interval(int(np.sum(~self.failed)), len(self.outcomes))
+
+    def reason_of(self, outcome: Outcome) -> str:
+        """Why a run counts as failed, without the number of the leg, or nothing."""
+        if outcome.status != "completed":
+            return re.sub(r"\bleg \d\b", "a leg", outcome.reason)
+        if self.limit is not None and not outcome.error <= self.limit:
+            return f"completed with E_ac above {self.limit:g} % s"
+        return ""
+
+    @property
+    def reasons(self) -> dict[str, int]:
+        """Number of failures by reason, the most frequent first."""
+        counts = Counter(self.reason_of(one) for one in self.outcomes)
+        return {reason: n for reason, n in counts.most_common() if reason}
+
+    def quantile(self, probability: float) -> Interval:
+        """Of E_ac over all runs, % s; a run that did not complete counts as infinite."""
+        return quantile_interval(np.where(np.isnan(self.errors), np.inf, self.errors), probability)
+
+    def influences(self) -> list[Influence]:
+        """One per factor and per size of a signed one, what matters most first."""
+        values, done = factor_values(self.draws), ~np.isnan(self.errors)
+        error = {name: rank_correlation(x[done], self.errors[done]) for name, x in values.items()}
+        failure = {name: rank_correlation(x, self.failed) for name, x in values.items()}
+        error_p = holm([one.p_value for one in error.values()])
+        failure_p = holm([one.p_value for one in failure.values()])
+        found = [
+            Influence(name, FACTORS[name.strip("|")], error[name], p, failure[name], q)
+            for name, p, q in zip(values, error_p, failure_p, strict=True)
+        ]
+        return sorted(found, key=lambda one: -_strength(one))
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What `summary.json` holds; E_ac in % s, infinite quantiles (failed runs) as null."""
+        done = np.isfinite(self.errors)
+        by_leg = Counter(one.leg for one in self.outcomes if one.leg is not None)
+        return {
+            "runs": len(self.outcomes),
+            "seed": self.seed,
+            "success": {"runs": int(np.sum(~self.failed)), **self.success._asdict()},
+            "limit": self.limit,
+            "completed": int(done.sum()),
+            "failures": self.reasons,
+            "failures_by_leg": {str(leg): by_leg[leg] for leg in sorted(by_leg)},
+            "E_ac_of_all": {str(q): self.quantile(q)._asdict() for q in QUANTILES},
+            "E_ac_of_completed": {
+                str(q): quantile_interval(self.errors[done], q)._asdict() for q in QUANTILES
+            }
+            if done.any()
+            else None,
+            "influences": [_influence_summary(one) for one in self.influences()],
+            "undisturbed": self.undisturbed._asdict(),
+            "ranges": {name: getattr(self.ranges, name) for name in vars(self.ranges)},
+            "scales": self.scales._asdict(),
+            "scenario": scenario_to_dict(self.experiment.scenario),
+            "versions": versions(),
+        }
+
+
+def factor_values(draws: list[Draw]) -> dict[str, Array]:
+    """(n,) of each factor in the units of FACTORS, and of the sizes of those with a sign."""
+    values = {
+        "payload": [one.payload for one in draws],
+        "torque_bias": [1e3 * rms(np.array(one.torque_bias)) for one in draws],
+        "noise": [100 * one.noise for one in draws],
+        "torque_limit": [one.torque_limit or math.inf for one in draws],
+        "damping": [1e3 * one.damping for one in draws],
+        "delay": [1e3 * one.delay for one in draws],
+        "lengths": [1e3 * rms(np.array(one.lengths)) for one in draws],
+        "anchors": [1e3 * rms(np.array(one.anchors)) for one in draws],
+    }
+    arrays = {name: np.array(column) for name, column in values.items()}
+    return arrays | {f"|{name}|": np.abs(arrays[name]) for name in SIGNED}
+
+
+def table(study: RobustnessStudy) -> str:
+    """All runs as CSV, a row each, empty where there is no number."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    head = [f"{name} [{unit}]" for name, unit in FACTORS.items()]
+    writer.writerow(
+        ["run", "status", "reason", "leg", "time [s]", "E_ac [% s]", "peak_torque [N m]", *head]
+    )
+    values = factor_values(study.draws)
+    for i, one in enumerate(study.outcomes):
+        numbers = [one.time, one.error, one.peak_torque, *(values[name][i] for name in FACTORS)]
+        cells = [repr(float(v)) if math.isfinite(v) else "" for v in numbers]
+        writer.writerow([i, one.status, study.reason_of(one), one.leg or "", *cells])
+    return text.getvalue()
+
+
+def _strength(one: Influence) -> float:
+    """The larger of the two |rho|; -1 for what never changed."""
+    return max(-1.0 if math.isnan(c.rho) else abs(c.rho) for c in (one.error, one.failure))
+
+
+def _influence_summary(one: Influence) -> dict[str, Any]:
+    return {
+        "factor": one.factor,
+        "unit": one.unit,
+        "error": one.error._asdict() | {"adjusted_p": one.error_p},
+        "failure": one.failure._asdict() | {"adjusted_p": one.failure_p},
+    }

@@ -1,0 +1,171 @@
+"""A reference against the workspace: margins, singularity, the largest amplitude, motor sizing."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.config import Scenario
+from stewart_drake.experiment import Experiment, assemble
+from stewart_drake.plant.workspace import Failure, diagnose
+from stewart_drake.signals import COORDINATES, LEGS
+from stewart_drake.studies.reach import (
+    Factor,
+    Margins,
+    first_exit,
+    instants,
+    largest_factor,
+    margins_along,
+)
+from stewart_drake.studies.singularity import characteristic_length, measure
+from stewart_drake.studies.sizing import Sizing, size_motors
+from stewart_drake.studies.workspace_map import Section, Travel, sections, travel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class WorkspaceStudy:
+    """What `analyze workspace` finds.
+
+    Attributes:
+        experiment: the scenario made concrete, reachable or not.
+        home: why the home pose is no place to work from, or None.
+        exit: when and why the reference first leaves the workspace, or None.
+        margins: along the reference.
+        factor: largest amplitude factor that fits.
+        travel: per coordinate from home; empty with a bad home pose.
+        sections: through home; empty with a bad home pose.
+        sizing: of the motors, or None where the reference leaves the workspace.
+    """
+
+    experiment: Experiment
+    home: Failure | None
+    exit: Failure | None
+    margins: Margins
+    factor: Factor
+    travel: list[Travel]
+    sections: list[Section]
+    sizing: Sizing | None
+
+    @property
+    def torque_limit(self) -> float | None:
+        """The scenario's, else the mechanism's, N m."""
+        limit = self.experiment.scenario.actuator.torque_limit
+        return self.experiment.mechanism.effort_limit if limit is None else limit
+
+    @property
+    def worst(self) -> tuple[float, int, float]:
+        """Time in s, leg and margin in m at the least reach margin of all legs and instants."""
+        row, leg = np.unravel_index(self.margins.reach.argmin(), self.margins.reach.shape)
+        return float(self.margins.time[row]), LEGS[leg], float(self.margins.reach[row, leg])
+
+    @property
+    def verdict(self) -> str:
+        """The answer in a sentence."""
+        opening = "" if self.home is None else f"the home pose is singular ({self.home.reason}); "
+        time, leg, margin = self.worst
+        if self.exit is None:
+            return (
+                f"yes: {opening}the reference stays in the workspace, leg {leg} is nearest to the "
+                f"end of its reach with {1e3 * margin:.3g} mm left at t = {time:.2f} s; "
+                f"{self._amplitude}"
+            )
+        short = (
+            f", at worst leg {leg} is short by {-1e3 * margin:.3g} mm at t = {time:.2f} s"
+            if margin < 0
+            else ""
+        )
+        return (
+            f"no: {opening}the reference leaves the workspace at t = {self.exit.time:.3f} s, "
+            f"{self.exit.reason}{short}; {self._amplitude}"
+        )
+
+    @property
+    def _amplitude(self) -> str:
+        value = self.factor.value
+        if np.isnan(value):
+            return "it does not move"
+        if value == 0:
+            return "not even its first pose is inside"
+        if not self.factor.limited:
+            return f"{value:g} times the amplitude fits, more was not tried"
+        return f"the largest amplitude that fits is {np.floor(1e3 * value) / 1e3:g} times this one"
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What `summary.json` holds; SI units, NaN where a value does not exist."""
+        m, (time, leg, margin) = self.margins, self.worst
+        return {
+            "verdict": self.verdict,
+            "fits": self.home is None and self.exit is None,
+            "home_failure": None if self.home is None else self.home._asdict(),
+            "exit": None if self.exit is None else self.exit._asdict(),
+            "worst": {"time": time, "leg": leg, "reach_margin": margin},
+            "largest_factor": self.factor.value,
+            "largest_factor_limited": self.factor.limited,
+            "legs": [
+                {
+                    "leg": LEGS[i],
+                    "least_reach_margin": m.reach[:, i].min(),
+                    "time": m.time[m.reach[:, i].argmin()],
+                    "least_sine": m.sines[:, i].min(),
+                    "least_transmission": least(m.transmission[:, i]),
+                }
+                for i in range(len(LEGS))
+            ],
+            "characteristic_length": characteristic_length(self.experiment.mechanism),
+            "least_parallel": m.parallel.min(),
+            "least_held": least(m.held),
+            "worst_condition": -least(-m.condition),
+            "worst_play": -least(-m.play),
+            "home": measure(self.experiment.mechanism, self.experiment.mechanism.home)._asdict(),
+            "travel": [t._asdict() for t in self.travel],
+            "sections": [_bounds(section) for section in self.sections],
+            "torque_limit": np.nan if self.torque_limit is None else self.torque_limit,
+            "motors": [] if self.sizing is None else self.sizing.summary(self.torque_limit),
+            "scenario": dataclasses.asdict(self.experiment.scenario),
+        }
+
+
+def study_workspace(scenario: Scenario) -> WorkspaceStudy:
+    """Judge a scenario's reference; one that leaves the workspace is analysed, not refused.
+
+    Raises:
+        ConfigError: the scenario itself is wrong.
+    """
+    experiment = assemble(scenario)
+    mechanism, reference = experiment.mechanism, experiment.reference
+    time = instants(scenario.duration)
+    left = first_exit(mechanism, reference, time)
+    return WorkspaceStudy(
+        experiment=experiment,
+        home=diagnose(mechanism, 0.0, mechanism.home),
+        exit=left,
+        margins=margins_along(mechanism, reference, time),
+        factor=largest_factor(mechanism, reference, time),
+        travel=travel(mechanism),
+        sections=sections(mechanism),
+        sizing=size_motors(experiment.nominal, reference, time) if left is None else None,
+    )
+
+
+def _bounds(section: Section) -> dict[str, Any]:
+    """Extent of a section and the share of its window that the workspace fills."""
+    inside = np.isfinite(section.condition)
+    found = {"coordinates": [COORDINATES[section.first], COORDINATES[section.second]]}
+    for axis, values, used in (
+        ("x", section.x, inside.any(axis=0)),
+        ("y", section.y, inside.any(axis=1)),
+    ):
+        ends = values[used][[0, -1]] if used.any() else np.full(2, np.nan)
+        found[axis] = ends.tolist()
+    return found | {"best_condition": least(section.condition)}
+
+
+def least(values: Array) -> float:
+    """The least of the numbers in an array, NaN where there are none."""
+    numbers = values[np.isfinite(values)]
+    return float(numbers.min()) if len(numbers) else np.nan

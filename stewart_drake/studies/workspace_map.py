@@ -1,0 +1,148 @@
+"""The workspace around home: travel along each coordinate, and sections through it."""
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.plant.workspace import diagnose, home_sign, standing
+from stewart_drake.signals import COORDINATES, NUM_COORDINATES
+from stewart_drake.studies.singularity import measure
+
+Array = NDArray[np.float64]
+
+SECTIONS: Final = ((3, 4), (3, 5), (0, 1), (2, 5))
+"""Pairs of coordinates: x-y, x-z, roll-pitch, yaw-z; the other four stay as at home."""
+POINTS: Final = 51
+"""Poses along each side of a section."""
+_STEPS: Final = 200
+_BISECTIONS: Final = 30
+_WIDER: Final = 2.0
+"""A section is first looked for this many travels wide: leaning may give room to shift."""
+_ROUGH: Final = 31
+_RIM: Final = 0.06
+
+
+class Travel(NamedTuple):
+    """How far one coordinate goes from home while the others stay, rad or m from home.
+
+    `low_reason` and `high_reason` say what ends it; "" where nothing did within half a turn or a
+    rod's length.
+    """
+
+    coordinate: str
+    low: float
+    high: float
+    low_reason: str
+    high_reason: str
+
+
+class Section(NamedTuple):
+    """A section of the workspace through home; arrays (len(y), len(x)).
+
+    `condition` is NaN outside the part that is connected with home within the section; `margin` is
+    positive in that part and zero on its border, see `plant.workspace.Standing.margin`.
+    """
+
+    first: int
+    """Index of the coordinate along x."""
+    second: int
+    x: Array
+    """rad or m."""
+    y: Array
+    condition: Array
+    margin: Array
+
+
+def last_inside(inside: Callable[[float], bool], limit: float) -> float:
+    """Largest s in [0, limit] with everything before it inside, to limit / 2^30 beyond a scan.
+
+    The scan of 200 steps finds the first exit unless one is narrower than a step; `inside(0)`
+    holds.
+    """
+    step = limit / _STEPS
+    last = next((k for k in range(_STEPS) if not inside((k + 1) * step)), None)
+    if last is None:
+        return limit
+    low, high = last * step, (last + 1) * step
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if inside(middle) else (low, middle)
+    return low
+
+
+def travel(mechanism: Mechanism) -> list[Travel]:
+    """The travel of all six coordinates; none from a home pose outside the workspace."""
+    if diagnose(mechanism, 0.0, mechanism.home) is not None:
+        return []
+    limits = [np.pi] * 3 + [float(mechanism.rod_lengths.max())] * 3
+    found = []
+    for k, limit in enumerate(limits):
+        axis = np.eye(NUM_COORDINATES)[k]
+        (low, why_low), (high, why_high) = (_end(mechanism, d * axis, limit) for d in (-1, 1))
+        found.append(Travel(COORDINATES[k], -low, high, why_low, why_high))
+    return found
+
+
+def sections(mechanism: Mechanism, points: int = POINTS) -> list[Section]:
+    """The sections `SECTIONS`; none from a home pose outside the workspace."""
+    spans = [(t.low, t.high) for t in travel(mechanism)]
+    return [_section(mechanism, pair, spans, points) for pair in SECTIONS if spans]
+
+
+def _margin(mechanism: Mechanism, pose: Array) -> float:
+    return standing(mechanism, pose).margin(home_sign(mechanism))
+
+
+def _end(mechanism: Mechanism, direction: Array, limit: float) -> tuple[float, str]:
+    """How far it goes from home in a direction, and what is there."""
+    home = mechanism.home
+    end = last_inside(lambda s: _margin(mechanism, home + s * direction) > 0, limit)
+    failure = diagnose(mechanism, 0.0, home + (end + 1e-6 * limit) * direction)
+    return end, "" if end == limit or failure is None else failure.reason
+
+
+def _section(
+    mechanism: Mechanism, pair: tuple[int, int], spans: list[tuple[float, float]], points: int
+) -> Section:
+    home = mechanism.home[list(pair)]
+    x_range, y_range = (
+        (home[i] + _WIDER * spans[k][0], home[i] + _WIDER * spans[k][1]) for i, k in enumerate(pair)
+    )
+    # Twice: over a window that is surely too large, then over what the workspace fills of it.
+    for number in (_ROUGH, points):
+        x, y = np.linspace(*x_range, number), np.linspace(*y_range, number)
+        margin = np.array([[_margin(mechanism, _at(mechanism, pair, a, b)) for a in x] for b in y])
+        connected = _connected(margin > 0, np.hypot(*np.meshgrid(x - home[0], y - home[1])))
+        x_range, y_range = _window(x, connected), _window(y, connected.T)
+    condition = np.full(connected.shape, np.nan)
+    for j, i in zip(*np.nonzero(connected), strict=True):
+        pose = _at(mechanism, pair, float(x[i]), float(y[j]))
+        condition[j, i] = measure(mechanism, pose).condition
+    return Section(*pair, x, y, condition, np.where(connected, margin, -np.abs(margin)))
+
+
+def _connected(inside: NDArray[np.bool_], distance: Array) -> NDArray[np.bool_]:
+    """The part of `inside` that holds the point nearest to home."""
+    if not inside.any():
+        return inside
+    parts, _ = label(inside)
+    nearest = np.unravel_index(np.where(inside, distance, np.inf).argmin(), inside.shape)
+    return np.asarray(parts == parts[nearest])
+
+
+def _window(axis: Array, inside: NDArray[np.bool_]) -> tuple[float, float]:
+    """The part of an axis over the inside, with a rim; all of it where nothing is inside."""
+    used = np.asarray(inside.any(axis=0))
+    ends = axis[used][[0, -1]] if used.any() else axis[[0, -1]]
+    rim = axis[1] - axis[0] + _RIM * (ends[1] - ends[0])
+    return float(ends[0] - rim), float(ends[1] + rim)
+
+
+def _at(mechanism: Mechanism, pair: tuple[int, int], a: float, b: float) -> Array:
+    pose = mechanism.home.copy()
+    pose[list(pair)] = a, b
+    return pose

@@ -1,0 +1,231 @@
+"""The network behind the tuner: densities in, (w_Q, w_R) out, in plain numpy.
+
+    y = W2 sigmoid(W1 (rho - input_mean) / input_scale + b1) + b2
+
+A network lives in one JSON file, read as strictly as a scenario.
+"""
+
+import dataclasses
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import field
+from pathlib import Path
+from typing import Any, Final, Literal, NoReturn
+
+import numpy as np
+import pydantic.dataclasses
+from numpy.typing import ArrayLike, NDArray
+from pydantic import ConfigDict
+from scipy.special import expit
+
+from stewart_drake.errors import ConfigError
+from stewart_drake.fileio import read_bytes, replacing
+from stewart_drake.resources import resolve
+from stewart_drake.signals import WEIGHTS
+from stewart_drake.tuner.density import NUM_INPUTS
+from stewart_drake.yamlio import brief, validate
+
+Array = NDArray[np.float64]
+
+DEFAULT: Final = "tuner"
+"""The shipped network."""
+NUM_OUTPUTS: Final = len(WEIGHTS)
+
+_MAX_BYTES: Final = 10_000_000
+_ARRAYS: Final = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Network:
+    """A trained network; the paper's has h = 10 hidden neurons.
+
+    Attributes:
+        input_mean: (18,) of the densities it was trained on.
+        input_scale: (18,) their spread, above zero.
+        W1: (h, 18) into the hidden layer, whose activation is the sigmoid.
+        b1: (h,) bias there.
+        W2: (2, h) into the output layer, which is linear.
+        b2: (2,) bias there.
+        bounds: (2, 2) lower, then upper bound of (w_Q, w_R); what uses the weights clips to them.
+        output: what the output layer gives: `weights` (w_Q, w_R) or `log_weights`, their natural
+            logarithms.
+        density: the kind of density it was trained on, `magnitude` or `signed`.
+        card: where it comes from: data, seed, versions, errors; plain JSON values.
+
+    Raises:
+        ConfigError: shapes that do not fit, values that are not finite, a scale or a lower bound
+            that is not above zero, an upper bound that is not above the lower one.
+    """
+
+    input_mean: Array
+    input_scale: Array
+    W1: Array
+    b1: Array
+    W2: Array
+    b2: Array
+    bounds: Array
+    output: Literal["weights", "log_weights"] = "weights"
+    density: Literal["magnitude", "signed"] = "magnitude"
+    card: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        hidden = np.shape(self.b1)[0] if np.ndim(self.b1) == 1 else 0
+        shapes = {
+            "input_mean": (NUM_INPUTS,),
+            "input_scale": (NUM_INPUTS,),
+            "b1": (max(1, hidden),),
+            "W1": (max(1, hidden), NUM_INPUTS),
+            "W2": (NUM_OUTPUTS, max(1, hidden)),
+            "b2": (NUM_OUTPUTS,),
+            "bounds": (2, NUM_OUTPUTS),
+        }
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, _frozen(name, getattr(self, name), shape))
+        if not np.all(self.input_scale > 0):
+            raise ConfigError(
+                f"input_scale: got {self.input_scale.min()!r}; expected numbers above 0"
+            )
+        if not np.all((self.bounds[0] > 0) & (self.bounds[1] > self.bounds[0])):
+            raise ConfigError(
+                f"bounds: got {brief(self.bounds.tolist())}; expected [lower, upper] of (w_Q, w_R) "
+                "with 0 < lower < upper"
+            )
+        for name, known in (
+            ("output", ("weights", "log_weights")),
+            ("density", ("magnitude", "signed")),
+        ):
+            if getattr(self, name) not in known:
+                raise ConfigError(
+                    f"{name}: got {brief(getattr(self, name))}; expected one of {', '.join(known)}"
+                )
+
+    @property
+    def hidden(self) -> int:
+        """Number of hidden neurons."""
+        return len(self.b1)
+
+    def __call__(self, densities: ArrayLike) -> Array:
+        """Raw weights, neither clipped nor checked; not finite where the input is not.
+
+        Args:
+            densities: (18,) or (N, 18).
+
+        Returns:
+            (2,) or (N, 2), w_Q and w_R.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            inputs = (np.asarray(densities, dtype=np.float64) - self.input_mean) / self.input_scale
+            outputs = expit(inputs @ self.W1.T + self.b1) @ self.W2.T + self.b2
+            return outputs if self.output == "weights" else np.exp(outputs)
+
+
+def _frozen(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """A read-only copy, checked."""
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ConfigError(f"{name}: got shape {array.shape}; expected {shape}")
+    if not np.all(np.isfinite(array)):
+        raise ConfigError(f"{name}: got a value that is not finite; expected finite numbers")
+    array.flags.writeable = False
+    return array
+
+
+# --------------------------------------------------------------------- the file
+
+
+@pydantic.dataclasses.dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+class _File:
+    """The file's keys, all of which must be there."""
+
+    input_mean: list[float]
+    input_scale: list[float]
+    W1: list[list[float]]
+    b1: list[float]
+    W2: list[list[float]]
+    b2: list[float]
+    bounds: list[list[float]]
+    output: Literal["weights", "log_weights"]
+    density: Literal["magnitude", "signed"]
+    card: dict[str, Any]
+
+
+def save_network(network: Network, path: str | Path) -> None:
+    """Write one JSON file, whole or not; what is loaded from it is equal to the last bit.
+
+    Raises:
+        ConfigError: the card holds what JSON does not have.
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    data = {f.name: getattr(network, f.name) for f in dataclasses.fields(network)}
+    data |= {name: data[name].tolist() for name in _ARRAYS}
+    try:
+        text = json.dumps(data | {"card": dict(network.card)}, indent=2, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"card: {error}; expected plain JSON values, null for NaN") from None
+    with replacing(path) as partial:
+        partial.write_text(text + "\n", encoding="utf-8")
+
+
+def load_network(name_or_path: str | Path) -> Network:
+    """Read a network; nothing in the file is executed.
+
+    Args:
+        name_or_path: a name in `models/weights/`, or a JSON file.
+
+    Raises:
+        ConfigError: no such file; not one JSON object with exactly the fields of `Network`, each
+            of them once, finite and of the right shape. One line, naming file and field.
+    """
+    path = resolve("weights", name_or_path)
+    data = _read(path)
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: holds {brief(data)}; expected a JSON object")
+    file = validate(_File, data, str(path))
+    for name in _ARRAYS:
+        rows = getattr(file, name)
+        if rows and isinstance(rows[0], list) and len({len(row) for row in rows}) > 1:
+            raise ConfigError(f"{path}: {name}: got rows of different lengths; expected a matrix")
+    try:
+        return Network(**vars(file))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def _read(path: Path) -> Any:
+    """Strict JSON: no NaN, no key twice."""
+    raw = read_bytes(path, _MAX_BYTES, "the JSON file of one network")
+    try:
+        return json.loads(
+            raw.decode("utf-8"),
+            parse_constant=_no_constant,
+            parse_float=_finite,
+            object_pairs_hook=_unique,
+        )
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: is not UTF-8 text; expected a JSON file") from None
+    except (ValueError, RecursionError) as error:
+        problem = "nested too deep" if isinstance(error, RecursionError) else str(error)
+        raise ConfigError(
+            f"{path}: is not readable as JSON ({problem}); expected the file of one network"
+        ) from None
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a number that JSON has")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{brief(text)} is larger than any float")
+    return value
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    for key, number in Counter(key for key, _ in pairs).items():
+        if number > 1:
+            raise ValueError(f"key {brief(key)} given {number} times")
+    return dict(pairs)

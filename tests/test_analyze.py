@@ -1,0 +1,287 @@
+"""The analyses of a whole scenario, from the command line."""
+
+import json
+import math
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import stewart_drake as sd
+from stewart_drake.cli import main
+from stewart_drake.config import ReferenceConfig
+from stewart_drake.experiment import prepare
+from stewart_drake.plant.workspace import standing
+from stewart_drake.resources import resolve
+from stewart_drake.studies import delay_limits, delay_map, hautus
+from stewart_drake.studies.delay_loop import loop_margins
+from stewart_drake.studies.delay_map import Cell, map_delays, run_cell, scaled_motion
+from stewart_drake.studies.verdict import delay_verdict
+from tests.mechanisms import PAPER
+
+TOO_FAR = "reference.amplitude=[0.26, 0.26, 0.26, 0.02, 0.02, 0.2]"
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three delays instead of thirty, and no simulations; those have their own tests."""
+    monkeypatch.setattr(hautus, "LONGEST", 2)
+    monkeypatch.setattr(delay_limits, "loop_margins", partial(loop_margins, delays=()))
+    cells = [Cell(8, 1.0, "completed", 21.0, math.nan), Cell(0, 1.0, "left_workspace", math.nan, 1)]
+    cells += [
+        Cell(0, 1.25, "out_of_reach", math.nan, 1),
+        Cell(8, 1.25, "solver_failed", math.nan, 1),
+    ]
+    monkeypatch.setattr(delay_limits, "delay_map", lambda *_: (cells, False))
+
+
+def analyze(kind: str, out: Path, *arguments: str) -> tuple[dict[str, Any], str]:
+    assert main(["analyze", kind, *arguments, "--out", str(out)]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    return summary, (out / "report.html").read_text()
+
+
+def settings(*values: str) -> list[str]:
+    return [part for value in values for part in ("--set", value)]
+
+
+def test_hautus_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    summary, page = analyze("hautus", tmp_path / "out")
+    systems = {system["name"]: system for system in summary["systems"]}
+    assert len(systems) == 1 + 3 * 3 + 2 * 10
+    for system in systems.values():
+        assert system["m"] == 6
+        assert system["controllable"]
+        assert system["stabilizable"]
+        assert system["detectable"]
+        assert system["stabilizable_margin"] > 1e-6
+        assert system["detectable_margin"] is None or system["detectable_margin"] > 1e-6
+    assert systems["error model, continuous"]["n"] == 18
+    assert systems["minimal chain, mu = 2"]["n"] == 30
+    for steps in range(3):
+        extra = systems[f"paper's chain, mu = {steps}"]
+        assert extra["n"] == 24 + 6 * steps
+        assert not extra["observable"]
+        assert extra["deficient"] == [
+            f"no output shows 6 directions in torque T(k-{steps + 1}), mode 0"
+        ]
+        assert not extra["drake"]["observable"]
+        assert systems[f"minimal chain, mu = {steps}"]["observable"]
+    told = capsys.readouterr().out
+    assert max(map(len, told.splitlines()[:-1])) <= 80  # the last one names the directory
+    assert "All 30 models are stabilizable and detectable" in told
+    assert "stewart-drake analyze hautus paper --out" in page
+    assert page.count("<img") == 2
+
+
+def test_drake_disagrees_where_powers_lose_the_digits(tmp_path: Path) -> None:
+    summary, page = analyze("hautus", tmp_path / "out")
+    noted = {system["name"]: system for system in summary["systems"] if system["note"]}
+    plant = noted["plant under gravity, t = 5.00 s"]
+    assert plant["controllable"]
+    assert not plant["drake"]["controllable"]
+    assert "powers up to the 11th" in plant["note"]
+    assert "powers up to the 11th" in page
+    agreeing = [s for s in summary["systems"] if not s["note"]]
+    for system in agreeing:
+        assert system["drake"] == {word: system[word] for word in hautus.QUESTIONS}
+
+
+def test_delay_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    summary, page = analyze("delay", tmp_path / "out")
+    assert summary["error_floor"] == pytest.approx(50 * (1 - math.cos(0.8)), rel=1e-6)
+    assert summary["error_floor_applies"]
+    verdict = delay_verdict(prepare(sd.load_scenario("paper")))
+    fastest = max(summary["poses"], key=lambda point: point["fastest_pole"])
+    assert fastest["fastest_pole"] == pytest.approx(verdict.pole, rel=0.02)
+    assert fastest["amplification"] == pytest.approx(math.exp(0.8 * fastest["fastest_pole"]))
+    assert summary["beatable"] == "yes"
+    assert [m["mu"] for m in summary["loop"]] == [8]
+    for limit in summary["largest_delay"]:
+        growth = math.exp(limit["delay"] * fastest["fastest_pole"])
+        assert growth == pytest.approx(limit["amplification"])
+    told = capsys.readouterr().out
+    assert max(map(len, told.splitlines()[:-1])) <= 80  # the last one names the directory
+    for part in ("beatable: yes", "1.64 ms longer", "21.0", "left 1.00", "no reach 1.00"):
+        assert part in told
+    assert page.count("<img") == 3
+
+
+def test_delay_under_gravity(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    summary, _ = analyze("delay", tmp_path / "out", *settings("plant.gravity=true"))
+    assert summary["beatable"] == "no"
+    assert not capsys.readouterr().out.startswith("Delay 0.8 s, beatable: yes")
+    checks = summary["growth_checks"]
+    assert len(checks) == 5
+    for check in checks:
+        assert check["expected"] > 10
+        assert check["simulated"] == pytest.approx(check["expected"], rel=0.05)
+
+
+@pytest.mark.parametrize("kind", ["hautus", "delay"])
+@pytest.mark.parametrize("gravity", ["plant.gravity=true", "plant.gravity=false"])
+def test_a_motion_out_of_reach_gets_a_verdict(
+    kind: str, gravity: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    summary, page = analyze(kind, tmp_path / "out", *settings(TOO_FAR, gravity))
+    opening = "The reference cannot be followed: leg 2 reached the end of its reach at t = 0.54 s"
+    assert summary["obstacles"][0].startswith(opening)
+    assert opening in page
+    assert " ".join(capsys.readouterr().out.split()).startswith(opening)
+    if kind == "delay":
+        assert max(point["t"] for point in summary["poses"]) < 0.54
+    else:
+        assert len(summary["skipped"]) == 12
+
+
+def singular_mechanism(folder: Path) -> Path:
+    """The paper's machine, assembled where its rods cannot hold it against one motion."""
+
+    def rolled(angle: float) -> np.ndarray:
+        return np.concatenate([[angle], PAPER.home[1:]])
+
+    roll = brentq(lambda a: standing(PAPER, rolled(a)).parallel, -1.39, -1.42, xtol=1e-15)
+    text = resolve("mechanism", "paper").read_text()
+    path = folder / "singular.yaml"
+    path.write_text(text.replace("home: [0, 0,", f"home: [{roll!r}, 0,", 1))
+    return path
+
+
+@pytest.mark.parametrize("gravity", ["plant.gravity=true", "plant.gravity=false"])
+def test_a_singular_home_pose_gets_a_verdict(
+    gravity: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mechanism = f"mechanism={singular_mechanism(tmp_path)}"
+    summary, _ = analyze("hautus", tmp_path / "hautus", *settings(mechanism, gravity))
+    told = capsys.readouterr().out
+    assert told.startswith("At the home pose: parallel singularity")
+    assert "No controller can be designed for" in " ".join(told.split())
+    by_name = {system["name"]: system for system in summary["systems"]}
+    model = by_name["error model, continuous"]
+    assert not model["stabilizable"]
+    (words,) = model["deficient"]
+    assert words.startswith("no torque reaches 1 direction in rate error")
+    summary, _ = analyze("delay", tmp_path / "delay", *settings(mechanism, gravity))
+    assert summary["obstacles"]
+    assert "parallel singularity" in summary["loop_problem"]
+    assert summary["poses"] == []
+
+
+def test_a_home_pose_at_a_dead_centre_gets_a_verdict(tmp_path: Path) -> None:
+    height = brentq(
+        lambda z: PAPER.reach_margins(np.concatenate([PAPER.home[:5], [z]])).min() - 1e-12, 0.4, 0.6
+    )
+    text = resolve("mechanism", "paper").read_text()
+    path = tmp_path / "dead.yaml"
+    path.write_text(text.replace("0, 0.38]", f"0, {height!r}]", 1))
+    summary, _ = analyze("hautus", tmp_path / "out", *settings(f"mechanism={path}"))
+    assert "leg 1 reached the end of its reach" in summary["obstacles"][0]
+    assert {system["family"] for system in summary["systems"]} == {"plant"}
+    assert len(summary["skipped"]) == 3
+
+
+def test_json_and_quiet(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["analyze", "delay", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["error_floor"] > 15
+    assert main(["analyze", "delay", "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["hautus", "--set", "delay.steps=-1"], "delay.steps"),
+        (["delay", "nowhere"], "nowhere"),
+        (["delay", "--controller", "nobody"], "nobody"),
+    ],
+)
+def test_bad_input_is_one_line(
+    arguments: list[str], part: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["analyze", *arguments]) == 2
+    complaint = capsys.readouterr().err
+    assert part in complaint
+    assert len(complaint.splitlines()) == 1
+
+
+# ------------------------------------------------------------------ the map
+
+
+def test_cells_are_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a short run: one that completes, one that leaves, one that is out of reach."""
+    monkeypatch.setattr(delay_map, "FACTORS", (0.5, 1.25))
+    monkeypatch.setattr(delay_map, "map_delays", lambda _: [0, 8])
+    scenario = sd.load_scenario("paper", settings=("duration=1.1", "controller.estimator=none"))
+    seen: list[tuple[int, int]] = []
+    cells, interrupted = delay_map.delay_map(scenario, lambda done, all_: seen.append((done, all_)))
+    assert not interrupted
+    assert [(cell.steps, cell.factor) for cell in cells] == [
+        (0, 0.5),
+        (0, 1.25),
+        (8, 0.5),
+        (8, 1.25),
+    ]
+    assert [cell.status for cell in cells] == ["completed", "out_of_reach"] * 2
+    assert seen[-1] == (2, 2)
+    alone = sd.load_scenario(
+        "paper",
+        settings=(
+            "duration=1.1",
+            "controller.estimator=none",
+            "plant.kind=exact",
+            "reference.amplitude=[0.1308996939, 0.1308996939, 0.1308996939, 0.01, 0.01, 0.04]",
+        ),
+    )
+    assert cells[2].error == pytest.approx(sd.simulate(alone).accumulated_error, rel=1e-9)
+    assert cells[1].time == pytest.approx(1.04)
+    assert math.isnan(cells[1].error)
+
+
+def test_ctrl_c_keeps_the_cells_that_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted_jobs(jobs: Any, function: Any, folder: Any, **_: Any) -> None:
+        key = next(iter(jobs))
+        (Path(folder) / f"{key}.json").write_bytes(function(*jobs[key]))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(delay_map, "run_jobs", interrupted_jobs)
+    scenario = sd.load_scenario("paper", settings=("duration=0.2", "controller.estimator=none"))
+    cells, interrupted = delay_map.delay_map(scenario)
+    assert interrupted
+    assert cells[0].status == "completed"
+    assert {cell.status for cell in cells[1:]} == {"not_run"}
+
+
+def test_a_run_that_leaves_the_workspace_says_when() -> None:
+    scenario = sd.load_scenario(
+        "paper", "delay_lqi", ("plant.kind=exact", "duration=3.0", "controller.catch_up=0")
+    )
+    outcome = json.loads(run_cell(scenario))
+    assert outcome["status"] == "left_workspace"
+    assert outcome["error"] is None
+    assert 1 < outcome["time"] < 2
+
+
+def test_motions_are_scaled_about_their_start() -> None:
+    sine = scaled_motion(ReferenceConfig(), 0.5)
+    assert sine is not None
+    assert sine.amplitude == pytest.approx(np.array(ReferenceConfig().amplitude) / 2)
+    way = ReferenceConfig(
+        kind="waypoints", times=[0.0, 1.0], poses=[[0, 0, 0, 0, 0, 0.4], [0, 0, 0.2, 0, 0, 0.3]]
+    )
+    half = scaled_motion(way, 0.5)
+    assert half is not None
+    assert half.poses == [
+        pytest.approx([0, 0, 0, 0, 0, 0.4]),
+        pytest.approx([0, 0, 0.1, 0, 0, 0.35]),
+    ]
+    assert scaled_motion(ReferenceConfig(kind="hold"), 0.5) is None
+    assert scaled_motion(ReferenceConfig(kind="hold"), 1.0) is not None
+
+
+def test_delays_of_the_map_lie_around_the_own_one() -> None:
+    assert map_delays(8) == [0, 4, 8, 12, 16]
+    assert map_delays(0) == [0, 1, 2, 4]
+    assert map_delays(1) == [0, 1, 2, 4]

@@ -1,0 +1,186 @@
+"""Command lines: what is refused, before anything is computed or written."""
+
+import fcntl
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from stewart_drake.cli import main
+from tests.faults import refusal, tree, written
+
+EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.1", "--set", "delay.steps=1")
+
+WITH_OUT: dict[str, list[str]] = {
+    "simulate": ["simulate", *EXACT],
+    "compare": ["compare", *EXACT],
+    "report": ["report", *EXACT],
+    "hautus": ["analyze", "hautus", *EXACT],
+    "delay": ["analyze", "delay", *EXACT],
+    "workspace": ["analyze", "workspace", *EXACT],
+    "robustness": ["analyze", "robustness", *EXACT],
+    "dataset": ["tune", "dataset"],
+    "evaluate": ["tune", "evaluate", "--scenarios", "1"],
+    "check": ["model", "check", "paper"],
+    "view": ["model", "view", "paper"],
+}
+"""Every command that writes into a directory."""
+
+BAD_ARGUMENTS = [
+    (["simulate", "--nope"], "--nope"),
+    (["simulat"], "simulate"),
+    (["simulate", "paper", "twice"], "twice"),
+    (["simulate", "--set"], "--set"),
+    (["simulate", "--set", "plant.kind"], "plant.kind"),
+    (["simulate", "--set", "=1"], "=1"),
+    (["simulate", "--set", "a.b.c.d=1"], "a.b.c.d"),
+    (["simulate", "--set", "plant=exact"], "plant"),
+    (["simulate", "--controller", "lqrr"], "lqr"),
+    (["simulate", ""], "scenario"),
+    (["simulate", "pa\nper"], "scenario"),
+    (["simulate", "x" * 5000], "scenario"),
+    (["simulate", "../../etc/passwd"], "scenario"),
+    (["simulate", "./\udcff.yaml"], "UTF-8"),
+    (["model", "check", ""], "mechanism"),
+    (["model", "check"], "MECHANISM"),
+    (["model", "sdf", "nope"], "mechanism"),
+    (["model", "chek", "paper"], "check"),
+    (["analyze", "hautu"], "hautus"),
+    (["analyze", "robustness", "--runs", "0"], "--runs"),
+    (["analyze", "robustness", "--runs", "many"], "--runs"),
+    (["analyze", "robustness", "--runs", "-3"], "--runs"),
+    (["analyze", "robustness", "--seed", "-1"], "--seed"),
+    (["analyze", "robustness", "--limit", "nan"], "--limit"),
+    (["analyze", "robustness", "--workers", "0"], "--workers"),
+    (["analyze", "robustness", "--vary", "payload"], "--vary"),
+    (["analyze", "robustness", "--vary", "payload=nan"], "payload"),
+    (["analyze", "robustness", "--vary", "payload=-1"], "payload"),
+    (["analyze", "robustness", "--vary", "payload=1e300"], "payload"),
+    (["analyze", "robustness", "--vary", "nothing=1"], "nothing"),
+    (["tune", "dataset", "--workers", "0"], "--workers"),
+    (["tune", "dataset", "--disturbed", "-1"], "--disturbed"),
+    (["tune", "dataset", "--disturbed", "1.5"], "--disturbed"),
+    (["tune", "dataset", "--seed", "-1"], "--seed"),
+    (["tune", "dataset", "--set", "duration=1"], "duration"),
+    (["tune", "dataset", "--set", "reference.kind=hold"], "reference"),
+    (["tune", "train"], "DATA"),
+    (["tune", "train", "nowhere"], "nowhere"),
+    (["tune", "train", ".", "--labels", "none"], "--labels"),
+    (["tune", "train", ".", "--out", "new.txt"], "--out"),
+    (["tune", "evaluate", "nope"], "weights"),
+    (["tune", "evaluate", "--scenarios", "0"], "--scenarios"),
+    (["export", "nowhere.nc"], "nowhere.nc"),
+    (["export"], "FILE"),
+]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"), BAD_ARGUMENTS, ids=[" ".join(a)[:60] for a, _ in BAD_ARGUMENTS]
+)
+def test_a_bad_command_line(arguments, said, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert said in refusal(arguments, capsys)
+    assert tree(tmp_path) == {}
+
+
+@pytest.mark.parametrize("command", WITH_OUT)
+def test_a_place_that_cannot_be_written_is_refused_at_once(command, tmp_path, capsys):
+    written(tmp_path / "file", "mine")
+    os.symlink("loop", tmp_path / "loop")
+    os.symlink("nowhere/at/all", tmp_path / "dangling")
+    places = ["file", "file/below", "loop", "dangling", "n" * 300]
+    # The kernel's own folders are closed to root as well.
+    places = [str(tmp_path / place) for place in places] + ["/proc/new", "/dev/null"]
+    before = tree(tmp_path)
+    for place in places:
+        said = refusal([*WITH_OUT[command], "--quiet", "--out", place], capsys)
+        assert "--out: got " in said
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("command", WITH_OUT)
+def test_bad_input_leaves_the_results_of_an_earlier_run_alone(command, tmp_path, capsys):
+    """Neither a folder that is there nor one that is not is touched."""
+    bad = written(tmp_path / "bad.yaml", "duration: -1\n")
+    (tmp_path / "old").mkdir()
+    for name in ("summary.json", "report.html", "signals.nc", "dataset.nc"):
+        written(tmp_path / "old" / name, "of an earlier run")
+    arguments = WITH_OUT[command]
+    if command in ("check", "view"):
+        arguments = ["model", command, str(bad)]
+    elif command == "evaluate":
+        arguments = [*arguments, "--scenario", str(bad)]
+    else:
+        number = 2 if arguments[0] in ("analyze", "tune") else 1
+        arguments = [*arguments[:number], str(bad), *arguments[number:]]
+    arguments = [word for word in arguments if word not in EXACT]
+    before = tree(tmp_path)
+    for place in ("old", "new/below"):
+        assert "bad.yaml" in refusal([*arguments, "--out", str(tmp_path / place)], capsys)
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("command", ["simulate", "workspace", "dataset"])
+def test_two_commands_do_not_write_into_one_directory(command, tmp_path, capsys):
+    written(tmp_path / "summary.json", "of the other")
+    before = tree(tmp_path)
+    other = os.open(tmp_path, os.O_RDONLY)
+    try:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        arguments = [*WITH_OUT[command], "--quiet", "--out", str(tmp_path)]
+        assert main(arguments) == 2
+        err = capsys.readouterr().err
+        assert "where another command is writing; wait for it to end" in err
+        assert err.count("\n") == 1
+        assert tree(tmp_path) == before
+    finally:
+        os.close(other)
+    assert main(["simulate", *EXACT, "--quiet", "--out", str(tmp_path)]) == 0
+
+
+@pytest.mark.parametrize("words", [["tune", "dataset"], ["tune", "evaluate", "--scenarios", "2"]])
+def test_runs_of_other_settings_keep_their_summary(words, tmp_path, capsys):
+    runs = tmp_path / ("runs" if words[1] == "dataset" else "fixed")
+    runs.mkdir()
+    written(runs / "manifest.json", json.dumps({"hash": "0", "settings": {}}))
+    written(tmp_path / "summary.json", "of those runs")
+    assert "other settings" in refusal([*words, "--out", str(tmp_path)], capsys)
+    assert (tmp_path / "summary.json").read_text() == "of those runs"
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\x89HDF\r\n\x1a\n" + b"0" * 64, bytes(4096)])
+def test_signals_and_data_that_are_none(content, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "mine.nc", content)
+    before = tree(tmp_path)
+    assert "mine.nc" in refusal(["export", "mine.nc"], capsys)
+    assert "mine.nc" in refusal(["tune", "train", "mine.nc", "--out", "new/net.json"], capsys)
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("keep", [0.1, 0.5, 0.95])
+def test_signals_cut_off_are_refused(keep, tmp_path, capsys):
+    assert main(["simulate", *EXACT, "--quiet", "--out", str(tmp_path)]) == 0
+    capsys.readouterr()
+    whole = (tmp_path / "signals.nc").read_bytes()
+    written(tmp_path / "cut.nc", whole[: int(keep * len(whole))])
+    assert "cut.nc" in refusal(["export", str(tmp_path / "cut.nc")], capsys)
+
+
+def test_a_folder_in_the_place_of_a_file_is_named(tmp_path, capsys):
+    (tmp_path / "summary.json").mkdir()
+    assert main(["model", "check", "paper", "--quiet", "--out", str(tmp_path)]) == 2
+    err = capsys.readouterr().err
+    assert "summary.json" in err and err.count("\n") == 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+def test_standard_output_that_is_full_is_one_line(capsys, monkeypatch):
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert main(["model", "sdf", "paper"]) == 2
+        monkeypatch.undo()
+        full.close = lambda: None  # type: ignore[method-assign]
+    assert json.dumps(capsys.readouterr().err).count("\\n") == 1

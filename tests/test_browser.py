@@ -1,0 +1,162 @@
+"""The replay in a real browser: it shows something, it moves, it says what is true, offline."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stewart_drake as sd
+from stewart_drake.report.replay import write_replay
+from tests.browser import Browser, browser, needs_chromium
+
+pytestmark = needs_chromium
+
+SETTINGS = ("plant.kind=exact", "duration=3.0")  # from rest: the plate is far off at first
+
+
+@pytest.fixture(scope="module")
+def run() -> sd.SimulationResult:
+    return sd.simulate(sd.load_scenario("paper", settings=SETTINGS))
+
+
+@pytest.fixture(scope="module")
+def page(run, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("replay") / "replay.html"
+    return write_replay(run, sd.load_mechanism("paper"), path, "paper, from rest")
+
+
+@pytest.fixture(scope="module")
+def tab() -> Iterator[Browser]:
+    with browser() as opened:
+        yield opened
+
+
+@pytest.fixture
+def replay(tab: Browser, page: Path) -> Browser:
+    tab.open(page)
+    tab.wait("viewer.animator.actions.length > 0 && document.querySelector('canvas') !== null")
+    return tab
+
+
+def seek(tab: Browser, time: float) -> None:
+    """Go to a time by the page's own slider, and let it draw."""
+    tab.evaluate(f"slider.value = {time}; slider.dispatchEvent(new Event('input'))")
+    frames = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    for _ in range(3):
+        tab.evaluate(frames)
+
+
+def scene(tab: Browser) -> np.ndarray:
+    """The middle of the canvas, where no panel covers the machine."""
+    return tab.screenshot()[60:620, 380:900]
+
+
+def test_it_loads_without_an_error_and_without_a_network(replay):
+    seek(replay, 1.0)
+    assert replay.errors == []
+    assert replay.requests == []
+    assert replay.evaluate("document.title") == "Replay"
+
+
+def test_errors_and_requests_would_be_seen(tab, tmp_path):
+    """The two lists above are empty for a reason."""
+    path = tmp_path / "wrong.html"
+    path.write_text(
+        "<!DOCTYPE html><script>console.error('one')</script><script>two()</script>"
+        "<img src='http://127.0.0.1:9/three.png'>"
+    )
+    tab.open(path)
+    tab.wait("document.images[0].complete")
+    assert any("one" in error for error in tab.errors)
+    assert any("two is not defined" in error for error in tab.errors)
+    assert tab.requests == ["http://127.0.0.1:9/three.png"]
+
+
+def test_the_canvas_shows_a_machine(replay):
+    seek(replay, 0.0)
+    image = scene(replay)
+    assert image.std() > 0.03, "a blank canvas"
+    red, green, blue = image.reshape(-1, 3).T
+    assert ((blue > 0.6) & (red < 0.3)).sum() > 1000, "no blue plate"
+    assert ((green > red + 0.15) & (green > blue + 0.05)).sum() > 200, "no green reference"
+
+
+def test_hidden_things_leave_a_blank_canvas(replay):
+    """What the test above takes for a machine is one."""
+    seek(replay, 0.0)
+    for path in ('["drake"]', '["reference"]', '["paths"]', '["Grid"]'):
+        replay.evaluate(f"viewer.set_property({path}, 'visible', false); viewer.set_dirty()")
+    time.sleep(0.3)
+    red, green, blue = scene(replay).reshape(-1, 3).T
+    assert ((blue > 0.6) & (red < 0.3)).sum() == 0
+    assert ((green > red + 0.15) & (green > blue + 0.05)).sum() == 0
+
+
+def test_the_animation_advances_by_itself(replay):
+    replay.evaluate("player.reset(); player.play()")
+    first, image = replay.evaluate("player.time"), scene(replay)
+    replay.wait(f"player.time > {first} + 0.8")
+    assert np.abs(scene(replay) - image).max() > 0.2
+    assert 0 < replay.evaluate("Number(slider.value)") <= 3.0
+
+
+def test_the_button_and_the_space_bar_play_and_pause(replay):
+    replay.evaluate("button.click()")
+    replay.wait("!player.playing && button.textContent === 'Play'")
+    held = replay.evaluate("player.time")
+    time.sleep(0.5)
+    assert replay.evaluate("player.time") == held
+    for kind in ("keyDown", "keyUp"):
+        replay.call("Input.dispatchKeyEvent", type=kind, key=" ", code="Space", text=" ")
+    replay.wait(f"player.playing && player.time > {held}")
+
+
+@pytest.mark.parametrize("at", [0.4, 1.0, 2.5])
+def test_plate_reference_and_readout_are_where_the_run_had_them(replay, run, at):
+    seek(replay, at)
+    row = run.signals.sel(time=at, method="nearest")
+    world = (
+        "(path => { const o = viewer.scene_tree.find(path).object; o.updateWorldMatrix(true, true);"
+        " return o.matrixWorld.elements.slice(12, 15) })"
+    )
+    # Meshcat draws with y up: its (x, y, z) are our (x, z, -y).
+    turned = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    plate = turned @ replay.evaluate(f"{world}(['drake', 'visualizer', 'paper', 'plate'])")
+    assert np.allclose(plate, row.pose.values[3:], atol=2e-4)
+    ghost = turned @ replay.evaluate(f"{world}(['reference'])")
+    assert np.linalg.norm(ghost - row.reference.values[3:]) < 0.02  # the disc's own height
+    off = 1e3 * np.linalg.norm(row.error.values[3:])
+    shown = replay.evaluate("now.textContent")
+    assert shown.startswith(f"t = {at:.2f} s")
+    assert float(shown.split("off by ")[1].split(" mm")[0]) == pytest.approx(off, rel=0.1, abs=5e-3)
+
+
+def test_cranks_take_the_colour_of_their_torque(replay, run):
+    loudest = run.signals.torque_applied.values
+    row, leg = np.unravel_index(np.abs(loudest).argmax(), loudest.shape)
+    path = f"['drake', 'visualizer', 'paper', 'crank_{leg + 1}', 'paper', 'arm', '<object>']"
+    color = f"viewer.scene_tree.find({path}).object.material.color.toArray()"
+    seek(replay, float(run.signals.time.values[row]) + 0.01)
+    red, _, blue = replay.evaluate(color)
+    assert (red > 2 * blue) if loudest[row, leg] > 0 else (blue > 2 * red)
+    seek(replay, 0.5)  # nothing has arrived yet
+    grey = replay.evaluate(color)
+    assert np.ptp(grey) < 1e-6
+
+
+@pytest.mark.parametrize(("width", "height"), [(1600, 900), (1000, 700), (375, 640)])
+def test_panels_leave_the_machine_visible_on_any_screen(tab, page, width, height):
+    tab.open(page, width, height)
+    boxes = tab.evaluate(
+        "[...document.querySelectorAll('.run')].map(e => { const b = e.getBoundingClientRect();"
+        " return [b.left, b.top, b.right, b.bottom, e.scrollWidth - e.clientWidth] })"
+    )
+    for left, top, right, bottom, overflow in boxes:
+        assert 0 <= left < right <= width and 0 <= top < bottom <= height
+        assert overflow <= 0
+    about, play = boxes
+    assert about[3] < play[1], "the panels overlap"
+    assert (about[2] - about[0]) * (about[3] - about[1]) < 0.35 * width * height
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width

@@ -1,0 +1,87 @@
+"""Signals as CSV: the header, the numbers, and what is refused."""
+
+import csv
+import io
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import stewart_drake as sd
+from stewart_drake.cli import main
+from stewart_drake.report.csv_file import signals_csv
+
+SHORT = ("--set", "plant.kind=exact", "--set", "duration=0.3")
+
+
+@pytest.fixture(scope="module")
+def run() -> sd.SimulationResult:
+    settings = ("plant.kind=exact", "duration=0.3", "start=on_reference", "queue=reference")
+    return sd.simulate(sd.load_scenario("paper", settings=settings))
+
+
+def table(text: str) -> dict[str, np.ndarray]:
+    head, *rows = csv.reader(io.StringIO(text))
+    assert len(set(head)) == len(head) and {len(row) for row in rows} == {len(head)}
+    values = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows])
+    return dict(zip(head, values.T, strict=True))
+
+
+def test_every_number_of_every_signal_is_there(run):
+    columns = table(signals_csv(run.signals))
+    assert len(columns) == 1 + sum(signal.shape[1] for signal in run.signals.values())
+    assert np.array_equal(columns["time[s]"], run.signals.time.values)
+    for name, column, unit in (
+        ("pose", "phi", "rad"),
+        ("pose", "z", "m"),
+        ("rates", "psi", "rad/s"),
+        ("integral", "x", "m s"),
+        ("reference", "theta", "rad"),
+        ("torque_applied", "3", "N m"),
+        ("parameters", "payload_mass", "kg"),
+        ("parameter_std", "joint_damping", "N m s/rad"),
+        ("weights", "w_R", "-"),
+        ("density", "torque_6", "-"),
+    ):
+        signal = run.signals[name]
+        dimension = next(d for d in signal.dims if d != "time")
+        labels = [str(label) for label in signal[dimension].values]
+        expected = signal.values[:, labels.index(column)]
+        assert np.allclose(columns[f"{name}_{column}[{unit}]"], expected, rtol=1e-11, atol=0)
+
+
+def test_what_is_not_a_number_is_an_empty_cell(run):
+    signals = run.signals.copy(deep=True)
+    signals.parameters.values[2, 6] = np.nan
+    column = table(signals_csv(signals))["parameters_payload_mass[kg]"]
+    assert np.isnan(column[2]) and np.isfinite(column[3:]).all()
+    assert "nan" not in signals_csv(signals)
+
+
+def test_export_gives_what_simulate_wrote(tmp_path, capsys):
+    assert main(["simulate", *SHORT, "--out", str(tmp_path), "--csv", "--quiet"]) == 0
+    written = (tmp_path / "signals.csv").read_text()
+    assert main(["export", str(tmp_path / "signals.nc")]) == 0
+    assert capsys.readouterr() == (written, "")
+    out = tmp_path / "new" / "again.csv"
+    assert main(["export", str(tmp_path / "signals.nc"), "--out", str(out)]) == 0
+    assert out.read_text() == written and len(table(written)["time[s]"]) == 16
+    assert main(["simulate", *SHORT, "--out", str(tmp_path), "--quiet"]) == 0
+    assert not (tmp_path / "signals.csv").exists(), "of an earlier run"
+
+
+@pytest.mark.parametrize("option", ["--csv", "--replay"])
+def test_files_need_a_place(option, capsys):
+    assert main(["simulate", *SHORT, option]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and option in err and "--out" in err
+
+
+def test_what_is_no_signals_file_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "text.nc").write_text("time,pose\n")
+    xr.Dataset({"a": ("x", [1.0])}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    for name in ("missing.nc", "text.nc", "other.nc", "."):
+        assert main(["export", str(tmp_path / name)]) == 2
+        out, err = capsys.readouterr()
+        assert out == "" and err.startswith("error: signals: ") and err.count("\n") == 1
+        assert "expected" in err

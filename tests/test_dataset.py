@@ -1,0 +1,309 @@
+"""The data set of the tuner: the paper's grid, its rows, its labels."""
+
+import dataclasses
+import io
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from stewart_drake.cli import main
+from stewart_drake.design.delay_model import delayed_model
+from stewart_drake.design.error_model import linear_model
+from stewart_drake.design.riccati import reduced_gain
+from stewart_drake.errors import ConfigError
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.simulation import simulate
+from stewart_drake.studies import dataset as module
+from stewart_drake.studies import grid
+from stewart_drake.studies.dataset import (
+    data_hash,
+    load_dataset,
+    make_dataset,
+    sample_run,
+    samples,
+)
+from stewart_drake.studies.disturbances import disturbed, draw
+from stewart_drake.studies.grid import (
+    DELAYS,
+    FREQUENCIES,
+    PAIRS,
+    PAPER_ROWS,
+    disturbed_runs,
+    paper_runs,
+)
+from stewart_drake.studies.labels import cells, labels
+from stewart_drake.tuner.density import WINDOW, densities
+
+# The paper's own controller costs little, keeps a small motion in the workspace at some delays and
+# loses it at others.
+SMALL = (
+    "plant.kind=exact",
+    "reference.amplitude=[0.01, 0.01, 0.01, 0.001, 0.001, 0.004]",
+)
+NOISE = (f"sensor.noise_std={[1e-5] * 12}", "sensor.seed=3")
+
+
+def base(*settings, controller="delay_lqi"):
+    return load_scenario("paper", controller, (*SMALL, *settings))
+
+
+def shrink(patch: pytest.MonkeyPatch) -> None:
+    """A grid of two delays, one frequency and three pairs."""
+    patch.setattr(grid, "DELAYS", (0, 3))
+    patch.setattr(grid, "FREQUENCIES", (2.0,))
+    patch.setattr(grid, "PAIRS", ((0.1, 4.0), (1.0, 1.0), (4.0, 0.1)))
+    patch.setattr(module, "PAPER_ROWS", 2 * 3 * 100)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data")
+    with pytest.MonkeyPatch.context() as patch:
+        shrink(patch)
+        make_dataset(base(), path, workers=1)
+    return path
+
+
+@pytest.fixture(scope="module")
+def data(folder):
+    return load_dataset(folder)
+
+
+# ---------------------------------------------------------------- the grid
+
+
+def test_the_papers_grid_has_180_runs_and_18000_rows():
+    runs = paper_runs(base())
+    assert len(runs) == 9 * len(DELAYS) * len(FREQUENCIES) == 180
+    assert len(runs) * grid.SAMPLES == PAPER_ROWS == 18_000
+    for run in runs.values():
+        c, sc = run.scenario.controller, run.scenario
+        assert (c.w_Q, c.w_R) == (run.w_Q, run.w_R)
+        assert sc.delay.steps == run.delay_steps in (0, 5, 10, 20, 30)
+        assert sc.reference.frequency == run.frequency in (0.5, 2, 4, 6)
+        assert sc.reference.frequency_unit == "rad/s"
+    assert len({(r.w_Q, r.w_R, r.delay_steps, r.frequency) for r in runs.values()}) == 180
+
+
+def test_the_grid_varies_nothing_else():
+    one = paper_runs(base())["delay10_frequency4_wQ1_wR1"].scenario
+    plain = base("delay.steps=10", "reference.frequency=4")
+    assert dataclasses.asdict(one) == dataclasses.asdict(plain)
+
+
+def test_nine_pairs_are_seven_gains():
+    dynamics = StewartDynamics(load_mechanism("paper"), gravity=False)
+    model = linear_model(*dynamics.linearize(load_mechanism("paper").home))
+    delayed = delayed_model(model, 0.1, 8, integral=True)
+    gains = [reduced_gain(delayed, q * np.eye(12), r * np.eye(6)) for q, r in PAIRS]
+    distinct: list[np.ndarray] = []
+    for K in gains:
+        if not any(np.allclose(K, other, rtol=1e-6, atol=1e-9) for other in distinct):
+            distinct.append(K)
+    assert len(PAIRS) == 9 and len(distinct) == 7
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (("reference.kind=hold",), "reference.kind"),
+        (("duration=5",), "duration"),
+        (("controller.period=0.03",), "controller.period"),
+    ],
+)
+def test_scenarios_that_do_not_suit_are_refused(settings, said):
+    with pytest.raises(ConfigError, match=said):
+        paper_runs(load_scenario("paper", settings=("plant.kind=exact", *settings)))
+
+
+# ---------------------------------------------------------------- the rows
+
+
+def test_rows_are_the_densities_that_the_loop_records():
+    scenario = base("delay.steps=1", *NOISE, controller="predictor_lqi")
+    result = simulate(scenario)
+    own = densities(samples(result))
+    recorded = result.signals.density.values[::5][:100]
+    # The loop reads its sample 5e-15 of the time earlier, and an error is a small difference.
+    np.testing.assert_allclose(own, recorded, rtol=1e-8)
+
+
+def test_a_run_that_ends_early_keeps_its_rows_empty_and_marked(data):
+    assert data.sizes == {"run": 6, "sample": 100, "input": 18, "weight": 2}
+    failed = data.status.values == "left_workspace"
+    assert 0 < failed.sum() < 6, "the grid of this test has both"
+    for i in np.flatnonzero(failed):
+        valid = data.valid.values[i]
+        known = np.arange(100) * 0.1 < float(data.stopped[i])
+        np.testing.assert_array_equal(valid, known)
+        assert np.isnan(data.density.values[i][~valid]).all()
+        assert np.isnan(data.samples.values[i][~valid]).all()
+        assert np.isnan(data.accumulated_error[i])
+    for i in np.flatnonzero(~failed):
+        assert data.valid.values[i].all()
+        assert np.isfinite(data.density.values[i]).all()
+        assert data.accumulated_error[i] > 0
+    rho = data.density.values[data.valid.values]
+    assert (rho >= 0).all() and (rho <= WINDOW).all()
+
+
+def test_a_resumed_data_set_has_the_same_bytes(folder, monkeypatch):
+    shrink(monkeypatch)
+    before = (folder / "dataset.nc").read_bytes()
+    runs = sorted((folder / "runs").glob("*.npz"))
+    assert len(runs) == 6
+    kept = {path: path.read_bytes() for path in runs}
+    for path in runs[:2]:
+        path.unlink()
+    (folder / "dataset.nc").unlink()
+    make_dataset(base(), folder, workers=2)
+    assert (folder / "dataset.nc").read_bytes() == before
+    assert {path: path.read_bytes() for path in runs} == kept
+
+
+def test_a_damaged_run_is_named(tmp_path):
+    runs = paper_runs(base())
+    some = dict(list(runs.items())[:1])
+    bad = tmp_path / "bad.npz"
+    bad.write_bytes(b"PK\x03\x04 not a zip")
+    with pytest.raises(ConfigError, match=r"bad\.npz: is damaged"):
+        module.assemble(some, dict.fromkeys(some, bad), {})
+
+
+def test_a_missing_or_foreign_file_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="tune dataset"):
+        load_dataset(tmp_path)
+    (tmp_path / "dataset.nc").write_text("text")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_dataset(tmp_path)
+    xr.Dataset({"x": ("run", [1.0])}).to_netcdf(tmp_path / "dataset.nc", engine="h5netcdf")
+    with pytest.raises(ConfigError, match="is not a data set"):
+        load_dataset(tmp_path)
+
+
+def test_the_hash_sees_every_value(data):
+    assert data_hash(data) == data_hash(data.copy(deep=True))
+    for name in ("samples", "weights", "accumulated_error"):
+        changed = data.copy(deep=True)
+        changed[name].values.flat[0] += 1e-12 + 1e-15 * abs(changed[name].values.flat[0])
+        assert data_hash(changed) != data_hash(data)
+
+
+# ---------------------------------------------------------------- labels
+
+
+def made_up(error, weights=PAIRS):
+    """A data set of one cell with these errors."""
+    n = len(error)
+    return xr.Dataset(
+        {
+            "weights": (("run", "weight"), np.array(weights)),
+            "accumulated_error": ("run", np.array(error, dtype=float)),
+            "rms_torque": ("run", np.linspace(1.0, 2.0, n)),
+            "delay_steps": ("run", np.full(n, 3)),
+            "frequency": ("run", np.full(n, 2.0)),
+            "disturbance": ("run", np.full(n, -1)),
+        }
+    )
+
+
+def test_labels_as_run_are_the_weights(data):
+    np.testing.assert_array_equal(labels(data, "as_run"), data.weights)
+
+
+def test_the_best_in_a_cell_labels_all_its_runs():
+    error = np.arange(9.0, 0.0, -1.0)
+    error[5] = 0.1  # (1, 4)
+    expected = np.tile([0.5, 2.0], (9, 1))
+    np.testing.assert_allclose(labels(made_up(error), "best_in_cell"), expected)
+    error[5] = np.nan
+    best = np.tile([1.0, 1.0], (9, 1))  # (4, 4), as the ratio 1
+    np.testing.assert_allclose(labels(made_up(error), "best_in_cell"), best)
+
+
+def test_torque_can_outweigh_the_error():
+    error = np.linspace(1.1, 1.0, 9)  # least at the end, where the torque is twice the least
+    assert np.allclose(labels(made_up(error), "best_in_cell")[0], [1.0, 1.0])
+    assert np.allclose(labels(made_up(error), "best_in_cell_torque")[0], [1.0, 1.0])
+    error = np.linspace(1.1, 1.0, 9)[::-1]
+    weights = PAIRS[::-1]
+    found = labels(made_up(error, weights), "best_in_cell_torque")[0]
+    assert np.allclose(found, [1.0, 1.0])
+    error = np.array([2.0] * 4 + [1.0] + [0.99] * 4)
+    ratio = np.divide(*labels(made_up(error), "best_in_cell_torque")[0])
+    assert ratio == pytest.approx(PAIRS[4][0] / PAIRS[4][1])
+    ratio = np.divide(*labels(made_up(error), "best_in_cell")[0])
+    assert ratio == pytest.approx(PAIRS[5][0] / PAIRS[5][1])
+
+
+def test_a_cell_without_a_survivor_has_no_best():
+    assert np.isnan(labels(made_up([np.nan] * 9), "best_in_cell")).all()
+    assert np.isnan(labels(made_up([np.nan] * 9), "best_in_cell_torque")).all()
+
+
+def test_cells_differ_in_weights_only(data):
+    found = cells(data)
+    assert sorted(map(len, found)) == [3, 3]
+    for members in found:
+        assert len({float(data.delay_steps[i]) for i in members}) == 1
+
+
+# ---------------------------------------------------------------- disturbed runs
+
+
+def test_draws_are_reproducible_extendable_and_unlike_those_for_evaluation():
+    scenario = base()
+    few, many = (draw(scenario, n, 5, "training") for n in (3, 6))
+    assert few == many[:3]
+    others = draw(scenario, 6, 5, "evaluation")
+    assert not {d.seed for d in many} & {d.seed for d in others}
+    assert draw(scenario, 3, 6, "training") != few
+
+
+def test_a_disturbance_does_what_it_says():
+    scenario = base()
+    one = next(d for d in draw(scenario, 20, 0, "training") if d.noise and d.payload_mass)
+    sc = disturbed(scenario, one)
+    assert sc.delay.steps == one.delay_steps
+    assert sc.reference.frequency == one.frequency
+    assert sc.reference.amplitude == pytest.approx(
+        [one.amplitude * a for a in scenario.reference.amplitude]
+    )
+    assert sc.plant.payload_mass == one.payload_mass
+    expected = one.noise * np.tile(sc.reference.amplitude, 2)
+    np.testing.assert_allclose(sc.sensor.noise_std, expected, rtol=1e-3)
+    assert scenario.plant.payload_mass == 0, "the scenario itself stays as it was"
+    assert len(disturbed_runs(scenario, [one])) == 9
+
+
+def test_a_run_says_how_it_ended():
+    scenario = base("delay.steps=8", "reference.frequency=2")
+    with np.load(io.BytesIO(sample_run(scenario)), allow_pickle=False) as file:
+        assert str(file["status"]) in ("completed", "left_workspace")
+        assert file["samples"].shape == (100, 18)
+        first = file["samples"][0]
+    # At t = 0 the plate rests at the reference's first pose: only the rates differ.
+    assert np.abs(first[:6]).max() == 0 and np.abs(first[6:12]).min() > 0
+
+
+# ---------------------------------------------------------------- the command
+
+
+def test_the_command_writes_a_data_set_of_disturbed_runs(tmp_path, capsys, monkeypatch):
+    arguments = ["tune", "dataset", "paper", "--controller", "delay_lqi", "--disturbed", "1"]
+    monkeypatch.setattr(grid, "PAIRS", ((1.0, 1.0),))
+    arguments += [part for setting in SMALL for part in ("--set", setting)]
+    assert main([*arguments, "--workers", "1", "--out", str(tmp_path)]) == 0
+    out, err = capsys.readouterr()
+    assert err == "" and all(len(line) <= 80 for line in out.splitlines()[:-1])
+    assert "1 runs, 100 rows" in out
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["runs"] == 1 and summary["rows"] == 100
+    assert summary["data_sha256"] == data_hash(load_dataset(tmp_path))
+    assert len(summary["draws"]) == 1
+    assert main([*arguments, "--seed", "1", "--out", str(tmp_path)]) == 2
+    assert "belongs to other settings" in capsys.readouterr().err

@@ -1,0 +1,122 @@
+"""What the command tells those who ask: help with examples, completion, 80 columns."""
+
+import os
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+import typer
+
+from stewart_drake.cli import app, main
+from stewart_drake.commands.examples import EXAMPLES
+from stewart_drake.config import Scenario
+from stewart_drake.resources import shipped
+from stewart_drake.scenario_loading import load_scenario, scenario_yaml, setting_choices
+from stewart_drake.yamlio import parse_yaml
+from tests import test_docs
+
+main(["--version"])  # which also puts the examples where they belong
+
+
+def commands(group: Any, words: tuple[str, ...] = ()) -> dict[str, Any]:
+    """All commands by the words that call them."""
+    found = {}
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            found |= commands(command, (*words, name))
+        else:
+            found[" ".join((*words, name))] = command
+    return found
+
+
+COMMANDS = commands(typer.main.get_command(app))
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_the_help_of_every_command_ends_with_an_example(words, capsys):
+    assert main([*words.split(), "--help"]) == 0
+    lines = capsys.readouterr().out.rstrip().splitlines()
+    assert lines[0].startswith("Usage: stewart-drake")
+    assert any(line.strip() in ("Example:", "Examples:") for line in lines)
+    assert lines[-1].startswith(f"    stewart-drake {words}")
+    assert all(len(line) <= 80 for line in lines)
+
+
+def test_every_example_is_of_a_command_and_parses():
+    unknown = set(EXAMPLES) - set(COMMANDS) - {""}
+    assert not unknown
+    for lines in EXAMPLES.values():
+        test_docs.test_commands_parse(
+            test_docs.Block(test_docs.ROOT / "examples", 1, "sh", "\n".join(lines))
+        )
+
+
+def test_no_summary_is_cut_off_in_the_list_of_commands(capsys):
+    for words in ([], ["model"], ["analyze"], ["tune"]):
+        assert main([*words, "--help"]) == 0
+        out = capsys.readouterr().out
+        assert all(len(line) <= 80 for line in out.splitlines())
+        if not words:
+            assert "..." not in out.partition("Commands:")[2]
+
+
+# ---------------------------------------------------------------- completion
+
+
+def offered(typed: str) -> list[str]:
+    """What bash would offer after this line."""
+    code = "import sys; from stewart_drake.cli import main; sys.exit(main())"
+    words = typed.split(" ")
+    environment = {
+        **os.environ,
+        "_STEWART_DRAKE_COMPLETE": "complete_bash",
+        "COMP_WORDS": typed,
+        "COMP_CWORD": str(len(words) - 1),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
+    assert done.stderr == "" and done.returncode == 0
+    return done.stdout.split()
+
+
+def test_the_shell_completes_commands_names_and_settings():
+    assert offered("stewart-drake si") == ["simulate"]
+    assert set(offered("stewart-drake simulate ")) >= set(shipped("scenario"))
+    assert offered("stewart-drake model check mot") == ["motion_base"]
+    assert offered("stewart-drake simulate --set plant.k") == [
+        "plant.kind=multibody",
+        "plant.kind=exact",
+    ]
+    assert "--replay" in offered("stewart-drake simulate --r")
+
+
+def test_the_script_for_a_shell_can_be_had():
+    code = "import sys; from stewart_drake.cli import main; sys.exit(main())"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "--show-completion", "bash"], capture_output=True, text=True
+    )
+    assert done.returncode == 0 and "stewart-drake" in done.stdout
+
+
+def test_every_offered_setting_names_a_field_and_its_values_are_accepted():
+    assert len(setting_choices()) == len(set(setting_choices())) > 40
+    for choice in setting_choices():
+        name, _, value = choice.partition("=")
+        section, _, field = name.rpartition(".")
+        owner = getattr(Scenario(), section) if section else Scenario()
+        assert hasattr(owner, field)
+        if value:
+            setattr(owner, field, parse_yaml(value, name))  # checked on assignment
+
+
+# ---------------------------------------------------------------- scenarios as text
+
+
+@pytest.mark.parametrize("name", shipped("scenario"))
+def test_a_scenario_written_as_text_is_read_back(name, tmp_path):
+    path = tmp_path / "again.yaml"
+    path.write_text(scenario_yaml(load_scenario(name)))
+    assert load_scenario(path) == load_scenario(name)
+    assert all(len(line) <= 120 for line in path.read_text().splitlines())

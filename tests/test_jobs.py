@@ -1,0 +1,338 @@
+"""The resumable parallel runner: nothing that has finished is lost, nothing is done twice."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from stewart_drake.errors import ConfigError
+from stewart_drake.studies import jobs as module
+from stewart_drake.studies.jobs import (
+    MANIFEST,
+    finished,
+    run_jobs,
+    settings_hash,
+    write_atomically,
+)
+
+ROOT = Path(__file__).resolve().parents[1]
+SETTINGS = {"gain": 1.0, "names": ["a"]}
+
+
+def text(*parts: object) -> bytes:
+    return " ".join(map(str, parts)).encode()
+
+
+def noted(folder: str, *parts: object) -> bytes:
+    """Leaves a trace of every call."""
+    with open(folder, "a") as file:
+        file.write(f"{parts[0]}\n")
+    return text(*parts)
+
+
+def environment(name: str) -> bytes:
+    return os.environ[name].encode()
+
+
+def process(number: int) -> bytes:
+    return text(os.getpid())
+
+
+def slow(number: int) -> bytes:
+    time.sleep(0.4)
+    return text(number)
+
+
+def refuse(number: int) -> bytes:
+    raise ConfigError(f"delay.steps: got {number}")
+
+
+def die_at_three(number: int) -> bytes:
+    if number == 3:
+        time.sleep(0.5)
+        os.kill(os.getpid(), signal.SIGKILL)
+    return text(number)
+
+
+def lacks_a_module(number: int) -> bytes:
+    raise ModuleNotFoundError("No module named 'nowhere'")
+
+
+def numbered(count: int) -> dict[str, tuple[int]]:
+    return {f"job{i}": (i,) for i in range(count)}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir() if not p.name.startswith(".")}
+
+
+# ---------------------------------------------------------------- what it does
+
+
+def test_every_job_is_a_file_in_order(tmp_path):
+    seen = []
+    paths = run_jobs(
+        {"b": ("two", 2), "a": ("one", 1)},
+        text,
+        tmp_path / "new" / "folder",
+        settings=SETTINGS,
+        suffix=".txt",
+        workers=2,
+        progress=lambda done, total: seen.append((done, total)),
+    )
+    assert {key: path.read_text() for key, path in paths.items()} == {"b": "two 2", "a": "one 1"}
+    assert list(paths) == ["b", "a"]
+    assert seen == [(0, 2), (1, 2), (2, 2)]
+    assert set(contents(tmp_path / "new" / "folder")) == {"a.txt", "b.txt", MANIFEST}
+
+
+def test_a_second_start_does_only_what_is_missing(tmp_path):
+    trace, folder = tmp_path / "trace", tmp_path / "runs"
+    calls = {str(i): (str(trace), i) for i in range(4)}
+    first = {key: calls[key] for key in ("1", "3")}
+    run_jobs(first, noted, folder, settings=SETTINGS, workers=1)
+    seen = []
+    run_jobs(calls, noted, folder, settings=SETTINGS, workers=1, progress=lambda *n: seen.append(n))
+    assert trace.read_text().split() == ["1", "3", "0", "2"]
+    assert seen == [(2, 4), (3, 4), (4, 4)]
+    assert finished(calls, folder) == {key: folder / f"{key}.json" for key in calls}
+
+
+def test_bad_keys_and_numbers_of_workers_are_refused(tmp_path):
+    for key in ("", "a/b", "..", ".hidden", "a b", "x" * 300):
+        with pytest.raises(ValueError, match="file name"):
+            run_jobs({key: (1,)}, text, tmp_path, settings=SETTINGS)
+    with pytest.raises(ConfigError, match="--workers: got 0"):
+        run_jobs(numbered(1), text, tmp_path, settings=SETTINGS, workers=0)
+
+
+def test_a_refused_job_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"^job0: delay\.steps: got 0$"):
+        run_jobs(numbered(1), refuse, tmp_path, settings=SETTINGS, workers=1)
+
+
+def test_workers_are_processes_with_one_thread(tmp_path):
+    variables = {key: (key,) for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+    paths = run_jobs(variables, environment, tmp_path, settings=SETTINGS, workers=2)
+    assert [path.read_text() for path in paths.values()] == ["1", "1"]
+
+
+# ---------------------------------------------------------------- settings and locks
+
+
+def test_the_hash_is_of_values_not_of_their_order():
+    assert settings_hash({"a": 1, "b": [1.0, None]}) == settings_hash({"b": [1.0, None], "a": 1})
+    assert settings_hash({"a": 1}) != settings_hash({"a": 2})
+
+
+def test_a_folder_of_other_settings_is_refused(tmp_path):
+    run_jobs(numbered(1), text, tmp_path, settings={"c": {"w": 1, "v": 2}})
+    before = contents(tmp_path)
+    with pytest.raises(ConfigError, match=r"other settings \(c\.w: 1 there, 3 now\)") as caught:
+        run_jobs(numbered(2), text, tmp_path, settings={"c": {"w": 3, "v": 2}})
+    assert "\n" not in str(caught.value)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("manifest", ["", "{", "[]", '{"hash": "0"}', None])
+def test_a_folder_with_a_bad_manifest_is_refused(tmp_path, manifest):
+    (tmp_path / "job0.json").write_text("{}")
+    if manifest is not None:
+        (tmp_path / MANIFEST).write_text(manifest)
+    with pytest.raises(ConfigError, match=MANIFEST):
+        run_jobs(numbered(1), text, tmp_path, settings=SETTINGS)
+    assert (tmp_path / "job0.json").read_text() == "{}"
+
+
+def test_the_manifest_says_what_the_settings_were(tmp_path):
+    run_jobs({}, text, tmp_path, settings=SETTINGS)
+    manifest = json.loads((tmp_path / MANIFEST).read_text())
+    assert manifest == {"hash": settings_hash(SETTINGS), "settings": SETTINGS}
+
+
+def test_two_processes_do_not_share_a_folder(tmp_path):
+    with (
+        module._locked(tmp_path),
+        pytest.raises(ConfigError, match="another process is working in this folder"),
+    ):
+        run_jobs(numbered(1), text, tmp_path, settings=SETTINGS)
+    run_jobs(numbered(1), text, tmp_path, settings=SETTINGS)
+
+
+# ---------------------------------------------------------------- what can go wrong
+
+
+def test_leftovers_are_removed_and_a_full_disk_spoils_nothing(tmp_path, monkeypatch):
+    (tmp_path / ".job1.json.part").write_text("half a fi")
+    run_jobs(numbered(1), text, tmp_path, settings=SETTINGS)
+    assert not list(tmp_path.glob(".*.part"))
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(module.os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        run_jobs(numbered(2), text, tmp_path, settings=SETTINGS, workers=1)
+    assert set(contents(tmp_path)) == {"job0.json", MANIFEST}
+    assert not list(tmp_path.glob(".*.part"))
+    monkeypatch.undo()
+    assert len(run_jobs(numbered(2), text, tmp_path, settings=SETTINGS, workers=1)) == 2
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    write_atomically(path, b"old")
+
+    def broken(source: Path, target: Path) -> None:
+        raise PermissionError("no")
+
+    monkeypatch.setattr(module.os, "replace", broken)
+    with pytest.raises(PermissionError):
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"old" and [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_killed_worker_costs_the_jobs_in_flight_only(tmp_path):
+    with pytest.raises(ChildProcessError, match="worker process was killed"):
+        run_jobs(numbered(4), die_at_three, tmp_path, settings=SETTINGS, workers=2)
+    assert {"job0.json", "job1.json", "job2.json"} <= set(contents(tmp_path))
+    run_jobs(numbered(4), text, tmp_path, settings=SETTINGS, workers=2)
+    assert (tmp_path / "job3.json").read_bytes() == b"3"
+
+
+def start(folder: Path) -> "subprocess.Popen[str]":
+    """A process with two workers on thirty jobs of 0.4 s."""
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom stewart_drake.studies.jobs import run_jobs\n"
+        "from tests.test_jobs import SETTINGS, numbered, slow\n"
+        "try:\n    run_jobs(numbered(30), slow, Path(sys.argv[1]), settings=SETTINGS, workers=2)\n"
+        "except KeyboardInterrupt:\n    sys.exit(130)\n"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", code, str(folder)],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        start_new_session=True,
+    )
+
+
+def wait_for(folder: Path, number: int) -> None:
+    limit = time.monotonic() + 60
+    while len(list(folder.glob("job*.json"))) < number:
+        assert time.monotonic() < limit
+        time.sleep(0.02)
+
+
+def group_is_gone(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+@pytest.mark.parametrize("whole_group", [True, False])
+def test_ctrl_c_keeps_what_has_finished(tmp_path, whole_group):
+    process = start(tmp_path)
+    wait_for(tmp_path, 2)
+    (os.killpg if whole_group else os.kill)(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (130, "")
+    done = [p.name for p in tmp_path.glob("job*.json")]
+    assert 2 <= len(done) < 30
+    assert not list(tmp_path.glob(".*.part"))
+
+
+def test_after_kill_9_the_next_start_gives_the_same_files(tmp_path):
+    process = start(tmp_path / "killed")
+    wait_for(tmp_path / "killed", 3)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate(timeout=30)  # its workers end too: they hold stderr open
+    limit = time.monotonic() + 10
+    while not group_is_gone(process.pid) and time.monotonic() < limit:
+        time.sleep(0.1)
+    assert group_is_gone(process.pid)
+    kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "killed").glob("job*.json")}
+    assert 3 <= len(kept) < 30
+    run_jobs(numbered(30), text, tmp_path / "killed", settings=SETTINGS, workers=1)
+    run_jobs(numbered(30), text, tmp_path / "whole", settings=SETTINGS, workers=1)
+    assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
+    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
+
+
+# ---------------------------------------------------------------- a Dask cluster
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as made:
+        yield made.scheduler_address
+
+
+def test_a_cluster_gives_the_same_files(tmp_path, cluster):
+    run_jobs(numbered(6), text, tmp_path / "cluster", settings=SETTINGS, scheduler=cluster)
+    run_jobs(numbered(6), text, tmp_path / "here", settings=SETTINGS, workers=1)
+    assert contents(tmp_path / "cluster") == contents(tmp_path / "here")
+
+
+def test_a_cluster_of_one_worker_is_used_too(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as made:
+        address = made.scheduler_address
+        paths = run_jobs(numbered(3), process, tmp_path, settings=SETTINGS, scheduler=address)
+    (there,) = {path.read_text() for path in paths.values()}
+    assert int(there) != os.getpid()
+
+
+def test_a_job_that_kills_its_workers_is_given_up(tmp_path, cluster):
+    with pytest.raises(ChildProcessError, match="Dask gave up"):
+        run_jobs({"job3": (3,)}, die_at_three, tmp_path, settings=SETTINGS, scheduler=cluster)
+
+
+def test_errors_of_a_cluster_are_one_line(tmp_path, cluster):
+    with pytest.raises(ConfigError, match=r"job0: delay\.steps"):
+        run_jobs(numbered(1), refuse, tmp_path, settings=SETTINGS, scheduler=cluster)
+    with pytest.raises(ConfigError, match="lack a module"):
+        run_jobs(numbered(1), lacks_a_module, tmp_path, settings=SETTINGS, scheduler=cluster)
+
+
+def test_a_cluster_with_threads_or_without_workers_is_refused(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    for number, threads, said in ((1, 2, "has 2 threads"), (0, 1, "has no workers")):
+        with (
+            distributed.LocalCluster(
+                n_workers=number,
+                threads_per_worker=threads,
+                processes=False,
+                dashboard_address=None,
+            ) as made,
+            pytest.raises(ConfigError, match=said),
+        ):
+            run_jobs(
+                numbered(1), text, tmp_path, settings=SETTINGS, scheduler=made.scheduler_address
+            )
+
+
+def test_an_address_without_a_scheduler_is_refused(tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    from stewart_drake.studies import cluster as backend
+
+    monkeypatch.setattr(backend, "_CONNECT_TIMEOUT", 0.2)
+    for address in ("nonsense", "tcp://127.0.0.1:1"):
+        with pytest.raises(
+            ConfigError, match=r"--scheduler: got .* expected the address"
+        ) as caught:
+            run_jobs(numbered(1), text, tmp_path, settings=SETTINGS, scheduler=address)
+        assert "\n" not in str(caught.value)

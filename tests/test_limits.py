@@ -1,0 +1,264 @@
+"""Limits that a delay sets: closed forms, simulations, python-control."""
+
+import math
+
+import control
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+
+import stewart_drake as sd
+from stewart_drake.design.delay_model import DelayedModel, chain, delayed_model
+from stewart_drake.design.error_model import ContinuousModel, linear_model
+from stewart_drake.design.limits import (
+    amplification,
+    closed_loop,
+    fastest_pole,
+    first_instability,
+    largest_delay,
+    loop_gain,
+    peaks,
+    sensitivity,
+    spectral_radius,
+)
+from stewart_drake.design.riccati import augmented_gain
+from stewart_drake.plant.exact import ExactPlant
+from stewart_drake.studies.basis import Basis, basis
+from stewart_drake.studies.delay_limits import error_floor, simulated_growth
+from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
+from stewart_drake.trajectories import evaluate
+from tests.mechanisms import PAPER
+
+Array = NDArray[np.float64]
+HEAVY = sd.StewartDynamics(PAPER, gravity=True)
+
+
+def found(*settings: str) -> Basis:
+    return basis(sd.load_scenario("paper", settings=("plant.kind=exact", *settings)))
+
+
+# ------------------------------------------------------------------ open loop
+
+
+@pytest.mark.parametrize("time", [0.0, 0.7, 1.6, 2.5, 4.4])
+def test_poles_are_those_of_central_differences(time: float) -> None:
+    pose = evaluate(found().experiment.reference, time)[:6]
+    torque = HEAVY.equilibrium_torque(pose)
+    A = np.zeros((12, 12))
+    h = 1e-5
+    for k in range(12):
+        step = h * np.eye(12)[k]
+        ends = [np.concatenate([pose, np.zeros(6)]) + sign * step for sign in (1, -1)]
+        rates = [np.concatenate([x[6:], HEAVY.accelerations(x[:6], x[6:], torque)]) for x in ends]
+        A[:, k] = (rates[0] - rates[1]) / (2 * h)
+    expected = np.linalg.eigvals(A).real.max()
+    assert expected > 3
+    assert fastest_pole(HEAVY.linearize(pose)[0]) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize(("time", "eta"), [(0.0, 0.8), (0.7, 0.3), (1.6, 0.2)])
+def test_a_prediction_error_grows_by_e_to_the_pole_times_the_delay(time: float, eta: float) -> None:
+    """Two runs of the exact plant in Drake's Simulator, 1e-7 apart along the fastest mode."""
+    pose = evaluate(found().experiment.reference, time)[:6]
+    torque = HEAVY.equilibrium_torque(pose)
+    values, vectors = np.linalg.eig(HEAVY.linearize(pose)[0])
+    at = values.real.argmax()
+    pole, mode = values[at].real, vectors[:, at].real
+    plant = ExactPlant(HEAVY)
+    ends = []
+    for sign in (1, -1):
+        context = plant.CreateDefaultContext()
+        plant.GetInputPort("torque").FixValue(context, torque)
+        start = np.concatenate([pose, np.zeros(6)]) + sign * 1e-7 * mode
+        context.SetContinuousState(start)
+        simulator = Simulator(plant, context)
+        config = SimulatorConfig(integration_scheme="runge_kutta5", accuracy=1e-12)
+        ApplySimulatorConfig(config, simulator)
+        simulator.AdvanceTo(eta)
+        ends.append(context.get_continuous_state_vector().CopyToVector())
+    growth = np.linalg.norm(ends[0] - ends[1]) / (2e-7 * np.linalg.norm(mode))
+    assert growth > 20
+    assert growth == pytest.approx(amplification(pole, eta), rel=0.05)
+    expected, simulated = simulated_growth(HEAVY, pose, eta, 1e-6)
+    assert expected == pytest.approx(amplification(pole, eta))
+    assert simulated == pytest.approx(growth, rel=0.05)
+
+
+def test_amplification_and_largest_delay_undo_each_other() -> None:
+    for pole in (0.5, 5.0, 36.0):
+        for tolerable in (2.0, 10.0, 1e3):
+            delay = largest_delay(pole, tolerable)
+            assert amplification(pole, delay) == pytest.approx(tolerable, rel=1e-12)
+    assert largest_delay(0.0, 2.0) == math.inf
+    assert amplification(0.0, 5.0) == 1
+    assert amplification(1e3, 1e3) == math.inf
+    assert fastest_pole(np.diag([-1.0, 1e-9])) == 0
+    with pytest.raises(ValueError, match="factor of 1 or more"):
+        largest_delay(1.0, 0.5)
+
+
+@pytest.mark.parametrize(("eta", "frequency"), [(0.8, 1.0), (0.4, 2.0), (1.5, 0.5)])
+def test_floor_of_a_sine_is_the_closed_form(eta: float, frequency: float) -> None:
+    """50 (1 - cos(w eta)) / w: 15.16 % s for the paper's delay."""
+    expected = 50 * (1 - math.cos(frequency * eta)) / frequency
+    assert error_floor(found(f"reference.frequency={frequency}"), eta) == pytest.approx(
+        expected, rel=1e-6
+    )
+    if (eta, frequency) == (0.8, 1.0):
+        assert expected == pytest.approx(15.16, abs=0.005)
+
+
+# ------------------------------------------------------------------ closed loop
+
+
+def loop(steps: int, fraction: float = 0.0) -> tuple[DelayedModel, Array]:
+    """Two coupled masses, one unstable, with their LQI gain."""
+    A = np.block(
+        [[np.zeros((2, 2)), np.eye(2)], [np.array([[1.0, 0.3], [-0.2, -0.5]]), -0.1 * np.eye(2)]]
+    )
+    B = np.vstack([np.zeros((2, 2)), [[1.0, 0.2], [-0.4, 2.0]]])
+    continuous = ContinuousModel(A, B, np.eye(2, 4))
+    model = delayed_model(continuous, 0.2, steps, fraction, integral=True)
+    return model, augmented_gain(model, np.eye(4), 0.1 * np.eye(2))
+
+
+@pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (3, 0.0), (0, 0.4), (2, 0.7)])
+def test_closed_loop_is_that_of_the_chain(steps: int, fraction: float) -> None:
+    model, K = loop(steps, fraction)
+    augmented = chain(model)
+    assert closed_loop(model, K) == pytest.approx(augmented.A - augmented.B @ K, abs=1e-14)
+
+
+def run(
+    model: DelayedModel, K: Array, disturbance: Array, gain: float = 1.0
+) -> tuple[Array, Array]:
+    """The loop torque by torque: commanded (k, m) and the state at the end."""
+    n, m = model.B_new.shape
+    e, sent = np.zeros(n), np.zeros((len(disturbance) + 50, m))
+    e[0] = 1e-3
+    length = (K.shape[1] - n) // m
+    for k in range(50, len(sent)):
+        queue = sent[k - length : k].ravel()
+        sent[k] = -K @ np.concatenate([e, queue])
+        acting = gain * sent + np.vstack([np.zeros((50, m)), disturbance])
+        e = (
+            model.A @ e
+            + model.B_old @ acting[k - model.steps - 1]
+            + model.B_new @ acting[k - model.steps]
+        )
+    return sent[50:], e
+
+
+@pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (3, 0.0), (2, 0.7)])
+def test_sensitivity_is_what_a_simulated_disturbance_of_a_motor_shows(
+    steps: int, fraction: float
+) -> None:
+    """In steady state the torque acting is S times the disturbance, the commanded one -T times."""
+    model, K = loop(steps, fraction)
+    omega, direction = 3.0, np.array([1.0, -0.5])
+    k = np.arange(400)
+    commanded, _ = run(model, K, np.sin(omega * 0.2 * k)[:, None] * direction)
+    z = np.exp(1j * omega * 0.2)
+    S = sensitivity(loop_gain(model, K, np.array([z])))[0]
+    expected = np.imag(((S - np.eye(2)) @ direction)[None] * np.exp(1j * omega * 0.2 * k)[:, None])
+    assert commanded[300:] == pytest.approx(expected[300:], abs=1e-6)
+
+
+@pytest.mark.parametrize("steps", [0, 2, 5])
+def test_margins_of_one_motor_agree_with_python_control(steps: int) -> None:
+    """A double integrator: eigenvalues against its transfer function's crossings."""
+    continuous = ContinuousModel(
+        np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.eye(1, 2)
+    )
+    model = delayed_model(continuous, 0.1, steps, 0.0, integral=False)
+    K = augmented_gain(model, np.eye(1), np.eye(1))
+    P = control.ss(model.A, model.B_new, K[:, :2], 0, 0.1)
+    memory = np.concatenate([[1.0], K[0, 2:][::-1]])  # 1 + sum K_i z^-i
+    lag = control.tf([1.0], [1.0] + steps * [0.0], 0.1)
+    filter_ = control.tf([1.0] + steps * [0.0], memory, 0.1)
+    L = control.tf(P) * lag * filter_
+    gains, *_ = control.stability_margins(L, returnall=True, method="poly")
+    up = first_instability(lambda by: closed_loop(model, K, 1 + by), 1e-3, 1e3)
+    at_nyquist = -1 / L(-1.0).real  # which python-control leaves out
+    crossings = np.append(gains, at_nyquist)
+    assert 1 + up == pytest.approx(min(crossings[crossings > 1.001]), rel=2e-3)
+    S, T = peaks(model, K, 0.1)
+    omega = np.linspace(0.01, 31.4, 200_000)
+    value = np.abs(1 / (1 + L(np.exp(0.1j * omega))))
+    assert S.value == pytest.approx(value.max(), rel=1e-5)
+    assert 1 / T.value <= up * 1.001
+
+
+def test_first_instability_of_a_scalar_loop() -> None:
+    """e' = a e - g k e leaves the circle at g k = 1 + a."""
+    a, k = 0.9, 0.5
+    limit = first_instability(lambda by: np.array([[a - (1 + by) * k]]), 1e-3, 100.0)
+    assert 1 + limit == pytest.approx((1 + a) / k, rel=1e-3)
+    assert first_instability(lambda by: np.array([[0.5]]), 1e-3, 10.0) == math.inf
+    assert first_instability(lambda by: np.array([[1.5 - by]]), 1e-3, 10.0) == 0
+
+
+def test_a_wrong_gain_of_the_motors_is_what_the_recurrence_shows() -> None:
+    model, K = loop(3)
+    limit = first_instability(lambda by: closed_loop(model, K, 1 + by), 1e-3, 10.0)
+    quiet = np.zeros((3000, 2))
+    inside = np.abs(run(model, K, quiet, 1 + 0.97 * limit)[1]).max()
+    outside = np.abs(run(model, K, quiet, 1 + 1.03 * limit)[1]).max()
+    assert inside < 1e-3 < outside
+
+
+def test_a_longer_delay_is_the_delayed_model_with_that_delay() -> None:
+    """Delay that the gain does not know of adds places to the loop, no more."""
+    model, K = loop(2)
+    later, _ = loop(4, 0.5)
+    A = closed_loop(later, K)
+    assert A.shape == (6 + 5 * 2,) * 2
+    assert spectral_radius(closed_loop(model, K)) < 1 < spectral_radius(A)
+    end = np.abs(run(later, K, np.zeros((300, 2)))[1]).max()
+    assert end > 1e3
+
+
+def margins(*settings: str, steps: int = 8) -> LoopMargins:
+    case = found(f"delay.steps={steps}", *settings)
+    return next(m for m in loop_margins(case, ()) if m.steps == steps)
+
+
+def test_margins_of_the_papers_loop() -> None:
+    """Those of docs/theory.md, section 13: 1.6 and 1.9 ms, and with tolerance 1 38 and 40 ms."""
+    tight, loose = margins(), margins("controller.w_R=1111.1111")
+    assert 1e3 * tight.later == pytest.approx(1.6, abs=0.05)
+    assert 1e3 * tight.earlier == pytest.approx(1.9, abs=0.05)
+    assert 1e3 * loose.later == pytest.approx(38, abs=0.5)
+    assert 1e3 * loose.earlier == pytest.approx(40, abs=0.5)
+    for m in (tight, loose):
+        least = min(m.gain_up - 1, 1 - m.gain_down)
+        assert 1 / m.T.value <= least * 1.001  # the small-gain bound
+        assert m.motor is not None
+        assert m.motor.gain_up >= m.gain_up  # six wrong motors are worse than one
+        # |S| bounds both classical margins of each motor from below.
+        assert m.motor.gain_up >= m.S.value / (m.S.value - 1) * 0.999
+        assert np.deg2rad(m.motor.phase) >= 2 * np.arcsin(0.5 / m.S.value) * 0.999
+
+
+def test_the_faithful_controller_is_unstable_on_the_true_plant() -> None:
+    """Its model has twice the true accelerations, through eight torques in flight."""
+    scenario = sd.load_scenario("paper", "delay_lqi", ("plant.kind=exact",))
+    (m,) = loop_margins(basis(scenario), ())
+    assert m.radius > 1.3
+    assert m.later == m.earlier == 0
+    assert m.motor is None
+    assert math.isnan(m.S.value)
+
+
+def test_zero_delay_cannot_be_shorter() -> None:
+    assert margins(steps=0).earlier == math.inf
+
+
+def test_linear_model_of_the_plant_is_the_loops() -> None:
+    """The loop is closed around the plant at the reference's first pose, not around its model."""
+    case = found()
+    pose = case.experiment.reference.value(0.0)[:, 0]
+    plant = linear_model(*case.experiment.nominal.linearize(pose))
+    assert plant.B.shape == (12, 6)
+    assert case.torque == pytest.approx(0.0133, rel=0.01)

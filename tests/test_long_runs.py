@@ -1,0 +1,170 @@
+"""Long runs and many runs: neither memory nor the loops' gaps grow.
+
+What a run records grows with its length by design, some 1.2 kB per 20 ms of signals; what must not
+grow is anything beside that.
+"""
+
+import gc
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.multibody.plant import MultibodyPlant
+
+from stewart_drake.diagram import build_closed_loop
+from stewart_drake.mechanism.kinematics import leg_geometry, rotation
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.signals import LEGS, POSE
+from stewart_drake.simulation import make_simulator, simulate
+from tests.mechanisms import PAPER
+
+ON_REFERENCE = ("start=on_reference", "queue=reference")
+STEADY = ("reference.frequency=0.5", "delay.steps=3", *ON_REFERENCE)
+MB = 1e6
+
+
+def memory() -> float:
+    """What this process holds in bytes, after tidying up."""
+    gc.collect()
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return float(pages * os.sysconf("SC_PAGE_SIZE"))
+
+
+needs_proc = pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="memory is read from /proc"
+)
+
+
+def growth_per_run(runs: int, warm_up: int) -> float:
+    """Bytes by which each of so many short runs makes the process larger: the slope of a line."""
+    settings = ("duration=0.2", "delay.steps=2", *ON_REFERENCE)
+    scenarios = [load_scenario("paper", None, (f"plant.kind={k}", *settings)) for k in PLANTS]
+    sizes = []
+    for number in range(warm_up + runs):
+        run = simulate(scenarios[number % len(scenarios)])
+        assert run.status == "completed"
+        if number >= warm_up:
+            sizes.append(memory())
+    return float(np.polyfit(np.arange(runs), sizes, 1)[0])
+
+
+PLANTS = ("exact", "multibody")
+
+
+@needs_proc
+def test_some_runs_leave_nothing_behind():
+    assert growth_per_run(runs=40, warm_up=20) < 0.1 * MB
+
+
+@pytest.mark.soak
+@needs_proc
+def test_a_thousand_runs_leave_nothing_behind():
+    """A leak of one context or one compiled function per run would be above."""
+    assert growth_per_run(runs=1000, warm_up=100) < 0.02 * MB
+
+
+@pytest.mark.soak
+@needs_proc
+def test_mechanisms_come_and_go():
+    """Functions are compiled for each mechanism and kept for the last ones only."""
+    import dataclasses
+
+    sizes = []
+    for number in range(300):
+        longer = PAPER.rod_lengths + 1e-6 * number
+        dynamics = StewartDynamics(dataclasses.replace(PAPER, rod_lengths=longer), gravity=False)
+        dynamics.inverse_dynamics(PAPER.home, np.zeros(6), np.zeros(6))
+        sizes.append(memory())
+    # The caches hold 64 mechanisms.
+    assert sizes[-1] - sizes[150] < 20 * MB
+
+
+def follow(kind: str, duration: float, *settings: str) -> list[tuple[float, float, float, float]]:
+    """Time, memory, loop gap in m and share of error every tenth of the way, nothing recorded."""
+    sc = load_scenario(
+        "paper", None, (f"plant.kind={kind}", f"duration={duration}", *STEADY, *settings)
+    )
+    loop = build_closed_loop(sc)
+    simulator = make_simulator(loop)
+    context = simulator.get_context()
+    simulator.Initialize()
+    plant = loop.GetSubsystemByName("plant")
+    rows = []
+    for end in duration * np.arange(1, 11) / 10:
+        for t in np.arange(context.get_time(), end, 5.0):
+            simulator.AdvanceTo(min(t + 5.0, end))
+        state = loop.GetOutputPort("state").Eval(context)
+        reference = loop.GetOutputPort("reference").Eval(context)
+        error = np.max(np.abs(state[POSE] - reference[POSE]) / loop.experiment.scale)
+        if kind == "multibody":
+            tree: MultibodyPlant = plant.tree
+            gap = joint_gap(tree, tree.GetMyContextFromRoot(context))
+        else:
+            gap = rod_error(state[POSE])
+        rows.append((float(end), memory(), gap, float(error)))
+    return rows
+
+
+def joint_gap(tree: MultibodyPlant, context: object) -> float:
+    """m, the largest distance between a rod's end and its joint on the plate."""
+    plate = tree.GetBodyByName("plate")
+    gaps = []
+    for leg, length, p_PQ in zip(LEGS, PAPER.rod_lengths, PAPER.p_PQ, strict=True):
+        rod = tree.GetBodyByName(f"rod_{leg}")
+        end = tree.EvalBodyPoseInWorld(context, rod).multiply(np.array([length, 0, 0]))
+        joint = tree.EvalBodyPoseInWorld(context, plate).multiply(p_PQ)
+        gaps.append(np.linalg.norm(end - joint))
+    return float(max(gaps))
+
+
+def rod_error(pose: np.ndarray) -> float:
+    """m, by how much the rods between crank tips and plate joints miss their length."""
+    legs = leg_geometry(PAPER, pose)
+    tips = PAPER.p_WS + PAPER.crank_lengths[:, None] * legs.crank
+    joints = pose[3:] + PAPER.p_PQ @ rotation(pose[:3]).T
+    lengths = np.linalg.norm(joints - tips, axis=1)
+    return float(np.abs(lengths - PAPER.rod_lengths).max())
+
+
+def check_steady(rows: list[tuple[float, float, float, float]], gap: float, error: float) -> None:
+    """Memory, gap and error of the second half are those of the first."""
+    _, sizes, gaps, errors = np.array(rows).T
+    assert sizes[-1] - sizes[4] < 5 * MB
+    assert gaps.max() < gap and gaps[5:].max() < 2 * gaps[:5].max() + 1e-9
+    assert errors.max() < error and errors[5:].max() < 2 * errors[:5].max() + 1e-6
+
+
+@needs_proc
+@pytest.mark.parametrize(
+    ("kind", "duration", "gap"), [("exact", 60.0, 1e-12), ("multibody", 20.0, 1e-6)]
+)
+def test_a_minute_is_as_good_as_a_second(kind, duration, gap):
+    check_steady(follow(kind, duration), gap, 1e-3)
+
+
+@pytest.mark.soak
+@needs_proc
+def test_an_hour_on_the_exact_plant():
+    check_steady(follow("exact", 3600.0), 1e-12, 1e-3)
+
+
+@pytest.mark.soak
+@needs_proc
+def test_an_hour_on_the_multibody_plant():
+    check_steady(follow("multibody", 3600.0, "plant.time_step=0.002"), 5e-6, 5e-3)
+
+
+@pytest.mark.soak
+@needs_proc
+def test_an_hour_is_recorded():
+    """All of it at once, as a user gets it: the record grows in proportion, and comes out whole."""
+    began, before = time.perf_counter(), memory()
+    sc = load_scenario("paper", None, ("plant.kind=exact", "duration=3600", *STEADY))
+    run = simulate(sc)
+    assert run.status == "completed"
+    assert run.signals.sizes["time"] == 180_001
+    assert memory() - before < 3000 * MB
+    assert run.summary["wall_s"] <= time.perf_counter() - began

@@ -1,0 +1,194 @@
+"""Numbers that go wrong in the running loop: it recovers, or stops and says why; all are counted.
+
+Faults are put in from outside: a sensor that fails at chosen samples, a gain that cannot be found,
+motors that are too weak for a while.
+"""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import stewart_drake.design.control_law as law_module
+import stewart_drake.diagram as diagram_module
+from stewart_drake.config import Scenario
+from stewart_drake.metrics import accumulated_error
+from stewart_drake.results import SimulationResult
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.simulation import simulate
+from stewart_drake.systems.sensor import Sensor
+
+Array = NDArray[np.float64]
+Spoil = Callable[[int, Array, dict[int, Array]], Array]
+"""From the number of a sample, its measurement and all earlier ones to what is sent."""
+
+SMALL = "reference.amplitude=[0.01, 0.01, 0.01, 0.001, 0.001, 0.004]"
+STATUSES = ("completed", "left_workspace", "solver_failed")
+PLACES = ((0,), (12,), (10, 11, 12, 13, 14), (1, 5, 9, 13, 17))
+"""The first sample, one later, five in a row, and every fourth."""
+
+
+def scenario(*settings: str, controller: str | None = None, plant: str = "exact") -> Scenario:
+    """The paper's experiment with a delay of 0.3 s, from its reference on."""
+    mine = (f"plant.kind={plant}", "delay.steps=3", "duration=4", "start=on_reference")
+    return load_scenario("paper", controller, (*mine, "queue=reference", *settings))
+
+
+def run_with(
+    monkeypatch: pytest.MonkeyPatch, spoil: Spoil, sc: Scenario | None = None
+) -> SimulationResult:
+    """A run whose sensor sends what `spoil` makes of the truth."""
+
+    class Faulty(Sensor):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            self._sent: dict[int, Array] = {}
+
+        def _measure(self, context: Any, output: Any) -> None:
+            super()._measure(context, output)
+            k = round(context.get_time() / self._period)
+            if k not in self._sent:  # the window of densities asks again
+                self._sent[k] = spoil(k, np.array(output.value()), self._sent)
+            output.SetFromVector(self._sent[k])
+
+    monkeypatch.setattr(diagram_module, "Sensor", Faulty)
+    return simulate(scenario() if sc is None else sc)
+
+
+def check_outcome(run: SimulationResult) -> None:
+    """It ran to its end, or says when and why not; its record is whole and its torques are real."""
+    assert run.status in STATUSES
+    assert (run.failure is None) == (run.status == "completed")
+    assert np.isfinite(run.accumulated_error) == (run.status == "completed")
+    assert np.isfinite(run.signals.torque_commanded.values).all()
+    json.dumps(run.summary["counts"])
+
+
+def share_of_swing(run: SimulationResult, last: float) -> float:
+    """Mean error over the last so many s, as a share of the reference's peak to peak."""
+    scale = np.ptp(run.signals.reference.values, axis=0)
+    late = run.signals.sel(time=slice(run.scenario.duration - last, None))
+    return accumulated_error(late.time.values, late.error.values, scale) / 100 / last
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("places", PLACES)
+def test_measurements_that_are_no_numbers(value, places, monkeypatch):
+    """The model stands in for them."""
+
+    def spoil(k: int, measured: Array, _: Any) -> Array:
+        if k in places:
+            measured[k % 12] = value
+        return measured
+
+    run = run_with(monkeypatch, spoil)
+    assert run.status == "completed"
+    assert run.summary["counts"]["bad_measurements"] == len(places)
+    assert run.summary["counts"]["riccati_failures"] == 0
+    assert share_of_swing(run, 1.0) < 1e-3
+
+
+@pytest.mark.parametrize(("controller", "plant"), [("delay_lqi", "exact"), (None, "multibody")])
+def test_the_same_for_another_controller_and_plant(controller, plant, monkeypatch):
+    sc = scenario(SMALL, "duration=2", controller=controller, plant=plant)
+    run = run_with(monkeypatch, lambda k, x, _: x * np.nan if 5 <= k < 8 else x, sc)
+    assert run.status == "completed"
+    assert run.summary["counts"]["bad_measurements"] == 3
+
+
+def test_a_sensor_that_is_gone_for_good(monkeypatch):
+    """Without any measurement the plant is steered by its model alone."""
+    run = run_with(monkeypatch, lambda k, x, _: x if k < 10 else np.full(12, np.nan))
+    check_outcome(run)
+    assert run.summary["counts"]["bad_measurements"] == len(run.signals.time) // 5 + 1 - 10
+
+
+@pytest.mark.parametrize("places", PLACES[1:])
+def test_dropped_samples(places, monkeypatch):
+    """The last measurement comes again in the place of the new one, and nobody says so."""
+    run = run_with(monkeypatch, lambda k, x, sent: sent[k - 1].copy() if k in places else x)
+    check_outcome(run)
+    assert run.summary["counts"]["bad_measurements"] == 0
+    if run.status == "completed":
+        assert share_of_swing(run, 0.5) < 0.05
+
+
+@pytest.mark.parametrize("size", [1e-2, 1e3, 1e150, 1e300])
+def test_a_spike(size, monkeypatch):
+    """One measurement far off, as a number: a filter that trusts it may lose the plate, no more."""
+
+    def spoil(k: int, measured: Array, _: Any) -> Array:
+        if k == 12:
+            measured[3] += size
+        return measured
+
+    check_outcome(run_with(monkeypatch, spoil))
+
+
+@pytest.mark.parametrize("controller", ["predictor_lqi", "delay_lqi"])
+@pytest.mark.parametrize("failing", [range(1), range(8, 9), range(8, 18)])
+def test_gains_that_cannot_be_found(failing, controller, monkeypatch):
+    """The last gain serves on; before the first one the feedforward goes alone."""
+    solve, calls = law_module.reduced_gain, {"started": -1}
+
+    def sometimes(*arguments: Any) -> Array:
+        if calls["started"] >= 0:
+            calls["started"] += 1
+            if calls["started"] - 1 in failing:
+                raise ValueError("the Riccati equation has no solution")
+        return solve(*arguments)
+
+    monkeypatch.setattr(law_module, "reduced_gain", sometimes)
+    build = diagram_module.DelayLqiController
+
+    def started(*arguments: Any) -> Any:
+        calls["started"] = 0  # the law tries itself out before
+        return build(*arguments)
+
+    monkeypatch.setattr(diagram_module, "DelayLqiController", started)
+    # The paper's controller keeps the plate without a delay only, with or without these faults.
+    delay = () if controller == "predictor_lqi" else ("delay.steps=0",)
+    run = simulate(scenario(SMALL, *delay, controller=controller))
+    assert run.summary["counts"]["riccati_failures"] == len(failing)
+    assert run.status == "completed"
+    if controller == "predictor_lqi":
+        assert share_of_swing(run, 1.0) < 1e-3
+
+
+def test_motors_at_their_limit_for_a_second(monkeypatch):
+    """From rest, with a limit that the catch-up does not know of: they are at it for long, and the
+    plate is caught in the end."""
+    sc = scenario("duration=8", "start=rest", "queue=zero", "delay.steps=2", SMALL)
+    free = simulate(sc)
+    limit = free.summary["peak_torque"] / 3
+    sc.actuator.torque_limit = limit
+    sc.controller.catch_up = 0.3
+    run = simulate(sc)
+    check_outcome(run)
+    assert run.summary["counts"]["saturated_steps"] >= 10
+    assert run.summary["peak_torque"] == pytest.approx(limit)
+    assert run.status == "completed"
+    assert share_of_swing(run, 1.0) < 1e-3
+
+
+def test_everything_at_once_is_counted(monkeypatch):
+    sc = scenario("actuator.torque_limit=0.01", "duration=3")
+
+    def spoil(k: int, measured: Array, sent: dict[int, Array]) -> Array:
+        if k in (4, 9, 10):
+            return np.full(12, np.nan)
+        return sent[k - 1].copy() if k == 20 else measured
+
+    run = run_with(monkeypatch, spoil, sc)
+    check_outcome(run)
+    counts = run.summary["counts"]
+    assert set(counts) >= {
+        "riccati_failures",
+        "bad_measurements",
+        "saturated_steps",
+        "tuner_fallbacks",
+    }
+    assert counts["bad_measurements"] == 3 and counts["saturated_steps"] > 0

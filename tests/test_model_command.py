@@ -1,0 +1,214 @@
+"""model check and model view: summary, drawing, and a viewer that survives any slider."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from pydrake.geometry import Meshcat
+
+from stewart_drake.cli import main
+from stewart_drake.mechanism.assembly import assemble
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.plant.workspace import diagnose
+from stewart_drake.report.mechanism_figures import mechanism_figure
+from stewart_drake.report.viewer import SLIDERS, STOP, PoseViewer, place, slider_range
+from stewart_drake.resources import shipped
+from stewart_drake.studies.mechanism_check import check_mechanism
+from tests.mechanisms import PAPER, random_mechanism
+from tests.singular import parallel_rods, stretched, write_mechanism
+
+HOME_VALUES = PAPER.home * ([180 / np.pi] * 3 + [1e3] * 3)
+
+
+# ------------------------------------------------------------------ model check
+
+
+@pytest.mark.parametrize("name", shipped("mechanism"))
+def test_check_tells_what_the_dynamics_say(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["model", "check", name, "--out", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("yes: ") and all(len(line) <= 80 for line in lines[:-1])
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "summary.json",
+        "mechanism.png",
+        "mechanism.svg",
+    }
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    mechanism = load_mechanism(name)
+    dynamics = StewartDynamics(mechanism, gravity=True)
+    np.testing.assert_allclose(summary["torque"], dynamics.equilibrium_torque(mechanism.home))
+    assert max(map(abs, summary["torque"])) < summary["torque_limit"]
+    A, _ = dynamics.linearize(mechanism.home)
+    poles = np.array(summary["poles"]) @ [1, 1j]
+    # Vieta: sum and sum of squares of the poles.
+    np.testing.assert_allclose(poles.sum(), np.trace(A), atol=1e-8)
+    np.testing.assert_allclose((poles**2).sum(), np.trace(A @ A), rtol=1e-9)
+    assert poles[0].real == poles.real.max() > 0
+    assert len(summary["travel"]) == 6
+
+
+def test_check_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["model", "check", "desktop", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["name"] == "desktop"
+
+
+@pytest.mark.parametrize(
+    ("machine", "why"), [(parallel_rods(), "parallel singularity"), (stretched(), "end of its")]
+)
+def test_check_of_a_singular_machine_is_a_verdict(
+    machine: Mechanism, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_mechanism(machine, tmp_path / "machine.yaml")
+    assert main(["model", "check", str(path), "--out", str(tmp_path / "out")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("no: the home pose is singular") and why in " ".join(lines[:2])
+    assert (tmp_path / "out" / "mechanism.png").exists()
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["torque"] == []
+
+
+def test_motors_that_cannot_hold_the_plate_are_told() -> None:
+    weak = load_mechanism("motion_base")
+    object.__setattr__(weak, "effort_limit", 500.0)
+    assert "cannot hold the plate, 928 N m" in check_mechanism(weak).verdict
+
+
+# ------------------------------------------------------------------ the drawing
+
+
+@pytest.mark.parametrize("seed", range(-3, 5))
+def test_the_numbers_of_the_legs_can_be_read(seed: int) -> None:
+    """No number covers another one; each view has all six; for any machine."""
+    mechanism = (
+        load_mechanism(shipped("mechanism")[seed])
+        if seed < 0
+        else random_mechanism(np.random.default_rng(seed))
+    )
+    figure = mechanism_figure(mechanism)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    for ax in figure.axes:
+        numbers = [text for text in ax.texts if text.get_text()]
+        assert sorted(text.get_text() for text in numbers) == list("123456")
+        boxes = [text.get_window_extent(canvas.get_renderer()) for text in numbers]
+        for i, box in enumerate(boxes):
+            assert ax.bbox.contains(box.x0, box.y0) and ax.bbox.contains(box.x1, box.y1)
+            assert not any(box.overlaps(other) for other in boxes[:i])
+
+
+def test_the_drawing_shows_cranks_and_rods_where_they_are() -> None:
+    mechanism = load_mechanism("motion_base")
+    home = assemble(mechanism, mechanism.home)
+    top, front = mechanism_figure(mechanism).axes
+    for ax, axes in ((top, [0, 1]), (front, [0, 2])):
+        drawn = {
+            tuple(np.round(np.ravel(line.get_xydata()), 6))  # type: ignore[arg-type]
+            for line in ax.lines
+        }
+        for shaft, tip in zip(mechanism.p_WS, home.p_WT, strict=True):
+            crank = 1e3 * np.concatenate([shaft[axes], tip[axes]])
+            assert tuple(np.round(crank, 6)) in drawn
+
+
+# ------------------------------------------------------------------ model view
+
+
+@pytest.fixture(scope="module")
+def viewer() -> Iterator[PoseViewer]:
+    yield PoseViewer(PAPER, Meshcat())
+
+
+def test_the_viewer_starts_at_home_with_a_slider_per_coordinate(viewer: PoseViewer) -> None:
+    np.testing.assert_allclose(viewer.values(), HOME_VALUES)
+    assert set(viewer.meshcat.GetSliderNames()) == set(SLIDERS)
+    low, high = slider_range(PAPER)
+    assert np.all(low < HOME_VALUES) and np.all(high > HOME_VALUES)
+
+
+def test_sliders_place_the_machine(viewer: PoseViewer) -> None:
+    values = HOME_VALUES + [5, -4, 10, 15, -20, 30]
+    placement = viewer.step(values)
+    pose = np.concatenate([np.deg2rad(values[:3]), values[3:] / 1e3])
+    np.testing.assert_allclose(placement.pose, pose)
+    np.testing.assert_allclose(placement.reach, PAPER.reach_margins(pose))
+    assert str(placement).startswith("reach margin")
+    tree = viewer._plant.GetMyContextFromRoot(viewer._context)
+    X_WP = viewer._plant.GetBodyByName("plate").EvalPoseInWorld(tree)
+    np.testing.assert_allclose(X_WP.translation(), pose[3:], atol=1e-12)
+
+
+def test_out_of_reach_is_shown_and_the_machine_stays_where_it_was(viewer: PoseViewer) -> None:
+    viewer.step(HOME_VALUES)
+    placement = viewer.step(HOME_VALUES + [0, 0, 0, 0, 0, 150])
+    margins = PAPER.reach_margins(placement.pose)
+    assert placement.failure is not None
+    leg = int(margins.argmin()) + 1
+    assert f"leg {leg} short by {-1e3 * margins.min():.3g} mm" in str(placement)
+    assert str(placement).startswith("out of reach: ")
+    assert viewer.meshcat.GetButtonClicks(str(placement)) == 0  # the panel says it
+    tree = viewer._plant.GetMyContextFromRoot(viewer._context)
+    X_WP = viewer._plant.GetBodyByName("plate").EvalPoseInWorld(tree)
+    np.testing.assert_allclose(X_WP.translation(), PAPER.home[3:], atol=1e-12)
+    viewer.step(HOME_VALUES)
+    with pytest.raises(RuntimeError):  # Drake's way to say that the old label is gone
+        viewer.meshcat.GetButtonClicks(str(placement))
+
+
+@given(values=st.lists(st.floats(-1e4, 1e4), min_size=6, max_size=6))
+@settings(deadline=None, max_examples=60)
+def test_no_slider_value_crashes(viewer: PoseViewer, values: list[float]) -> None:
+    placement = viewer.step(values)
+    assert (placement.failure is None) == (diagnose(PAPER, 0.0, placement.pose) is None)
+    assert len(str(placement)) > 10
+
+
+@pytest.mark.parametrize("machine", [parallel_rods(), stretched()])
+def test_a_singular_machine_can_be_viewed(machine: Mechanism) -> None:
+    viewer = PoseViewer(machine, Meshcat())
+    assert place(machine, viewer.values()).failure is not None
+    assert viewer.values().shape == (6,)
+
+
+def test_the_viewer_follows_the_sliders_until_it_is_stopped(viewer: PoseViewer) -> None:
+    class Clicked:
+        """A Meshcat whose sliders move and whose button is pressed at the fourth look."""
+
+        def __init__(self, meshcat: Meshcat) -> None:
+            self.looks, self._meshcat = 0, meshcat
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._meshcat, name)
+
+        def GetButtonClicks(self, name: str) -> int:
+            assert name == STOP
+            self.looks += 1
+            if self.looks == 2:
+                self._meshcat.SetSliderValue("z [mm]", 400.0)
+            return int(self.looks == 4)
+
+    said: list[str] = []
+    real = viewer.meshcat
+    viewer.meshcat = Clicked(real)  # type: ignore[assignment]
+    try:
+        viewer.run(said.append)
+    finally:
+        viewer.meshcat = real
+    assert said == [str(place(PAPER, HOME_VALUES)), str(place(PAPER, viewer.values()))]
+    assert viewer.values()[5] == 400.0
+
+
+def test_view_writes_a_page_that_needs_no_server(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["model", "view", "desktop", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "view.html").stat().st_size > 500_000
+    assert "view.html" in capsys.readouterr().out

@@ -1,0 +1,261 @@
+"""The network: its output, and a file that is read strictly and comes back to the last bit."""
+
+import dataclasses
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from stewart_drake.errors import ConfigError
+from stewart_drake.resources import shipped
+from stewart_drake.tuner.network import Network, load_network, save_network
+
+Array = NDArray[np.float64]
+ARRAYS = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds")
+
+
+def small_network(hidden: int = 10, **changes: Any) -> Network:
+    """An untrained one, always the same, whose weights move a lot."""
+    rng = np.random.default_rng(7)
+    fields: dict[str, Any] = {
+        "input_mean": rng.uniform(0.5, 1.5, 18),
+        "input_scale": rng.uniform(0.5, 2.0, 18),
+        "W1": rng.normal(0, 1, (hidden, 18)),
+        "b1": rng.normal(0, 1, hidden),
+        "W2": rng.normal(0, 0.7, (2, hidden)),
+        "b2": rng.normal(0, 0.5, 2),
+        "bounds": [[0.1, 0.1], [4.0, 4.0]],
+        "output": "log_weights",
+        "card": {"seed": 7, "errors": {"test": None}, "names": ["a", "ü"]},
+    }
+    return Network(**(fields | changes))
+
+
+def torch_twin(torch: Any, network: Network) -> Callable[[Array], Array]:
+    """The same network built from torch's own layers, in double precision."""
+    layers = torch.nn.Sequential(
+        torch.nn.Linear(18, network.hidden), torch.nn.Sigmoid(), torch.nn.Linear(network.hidden, 2)
+    ).double()
+    with torch.no_grad():
+        for layer, weight, bias in (
+            (layers[0], network.W1, network.b1),
+            (layers[2], network.W2, network.b2),
+        ):
+            layer.weight.copy_(torch.tensor(np.array(weight)))
+            layer.bias.copy_(torch.tensor(np.array(bias)))
+
+    def run(densities: Array) -> Array:
+        with torch.no_grad():
+            inputs = torch.tensor((densities - network.input_mean) / network.input_scale)
+            outputs = layers(inputs)
+            outputs = outputs if network.output == "weights" else torch.exp(outputs)
+        return np.array(outputs.numpy())
+
+    return run
+
+
+# ------------------------------------------------------------------ the output
+
+
+def test_a_network_small_enough_for_pencil_and_paper() -> None:
+    """One neuron sees rho_1 only: sigmoid(ln 3 (rho - 2) / 0.5) is 3/4 at 2.5 and 1/2 at 2."""
+    W1 = np.zeros((1, 18))
+    W1[0, 0] = np.log(3)
+    network = Network(
+        input_mean=np.full(18, 2.0),
+        input_scale=np.full(18, 0.5),
+        W1=W1,
+        b1=np.zeros(1),
+        W2=np.array([[4.0], [-8.0]]),
+        b2=np.array([1.0, 10.0]),
+        bounds=np.array([[0.1, 0.1], [4.0, 4.0]]),
+    )
+    densities = np.ones((2, 18))
+    densities[:, 0] = 2.5, 2.0
+    np.testing.assert_allclose(network(densities), [[4.0, 4.0], [3.0, 6.0]], rtol=1e-15)
+    np.testing.assert_allclose(network(densities[0]), [4.0, 4.0], rtol=1e-15)
+    logs = dataclasses.replace(network, output="log_weights")
+    np.testing.assert_allclose(logs(densities), np.exp([[4.0, 4.0], [3.0, 6.0]]), rtol=1e-15)
+
+
+@pytest.mark.parametrize("output", ["weights", "log_weights"])
+@pytest.mark.parametrize("hidden", [1, 10, 23])
+def test_torch_gives_the_same_weights(hidden: int, output: str) -> None:
+    torch = pytest.importorskip("torch")
+    network = small_network(hidden, output=output)
+    rho = np.random.default_rng(0).uniform(0, 31, (200, 18))
+    np.testing.assert_allclose(
+        network(rho), torch_twin(torch, network)(rho), rtol=1e-12, atol=1e-12
+    )
+
+
+def test_the_output_is_finite_for_any_density_and_not_for_a_missing_one() -> None:
+    network = small_network(W1=1e4 * small_network().W1)
+    assert np.all(np.isfinite(network(np.full(18, 1e6))))
+    assert np.all(np.isnan(network(np.full(18, np.nan))))
+    assert np.all(np.isinf(small_network(b2=[800.0, 800.0])(np.ones(18))))
+
+
+def test_a_network_does_not_change_once_made() -> None:
+    W1 = np.ones((10, 18))
+    network = small_network(W1=W1)
+    W1[:] = 2
+    assert np.all(network.W1 == 1)
+    with pytest.raises(ValueError, match="read-only"):
+        network.W1[0, 0] = 2
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        network.W1 = W1  # type: ignore[misc]
+
+
+# ------------------------------------------------------------------ the file
+
+
+def written(tmp_path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
+    """The file of a network, changed."""
+    path = tmp_path / "network.json"
+    save_network(small_network(), path)
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps(change(data) or data))
+    return path
+
+
+@given(
+    hidden=st.integers(1, 4),
+    data=st.data(),
+    output=st.sampled_from(["weights", "log_weights"]),
+    density=st.sampled_from(["magnitude", "signed"]),
+)
+def test_a_file_comes_back_to_the_last_bit(
+    hidden: int, data: st.DataObject, output: str, density: str, tmp_path_factory: Any
+) -> None:
+    finite = st.floats(allow_nan=False, allow_infinity=False)
+    W1 = data.draw(arrays(np.float64, (hidden, 18), elements=finite))
+    W2 = data.draw(arrays(np.float64, (2, hidden), elements=finite))
+    network = small_network(
+        hidden, W1=W1, W2=W2, b1=W1[:, 0], b2=W2[:, 0], output=output, density=density
+    )
+    path = tmp_path_factory.mktemp("networks") / "one.json"
+    save_network(network, path)
+    first = path.read_bytes()
+    again = load_network(path)
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(again, name), getattr(network, name), strict=True)
+    assert (again.output, again.density, again.card) == (output, density, network.card)
+    save_network(again, path)
+    assert path.read_bytes() == first
+    assert [p.name for p in path.parent.iterdir()] == ["one.json"]
+
+
+def _set(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda data: data.update({key: value})
+
+
+WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
+    "missing": (lambda d: d.pop("b1") and None, ["b1", "missing"]),
+    "unknown": (_set("W3", [1.0]), ["W3: unknown key"]),
+    "misspelt": (_set("bound", []), ["did you mean bounds?"]),
+    "text": (lambda d: d["b2"].__setitem__(0, "1"), ["b2[0]: got '1'", "a number"]),
+    "truth": (lambda d: d["b2"].__setitem__(0, True), ["b2[0]: got True", "a number"]),
+    "null": (lambda d: d["W1"][3].__setitem__(2, None), ["W1[3][2]: got None", "a number"]),
+    "huge whole number": (lambda d: d["b2"].__setitem__(0, 10**400), ["b2[0]", "finite number"]),
+    "ragged": (lambda d: d["W1"][3].pop() and None, ["W1: got rows of different lengths"]),
+    "one input less": (_set("input_mean", [0.0] * 17), ["input_mean: got shape (17,)", "(18,)"]),
+    "one neuron less": (lambda d: d["b1"].pop() and None, ["W1: got shape (10, 18)", "(9, 18)"]),
+    "no neuron": (_set("b1", []), ["b1: got shape (0,)"]),
+    "an output more": (_set("b2", [0.0] * 3), ["b2: got shape (3,)", "(2,)"]),
+    "a scale of zero": (_set("input_scale", [0.0] * 18), ["input_scale: got", "above 0"]),
+    "a bound of zero": (_set("bounds", [[0.0, 0.1], [4.0, 4.0]]), ["bounds: got", "0 < lower"]),
+    "bounds the wrong way": (_set("bounds", [[4.0, 4.0], [0.1, 0.1]]), ["bounds: got"]),
+    "another output": (_set("output", "ratio"), ["output: got 'ratio'", "log_weights"]),
+    "another density": (_set("density", "log"), ["density: got 'log'", "magnitude"]),
+    "no card": (_set("card", None), ["card: got None", "a mapping"]),
+    "a list": (lambda d: [d], ["expected a JSON object"]),
+}
+
+
+@pytest.mark.parametrize(("change", "parts"), WRONG.values(), ids=WRONG.keys())
+def test_a_wrong_file_is_refused_in_one_line(
+    tmp_path: Path, change: Callable[[dict[str, Any]], Any], parts: list[str]
+) -> None:
+    path = written(tmp_path, change)
+    with pytest.raises(ConfigError) as caught:
+        load_network(path)
+    message = str(caught.value)
+    assert message.startswith(str(path)) and "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        (b'{"b1": [NaN]}', "NaN is not a number"),
+        (b'{"card": {"x": -Infinity}}', "-Infinity is not a number"),
+        (b'{"card": {"x": 1e999}}', "'1e999' is larger than any float"),
+        (b'{"b1": [1], "b1": [2]}', "key 'b1' given 2 times"),
+        (b'{"card": {"a": 1, "a": 1}}', "key 'a' given 2 times"),
+        (b"{", "is not readable as JSON"),
+        (b"", "is not readable as JSON"),
+        (b"[" * 100_000, "is not readable as JSON (nested too deep)"),
+        (b"\xff\xfe", "is not UTF-8 text"),
+        (b"3", "holds 3; expected a JSON object"),
+        (pickle.dumps(print), "is not"),
+        (b" " * 10_000_001, "is larger than 10 MB"),
+    ],
+)
+def test_what_is_not_strict_json_is_refused(tmp_path: Path, text: bytes, part: str) -> None:
+    path = tmp_path / "w.json"
+    path.write_bytes(text)
+    with pytest.raises(ConfigError) as caught:
+        load_network(path)
+    assert part in str(caught.value)
+
+
+def test_a_missing_file_or_name_and_a_directory_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no file"):
+        load_network(tmp_path / "none.json")
+    with pytest.raises(ConfigError, match="got 'no_such_network'"):
+        load_network("no_such_network")
+    with pytest.raises(ConfigError, match="is not a file"):
+        load_network(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"b1": [np.inf] + [0.0] * 9},
+        {"b1": 0.0},
+        {"W1": np.zeros((18, 10))},
+        {"output": "log"},
+        {"density": "plain"},
+    ],
+)
+def test_a_wrong_network_cannot_be_made(changes: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=f"{next(iter(changes))}: got"):
+        small_network(**changes)
+
+
+@pytest.mark.parametrize("card", [{"a": np.nan}, {"a": np.float64}, {"a": {1, 2}}])
+def test_a_card_that_is_no_json_leaves_the_old_file(tmp_path: Path, card: dict[str, Any]) -> None:
+    path = tmp_path / "w.json"
+    save_network(small_network(), path)
+    before = path.read_bytes()
+    with pytest.raises(ConfigError, match="card: "):
+        save_network(small_network(card=card), path)
+    assert path.read_bytes() == before
+
+
+def test_shipped_networks_load() -> None:
+    for name in shipped("weights"):
+        network = load_network(name)
+        assert network.card, f"{name} does not say where it comes from"
+        weights = network(np.ones(18))
+        assert np.all(np.isfinite(weights)) and np.all(weights > 0)

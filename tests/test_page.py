@@ -1,0 +1,156 @@
+"""The analysis page: one file, nothing fetched, whatever the names in it are."""
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+
+from stewart_drake.report.page import (
+    Page,
+    Picture,
+    Provenance,
+    Section,
+    Table,
+    command_line,
+    write_page,
+)
+from stewart_drake.report.style import figure_style
+
+
+class Outline(HTMLParser):
+    """Tags and text of a page; complains of tags that do not match."""
+
+    VOID = {"meta", "img", "br", "link"}
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attributes)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data.strip())
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def picture(dense: bool = False) -> Picture:
+    with figure_style():
+        figure = Figure(figsize=(3, 2))
+        figure.subplots().plot([0, 1], [1, 0])
+    return Picture(figure, "a line that goes down", dense)
+
+
+def page(**changes: object) -> Page:
+    table = Table(
+        ("model", "margin", "note"),
+        [("<b>a</b> & b", "1.2e-3", "x" * 50), ("c", "-", "fine"), ("d", "> 5", "")],
+        "Some models.",
+    )
+    sections = [
+        Section("One", ("First.", "Second <i>paragraph</i>."), [table], [picture()]),
+        Section("Two", pictures=[picture(dense=True)]),
+        Section("Three", ("Hidden.",), folded=True),
+    ]
+    made = Provenance("stewart-drake analyze hautus 'a b'", {"drake": "1.51"}, 12.3)
+    parts = {"title": "A <title>", "verdict": "All is well.", "tone": "good", "facts": {"mu": "8"}}
+    return Page(**{**parts, "sections": sections, "provenance": made, **changes})  # type: ignore[arg-type]
+
+
+def test_a_page_holds_everything_and_fetches_nothing() -> None:
+    text = page().html()
+    outline = Outline(text)
+    sources = [image["src"] or "" for image in outline.all("img")]
+    assert [source.partition(";")[0] for source in sources] == [
+        "data:image/svg+xml",
+        "data:image/png",
+    ]
+    assert not outline.all("script")
+    assert not outline.all("link")
+    assert not re.search(r"(src|href)=\"(?!data:|#)", text)
+    assert "url(" not in text
+    words = " ".join(outline.words)
+    for part in ("All is well.", "First.", "a line that goes down", "drake 1.51", "12 s", "mu"):
+        assert part in words
+    assert [image["alt"] for image in outline.all("img")] == ["a line that goes down"] * 2
+    assert [a["href"] for a in outline.all("a")] == ["#s1", "#s2", "#s3"]
+    assert {"s1", "s2", "s3"} <= {section["id"] for section in outline.all("section")}
+    assert len(outline.all("details")) == 1
+
+
+def test_names_from_files_are_text_and_not_markup() -> None:
+    text = page(verdict="<script>alert(1)</script>").html()
+    assert "<script" not in text
+    assert "<b>a</b>" not in text
+    outline = Outline(text)
+    assert "<b>a</b> & b" in outline.words
+    assert "A <title>" in outline.words
+    assert "stewart-drake analyze hautus 'a b'" in outline.words
+
+
+def test_numbers_are_aligned_and_long_words_are_broken() -> None:
+    cells = [cell["class"] or "" for cell in Outline(page().html()).all("td")][:3]
+    assert [("n" in c.split(), "s" in c.split()) for c in cells] == [
+        (False, True),
+        (True, True),
+        (False, False),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("cells", "numeric"),
+    [(["1", "-2.5", "∞"], True), (["1", "yes"], False), ([], False), (["±3", "≤ 4", ""], True)],
+)
+def test_a_column_of_numbers_is_told_from_one_of_words(cells: list[str], numeric: bool) -> None:
+    assert Table(("x",), [(cell,) for cell in cells]).numeric == [numeric]
+
+
+def test_a_row_of_another_length_is_refused() -> None:
+    with pytest.raises(ValueError, match="row 2 has 1 cells; expected 2"):
+        Table(("a", "b"), [("1", "2"), ("3",)])
+
+
+def test_the_same_page_gives_the_same_bytes(tmp_path: Path) -> None:
+    first, second = (write_page(page(), tmp_path / f"{k}.html") for k in range(2))
+    assert first.read_bytes() == second.read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.html", "1.html"]
+
+
+def test_a_page_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(OSError):
+        write_page(page(), tmp_path / "nowhere" / "report.html")
+    assert not list(tmp_path.iterdir())
+
+
+def test_few_sections_need_no_contents_and_no_time_is_no_line() -> None:
+    plain = page(sections=[Section("One")], provenance=Provenance("x", {"drake": "1.51"}))
+    text = plain.html()
+    assert "<nav" not in text
+    assert "Computed in" not in text
+
+
+def test_command_lines_are_quoted_for_a_shell() -> None:
+    line = command_line(
+        "analyze",
+        "delay",
+        "my file.yaml",
+        settings=["delay.steps=4", "reference.amplitude=[1, 2]"],
+        options={"controller": None, "out": Path("out")},
+    )
+    assert line == (
+        "stewart-drake analyze delay 'my file.yaml' --set delay.steps=4 "
+        "--set 'reference.amplitude=[1, 2]' --out out"
+    )

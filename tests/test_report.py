@@ -1,0 +1,253 @@
+"""The report: whole, true, self-contained, and shown by a real browser without an error."""
+
+import json
+import os
+import re
+import time
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from stewart_drake.cli import main
+from stewart_drake.report import collect as collect_module
+from stewart_drake.report.collect import ANALYSES, Analysis, collect
+from stewart_drake.report.page import Page, Provenance
+from stewart_drake.report.report_page import comparison_rows, mean_error, report_page
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.simulation import simulate
+from stewart_drake.studies.compare import CONTROLLERS, LABELS
+from stewart_drake.tuner.network import save_network
+from stewart_drake.yamlio import load_yaml
+from tests.browser import browser, needs_chromium
+from tests.test_network import small_network
+
+SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory) -> Path:
+    """The folder of a report on two seconds of the paper's scenario."""
+    folder = tmp_path_factory.mktemp("report")
+    (folder / "summary.json").write_text("of an earlier run")
+    assert main(["report", "paper", *SETTINGS, "--out", str(folder), "--quiet"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def html(report) -> str:
+    return (report / "report.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def summary(report) -> dict:
+    return json.loads((report / "summary.json").read_text())
+
+
+def text_of(html: str) -> str:
+    """What a reader sees, roughly: without tags, styles and the replay inside."""
+
+    class Reader(HTMLParser):
+        def __init__(self) -> None:
+            super().__init__()
+            self.parts: list[str] = []
+
+        def handle_data(self, data: str) -> None:
+            self.parts.append(data)
+
+    reader = Reader()
+    reader.feed(html)
+    return " ".join(" ".join(reader.parts).split())
+
+
+# ---------------------------------------------------------------- what it holds
+
+
+def test_there_are_three_files_and_no_half_ones(report):
+    assert sorted(os.listdir(report)) == ["replay.html", "report.html", "summary.json"]
+
+
+def test_the_summary_agrees_with_the_commands_of_their_own(summary, tmp_path, capsys):
+    assert main(["simulate", "paper", *SETTINGS, "--json"]) == 0
+    own = json.loads(capsys.readouterr().out)
+    for name in ("status", "accumulated_error", "peak_torque", "delay_floor", "cost"):
+        assert summary["run"][name] == own[name]
+    assert list(summary["controllers"]) == list(CONTROLLERS)
+    assert summary["controllers"]["lqr"]["failure"]["leg"] == 2
+    assert list(summary["analyses"]) == list(ANALYSES)
+    assert main(["analyze", "workspace", "paper", *SETTINGS, "--json"]) == 0
+    work = json.loads(capsys.readouterr().out)
+    assert summary["analyses"]["workspace"]["largest_factor"] == work["largest_factor"]
+
+
+def test_it_answers_in_words(html, summary):
+    text = text_of(html)
+    assert summary["verdict"] in text and "The plate follows its reference" in text
+    for name in ANALYSES:
+        said = summary["analyses"][name]["verdict"]
+        assert said[1:].removesuffix(".") in text
+    assert "stewart-drake report paper --set plant.kind=exact" in text
+    assert "drake " in text and "casadi " in text and "python " in text
+
+
+def test_table_ii_has_the_papers_numbers_and_ours(html, summary):
+    rows = re.findall(r"<tr>\s*(.*?)</tr>", html.partition("Table II")[2], re.DOTALL)
+    cells = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in rows]
+    table = {row[0]: row for row in cells if row}
+    paper = [table[LABELS[name]][1] for name in CONTROLLERS]
+    assert paper == ["NaN", "NaN", "225", "80", "-"]
+    assert "left workspace at 1.36 s, leg 2" in table[LABELS["lqr"]]
+    ours = float(table[LABELS["predictor_lqi"]][2])
+    own = summary["controllers"]["predictor_lqi"]["accumulated_error"]
+    assert ours == pytest.approx(own, rel=5e-3)
+
+
+def test_figures_of_the_paper_are_redrawn_with_their_captions(html):
+    text = text_of(html)
+    for figure in ("5(a)", "5(b)", "7(a)", "7(b)"):
+        assert f"As figure {figure} of the paper" in text
+    assert ("As figure 6 of the paper" in text) != ("there is no figure 6" in text)
+
+
+def test_the_scenario_in_it_runs_again(html, tmp_path):
+    listing = re.findall(r"<pre>(.*?)</pre>", html, re.DOTALL)[0]
+    path = tmp_path / "again.yaml"
+    path.write_text(listing)
+    assert load_yaml(path)["duration"] == 2.0
+    settings = ("plant.kind=exact", "duration=2.0")
+    assert load_scenario(path) == load_scenario("paper", settings=settings)
+
+
+def test_nothing_in_it_comes_from_elsewhere(html):
+    page = re.sub(r'srcdoc="[^"]*"', "", html)  # the replay has a test of its own
+    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page)
+    assert "@import" not in page and "url(" not in page
+    assert "sandbox=" in html and "<script" not in page
+
+
+def test_the_mean_error_leaves_out_the_time_in_which_nothing_can_act(summary):
+    found = collect_of(load_scenario("paper", settings=("plant.kind=exact", "duration=2.0")))
+    run = found.run
+    share = (run.accumulated_error - run.summary["delay_floor"]) / (2.0 - 0.8)
+    assert mean_error(run) == pytest.approx(share)
+
+
+# ---------------------------------------------------------------- other scenarios
+
+
+def collect_of(scenario, **changes):
+    """What a report is made of, with one run and without the analyses' work."""
+    made = Provenance("command")
+    blank = Analysis("yes: it is.", "good", Page("t", "v", [], made), {})
+    parts = {
+        "scenario": scenario,
+        "failure": None,
+        "run": changes.get("run") or simulate(scenario),
+        "analyses": dict.fromkeys(ANALYSES, blank),
+    }
+    return collect_module.Collected(**(parts | changes))
+
+
+def test_a_run_that_ends_early_is_told_at_once():
+    scenario = load_scenario("paper", "lqr", ("plant.kind=exact",))
+    page = report_page(collect_of(scenario), "mine", Provenance("command"))
+    assert page.tone == "bad"
+    assert re.match(r"The run ended after 1\.\d\d of 10 s: .*leg 2", page.verdict)
+    assert "mine" in page.title and "<h1>" in page.html()
+
+
+def test_a_motion_out_of_reach_gets_a_report_without_runs(tmp_path, capsys, monkeypatch):
+    def only_workspace(scenario, scenarios, progress):
+        assert not scenarios
+        return dict.fromkeys(ANALYSES, collect_module._analyse("workspace", scenario))
+
+    monkeypatch.setattr(collect_module, "_work", only_workspace)
+    amplitude = "reference.amplitude=[0.3, 0.3, 0.3, 0.2, 0.2, 0.3]"
+    arguments = ["report", "paper", "--set", amplitude, "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    out, err = capsys.readouterr()
+    assert err == "" and all(len(line) <= 80 for line in out.splitlines()[:-1])
+    assert "leaves the workspace at t = 0.29" in " ".join(out.split())
+    assert sorted(os.listdir(tmp_path)) == ["report.html", "summary.json"]
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["tone"] == "bad" and summary["run"] is None and summary["controllers"] == {}
+
+
+def test_the_tuners_runs_are_there_where_there_is_a_network(monkeypatch, tmp_path):
+    jobs = {}
+
+    def kept(scenario, scenarios, progress):
+        jobs.update(scenarios)
+        return dict.fromkeys((*scenarios, *ANALYSES))
+
+    monkeypatch.setattr(collect_module, "_work", kept)
+    for there in (False, True):
+        monkeypatch.setattr(collect_module, "has_network", lambda scenario, t=there: t)
+        jobs.clear()
+        found = collect("paper", ["plant.kind=exact"])
+        tuned = {name: sc for name, sc in jobs.items() if name.startswith("tuned-")}
+        assert len(tuned) == len(found.tuned) == (3 if there else 0)
+        assert all(sc.tuner.kind == "ann" for sc in tuned.values())
+    # Its own controller is the shipped predictor: that run stands for both.
+    assert set(jobs) - set(tuned) == set(CONTROLLERS)
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("controller: {feedforward: none}")
+    collect(mine)
+    assert jobs["run"].controller.feedforward == "none"
+
+
+def test_figure_6_and_the_tuned_rows_are_of_the_tuners_runs(tmp_path):
+    save_network(small_network(), tmp_path / "network.json")
+    short = ("plant.kind=exact", "duration=1.0")
+    tuner = ("tuner.kind=ann", f"tuner.weights={tmp_path / 'network.json'}")
+    plain = simulate(load_scenario("paper", settings=short))
+    tuned = {
+        name: simulate(load_scenario("paper", name, (*short, *tuner)))
+        for name in ("delay_lqr", "delay_lqi", "predictor_lqi")
+    }
+    found = collect_of(plain.scenario, run=plain, comparison={"lqi": plain}, tuned=tuned)
+    labels = [row[0] for row in comparison_rows(found)]
+    assert labels == [LABELS["lqi"], *(f"{LABELS[name]}, tuned" for name in tuned)]
+    assert [row[1] for row in comparison_rows(found)] == ["NaN", "225", "80", "-"]
+    sections = report_page(found, "n", Provenance("c")).sections
+    (section,) = (section for section in sections if "compared" in section.heading)
+    captions = [picture.caption for picture in section.pictures]
+    assert sum("figure 6" in caption for caption in captions) == 1
+    shown = next(p.figure for p in section.pictures if "figure 6" in p.caption)
+    titles = [ax.get_title() for ax in shown.axes if ax.get_title()]
+    assert titles == [LABELS[name] for name in tuned]
+    assert not any("no figure 6" in text for text in section.text)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["papper"], ["papper", "paper"]),
+        (["--set", "plant.knd=exact"], ["plant.knd", "did you mean plant.kind?"]),
+        (["--out", "/proc/nothing"], ["--out", "expected a directory that can be written"]),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(arguments, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("error: ") and err.count("\n") == 1
+    assert all(words in err for words in said)
+
+
+# ---------------------------------------------------------------- in a browser
+
+
+@needs_chromium
+def test_a_browser_shows_it_without_an_error_on_any_screen(report):
+    with browser() as tab:
+        for width, scheme in ((1100, "light"), (380, "dark")):
+            tab.open(report / "report.html", width, 900, prefers_color_scheme=scheme)
+            tab.wait("[...document.images].every(i => i.complete)")
+            assert tab.evaluate("[...document.images].every(i => i.naturalWidth > 100)")
+            assert tab.evaluate("document.documentElement.scrollWidth") <= width
+            tab.evaluate("document.querySelector('iframe').scrollIntoView()")
+            time.sleep(3.0)
+            inside = tab.screenshot()[80:560, : width - 40]
+            assert inside.std() > 0.03, "the replay inside is blank"
+            assert tab.errors == [] and tab.requests == []

@@ -1,0 +1,566 @@
+"""Monte Carlo: the statistics against their definitions, the draws, and the study as a whole."""
+
+import csv
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import stewart_drake as sd
+from stewart_drake.cli import main
+from stewart_drake.config import Scenario
+from stewart_drake.errors import ConfigError
+from stewart_drake.experiment import prepare
+from stewart_drake.mechanism import kinematics
+from stewart_drake.report.page import Provenance
+from stewart_drake.report.robustness_page import robustness_page, robustness_table
+from stewart_drake.results import jsonable
+from stewart_drake.simulation import simulate
+from stewart_drake.studies import robustness, statistics
+from stewart_drake.studies.robustness import run_draw, study_robustness
+from stewart_drake.studies.robustness_result import (
+    Outcome,
+    RobustnessStudy,
+    factor_values,
+    table,
+)
+from stewart_drake.studies.uncertainty import (
+    UNDISTURBED,
+    Draw,
+    Ranges,
+    Scales,
+    disturbed,
+    draw,
+    read_ranges,
+    scales_of,
+    true_mechanism,
+)
+from tests.mechanisms import PAPER
+
+ROOT = Path(__file__).resolve().parents[1]
+SCALES = Scales(4.0, (0.26, 0.26, 0.26, 0.02, 0.02, 0.08), 0.0133, 0.95, 0.11, 0.1, 0.66)
+NOTHING = dict.fromkeys(
+    ("payload", "torque_bias", "noise", "damping", "delay", "lengths", "anchors"), 0.0
+)
+
+
+def short(**changes: Any) -> Scenario:
+    """The paper's experiment on the exact plant, its first 0.2 s, where nothing has gone wrong."""
+    scenario = sd.load_scenario(
+        "paper", None, ["plant.kind=exact", "start=on_reference", "queue=reference"]
+    )
+    return replace(scenario, **{"duration": 0.2, **changes})
+
+
+# ---------------------------------------------------------------- statistics
+
+
+@settings(deadline=None)
+@given(st.integers(1, 2000), st.data(), st.floats(0.5, 0.999))
+def test_wilson_ends_solve_their_equation(n: int, data: st.DataObject, confidence: float) -> None:
+    s = data.draw(st.integers(0, n))
+    found = statistics.wilson_interval(s, n, confidence)
+    z = scipy.stats.norm.ppf((1 + confidence) / 2)
+    assert 0 <= found.low <= found.value == s / n <= found.high <= 1
+    for p in (found.low, found.high):
+        assert (s / n - p) ** 2 == pytest.approx(z**2 * p * (1 - p) / n, abs=1e-9)
+    reference = scipy.stats.binomtest(s, n).proportion_ci(confidence, method="wilson")
+    assert found[1:] == pytest.approx((reference.low, reference.high), abs=1e-12)
+
+
+@pytest.mark.parametrize("p", [0.02, 0.3, 0.5, 0.9, 0.99])
+def test_wilson_covers_as_often_as_promised(p: float) -> None:
+    """Summed over all outcomes of 100 trials, no sampling; Wald's interval has 0.63 at 0.99."""
+    n = 100
+    chance = scipy.stats.binom.pmf(np.arange(n + 1), n, p)
+    intervals = [statistics.wilson_interval(s, n) for s in range(n + 1)]
+    covered = sum(c for c, i in zip(chance, intervals, strict=True) if i.low <= p <= i.high)
+    assert 0.9 < covered < 0.99
+
+
+@pytest.mark.parametrize(("s", "n"), [(0, 0), (-1, 5), (6, 5)])
+def test_wilson_refuses_what_is_no_share(s: int, n: int) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        statistics.wilson_interval(s, n)
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.integers(-5, 5), st.floats(-1e3, 1e3)), min_size=4, max_size=60))
+def test_rank_correlation_is_scipys(pairs: list[tuple[int, float]]) -> None:
+    x, y = np.array(pairs, dtype=float).T
+    found = statistics.rank_correlation(x, y)
+    if len(set(x)) == 1 or len(set(y)) == 1:
+        assert all(math.isnan(value) for value in found)
+        return
+    reference = scipy.stats.spearmanr(x, y)
+    assert found.rho == pytest.approx(reference.statistic, abs=1e-12)
+    assert found.p_value == pytest.approx(reference.pvalue, rel=1e-6, abs=1e-12)
+    assert found.low <= found.rho <= found.high
+    assert found.rho == pytest.approx(statistics.rank_correlation(np.exp(x), y).rho)
+
+
+def test_the_interval_of_the_rank_correlation_covers_the_truth() -> None:
+    """Pairs from a normal distribution of correlation r have rho = 6/pi asin(r/2)."""
+    rng, r = np.random.default_rng(1), 0.6
+    truth, hits, trials = 6 / math.pi * math.asin(r / 2), 0, 2000
+    for _ in range(trials):
+        x, e = rng.standard_normal((2, 60))
+        found = statistics.rank_correlation(x, r * x + math.sqrt(1 - r**2) * e)
+        hits += found.low <= truth <= found.high
+    assert 0.935 < hits / trials < 0.965
+
+
+def test_too_few_pairs_have_no_correlation() -> None:
+    assert math.isnan(statistics.rank_correlation([1, 2, 3], [1, 2, 3]).rho)
+
+
+@pytest.mark.parametrize("q", [0.5, 0.9])
+@pytest.mark.parametrize("n", [20, 200])
+def test_quantiles_are_covered(n: int, q: float) -> None:
+    """Of uniform numbers, whose q-quantile is q; infinite ones are the worst there are."""
+    rng, hits, trials = np.random.default_rng(2), 0, 1500
+    for _ in range(trials):
+        values = rng.uniform(size=n)
+        values[values > 0.95] = np.inf
+        found = statistics.quantile_interval(values, q)
+        assert found.value == np.quantile(values, q, method="inverted_cdf")
+        hits += found.low <= q <= found.high
+    assert hits / trials > 0.94
+
+
+def test_small_samples_leave_quantiles_open() -> None:
+    found = statistics.quantile_interval([1.0, 2.0, 3.0], 0.9)
+    assert (found.value, found.high) == (3.0, np.inf)
+    assert statistics.quantile_interval([1.0, np.inf], 0.99).value == np.inf
+    for bad in ([], [1.0, np.nan]):
+        with pytest.raises(ValueError, match="expected"):
+            statistics.quantile_interval(bad, 0.5)
+
+
+def test_holm_by_hand() -> None:
+    found = statistics.holm([0.01, 0.04, np.nan, 0.03, 0.005])
+    assert found == pytest.approx([0.03, 0.06, np.nan, 0.06, 0.02], nan_ok=True)
+    assert statistics.holm([0.6, 0.7]) == pytest.approx([1, 1])
+
+
+def test_chance_alone_is_rarely_taken_for_an_influence() -> None:
+    """Ten unrelated quantities at once: at most 5 % of studies see anything, without Holm 40 %."""
+    rng, trials, seen, naive = np.random.default_rng(3), 400, 0, 0
+    for _ in range(trials):
+        y, *factors = rng.standard_normal((11, 40))
+        p = [statistics.rank_correlation(x, y).p_value for x in factors]
+        naive += min(p) < 0.05
+        seen += min(statistics.holm(p)) < 0.05
+    assert seen / trials < 0.08
+    assert naive / trials > 0.3
+
+
+# ---------------------------------------------------------------- draws
+
+
+def test_a_draw_depends_on_seed_and_index_alone() -> None:
+    scenario, ranges = short(), Ranges()
+    forward = [draw(ranges, SCALES, scenario, 3, i) for i in range(5)]
+    backward = [draw(ranges, SCALES, scenario, 3, i) for i in reversed(range(5))]
+    assert forward == backward[::-1]
+    assert len({one.seed for one in forward}) == 5
+    assert draw(ranges, SCALES, scenario, 4, 0) != forward[0]
+
+
+@pytest.mark.parametrize("name", [*NOTHING, "torque_limit", "delay_steps"])
+def test_a_range_of_its_own_leaves_the_other_draws_alone(name: str) -> None:
+    changed: dict[str, Any] = {name: {"torque_limit": None, "delay_steps": 3}.get(name, 0.0)}
+    if name == "delay_steps":
+        name = "delay"
+    for i in range(5):
+        one = draw(Ranges(), SCALES, short(), 0, i)
+        other = draw(replace(Ranges(), **changed), SCALES, short(), 0, i)
+        assert one._replace(**{name: getattr(other, name)}) == other
+
+
+def test_draws_fill_their_ranges() -> None:
+    scenario, r, n = short(), Ranges(delay_steps=2), 2000
+    draws = [draw(r, SCALES, scenario, 0, i) for i in range(n)]
+    values = factor_values(draws)
+    ends = {
+        "payload": (-0.4, 0.4),
+        "torque_bias": (0, 20 * 0.0133),
+        "noise": (0, 0.1),
+        "torque_limit": (0.66, 3 * 0.66),
+        "damping": (0, 20 * 0.0133 / 0.95),
+        "lengths": (0, 2e-4 * 110),
+        "anchors": (0, 2e-4 * 110),
+    }
+    for name, (low, high) in ends.items():
+        uniform = scipy.stats.uniform(low, high - low).cdf
+        assert scipy.stats.kstest(values[name], uniform).pvalue > 1e-3, name
+    steps, rest = np.divmod(values["delay"] / 100 + 0.5, 1)
+    assert np.bincount((steps + 2).astype(int)) == pytest.approx([n / 5] * 5, rel=0.2)
+    assert np.abs(rest - 0.5).max() <= 0.01
+    # The directions of the bias favour no motor and no sign.
+    directions = np.array([one.torque_bias for one in draws])
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    assert np.abs(directions.mean(axis=0)).max() < 0.04
+    assert directions.T @ directions / n == pytest.approx(np.eye(6) / 6, abs=0.02)
+
+
+def test_a_delay_is_never_negative() -> None:
+    scenario = short()
+    scenario.delay.steps = 1
+    ranges = Ranges(delay_steps=5)
+    totals = []
+    for i in range(60):
+        one = draw(ranges, SCALES, scenario, 0, i)
+        delay = disturbed(scenario, SCALES.motion, one).delay
+        totals.append(delay.steps + delay.fraction)
+        assert totals[-1] == pytest.approx(1 + one.delay / 0.1, abs=1e-9)
+    assert min(totals) == 0.0
+    assert max(totals) > 5
+
+
+def test_the_scenario_changes_as_drawn_and_the_belief_stays() -> None:
+    scenario = short()
+    scenario.plant.payload_mass, scenario.plant.torque_bias = 0.5, [0.1] * 6
+    scenario.sensor.noise_std = [1e-3] * 12
+    one = UNDISTURBED._replace(
+        payload=0.25, torque_bias=(0.01,) * 6, noise=0.01, damping=0.02, delay=-0.03, seed=7,
+        torque_limit=2.0,
+    )  # fmt: skip
+    other = disturbed(scenario, SCALES.motion, one)
+    assert other.plant.payload_mass == 0.75
+    assert other.plant.torque_bias == pytest.approx([0.11] * 6)
+    assert other.plant.joint_damping == 0.02
+    assert (other.delay.steps, other.delay.fraction) == (7, pytest.approx(0.7))
+    assert (other.controller.delay_steps, other.controller.delay_fraction) == (8, 0.0)
+    assert other.actuator.torque_limit == 2.0
+    assert other.sensor.noise_std == pytest.approx(1e-3 + 0.01 * np.tile(SCALES.motion, 2))
+    assert (other.sensor.seed, scenario.sensor.seed) == (7, 0)
+    other.check()
+
+
+def test_a_scenarios_own_limit_is_kept() -> None:
+    scenario = short()
+    scenario.actuator.torque_limit = 1.0
+    limits = [draw(Ranges(), SCALES, scenario, 0, i).torque_limit or 0 for i in range(50)]
+    assert max(limits) == 1.0 > min(limits) >= 0.66
+    none = draw(Ranges(torque_limit=None), SCALES, scenario, 0, 0)
+    assert none.torque_limit == 1.0
+
+
+def test_multibody_delays_are_whole_steps() -> None:
+    scenario = short()
+    scenario.plant.kind = "multibody"
+    for i in range(20):
+        one = draw(Ranges(delay=0.05), SCALES, scenario, 0, i)
+        disturbed(scenario, SCALES.motion, one).check()
+
+
+def test_ranges_from_settings() -> None:
+    ranges = read_ranges(["payload=0.2", "torque_limit=null", "delay_steps=1"])
+    assert ranges == Ranges(payload=0.2, torque_limit=None, delay_steps=1)
+    for bad, said in (
+        ("payload", "name=value"),
+        ("payload=2.0", "payload: got 2.0"),
+        ("paylod=0.1", "did you mean payload"),
+        ("torque_limit=[3.0, 1.0]", "lesser one first"),
+        ("noise=-1.0", "noise: got -1.0"),
+    ):
+        with pytest.raises(ConfigError, match=said) as caught:
+            read_ranges([bad])
+        assert "\n" not in str(caught.value)
+
+
+# ---------------------------------------------------------------- another machine than believed
+
+
+def test_the_true_machine_is_off_by_what_was_drawn() -> None:
+    rng = np.random.default_rng(0)
+    one = UNDISTURBED._replace(
+        lengths=tuple(1e-4 * rng.standard_normal(12)),
+        anchors=tuple(1e-4 * rng.standard_normal(36)),
+        payload=-0.3,
+    )
+    truth = true_mechanism(PAPER, 0.1, one)
+    assert truth.crank_lengths - PAPER.crank_lengths == pytest.approx(one.lengths[:6])
+    assert truth.rod_lengths - PAPER.rod_lengths == pytest.approx(one.lengths[6:])
+    assert np.ravel(truth.p_WS - PAPER.p_WS) == pytest.approx(one.anchors[:18])
+    assert np.ravel(truth.p_PQ - PAPER.p_PQ) == pytest.approx(one.anchors[18:])
+    assert truth.plate.mass == pytest.approx(4.0 - 0.2)
+    assert true_mechanism(PAPER, 0.1, UNDISTURBED._replace(payload=-0.1)) is PAPER
+
+
+def test_lacking_mass_is_a_negative_payload() -> None:
+    rng = np.random.default_rng(0)
+    one = UNDISTURBED._replace(payload=-0.3)
+    light = sd.StewartDynamics(true_mechanism(PAPER, 0.0, one))
+    nominal, theta = sd.StewartDynamics(PAPER), np.zeros(8)
+    theta[6] = -0.3
+    pose, rates, torque = PAPER.home + 0.01 * rng.standard_normal(6), *rng.standard_normal((2, 6))
+    assert light.accelerations(pose, rates, torque) == pytest.approx(
+        nominal.accelerations(pose, rates, torque, theta), rel=1e-10
+    )
+
+
+@pytest.mark.parametrize("kind", ["exact", "multibody"])
+def test_the_loop_simulates_the_true_machine(kind: str) -> None:
+    """For 0.4 s only the torques in flight act, which move a plate ten times as heavy less."""
+    scenario = short(start="rest", queue="reference", duration=0.4)
+    scenario.plant.kind = kind
+    scenario.delay.steps, scenario.controller.catch_up = 8, 0.0
+    heavy = replace(PAPER, plate=replace(PAPER.plate, mass=40.0, inertia=10 * PAPER.plate.inertia))
+    legs = replace(PAPER, crank_lengths=1.01 * PAPER.crank_lengths)
+    moved = {}
+    for name, truth in (("same", None), ("heavy", heavy), ("legs", legs)):
+        result = simulate(scenario, truth=truth)
+        moved[name] = result.signals.pose.values
+    way = {name: np.abs(pose[-1] - pose[0]).max() for name, pose in moved.items()}
+    assert 0.05 < way["heavy"] / way["same"] < 0.2
+    assert np.abs(moved["legs"] - moved["same"]).max() > 1e-3 * way["same"]
+    experiment = prepare(scenario, heavy)
+    assert experiment.nominal.mechanism == PAPER
+    assert experiment.truth == heavy
+
+
+def test_the_true_machine_decides_where_the_workspace_ends() -> None:
+    """Rods so short that the machine can only just be assembled cannot follow the reference."""
+    scenario = sd.load_scenario("paper", None, ["plant.kind=exact"])
+    lack = float(kinematics.reach_margins(PAPER, PAPER.home).min())
+    for share, at_start in ((0.99999, True), (0.8, False)):
+        one = UNDISTURBED._replace(lengths=(0.0,) * 6 + (-share * lack,) * 6)
+        found = json.loads(run_draw(scenario, SCALES.motion, one))["outcome"]
+        assert found["status"] == "left_workspace"
+        assert found["error"] is None
+        assert found["leg"] in range(1, 7)
+        assert (found["time"] == 0) == at_start
+    one = UNDISTURBED._replace(lengths=(0.0,) * 6 + (-1.1 * lack,) * 6)
+    found = json.loads(run_draw(scenario, SCALES.motion, one))["outcome"]
+    assert found["status"] == "not_assembled"
+    assert "out of reach" in found["reason"]
+
+
+def test_what_cannot_be_prepared_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise ConfigError("controller.catch_up: got 1 s")
+
+    monkeypatch.setattr(robustness, "simulate", refuse)
+    found = json.loads(run_draw(short(), SCALES.motion, UNDISTURBED))["outcome"]
+    assert found["status"] == "refused"
+    assert found["reason"] == "controller.catch_up: got 1 s"
+
+
+# ---------------------------------------------------------------- the study
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name[0] != "."}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RobustnessStudy]:
+    folder = tmp_path_factory.mktemp("robustness") / "whole"
+    return folder, study_robustness(short(), folder, runs=4, workers=1)
+
+
+def test_a_resumed_study_equals_an_uninterrupted_one(
+    tmp_path: Path, whole: tuple[Path, RobustnessStudy]
+) -> None:
+    folder, study = whole
+    first = study_robustness(short(), tmp_path, runs=2, workers=1)
+    assert first.outcomes == study.outcomes[:2]
+    (tmp_path / "runs" / "run000000.json").unlink()
+    resumed = study_robustness(short(), tmp_path, runs=4, workers=2)
+    assert contents(tmp_path) == contents(folder)
+    assert jsonable(resumed.summary) == jsonable(study.summary)
+    with pytest.raises(ConfigError, match="belongs to other settings"):
+        study_robustness(short(), tmp_path, runs=4, seed=1)
+
+
+def test_a_killed_study_goes_on(tmp_path: Path, whole: tuple[Path, RobustnessStudy]) -> None:
+    folder, _ = whole
+    code = (
+        "import sys\nfrom stewart_drake.studies.robustness import study_robustness\n"
+        "from tests.test_robustness import short\n"
+        "study_robustness(short(), sys.argv[1], runs=400, workers=1)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], cwd=ROOT)
+    limit = time.monotonic() + 120
+    while len(list(tmp_path.glob("runs/run*.json"))) < 3:
+        assert time.monotonic() < limit
+        assert process.poll() is None
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    for path in tmp_path.glob("runs/run*.json"):
+        if int(path.stem[3:]) >= 4:
+            path.unlink()
+    assert not (tmp_path / "runs.csv").exists()
+    time.sleep(1.0)  # its worker ends within half a second, and with it the lock
+    study_robustness(short(), tmp_path, runs=4, workers=1)
+    assert contents(tmp_path) == contents(folder)
+
+
+def test_a_cluster_gives_the_same_study(
+    tmp_path: Path, whole: tuple[Path, RobustnessStudy]
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    folder, _ = whole
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        study_robustness(short(), tmp_path, runs=4, scheduler=cluster.scheduler_address)
+    assert contents(tmp_path) == contents(folder)
+
+
+def test_a_damaged_file_is_named(tmp_path: Path) -> None:
+    study_robustness(short(), tmp_path, runs=1, workers=1)
+    (tmp_path / "runs" / "run000000.json").write_text('{"outcome": {"status": "completed"}}')
+    with pytest.raises(ConfigError, match=r"run000000\.json: is damaged"):
+        study_robustness(short(), tmp_path, runs=1, workers=1)
+
+
+def test_nothing_drawn_changes_nothing(tmp_path: Path) -> None:
+    ranges = Ranges(**NOTHING, torque_limit=None)
+    study = study_robustness(short(), tmp_path, ranges=ranges, runs=2, workers=1)
+    assert study.outcomes == [study.undisturbed] * 2
+    assert study.undisturbed.error == simulate(short()).accumulated_error
+    assert all(math.isnan(one.error.rho) for one in study.influences())
+    robustness_table(study)
+    robustness_page(study, Provenance("command")).html()
+
+
+def test_bad_numbers_are_refused(tmp_path: Path) -> None:
+    for options, said in (({"runs": 0}, "--runs: got 0"), ({"limit": -1.0}, "--limit: got -1")):
+        with pytest.raises(ConfigError, match=said):
+            study_robustness(short(), tmp_path, **options)  # type: ignore[arg-type]
+
+
+def test_scales_of_the_paper() -> None:
+    scales = scales_of(prepare(short(duration=10.0)), 0.7)
+    assert scales.motion == pytest.approx([math.radians(15)] * 3 + [0.02, 0.02, 0.08])
+    assert (scales.plate_mass, scales.crank, scales.commanded) == (4.0, 0.11, 0.7)
+    assert 0.5 < scales.speed < 2
+
+
+# ---------------------------------------------------------------- what is told of it
+
+
+def made_up(n: int = 400, limit: float | None = None) -> RobustnessStudy:
+    """E_ac grows with the noise, the delay and nothing else; late delays fail."""
+    scenario = short()
+    draws = [draw(Ranges(), SCALES, scenario, 1, i) for i in range(n)]
+    outcomes = []
+    for one in draws:
+        error = math.exp(5e3 * one.noise + 3e3 * abs(one.delay))
+        failed = one.delay > 8e-4
+        outcomes.append(
+            Outcome("left_workspace", "leg 3 reached the end of its reach", 3, 2.0, math.nan, 1.0)
+            if failed
+            else Outcome("completed", "", None, math.nan, error, 1.0)
+        )
+    undisturbed = Outcome("completed", "", None, math.nan, 1.0, 1.0)
+    return RobustnessStudy(
+        prepare(scenario), Ranges(), SCALES, 0, limit, undisturbed, draws, outcomes
+    )
+
+
+def test_influences_are_found() -> None:
+    study = made_up()
+    found = {one.factor: one for one in study.influences()}
+    assert study.influences()[0].factor == "noise"
+    assert found["noise"].error.rho > 0.8
+    assert found["|delay|"].error_p < 0.05
+    assert found["delay"].failure.rho > 0.4
+    assert found["delay"].failure_p < 1e-6
+    for name in ("payload", "torque_bias", "damping", "lengths", "anchors", "torque_limit"):
+        assert found[name].error_p > 0.05
+        assert found[name].failure_p > 0.05
+    assert "noise of the sensor, delay error." in robustness_table(study).replace("\n  ", " ")
+
+
+def test_failures_are_counted_and_never_dropped() -> None:
+    study = made_up()
+    failures = sum(one.delay > 8e-4 for one in study.draws)
+    assert 0 < failures < 400
+    assert study.success.value == 1 - failures / 400
+    assert study.reasons == {"a leg reached the end of its reach": failures}
+    assert study.quantile(0.99).value == np.inf
+    assert study.summary["failures_by_leg"] == {"3": failures}
+    assert jsonable(study.summary)["E_ac_of_all"]["0.99"]["value"] is None
+    assert study.summary["E_ac_of_completed"]["0.99"]["value"] < np.inf
+    lines = list(csv.DictReader(table(study).splitlines()))
+    assert len(lines) == 400
+    assert sum(row["E_ac [% s]"] == "" for row in lines) == failures
+    assert float(lines[5]["noise [%]"]) == 100 * study.draws[5].noise
+    strict = made_up(limit=5.0)
+    assert strict.reasons["completed with E_ac above 5 % s"] == np.sum(study.errors > 5)
+    assert strict.success.value < study.success.value
+
+
+def test_tables_and_pages_of_extreme_studies() -> None:
+    for study in (
+        made_up(1),
+        made_up(400),
+        made_up(400, limit=3.0),
+        made_up()._replace(
+            outcomes=[Outcome("not_assembled", "home", None, 0.0, math.nan, math.nan)] * 400
+        ),
+    ):
+        text = robustness_table(study)
+        assert max(map(len, text.splitlines())) <= 80
+        page = robustness_page(study, Provenance("command")).html()
+        assert page.count("<img") == (4 if study.failed.any() else 3)
+        json.dumps(jsonable(study.summary), allow_nan=False)
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    words = ["analyze", "robustness", "paper", "--runs", "3", "--seed", "5", "--out", str(out)]
+    words += ["--set", "duration=0.2", "--vary", "delay=0", "--vary", "noise=0.002"]
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert max(map(len, told.splitlines()[:-1])) <= 80
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["runs"] == 3
+    assert summary["ranges"]["noise"] == 0.002
+    assert summary["scenario"]["plant"]["kind"] == "exact"
+    page = (out / "report.html").read_text()
+    command = "stewart-drake analyze robustness paper --set duration=0.2 --vary delay=0 --vary"
+    assert command in page
+    assert {p.name for p in out.iterdir() if p.name[0] != "."} == {
+        "summary.json", "report.html", "runs.csv", "runs",
+    }  # fmt: skip
+    assert main([*words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == summary
+    assert main([*words[:-1], "noise=0.001"]) == 2
+    assert "belongs to other settings" in capsys.readouterr().err
+
+
+def test_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(robustness, "study_robustness", interrupted)
+    assert main(["analyze", "robustness", "--out", str(tmp_path)]) == 130
+    assert "finished runs are kept" in capsys.readouterr().err
+    assert main(["analyze", "robustness"]) == 130
+    assert "nothing is kept without --out" in capsys.readouterr().err
+
+
+def test_draws_survive_pickling() -> None:
+    import pickle
+
+    one = draw(Ranges(), SCALES, short(), 0, 0)
+    assert isinstance(one, Draw)
+    assert pickle.loads(pickle.dumps(one)) == one

@@ -1,0 +1,273 @@
+"""Levenberg-Marquardt training of the tuner's network."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from stewart_drake.cli import main
+from stewart_drake.errors import ConfigError
+from stewart_drake.signals import TUNER_INPUTS
+from stewart_drake.studies import levenberg, training
+from stewart_drake.studies.dataset import data_hash
+from stewart_drake.studies.grid import PAIRS
+from stewart_drake.studies.levenberg import TorchModel, fit, initial_theta, unpack
+from stewart_drake.studies.training import summarize, train, training_rows
+from stewart_drake.tuner.network import load_network, save_network
+
+pytest.importorskip("torch")
+
+rng = np.random.default_rng
+NUMBERS = ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_variation")
+
+
+def toy_data(cells=8, seed=0):
+    """Runs of noise whose best gain shows in how steady the errors are."""
+    random = rng(seed)
+    runs, rows = [], []
+    for cell in range(cells):
+        steadiness = cell / (cells - 1)
+        for q, r in PAIRS:
+            steady = 1.0 + 0.1 * random.standard_normal((100, 18))
+            wild = random.standard_normal((100, 18))
+            rows.append(steadiness * steady + (1 - steadiness) * wild)
+            wanted = np.log(0.1) + steadiness * np.log(100.0)
+            runs.append((q, r, cell, 1.0 + (np.log(q / r) - wanted) ** 2))
+    samples = np.array(rows)
+    samples[3, 40:] = np.nan  # a run that ended early
+    q, r, cell, error = (np.array(column, dtype=float) for column in zip(*runs, strict=True))
+    error[3] = np.nan
+    number = len(runs)
+    return xr.Dataset(
+        {
+            "samples": (("run", "sample", "input"), samples),
+            "valid": (("run", "sample"), np.isfinite(samples).all(axis=2)),
+            "weights": (("run", "weight"), np.column_stack([q, r])),
+            "delay_steps": ("run", cell),
+            "frequency": ("run", np.ones(number)),
+            "disturbance": ("run", np.full(number, -1)),
+            "status": ("run", np.where(np.isnan(error), "left_workspace", "completed")),
+            **dict.fromkeys(
+                ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_variation"),
+                ("run", error),
+            ),
+        },
+        {"input": list(TUNER_INPUTS)},
+        {"settings": json.dumps({"data": "toy"})},
+    )
+
+
+@pytest.fixture(scope="module")
+def data():
+    return toy_data()
+
+
+@pytest.fixture(scope="module")
+def trained(data):
+    return train(data, max_rows=1500, evaluations=25)
+
+
+# ---------------------------------------------------------------- the model
+
+
+def numpy_outputs(theta, u, hidden):
+    W1, b1, W2, b2 = unpack(theta, u.shape[1], hidden)
+    return (1 / (1 + np.exp(-(u @ W1.T + b1)))) @ W2.T + b2
+
+
+def test_outputs_are_those_of_the_formula():
+    theta, u = rng(0).standard_normal(212), rng(1).standard_normal((7, 18))
+    model = TorchModel(18, 10)
+    np.testing.assert_allclose(
+        model.outputs(theta, u), numpy_outputs(theta, u, 10), rtol=1e-12, atol=1e-12
+    )
+
+
+def test_the_jacobian_is_that_of_finite_differences():
+    theta, u = rng(2).standard_normal(212), rng(3).standard_normal((4, 18))
+    model, h = TorchModel(18, 10), 1e-6
+    J = model.jacobian(theta, u)
+    assert J.shape == (4, 2, 212)
+    steps = h * np.eye(212)
+    differences = [
+        (numpy_outputs(theta + s, u, 10) - numpy_outputs(theta - s, u, 10)) / (2 * h) for s in steps
+    ]
+    np.testing.assert_allclose(J, np.stack(differences, axis=-1), atol=1e-6)
+    assert np.abs(J).max() > 0.1
+
+
+# ---------------------------------------------------------------- the solver
+
+
+def oracle(theta, u, y, hidden, iterations=500):
+    """Levenberg-Marquardt by dense normal equations and a Jacobian by hand."""
+
+    def residual(x):
+        return (numpy_outputs(x, u, hidden) - y).ravel()
+
+    def jacobian(x):
+        W1, b1, W2, _ = unpack(x, u.shape[1], hidden)
+        s = 1 / (1 + np.exp(-(u @ W1.T + b1)))
+        slope = s * (1 - s)
+        rows = []
+        for k in range(2):
+            db1 = slope * W2[k]
+            dW1 = db1[:, :, None] * u[:, None, :]
+            dW2, db2 = np.zeros((len(u), 2, hidden)), np.zeros((len(u), 2))
+            dW2[:, k], db2[:, k] = s, 1
+            parts = (dW1, db1, dW2, db2)
+            rows.append(np.hstack([part.reshape(len(u), -1) for part in parts]))
+        return np.stack(rows, axis=1).reshape(2 * len(u), -1)
+
+    damping, r = 1e-3, residual(theta)
+    for _ in range(iterations):
+        J = jacobian(theta)
+        step = -np.linalg.solve(J.T @ J + damping * np.eye(len(theta)), J.T @ r)
+        trial = residual(theta + step)
+        if trial @ trial < r @ r:
+            theta, r, damping = theta + step, trial, damping / 3
+        else:
+            damping *= 2
+    return theta, float(r @ r)
+
+
+def test_training_finds_the_minimum_that_a_dense_solver_finds():
+    # Noisy targets of a small network: the minimum is far from zero.
+    hidden, random = 2, rng(4)
+    u = random.standard_normal((300, 3))
+    truth = 2 * random.standard_normal(hidden * 3 + hidden + 2 * hidden + 2)
+    y = numpy_outputs(truth, u, hidden) + 0.1 * random.standard_normal((300, 2))
+    start = truth + 0.1 * random.standard_normal(len(truth))
+    expected, least = oracle(start, u, y, hidden)
+    found = fit(TorchModel(3, hidden), start, (u, y), (u[:0], y[:0]), 500)
+    assert found.converged
+    cost = float(np.sum((numpy_outputs(found.theta, u, hidden) - y) ** 2))
+    assert cost == pytest.approx(least, rel=1e-8) and cost > 1
+    answers = numpy_outputs(found.theta, u, hidden)
+    np.testing.assert_allclose(answers, numpy_outputs(expected, u, hidden), atol=1e-4)
+    assert found.curve[-1, 0] == pytest.approx(np.sqrt(cost / y.size))
+    assert (np.diff(found.curve[:, 0]) <= 1e-15).all()
+    assert np.isnan(found.curve[:, 1]).all(), "there are no test rows here"
+
+
+def test_the_start_answers_with_the_mean():
+    y = rng(5).standard_normal((50, 2))
+    theta = initial_theta(18, 10, y, 0)
+    np.testing.assert_allclose(numpy_outputs(theta, np.zeros((1, 18)), 10)[0], y.mean(axis=0))
+
+
+# ---------------------------------------------------------------- from data to network
+
+
+def test_the_network_is_what_was_trained(trained, data):
+    rows = training_rows(data, "best_in_cell", "magnitude")
+    network = trained.network
+    answers = np.log(network(rows.densities))
+    theta = np.concatenate([getattr(network, n).ravel() for n in ("W1", "b1", "W2", "b2")])
+    u = (rows.densities - network.input_mean) / network.input_scale
+    np.testing.assert_allclose(TorchModel(18, 10).outputs(theta, u), answers, rtol=0, atol=1e-12)
+
+
+def test_it_learns_what_there_is_to_learn(trained):
+    error = trained.network.card["rms_error"]
+    assert error["test"] < 0.9 * error["test_of_a_constant"]
+    assert trained.curve[-1, 0] < trained.curve[0, 0]
+    correlation = summarize(trained)["correlation"]
+    assert correlation["w_Q"] > 0.5 and correlation["w_R"] > 0.5
+
+
+def test_the_same_seed_gives_the_same_network(trained, data):
+    again = train(data, max_rows=1500, evaluations=25)
+    other = train(data, max_rows=1500, evaluations=25, seed=1)
+    for name in ("input_mean", "input_scale", "W1", "b1", "W2", "b2"):
+        np.testing.assert_array_equal(getattr(again.network, name), getattr(trained.network, name))
+    assert again.network.card == trained.network.card
+    assert not np.array_equal(other.network.W1, trained.network.W1)
+
+
+def test_the_card_tells_where_it_comes_from(trained, data, tmp_path):
+    card = trained.network.card
+    assert card["data_sha256"] == data_hash(data)
+    assert card["seed"] == 0 and card["labels"] == "best_in_cell" and card["split"] == "run"
+    assert "torch" in card["versions"] and card["rows"]["trained_on"] == 1500
+    save_network(trained.network, tmp_path / "net.json")
+    assert dict(load_network(tmp_path / "net.json").card) == card
+
+
+def test_labels_as_run_train_the_weights_themselves(data):
+    network = train(data, kind="as_run", max_rows=300, evaluations=3).network
+    assert network.output == "weights"
+    np.testing.assert_array_equal(network.bounds, [[0.1, 0.1], [4, 4]])
+    best = train(data, max_rows=300, evaluations=3).network
+    assert best.output == "log_weights"
+    np.testing.assert_allclose(best.bounds, [[40**-0.5] * 2, [40**0.5] * 2])
+
+
+def test_rows_after_a_failure_are_not_trained_on(data):
+    rows = training_rows(data, "as_run", "magnitude")
+    assert len(rows.densities) == data.sizes["run"] * 100 - 60
+    assert (rows.runs == 3).sum() == 40
+    assert np.isfinite(rows.densities).all()
+
+
+@pytest.mark.parametrize("split", training.SPLITS)
+def test_splits_keep_together_what_belongs_together(data, split):
+    rows = training_rows(data, "best_in_cell", "magnitude")
+    mask = training._split(rows, split, rng(0))
+    assert mask.mean() == pytest.approx(0.7, abs=0.06)
+    group = {"sample": np.arange(len(mask)), "run": rows.runs, "cell": rows.cells}[split]
+    assert not set(group[mask]) & set(group[~mask])
+
+
+def test_without_survivors_there_is_nothing_to_train_on(data):
+    dead = data.copy(deep=True)
+    dead["accumulated_error"][:] = np.nan
+    with pytest.raises(ConfigError, match="expected more runs that complete"):
+        train(dead)
+
+
+def test_without_torch_the_message_tells_the_fix(data, monkeypatch):
+    monkeypatch.setitem(levenberg.__builtins__, "__import__", _no_torch)
+    with pytest.raises(ConfigError, match=r"pip install 'stewart-drake\[train\]'"):
+        train(data)
+
+
+def _no_torch(name, *rest, _import=__import__):
+    if name == "torch":
+        raise ImportError(name)
+    return _import(name, *rest)
+
+
+# ---------------------------------------------------------------- the command
+
+
+def test_the_command_writes_network_figures_and_summary(data, tmp_path, capsys):
+    data.to_netcdf(tmp_path / "dataset.nc", engine="h5netcdf")
+    out = tmp_path / "new" / "net.json"
+    assert main(["tune", "train", str(tmp_path), "--out", str(out), "--split", "cell"]) == 0
+    printed, err = capsys.readouterr()
+    assert err == "" and all(len(line) <= 80 for line in printed.splitlines()[:-1])
+    assert {path.name for path in out.parent.iterdir()} == {
+        "net.json",
+        "summary.json",
+        *(f"{n}.{s}" for n in ("training_curve", "regression") for s in ("png", "svg")),
+    }
+    summary = json.loads((out.parent / "summary.json").read_text())
+    assert summary["rows"]["trained_on"] <= training.MAX_ROWS
+    assert load_network(out).card["split"] == "cell"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nowhere"], "tune dataset"),
+        (["nowhere", "--out", "net.txt"], "expected a file ending in .json"),
+        (["nowhere", "--labels", "best"], "--labels"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(arguments, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["tune", "train", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and said in err

@@ -1,0 +1,314 @@
+"""The tuner in the loop: window and network as systems, who knows what when, what goes wrong."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+import stewart_drake as sd
+from stewart_drake.diagram import ClosedLoop, build_closed_loop
+from stewart_drake.simulation import make_simulator
+from stewart_drake.systems.density import DensityWindow
+from stewart_drake.systems.sensor import Sensor
+from stewart_drake.systems.tuner import AnnTuner
+from stewart_drake.timing import look_time
+from stewart_drake.tuner.density import NUM_INPUTS, densities
+from stewart_drake.tuner.law import MAX_FACTOR, tune
+from stewart_drake.tuner.network import Network, save_network
+from tests.test_network import small_network, torch_twin
+from tests.test_systems import carry_out, ports
+
+Array = NDArray[np.float64]
+
+FIXED = np.array([1.0, 2.0])
+OVERFLOWING = {"b2": [800.0, 0.0]}
+"""Changes of a network after which the first weight is infinite."""
+
+
+# ------------------------------------------------------------------ the law
+
+
+@given(
+    rho=arrays(np.float64, NUM_INPUTS, elements=st.floats()),
+    last=arrays(np.float64, 2, elements=st.floats(1e-3, 1e3)),
+)
+def test_weights_stay_finite_positive_and_within_the_rate(rho: Array, last: Array) -> None:
+    weights, fell_back = tune(small_network(), rho, last, FIXED)
+    assert fell_back is not bool(np.all(np.isfinite(small_network()(rho))))
+    assert np.all(weights > 0)
+    factor = MAX_FACTOR * (1 + 1e-15)
+    assert np.all((last / factor <= weights) & (weights <= last * factor))
+
+
+def test_where_the_rate_allows_it_the_weights_are_the_clipped_output() -> None:
+    rng, network = np.random.default_rng(0), small_network()
+    clipped = 0
+    for rho in rng.uniform(0, 3, (200, NUM_INPUTS)):
+        weights, fell_back = tune(network, rho, FIXED, FIXED, factor=1e9)
+        low, high = network.bounds
+        np.testing.assert_array_equal(weights, np.maximum(low, np.minimum(high, network(rho))))
+        assert not fell_back
+        clipped += bool(np.any(weights != network(rho)))
+    assert 0 < clipped < 200
+
+
+@pytest.mark.parametrize("output", ["not finite in", "infinite out"])
+def test_a_failing_network_leads_back_to_the_fixed_weights_at_the_same_rate(output: str) -> None:
+    network = small_network(**(OVERFLOWING if output == "infinite out" else {}))
+    rho = np.full(NUM_INPUTS, np.nan if output == "not finite in" else 1.0)
+    weights = np.array([4.0, 2.0])
+    for expected in ([4 / 1.5, 2.0], [4 / 1.5**2, 2.0], [4 / 1.5**3, 2.0], [1.0, 2.0], [1.0, 2.0]):
+        weights, fell_back = tune(network, rho, weights, FIXED)
+        assert fell_back
+        np.testing.assert_allclose(weights, expected, rtol=1e-15)
+
+
+# ------------------------------------------------------------------ the systems
+
+
+def sample_in(system: DensityWindow, context: Context, sample: Array) -> Array:
+    """Let the window take one sample in; the densities afterwards."""
+    reference = np.arange(18.0)
+    for name, value in (
+        ("measurement", sample[:12] + reference[:12]),
+        ("reference", reference),
+        ("torque", sample[12:]),
+    ):
+        system.GetInputPort(name).FixValue(context, value)
+    carry_out(system._update, context)
+    return np.array(system.GetOutputPort("density").Eval(context))
+
+
+def test_window_topology_and_initial_state() -> None:
+    system = DensityWindow(0.1)
+    assert ports(system) == (
+        {"measurement": 12, "reference": 18, "torque": 6},
+        {"density": 18},
+    )
+    assert not system.HasAnyDirectFeedthrough()
+    context = system.CreateDefaultContext()
+    assert np.all(np.isnan(system.window(context)))
+    assert np.all(np.isnan(system.GetOutputPort("density").Eval(context)))
+
+
+@pytest.mark.parametrize("kind", ["magnitude", "signed"])
+def test_window_gives_the_densities_of_the_samples_so_far(kind: Any) -> None:
+    samples = np.random.default_rng(1).normal(1, 1, (70, NUM_INPUTS))
+    samples[[0, 20]] = np.nan  # nothing known at all, first and later
+    samples[33, :12] = np.nan
+    system = DensityWindow(0.1, kind)
+    context = system.CreateDefaultContext()
+    expected = densities(samples, kind)
+    for k, sample in enumerate(samples):
+        found = sample_in(system, context, sample)
+        if k == 0:
+            assert np.all(np.isnan(found))
+        else:
+            np.testing.assert_allclose(found, expected[k], rtol=1e-9)
+
+
+def test_tuner_topology_state_and_output() -> None:
+    system = AnnTuner(small_network(), FIXED, 0.1)
+    assert ports(system) == ({"density": 18}, {"weights": 2})
+    context = system.CreateDefaultContext()
+    out = system.GetOutputPort("weights")
+    system.GetInputPort("density").FixValue(context, np.full(18, np.nan))
+    np.testing.assert_array_equal(out.Eval(context), FIXED)
+    assert system.fallbacks(context) == 0
+
+
+# ------------------------------------------------------------------ the loop
+
+
+def scenario(tmp_path: Path, network: Network | None, *settings: str) -> sd.Scenario:
+    """The paper's scenario on the exact plant, with this network or with fixed weights."""
+    tuner = []
+    if network is not None:
+        save_network(network, tmp_path / "network.json")
+        tuner = ["tuner.kind=ann", f"tuner.weights={tmp_path / 'network.json'}"]
+    return sd.load_scenario("paper", settings=["plant.kind=exact", *tuner, *settings])
+
+
+def at_samples(result: sd.SimulationResult) -> Any:
+    """The signals at the controller's samples, 0.1 s apart."""
+    return result.signals.isel(time=slice(None, None, 5))
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory: pytest.TempPathFactory) -> sd.SimulationResult:
+    """The paper's whole experiment with a network."""
+    return sd.simulate(scenario(tmp_path_factory.mktemp("tuned"), small_network()))
+
+
+def test_the_papers_experiment_completes_with_a_network(tuned: sd.SimulationResult) -> None:
+    assert tuned.status == "completed"
+    assert tuned.accumulated_error < 25
+    weights = tuned.signals.weights.values
+    assert np.all((weights >= 0.1) & (weights <= 4.0))
+    assert np.ptp(weights[:, 0]) > 0.5 and np.ptp(weights[:, 1]) > 0.5
+    counts = tuned.summary["counts"]
+    assert counts["tuner_fallbacks"] == counts["riccati_failures"] == 0
+    rho = tuned.signals.density.values
+    assert np.all((rho >= 0) & (rho <= 31))
+
+
+def test_weights_rest_on_the_samples_before(tuned: sd.SimulationResult) -> None:
+    """w_k = tune(rho_{k-1}, w_{k-1}), w_0 = fixed; neither earlier nor later data."""
+    s, network = at_samples(tuned), small_network()
+    weights, rho = s.weights.values, s.density.values
+    np.testing.assert_array_equal(weights[0], [1.0, 1.0])
+
+    def replay(age: int) -> Array:
+        """Had the tuner seen densities so many samples old."""
+        samples = range(2, len(weights))
+        return np.array(
+            [tune(network, rho[k - age], weights[k - 1], np.ones(2))[0] for k in samples]
+        )
+
+    np.testing.assert_allclose(weights[2:], replay(1), rtol=1e-13)
+    for wrong in (0, 2):
+        assert np.abs(weights[2:] / replay(wrong) - 1).max() > 0.1
+
+
+def test_the_network_in_the_loop_is_the_torch_network(tuned: sd.SimulationResult) -> None:
+    torch = pytest.importorskip("torch")
+    s, network = at_samples(tuned), small_network()
+    weights = s.weights.values
+    twin = torch_twin(torch, network)(s.density.values[:-1])
+    goal = np.clip(twin, *network.bounds)
+    limited = np.clip(goal, weights[:-1] / MAX_FACTOR, weights[:-1] * MAX_FACTOR)
+    np.testing.assert_allclose(weights[1:], limited, rtol=1e-12, atol=0)
+    free = np.abs(limited / twin - 1) < 1e-15  # neither bounded nor rate-limited
+    assert free.mean() > 0.3
+
+
+@pytest.mark.parametrize("kind", ["magnitude", "signed"])
+def test_recorded_densities_are_those_of_the_recorded_signals(tmp_path: Path, kind: Any) -> None:
+    """On the multibody plant, where the state is the same just before and after an instant."""
+    settings = ("plant.kind=multibody", "duration=4.0")
+    result = sd.simulate(scenario(tmp_path, small_network(density=kind), *settings))
+    s = at_samples(result)
+    rate_error = s.rates.values - s.reference_rates.values
+    samples = np.hstack([s.error.values, rate_error, s.torque_commanded.values])
+    expected = densities(samples, kind)
+    # The reference is read 5e-15 t apart.
+    np.testing.assert_allclose(s.density.values, expected, rtol=1e-12, atol=1e-11)
+    assert list(s.tuner_input.values[[0, 6, 12]]) == ["error_phi", "rate_error_phi", "torque_1"]
+
+
+def test_the_window_holds_what_the_density_is_taken_of(tmp_path: Path) -> None:
+    """Recorded density and `densities` of the very samples, to 1e-12."""
+    loop = build_closed_loop(scenario(tmp_path, None, "duration=4.0"))
+    window: Any = loop.GetSubsystemByName("density")
+    simulator = make_simulator(loop)
+    context = simulator.get_context()
+    simulator.Initialize()
+    samples, found = [], []
+    for k in range(41):
+        if k:
+            simulator.AdvanceTo(look_time(0.1 * k))
+        samples.append(window.window(window.GetMyContextFromRoot(context))[-1].copy())
+        found.append(loop.GetOutputPort("density").Eval(context))
+        np.testing.assert_array_equal(
+            samples[-1][12:], loop.GetOutputPort("torque_commanded").Eval(context)
+        )
+        state = loop.GetOutputPort("state").Eval(context)
+        reference = loop.GetOutputPort("reference").Eval(context)
+        np.testing.assert_allclose(samples[-1][:12], state - reference[:12], atol=1e-12)
+    np.testing.assert_allclose(found, densities(samples), rtol=1e-12)
+
+
+def subsystems(loop: ClosedLoop) -> set[str]:
+    return {system.get_name() for system in loop.GetSystems()}
+
+
+def test_fixed_weights_stay_and_a_network_takes_their_place(tmp_path: Path) -> None:
+    fixed = scenario(tmp_path, None, "duration=1.0", "controller.w_R=3")
+    result = sd.simulate(fixed)
+    np.testing.assert_array_equal(result.signals.weights.values, np.tile([1.0, 3.0], (51, 1)))
+    assert result.summary["counts"]["tuner_fallbacks"] == 0
+    with_network = build_closed_loop(scenario(tmp_path, small_network()))
+    assert subsystems(build_closed_loop(fixed)) ^ subsystems(with_network) == {"weights", "tuner"}
+    tuner = with_network.GetSubsystemByName("tuner")
+    sources = {
+        target.get_name(): source.get_name()
+        for (target, _), (source, _) in with_network.connection_map().items()
+        if "tuner" in (target.get_name(), source.get_name())
+    }
+    assert sources == {"controller": "tuner", "tuner": "density"}
+    assert not with_network.HasAnyDirectFeedthrough()
+    assert tuner.HasAnyDirectFeedthrough()
+
+
+def test_a_network_that_fails_is_a_controller_with_fixed_weights(tmp_path: Path) -> None:
+    settings = ("duration=2.0", "controller.w_R=1000")  # outside the network's bounds
+    failing = sd.simulate(scenario(tmp_path, small_network(**OVERFLOWING), *settings))
+    fixed = sd.simulate(scenario(tmp_path, None, *settings))
+    assert failing.signals.identical(fixed.signals)
+    assert failing.summary["counts"]["tuner_fallbacks"] == 20  # all samples but the first
+    assert failing.accumulated_error == fixed.accumulated_error
+
+
+def test_missed_measurements_do_not_reach_the_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missed, measure = (0, 7, 8), Sensor._measure
+
+    def lose(self: Sensor, context: Context, output: BasicVector) -> None:
+        measure(self, context, output)
+        if round(context.get_time() / 0.1) in missed:
+            output.SetFromVector(np.full(12, np.nan))
+
+    monkeypatch.setattr(Sensor, "_measure", lose)
+    result = sd.simulate(scenario(tmp_path, small_network(), "duration=4.5"))
+    assert result.status == "completed"
+    counts = result.summary["counts"]
+    assert counts["bad_measurements"] == 3 and counts["tuner_fallbacks"] == 0
+    s = at_samples(result)
+    assert np.all(np.isfinite(s.weights.values)) and np.all(np.isfinite(s.density.values))
+    np.testing.assert_array_equal(s.density.values[list(missed), :12], 1.0)
+    rate_error = s.rates.values - s.reference_rates.values
+    samples = np.hstack([s.error.values, rate_error, s.torque_commanded.values])
+    samples[list(missed), :12] = np.nan
+    np.testing.assert_allclose(s.density.values, densities(samples), rtol=1e-6)
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
+    noise = f"sensor.noise_std=[{', '.join(['1e-4'] * 12)}]"
+    saved = []
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        settings = ("duration=2.0", noise, f"sensor.seed={seed}")
+        sd.simulate(scenario(tmp_path, small_network(), *settings)).save(tmp_path / name)
+        saved.append((tmp_path / name / "signals.nc").read_bytes())
+    assert saved[0] == saved[1] != saved[2]
+
+
+def test_a_loop_can_be_run_twice(tmp_path: Path) -> None:
+    """State lives in the Context, not in the systems."""
+    loop = build_closed_loop(scenario(tmp_path, small_network()))
+    ends = []
+    for _ in range(2):
+        simulator = make_simulator(loop)
+        simulator.AdvanceTo(0.75)
+        ends.append(loop.GetOutputPort("weights_used").Eval(simulator.get_context()))
+    np.testing.assert_array_equal(ends[0], ends[1])
+    assert np.any(ends[0] != 1.0)
+
+
+@pytest.mark.parametrize("weights", ["no_such_network", "./none.json"])
+def test_a_network_that_is_not_there_is_refused(weights: str) -> None:
+    settings = ["tuner.kind=ann", f"tuner.weights={weights}"]
+    with pytest.raises(sd.ConfigError, match=r"^tuner\.weights: "):
+        sd.simulate(sd.load_scenario("paper", settings=settings))
+
+
+def test_systems_are_leaf_systems_without_continuous_state() -> None:
+    for system in (DensityWindow(0.1), AnnTuner(small_network(), FIXED, 0.1)):
+        assert isinstance(system, LeafSystem)
+        assert system.CreateDefaultContext().num_continuous_states() == 0

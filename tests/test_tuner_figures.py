@@ -1,0 +1,216 @@
+"""Figures of the tuner: that they show the real network, the real loop, the weights as set."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
+
+import stewart_drake as sd
+from stewart_drake import resources
+from stewart_drake.plant.workspace import Failure
+from stewart_drake.report.figures import comparison_figures, run_figures
+from stewart_drake.report.loop_figure import loop_figure
+from stewart_drake.report.tables import shipped_table
+from stewart_drake.report.tuner_figures import network_figure, weights_figure
+from stewart_drake.tuner.network import save_network
+from tests.test_network import small_network
+
+
+def tuned_scenario(folder: Path, *settings: str) -> sd.Scenario:
+    path = folder / "network.json"
+    save_network(small_network(), path)
+    tuner = ("tuner.kind=ann", f"tuner.weights={path}")
+    return sd.load_scenario("paper", settings=["plant.kind=exact", *tuner, *settings])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> sd.SimulationResult:
+    return sd.simulate(tuned_scenario(tmp_path_factory.mktemp("run"), "duration=2.0"))
+
+
+def visible_texts(ax: Axes) -> list[Text]:
+    return [text for text in ax.texts if text.get_text().strip()]
+
+
+def overlaps(figure: Figure, texts: list[Text]) -> list[tuple[str, str]]:
+    """Pairs of texts that cover each other."""
+    figure.canvas.draw()
+    boxes: list[tuple[str, Bbox]] = [(t.get_text(), t.get_window_extent()) for t in texts]
+    return [
+        (one, other)
+        for k, (one, a) in enumerate(boxes)
+        for other, b in boxes[k + 1 :]
+        if a.overlaps(b)
+    ]
+
+
+# ------------------------------------------------------------------ the loop
+
+
+@pytest.mark.parametrize("kind", ["exact", "multibody"])
+@pytest.mark.parametrize("tuner", ["fixed", "ann"])
+def test_the_loop_is_drawn_as_it_is_built(tmp_path: Path, kind: str, tuner: str) -> None:
+    settings = [f"plant.kind={kind}", "actuator.torque_limit=2"]
+    scenario = sd.load_scenario("paper", settings=settings)
+    if tuner == "ann":
+        scenario = tuned_scenario(tmp_path, *settings)
+    loop = sd.build_closed_loop(scenario)
+    figure = loop_figure(loop)
+    (ax,) = figure.axes
+    assert {patch.get_gid() for patch in ax.patches if patch.get_gid()} == {
+        system.get_name() for system in loop.GetSystems()
+    }
+    connections = {
+        f"{source.get_name()}-{target.get_name()}": str(source.get_output_port(i).size())
+        for (target, _), (source, i) in loop.connection_map().items()
+    }
+    drawn = [line.get_gid() for line in ax.lines if line.get_gid()]
+    assert sorted(drawn) == sorted(connections)
+    sizes = [text.get_text().split("\n")[1] for text in ax.texts if "\n" in text.get_text()]
+    assert sorted(sizes) == sorted(connections.values())
+    assert not overlaps(figure, visible_texts(ax))
+
+
+def test_every_line_of_the_loop_ends_at_the_edge_of_its_blocks(tmp_path: Path) -> None:
+    (ax,) = loop_figure(sd.build_closed_loop(tuned_scenario(tmp_path))).axes
+    blocks = {patch.get_gid(): patch for patch in ax.patches if patch.get_gid()}
+    for line in ax.lines:
+        if not line.get_gid():
+            continue
+        x, y = np.array(line.get_xdata(), float), np.array(line.get_ydata(), float)
+        assert np.all((np.diff(x) == 0) | (np.diff(y) == 0)), "not along the axes"
+        for name, k in zip(line.get_gid().split("-"), (0, -1), strict=True):
+            b: Any = blocks[name]
+            left, low, right, high = b.get_x(), b.get_y(), b.get_x() + b.get_width(), 0.0
+            high = low + b.get_height()
+            on_side = min(abs(x[k] - left), abs(x[k] - right)) < 1e-9 and low <= y[k] <= high
+            on_edge = min(abs(y[k] - low), abs(y[k] - high)) < 1e-9 and left <= x[k] <= right
+            assert on_side or on_edge, f"{line.get_gid()} misses {name}"
+
+
+def test_a_block_without_a_place_is_named() -> None:
+    from pydrake.systems.framework import DiagramBuilder
+    from pydrake.systems.primitives import Integrator
+
+    builder = DiagramBuilder()
+    builder.AddNamedSystem("surprise", Integrator(1))
+    with pytest.raises(ValueError, match="block 'surprise'"):
+        loop_figure(builder.Build())
+
+
+# ------------------------------------------------------------------ the network
+
+
+@pytest.mark.parametrize("hidden", [1, 10, 25])
+def test_the_network_is_drawn_link_by_link(hidden: int) -> None:
+    network = small_network(hidden)
+    figure = network_figure(network)
+    (ax,) = figure.axes
+    links = [
+        line for line in ax.lines if len(line.get_xdata()) == 2 and line.get_marker() == "None"
+    ]
+    weights = np.concatenate([network.W1.ravel(), network.W2.ravel()])
+    assert len(links) == len(weights)
+    shares = np.concatenate(
+        [(np.abs(W) / np.abs(W).max()).ravel() for W in (network.W1, network.W2)]
+    )
+    widths = np.array([line.get_linewidth() for line in links])
+    np.testing.assert_allclose(widths, 0.2 + 2.2 * shares)
+    dashed = np.array([line.get_linestyle() != "-" for line in links])
+    np.testing.assert_array_equal(dashed, weights < 0)
+    neurons = [len(line.get_xdata()) for line in ax.lines if line.get_marker() == "o"]
+    assert neurons == [18, hidden, 2]
+    assert not overlaps(figure, visible_texts(ax))
+    for text in visible_texts(ax):
+        box = text.get_window_extent()
+        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= box.y0
+
+
+def test_the_network_says_what_it_is() -> None:
+    for output, name in (("weights", "w_Q"), ("log_weights", "ln w_Q")):
+        (ax,) = network_figure(small_network(output=output, density="signed")).axes
+        texts = {text.get_text() for text in ax.texts}
+        assert name in texts and "ρ of torque 6" in texts
+        assert any("signed" in text for text in texts)
+
+
+def test_a_shipped_network_is_listed_with_what_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resources, "data_root", lambda: tmp_path)
+    (tmp_path / "models" / "weights").mkdir(parents=True)
+    save_network(small_network(7, density="signed"), tmp_path / "models" / "weights" / "mine.json")
+    lines = shipped_table("weights").splitlines()
+    assert lines[0].startswith("  mine  A network of 18 densities (signed), 7 hidden neurons")
+    assert "from 0.1 to 4" in " ".join(map(str.strip, lines)) and max(map(len, lines)) <= 80
+
+
+# ------------------------------------------------------------------ the weights
+
+
+def test_weights_and_their_ratio_are_those_of_the_run(run: sd.SimulationResult) -> None:
+    figure = weights_figure({"one": run, "two": run})
+    above, other, below, _ = figure.axes
+    weights = run.signals.weights.values
+    for line, column in zip(above.lines, weights.T, strict=True):
+        np.testing.assert_array_equal(line.get_ydata(), column)
+        assert line.get_drawstyle() == "steps-post"
+    assert to_rgb(above.lines[0].get_color()) != to_rgb(above.lines[1].get_color())
+    assert above.lines[0].get_linestyle() != above.lines[1].get_linestyle()
+    np.testing.assert_array_equal(below.lines[0].get_ydata(), weights[:, 0] / weights[:, 1])
+    assert [ax.get_title() for ax in (above, other)] == ["one", "two"]
+    assert above.get_ylim() == other.get_ylim()
+    figure.canvas.draw()
+    assert figure.legends[0].get_window_extent().y0 >= above.title.get_window_extent().y1
+
+
+def test_a_run_that_ended_early_has_a_cross_and_a_short_axis(run: sd.SimulationResult) -> None:
+    early = dataclasses.replace(
+        run,
+        status="left_workspace",
+        stopped=Failure(0.5, 2, 0.0, "leg 2 reached the end of its reach"),
+        signals=run.signals.isel(time=slice(0, 25)),
+    )
+    figure = weights_figure({"one": run, "two": early})
+    crosses = [line for ax in figure.axes for line in ax.lines if line.get_marker() == "x"]
+    assert [line.get_xdata()[0] for line in crosses] == [0.5, 0.5]
+    assert [ax.get_xlim()[1] for ax in figure.axes[:2]] == [2.0, pytest.approx(0.55)]
+    assert "run ended" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_a_run_stopped_before_its_first_sample_can_be_drawn(run: sd.SimulationResult) -> None:
+    nothing = dataclasses.replace(
+        run,
+        status="interrupted",
+        stopped=Failure(0.0, None, np.nan, "interrupted"),
+        signals=run.signals.isel(time=slice(0, 0)),
+    )
+    weights_figure({"nothing": nothing}).draw_without_rendering()
+
+
+def test_weights_are_shown_where_a_network_set_them(
+    run: sd.SimulationResult, tmp_path: Path
+) -> None:
+    before = dict(plt.rcParams)
+    weights_figure({"one": run})
+    network_figure(small_network())
+    assert dict(plt.rcParams) == before, "the user's settings were changed"
+    assert not plt.get_fignums(), "a window could open"
+    assert "weights.png" in [path.name for path in run_figures(run, tmp_path)]
+    fixed = dataclasses.replace(run, scenario=sd.load_scenario("paper"))
+    for results, shown in (
+        ({"lqr": run, "delay_lqi": run}, True),
+        ({"lqr": run}, False),
+        ({"delay_lqi": fixed}, False),
+    ):
+        names = [path.name for path in comparison_figures(results, tmp_path)]
+        assert ("weights.png" in names) is shown

@@ -1,0 +1,361 @@
+"""Workspace studies against closed forms, the kinematic Jacobian, energy, and `prepare` itself."""
+
+import dataclasses
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from stewart_drake.cli import main
+from stewart_drake.config import ReferenceConfig, Scenario
+from stewart_drake.errors import ConfigError
+from stewart_drake.experiment import assemble, prepare
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.plant.equations import DEAD_CENTRE_SINE
+from stewart_drake.plant.workspace import SINGULARITY_LIMIT, home_sign, standing
+from stewart_drake.resources import shipped
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.studies.reach import (
+    LARGEST_FACTOR,
+    first_exit,
+    instants,
+    largest_factor,
+    margins_along,
+)
+from stewart_drake.studies.singularity import characteristic_length, measure, wrenches
+from stewart_drake.studies.sizing import size_motors
+from stewart_drake.studies.workspace import study_workspace
+from stewart_drake.studies.workspace_map import last_inside, sections, travel
+from stewart_drake.trajectories import make_reference
+from tests.mechanisms import PAPER, random_mechanism, random_pose
+from tests.singular import parallel_rods, stretched, write_mechanism
+
+Array = NDArray[np.float64]
+seeds = st.integers(0, 2**32 - 1)
+seeded = settings(max_examples=30, deadline=None, derandomize=True)
+
+
+def heave(amplitude: float, frequency: float = 1.0, pose: Array = PAPER.home) -> Scenario:
+    """The paper's scenario, but up and down only."""
+    sine = ReferenceConfig(
+        amplitude=[0.0] * 5 + [amplitude], offset=list(map(float, pose)), frequency=frequency
+    )
+    return dataclasses.replace(load_scenario("paper"), reference=sine)
+
+
+# ------------------------------------------------------------------ measures of a pose
+
+
+@given(seed=seeds)
+@seeded
+def test_condition_and_play_are_those_of_the_jacobian_in_twists(seed: int) -> None:
+    """A = J diag(E^-1 / rho, 1), and J is checked against finite differences elsewhere."""
+    rng = np.random.default_rng(seed)
+    mechanism = random_mechanism(rng)
+    pose = random_pose(rng, mechanism)
+    found = measure(mechanism, pose)
+    if found.margin <= 0:  # a random pose may lie beyond a parallel singularity
+        return
+    to_rates = np.eye(6)
+    to_rates[:3, :3] = np.linalg.inv(angle_rate_map(pose[:3])) / characteristic_length(mechanism)
+    values = np.linalg.svd(mechanism.jacobian(pose) @ to_rates, compute_uv=False)
+    np.testing.assert_allclose(found.condition, values[0] / values[-1], rtol=1e-8)
+    np.testing.assert_allclose(found.play, 1 / values[-1], rtol=1e-8)
+
+
+@given(seed=seeds, turn=st.floats(-3, 3), size=st.floats(0.1, 10))
+@seeded
+def test_condition_depends_neither_on_size_nor_on_the_frame(
+    seed: int, turn: float, size: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    mechanism = random_mechanism(rng)
+    R = rotation(np.array([0.0, 0.0, turn]))
+    scale = np.repeat([1.0, size], 3)
+
+    def moved(pose: Array) -> Array:
+        """Yaw comes last in R = Rz Ry Rx, so that turning the world adds to it."""
+        return scale * np.concatenate([pose[:3] + [0, 0, turn], R @ pose[3:]])
+
+    other = dataclasses.replace(
+        mechanism,
+        home=moved(mechanism.home),
+        p_WS=size * mechanism.p_WS @ R.T,
+        R_WS=R @ mechanism.R_WS,
+        p_PQ=size * mechanism.p_PQ,
+        crank_lengths=size * mechanism.crank_lengths,
+        rod_lengths=size * mechanism.rod_lengths,
+    )
+    pose = random_pose(rng, mechanism)
+    one, two = measure(mechanism, pose), measure(other, moved(pose))
+    np.testing.assert_allclose(two.condition, one.condition, rtol=1e-7)
+    np.testing.assert_allclose(two.parallel, one.parallel, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(two.reach, size * one.reach, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(two.play, size * one.play, rtol=1e-7)
+
+
+def test_wrenches_are_what_shortens_rods_on_locked_cranks() -> None:
+    """Virtual work: d |p_TQ| = W' [rho omega; v] dt, by central differences of the twist."""
+    pose = PAPER.home + [0.1, -0.2, 0.15, 0.01, -0.02, 0.03]
+    legs, rho = leg_geometry(PAPER, pose), characteristic_length(PAPER)
+    tips = PAPER.p_WS + PAPER.crank_lengths[:, None] * legs.crank
+
+    def lengths(twist: Array) -> Array:
+        p_PQ_W = legs.p_PQ_W + np.cross(twist[:3] / rho, legs.p_PQ_W)
+        return np.linalg.norm(pose[3:] + twist[3:] + p_PQ_W - tips, axis=1)
+
+    h = 1e-6
+    rows = [(lengths(h * e) - lengths(-h * e)) / (2 * h) for e in np.eye(6)]
+    np.testing.assert_allclose(wrenches(PAPER, legs), rows, atol=1e-9)
+
+
+def test_parallel_rods_do_not_hold_the_plate() -> None:
+    """Six parallel forces span three directions: no yaw, no shift."""
+    mechanism = parallel_rods()
+    W = wrenches(mechanism, leg_geometry(mechanism, mechanism.home))
+    np.testing.assert_allclose(np.linalg.svd(W, compute_uv=False)[3:], 0, atol=1e-12)
+    found = measure(mechanism, mechanism.home)
+    assert abs(found.parallel) < 1e-12 and found.margin < 0 and np.isnan(found.condition)
+
+
+def test_the_condition_grows_like_the_root_of_the_distance_to_a_dead_centre() -> None:
+    mechanism = stretched()
+    distances = np.array([1e-3, 1e-4])
+    values = [measure(mechanism, mechanism.home - [0, 0, 0, x, 0, 0]) for x in distances]
+    slope = np.diff(np.log([v.condition for v in values])) / np.diff(np.log(distances))
+    np.testing.assert_allclose(slope, -0.5, atol=0.03)
+    assert not measure(mechanism, mechanism.home).margin > 0
+
+
+# ------------------------------------------------------------------ around home
+
+
+@given(end=st.floats(1e-3, 2.0) | st.integers(1, 200).map(lambda k: np.nextafter(k * 0.005, 0)))
+@settings(deadline=None)
+def test_the_last_inside_is_found(end: float) -> None:
+    found = last_inside(lambda s: s <= end, 1.0)
+    np.testing.assert_allclose(found, min(end, 1.0), atol=1e-8)
+    assert found <= end
+
+
+def test_the_last_inside_is_before_the_first_gap() -> None:
+    np.testing.assert_allclose(last_inside(lambda s: not 0.3 < s < 0.4, 1.0), 0.3, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", shipped("mechanism"))
+def test_travel_ends_on_the_border(name: str) -> None:
+    mechanism = load_mechanism(name)
+    for k, t in enumerate(travel(mechanism)):
+        assert t.low < 0 < t.high
+        for end, reason in ((t.low, t.low_reason), (t.high, t.high_reason)):
+            now = standing(mechanism, mechanism.home + end * np.eye(6)[k])
+            assert 0 <= now.margin(home_sign(mechanism)) < 1e-3
+            if "end of its reach" in reason:
+                np.testing.assert_allclose(now.sines.min(), DEAD_CENTRE_SINE, atol=1e-4)
+            else:
+                assert "parallel" in reason
+                np.testing.assert_allclose(abs(now.parallel), SINGULARITY_LIMIT, rtol=1e-3)
+
+
+def test_a_machine_with_a_mirror_plane_travels_alike_to_both_sides() -> None:
+    """The desktop one, with rotation 0, is its own mirror image in the x-z plane."""
+    for t in travel(load_mechanism("desktop")):
+        if t.coordinate in ("phi", "psi", "y"):
+            np.testing.assert_allclose(-t.low, t.high, rtol=1e-6)
+
+
+def test_sections_meet_the_travel_on_their_axes() -> None:
+    mechanism = load_mechanism("desktop")
+    spans = travel(mechanism)
+    for section in sections(mechanism, points=31):
+        inside = np.isfinite(section.condition)
+        assert 0.2 < inside.mean() < 0.9
+        # The window was found on a rough grid: no more than the tip of a spike may touch its rim.
+        assert np.mean([*inside[[0, -1]].ravel(), *inside[:, [0, -1]].ravel()]) < 0.03
+        np.testing.assert_array_equal(inside, section.margin > 0)
+        row = np.abs(section.y - mechanism.home[section.second]).argmin()
+        ends = section.x[inside[row]][[0, -1]] - mechanism.home[section.first]
+        low, high = spans[section.first][1:3]
+        cell = section.x[1] - section.x[0]
+        np.testing.assert_allclose(ends, [low, high], atol=2 * cell)
+        assert np.nanmin(section.condition) >= 1
+
+
+# ------------------------------------------------------------------ along a reference
+
+
+def test_the_exit_of_a_heave_is_where_the_travel_says() -> None:
+    """A sin(t) = travel; and at worst the leg is short by what its margin says at the peak."""
+    up = travel(PAPER)[5]
+    study = study_workspace(heave(0.2))
+    assert study.exit is not None
+    np.testing.assert_allclose(study.exit.time, math.asin(up.high / 0.2), atol=1e-6)
+    assert study.exit.reason == up.high_reason and study.sizing is None
+    time, leg, margin = study.worst
+    at_peak = PAPER.reach_margins(PAPER.home + [0, 0, 0, 0, 0, 0.2])
+    np.testing.assert_allclose(margin, at_peak.min(), rtol=1e-3)
+    assert f"t = {study.exit.time:.3f} s" in study.verdict
+    assert f"leg {leg} is short by {-1e3 * margin:.3g} mm at t = {time:.2f} s" in study.verdict
+    with pytest.raises(ConfigError, match="reference: leg"):
+        prepare(heave(0.2))
+
+
+def test_the_largest_heave_is_the_shorter_travel() -> None:
+    """Hence the scaled scenario is accepted, and one a permille larger is not."""
+    t = travel(PAPER)[5]
+    study = study_workspace(heave(0.05))
+    np.testing.assert_allclose(study.factor.value, min(t.high, -t.low) / 0.05, rtol=1e-4)
+    assert study.factor.limited and study.exit is None
+    prepare(heave(0.05 * study.factor.value))
+    with pytest.raises(ConfigError, match="reach"):
+        prepare(heave(0.05 * study.factor.value * 1.001))
+
+
+@pytest.mark.parametrize("name", shipped("scenario"))
+def test_every_shipped_reference_fits_and_so_does_its_largest_scaling(name: str) -> None:
+    experiment = assemble(load_scenario(name))
+    time = instants(experiment.scenario.duration)
+    assert first_exit(experiment.mechanism, experiment.reference, time) is None
+    factor = largest_factor(experiment.mechanism, experiment.reference, time)
+    assert factor.limited and 1 < factor.value < LARGEST_FACTOR
+    poses = np.array([experiment.reference.value(t)[:, 0] for t in time])
+    sign = home_sign(experiment.mechanism)
+    for share, inside in ((1.0, True), (1.002, False)):
+        scaled = poses[0] + share * factor.value * (poses - poses[0])
+        margins = [standing(experiment.mechanism, pose).margin(sign) for pose in scaled]
+        assert (min(margins) > 0) is inside
+
+
+@pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
+def test_the_table_in_the_theory_is_what_comes_out(name: str) -> None:
+    text = (Path(__file__).parents[1] / "docs" / "theory.md").read_text(encoding="utf-8")
+    (row,) = re.findall(rf"^\| `{name}`.*\|$", text, re.MULTILINE)
+    numbers = [float(n) for n in re.findall(r"-?\d+\.?\d*", row.replace("−", "-").split("|", 2)[2])]
+    experiment = assemble(load_scenario(name))
+    mechanism, time = experiment.mechanism, instants(experiment.scenario.duration)
+    heave_range = travel(mechanism)[5]
+    worst = np.nanmax(margins_along(mechanism, experiment.reference, time).condition)
+    factor = largest_factor(mechanism, experiment.reference, time).value
+    found = [
+        1e3 * heave_range.low,
+        1e3 * heave_range.high,
+        measure(mechanism, mechanism.home).condition,
+        worst,
+        factor,
+    ]
+    np.testing.assert_allclose(numbers, found, rtol=5e-3)
+
+
+def test_factors_at_the_ends_of_what_can_be() -> None:
+    time = instants(2.0)
+    still = make_reference(ReferenceConfig(kind="hold", offset=list(PAPER.home)), 2.0)
+    assert math.isnan(largest_factor(PAPER, still, time).value)
+    outside = list(map(float, PAPER.home + [0, 0, 0, 0, 0, 0.3]))
+    gone = make_reference(ReferenceConfig(kind="hold", offset=outside), 2.0)
+    assert largest_factor(PAPER, gone, time) == (0.0, True)
+    tiny = make_reference(heave(0.001).reference, 2.0)
+    assert largest_factor(PAPER, tiny, time) == (LARGEST_FACTOR, False)
+    failure = first_exit(PAPER, gone, time)
+    assert failure is not None and failure.time == 0.0
+
+
+# ------------------------------------------------------------------ motors
+
+
+def test_motors_at_rest_hold_the_equilibrium() -> None:
+    dynamics = StewartDynamics(PAPER, gravity=True)
+    still = make_reference(ReferenceConfig(kind="hold", offset=list(PAPER.home)), 1.0)
+    sizing = size_motors(dynamics, still, instants(0.1))
+    np.testing.assert_allclose(
+        sizing.torque, dynamics.equilibrium_torque(PAPER.home)[None] + 0 * sizing.torque
+    )
+    assert not sizing.speed.any() and not sizing.power.any()
+    limited = sizing.summary(2.0)[0]
+    assert limited["use_of_limit"] == pytest.approx(limited["peak_torque"] / 2.0)
+    assert math.isnan(sizing.summary(None)[0]["use_of_limit"])
+
+
+def test_the_motors_work_is_the_machine_s_energy() -> None:
+    """Sum of powers over time = kinetic plus potential energy gained; no friction."""
+    experiment = assemble(load_scenario("motion_base"))
+    time = np.linspace(0.0, 4.7, 2001)
+    sizing = size_motors(experiment.nominal, experiment.reference, time)
+    work = np.concatenate(
+        [[0.0], np.cumsum(np.diff(time) * (sizing.power[1:] + sizing.power[:-1]).sum(axis=1) / 2)]
+    )
+    energy = []
+    for t in time[::200]:
+        rates = experiment.reference.EvalDerivative(t, 1)[:, 0]
+        energy.append(experiment.nominal.energy(experiment.reference.value(t)[:, 0], rates))
+    gained = np.array(energy) - energy[0]
+    np.testing.assert_allclose(work[::200], gained, atol=1e-4 * np.abs(gained).max())
+    assert np.abs(gained).max() > 500
+
+
+# ------------------------------------------------------------------ the command
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stewart_drake.studies.workspace_map.POINTS", 15)
+    monkeypatch.setattr("stewart_drake.studies.workspace_map._ROUGH", 15)
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_command_writes_a_table_a_page_and_a_summary(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["analyze", "workspace", "desktop", "--out", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("yes: the reference stays in the workspace")
+    assert all(len(line) <= 80 for line in lines[:-1])
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["fits"] is True and summary["exit"] is None
+    assert summary["largest_factor"] > 1 and len(summary["motors"]) == 6
+    assert [leg["leg"] for leg in summary["legs"]] == [1, 2, 3, 4, 5, 6]
+    assert summary["torque_limit"] == 0.4 and summary["scenario"]["mechanism"] == "desktop"
+    page = (tmp_path / "report.html").read_text()
+    assert "Workspace of desktop" in page and page.count("<img") == 3
+    assert "stewart-drake analyze workspace desktop" in page
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_reference_that_leaves_is_analysed_not_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    amplitude = "reference.amplitude=[0.3, 0.3, 0.3, 0.02, 0.02, 0.1]"
+    arguments = ["analyze", "workspace", "--set", amplitude, "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert out.startswith("no: the reference leaves the workspace at t = 1.061 s, leg 2 reached")
+    assert "leg 4 is short by 15.2 mm" in out and "0.872 times this one" in out
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["fits"] is False and summary["exit"]["leg"] == 2 and summary["motors"] == []
+    assert (tmp_path / "report.html").read_text().count("<img") == 2
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("machine", [parallel_rods(), stretched()], ids=["parallel", "dead centre"])
+def test_a_singular_home_pose_gets_a_verdict(
+    machine: Mechanism, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_mechanism(machine, tmp_path / "singular.yaml")
+    hold = ["--set", "reference.kind=hold", "--set", f"reference.offset={machine.home.tolist()}"]
+    chosen = ["--set", f"mechanism={path}", *hold]
+    assert main(["analyze", "workspace", "paper", *chosen, "--out", str(tmp_path / "a")]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert out.startswith("no: the home pose is singular")
+    summary = json.loads((tmp_path / "a" / "summary.json").read_text())
+    assert summary["home_failure"]["reason"] and summary["travel"] == summary["sections"] == []
+    assert main(["simulate", "paper", *chosen]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "reference:" in err
