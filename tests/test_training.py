@@ -242,8 +242,8 @@ def _no_torch(name, *rest, _import=__import__):
 # ---------------------------------------------------------------- the command
 
 
-def test_the_command_writes_network_figures_and_summary(data, tmp_path, capsys):
-    data.to_netcdf(tmp_path / "dataset.nc", engine="h5netcdf")
+def test_the_command_writes_network_figures_and_summary(tmp_path, capsys):
+    toy_data(cells=3).to_netcdf(tmp_path / "dataset.nc", engine="h5netcdf")
     out = tmp_path / "new" / "net.json"
     assert main(["tune", "train", str(tmp_path), "--out", str(out), "--split", "cell"]) == 0
     printed, err = capsys.readouterr()

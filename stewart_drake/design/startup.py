@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 PREDICTION_BUDGET = 2e-5
 """rad and m by which integrating over the delay may move the predicted pose."""
+ASTRAY = 0.3
+"""rad, and crank lengths, from the reference on which a prediction is of no use."""
 LEAST_TORQUE_SCALE = 0.01
 """N m."""
 TOLERANCE = 0.03
@@ -75,24 +77,33 @@ def choose_substeps(
     """Least number of Runge-Kutta steps per period that keeps the prediction within its budget.
 
     Along the reference, the pose predicted over the delay with n steps per period is compared with
-    that of 2 n steps; their difference is 15/16 of the error with n.
+    that of 2 n steps; their difference is 15/16 of the error with n. Torques held for long periods
+    may lead far away from the reference, where no number of steps would do: there the comparison
+    ends.
     """
     horizon = max(steps, 1)
     holds = period * np.arange(horizon)
+    crank = dynamics.mechanism.crank_lengths.min()
+    near = ASTRAY * np.repeat([1.0, crank], 3)
     cases = []
     for t in np.linspace(0.0, duration, 8, endpoint=False):
         start = evaluate(reference, t)[:12]
-        cases.append((start, mean_torques(dynamics, reference, t + holds, t + holds + period)))
+        wanted = np.array([reference.value(t + hold + period)[:, 0] for hold in holds])
+        torques = mean_torques(dynamics, reference, t + holds, t + holds + period)
+        cases.append((start, torques, wanted))
+
+    def error(substeps: int) -> float:
+        worst = 0.0
+        for start, torques, wanted in cases:
+            coarse, fine = (
+                dynamics.predict(start, torques, period, n)[:, POSE]
+                for n in (substeps, 2 * substeps)
+            )
+            useful = np.logical_and.accumulate(np.all(np.abs(fine - wanted) < near, axis=1))
+            worst = max(worst, np.abs(coarse - fine)[useful].max(initial=0.0))
+        return worst
+
     substeps = 1
-    while substeps < 64:
-        worst = max(
-            np.abs(
-                dynamics.predict(start, torques, period, substeps)[-1, POSE]
-                - dynamics.predict(start, torques, period, 2 * substeps)[-1, POSE]
-            ).max()
-            for start, torques in cases
-        )
-        if worst <= PREDICTION_BUDGET:
-            break
+    while substeps < 64 and not error(substeps) <= PREDICTION_BUDGET:
         substeps *= 2
     return substeps

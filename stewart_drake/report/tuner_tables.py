@@ -80,14 +80,14 @@ def evaluation_table(evaluation: Evaluation) -> str:
             f"{name + mark:<14}{one['failures']:>10}{number(one['mean']):>12}"
             f"{f'{number(low)} to {number(high)}':>20}{number(one['worst']):>10}"
         )
-    low, high = (100 * x for x in s["improvement_interval"])
+    low, high = (-100 * x for x in reversed(s["improvement_interval"]))
     extra = s["candidates"][TUNER]["failures"] - s["candidates"][s["best_fixed"]]["failures"]
     lines.append(
         wrap(
             f"E_ac in % s over the {s['common']} of {drawn} scenarios that all complete; * best "
-            f"fixed gain. The tuner's mean is {100 * s['improvement']:.1f} % below it (95 %: "
-            f"{low:.1f} to {high:.1f}), with {extra:+d} failures; the best gain of each scenario, "
-            f"picked in hindsight, would be {100 * s['hindsight']:.1f} % below it."
+            f"fixed gain. Against it the tuner's mean is {-100 * s['improvement']:+.1f} % (95 %: "
+            f"{low:+.1f} to {high:+.1f}), with {extra:+d} failures; that of the best gain of each "
+            f"scenario, picked in hindsight, {-100 * s['hindsight']:+.1f} %."
         )
     )
     return "\n".join(lines)
