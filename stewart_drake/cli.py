@@ -46,6 +46,10 @@ def main(arguments: list[str] | None = None) -> int:
         return _complain(_usage_message(error))
     except typer.Abort:  # Ctrl-C in a command that has nothing to keep
         return INTERRUPTED
+    except ImportError as error:  # what Drake makes of a Ctrl-C while it is loaded
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            return INTERRUPTED
+        raise
     except BrokenPipeError:  # whoever read the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

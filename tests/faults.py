@@ -1,5 +1,6 @@
 """What can go wrong: files, by faults made from the dataclass that describes them; processes."""
 
+import contextlib
 import copy
 import dataclasses
 import json
@@ -202,10 +203,12 @@ def forked(work: Callable[[], object]) -> int:
     """
     pid = os.fork()
     if pid:
+        with contextlib.suppress(OSError):  # both do it, so that it is done whoever comes first
+            os.setpgid(pid, pid)
         return pid
     status = 70
     try:
-        os.setsid()
+        os.setpgid(0, 0)
         nowhere = os.open(os.devnull, os.O_RDWR)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)

@@ -7,6 +7,10 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
+from stewart_drake.cli import main
+
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
 
 
@@ -23,11 +27,13 @@ def started(code: str, folder: Path) -> subprocess.Popen:
 
 def test_ctrl_c_ends_it_with_nothing_written(tmp_path):
     code = (
-        "import sys; from stewart_drake.cli import main;"
+        "import sys, stewart_drake.simulation; from stewart_drake.cli import main;"
+        "print('ready', file=sys.stderr, flush=True);"
         f"sys.exit(main(['report', *{SETTINGS!r}, '--out', sys.argv[1]]))"
     )
     process = started(code, tmp_path)
-    time.sleep(8.0)
+    assert process.stderr is not None and process.stderr.readline() == "ready\n"
+    time.sleep(4.0)
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130 and "Traceback" not in err
@@ -56,3 +62,17 @@ def test_kill_9_leaves_no_half_page(tmp_path):
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate(timeout=60)
         assert (tmp_path / "report.html").read_text().rstrip().endswith("</html>")
+
+
+def test_ctrl_c_while_drake_is_loaded_is_one_as_well(monkeypatch):
+    """A C++ module whose loading is interrupted says so by an ImportError."""
+    stop: BaseException | None = KeyboardInterrupt()
+
+    def loading(kind):
+        raise ImportError("initialization failed") from stop
+
+    monkeypatch.setattr("stewart_drake.report.tables.shipped_table", loading)
+    assert main(["list"]) == 130
+    stop = None
+    with pytest.raises(ImportError):
+        main(["list"])
