@@ -13,8 +13,11 @@ endif
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export MPLBACKEND := Agg
 
-# Bytecode is left to the first import: compiling all of it doubles the time of an installation.
+# Compiled on all cores, which pip does not do; and where Python is told to write no bytecode, every
+# command would otherwise compile all that it imports anew, for seconds. Some packages carry files that
+# are no Python, which is no error here.
 PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
+COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib
 
 .DEFAULT_GOAL := help
 .PHONY: demo test lint format-check types wheel newest bench soak clean help
@@ -69,9 +72,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
 	@echo "installing stewart-drake and its dependencies into $(VENV) (a few minutes the first time)"
 	@$(PIP_INSTALL) -e '.[train,dev]'
+	@$(COMPILE) >/dev/null || true
 	@touch $@
 
 $(INSTALLED_BENCH): $(INSTALLED)
 	@echo "installing what only the benchmarks need"
 	@$(PIP_INSTALL) -e '.[bench]'
+	@$(COMPILE) >/dev/null || true
 	@touch $@
