@@ -21,7 +21,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.equations import DEAD_CENTRE_SINE
-from stewart_drake.plant.workspace import SINGULARITY_LIMIT, home_sign, standing
+from stewart_drake.plant.workspace import SINGULARITY_LIMIT, margin, standing
 from stewart_drake.resources import shipped
 from stewart_drake.scenario_loading import load_scenario
 from stewart_drake.studies.reach import (
@@ -157,8 +157,9 @@ def test_travel_ends_on_the_border(name: str) -> None:
     for k, t in enumerate(travel(mechanism)):
         assert t.low < 0 < t.high
         for end, reason in ((t.low, t.low_reason), (t.high, t.high_reason)):
-            now = standing(mechanism, mechanism.home + end * np.eye(6)[k])
-            assert 0 <= now.margin(home_sign(mechanism)) < 1e-3
+            pose = mechanism.home + end * np.eye(6)[k]
+            assert 0 <= margin(mechanism, pose) < 1e-3
+            now = standing(mechanism, pose)
             if "end of its reach" in reason:
                 np.testing.assert_allclose(now.sines.min(), DEAD_CENTRE_SINE, atol=1e-4)
             else:
@@ -228,10 +229,9 @@ def test_every_shipped_reference_fits_and_so_does_its_largest_scaling(name: str)
     factor = largest_factor(experiment.mechanism, experiment.reference, time)
     assert factor.limited and 1 < factor.value < LARGEST_FACTOR
     poses = np.array([experiment.reference.value(t)[:, 0] for t in time])
-    sign = home_sign(experiment.mechanism)
     for share, inside in ((1.0, True), (1.002, False)):
         scaled = poses[0] + share * factor.value * (poses - poses[0])
-        margins = [standing(experiment.mechanism, pose).margin(sign) for pose in scaled]
+        margins = [margin(experiment.mechanism, pose) for pose in scaled]
         assert (min(margins) > 0) is inside
 
 

@@ -25,7 +25,7 @@ from stewart_drake.design.holds import (
 )
 from stewart_drake.errors import ConfigError
 from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.workspace import home_sign, standing
+from stewart_drake.plant.workspace import margin
 from stewart_drake.signals import POSE, RATES
 from stewart_drake.trajectories import Piece, catch_up, evaluate, through_states
 
@@ -154,8 +154,7 @@ def _response(
 
 def _inside(dynamics: StewartDynamics, states: Array) -> bool:
     mechanism = dynamics.mechanism
-    sign = home_sign(mechanism)
-    return all(standing(mechanism, state[POSE]).margin(sign) > 0 for state in states)
+    return all(margin(mechanism, state[POSE]) > 0 for state in states)
 
 
 def _sensitivity(

@@ -87,16 +87,19 @@ def prediction_matrix(model: DelayedModel) -> Array:
     Without a fraction this is [A^mu, A^(mu-1) B, ..., B], ordered as the queue.
     """
     n, m = model.B_new.shape
-    extra = model.queue_length - model.steps
+    extra, length = model.queue_length - model.steps, m * model.queue_length
     # Read backwards: T_{k-1} acts last, its predecessors one factor A earlier each.
-    power, both = np.eye(n), np.hstack([model.B_new, model.B_old])
-    torques = np.zeros((n, m * model.queue_length))
-    for place in reversed(range(model.steps)):
-        torques[:, m * (place + extra) : m * (place + extra + 1)] += both[:, :m]
-        torques[:, m * place : m * (place + 1)] += both[:, m:]
-        power, both = model.A @ power, model.A @ both
-    newest = np.zeros((m * extra, n + m * model.queue_length))
-    newest[:, n + m * (model.queue_length - extra) :] = np.eye(m * extra)
+    ahead, acting = np.hstack([np.eye(n), model.B_new, model.B_old]), []
+    for _ in range(model.steps):
+        acting.append(ahead[:, n:])
+        ahead = model.A @ ahead
+    power, torques = ahead[:, :n], np.zeros((n, length))
+    if acting:
+        oldest_first = np.stack(acting[::-1], axis=1)
+        torques[:, m * extra :] += oldest_first[:, :, :m].reshape(n, -1)
+        torques[:, : m * model.steps] += oldest_first[:, :, m:].reshape(n, -1)
+    newest = np.zeros((m * extra, n + length))
+    newest[:, n + length - m * extra :] = np.eye(m * extra)
     return np.vstack([np.hstack([power, torques]), newest])
 
 
@@ -131,7 +134,7 @@ def _check(A: Array, B: Array, Q: Array, R: Array) -> None:
     for name, (matrix, shape) in expected.items():
         if matrix.shape != shape:
             raise RiccatiError(f"{name}: got shape {matrix.shape}; expected {shape}")
-        if not np.all(np.isfinite(matrix)):
+        if not np.isfinite(matrix).all():
             raise RiccatiError(f"{name}: has entries that are not finite")
     for name, matrix in (("Q", Q), ("R", R)):
         if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():

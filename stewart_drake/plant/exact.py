@@ -16,7 +16,7 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 
 from stewart_drake.lifetime import weak
 from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.workspace import home_sign, standing
+from stewart_drake.plant.workspace import margin
 from stewart_drake.signals import NUM_STATE, NUM_TORQUES, POSE, RATES
 
 Array = NDArray[np.float64]
@@ -30,7 +30,7 @@ def ExactPlant_(T):
         """A mechanism's plate under motor torques, loops closed exactly.
 
         Dynamics:  d[pose; rates]/dt = [rates; accelerations(pose, rates, torque)].
-        Witness:   the least of the margins of `plant.workspace.standing`; the simulation ends
+        Witness:   the least of the margins of `plant.workspace.margin`; the simulation ends
                    where it passes zero: a leg at a dead centre, a parallel singularity, a pitch
                    of 85 degrees.
 
@@ -55,7 +55,6 @@ def ExactPlant_(T):
         ) -> None:
             super().__init__(converter=converter)
             self.dynamics = dynamics
-            self._home_sign = home_sign(dynamics.mechanism)
             self._initial = np.concatenate([dynamics.mechanism.home, np.zeros(6)])
             if initial_state is not None:
                 self._initial[:] = initial_state
@@ -94,9 +93,9 @@ def ExactPlant_(T):
             context.SetContinuousState(state)
 
         def margin(self, context) -> float:
-            """Positive inside the permitted region, see `plant.workspace.Standing.margin`."""
+            """Positive inside the permitted region, see `plant.workspace.margin`."""
             pose = context.get_continuous_state_vector().CopyToVector()[POSE]
-            return standing(self.dynamics.mechanism, pose).margin(self._home_sign)
+            return margin(self.dynamics.mechanism, pose)
 
         def DoGetWitnessFunctions(self, context):
             return [self._witness] if T is float else []

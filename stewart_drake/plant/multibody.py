@@ -25,7 +25,7 @@ from stewart_drake.mechanism.assembly import joint_state
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map
 from stewart_drake.mechanism.sdformat import to_sdformat
-from stewart_drake.plant.workspace import home_sign, standing
+from stewart_drake.plant.workspace import margin
 from stewart_drake.signals import (
     ANGLES,
     LEGS,
@@ -108,7 +108,6 @@ class PlateState(LeafSystem):
     def __init__(self, plant: MultibodyPlant, mechanism: Mechanism) -> None:
         super().__init__()
         self._mechanism = mechanism
-        self._home_sign = home_sign(mechanism)
         self._home_angles = mechanism.crank_angles(mechanism.home)
         floating = plant.GetJointByName("plate")
         motors = [plant.GetJointByName(f"motor_{leg}") for leg in LEGS]
@@ -132,7 +131,7 @@ class PlateState(LeafSystem):
 
     def _watch(self, context: Context) -> EventStatus:
         tree = np.asarray(self._tree.Eval(context))
-        now = standing(self._mechanism, tree[self._pose], self._home_angles + tree[self._cranks])
-        if now.margin(self._home_sign) > 0:
+        angles = self._home_angles + tree[self._cranks]
+        if margin(self._mechanism, tree[self._pose], angles) > 0:
             return EventStatus.DidNothing()
         return EventStatus.ReachedTermination(self, "the plate left its workspace")

@@ -1,6 +1,8 @@
 """Where a mechanism may be: off dead centres and parallel singularities, angles distinct."""
 
+from collections.abc import Sequence
 from functools import lru_cache
+from itertools import combinations
 from typing import NamedTuple
 
 import casadi as ca
@@ -45,14 +47,6 @@ class Standing(NamedTuple):
     parallel: float
     pitch: float
 
-    def margin(self, home_sign: float) -> float:
-        """Positive inside the permitted region, zero on its boundary, dimensionless."""
-        return min(
-            float(self.sines.min()) - DEAD_CENTRE_SINE,
-            home_sign * self.parallel - SINGULARITY_LIMIT,
-            float(PITCH_LIMIT - abs(self.pitch)),
-        )
-
 
 def standing(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> Standing:
     """Where a pose (6,) is in the workspace; defined everywhere, also out of reach.
@@ -60,19 +54,30 @@ def standing(mechanism: Mechanism, pose: Array, crank_angles: Array | None = Non
     With the crank angles (6,) of a simulated tree given, a crank that has passed its dead centre
     shows as a negative sine; from the pose alone it cannot be seen.
     """
+    measures = _measures(mechanism, pose, crank_angles)
+    return Standing(measures[:NUM_LEGS], float(measures[NUM_LEGS]), float(pose[1]))
+
+
+def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> float:
+    """Positive where `standing` is permitted, zero on the boundary, dimensionless; NaN for NaN."""
+    measures = _measures(mechanism, pose, crank_angles)
+    measures[NUM_LEGS] *= home_sign(mechanism)
+    return float((measures - _LEAST).min())
+
+
+_LEAST = np.array([DEAD_CENTRE_SINE] * NUM_LEGS + [SINGULARITY_LIMIT, -PITCH_LIMIT])
+
+
+def _measures(mechanism: Mechanism, pose: Array, crank_angles: Array | None) -> Array:
+    """(8,): the six sines, the parallel measure, minus the pitch's amount in rad."""
     functions = _functions(mechanism)
     if crank_angles is None:
-        sines, wrenches = functions.of_pose(pose)
-    else:
-        sines, wrenches = functions.of_tree(pose, crank_angles)
-    # A state that is not finite has no standing: NaN.
-    with np.errstate(over="ignore", invalid="ignore"):
-        parallel = float(np.linalg.det(wrenches))
-    return Standing(sines, parallel, float(pose[1]))
+        return functions.of_pose(pose)[0]
+    return functions.of_tree(pose, crank_angles)[0]
 
 
 class _Functions(NamedTuple):
-    """Sines (6,) and wrenches (6, 6), from a pose or from a pose and crank angles."""
+    """The measures, from a pose or from a pose and crank angles."""
 
     of_pose: Compiled
     of_tree: Compiled
@@ -83,9 +88,9 @@ def _functions(mechanism: Mechanism) -> _Functions:
     """Compiled, because every integration step asks; one thread at a time, see `Compiled`."""
     pose, angles = ca.SX.sym("pose", 6), ca.SX.sym("angles", 6)
     R_WP = equations.rotation(pose[:3])
-    # Forces along the rods, and their moments over the plate's mean radius, as unit-free columns.
+    # Forces along the rods, and their moments over the plate's mean radius, are free of units.
     radius = float(np.linalg.norm(mechanism.p_PQ, axis=1).mean())
-    results: dict[str, list[tuple[ca.SX, ca.SX]]] = {"pose": [], "tree": []}
+    legs: dict[str, list[tuple[ca.SX, ca.SX, ca.SX]]] = {"pose": [], "tree": []}
     for leg in range(NUM_LEGS):
         u, length = float(mechanism.crank_lengths[leg]), float(mechanism.rod_lengths[leg])
         branch, R_WS = float(mechanism.branches[leg]), ca.DM(mechanism.R_WS[leg])
@@ -101,13 +106,32 @@ def _functions(mechanism: Mechanism) -> _Functions:
         ):
             rod = (q - u * ca.vertcat(ca.cos(alpha), ca.sin(alpha), 0)) / length
             e = ca.mtimes(R_WS, rod)
-            results[kind].append((sine, ca.vertcat(ca.cross(b, e) / radius, e)))
+            legs[kind].append((sine, ca.cross(b, e) / radius, e))
     functions = []
     for kind, arguments in (("pose", [pose]), ("tree", [pose, angles])):
-        sines, wrenches = zip(*results[kind], strict=True)
-        outputs = [ca.vertcat(*sines), ca.densify(ca.horzcat(*wrenches))]
-        functions.append(Compiled(ca.Function(kind, arguments, outputs, {"cse": True})))
+        sines, moments, forces = zip(*legs[kind], strict=True)
+        measures = ca.vertcat(*sines, _determinant(moments, forces), -ca.fabs(pose[1]))
+        functions.append(Compiled(ca.Function(kind, arguments, [measures], {"cse": True})))
     return _Functions(*functions)
+
+
+def _determinant(above: Sequence[ca.SX], below: Sequence[ca.SX]) -> ca.SX:
+    """Of the 6 x 6 matrix of columns [above; below], each of three, by Laplace's expansion.
+
+    Sum over the choices S of three columns of sgn(S) det(above_S) det(below_rest): no division, so
+    it passes zero smoothly.
+    """
+
+    def triple(columns: Sequence[ca.SX], chosen: Sequence[int]) -> ca.SX:
+        a, b, c = (columns[i] for i in chosen)
+        return ca.dot(a, ca.cross(b, c))
+
+    total = ca.SX(0)
+    for chosen in combinations(range(NUM_LEGS), 3):
+        rest = [i for i in range(NUM_LEGS) if i not in chosen]
+        sign = (-1) ** (sum(chosen) - 3)  # of the permutation (chosen, rest)
+        total += sign * triple(above, chosen) * triple(below, rest)
+    return total
 
 
 @lru_cache(maxsize=64)
@@ -122,13 +146,13 @@ def diagnose(
     """The failure at a pose that has left the permitted region, or None inside it."""
     if not np.all(np.isfinite(pose)):
         return Failure(time, None, np.nan, "the simulated state is not finite")
-    now, sign = standing(mechanism, pose, crank_angles), home_sign(mechanism)
-    if now.margin(sign) > 0:
+    if margin(mechanism, pose, crank_angles) > 0:
         return None
+    now, sign = standing(mechanism, pose, crank_angles), home_sign(mechanism)
     leg = int(now.sines.argmin())
     if now.sines[leg] <= DEAD_CENTRE_SINE:
-        margin = float(mechanism.reach_margins(pose)[leg])
-        return Failure(time, LEGS[leg], margin, f"leg {LEGS[leg]} reached the end of its reach")
+        reach = float(mechanism.reach_margins(pose)[leg])
+        return Failure(time, LEGS[leg], reach, f"leg {LEGS[leg]} reached the end of its reach")
     if abs(now.pitch) >= PITCH_LIMIT:
         return Failure(time, None, PITCH_LIMIT - abs(now.pitch), "the pitch passed 85 degrees")
     return Failure(

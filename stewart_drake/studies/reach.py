@@ -8,7 +8,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.experiment import REACH_CHECK_PERIOD
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.plant.workspace import Failure, diagnose, home_sign, standing
+from stewart_drake.plant.workspace import Failure, diagnose, margin
 from stewart_drake.studies.singularity import measure
 
 Array = NDArray[np.float64]
@@ -98,10 +98,10 @@ def largest_factor(mechanism: Mechanism, reference: Trajectory, time: Array) -> 
     steps of `FACTOR_STEP` and bisection; a gap narrower than a step can go unseen.
     """
     poses = np.array([reference.value(t)[:, 0] for t in time])
-    change, sign = poses - poses[0], home_sign(mechanism)
+    change = poses - poses[0]
 
     def fits(factor: float) -> bool:
-        return all(standing(mechanism, poses[0] + factor * row).margin(sign) > 0 for row in change)
+        return all(margin(mechanism, poses[0] + factor * row) > 0 for row in change)
 
     if not fits(0.0):
         return Factor(0.0, True)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import LegGeometry, leg_geometry
-from stewart_drake.plant.workspace import home_sign, standing
+from stewart_drake.plant.workspace import home_sign, margin, standing
 
 Array = NDArray[np.float64]
 
@@ -53,9 +53,9 @@ def measure(mechanism: Mechanism, pose: Array) -> Measures:
     """All measures of a pose (6,), which may be out of reach."""
     pose = np.asarray(pose, dtype=np.float64)
     now, sign = standing(mechanism, pose), home_sign(mechanism)
-    margin = now.margin(sign)
+    inside = margin(mechanism, pose)
     rest = (np.full(6, np.nan), np.nan, np.nan, np.nan)
-    if margin > 0:
+    if inside > 0:
         legs = leg_geometry(mechanism, pose)
         W = wrenches(mechanism, legs)
         A = W.T / (mechanism.crank_lengths * legs.transmission)[:, None]
@@ -63,7 +63,7 @@ def measure(mechanism: Mechanism, pose: Array) -> Measures:
         held = float(np.linalg.svd(W, compute_uv=False)[-1])
         rest = (np.abs(legs.transmission), held, values[0] / values[-1], 1 / values[-1])
     return Measures(
-        mechanism.reach_margins(pose), now.sines, (sign or 1.0) * now.parallel, margin, *rest
+        mechanism.reach_margins(pose), now.sines, (sign or 1.0) * now.parallel, inside, *rest
     )
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.plant.workspace import diagnose, home_sign, standing
+from stewart_drake.plant.workspace import diagnose, margin
 from stewart_drake.signals import COORDINATES, NUM_COORDINATES
 from stewart_drake.studies.singularity import measure
 
@@ -93,14 +93,10 @@ def sections(mechanism: Mechanism, points: int = POINTS) -> list[Section]:
     return [_section(mechanism, pair, spans, points) for pair in SECTIONS if spans]
 
 
-def _margin(mechanism: Mechanism, pose: Array) -> float:
-    return standing(mechanism, pose).margin(home_sign(mechanism))
-
-
 def _end(mechanism: Mechanism, direction: Array, limit: float) -> tuple[float, str]:
     """How far it goes from home in a direction, and what is there."""
     home = mechanism.home
-    end = last_inside(lambda s: _margin(mechanism, home + s * direction) > 0, limit)
+    end = last_inside(lambda s: margin(mechanism, home + s * direction) > 0, limit)
     failure = diagnose(mechanism, 0.0, home + (end + 1e-6 * limit) * direction)
     return end, "" if end == limit or failure is None else failure.reason
 
@@ -115,14 +111,14 @@ def _section(
     # Twice: over a window that is surely too large, then over what the workspace fills of it.
     for number in (_ROUGH, points):
         x, y = np.linspace(*x_range, number), np.linspace(*y_range, number)
-        margin = np.array([[_margin(mechanism, _at(mechanism, pair, a, b)) for a in x] for b in y])
-        connected = _connected(margin > 0, np.hypot(*np.meshgrid(x - home[0], y - home[1])))
+        inside = np.array([[margin(mechanism, _at(mechanism, pair, a, b)) for a in x] for b in y])
+        connected = _connected(inside > 0, np.hypot(*np.meshgrid(x - home[0], y - home[1])))
         x_range, y_range = _window(x, connected), _window(y, connected.T)
     condition = np.full(connected.shape, np.nan)
     for j, i in zip(*np.nonzero(connected), strict=True):
         pose = _at(mechanism, pair, float(x[i]), float(y[j]))
         condition[j, i] = measure(mechanism, pose).condition
-    return Section(*pair, x, y, condition, np.where(connected, margin, -np.abs(margin)))
+    return Section(*pair, x, y, condition, np.where(connected, inside, -np.abs(inside)))
 
 
 def _connected(inside: NDArray[np.bool_], distance: Array) -> NDArray[np.bool_]:
