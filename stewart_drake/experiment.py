@@ -9,7 +9,7 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.config import Scenario
 from stewart_drake.design.catch_up import plan_catch_up
 from stewart_drake.design.control_law import DelayLqi
-from stewart_drake.design.estimator import filter_settings
+from stewart_drake.design.filter_settings import filter_settings
 from stewart_drake.design.law_types import LawOptions
 from stewart_drake.design.startup import (
     choose_substeps,
@@ -178,6 +178,7 @@ def control_law(experiment: Experiment) -> tuple[DelayLqi, Trajectory, float]:
             experiment.mechanism.plate.mass,
             torque_scale,
             sc.actuator.torque_limit,
+            c.period,
         )
         if c.estimator == "parameters"
         else None,

@@ -108,6 +108,22 @@ def test_an_unknown_plant_is_found(unknown: tuple[str, ...], bound: float) -> No
         np.testing.assert_allclose(found, truth, rtol=0.01)
 
 
+@pytest.mark.parametrize("late", [-1.5e-3, -1e-3, 1e-3, 1.5e-3])
+def test_a_delay_a_little_off_is_survived_from_rest(late: float) -> None:
+    """The catch-up's large torques come at other times than the estimator believes (in s)."""
+    periods = 8 + late / 0.1
+    steps = int(periods)
+    result = run(
+        EXACT,
+        f"delay.steps={steps}",
+        f"delay.fraction={periods - steps}",
+        "controller.delay_steps=8",
+        "controller.delay_fraction=0.0",
+    )
+    assert result.accumulated_error < 24
+    assert np.abs(result.signals.parameters.values[-1]).max() < 1e-2
+
+
 def test_full_amplitude_under_gravity_on_the_exact_plant() -> None:
     scenario = sd.load_scenario("gravity", settings=(EXACT, "duration=3.0"))
     assert sd.simulate(scenario).accumulated_error <= 0.05

@@ -12,7 +12,8 @@ from scipy.optimize import least_squares, lsq_linear
 from scipy.stats import chi2
 
 from stewart_drake.design import estimator
-from stewart_drake.design.estimator import PATIENCE, Estimate, FilterSettings, advance, start
+from stewart_drake.design.estimator import PATIENCE, Estimate, Period, advance, start
+from stewart_drake.design.filter_settings import FilterSettings, filter_settings
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.signals import BIAS, DAMPING, PAYLOAD
 from tests.mechanisms import PAPER
@@ -30,6 +31,7 @@ ASSUMED = FilterSettings(
     lower=np.array([-10.0] * 6 + [0.0, 0.0]),
     upper=np.array([10.0] * 6 + [40.0, 10.0]),
     model_std=np.full(12, 1e-9),
+    timing_std=0.0,
 )
 PLANT = StewartDynamics(PAPER, gravity=False)
 
@@ -44,6 +46,11 @@ class Run(NamedTuple):
     inputs: list[tuple[Array, Array]]
     """Torques and durations of every period."""
     estimates: list[Estimate]
+
+
+def acted(torques: Array, durations: Array, substeps: int = SUBSTEPS) -> Period:
+    """A period whose last torque goes on."""
+    return Period(torques, durations, torques[-1], substeps)
 
 
 def motion(t: float, size: float = 0.6) -> tuple[Array, Array, Array]:
@@ -76,7 +83,7 @@ def run(
             durations = PERIOD * np.array([fraction, 1 - fraction])
         x = PLANT.predict(x, torques, durations, SUBSTEPS, truth)[-1]
         y = x + assumed.noise_std * rng.standard_normal(12)
-        estimates.append(advance(estimates[-1], PLANT, torques, durations, SUBSTEPS, y, assumed))
+        estimates.append(advance(estimates[-1], PLANT, acted(torques, durations), y, assumed))
         states.append(x)
         measurements.append(y)
         inputs.append((torques, durations))
@@ -120,7 +127,7 @@ def test_transition_equals_central_differences(t: float, gravity: bool) -> None:
 
     def error(period: float) -> float:
         durations = period * np.array([0.3, 0.7])
-        after, F = estimator._transition(dynamics, point, torques, durations, 4)
+        after, F = estimator._transition(dynamics, point, acted(torques, durations, 4))
         expected = central_difference(
             lambda p: dynamics.predict(p[:12], torques, durations, 16, p[12:])[-1], point
         )
@@ -139,7 +146,7 @@ def test_transition_equals_central_differences(t: float, gravity: bool) -> None:
 def test_without_a_measurement_the_model_goes_on_alone() -> None:
     result = run(inside(np.random.default_rng(0)), seed=0)
     estimate, (torques, durations) = result.estimates[-1], result.inputs[-1]
-    after = advance(estimate, PLANT, torques, durations, SUBSTEPS, None, ASSUMED)
+    after = advance(estimate, PLANT, acted(torques, durations), None, ASSUMED)
     expected = PLANT.predict(estimate.state, torques, durations, 8, estimate.parameters)[-1]
     assert np.abs(after.state - expected).max() < 1e-6
     assert np.array_equal(after.parameters, estimate.parameters)
@@ -154,13 +161,42 @@ def test_without_a_measurement_the_model_goes_on_alone() -> None:
     assert np.array_equal(after.covariance, after.covariance.T)
 
 
+@pytest.mark.parametrize(("split", "tolerance"), [(1.0, 1e-3), (0.7, 0.1)])
+@pytest.mark.parametrize("late", [1e-5, -1e-5])
+def test_kicks_are_what_early_and_late_torques_do(
+    split: float, tolerance: float, late: float
+) -> None:
+    """A change at the end exactly; one before the end but for what its kick feeds back by then."""
+    rng = np.random.default_rng(5)
+    pose, rates, accelerations = motion(0.8)
+    x, theta = np.concatenate([pose, rates]), inside(rng)
+    held = PLANT.inverse_dynamics(pose, rates, accelerations, theta)
+    three = held + rng.normal(0, 0.05, (3, 6))
+    durations = PERIOD * np.array([split, 1 - split])[: 1 if split == 1 else 2]
+    period = Period(three[: len(durations)], durations, three[len(durations)], 8)
+    after = PLANT.predict(x, period.torques, durations, 8, theta)[-1]
+    kick = estimator._kicks(PLANT, after, theta, period)[0]
+
+    # The same second in three pieces, the first change `late` after its time.
+    parts = [split * PERIOD + late, PERIOD * (1 - split) - late]
+    if split == 1.0 and late > 0:  # still the old torque when the new one should act
+        forwards = PLANT.predict(x, three[:1], np.array(parts[:1]), 8, theta)[-1]
+        expected = PLANT.predict(x, three[:2], np.array([PERIOD, late]), 8, theta)[-1]
+        assert relative((forwards - expected)[6:], -late * kick[6:]) < tolerance
+    else:
+        moved = PLANT.predict(x, three[:2], np.array(parts), 8, theta)[-1] - after
+        assert relative(moved[6:], -late * kick[6:]) < tolerance
+        if split < 1:  # else there is no time to move the pose
+            assert relative(moved[:6], -late * kick[:6]) < tolerance
+
+
 def test_a_period_of_two_torques_is_two_shorter_ones() -> None:
     """The same torque twice is that torque; a split period is its parts one after the other."""
     result = run(inside(np.random.default_rng(1)), seed=1, fraction=0.3, steps=4)
     estimate, (torques, durations) = result.estimates[-1], result.inputs[-1]
 
     def after(e: Estimate, torques: Array, durations: Array, y: Array | None) -> Estimate:
-        return advance(e, PLANT, torques, durations, SUBSTEPS, y, ASSUMED)
+        return advance(e, PLANT, acted(torques, durations), y, ASSUMED)
 
     at_once = after(estimate, torques, durations, None)
     halfway = after(estimate, torques[:1], durations[:1], None)
@@ -232,7 +268,7 @@ def test_errors_of_the_parameters_are_as_large_as_the_filter_says(draw) -> None:
 
 
 def test_without_noise_all_parameters_are_found() -> None:
-    assumed = estimator.filter_settings(np.zeros(12), AMPLITUDE, PAPER.plate.mass, 0.1, None)
+    assumed = filter_settings(np.zeros(12), AMPLITUDE, PAPER.plate.mass, 0.1, None, PERIOD)
     for fraction in (0.0, 0.3):
         result = run(inside(np.random.default_rng(3)), 3, assumed, fraction)
         error = np.abs(result.estimates[-1].parameters - result.truth)
@@ -291,16 +327,16 @@ def test_what_was_learnt_about_combinations_survives_a_bound() -> None:
 def test_an_outlier_is_passed_over(size: float) -> None:
     result = run(inside(np.random.default_rng(4)), 4)
     before, (torques, durations) = result.estimates[-2], result.inputs[-1]
-    expected = advance(before, PLANT, torques, durations, SUBSTEPS, None, ASSUMED)
+    expected = advance(before, PLANT, acted(torques, durations), None, ASSUMED)
     for channel in (0, 3, 5, 6, 11):
         y = result.measurements[-1].copy()
         y[channel] += size
-        after = advance(before, PLANT, torques, durations, SUBSTEPS, y, ASSUMED)
+        after = advance(before, PLANT, acted(torques, durations), y, ASSUMED)
         assert after.outliers == 1
         assert np.array_equal(after.mean, expected.mean)
         assert np.array_equal(after.covariance, expected.covariance)
         y = PLANT.predict(result.states[-1], torques, durations, SUBSTEPS, result.truth)[-1]
-        again = advance(after, PLANT, torques, durations, SUBSTEPS, y, ASSUMED)
+        again = advance(after, PLANT, acted(torques, durations), y, ASSUMED)
         assert again.outliers == 0
         assert squared(again.parameters - result.truth, again.covariance[12:, 12:]) < 40
 
@@ -313,11 +349,11 @@ def test_after_patience_the_measurement_is_believed() -> None:
     torques, durations = result.inputs[-1]
     for count in range(1, PATIENCE):
         moved = PLANT.predict(moved, torques, durations, SUBSTEPS, result.truth)[-1]
-        estimate = advance(estimate, PLANT, torques, durations, SUBSTEPS, moved, ASSUMED)
+        estimate = advance(estimate, PLANT, acted(torques, durations), moved, ASSUMED)
         assert estimate.outliers == count
         assert abs(estimate.state[3] - moved[3]) > 5e-3
     moved = PLANT.predict(moved, torques, durations, SUBSTEPS, result.truth)[-1]
-    estimate = advance(estimate, PLANT, torques, durations, SUBSTEPS, moved, ASSUMED)
+    estimate = advance(estimate, PLANT, acted(torques, durations), moved, ASSUMED)
     assert estimate.outliers == 0
     assert np.array_equal(estimate.state, moved)
     assert np.array_equal(estimate.parameters, result.estimates[-1].parameters)
@@ -334,7 +370,7 @@ def test_a_sensor_gone_crazy_and_well_again_leaves_no_trace(crazy: float) -> Non
         zip(result.inputs, result.measurements[1:], strict=True)
     ):
         seen = np.full(12, crazy) if 1 <= k <= 5 else y
-        estimate = advance(estimate, PLANT, torques, durations, SUBSTEPS, seen, ASSUMED)
+        estimate = advance(estimate, PLANT, acted(torques, durations), seen, ASSUMED)
         estimates.append(estimate)
     assert all(np.all(np.isfinite(e.mean)) for e in estimates)
     assert all(np.all(np.isfinite(e.covariance)) for e in estimates)
@@ -352,6 +388,6 @@ def test_a_payload_put_on_later_is_found() -> None:
     for torques, durations in before.inputs:
         x = PLANT.predict(x, torques, durations, SUBSTEPS, truth)[-1]
         y = x + NOISE * rng.standard_normal(12)
-        estimate = advance(estimate, PLANT, torques, durations, SUBSTEPS, y, ASSUMED)
+        estimate = advance(estimate, PLANT, acted(torques, durations), y, ASSUMED)
     assert estimate.parameters[PAYLOAD] == pytest.approx(1.0, abs=0.1)
     assert squared(estimate.parameters - truth, estimate.covariance[12:, 12:]) < 40

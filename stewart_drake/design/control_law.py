@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from stewart_drake.design import estimator
 from stewart_drake.design.delay_model import delayed_model
 from stewart_drake.design.error_model import ContinuousModel, double_integrators, linear_model
-from stewart_drake.design.estimator import Estimate
+from stewart_drake.design.estimator import Estimate, Period
 from stewart_drake.design.holds import (
     GAUSS_NODES,
     held_torques,
@@ -180,18 +180,13 @@ class DelayLqi:
             if o.filter is None:
                 return None, measurement, False
             return estimator.start(measurement, o.filter), measurement, False
-        torques, durations = (a[: self._per_period()] for a in self._acting(memory.in_flight))
-        substeps = o.substeps_for(torques)
+        acting, times = self._acting(memory.in_flight)
+        n = self._per_period()
+        torques, durations, substeps = acting[:n], times[:n], o.substeps_for(acting[:n])
         if o.filter is not None and memory.estimate is not None:
-            estimate = estimator.advance(
-                memory.estimate,
-                self.dynamics,
-                torques,
-                durations,
-                substeps,
-                None if bad else measurement,
-                o.filter,
-            )
+            period = Period(torques, durations, acting[min(n, len(acting) - 1)], substeps)
+            usable = None if bad else measurement
+            estimate = estimator.advance(memory.estimate, self.dynamics, period, usable, o.filter)
             return estimate, estimate.state, bad
         if not bad:
             started = None if o.filter is None else estimator.start(measurement, o.filter)

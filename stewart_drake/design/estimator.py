@@ -11,23 +11,17 @@ theta alone.
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.special import chdtri
 
+from stewart_drake.design.filter_settings import FilterSettings
 from stewart_drake.design.holds import GAUSS_NODES
 from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.signals import (
-    BIAS,
-    DAMPING,
-    NUM_PARAMETERS,
-    NUM_STATE,
-    PAYLOAD,
-    POSE,
-    RATES,
-)
+from stewart_drake.signals import NUM_PARAMETERS, NUM_STATE, POSE, RATES
 
 Array = NDArray[np.float64]
 THETA = slice(NUM_STATE, NUM_STATE + NUM_PARAMETERS)
@@ -44,53 +38,17 @@ PATIENCE = 3
 """After so many outliers in a row the model must be wrong, and the measurement is believed."""
 
 
-@dataclass(frozen=True)
-class FilterSettings:
-    """What the filter assumes; standard deviations in SI units.
+class Period(NamedTuple):
+    """What acted between two samples, as far as the delay is what it is believed to be."""
 
-    Attributes:
-        noise_std: (12,) of the measurement.
-        prior_std: (8,) of the parameters before any measurement.
-        lower, upper: (8,) physical bounds of the parameters.
-        model_std: (12,) by which one step of the model may be off; without it a noiseless sensor
-            would let the filter explain integration errors by parameters.
-    """
-
-    noise_std: Array
-    prior_std: Array
-    lower: Array
-    upper: Array
-    model_std: Array
-
-
-MODEL_ERROR = 2e-4
-"""Share of the motion by which one step of the model may be off: what a 1 ms engine deviates."""
-
-
-def filter_settings(
-    noise_std: Array,
-    motion_scale: Array,
-    plate_mass: float,
-    torque_scale: float,
-    torque_limit: float | None,
-) -> FilterSettings:
-    """Settings for a machine: a payload up to ten plates, friction and bias by its torques.
-
-    Args:
-        noise_std: (12,) of the measurement.
-        motion_scale: (6,) how far each coordinate moves, rad and m; the same per s for the rates.
-        plate_mass: kg.
-        torque_scale: torque that the motion takes, N m.
-        torque_limit: of the motors in N m, or None.
-    """
-    prior, lower, upper = (np.empty(NUM_PARAMETERS) for _ in range(3))
-    bias_bound = 100 * torque_scale if torque_limit is None else torque_limit
-    prior[BIAS], lower[BIAS], upper[BIAS] = 0.3 * torque_scale, -bias_bound, bias_bound
-    prior[PAYLOAD], upper[PAYLOAD] = 0.25 * plate_mass, 10 * plate_mass
-    lower[PAYLOAD] = -0.5 * plate_mass  # a plate that is lighter than believed
-    prior[DAMPING], lower[DAMPING], upper[DAMPING] = 0.1 * torque_scale, 0.0, 100 * torque_scale
-    model_std = MODEL_ERROR * np.concatenate([motion_scale, motion_scale])
-    return FilterSettings(np.asarray(noise_std), prior, lower, upper, model_std)
+    torques: Array
+    """(n, 6) N m, one after the other."""
+    durations: Array
+    """(n,) s."""
+    following: Array
+    """(6,) N m, acts next."""
+    substeps: int
+    """Integration steps per torque."""
 
 
 @dataclass(frozen=True)
@@ -127,13 +85,11 @@ def start(measurement: Array, settings: FilterSettings) -> Estimate:
 def advance(
     estimate: Estimate,
     dynamics: StewartDynamics,
-    torques: Array,
-    durations: Array,
-    substeps: int,
+    period: Period,
     measurement: Array | None,
     settings: FilterSettings,
 ) -> Estimate:
-    """One period: torques (n, 6) acted for `durations` (n,) s; then a measurement (12,), or none.
+    """One period, then a measurement (12,) at its end, or none.
 
     The first steps move the parameters far: linearising once is not enough. The mean xi of
     [previous state; parameters] is found by Gauss-Newton iterations of
@@ -146,10 +102,10 @@ def advance(
     """
     outliers = 0 if measurement is None else estimate.outliers + 1
     if measurement is not None:
-        after = _attempt(estimate, dynamics, torques, durations, substeps, measurement, settings)
+        after = _attempt(estimate, dynamics, period, measurement, settings)
         if after is not None:
             return after
-    after = _attempt(estimate, dynamics, torques, durations, substeps, None, settings)
+    after = _attempt(estimate, dynamics, period, None, settings)
     if after is not None and outliers < PATIENCE:
         return replace(after, outliers=outliers)
     if measurement is None:
@@ -161,16 +117,14 @@ def advance(
 def _attempt(
     estimate: Estimate,
     dynamics: StewartDynamics,
-    torques: Array,
-    durations: Array,
-    substeps: int,
+    period: Period,
     measurement: Array | None,
     settings: FilterSettings,
 ) -> Estimate | None:
     """`advance` for a measurement that fits; None for an outlier, or without a finite result."""
     try:
         with np.errstate(all="ignore"):
-            after = _filter(estimate, dynamics, torques, durations, substeps, measurement, settings)
+            after = _filter(estimate, dynamics, period, measurement, settings)
     except (np.linalg.LinAlgError, ValueError):
         return None
     if after is None or not np.all(np.isfinite(after.covariance)):
@@ -181,20 +135,19 @@ def _attempt(
 def _filter(
     estimate: Estimate,
     dynamics: StewartDynamics,
-    torques: Array,
-    durations: Array,
-    substeps: int,
+    period: Period,
     measurement: Array | None,
     settings: FilterSettings,
 ) -> Estimate | None:
     prior, P = estimate.mean, estimate.covariance
-    drift = settings.model_std**2
-    R = np.diag(settings.noise_std**2 + drift)
     xi = prior
     # Corrections of parameters that are known already are too small to need F to fourth order.
     known = np.all(estimate.parameter_std <= KNOWN * settings.prior_std)
     nodes = MIDPOINT if known else GAUSS_NODES
-    after, F = _transition(dynamics, xi, torques, durations, substeps, nodes)
+    after, F = _transition(dynamics, xi, period, nodes)
+    kicks = _kicks(dynamics, after, xi[THETA], period)
+    drift = np.diag(settings.model_std**2) + settings.timing_std**2 * kicks.T @ kicks
+    R = np.diag(settings.noise_std**2) + drift
     if measurement is not None:
         for _ in range(ITERATIONS):
             H = F[:NUM_STATE]
@@ -211,32 +164,39 @@ def _filter(
             if np.all(np.abs(shift) <= small):
                 after = linear
                 break
-            after = _integrate(dynamics, xi, torques, durations, substeps)[-1]
+            after = _integrate(dynamics, xi, period)[-1]
             if np.all(np.abs(after - linear) <= small):
                 break
-            after, F = _transition(dynamics, xi, torques, durations, substeps, nodes)
+            after, F = _transition(dynamics, xi, period, nodes)
         if not innovation @ np.linalg.solve(S, innovation) <= GATE:  # or NaN
             return None
         P = posterior
     P = F @ P @ F.T
-    P[np.diag_indices(NUM_STATE)] += drift
+    P[:NUM_STATE, :NUM_STATE] += drift
     return Estimate(np.concatenate([after, xi[THETA]]), (P + P.T) / 2)
 
 
-def _integrate(
-    dynamics: StewartDynamics, xi: Array, torques: Array, durations: Array, substeps: int
-) -> Array:
+def _kicks(dynamics: StewartDynamics, state: Array, theta: Array, period: Period) -> Array:
+    """(n, 12) change of the last state per s by which one of the n changes of torque comes early.
+
+    To first order: for that time the acceleration differs by B dT, which stays in the rates, and
+    moves the pose for what is left of the period.
+    """
+    pose, rates = state[POSE], state[RATES]
+    torques = (*period.torques, period.following)
+    changes = np.diff([dynamics.accelerations(pose, rates, T, theta) for T in torques], axis=0)
+    left = period.durations.sum() - np.cumsum(period.durations)
+    return np.hstack([left[:, None] * changes, changes])
+
+
+def _integrate(dynamics: StewartDynamics, xi: Array, period: Period) -> Array:
     """States (n, 12) after each of n torques, from [state; parameters] (20,)."""
+    torques, durations, substeps = period.torques, period.durations, period.substeps
     return dynamics.predict(xi[:NUM_STATE], torques, durations, substeps, xi[THETA])
 
 
 def _transition(
-    dynamics: StewartDynamics,
-    xi: Array,
-    torques: Array,
-    durations: Array,
-    substeps: int,
-    nodes: Array = GAUSS_NODES,
+    dynamics: StewartDynamics, xi: Array, period: Period, nodes: Array = GAUSS_NODES
 ) -> tuple[Array, Array]:
     """State (12,) after the torques, and F (20, 20) of [state; parameters].
 
@@ -246,8 +206,8 @@ def _transition(
     """
     x, theta = xi[:NUM_STATE], xi[THETA]
     total = np.eye(NUM_STATE + NUM_PARAMETERS)
-    ends = _integrate(dynamics, xi, torques, durations, substeps)
-    for torque, h, end in zip(torques, durations, ends, strict=True):
+    ends = _integrate(dynamics, xi, period)
+    for torque, h, end in zip(period.torques, period.durations, ends, strict=True):
         L = np.zeros((len(nodes), *total.shape))
         for place, node in zip(L, nodes, strict=True):
             pose, rates = _within_hold(x, end, h, node)

@@ -6,7 +6,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.design.estimator import Estimate, FilterSettings
+from stewart_drake.design.estimator import Estimate
+from stewart_drake.design.filter_settings import FilterSettings
 from stewart_drake.mechanism.torque_map import TorqueMap
 from stewart_drake.signals import queue_length
 
