@@ -28,15 +28,16 @@ demo: $(INSTALLED)  ## the paper's comparison, from rest and started on the refe
 		--out out/demo/on_reference
 	@echo "figures:"; find out/demo -name '*.png' -o -name '*.svg' -o -name '*.pdf' | sort | sed 's/^/  /'
 
-# Two workers with one thread each, so that they do not fight over the processor.
+# Workers of one thread each, so that they do not fight over the processor.
+WORKERS := -n logical --maxprocesses 4
 test soak bench: export OMP_NUM_THREADS := 1
 test soak bench: export OPENBLAS_NUM_THREADS := 1
 
 test: $(INSTALLED)  ## the tests; ARGS="..." is handed to pytest
-	$(BIN)/pytest -n 2 $(ARGS)
+	$(BIN)/pytest $(WORKERS) $(ARGS)
 
 soak: $(INSTALLED)  ## the endurance runs, which `make test` leaves out
-	$(BIN)/pytest -n 2 -m soak $(ARGS)
+	$(BIN)/pytest $(WORKERS) -m soak $(ARGS)
 
 lint: $(INSTALLED)  ## ruff's rules
 	$(BIN)/ruff check .

@@ -15,15 +15,18 @@ from stewart_drake.tuner.density import NUM_INPUTS
 from stewart_drake.tuner.network import NUM_OUTPUTS, load_network
 
 WIDTH: Final = 80
+_NO_BREAK: Final = "\N{NO-BREAK SPACE}"
 _COLUMNS: Final = "{:<16}{:>5}{:>11}{:>11}{:>11}{:>7}{:>7}{:>7}{:>5}"
 _NOTE: Final = "floor: from the delay alone; torques as commanded, var.: their total variation"
 
 
 def wrap(text: str, first: str = "", rest: str = "  ") -> str:
     """One paragraph of at most WIDTH columns, its first line and the others opened as given."""
-    return textwrap.fill(
-        text, WIDTH, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
+    together = re.sub(r"(?<=\d) (?=%|mm\b|ms\b|s\b)", _NO_BREAK, text)
+    filled = textwrap.fill(
+        together, WIDTH, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
     )
+    return filled.replace(_NO_BREAK, " ")
 
 
 def rows(entries: Mapping[str, str]) -> str:
