@@ -146,7 +146,7 @@ def _filter(
     nodes = MIDPOINT if known else GAUSS_NODES
     after, F = _transition(dynamics, xi, period, nodes)
     kicks = _kicks(dynamics, after, xi[THETA], period)
-    drift = np.diag(settings.model_std**2) + settings.timing_std**2 * kicks.T @ kicks
+    drift = np.diag(settings.model_std**2 + settings.timing_std**2 * np.sum(kicks**2, axis=0))
     R = np.diag(settings.noise_std**2) + drift
     if measurement is not None:
         for _ in range(ITERATIONS):
