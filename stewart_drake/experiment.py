@@ -23,6 +23,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.workspace import Failure, diagnose
 from stewart_drake.resources import resolve
+from stewart_drake.signals import POSITION
 from stewart_drake.trajectories import evaluate, make_reference, peak_to_peak
 from stewart_drake.tuner.network import DEFAULT, Network, load_network
 
@@ -66,12 +67,27 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
     experiment = assemble(scenario, truth)
     failure = reference_failure(experiment)
     if failure is not None:
+        first = experiment.reference.value(0.0)[:, 0]
         raise ConfigError(
             f"reference: {failure.reason} at t = {failure.time:.2f} s"
             + (f", short by {-1e3 * failure.margin:.3g} mm" if failure.margin < 0 else "")
-            + "; expected a motion within reach, such as one of smaller amplitude"
+            + "; expected a motion within reach"
+            + (
+                ", such as one of smaller amplitude"
+                if failure.time > 0
+                else f": {first_pose_text(first, experiment.mechanism)}"
+            )
         )
     return experiment
+
+
+def first_pose_text(pose: Array, mechanism: Mechanism) -> str:
+    """Where a reference begins, and home: a wrong unit shows, and a height counted from home."""
+    first, home = (
+        ", ".join(f"{1e3 * value:.6g}" for value in where[POSITION])
+        for where in (pose, mechanism.home)
+    )
+    return f"it begins at x, y, z = {first} mm, home is at {home} mm"
 
 
 def reference_failure(experiment: Experiment) -> Failure | None:

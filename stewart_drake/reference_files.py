@@ -110,7 +110,10 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
     labels = [cell.strip() for cell in cells[0]]
     for index, (line, row) in enumerate(zip(lines[1:], cells[1:], strict=True)):
         if len(row) != 7:
-            raise ConfigError(f"{path}: row {line}: got {len(row)} cells; expected 7, as above")
+            hint = ", with a point for the decimals" if len(row) > 7 else ""
+            raise ConfigError(
+                f"{path}: row {line}: got {len(row)} cells; expected 7, as above{hint}"
+            )
         for column, text in enumerate(row):
             place = f"{path}: row {line}, column {labels[column]}"
             try:
@@ -127,7 +130,10 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
                 raise ConfigError(f"{place}: {problem}")
             samples[index, target] = value
     if len(samples) < _MIN_ROWS:
-        raise ConfigError(f"{path}: got {len(samples)} samples; expected at least {_MIN_ROWS}")
+        plural = "" if len(samples) == 1 else "s"
+        raise ConfigError(
+            f"{path}: got {len(samples)} sample{plural}; expected at least {_MIN_ROWS}"
+        )
     steps = np.diff(samples[:, 0])
     widest, median = int(np.argmax(steps)), float(np.median(steps))
     if steps[widest] > _MAX_GAP * median:
@@ -139,11 +145,11 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
     kink = _roughest(samples[:, 0], samples[:, 1:])
     if kink is not None:
         sample, axis, size = kink
-        label = labels[order.index(axis + 1)]
-        unit = "rad" if axis < 3 else "m"
+        column = order.index(axis + 1)
+        size, unit = size / scales[column], labels[column].partition("[")[2].strip(" ]")
         raise ConfigError(
-            f"{path}: row {lines[sample + 1]}, column {label}: got {size:.3g} {unit} off the "
-            "cubic through its neighbours; expected a smooth motion with some ten samples per "
+            f"{path}: row {lines[sample + 1]}, column {labels[column]}: got {size:.3g} {unit} off "
+            "the cubic through its neighbours; expected a smooth motion with some ten samples per "
             "swing, filter or resample it"
         )
     return samples[:, 0].copy(), samples[:, 1:].copy()
@@ -167,6 +173,14 @@ def _read_cells(path: Path) -> tuple[list[int], list[list[str]]]:
 def _read_header(path: Path, header: list[str]) -> tuple[list[str], list[float]]:
     """Name and factor to SI units of each column."""
     names, scales = [], []
+    for separator in (";", "\t"):
+        if separator in header[0]:
+            raise ConfigError(
+                f"{path}: row 1: got cells separated by {separator!r}; expected commas, and points "
+                "for the decimals"
+            )
+    if header[0].strip()[:1].isdigit():
+        raise ConfigError(f"{path}: row 1: got {brief(header[0])}; expected a header {_HEADER}")
     for cell in header:
         match = re.fullmatch(r"\s*(\w+)\s*\[\s*(\w+)\s*\]\s*", cell)
         name, unit = (part.lower() for part in match.groups()) if match else ("", "")

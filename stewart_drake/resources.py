@@ -1,6 +1,6 @@
 """Where the shipped mechanisms, scenarios, controllers and tuner weights are found.
 
-A word is a shipped name; anything with a slash, or ending in `.yaml` or `.json`, is a path.
+A word is a shipped name; anything with a slash, or ending in `.yaml`, `.yml` or `.json`, is a path.
 """
 
 import difflib
@@ -48,7 +48,9 @@ def shipped(kind: Kind) -> list[str]:
 def is_path(name_or_path: str | Path) -> bool:
     """Whether this is a path; otherwise it is a shipped name."""
     text = str(name_or_path)
-    return isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".json"))
+    return (
+        isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml", ".json"))
+    )
 
 
 def absolute_path(path: str | Path, relative_to: Path | None = None) -> Path:
@@ -79,7 +81,7 @@ def resolve(kind: Kind, name_or_path: str | Path, relative_to: Path | None = Non
     if name not in shipped(kind):
         raise ConfigError(
             f"{kind}: got {name!r}; expected one of {_nearest(kind, name)}, or a path "
-            "(with a slash, or ending in .yaml or .json)"
+            "(with a slash, or ending in .yaml, .yml or .json)"
         )
     folder, suffix = _PLACES[kind]
     return data_root() / folder / f"{name}{suffix}"

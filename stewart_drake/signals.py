@@ -6,6 +6,8 @@ Nothing else in the package does index arithmetic on these vectors.
 from typing import Final
 
 COORDINATES: Final = ("phi", "theta", "psi", "x", "y", "z")
+COORDINATE_NAMES: Final = ("roll", "pitch", "yaw", "x", "y", "z")
+"""The same for a person, and in files that a person writes."""
 COORDINATE_UNITS: Final = ("rad", "rad", "rad", "m", "m", "m")
 LEGS: Final = (1, 2, 3, 4, 5, 6)
 """Legs are numbered from one wherever a person reads the number."""

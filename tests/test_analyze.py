@@ -72,7 +72,7 @@ def test_hautus_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         assert systems[f"minimal chain, mu = {steps}"]["observable"]
     told = capsys.readouterr().out
     assert max(map(len, told.splitlines()[:-1])) <= 80  # the last one names the directory
-    assert "All 30 models are stabilizable and detectable" in told
+    assert "All 30 models are stabilisable and detectable" in told
     assert "stewart-drake analyze hautus paper --out" in page
     assert page.count("<img") == 2
 

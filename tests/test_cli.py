@@ -58,6 +58,15 @@ def files(folder: Path) -> set[str]:
             ["simulate", "--set", "reference.amplitude=[0.3, 0.3, 0.3, 0.2, 0.2, 0.3]"],
             ["reference", "leg", "t = 0.30 s", "smaller amplitude"],
         ),
+        (
+            ["simulate", "--set", "reference.offset=[0, 0, 0, 0, 0, 380]"],
+            [
+                "reference",
+                "t = 0.00 s",
+                "begins at x, y, z = 0, 0, 380000 mm",
+                "home is at 0, 0, 380",
+            ],
+        ),
         (["simulate", "--contoller", "lqi"], ["--contoller", "did you mean --controller?"]),
         (["simulate", "--out"], ["--out", "requires"]),
         (["simulate", "paper", "twice"], ["twice"]),
@@ -239,6 +248,7 @@ def test_model_sdf_is_the_models(tmp_path, capsys):
     assert main(["model", "sdf", "paper"]) == 0
     assert capsys.readouterr().out == text
     assert main(["model", "sdf", "paper", "--out", str(tmp_path / "new" / "paper.sdf")]) == 0
+    assert "paper.sdf" in capsys.readouterr().out
     assert (tmp_path / "new" / "paper.sdf").read_text() == text
 
 

@@ -65,6 +65,7 @@ def test_export_gives_what_simulate_wrote(tmp_path, capsys):
     assert capsys.readouterr() == (written, "")
     out = tmp_path / "new" / "again.csv"
     assert main(["export", str(tmp_path / "signals.nc"), "--out", str(out)]) == 0
+    assert "again.csv" in capsys.readouterr().out
     assert out.read_text() == written and len(table(written)["time[s]"]) == 16
     assert main(["simulate", *SHORT, "--out", str(tmp_path), "--quiet"]) == 0
     assert not (tmp_path / "signals.csv").exists(), "of an earlier run"

@@ -123,6 +123,30 @@ def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(compar
     assert legend == ["reference", *LABELS.values(), "run ended"]
 
 
+def test_labels_of_small_values_stay_off_the_names_of_the_axes(run, drawn):
+    """A plate that follows to 1e-3 has many digits to be shown."""
+    for size in (3e-6, 8e-6, 3e-5, 2e-4, 5e-3, 0.1):
+        signals = run.signals.copy()
+        signals["error"] = signals.error * 0 + size * np.linspace(-1, 0.2, 51)[:, None]
+        run_figures(dataclasses.replace(run, signals=signals), "unused")
+        drawn["errors"].canvas.draw()
+        for ax in drawn["errors"].axes:
+            name = ax.yaxis.label.get_window_extent().x1
+            assert all(name < text.get_window_extent().x0 for text in ax.get_yticklabels())
+
+
+def test_rounding_does_not_fill_the_axis_of_a_coordinate_that_rests(run, drawn):
+    signals = run.signals.copy(deep=True)
+    signals["reference"][:, 4] = 0.0
+    signals["pose"][:, 4] = 1e-9 * np.sin(signals.time.values)
+    run_figures(dataclasses.replace(run, signals=signals), "unused")
+    axes = drawn["states"].axes
+    labels = [ax.get_ylabel() for ax in axes]
+    low, high = limits(axes[labels.index("y  [mm]")])
+    widest = 1e3 * np.ptp(signals.reference.values[:, 5])
+    assert low < 0 < high and 0.01 * widest < high - low < 0.05 * widest
+
+
 def test_where_all_runs_diverge_they_are_shown_whole(comparison, drawn):
     run_figures(comparison["lqr"], "unused")
     for name, signal in (("states", "pose"), ("errors", "error")):

@@ -14,6 +14,7 @@ from stewart_drake.report import collect as collect_module
 from stewart_drake.report.collect import ANALYSES, Analysis, collect
 from stewart_drake.report.page import Page, Provenance
 from stewart_drake.report.report_page import comparison_rows, mean_error, report_page
+from stewart_drake.report.tables import comparison_table
 from stewart_drake.scenario_loading import load_scenario
 from stewart_drake.simulation import simulate
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
@@ -106,7 +107,23 @@ def test_figures_of_the_paper_are_redrawn_with_their_captions(html):
     text = text_of(html)
     for figure in ("5(a)", "5(b)", "7(a)", "7(b)"):
         assert f"As figure {figure} of the paper" in text
-    assert ("As figure 6 of the paper" in text) != ("there is no figure 6" in text)
+    assert ("As figure 6 of the paper" in text) != ("its weights are not shown" in text)
+
+
+def test_another_motion_is_not_held_against_the_papers_numbers():
+    settings = ("plant.kind=exact", "duration=1.0", "reference.frequency=0.5")
+    run = simulate(load_scenario("paper", settings=settings))
+    found = collect_of(run.scenario, run=run, comparison={"delay_lqi": run})
+    page = report_page(found, "n", Provenance("c"))
+    (section,) = (section for section in page.sections if "compared" in section.heading)
+    (table,) = section.tables
+    assert table.rows[0][0] == LABELS["delay_lqi"] and "80" not in table.rows[0]
+    assert not any("paper" in text for text in (*section.text, *table.columns, table.caption))
+    assert not any("paper" in picture.caption for picture in section.pictures)
+    text = comparison_table({"delay_lqi": run})
+    assert (
+        "paper" not in text and " 80 " not in text and all(len(s) <= 80 for s in text.split("\n"))
+    )
 
 
 def test_the_scenario_in_it_runs_again(html, tmp_path):
@@ -216,7 +233,7 @@ def test_figure_6_and_the_tuned_rows_are_of_the_tuners_runs(tmp_path):
     shown = next(p.figure for p in section.pictures if "figure 6" in p.caption)
     titles = [ax.get_title() for ax in shown.axes if ax.get_title()]
     assert titles == [LABELS[name] for name in tuned]
-    assert not any("no figure 6" in text for text in section.text)
+    assert not any("weights are not shown" in text for text in section.text)
 
 
 @pytest.mark.parametrize(

@@ -240,10 +240,13 @@ def changed(row: int, text: str) -> str:
 
 BAD_CSV = {
     "empty": ("", ["is empty", "time[s]"]),
-    "no header": ("\n".join(GOOD_ROWS), ["row 1", "unknown column '0.0'", "time[s]"]),
+    "no header": ("\n".join(GOOD_ROWS), ["row 1", "'0.0'", "a header time[s]"]),
     "header only": (HEADER, ["got 0 samples", "at least 4"]),
     "three rows": ("\n".join([HEADER, *GOOD_ROWS[:3]]), ["got 3 samples", "at least 4"]),
-    "semicolons": (HEADER.replace(",", ";"), ["row 1", "unknown column"]),
+    "one row": ("\n".join([HEADER, GOOD_ROWS[0]]), ["got 1 sample;", "at least 4"]),
+    "semicolons": (HEADER.replace(",", ";"), ["row 1", "separated by ';'", "expected commas"]),
+    "tabs": (HEADER.replace(",", "\t"), ["row 1", "separated by '\\t'", "expected commas"]),
+    "decimal commas": (changed(1, "0,1,0,0,0,0,0,0,38"), ["row 3", "got 9 cells", "a point for"]),
     "no units": ("time,roll,pitch,yaw,x,y,z", ["row 1", "unknown column 'time'"]),
     "odd unit": (HEADER.replace("x[m]", "x[ft]"), ["row 1", "'x[ft]'", "x in m or mm"]),
     "odd time unit": (HEADER.replace("[s]", "[ms]"), ["row 1", "'time[ms]'", "time in s"]),
@@ -272,6 +275,15 @@ BAD_CSV = {
     "jump": (
         "\n".join([HEADER, *(f"{t / 10},0,{0.2 * (t > 5)},0,0,0,0.38" for t in range(12))]),
         ["pitch[rad]", "0.1 rad off", "smooth"],
+    ),
+    "jump in degrees": (
+        "\n".join(
+            [
+                HEADER.replace("pitch[rad]", "pitch [ deg ]"),
+                *(f"{t / 10},0,{8 * (t > 5)},0,0,0,0.38" for t in range(12)),
+            ]
+        ),
+        ["pitch [ deg ]", "got 4 deg off", "smooth"],
     ),
     "too few samples": (
         "\n".join([HEADER, *(f"{t},0,0,0,{math.sin(1.5 * t)},0,0" for t in range(20))]),

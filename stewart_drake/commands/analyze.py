@@ -41,7 +41,7 @@ def hautus(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Controllability and observability of every model, mode by mode."""
+    """Whether every model can be controlled and observed, by mode."""
     from stewart_drake.report.hautus_page import hautus_page, hautus_table
     from stewart_drake.scenario_loading import load_scenario
     from stewart_drake.studies.hautus import study_hautus
@@ -98,7 +98,11 @@ def workspace(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Whether the reference stays within reach, how large it may be, and what the motors do."""
+    """Whether the motion fits the machine, and what the motors do.
+
+    A motion that does not fit is analysed too. Shown are the reach that each leg has left, how
+    large the motion may be, and torque, speed and power of each motor.
+    """
     from stewart_drake.report.workspace_page import workspace_page, workspace_table
     from stewart_drake.scenario_loading import load_scenario
     from stewart_drake.studies.workspace import study_workspace
@@ -145,7 +149,10 @@ def robustness(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Monte Carlo: how often it works, how well, and what matters; --out makes it resumable."""
+    """Monte Carlo: how often it works, how well, and what matters.
+
+    With --out the same command goes on where it was stopped.
+    """
     from stewart_drake.report.robustness_page import robustness_page, robustness_table
     from stewart_drake.scenario_loading import load_scenario
     from stewart_drake.studies.robustness import study_robustness

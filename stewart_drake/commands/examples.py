@@ -24,7 +24,7 @@ EXAMPLES: Final = {
     "analyze workspace": ("stewart-drake analyze workspace paper --out out/workspace",),
     "analyze robustness": ("stewart-drake analyze robustness paper --out out/robustness",),
     "tune dataset": ("stewart-drake tune dataset paper --out out/data",),
-    "tune train": ("stewart-drake tune train out/data --out out/train",),
+    "tune train": ("stewart-drake tune train out/data --out out/tuner.json",),
     "tune evaluate": ("stewart-drake tune evaluate --out out/evaluate",),
 }
 """By the words of the command; each line runs as it stands."""

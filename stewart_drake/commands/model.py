@@ -42,6 +42,7 @@ def sdf(
     check_writable(out.parent, alone=False)
     with replacing(out) as partial:
         partial.write_text(text)
+    echo(f"written to {out}")
 
 
 @app.command()
@@ -82,7 +83,7 @@ def view(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Show a mechanism in a browser, with sliders for its pose and its reach margins."""
+    """Show a mechanism in a browser, with sliders for its pose."""
     from stewart_drake.mechanism.files import load_mechanism
     from stewart_drake.report.viewer import STOP, PoseViewer
 

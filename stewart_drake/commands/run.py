@@ -131,6 +131,7 @@ def export(
         raise ConfigError(f"--out: got {str(out)!r}, a directory; expected a file")
     check_writable(out.parent, alone=False)
     write_csv(dataset, out)
+    echo(f"written to {out}")
 
 
 def compare(
@@ -140,7 +141,7 @@ def compare(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Run the five controllers on a scenario: Table II."""
+    """Run the five shipped controllers on a scenario, as a table."""
     from stewart_drake.experiment import prepare
     from stewart_drake.report.tables import comparison_table, wrap
     from stewart_drake.scenario_loading import load_scenario

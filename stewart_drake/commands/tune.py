@@ -74,7 +74,7 @@ def dataset(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Run the grid of delays, frequencies and weights: 180 runs of 100 samples."""
+    """Run the grid of delays, frequencies and weights, 180 runs."""
     from stewart_drake.report.tuner_tables import dataset_table
     from stewart_drake.results import write_json
     from stewart_drake.studies.dataset import make_dataset, summarize
@@ -171,7 +171,7 @@ def evaluate(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Compare the tuner with every fixed gain of the grid on unseen scenarios."""
+    """Compare the tuner with every fixed gain on unseen scenarios."""
     from stewart_drake.report.tuner_tables import evaluation_table
     from stewart_drake.results import write_json
     from stewart_drake.studies.evaluation import evaluate as run

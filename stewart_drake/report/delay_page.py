@@ -85,7 +85,11 @@ def delay_table(study: DelayStudy) -> str:
         entries["closed loop"] = study.loop_problem
     lines = [wrap(verdict(study)[0]), "", rows(entries)]
     if study.cells:
-        lines += ["", "E_ac in % s over delay and amplitude, exact plant", _map_table(study)]
+        lines += [
+            "",
+            "E_ac in % s over the delay of mu periods and the amplitude, exact plant",
+            _map_table(study),
+        ]
     if study.interrupted:
         lines.append("interrupted: not all simulations were run")
     return "\n".join(lines)

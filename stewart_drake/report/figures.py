@@ -17,7 +17,7 @@ from stewart_drake.report import style
 from stewart_drake.report.style import figure_style, write_figure
 from stewart_drake.report.tuner_figures import weights_figure
 from stewart_drake.results import SimulationResult
-from stewart_drake.signals import COORDINATES, LEGS, PARAMETERS
+from stewart_drake.signals import ANGLES, COORDINATES, LEGS, PARAMETERS, POSE, POSITION
 from stewart_drake.studies.compare import LABELS
 
 Array = NDArray[np.float64]
@@ -39,6 +39,9 @@ _ERROR_REACH: Final = 0.5
 _LEAST_SIGMAS: Final = 0.02
 """A parameter's axis shows at least this share of its largest standard deviation to either side:
 the band narrows by orders of magnitude, and the estimate counts."""
+_LEAST_SPAN: Final = 0.02
+"""A coordinate's axis spans at least this share of the widest motion among those of its unit: where
+the reference rests, rounding is not to fill it."""
 _MARGIN: Final = 0.06
 """Empty share of an axis beyond the data."""
 
@@ -128,11 +131,13 @@ def _write(figures: Mapping[str, Figure], directory: str | Path) -> list[Path]:
 def _states(runs: Mapping[str, SimulationResult], lines: Mapping[str, style.Line]) -> Figure:
     figure, axes = _grid(runs.values())
     wanted = max((run.signals for run in runs.values()), key=lambda s: s.sizes["time"])
+    spans = _FACTORS * np.array([_span(values) for values in wanted.reference.values.T[POSE]])
+    least = _LEAST_SPAN * np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
     for k, ax in enumerate(axes):
         reference = _FACTORS[k] * wanted.reference.values[:, k]
         ax.plot(wanted.time.values, reference, label="reference", **style.REFERENCE._asdict())
         data = {label: _FACTORS[k] * run.signals.pose.values[:, k] for label, run in runs.items()}
-        _limit(ax, [reference, *_trusted(runs, data)], data, _STATE_REACH * _span(reference))
+        _limit(ax, [reference, *_trusted(runs, data)], data, _STATE_REACH * spans[k], least[k])
         _plot(ax, runs, lines, data)
         ax.set_ylabel(f"{_SYMBOLS[COORDINATES[k]]}  [{_UNITS[k]}]")
     return _with_legend(figure, axes)
@@ -207,6 +212,8 @@ def _grid(
     axes = figure.subplots(rows, 2, sharex=True, sharey=sharey)
     for ax in axes.ravel():
         ax.yaxis.set_label_coords(-0.14, 0.5)
+        # More digits than these would run into the label.
+        ax.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True)
     for ax in axes[-1]:
         ax.set_xlabel("time  [s]")
     axes[0, 0].set_xlim(0, max(_end(run) for run in runs))
@@ -260,14 +267,18 @@ def _span(values: Array) -> float:
     return float(np.ptp(values)) if len(values) else 0.0
 
 
-def _limit(ax: Axes, core: list[Array], data: Mapping[str, Array], reach: float) -> None:
-    """Limits that show `core` whole, and of all the data what is not further than `reach` off."""
+def _limit(
+    ax: Axes, core: list[Array], data: Mapping[str, Array], reach: float, least: float = 0.0
+) -> None:
+    """Limits, `least` apart, that show `core` whole and of all data what is `reach` off it."""
     inside = _finite(core)
     if not len(inside):
         return
     everything = _finite([inside, *data.values()])
     low = max(everything.min(), inside.min() - reach)
     high = min(everything.max(), inside.max() + reach)
+    widening = max(0.0, least - (high - low)) / 2
+    low, high = low - widening, high + widening
     margin = _MARGIN * (high - low)
     if margin > 0:
         ax.set_ylim(low - margin, high + margin)

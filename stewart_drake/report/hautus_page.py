@@ -43,7 +43,7 @@ def verdict(study: HautusStudy) -> tuple[str, Tone]:
         return f"{obstacles} There is no pose at which a model exists.".strip(), "bad"
     least = min(study.systems, key=lambda s: s.margins["stabilizable"])
     text = (
-        f"All {len(study.systems)} models are stabilizable and detectable; the least margin is "
+        f"All {len(study.systems)} models are stabilisable and detectable; the least margin is "
         f"{least.margins['stabilizable']:.1e} ({least.name}), the tolerance "
         f"{least.reach.tolerance:.0e}."
     )
@@ -76,7 +76,8 @@ def hautus_table(study: HautusStudy) -> str:
     lines += [wrap(sentence) for sentence in _skipped(study)]
     lines += [wrap(sentence) for sentence in _deficiencies(study.systems)]
     lines.append(wrap(_drake_text(study)))
-    lines.append("det., stab.: fails, but only modes that decay: detectable, stabilizable")
+    lines.append("det., stab.: fails, but only modes that decay: detectable, stabilisable")
+    lines.append("mu: the delay in periods")
     return "\n".join(lines)
 
 

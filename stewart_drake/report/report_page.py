@@ -14,12 +14,12 @@ from stewart_drake.config import Scenario
 from stewart_drake.report.collect import ANALYSES, Analysis, Collected
 from stewart_drake.report.figures import draw_comparison, draw_run
 from stewart_drake.report.page import Page, Picture, Provenance, Section, Table, Tone
-from stewart_drake.report.tables import number
+from stewart_drake.report.tables import number, paper_error
 from stewart_drake.report.tuner_figures import weights_figure
 from stewart_drake.results import SimulationResult
 from stewart_drake.scenario_loading import scenario_yaml
-from stewart_drake.signals import COORDINATES
-from stewart_drake.studies.compare import LABELS, PAPER_ERRORS
+from stewart_drake.signals import COORDINATE_NAMES
+from stewart_drake.studies.compare import LABELS, is_papers
 
 GOOD: Final = 5.0
 """% of peak to peak: a mean error up to here, once torques can act, is called good."""
@@ -30,13 +30,21 @@ _QUESTIONS: Final = {
     "workspace": "Does the motion fit the machine?",
 }
 _CAPTIONS: Final = {
-    "states": "As figure 5(a) of the paper: the plate's six coordinates.",
-    "errors": "As figure 5(b) of the paper: their errors.",
-    "torques_delay_lqr": "As figure 7(a) of the paper: torques without integral action.",
-    "torques_delay_lqi": "As figure 7(b) of the paper: torques with integral action.",
-    "torques_predictor_lqi": "The same for the controller that this project adds.",
-    "weights": "As figure 6 of the paper: the weights that the tuner's network sets online.",
+    "states": "The plate's six coordinates.",
+    "errors": "Their errors.",
+    "torques_delay_lqr": "Torques of the delay-aware LQR, without integral action.",
+    "torques_delay_lqi": "Torques of the delay-aware LQI, with integral action.",
+    "torques_predictor_lqi": "Torques of the LQI with nonlinear prediction.",
+    "weights": "The weights that the tuner's network sets online.",
 }
+_PAPER_FIGURES: Final = {
+    "states": "5(a)",
+    "errors": "5(b)",
+    "torques_delay_lqr": "7(a)",
+    "torques_delay_lqi": "7(b)",
+    "weights": "6",
+}
+"""Of the paper, which show the same for its experiment."""
 _RUN_CAPTIONS: Final = {
     "states": "Where the plate was, and where it should have been.",
     "errors": "The difference.",
@@ -50,15 +58,19 @@ _COLUMNS: Final = (
     "E_ac [%\u00a0s]",
     "floor [%\u00a0s]",
     "outcome",
-    "cost (40)",
+    "cost",
     "peak [N\u00a0m]",
     "rms [N\u00a0m]",
     "variation [N\u00a0m]",
     "step [ms]",
 )
+_ERROR_IS: Final = (
+    "E_ac is the error in percent of the motion's peak to peak, averaged over the six coordinates "
+    "and accumulated over time."
+)
 _NO_NETWORK: Final = (
-    "There is no network for the tuner here, so that there is no figure 6; stewart-drake tune "
-    "makes one."
+    "There is no network for the tuner here, so that its weights are not shown; stewart-drake "
+    "tune makes one."
 )
 
 
@@ -140,7 +152,7 @@ def mean_error(run: SimulationResult) -> float:
 
 
 def comparison_rows(found: Collected) -> list[tuple[str, ...]]:
-    """Table II: a row per controller, the tuner's after those with fixed weights."""
+    """A row per controller, the tuner's after those with fixed weights."""
     runs = [(LABELS[name], name, run) for name, run in found.comparison.items()]
     runs += [(f"{LABELS[name]}, tuned", name, run) for name, run in found.tuned.items()]
     return [_row(label, name, run) for label, name, run in runs]
@@ -157,7 +169,7 @@ def _run_sections(found: Collected, replay: str) -> Iterator[Section]:
         ("floor, from the delay alone", f"{number(s['delay_floor'])} % s"),
         *(
             (f"peak error, {name}", f"{number(value)} % of peak to peak")
-            for name, value in zip(COORDINATES, s["peak_error"], strict=True)
+            for name, value in zip(COORDINATE_NAMES, s["peak_error"], strict=True)
         ),
         ("torque, peak and rms", f"{number(s['peak_torque'])} and {number(s['rms_torque'])} N m"),
         ("controller step, median", f"{number(s['controller_step_ms']['median'])} ms"),
@@ -166,34 +178,39 @@ def _run_sections(found: Collected, replay: str) -> Iterator[Section]:
         text = "Drag to look around. The ring is where the plate should be."
         yield Section("Replay", (text,), frame=replay)
     pictures = _pictures(draw_run(found.run), _RUN_CAPTIONS)
-    yield Section("The run", (), [Table(("", "value"), entries)], pictures)
+    yield Section("The run", (_ERROR_IS,), [Table(("", "value"), entries)], pictures)
 
 
 def _comparison(found: Collected) -> Section:
+    papers, captions = is_papers(found.scenario), dict(_CAPTIONS)
     text = [
-        "The same scenario under each of the shipped controllers. E_ac is the accumulated error "
-        "(47), the floor what the delay alone costs; torques are as commanded, their variation "
-        "tells trembling. The paper's numbers are those of its Table II, for its own "
-        "experiment; its delay-aware controllers had the tuner.",
+        "The same scenario under each of the shipped controllers. The floor is what the delay "
+        "alone adds to E_ac; the cost sums squared errors and torques, weighted by w_Q and w_R; "
+        "torques are as commanded, their variation tells trembling.",
     ]
+    if papers:
+        text.append(
+            "The paper's numbers are those of its Table II; its delay-aware controllers had the "
+            "tuner."
+        )
+        for name, figure in _PAPER_FIGURES.items():
+            text_below = captions[name][:1].lower() + captions[name][1:]
+            captions[name] = f"As figure {figure} of the paper: {text_below}"
     figures = draw_comparison(found.comparison)
     if found.tuned:
         figures["weights"] = weights_figure({LABELS[n]: run for n, run in found.tuned.items()})
     elif "weights" not in figures:
         text.append(_NO_NETWORK)
     order = [name for name in _CAPTIONS if name in figures]
-    pictures = _pictures({name: figures[name] for name in order}, _CAPTIONS)
-    table = Table(
-        _COLUMNS, comparison_rows(found), "Table II of the paper, and what comes out here"
-    )
+    pictures = _pictures({name: figures[name] for name in order}, captions)
+    caption = "Table II of the paper, and what comes out here" if papers else ""
+    columns = _COLUMNS if papers else (_COLUMNS[0], *_COLUMNS[2:])
+    table = Table(columns, comparison_rows(found), caption)
     return Section("The controllers compared", text, [table], pictures)
 
 
 def _row(label: str, name: str, run: SimulationResult) -> tuple[str, ...]:
-    s, paper = run.summary, "-"
-    if name in PAPER_ERRORS:
-        error = PAPER_ERRORS[name]
-        paper = "NaN" if error is None else f"{error:.0f}"
+    s = run.summary
     outcome = run.status.replace("_", " ")
     if run.stopped is not None:
         leg = "" if run.stopped.leg is None else f", leg {run.stopped.leg}"
@@ -201,7 +218,7 @@ def _row(label: str, name: str, run: SimulationResult) -> tuple[str, ...]:
     torques = (s["peak_torque"], s["rms_torque"], s["torque_variation"])
     return (
         label,
-        paper,
+        *([paper_error(name)] if is_papers(run.scenario) else []),
         number(s["accumulated_error"]),
         number(s["delay_floor"]),
         outcome,

@@ -137,12 +137,14 @@ def robustness_page(study: RobustnessStudy, made: Provenance) -> Page:
     ]
     facts = {
         "mechanism": study.experiment.mechanism.name,
-        "start": f"{sc.start}, queue {sc.queue}",
+        "start": f"{sc.start.replace('_', ' ')}, torques in flight: {sc.queue}",
         "delay": f"{(sc.delay.steps + sc.delay.fraction) * sc.controller.period:g} s",
         "runs": f"{len(study.outcomes)}, seed {study.seed}, {sc.plant.kind} plant",
         "undisturbed E_ac": f"{number(study.undisturbed.error)} % s",
     }
-    return Page(f"Robustness of {sc.mechanism}", text, sections, made, tone, facts)
+    return Page(
+        f"Robustness of {study.experiment.mechanism.name}", text, sections, made, tone, facts
+    )
 
 
 def percent(share: Interval) -> str:

@@ -9,15 +9,18 @@ from typing import Final
 
 from stewart_drake.resources import Kind, resolve, shipped
 from stewart_drake.results import SimulationResult
-from stewart_drake.signals import COORDINATES
-from stewart_drake.studies.compare import LABELS, PAPER_ERRORS
+from stewart_drake.signals import COORDINATE_NAMES
+from stewart_drake.studies.compare import LABELS, PAPER_ERRORS, is_papers
 from stewart_drake.tuner.density import NUM_INPUTS
 from stewart_drake.tuner.network import NUM_OUTPUTS, load_network
 
 WIDTH: Final = 80
 _NO_BREAK: Final = "\N{NO-BREAK SPACE}"
 _COLUMNS: Final = "{:<16}{:>5}{:>11}{:>11}{:>11}{:>7}{:>7}{:>7}{:>5}"
-_NOTE: Final = "floor: from the delay alone; torques as commanded, var.: their total variation"
+_NOTE: Final = (
+    "floor: of E_ac, from the delay alone; N m: torques as commanded, peak, rms and\n"
+    "total variation; step: the controller's computing time, median"
+)
 
 
 def wrap(text: str, first: str = "", rest: str = "  ") -> str:
@@ -39,7 +42,7 @@ def run_table(result: SimulationResult) -> str:
     """How one run ended, its errors, torques and computing times."""
     s = result.summary
     step, floor = s["controller_step_ms"], f"delay floor {number(s['delay_floor'])} % s"
-    peaks = zip(COORDINATES, s["peak_error"], strict=True)
+    peaks = zip(COORDINATE_NAMES, s["peak_error"], strict=True)
     entries = {"status": result.status.replace("_", " ")}
     if result.stopped is not None:
         entries["status"] += f" at {result.stopped.time:.3f} s"
@@ -60,10 +63,12 @@ def run_table(result: SimulationResult) -> str:
 
 
 def comparison_table(results: Mapping[str, SimulationResult]) -> str:
-    """Table II: one row per controller, with the paper's own numbers."""
+    """One row per controller; for the paper's experiment with the numbers of its Table II."""
+    papers = any(is_papers(result.scenario) for result in results.values())
+    paper, unit = ("paper", "% s") if papers else ("", "")
     lines = [
-        _COLUMNS.format("", "paper", "E_ac", "floor", "cost", "peak", "rms", "var.", "step"),
-        _COLUMNS.format("controller", "% s", "% s", "% s", "(40)", "N m", "N m", "N m", "ms"),
+        _COLUMNS.format("", paper, "E_ac", "floor", "cost", "peak", "rms", "var.", "step"),
+        _COLUMNS.format("controller", unit, "% s", "% s", "-", "N m", "N m", "N m", "ms"),
     ]
     for name, result in results.items():
         s = result.summary
@@ -76,7 +81,7 @@ def comparison_table(results: Mapping[str, SimulationResult]) -> str:
             outcome = f"{f'{status} at {result.stopped.time:.2f} s{leg}':>33}"
         torques = (s["peak_torque"], s["rms_torque"], s["torque_variation"])
         lines.append(
-            f"{LABELS[name]:<16}{_paper(name):>5}{outcome}"
+            f"{LABELS[name]:<16}{paper_error(name) if papers else '':>5}{outcome}"
             + "".join(f"{number(value, 2):>7}" for value in torques)
             + f"{number(s['controller_step_ms']['median'], 2):>5}"
         )
@@ -114,7 +119,8 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{max(0, decimals)}f}"
 
 
-def _paper(name: str) -> str:
+def paper_error(name: str) -> str:
+    """What the paper reports of a controller, in % s; a dash where it reports none."""
     if name not in PAPER_ERRORS:
         return "-"
     error = PAPER_ERRORS[name]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stewart_drake.plant.equations import DEAD_CENTRE_SINE
 from stewart_drake.plant.workspace import SINGULARITY_LIMIT, Failure
 from stewart_drake.report.style import Line, figure_style
-from stewart_drake.signals import LEGS
+from stewart_drake.signals import COORDINATE_NAMES, LEGS
 from stewart_drake.studies.reach import Margins
 from stewart_drake.studies.sizing import Sizing
 from stewart_drake.studies.workspace_map import Section
@@ -39,7 +39,6 @@ _CMAP: Final = colormaps["cividis_r"]
 _OUTSIDE: Final = "#F2F2F2"
 _UNITS: Final = ("deg",) * 3 + ("mm",) * 3
 _FACTORS: Final = (180 / np.pi,) * 3 + (1e3,) * 3
-NAMES: Final = ("roll", "pitch", "yaw", "x", "y", "z")
 
 
 def margins_figure(margins: Margins, left: Failure | None) -> Figure:
@@ -168,5 +167,5 @@ def _section(ax: Axes, section: Section, home: Array, poses: Array, norm: Bounda
     ax.plot(*(f * home[k] for f, k in zip(factors, pair, strict=True)), "k+", ms=9, mew=1.5)
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[0], y[-1])
-    ax.set_xlabel(f"{NAMES[pair[0]]}  [{_UNITS[pair[0]]}]")
-    ax.set_ylabel(f"{NAMES[pair[1]]}  [{_UNITS[pair[1]]}]")
+    ax.set_xlabel(f"{COORDINATE_NAMES[pair[0]]}  [{_UNITS[pair[0]]}]")
+    ax.set_ylabel(f"{COORDINATE_NAMES[pair[1]]}  [{_UNITS[pair[1]]}]")

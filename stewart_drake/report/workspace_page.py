@@ -9,11 +9,11 @@ from stewart_drake.plant.workspace import SINGULARITY_LIMIT
 from stewart_drake.report.page import Page, Picture, Provenance, Section, Table
 from stewart_drake.report.tables import number, rows, wrap
 from stewart_drake.report.workspace_figures import (
-    NAMES,
     margins_figure,
     motors_figure,
     sections_figure,
 )
+from stewart_drake.signals import COORDINATE_NAMES
 from stewart_drake.studies.sizing import Sizing
 from stewart_drake.studies.workspace import WorkspaceStudy
 from stewart_drake.studies.workspace_map import Travel
@@ -70,7 +70,7 @@ def travel_text(travel: list[Travel]) -> str:
     parts = []
     for k, t in enumerate(travel):
         factor, unit = _unit(k)
-        parts.append(f"{NAMES[k]} {factor * t.low:.3g} to +{factor * t.high:.3g} {unit}")
+        parts.append(f"{COORDINATE_NAMES[k]} {factor * t.low:.3g} to +{factor * t.high:.3g} {unit}")
     return ", ".join(parts)
 
 
@@ -95,7 +95,7 @@ def workspace_page(study: WorkspaceStudy, made: Provenance) -> Page:
     fits = study.exit is None
     return Page(
         title=f"Workspace of {mechanism.name}, {scenario.reference.kind} reference",
-        verdict=study.verdict,
+        verdict=study.verdict[:1].upper() + study.verdict[1:],
         sections=parts,
         provenance=made,
         tone="bad" if not fits else "fair" if study.home is not None else "good",
@@ -105,7 +105,13 @@ def workspace_page(study: WorkspaceStudy, made: Provenance) -> Page:
 
 def _along(study: WorkspaceStudy, summary: dict[str, Any]) -> Section:
     table = Table(
-        ("leg", "least reach margin, mm", "at, s", "least sine off dead centre", "least r·t"),
+        (
+            "leg",
+            "least reach margin [mm]",
+            "at [s]",
+            "least sine off dead centre",
+            "least transmission",
+        ),
         [
             (
                 str(leg["leg"]),
@@ -124,7 +130,8 @@ def _along(study: WorkspaceStudy, summary: dict[str, Any]) -> Section:
         f"closed. A run ends where a crank comes within {DEAD_CENTRE_SINE:g} (sine of the angle) "
         "of its dead centre: there it cannot follow (serial singularity). It also ends where "
         f"det W falls below {SINGULARITY_LIMIT:g}: there locked cranks no longer hold the plate "
-        "(parallel singularity).",
+        "(parallel singularity). The transmission is the cosine of the angle between the rod and "
+        "the way of the crank's tip.",
         "The condition number is that of A, which takes the plate's twist to crank rates, with "
         f"angular velocities times {length:.4g} mm, the mean distance of the plate joints from "
         "the centre of mass. 1 is a machine alike in all directions.",
@@ -140,13 +147,13 @@ def _along(study: WorkspaceStudy, summary: dict[str, Any]) -> Section:
 
 def _motors(sizing: Sizing, torque_limit: float | None, motors: list[dict[str, Any]]) -> Section:
     names = {
-        "peak_torque": "torque peak, N m",
-        "rms_torque": "torque rms",
-        "peak_speed": "speed peak, rad/s",
-        "rms_speed": "speed rms",
-        "peak_power": "power peak, W",
-        "least_power": "power least",
-        "rms_power": "power rms",
+        "peak_torque": "torque peak [N\u00a0m]",
+        "rms_torque": "torque rms [N\u00a0m]",
+        "peak_speed": "speed peak [rad/s]",
+        "rms_speed": "speed rms [rad/s]",
+        "peak_power": "power peak [W]",
+        "least_power": "power least [W]",
+        "rms_power": "power rms [W]",
     }
     table = Table(
         ("leg", *names.values()),
@@ -170,7 +177,7 @@ def _around(study: WorkspaceStudy) -> Section:
         factor, unit = _unit(k)
         table_rows.append(
             (
-                NAMES[k],
+                COORDINATE_NAMES[k],
                 unit,
                 f"{factor * t.low:.4g}",
                 t.low_reason,

@@ -1,5 +1,6 @@
 """The shipped controllers on one scenario."""
 
+import math
 import signal
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.config import Scenario
 from stewart_drake.errors import ConfigError
+from stewart_drake.resources import resolve
 from stewart_drake.results import SimulationResult, write_json, write_signals
 from stewart_drake.scenario_loading import load_scenario
 from stewart_drake.simulation import simulate
@@ -29,6 +31,8 @@ LABELS: Final = {
 }
 PAPER_ERRORS: Final = {"lqr": None, "lqi": None, "delay_lqr": 225.0, "delay_lqi": 80.0}
 """E_ac in % s that the paper reports in its Table II, None where it reports a failure."""
+PAPER_DELAY: Final = 0.8
+"""s, of the experiment in that table."""
 
 Progress = Callable[[str, float, float], None]
 """Called with a controller's name, its simulated time in s and its error in % of peak to peak."""
@@ -74,6 +78,17 @@ def compare(
             board.stop()
         results = zip(scenarios, runs.result(), strict=True)
     return {name: result for name, result in results if result is not None}
+
+
+def is_papers(scenario: Scenario) -> bool:
+    """Whether the paper's numbers are about this scenario: its mechanism, motion and delay."""
+    own, delay = Scenario(), scenario.delay
+    eta = (delay.steps + delay.fraction) * scenario.controller.period
+    return (
+        resolve("mechanism", scenario.mechanism) == resolve("mechanism", own.mechanism)
+        and scenario.reference == own.reference
+        and math.isclose(eta, PAPER_DELAY)
+    )
 
 
 def save_comparison(results: dict[str, SimulationResult], directory: str | Path) -> None:

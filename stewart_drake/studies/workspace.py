@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.config import Scenario
-from stewart_drake.experiment import Experiment, assemble
+from stewart_drake.experiment import Experiment, assemble, first_pose_text
 from stewart_drake.plant.workspace import Failure, diagnose
 from stewart_drake.signals import COORDINATES, LEGS
 from stewart_drake.studies.reach import (
@@ -89,7 +89,10 @@ class WorkspaceStudy:
         if np.isnan(value):
             return "it does not move"
         if value == 0:
-            return "not even its first pose is inside"
+            home = self.experiment.mechanism
+            return (
+                f"not even its first pose is inside: {first_pose_text(self.margins.pose[0], home)}"
+            )
         if not self.factor.limited:
             return f"{value:g} times the amplitude fits, more was not tried"
         return f"the largest amplitude that fits is {np.floor(1e3 * value) / 1e3:g} times this one"
