@@ -181,7 +181,19 @@ def _explain(type_: type, error: Any) -> str:
         owner = _alternative(_hint_at(type_, loc[:-1]), dataclasses.is_dataclass)
         known = [f.name for f in dataclasses.fields(owner)] if owner else []
         alike = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean {_dotted((*loc[:-1], alike[0]))}?" if alike else ""
+        # A field may have been named without its section.
+        deeper = [
+            f"{section}.{name}"
+            for section in known
+            if (
+                inner := _alternative(
+                    _hint_at(type_, (*loc[:-1], section)), dataclasses.is_dataclass
+                )
+            )
+            and name in {f.name for f in dataclasses.fields(inner)}
+        ]
+        meant = alike[0] if alike else deeper[0] if len(deeper) == 1 else None
+        hint = f"did you mean {_dotted((*loc[:-1], meant))}?" if meant else ""
         expected = hint or f"expected one of {', '.join(known)}"
         return f"{_cut(field, 60)}: unknown key; {expected}"
     if error["type"].startswith("missing"):

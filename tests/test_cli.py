@@ -46,6 +46,8 @@ def files(folder: Path) -> set[str]:
     ("arguments", "said"),
     [
         (["simulate", "--set", "plant.knd=exact"], ["plant.knd", "did you mean plant.kind?"]),
+        (["simulate", "--set", "gravity=true"], ["gravity: unknown", "mean plant.gravity?"]),
+        (["simulate", "--set", "kind=exact"], ["kind: unknown", "expected one of mechanism"]),
         (["simulate", "--set", "delay.steps=-1"], ["delay.steps", "-1", "at least 0"]),
         (["simulate", "--set", "controller.period=0"], ["controller.period", "got 0", "at least"]),
         (["simulate", "--set", "plant.time_step=0.003"], ["plant.time_step", "0.003", "whole"]),

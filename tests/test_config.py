@@ -401,6 +401,12 @@ def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
         one_line(caught)
 
 
+def test_a_file_may_end_in_yml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.yml").write_text("duration: 3.0\n")
+    assert load_scenario("own.yml").duration == 3.0
+
+
 def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
     path = tmp_path / "bom.yaml"
     path.write_bytes(b"\xef\xbb\xbfduration: 3\n")

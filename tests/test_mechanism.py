@@ -108,7 +108,7 @@ INVALID = [
     ({"pattern.rotation_deg": float("nan")}, "pattern.rotation_deg: got nan", "finite"),
     (
         {"home": [0, 0, 0, 0, 0, 0.6]},
-        "home: got [0, 0, 0, 0, 0, 0.6], out of reach",
+        "home: got [0, 0, 0, 0, 0, 0.6], out of reach: all legs short by ",
         "within reach",
     ),
     ({"home": [0, 0, 0, 0, 0.38]}, "home: got [0, 0, 0, 0, 0.38]", "6 items"),
@@ -121,6 +121,7 @@ INVALID = [
     (third_leg(motor_axis=[0, 0, 0]), "legs[2].motor_axis: got [0.0, 0.0, 0.0]", "not zero"),
     (third_leg(crank_zero=[0, 0, 0]), "legs[2].crank_zero: got [0.0, 0.0, 0.0]", "not zero"),
     (third_leg(crank_zero=[1, 1, 0]), "legs[2].crank_zero: got 45 degrees", "perpendicular"),
+    (third_leg(crank_zero=[0.005, 1, 0]), "legs[2].crank_zero: got 89.7", "perpendicular"),
     (third_leg(crank_zero=[2, 0, 0]), "legs[2].crank_zero: got 0 degrees", "perpendicular"),
     (third_leg(branch=0), "legs[2].branch: got 0", "-1 or 1"),
     (third_leg(branch=0.5), "legs[2].branch: got 0.5", "-1 or 1"),
@@ -268,6 +269,23 @@ def test_explicit_legs_give_the_geometry_of_the_pattern(load: Loader) -> None:
             np.testing.assert_allclose(given, expected, atol=1e-14, err_msg=field.name)
     pose = PAPER.home + [0.1, 0.05, -0.1, 0.01, 0, 0.02]
     np.testing.assert_allclose(explicit.crank_angles(pose), PAPER.crank_angles(pose), atol=1e-12)
+
+
+def test_directions_may_be_written_with_three_decimals(load: Loader) -> None:
+    legs = [
+        {
+            "shaft": PAPER.p_WS[i].tolist(),
+            "motor_axis": PAPER.R_WS[i][:, 2].round(3).tolist(),
+            "crank_zero": PAPER.R_WS[i][:, 0].round(3).tolist(),
+            "plate_joint": PAPER.p_PQ[i].tolist(),
+            "branch": int(PAPER.branches[i]),
+        }
+        for i in range(6)
+    ]
+    rounded = load(paper_with({"pattern": ABSENT, "legs": legs}))
+    np.testing.assert_allclose(rounded.R_WS, PAPER.R_WS, atol=2e-3)
+    right = np.einsum("kji,kjl->kil", rounded.R_WS, rounded.R_WS)
+    np.testing.assert_allclose(right, np.broadcast_to(np.eye(3), (6, 3, 3)), atol=1e-14)
 
 
 def test_lengths_may_differ_from_leg_to_leg(load: Loader) -> None:

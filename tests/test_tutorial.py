@@ -19,7 +19,7 @@ FENCE = re.compile(r"^```(\w+) ?(\S*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 def test_the_names_of_saved_files_are_told_in_the_text():
     text = TUTORIAL.read_text(encoding="utf-8")
     names = [name for _, name, _ in FENCE.findall(text) if name]
-    assert len(names) == 2 and all(f"*{name}*" in text for name in names)
+    assert len(names) == 3 and all(f"*{name}*" in text for name in names)
 
 
 def test_everything_in_it_works(tmp_path, monkeypatch, capsys):
@@ -56,6 +56,14 @@ def check_what_it_says(told: dict[str, str]) -> None:
     for words in ("--set delay.steps=5 --set controller.delay_steps=4", "--controller lqi"):
         out = told[f"simulate waves.yaml {words}"]
         assert "left workspace at" in out and re.search(r"leg \d", out)
+    slow = (
+        "simulate waves.yaml --set delay.fraction=0.1 --set controller.delay_steps=4 "
+        "--set controller.w_R=1000"
+    )
+    assert "completed" in told[slow]
+    usual = slow.split()[:-2]
+    assert main([*usual, "--out", "out/usual", "--quiet"]) == 0
+    assert json.loads(Path("out/usual/summary.json").read_text())["status"] == "left_workspace"
     shown = FENCE.findall(TUTORIAL.read_text(encoding="utf-8"))
     (sample,) = (text for language, _, text in shown if language == "text")
     real = told["simulate waves.yaml --out out/waves --csv --replay"]

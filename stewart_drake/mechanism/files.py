@@ -20,6 +20,8 @@ _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 # Limits far beyond any platform keep squares and products of what a file says finite.
 _SHORTEST, _LONGEST = 1e-6, 1e3
+_MOST_LEAN = 2e-3
+"""rad; directions written with three decimals are off the right angle by less."""
 Coordinate = Annotated[float, Field(ge=-_LONGEST, le=_LONGEST)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 Radius = Annotated[float, Field(ge=_SHORTEST, le=_LONGEST)]
@@ -108,7 +110,8 @@ class LegSpec:
     """One leg: points in m, W for the shaft, P for the plate joint; directions need no unit length.
 
     `crank_zero` is the direction of the crank at angle zero, perpendicular to `motor_axis`, about
-    which the angle grows right-handed. `branch` (-1 or 1): which of the two crank solutions.
+    which the angle grows right-handed; what it leans by rounding is taken off. `branch` (-1 or 1):
+    which of the two crank solutions.
     """
 
     shaft: Point
@@ -229,7 +232,7 @@ def _explicit_anchors(legs: list[LegSpec]) -> tuple[Array, Array, Array, Array]:
                     f"legs[{leg - 1}].{field}: got {direction}; expected a direction, not zero"
                 )
         n, x = axis / lengths[0], zero / lengths[1]
-        if abs(n @ x) > 1e-6:
+        if abs(n @ x) > _MOST_LEAN:
             raise ConfigError(
                 f"legs[{leg - 1}].crank_zero: got {np.rad2deg(np.arccos(n @ x)):.6g} degrees to "
                 "motor_axis; expected a perpendicular direction"
