@@ -92,9 +92,10 @@ def robustness_table(study: RobustnessStudy) -> str:
         span = "" if one.factor.startswith("|") else spans[one.factor]
         cells = (_rho(one.error, one.error_p), _rho(one.failure, one.failure_p))
         lines.append(_ROW.format(title(one.factor), span, *cells))
-    lines.append(
-        f"*: beyond chance, adjusted p below {SIGNIFICANT:g}; |...|: by size; -: all runs alike"
-    )
+    lines += [
+        "+: the larger, the worse; -: the larger, the better; |...|: by size, either way",
+        f"*: beyond chance, adjusted p below {SIGNIFICANT:g}; a dash: all runs alike",
+    ]
     return "\n".join(lines)
 
 

@@ -50,7 +50,7 @@ def margins_figure(margins: Margins, left: Failure | None) -> Figure:
         axes = figure.subplots(2, 2, sharex=True).ravel()
         _legs(axes[0], margins.time, 1e3 * margins.reach, "reach margin  [mm]", 0.0)
         _legs(axes[1], margins.time, margins.sines, "sine off dead centre  [-]", DEAD_CENTRE_SINE)
-        axes[1].set_ylim(max(-1.05, axes[1].get_ylim()[0]), 1.05)
+        axes[1].set_ylim(max(-0.05, axes[1].get_ylim()[0]), 1.05)
         style = LEG_LINES[4]._asdict()
         inside = np.where(np.isnan(margins.condition), np.nan, margins.parallel)
         axes[2].plot(margins.time, inside, **style)

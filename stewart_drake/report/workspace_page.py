@@ -38,7 +38,7 @@ def workspace_table(study: WorkspaceStudy) -> str:
                 leg["leg"],
                 number(1e3 * leg["least_reach_margin"]),
                 f"{leg['time']:.2f}",
-                number(leg["least_sine"], 2),
+                _sine(leg, 2),
                 *(
                     number(motor.get(name, np.nan))
                     for name in (
@@ -117,7 +117,7 @@ def _along(study: WorkspaceStudy, summary: dict[str, Any]) -> Section:
                 str(leg["leg"]),
                 number(1e3 * leg["least_reach_margin"]),
                 f"{leg['time']:.2f}",
-                number(leg["least_sine"]),
+                _sine(leg),
                 number(leg["least_transmission"]),
             )
             for leg in summary["legs"]
@@ -201,6 +201,12 @@ def _around(study: WorkspaceStudy) -> Section:
         "earlier."
     ]
     return Section("Around home", text, [table], [picture])
+
+
+def _sine(leg: dict[str, Any], digits: int = 3) -> str:
+    """What is left to the dead centre; a dash where the leg does not reach: there is no angle."""
+    value = leg["least_sine"]
+    return number(value if value >= 0 else np.nan, digits)
 
 
 def _factor(study: WorkspaceStudy) -> str:
