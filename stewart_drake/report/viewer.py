@@ -148,12 +148,18 @@ class PoseViewer:
 
 
 def aim_camera(meshcat: Meshcat, mechanism: Mechanism) -> None:
-    """Look at a machine of any size so that it fills most of the window."""
+    """Look at a machine of any size so that it fills most of the window, over a fitting grid."""
     joints = mechanism.home[3:] + mechanism.p_PQ
     target = np.array([0.0, 0.0, (joints[:, 2].mean() + mechanism.p_WS[:, 2].mean()) / 2])
     radius = np.linalg.norm(np.vstack([joints, mechanism.p_WS]) - target, axis=1).max()
     eye: Any = target + radius * np.array(_VIEW)
     meshcat.SetCameraPose(eye, target)  # type: ignore[arg-type]
+    # Meshcat's own grid has squares of a metre: of a small machine one sees a bar at the horizon.
+    meshcat.SetProperty("/Grid", "scale", [10.0 ** np.floor(np.log10(radius))] * 3)
+    meshcat.SetProperty("/Grid", "position", [0.0, 0.0, -0.06 * radius])
+    meshcat.SetProperty("/Grid", "opacity", 0.25)
+    meshcat.SetProperty("/Background", "top_color", [1.0, 1.0, 1.0])
+    meshcat.SetProperty("/Background", "bottom_color", [0.86, 0.88, 0.91])
 
 
 def _transform(R: Any, p: Any) -> RigidTransform:
