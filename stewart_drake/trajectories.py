@@ -35,6 +35,7 @@ _STOP_SPEED: Final = 1e-3
 """rad/s or m/s; a motion that ends slower than this, or than the share below, is at rest."""
 _STOP_SHARE: Final = 0.05
 """Of the coordinate's largest speed at a sample."""
+_GOLDEN: Final = (math.sqrt(5) - 1) / 2
 
 
 def make_reference(config: ReferenceConfig, duration: float) -> Trajectory:
@@ -79,6 +80,21 @@ def evaluate(trajectory: Trajectory, t: float) -> Array:
     result[RATES] = trajectory.EvalDerivative(t, 1)[:, 0]
     result[ACCELERATIONS] = trajectory.EvalDerivative(t, 2)[:, 0]
     return result
+
+
+def spread_instants(duration: float, number: int) -> Array:
+    """Where to look at a motion of unknown period: an instant (number,) in each equal part.
+
+    Evenly spaced ones may all fall on the same phase, such as on the zeros of a sine of 0.5 Hz
+    that is looked at once a second. These sit at the places of the golden sequence in their parts,
+    so that whatever the period, the phases seen are spread evenly.
+
+    Args:
+        duration: s.
+        number: of instants, the first of which is 0.
+    """
+    k = np.arange(number)
+    return duration / number * (k + k * _GOLDEN % 1)
 
 
 def angular_frequency(config: ReferenceConfig) -> float:

@@ -543,6 +543,18 @@ def test_a_step_changes_nothing_it_was_given() -> None:
     assert all(np.array_equal(a, b) for a, b in zip(inputs, before, strict=True))
 
 
+@pytest.mark.parametrize(("frequency", "whole", "odd"), [("0.5", 200, 203.7), ("0.8", 10, 10.37)])
+def test_a_duration_of_whole_periods_designs_the_same_law(
+    frequency: str, whole: float, odd: float
+) -> None:
+    """Evenly spaced instants would all see the sine at rest, free of torque and of acceleration."""
+    motion = (f"reference.frequency={frequency}", "reference.frequency_unit=Hz", "delay.steps=1")
+    one, other = (law_of(*motion, f"duration={d}").options for d in (whole, odd))
+    assert one.torque_weights == pytest.approx(other.torque_weights, rel=0.02)
+    assert one.gentle_torque == pytest.approx(other.gentle_torque, rel=0.02)
+    assert one.substeps == other.substeps
+
+
 def test_the_nominal_plant_of_the_law_is_the_scenarios() -> None:
     assert isinstance(law_of().dynamics, StewartDynamics)
     assert law_of("plant.gravity=true", "delay.steps=0").dynamics.gravity == 9.81

@@ -20,6 +20,7 @@ from stewart_drake.trajectories import (
     evaluate,
     make_reference,
     peak_to_peak,
+    spread_instants,
 )
 
 Array = NDArray[np.float64]
@@ -376,6 +377,26 @@ def test_the_peak_to_peak_of_samples_is_their_range_within_the_run(tmp_path: Pat
     )
     first_quarter = peak_to_peak(config, make_reference(config, 1.5), 1.5)
     np.testing.assert_allclose(first_quarter, whole / 2 * math.sin(1.5), rtol=1e-6)
+
+
+# Where to look at a motion
+
+
+@given(
+    duration=st.floats(0.1, 1e4),
+    number=st.integers(8, 300),
+    periods=st.sampled_from([0.25, 0.5, 1.0, 1.5, 2.0, 7.0, 100.0]),
+)
+def test_spread_instants_see_all_phases_of_a_motion_in_step_with_the_parts(
+    duration: float, number: int, periods: float
+) -> None:
+    times = spread_instants(duration, number)
+    part = duration / number
+    assert times[0] == 0 and times[-1] < duration
+    np.testing.assert_array_equal(np.floor(times / part * (1 + 1e-12)), np.arange(number))
+    phases = np.sort(times / part * periods % 1)  # so many periods in each part
+    gaps = np.diff([*phases, phases[0] + 1])
+    assert gaps.max() < 0.45  # evenly spaced instants: 0.5 at the best with half a period, else 1
 
 
 # Catch-up

@@ -9,7 +9,7 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.design.holds import mean_torques
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.signals import ACCELERATIONS, NUM_TORQUES, POSE, RATES, queue_length
-from stewart_drake.trajectories import evaluate
+from stewart_drake.trajectories import evaluate, spread_instants
 
 Array = NDArray[np.float64]
 
@@ -19,6 +19,8 @@ ASTRAY = 0.3
 """rad, and crank lengths, from the reference on which a prediction is of no use."""
 LEAST_TORQUE_SCALE = 0.01
 """N m."""
+INSTANTS = 200
+"""At which the torques along a reference are looked at."""
 TOLERANCE = 0.03
 """Pose error that is tolerable, as a share of half the reference's peak to peak.
 
@@ -61,14 +63,16 @@ def weight_scales(
     return 1 / tolerable**2, 1 / tolerable**2, np.full(NUM_TORQUES, 1 / peak**2)
 
 
+def reference_torques(dynamics: StewartDynamics, reference: Trajectory, duration: float) -> Array:
+    """Largest of the six motor torques (INSTANTS,) in N m along the reference."""
+    states = (evaluate(reference, t) for t in spread_instants(duration, INSTANTS))
+    torques = [dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in states]
+    return np.abs(torques).max(axis=1)
+
+
 def reference_torque(dynamics: StewartDynamics, reference: Trajectory, duration: float) -> float:
     """Largest motor torque in N m that following the reference takes."""
-    times = np.linspace(0.0, duration, 201)
-    states = (evaluate(reference, t) for t in times)
-    return max(
-        float(np.abs(dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])).max())
-        for x in states
-    )
+    return float(reference_torques(dynamics, reference, duration).max())
 
 
 def choose_substeps(
@@ -86,7 +90,7 @@ def choose_substeps(
     crank = dynamics.mechanism.crank_lengths.min()
     near = ASTRAY * np.repeat([1.0, crank], 3)
     cases = []
-    for t in np.linspace(0.0, duration, 8, endpoint=False):
+    for t in spread_instants(duration, 8):
         start = evaluate(reference, t)[:12]
         wanted = np.array([reference.value(t + hold + period)[:, 0] for hold in holds])
         torques = mean_torques(dynamics, reference, t + holds, t + holds + period)

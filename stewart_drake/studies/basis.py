@@ -1,12 +1,12 @@
 """What every analysis of a scenario starts from, also where its motion cannot be followed."""
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.config import Scenario
-from stewart_drake.design.startup import LEAST_TORQUE_SCALE
+from stewart_drake.design.startup import LEAST_TORQUE_SCALE, reference_torques
 from stewart_drake.experiment import (
     REACH_CHECK_PERIOD,
     Experiment,
@@ -15,12 +15,8 @@ from stewart_drake.experiment import (
     reference_failure,
 )
 from stewart_drake.plant.workspace import Failure, diagnose
-from stewart_drake.signals import ACCELERATIONS, POSE, RATES
-from stewart_drake.trajectories import evaluate
 
 Array = NDArray[np.float64]
-
-_INSTANTS: Final = 201
 
 
 class Basis(NamedTuple):
@@ -68,12 +64,10 @@ def basis(scenario: Scenario) -> Basis:
     experiment = assemble(scenario)
     mechanism, reference = experiment.mechanism, experiment.reference
     failure = reference_failure(experiment)
-    end, torques = _end(scenario.duration, failure), [0.0]
-    for t in np.linspace(0.0, end, _INSTANTS) if end > 0 else ():
-        x = evaluate(reference, t)
-        needed = experiment.nominal.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
-        torques.append(float(np.abs(needed).max()))
-    torque = max(torques) if failure is None else float(np.median(torques))
+    end, torque = _end(scenario.duration, failure), 0.0
+    if end > 0:
+        torques = reference_torques(experiment.nominal, reference, end)
+        torque = float(torques.max() if failure is None else np.median(torques))
     return Basis(
         experiment=experiment,
         failure=failure,

@@ -15,12 +15,13 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.config import Scenario
-from stewart_drake.design.startup import reference_torque
+from stewart_drake.design.startup import INSTANTS
 from stewart_drake.errors import ConfigError
 from stewart_drake.experiment import Experiment, believed_delay, motion_scale
 from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.signals import NUM_LEGS, NUM_TORQUES
 from stewart_drake.studies.sizing import size_motors
+from stewart_drake.trajectories import spread_instants
 from stewart_drake.yamlio import brief, parse_yaml, validate
 
 Array = NDArray[np.float64]
@@ -136,12 +137,12 @@ def scales_of(experiment: Experiment, commanded: float) -> Scales:
         commanded: largest torque that the undisturbed run commands, N m.
     """
     sc = experiment.scenario
-    times = np.linspace(0.0, sc.duration, 201)
+    times = spread_instants(sc.duration, INSTANTS)
     sizing = size_motors(experiment.nominal, experiment.reference, times)
     return Scales(
         plate_mass=experiment.mechanism.plate.mass,
         motion=tuple(motion_scale(experiment).tolist()),
-        torque=reference_torque(experiment.nominal, experiment.reference, sc.duration),
+        torque=float(np.abs(sizing.torque).max()),
         speed=float(np.abs(sizing.speed).max()),
         crank=float(experiment.mechanism.crank_lengths.mean()),
         period=sc.controller.period,
