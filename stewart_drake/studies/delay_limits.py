@@ -14,17 +14,17 @@ from stewart_drake.design.riccati import RiccatiError
 from stewart_drake.metrics import delay_floor
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.workspace import diagnose
-from stewart_drake.signals import ACCELERATIONS, POSE, RATES
+from stewart_drake.signals import POSE
 from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
 from stewart_drake.studies.delay_map import Cell, Progress, delay_map, map_delays
-from stewart_drake.studies.verdict import Verdict
-from stewart_drake.trajectories import evaluate
+from stewart_drake.studies.verdict import Verdict, pole_in_motion
 
 Array = NDArray[np.float64]
 
-INSTANTS: Final = 61
-"""Poles are looked at this often along the reference."""
+INSTANTS: Final = 62
+"""Poles are looked at this often along the reference; 61 steps, a prime, since a round number of
+them may be in step with the motion."""
 TOLERABLE: Final = (2.0, 10.0, 100.0, 1000.0)
 """Growths of prediction errors for which the largest delay is given."""
 _CHECKS: Final = 5
@@ -45,7 +45,7 @@ class PolePoint(NamedTuple):
     moving: float
     """Fastest unstable pole, 1/s, linearised about the moving reference; 0 without one."""
     held: float
-    """The same with the plate held still at that pose; NaN where no torque holds it."""
+    """The same with the plate held still at that pose."""
 
 
 class Growth(NamedTuple):
@@ -216,12 +216,9 @@ def _poles(found: Basis) -> list[PolePoint]:
     experiment, points = found.experiment, []
     end = found.followed_until
     for t in np.linspace(0.0, end, INSTANTS) if end > 0 else ():
-        x = evaluate(experiment.reference, t)
-        pose, rates = x[POSE], x[RATES]
-        torque = experiment.nominal.inverse_dynamics(pose, rates, x[ACCELERATIONS])
-        moving = fastest_pole(experiment.nominal.derivatives(pose, rates, torque).A)
+        pose = experiment.reference.value(t)[:, 0]
         held = fastest_pole(experiment.nominal.linearize(pose)[0])
-        points.append(PolePoint(float(t), moving, held))
+        points.append(PolePoint(float(t), pole_in_motion(experiment, t), held))
     return points
 
 

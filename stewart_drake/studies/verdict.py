@@ -6,14 +6,14 @@ from typing import Final, Literal
 
 import numpy as np
 
+from stewart_drake.design.limits import amplification, fastest_pole
 from stewart_drake.experiment import Experiment
 from stewart_drake.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.trajectories import evaluate
 
 INSTANTS: Final = 30
-"""Poles are looked at this often along the reference."""
-SLOWEST_POLE: Final = 1e-3
-"""1/s; below it a pole is the rounding of a double integrator's zero."""
+"""Poles are looked at this often along the reference; 29 steps, a prime, since a round number of
+them may be in step with the motion."""
 HARDLY: Final = 10.0
 NO: Final = 1e3
 """Growth of prediction errors from which a delay is hardly, or not, beatable."""
@@ -36,10 +36,7 @@ class Verdict:
     @property
     def amplification(self) -> float:
         """e^(pole eta), infinite where that overflows."""
-        try:
-            return math.exp(self.pole * self.eta)
-        except OverflowError:
-            return math.inf
+        return amplification(self.pole, self.eta)
 
     @property
     def beatable(self) -> Literal["yes", "hardly", "no"]:
@@ -59,21 +56,22 @@ class Verdict:
 
 
 def delay_verdict(experiment: Experiment) -> Verdict:
-    """Judge the scenario's true delay by the open loop's poles along its reference.
-
-    The nominal plant is linearised about the moving reference, with the torque that follows it.
-    """
-    sc, plant = experiment.scenario, experiment.nominal
-    pole, time = 0.0, 0.0
-    for t in np.linspace(0.0, sc.duration, INSTANTS):
-        wanted = evaluate(experiment.reference, t)
-        pose, rates = wanted[POSE], wanted[RATES]
-        torque = plant.inverse_dynamics(pose, rates, wanted[ACCELERATIONS])
-        fastest = np.linalg.eigvals(plant.derivatives(pose, rates, torque).A).real.max()
-        if fastest > max(pole, SLOWEST_POLE):
-            pole, time = float(fastest), float(t)
+    """Judge the scenario's true delay by the open loop's poles along its reference."""
+    sc, times = experiment.scenario, np.linspace(0.0, experiment.scenario.duration, INSTANTS)
+    poles = [pole_in_motion(experiment, t) for t in times]
+    worst = int(np.argmax(poles))
     eta = (sc.delay.steps + sc.delay.fraction) * sc.controller.period
-    return Verdict(eta=eta, pole=pole, time=time)
+    return Verdict(eta=eta, pole=poles[worst], time=float(times[worst]))
+
+
+def pole_in_motion(experiment: Experiment, time: float) -> float:
+    """Fastest pole of the nominal plant, 1/s, 0 without a growing one, about the moving reference.
+
+    `time` in s; the torque is the one that follows the reference then.
+    """
+    x, plant = evaluate(experiment.reference, time), experiment.nominal
+    torque = plant.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
+    return fastest_pole(plant.derivatives(x[POSE], x[RATES], torque).A)
 
 
 def _power(exponent: float) -> str:
