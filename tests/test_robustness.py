@@ -259,6 +259,15 @@ def test_a_scenarios_own_limit_is_kept() -> None:
     assert none.torque_limit == 1.0
 
 
+def test_where_nothing_is_commanded_no_limit_is_drawn() -> None:
+    """At rest without gravity, multiples of the undisturbed run's torque would forbid any."""
+    scenario, idle = short(), SCALES._replace(commanded=0.0)
+    one = draw(Ranges(), idle, scenario, 0, 0)
+    assert one.torque_limit is None
+    disturbed(scenario, SCALES.motion, one).check()
+    assert draw(Ranges(), SCALES, scenario, 0, 0)._replace(torque_limit=None) == one
+
+
 def test_multibody_delays_are_whole_steps() -> None:
     scenario = short()
     scenario.plant.kind = "multibody"

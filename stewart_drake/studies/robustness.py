@@ -1,5 +1,6 @@
 """How a scenario bears what is not known of the machine: many runs, each with one drawn machine."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -64,7 +65,7 @@ def study_robustness(
     common: dict[str, Any] = {
         "settings": {
             "scenario": scenario_to_dict(scenario),
-            "ranges": {name: getattr(ranges, name) for name in vars(ranges)},
+            "ranges": dataclasses.asdict(ranges),
             "seed": seed,
         },
         "workers": workers,

@@ -1,6 +1,7 @@
 """What a Monte Carlo study of a scenario has found: shares, quantiles, and what mattered."""
 
 import csv
+import dataclasses
 import io
 import math
 import re
@@ -155,7 +156,7 @@ class RobustnessStudy(NamedTuple):
             else None,
             "influences": [_influence_summary(one) for one in self.influences()],
             "undisturbed": self.undisturbed._asdict(),
-            "ranges": {name: getattr(self.ranges, name) for name in vars(self.ranges)},
+            "ranges": dataclasses.asdict(self.ranges),
             "scales": self.scales._asdict(),
             "scenario": scenario_to_dict(self.experiment.scenario),
             "versions": versions(),

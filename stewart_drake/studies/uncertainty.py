@@ -258,7 +258,8 @@ def _of_random_size(rng: np.random.Generator, number: int, largest: float) -> tu
 
 
 def _limit(ranges: Ranges, scales: Scales, strength: float, own: float | None) -> float | None:
-    if ranges.torque_limit is None:
+    # Where the undisturbed run takes no torque, as at rest without gravity, a limit has no scale.
+    if ranges.torque_limit is None or scales.commanded == 0:
         return own
     low, high = ranges.torque_limit
     limit = scales.commanded * (low + (high - low) * strength)
