@@ -508,6 +508,20 @@ def test_a_failed_riccati_equation_keeps_the_last_good_gain(
     assert np.abs(loop.states[-1][:6] - reference(1.0)[:6]).max() < 1e-3
 
 
+@pytest.mark.parametrize("fraction", [0.0, 0.3])
+def test_the_last_good_gain_sees_the_same_errors(fraction: float) -> None:
+    """What held torques leave of the rates is no error to it either."""
+    law = law_of("delay.steps=2", f"delay.fraction={fraction}", "controller.estimator=none")
+    preview = np.array([sine(1.0)(max(0.0, 0.3 + t)) for t in law.preview_times])
+    memory, x = sampled(law), preview[0, :12] + 1e-3
+    well = law.step(memory, x, preview, WEIGHTS)
+    failed = law.step(
+        dataclasses.replace(memory, gain=well.gain), x, preview, np.array([np.nan, 1.0])
+    )
+    assert failed.counts.riccati_failures == 1
+    assert np.array_equal(failed.torque, well.torque)
+
+
 @pytest.mark.parametrize("weights", [[np.nan, 1.0], [1.0, 0.0], [-1.0, 1.0], [np.inf, 1.0]])
 def test_bad_weights_keep_the_last_good_gain(weights: list[float]) -> None:
     law = law_of("delay.steps=2", "controller.estimator=none")

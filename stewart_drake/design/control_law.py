@@ -124,9 +124,9 @@ class DelayLqi:
         gain, failed = None, False
         try:
             model = self._model(point, feedforward[-1], theta)
-            gain = self._gain(model, weights)
             if self.options.feedforward == "inverse_dynamics":
                 error_ahead -= self._offset(changes, model.B[RATES])
+            gain = self._gain(model, weights)
         except UnreachablePoseError:
             failed = True  # nothing to regulate: the feedforward goes on alone
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
