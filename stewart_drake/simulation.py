@@ -123,13 +123,15 @@ def make_simulator(loop: ClosedLoop) -> Simulator:
 def _instants(scenario: Scenario) -> Iterator[tuple[float, bool, bool]]:
     """Instants to look at, whether on the metric's grid (or last), whether a controller sample."""
     end = scenario.duration
-    grid = METRIC_PERIOD * np.arange(int(end / METRIC_PERIOD + 1e-9) + 1)
-    period = scenario.controller.period
-    samples = period * np.arange(int(end / period + 1e-9) + 1)
-    # Grid and samples that agree but for rounding are one instant.
-    for key in sorted({*np.round(grid, 9), *np.round(samples, 9), round(end, 9)}):
-        on_grid = np.abs(grid - key).min() < 1e-8 or abs(key - end) < 1e-8
-        yield min(float(key), end), bool(on_grid), bool(np.abs(samples - key).min() < 1e-8)
+
+    def multiples(period: float) -> set[float]:
+        # Grid and samples that agree but for rounding are one instant.
+        return {*np.round(period * np.arange(int(end / period + 1e-9) + 1), 9).tolist()}
+
+    logged = multiples(METRIC_PERIOD) | {round(end, 9)}
+    samples = multiples(scenario.controller.period)
+    for t in sorted(logged | samples):
+        yield min(t, end), t in logged, t in samples
 
 
 def _failure(loop: ClosedLoop, context: Context) -> Failure:
