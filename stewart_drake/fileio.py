@@ -19,8 +19,6 @@ def read_bytes(path: Path, most: int, expected: str) -> bytes:
     Raises:
         ConfigError: one line, opened by the path.
     """
-    if "\0" in str(path):
-        raise ConfigError(f"{str(path)!r}: is no file name; expected {expected}")
     try:
         if path.exists() and not path.is_file():
             raise ConfigError(f"{path}: is not a file; expected {expected}")
@@ -32,7 +30,7 @@ def read_bytes(path: Path, most: int, expected: str) -> bytes:
         ) from None
     except ConfigError:
         raise
-    except ValueError:  # a zero byte
+    except ValueError:  # a zero byte, half a surrogate pair
         raise ConfigError(f"{str(path)!r}: is no file name; expected {expected}") from None
     if len(raw) > most:
         limit = f"{most // 1_000_000} MB" if most >= 1_000_000 else f"{most // 1000} kB"
