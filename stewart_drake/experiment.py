@@ -90,10 +90,14 @@ def first_pose_text(pose: Array, mechanism: Mechanism) -> str:
     return f"it begins at x, y, z = {first} mm, home is at {home} mm"
 
 
+def check_instants(duration: float) -> Array:
+    """Where a reference is checked against the workspace, s: every REACH_CHECK_PERIOD, and last."""
+    return np.append(np.arange(0.0, duration - 1e-9, REACH_CHECK_PERIOD), duration)
+
+
 def reference_failure(experiment: Experiment) -> Failure | None:
     """Where and why the reference first leaves the workspace, or None."""
-    duration = experiment.scenario.duration
-    for t in np.arange(0.0, duration + REACH_CHECK_PERIOD, REACH_CHECK_PERIOD):
+    for t in check_instants(experiment.scenario.duration):
         failure = diagnose(experiment.mechanism, t, experiment.reference.value(t)[:, 0])
         if failure is not None:
             return failure

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stewart_drake.cli import main
 from stewart_drake.config import ReferenceConfig, Scenario
 from stewart_drake.errors import ConfigError
-from stewart_drake.experiment import assemble, prepare
+from stewart_drake.experiment import assemble, check_instants, prepare, reference_failure
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
@@ -27,7 +27,6 @@ from stewart_drake.scenario_loading import load_scenario
 from stewart_drake.studies.reach import (
     LARGEST_FACTOR,
     first_exit,
-    instants,
     largest_factor,
     margins_along,
 )
@@ -210,6 +209,14 @@ def test_the_exit_of_a_heave_is_where_the_travel_says() -> None:
         prepare(heave(0.2))
 
 
+@pytest.mark.parametrize(("later", "fits"), [(-1e-3, True), (1e-3, False)])
+def test_a_motion_is_checked_up_to_its_end_and_not_beyond(later: float, fits: bool) -> None:
+    leaves = math.asin(travel(PAPER)[5].high / 0.2)
+    scenario = dataclasses.replace(heave(0.2), duration=leaves + later)
+    assert (study_workspace(scenario).exit is None) is fits
+    assert (reference_failure(assemble(scenario)) is None) is fits
+
+
 def test_the_largest_heave_is_the_shorter_travel() -> None:
     """Hence the scaled scenario is accepted, and one a permille larger is not."""
     t = travel(PAPER)[5]
@@ -224,7 +231,7 @@ def test_the_largest_heave_is_the_shorter_travel() -> None:
 @pytest.mark.parametrize("name", shipped("scenario"))
 def test_every_shipped_reference_fits_and_so_does_its_largest_scaling(name: str) -> None:
     experiment = assemble(load_scenario(name))
-    time = instants(experiment.scenario.duration)
+    time = check_instants(experiment.scenario.duration)
     assert first_exit(experiment.mechanism, experiment.reference, time) is None
     factor = largest_factor(experiment.mechanism, experiment.reference, time)
     assert factor.limited and 1 < factor.value < LARGEST_FACTOR
@@ -241,7 +248,7 @@ def test_the_table_in_the_theory_is_what_comes_out(name: str) -> None:
     (row,) = re.findall(rf"^\| `{name}`.*\|$", text, re.MULTILINE)
     numbers = [float(n) for n in re.findall(r"-?\d+\.?\d*", row.replace("−", "-").split("|", 2)[2])]
     experiment = assemble(load_scenario(name))
-    mechanism, time = experiment.mechanism, instants(experiment.scenario.duration)
+    mechanism, time = experiment.mechanism, check_instants(experiment.scenario.duration)
     heave_range = travel(mechanism)[5]
     worst = np.nanmax(margins_along(mechanism, experiment.reference, time).condition)
     factor = largest_factor(mechanism, experiment.reference, time).value
@@ -256,7 +263,7 @@ def test_the_table_in_the_theory_is_what_comes_out(name: str) -> None:
 
 
 def test_factors_at_the_ends_of_what_can_be() -> None:
-    time = instants(2.0)
+    time = check_instants(2.0)
     still = make_reference(ReferenceConfig(kind="hold", offset=list(PAPER.home)), 2.0)
     assert math.isnan(largest_factor(PAPER, still, time).value)
     outside = list(map(float, PAPER.home + [0, 0, 0, 0, 0, 0.3]))
@@ -274,7 +281,7 @@ def test_factors_at_the_ends_of_what_can_be() -> None:
 def test_motors_at_rest_hold_the_equilibrium() -> None:
     dynamics = StewartDynamics(PAPER, gravity=True)
     still = make_reference(ReferenceConfig(kind="hold", offset=list(PAPER.home)), 1.0)
-    sizing = size_motors(dynamics, still, instants(0.1))
+    sizing = size_motors(dynamics, still, check_instants(0.1))
     np.testing.assert_allclose(
         sizing.torque, dynamics.equilibrium_torque(PAPER.home)[None] + 0 * sizing.torque
     )

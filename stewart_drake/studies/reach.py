@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.experiment import REACH_CHECK_PERIOD
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.plant.workspace import Failure, diagnose, margin
 from stewart_drake.studies.singularity import measure
@@ -49,11 +48,6 @@ class Factor(NamedTuple):
 
     value: float
     limited: bool
-
-
-def instants(duration: float) -> Array:
-    """Where `experiment.prepare` looks at a reference, s."""
-    return np.arange(0.0, duration + REACH_CHECK_PERIOD, REACH_CHECK_PERIOD)
 
 
 def margins_along(mechanism: Mechanism, reference: Trajectory, time: Array) -> Margins:

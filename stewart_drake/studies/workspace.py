@@ -8,14 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.config import Scenario
-from stewart_drake.experiment import Experiment, assemble, first_pose_text
+from stewart_drake.experiment import (
+    Experiment,
+    assemble,
+    check_instants,
+    first_pose_text,
+)
 from stewart_drake.plant.workspace import Failure, diagnose
 from stewart_drake.signals import COORDINATES, LEGS
 from stewart_drake.studies.reach import (
     Factor,
     Margins,
     first_exit,
-    instants,
     largest_factor,
     margins_along,
 )
@@ -141,7 +145,7 @@ def study_workspace(scenario: Scenario) -> WorkspaceStudy:
     """
     experiment = assemble(scenario)
     mechanism, reference = experiment.mechanism, experiment.reference
-    time = instants(scenario.duration)
+    time = check_instants(scenario.duration)
     left = first_exit(mechanism, reference, time)
     return WorkspaceStudy(
         experiment=experiment,
