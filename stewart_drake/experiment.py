@@ -139,6 +139,17 @@ def _network(scenario: Scenario) -> Network | None:
     return load_network(path)
 
 
+def waits_at_rest(scenario: Scenario) -> bool:
+    """Whether the nominal plate stays where it is until the first torque of the controller acts.
+
+    The floor of E_ac (`metrics.delay_floor`) supposes that.
+    """
+    held = scenario.queue == "equilibrium"
+    return scenario.start == "rest" and (
+        held or (scenario.queue == "zero" and not scenario.plant.gravity)
+    )
+
+
 def believed_delay(scenario: Scenario) -> tuple[int, float]:
     """Delay steps and fraction that the controller assumes; null means the true ones."""
     controller, true = scenario.controller, scenario.delay

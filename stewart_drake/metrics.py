@@ -47,7 +47,7 @@ def peak_error(error: Array, scale: Array) -> Array:
 
 
 def delay_floor(time: Array, reference: Array, scale: Array, eta: float) -> float:
-    """E_ac in % s that a plate at rest with nothing in flight collects before any torque acts.
+    """E_ac in % s that a plate which waits at rest collects before any torque acts.
 
     Args:
         time: (n,) s.

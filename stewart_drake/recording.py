@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context
 from stewart_drake import metrics
 from stewart_drake.design.law_types import Counts
 from stewart_drake.diagram import ClosedLoop
-from stewart_drake.experiment import Experiment
+from stewart_drake.experiment import Experiment, waits_at_rest
 from stewart_drake.plant.workspace import Failure
 from stewart_drake.results import versions
 from stewart_drake.signals import (
@@ -176,7 +176,7 @@ def summarize(
 
 def _floor(experiment: Experiment, signals: xr.Dataset) -> float:
     sc = experiment.scenario
-    if sc.start != "rest" or sc.queue == "reference":
+    if not waits_at_rest(sc):
         return 0.0
     eta = (sc.delay.steps + sc.delay.fraction) * sc.controller.period
     return metrics.delay_floor(signals.time.values, signals.reference.values, experiment.scale, eta)

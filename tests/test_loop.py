@@ -22,6 +22,7 @@ from stewart_drake.results import SimulationResult
 from stewart_drake.scenario_loading import load_scenario
 from stewart_drake.signals import LEGS
 from stewart_drake.simulation import make_simulator, simulate
+from stewart_drake.studies.delay_limits import study_delay
 from stewart_drake.trajectories import evaluate, make_reference
 from tests.mechanisms import PAPER
 
@@ -226,7 +227,25 @@ def test_delay_floor_is_what_a_plate_that_cannot_move_collects(plant: str) -> No
         run.signals.time.values[waiting], run.signals.error.values[waiting], scale
     )
     assert collected == pytest.approx(run.summary["delay_floor"], rel=1e-9)
-    assert result("duration=0.3", *ON_REFERENCE).summary["delay_floor"] == 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "waits"),
+    [
+        (("queue=zero",), True),
+        (("queue=equilibrium",), True),
+        (("queue=reference",), False),
+        (("queue=equilibrium", "plant.gravity=true"), True),
+        (("queue=zero", "plant.gravity=true"), False),
+        (ON_REFERENCE, False),
+    ],
+)
+def test_the_floor_is_that_of_a_plate_which_waits(settings: tuple[str, ...], waits: bool) -> None:
+    """In the summary of a run and in the analysis of the delay alike; where it falls, none."""
+    sc = scenario("duration=0.3", *settings)
+    floor = simulate(sc).summary["delay_floor"]
+    assert (floor > 1) is waits and (floor == 0) is not waits
+    assert study_delay(sc, simulations=False).floor_applies is waits
 
 
 def test_summary_is_what_the_signals_say() -> None:

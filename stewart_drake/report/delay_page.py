@@ -23,8 +23,8 @@ _GROWTH_TEXT: Final = (
     "still: at rest at the same pose.",
 )
 _FLOOR_TEXT: Final = (
-    "A plate at rest with nothing in flight stays where it is for η. What E_ac collects by then is "
-    "a floor that no controller goes below (without gravity, which would move the plate)."
+    "A plate at rest with nothing in flight that moves it stays where it is for η. What E_ac "
+    "collects by then is a floor that no controller goes below."
 )
 _LOOP_TEXT: Final = (
     "The delayed LQI loop, linearised at the reference's first pose and cut at the motors. S is "
@@ -66,7 +66,7 @@ def delay_table(study: DelayStudy) -> str:
         entries["largest delay"] = ", ".join(
             f"{_seconds(delay)} for a growth of {a:g}" for a, delay, _ in study.limits
         )
-    floor = f"{number(study.floors[sc.delay.steps])} % s from rest with nothing in flight"
+    floor = f"{number(study.floors[sc.delay.steps])} % s of a plate that waits at rest"
     entries["floor of E_ac"] = floor + ("" if study.floor_applies else " (does not apply here)")
     loop = study.loop
     if loop is not None and loop.radius < 1:

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 from stewart_drake.config import Scenario
 from stewart_drake.design.limits import amplification, fastest_pole, largest_delay
 from stewart_drake.design.riccati import RiccatiError
+from stewart_drake.experiment import waits_at_rest
 from stewart_drake.metrics import delay_floor
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.workspace import diagnose
@@ -69,7 +70,7 @@ class DelayStudy:
         eta: total delay, s.
         poles: along the reference, as far as it can be followed.
         growths: e^(p eta) checked by simulation; none where nothing grows.
-        floors: E_ac in % s of a plate at rest with nothing in flight, by whole periods of delay.
+        floors: E_ac in % s of a plate that waits at rest, by whole periods of delay.
         loops: the closed loop by delay; empty with a reason in `loop_problem`.
         loop_problem: why there is no closed loop to judge, or empty.
         cells: simulations by delay and amplitude.
@@ -102,9 +103,8 @@ class DelayStudy:
 
     @property
     def floor_applies(self) -> bool:
-        """Whether the scenario starts at rest with nothing in flight, as the floor supposes."""
-        sc = self.basis.experiment.scenario
-        return sc.start == "rest" and sc.queue == "zero"
+        """Whether the scenario waits at rest, as the floor supposes."""
+        return waits_at_rest(self.basis.experiment.scenario)
 
     @property
     def limits(self) -> list[tuple[float, float, float]]:
