@@ -100,7 +100,7 @@ class MultibodyStewart(Diagram):
         """Put the machine, in its own context, into [pose; rates] (12,), all loops closed.
 
         Raises:
-            UnreachablePoseError: the pose is out of reach.
+            UnreachablePoseError, SingularPoseError: see `plant.multibody.set_pose`.
         """
         tree_context = self.GetMutableSubsystemContext(self.tree, context)
         set_pose(self.tree, tree_context, self.mechanism, state[POSE], state[RATES])

@@ -17,14 +17,11 @@ NUM_COORDINATES: Final = 6
 NUM_TORQUES: Final = NUM_LEGS
 NUM_STATE: Final = 2 * NUM_COORDINATES
 """`state` = [pose(6); rates(6)]."""
-NUM_ERROR: Final = 3 * NUM_COORDINATES
-"""`error state` = [pose error(6); rate error(6); integral(6)], the e of equation (27)."""
 NUM_REFERENCE: Final = 3 * NUM_COORDINATES
 """`reference` = [pose(6); rates(6); accelerations(6)]."""
 
 POSE: Final = slice(0, 6)
 RATES: Final = slice(6, 12)
-INTEGRAL: Final = slice(12, 18)
 ACCELERATIONS: Final = slice(12, 18)
 
 ANGLES: Final = slice(0, 3)

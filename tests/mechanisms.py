@@ -16,13 +16,6 @@ SPREAD = np.array([0.25, 0.25, 0.25, 0.03, 0.03, 0.06])
 """How far random poses lie from home, rad and m."""
 
 
-def random_rotation(rng: np.random.Generator) -> Array:
-    """A rotation matrix, uniformly distributed."""
-    q, r = np.linalg.qr(rng.standard_normal((3, 3)))
-    q = q * np.sign(np.diag(r))
-    return q if np.linalg.det(q) > 0 else -q
-
-
 def random_inertia(rng: np.random.Generator, scale: float) -> Array:
     """Three different principal moments that some rigid body has."""
     # Second moments of mass about three planes are free; moments of inertia are their sums.

@@ -48,10 +48,7 @@ def toy_data(cells=8, seed=0):
             "frequency": ("run", np.ones(number)),
             "disturbance": ("run", np.full(number, -1)),
             "status": ("run", np.where(np.isnan(error), "left_workspace", "completed")),
-            **dict.fromkeys(
-                ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_variation"),
-                ("run", error),
-            ),
+            **dict.fromkeys(NUMBERS, ("run", error)),
         },
         {"input": list(TUNER_INPUTS)},
         {"settings": json.dumps({"data": "toy"})},

@@ -53,7 +53,7 @@ class SplitKind(StrEnum):
 
 
 class DensityKind(StrEnum):
-    """Choices of --density, those of `studies.training.DENSITIES`."""
+    """Choices of --density, those of `tuner.density.Kind`."""
 
     magnitude = "magnitude"
     signed = "signed"

@@ -65,8 +65,6 @@ class StewartDynamics:
     def _or_default(self, parameters: ArrayLike | None) -> ArrayLike:
         return self.parameters if parameters is None else parameters
 
-    # What the rest of the package calls.
-
     def accelerations(
         self,
         pose: ArrayLike,

@@ -74,6 +74,7 @@ def set_pose(
 
     Raises:
         UnreachablePoseError: the pose is out of reach.
+        SingularPoseError: the plate moves at the dead centre of a leg.
     """
     joints = joint_state(mechanism, pose, rates)
     floating = cast(RpyFloatingJoint, plant.GetJointByName("plate"))

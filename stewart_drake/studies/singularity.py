@@ -33,7 +33,7 @@ class Measures(NamedTuple):
     parallel: float
     """det W with its sign at home made positive, 0 at a parallel singularity."""
     margin: float
-    """Positive inside the workspace, see `plant.workspace.Standing.margin`."""
+    """Positive inside the workspace, see `plant.workspace.margin`."""
     transmission: Array
     """(6,) |r . tangent|: share of a crank's push that goes along its rod."""
     held: float

@@ -14,15 +14,13 @@ from stewart_drake.results import versions
 from stewart_drake.studies.dataset import data_hash
 from stewart_drake.studies.labels import Labels, cells, labels
 from stewart_drake.studies.levenberg import TorchModel, fit, initial_theta, unpack
-from stewart_drake.tuner.density import NUM_INPUTS, densities
+from stewart_drake.tuner.density import NUM_INPUTS, Kind, densities
 from stewart_drake.tuner.network import Network
 
 Array = NDArray[np.float64]
 
 Split = Literal["sample", "run", "cell"]
 SPLITS: Final = ("sample", "run", "cell")
-Density = Literal["magnitude", "signed"]
-DENSITIES: Final = ("magnitude", "signed")
 
 HIDDEN: Final = 10
 TRAIN_SHARE: Final = 0.7
@@ -64,7 +62,7 @@ def train(
     *,
     kind: Labels = "best_in_cell",
     split: Split = "run",
-    density: Density = "magnitude",
+    density: Kind = "magnitude",
     seed: int = 0,
     hidden: int = HIDDEN,
     max_rows: int = MAX_ROWS,
@@ -140,7 +138,7 @@ def train(
     return Training(network, found.curve, test[1], outputs)
 
 
-def training_rows(dataset: xr.Dataset, kind: Labels, density: Density) -> Rows:
+def training_rows(dataset: xr.Dataset, kind: Labels, density: Kind) -> Rows:
     """The valid rows that have a label, targets as the output layer gives them."""
     wanted = labels(dataset, kind)
     use = dataset.valid.values & np.all(np.isfinite(wanted), axis=1)[:, np.newaxis]

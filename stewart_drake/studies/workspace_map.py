@@ -44,7 +44,7 @@ class Section(NamedTuple):
     """A section of the workspace through home; arrays (len(y), len(x)).
 
     `condition` is NaN outside the part that is connected with home within the section; `margin` is
-    positive in that part and zero on its border, see `plant.workspace.Standing.margin`.
+    positive in that part and zero on its border, see `plant.workspace.margin`.
     """
 
     first: int
