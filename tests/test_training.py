@@ -1,19 +1,22 @@
 """Levenberg-Marquardt training of the tuner's network."""
 
 import json
+from typing import get_args
 
 import numpy as np
 import pytest
 import xarray as xr
 
 from stewart_drake.cli import main
+from stewart_drake.commands import tune
 from stewart_drake.errors import ConfigError
 from stewart_drake.signals import TUNER_INPUTS
-from stewart_drake.studies import levenberg, training
+from stewart_drake.studies import labels, levenberg, training
 from stewart_drake.studies.dataset import data_hash
 from stewart_drake.studies.grid import PAIRS
 from stewart_drake.studies.levenberg import TorchModel, fit, initial_theta, unpack
 from stewart_drake.studies.training import summarize, train, training_rows
+from stewart_drake.tuner.density import Kind
 from stewart_drake.tuner.network import load_network, save_network
 
 pytest.importorskip("torch")
@@ -206,6 +209,18 @@ def test_rows_after_a_failure_are_not_trained_on(data):
     assert len(rows.densities) == data.sizes["run"] * 100 - 60
     assert (rows.runs == 3).sum() == 40
     assert np.isfinite(rows.densities).all()
+
+
+@pytest.mark.parametrize(
+    ("choices", "known"),
+    [
+        (tune.LabelKind, labels.LABELS),
+        (tune.SplitKind, training.SPLITS),
+        (tune.DensityKind, get_args(Kind)),
+    ],
+)
+def test_the_command_offers_what_training_knows(choices, known):
+    assert tuple(choices) == known
 
 
 @pytest.mark.parametrize("split", training.SPLITS)

@@ -11,10 +11,14 @@ import typer
 from stewart_drake.commands.common import (
     INTERRUPTED,
     AsJson,
+    Controller,
     Out,
     Quiet,
     ScenarioName,
+    Scheduler,
+    Seed,
     Settings,
+    Workers,
     check_writable,
     print_json,
     remove,
@@ -27,9 +31,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(rich_markup_mode=None, help="Tell beforehand what can be controlled, and how.")
 
-Controller = Annotated[
-    str | None, typer.Option(metavar="NAME|FILE", help="Laid over the scenario's own.")
-]
 PAGE = "report.html"
 
 
@@ -135,16 +136,12 @@ def robustness(
         ),
     ] = None,
     runs: Annotated[int, typer.Option(metavar="N", help="How many machines to draw.")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 0,
+    seed: Seed = 0,
     limit: Annotated[
         float | None, typer.Option(metavar="E_AC", help="A run above, in % s, counts as failed.")
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(metavar="N", help="Processes; all cores by default.")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to run on instead.")
-    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     out: Out = None,
     quiet: Quiet = False,
     as_json: AsJson = False,

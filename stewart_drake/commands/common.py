@@ -62,6 +62,14 @@ Settings = Annotated[
         autocompletion=complete_setting,
     ),
 ]
+Controller = Annotated[
+    str | None, typer.Option(metavar="NAME|FILE", help="Laid over the scenario's own.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")]
+Workers = Annotated[int | None, typer.Option(metavar="N", help="Processes; all cores by default.")]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to run on instead.")
+]
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="For summary, signals, figures.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
@@ -111,6 +119,17 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
             f"--out: got {str(directory)!r}; expected a directory that can be written "
             f"({getattr(error, 'strerror', None) or error})"
         ) from None
+
+
+def check_file(path: Path) -> None:
+    """Make the directory of a file that `--out` names.
+
+    Raises:
+        ConfigError: it is a directory itself, or its own cannot be written to.
+    """
+    if path.is_dir():
+        raise ConfigError(f"--out: got {str(path)!r}, a directory; expected a file")
+    check_writable(path.parent, alone=False)
 
 
 def release() -> None:

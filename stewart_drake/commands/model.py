@@ -9,13 +9,13 @@ from stewart_drake.commands.common import (
     AsJson,
     MechanismName,
     Quiet,
+    check_file,
     check_writable,
     open_meshcat,
     print_json,
     remove,
     silence,
 )
-from stewart_drake.errors import ConfigError
 from stewart_drake.fileio import replacing
 from stewart_drake.report.terminal import echo
 
@@ -37,9 +37,7 @@ def sdf(
     if out is None:
         typer.echo(text, nl=False)
         return
-    if out.is_dir():
-        raise ConfigError(f"--out: got {str(out)!r}, a directory; expected a file")
-    check_writable(out.parent, alone=False)
+    check_file(out)
     with replacing(out) as partial:
         partial.write_text(text)
     echo(f"written to {out}")

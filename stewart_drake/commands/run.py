@@ -9,10 +9,12 @@ import typer
 from stewart_drake.commands.common import (
     INTERRUPTED,
     AsJson,
+    Controller,
     Out,
     Quiet,
     ScenarioName,
     Settings,
+    check_file,
     check_writable,
     open_meshcat,
     print_json,
@@ -32,9 +34,7 @@ REPLAY: Final = "replay.html"
 
 def simulate(
     scenario: ScenarioName = "paper",
-    controller: Annotated[
-        str | None, typer.Option(metavar="NAME|FILE", help="Laid over the scenario's own.")
-    ] = None,
+    controller: Controller = None,
     settings: Settings = None,
     out: Out = None,
     csv: Annotated[bool, typer.Option("--csv", help="Write signals.csv too; needs --out.")] = False,
@@ -127,9 +127,7 @@ def export(
     if out is None:
         typer.echo(signals_csv(dataset), nl=False)
         return
-    if out.is_dir():
-        raise ConfigError(f"--out: got {str(out)!r}, a directory; expected a file")
-    check_writable(out.parent, alone=False)
+    check_file(out)
     write_csv(dataset, out)
     echo(f"written to {out}")
 

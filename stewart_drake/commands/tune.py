@@ -10,9 +10,13 @@ import typer
 from stewart_drake.commands.common import (
     INTERRUPTED,
     AsJson,
+    Controller,
     Quiet,
     ScenarioName,
+    Scheduler,
+    Seed,
     Settings,
+    Workers,
     check_writable,
     print_json,
     remove,
@@ -25,14 +29,6 @@ from stewart_drake.report.terminal import count_bar, echo
 app = typer.Typer(rich_markup_mode=None, help="Data for the neural tuner, its training, its worth.")
 
 Out = Annotated[Path, typer.Option(metavar="DIR", help="Where runs, results and summary go.")]
-Controller = Annotated[
-    str | None, typer.Option(metavar="NAME|FILE", help="Laid over the scenario's own.")
-]
-Seed = Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")]
-Workers = Annotated[int | None, typer.Option(metavar="N", help="Processes; all cores by default.")]
-Scheduler = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to run on instead.")
-]
 _GO_ON = "stopped; finished runs are kept, the same command goes on from there"
 
 
