@@ -44,14 +44,19 @@ class Experiment(NamedTuple):
     truth: Mechanism
     """The machine that is simulated."""
     reference: Trajectory
-    scale: Array
-    """(6,) peak to peak of the reference, 1 where it is constant."""
+    peak_to_peak: Array
+    """(6,) of the reference, rad and m, 0 where it is constant."""
     nominal: StewartDynamics
     """The plant as the controller knows it."""
     start: Array
     """(12,) state at t = 0."""
     network: Network | None
     """What sets the weights, or None."""
+
+    @property
+    def scale(self) -> Array:
+        """(6,) A_i of equation (47): the peak to peak, 1 where the reference is constant."""
+        return np.where(self.peak_to_peak > 0, self.peak_to_peak, 1.0)
 
 
 def prepare(scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
@@ -122,7 +127,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
         mechanism=mechanism,
         truth=mechanism if truth is None else truth,
         reference=reference,
-        scale=peak_to_peak(scenario.reference, reference, scenario.duration),
+        peak_to_peak=peak_to_peak(scenario.reference, reference, scenario.duration),
         nominal=StewartDynamics(mechanism, gravity=scenario.plant.gravity),
         start=start,
         network=network,
@@ -174,7 +179,7 @@ def believed_queue(experiment: Experiment, options: LawOptions) -> Array:
 def motion_scale(experiment: Experiment) -> Array:
     """(6,) rad and m: half the reference's peak to peak, 0.1 rad or 0.1 cranks where constant."""
     still = np.repeat([0.1, 0.1 * experiment.mechanism.crank_lengths.min()], 3)
-    return np.where(experiment.scale != 1.0, experiment.scale / 2, still)
+    return np.where(experiment.peak_to_peak > 0, experiment.peak_to_peak / 2, still)
 
 
 def control_law(experiment: Experiment) -> tuple[DelayLqi, Trajectory, float]:
@@ -186,7 +191,7 @@ def control_law(experiment: Experiment) -> tuple[DelayLqi, Trajectory, float]:
     peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
     torque_scale = max(0.1, peak_torque)
     error_weights, integral_weights, torque_weights = weight_scales(
-        c.weight_scaling, experiment.scale, peak_torque
+        c.weight_scaling, experiment.peak_to_peak, peak_torque
     )
     options = LawOptions(
         period=c.period,

@@ -103,7 +103,7 @@ def angular_frequency(config: ReferenceConfig) -> float:
 
 
 def peak_to_peak(config: ReferenceConfig, trajectory: Trajectory, duration: float) -> Array:
-    """What tracking errors are measured against.
+    """How far the motion goes, which tracking errors are measured against.
 
     Args:
         config: the scenario's section.
@@ -112,7 +112,7 @@ def peak_to_peak(config: ReferenceConfig, trajectory: Trajectory, duration: floa
 
     Returns:
         (6,) rad and m: for a sine twice its amplitude, whether or not `duration` shows all of it;
-        else the range within [0, duration]. It is 1 where the coordinate is constant.
+        else the range within [0, duration]. It is 0 where the coordinate is constant.
     """
     if config.kind == "sine":
         span = 2 * np.abs(np.array(config.amplitude))
@@ -120,7 +120,7 @@ def peak_to_peak(config: ReferenceConfig, trajectory: Trajectory, duration: floa
         samples = int(np.clip(math.ceil(duration / _GRID), 1000, 1_000_000)) + 1
         values = trajectory.vector_values(np.linspace(0.0, duration, samples))
         span = np.ptp(values, axis=1)
-    return np.where(span < _CONSTANT, 1.0, span)
+    return np.where(span < _CONSTANT, 0.0, span)
 
 
 def catch_up(

@@ -22,7 +22,8 @@ from stewart_drake.design.holds import (
 )
 from stewart_drake.design.law_types import Memory
 from stewart_drake.design.riccati import RiccatiError, full_gain
-from stewart_drake.experiment import control_law, prepare
+from stewart_drake.design.startup import weight_scales
+from stewart_drake.experiment import assemble, control_law, motion_scale, prepare
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.scenario_loading import load_scenario
@@ -567,6 +568,20 @@ def test_a_duration_of_whole_periods_designs_the_same_law(
     assert one.torque_weights == pytest.approx(other.torque_weights, rel=0.02)
     assert one.gentle_torque == pytest.approx(other.gentle_torque, rel=0.02)
     assert one.substeps == other.substeps
+
+
+def test_a_motion_of_one_radian_peak_to_peak_is_no_constant() -> None:
+    """Constants are measured against 1, which is also what an amplitude of 0.5 comes to."""
+    scales = []
+    for amplitude in (0.5, 0.5001):
+        settings = [f"reference.amplitude=[0,0,{amplitude},0,0,0]", "plant.kind=exact"]
+        experiment = assemble(load_scenario("paper", None, settings))
+        scales.append(motion_scale(experiment))
+        assert scales[-1][2] == pytest.approx(amplitude)
+        assert experiment.scale == pytest.approx([1, 1, 2 * amplitude, 1, 1, 1])
+        weights, _, _ = weight_scales("bryson", experiment.peak_to_peak, 1.0)
+        assert weights[2] == pytest.approx((0.03 * amplitude) ** -2)
+    assert scales[0] == pytest.approx(scales[1], rel=1e-3)
 
 
 def test_the_nominal_plant_of_the_law_is_the_scenarios() -> None:

@@ -359,14 +359,14 @@ def test_any_samples_are_a_reference_or_are_refused(
 def test_the_peak_to_peak_of_a_sine_is_twice_its_amplitude_however_short_the_run() -> None:
     config = ReferenceConfig(amplitude=[0.1, -0.2, 0.0, 0.01, 0.0, 0.02], frequency=1e-3)
     span = peak_to_peak(config, make_reference(config, 0.1), 0.1)
-    np.testing.assert_allclose(span, [0.2, 0.4, 1.0, 0.02, 1.0, 0.04])
+    np.testing.assert_allclose(span, [0.2, 0.4, 0, 0.02, 0, 0.04])
 
 
-def test_the_peak_to_peak_of_a_constant_is_one() -> None:
+def test_the_peak_to_peak_of_a_constant_is_zero() -> None:
     config = ReferenceConfig(kind="hold")
-    np.testing.assert_array_equal(peak_to_peak(config, make_reference(config, 5.0), 5.0), [1] * 6)
+    np.testing.assert_array_equal(peak_to_peak(config, make_reference(config, 5.0), 5.0), [0] * 6)
     still = ReferenceConfig(kind="waypoints", times=[0, 1, 3], poses=[[0.3] * 6] * 3)
-    np.testing.assert_array_equal(peak_to_peak(still, make_reference(still, 5.0), 5.0), [1] * 6)
+    np.testing.assert_array_equal(peak_to_peak(still, make_reference(still, 5.0), 5.0), [0] * 6)
 
 
 def test_the_peak_to_peak_of_samples_is_their_range_within_the_run(tmp_path: Path) -> None:

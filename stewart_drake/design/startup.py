@@ -52,13 +52,12 @@ def weight_scales(
     """Weights (6,) of the pose error, its integral and the torques in the cost, before w_Q, w_R.
 
     Bryson's rule, one over the square of what is tolerable: of the error TOLERANCE times half the
-    reference's peak to peak (1 where it is constant), that for 1 s of the integral, and the torque
+    reference's peak to peak (1 where that is 0), that for 1 s of the integral, and the torque
     in N m that the reference takes.
     """
     if kind == "identity":
         return np.ones(6), np.ones(6), np.ones(6)
-    moving = peak_to_peak != 1.0
-    tolerable = TOLERANCE * np.where(moving, peak_to_peak / 2, 1.0)
+    tolerable = TOLERANCE * np.where(peak_to_peak > 0, peak_to_peak / 2, 1.0)
     peak = max(LEAST_TORQUE_SCALE, peak_torque)
     return 1 / tolerable**2, 1 / tolerable**2, np.full(NUM_TORQUES, 1 / peak**2)
 

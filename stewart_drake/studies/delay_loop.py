@@ -114,7 +114,7 @@ def loop_margins(found: Basis, delays: Iterable[int] = DELAYS) -> list[LoopMargi
     if c.model == "paper":
         design = double_integrators(torque_map(mechanism, pose, c.torque_map))
     errors, integrals, torques = weight_scales(
-        c.weight_scaling, found.experiment.scale, found.torque
+        c.weight_scaling, found.experiment.peak_to_peak, found.torque
     )
     Q = c.w_Q * np.diag(np.concatenate([errors, integrals] if c.integral else [errors]))
     R = c.w_R * np.diag(torques)
