@@ -6,8 +6,8 @@ state obeys the exact dynamics under the torques that are known to act:
     [x_{k+1}; theta] = [f(x_k, T, theta); theta] + noise,       y_k = x_k + measurement noise.
 
 Linearised, F = [[Phi, S], [0, 1]] with Phi = df/dx and S = df/dtheta. One-step prediction errors
-drive the filter; a measurement without noise makes x_k = y_k and leaves the textbook filter over
-theta alone.
+drive the filter: y_k corrects x_{k-1} and theta, and x_k follows by the model. The error of one
+step of the model counts as noise of y_k there, and widens the covariance of x_k.
 """
 
 from dataclasses import dataclass, replace
