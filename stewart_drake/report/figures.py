@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.report import style
 from stewart_drake.report.style import figure_style, write_figure
-from stewart_drake.report.tuner_figures import weights_figure
+from stewart_drake.report.tuner_figures import shown_until, weights_figure
 from stewart_drake.results import SimulationResult
 from stewart_drake.signals import ANGLES, COORDINATES, LEGS, PARAMETERS, POSE, POSITION
 from stewart_drake.studies.compare import LABELS
@@ -31,8 +31,6 @@ _SYMBOLS: Final = dict(zip(COORDINATES, ("roll φ", "pitch θ", "yaw ψ", "x", "
 _PARAMETER_UNITS: Final = ("mN m",) * 6 + ("kg", "mN m s/rad")
 _PARAMETER_FACTORS: Final = np.array([1e3] * 6 + [1.0, 1e3])
 _CROSS: Final = "x"
-_AFTER_END: Final = 1.1
-"""Where all runs ended early, the time axis goes on for this factor."""
 _STATE_REACH: Final = 0.3
 _ERROR_REACH: Final = 0.5
 """How far a diverging run may widen an axis, as a share of the reference's peak to peak."""
@@ -216,14 +214,8 @@ def _grid(
         ax.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True)
     for ax in axes[-1]:
         ax.set_xlabel("time  [s]")
-    axes[0, 0].set_xlim(0, max(_end(run) for run in runs))
+    axes[0, 0].set_xlim(0, max(shown_until(run) for run in runs))
     return figure, list(axes.T.ravel())
-
-
-def _end(run: SimulationResult) -> float:
-    """s, what the time axis shows of a run."""
-    end = run.scenario.duration
-    return end if run.stopped is None else min(end, _AFTER_END * run.stopped.time) or end
 
 
 def _with_legend(figure: Figure, axes: list[Axes]) -> Figure:

@@ -150,9 +150,8 @@ def robustness_page(study: RobustnessStudy, made: Provenance) -> Page:
 
 def percent(share: Interval) -> str:
     """A share with its interval."""
-    return f"{_percent(share.value)} % (95 % interval {_percent(share.low)} to " + (
-        f"{_percent(share.high)} %)"
-    )
+    interval = f"{_percent(share.low)} to {_percent(share.high)} %"
+    return f"{_percent(share.value)} % (95 % interval {interval})"
 
 
 def _percent(share: float) -> str:

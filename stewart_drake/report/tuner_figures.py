@@ -63,14 +63,17 @@ def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
             _draw_weights(axes[0, column], axes[1, column], run)
             axes[0, column].set_title(label)
             axes[1, column].set_xlabel("time  [s]")
-            end = run.scenario.duration
-            if run.stopped is not None:
-                end = min(end, _AFTER_END * run.stopped.time) or end
-            axes[0, column].set_xlim(0, end)
+            axes[0, column].set_xlim(0, shown_until(run))
         axes[0, 0].set_ylabel("weight")
         axes[1, 0].set_ylabel("w_Q / w_R")
         figure.legend(*_weight_handles(axes), loc="upper center", ncols=4)
         return figure
+
+
+def shown_until(run: SimulationResult) -> float:
+    """s, where the time axis of a run ends."""
+    end = run.scenario.duration
+    return end if run.stopped is None else min(end, _AFTER_END * run.stopped.time) or end
 
 
 def _draw_weights(above: Axes, below: Axes, run: SimulationResult) -> None:
