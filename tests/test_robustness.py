@@ -369,6 +369,22 @@ def test_what_cannot_be_prepared_is_an_outcome(monkeypatch: pytest.MonkeyPatch) 
     assert found["reason"] == "controller.catch_up: got 1 s"
 
 
+@pytest.mark.parametrize(
+    ("drawn", "field"),
+    [
+        ({"torque_bias": (2e3,) * 6}, "plant.torque_bias[0]: got 2000.0"),
+        ({"damping": 2e3}, "plant.joint_damping: got 2000.0"),
+        ({"noise": 1e5}, "sensor.noise_std[0]: got 26000.0"),
+        ({"delay": 100.0}, "delay.steps: got 1008"),
+    ],
+)
+def test_a_draw_beyond_all_scenarios_is_an_outcome(drawn: dict[str, Any], field: str) -> None:
+    one = UNDISTURBED._replace(**drawn)
+    found = json.loads(run_draw(short(), SCALES.motion, one))["outcome"]
+    assert found["status"] == "refused"
+    assert field in found["reason"]
+
+
 # ---------------------------------------------------------------- the study
 
 

@@ -101,8 +101,8 @@ def _run(scenario: Scenario, motion: tuple[float, ...], one: Draw) -> Outcome:
         truth = true_mechanism(mechanism, scenario.plant.payload_mass, one)
     except (ConfigError, UnreachablePoseError) as error:
         return Outcome("not_assembled", str(error), None, 0.0, math.nan, math.nan)
-    variant = disturbed(scenario, motion, one)
     try:
+        variant = disturbed(scenario, motion, one)
         start = assemble(variant, truth).start
         outside = diagnose(truth, 0.0, start[POSE])
         if outside is not None:

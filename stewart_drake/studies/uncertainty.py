@@ -190,39 +190,29 @@ def disturbed(scenario: Scenario, motion: tuple[float, ...], one: Draw) -> Scena
         scenario: the undisturbed one; it stays as it is.
         motion: (6,) as in `Scales`.
         one: the draw.
+
+    Raises:
+        ConfigError: what was drawn is beyond what a scenario may hold.
     """
-    sc = scenario
-    believed = believed_delay(sc)
+    sc, data = scenario, dataclasses.asdict(scenario)
     fraction = sc.delay.fraction + one.delay / sc.controller.period
     whole = math.floor(fraction + 1e-9)
-    own = np.array(sc.sensor.noise_std)
-    noise = own if one.noise == 0 else own + one.noise * np.tile(motion, 2)
-    return dataclasses.replace(
-        sc,
-        plant=dataclasses.replace(
-            sc.plant,
-            payload_mass=max(0.0, sc.plant.payload_mass + one.payload),
-            torque_bias=[a + b for a, b in zip(sc.plant.torque_bias, one.torque_bias, strict=True)],
-            joint_damping=sc.plant.joint_damping + one.damping,
-        ),
-        delay=dataclasses.replace(
-            sc.delay,
-            steps=sc.delay.steps + whole,
-            fraction=round(max(0.0, fraction - whole), 12),
-        ),
-        controller=dataclasses.replace(
-            sc.controller, delay_steps=believed[0], delay_fraction=believed[1]
-        ),
-        actuator=dataclasses.replace(
-            sc.actuator,
-            torque_limit=sc.actuator.torque_limit if one.torque_limit is None else one.torque_limit,
-        ),
-        sensor=dataclasses.replace(
-            sc.sensor,
-            noise_std=noise.tolist(),
-            seed=sc.sensor.seed if one.noise == 0 else one.seed,
-        ),
-    )
+    data["plant"] |= {
+        "payload_mass": max(0.0, sc.plant.payload_mass + one.payload),
+        "torque_bias": [a + b for a, b in zip(sc.plant.torque_bias, one.torque_bias, strict=True)],
+        "joint_damping": sc.plant.joint_damping + one.damping,
+    }
+    data["delay"] = {
+        "steps": sc.delay.steps + whole,
+        "fraction": round(max(0.0, fraction - whole), 12),
+    }
+    data["controller"]["delay_steps"], data["controller"]["delay_fraction"] = believed_delay(sc)
+    if one.torque_limit is not None:
+        data["actuator"]["torque_limit"] = one.torque_limit
+    if one.noise != 0:
+        std = np.array(sc.sensor.noise_std) + one.noise * np.tile(motion, 2)
+        data["sensor"] = {"noise_std": std.tolist(), "seed": one.seed}
+    return validate(Scenario, data, "drawn")
 
 
 def true_mechanism(mechanism: Mechanism, payload: float, one: Draw) -> Mechanism:
