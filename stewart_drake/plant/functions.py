@@ -1,6 +1,7 @@
 """The equations of motion of a mechanism, compiled into CasADi functions on first use."""
 
 from functools import cached_property, lru_cache
+from typing import Final
 
 import casadi as ca
 
@@ -9,6 +10,10 @@ from stewart_drake.plant import equations
 from stewart_drake.plant.compiled import Compiled
 from stewart_drake.plant.derivatives import residual_derivatives
 from stewart_drake.signals import NUM_PARAMETERS, NUM_STATE
+
+_UNROLLED: Final = 64
+"""Steps in one piece of a prediction; longer ones are loops of such pieces, because one piece of n
+steps takes memory like n^2, 10 GB for 4000."""
 
 
 @lru_cache(maxsize=64)
@@ -127,6 +132,6 @@ class DynamicsFunctions:
     def many_steps(self, steps: int) -> Compiled:
         """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12), one call."""
         if steps not in self._many:
-            accumulated = self._runge_kutta4.mapaccum("predict", steps, {"base": max(2, steps)})
+            accumulated = self._runge_kutta4.mapaccum("predict", steps, {"base": _UNROLLED})
             self._many[steps] = Compiled(accumulated)
         return self._many[steps]
