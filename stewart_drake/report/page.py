@@ -198,4 +198,4 @@ def environment() -> Environment:
 
 def _is_number(cell: str) -> bool:
     text = cell.strip()
-    return text in ("", "-", "–", "∞") or text.lstrip("+-−<>≤≥±").strip()[:1].isdigit()
+    return text in ("", "-", "–", "∞", "NaN") or text.lstrip("+-−<>≤≥±").strip()[:1].isdigit()

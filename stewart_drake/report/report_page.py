@@ -61,7 +61,7 @@ _COLUMNS: Final = (
     "cost",
     "peak [N\u00a0m]",
     "rms [N\u00a0m]",
-    "variation [N\u00a0m]",
+    "var. [N\u00a0m]",
     "step [ms]",
 )
 _ERROR_IS: Final = (
@@ -186,7 +186,7 @@ def _comparison(found: Collected) -> Section:
     text = [
         "The same scenario under each of the shipped controllers. The floor is what the delay "
         "alone adds to E_ac; the cost sums squared errors and torques, weighted by w_Q and w_R; "
-        "torques are as commanded, their variation tells trembling.",
+        "torques are as commanded, their total variation (var.) tells trembling.",
     ]
     if papers:
         text.append(
