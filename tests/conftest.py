@@ -1,0 +1,8 @@
+"""What all tests need of the process they run in."""
+
+import signal
+
+# A shell that runs the tests in the background lets them ignore Ctrl-C, and the commands that they
+# start would inherit that; those are tested for what they do on Ctrl-C.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
