@@ -202,12 +202,13 @@ def _outcomes(
     parallel = joblib.Parallel(
         n_jobs=-1 if scheduler else number, batch_size=1, return_as="generator_unordered"
     )
-    resource_tracker.ensure_running()
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        outcomes = parallel(calls)
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    with _silent_trackers():
+        resource_tracker.ensure_running()
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            outcomes = parallel(calls)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     try:
         with warnings.catch_warnings(), closing(outcomes):
             # On leaving early joblib warns that not all results were fetched: that is meant.
@@ -218,6 +219,23 @@ def _outcomes(
             "a worker process was killed, perhaps for want of memory; what had finished is kept "
             "and the same command goes on from there"
         ) from None
+
+
+@contextmanager
+def _silent_trackers() -> Iterator[None]:
+    """Let processes that are started here say nothing of what a killed worker has left to clear.
+
+    The trackers that clear it are processes of their own, which warn beside our one line.
+    """
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [before, "ignore:resource_tracker"]))
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONWARNINGS"]
+        else:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 def _backend(scheduler: str | None) -> AbstractContextManager[Any]:
