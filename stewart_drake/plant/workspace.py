@@ -1,8 +1,6 @@
 """Where a mechanism may be: off dead centres and parallel singularities, angles distinct."""
 
-from collections.abc import Sequence
 from functools import lru_cache
-from itertools import combinations
 from typing import NamedTuple
 
 import casadi as ca
@@ -41,11 +39,12 @@ class Failure(NamedTuple):
 class Standing(NamedTuple):
     """`sines` (6,): of the cranks' angles off dead centre, negative on the other branch.
     `parallel`: signed measure of parallel singularity, 0 where cranks no longer hold the plate.
-    `pitch`: rad."""
+    `pitch`: rad. `margin`: see the function of this name."""
 
     sines: Array
     parallel: float
     pitch: float
+    margin: float
 
 
 def standing(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> Standing:
@@ -55,17 +54,22 @@ def standing(mechanism: Mechanism, pose: Array, crank_angles: Array | None = Non
     shows as a negative sine; from the pose alone it cannot be seen.
     """
     measures = _measures(mechanism, pose, crank_angles)
-    return Standing(measures[:NUM_LEGS], float(measures[NUM_LEGS]), float(pose[1]))
+    parallel, least = float(measures[NUM_LEGS]), _margin(mechanism, measures)
+    return Standing(measures[:NUM_LEGS], parallel, float(pose[1]), least)
 
 
 def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> float:
     """Positive where `standing` is permitted, zero on the boundary, dimensionless; NaN for NaN."""
-    measures = _measures(mechanism, pose, crank_angles)
-    measures[NUM_LEGS] *= home_sign(mechanism)
-    return float((measures - _LEAST).min())
+    return _margin(mechanism, _measures(mechanism, pose, crank_angles))
 
 
 _LEAST = np.array([DEAD_CENTRE_SINE] * NUM_LEGS + [SINGULARITY_LIMIT, -PITCH_LIMIT])
+
+
+def _margin(mechanism: Mechanism, measures: Array) -> float:
+    above = measures - _LEAST
+    above[NUM_LEGS] = home_sign(mechanism) * measures[NUM_LEGS] - _LEAST[NUM_LEGS]
+    return float(above.min())
 
 
 def _measures(mechanism: Mechanism, pose: Array, crank_angles: Array | None) -> Array:
@@ -90,7 +94,7 @@ def _functions(mechanism: Mechanism) -> _Functions:
     R_WP = equations.rotation(pose[:3])
     # Forces along the rods, and their moments over the plate's mean radius, are free of units.
     radius = float(np.linalg.norm(mechanism.p_PQ, axis=1).mean())
-    legs: dict[str, list[tuple[ca.SX, ca.SX, ca.SX]]] = {"pose": [], "tree": []}
+    legs: dict[str, list[tuple[ca.SX, ca.SX]]] = {"pose": [], "tree": []}
     for leg in range(NUM_LEGS):
         u, length = float(mechanism.crank_lengths[leg]), float(mechanism.rod_lengths[leg])
         branch, R_WS = float(mechanism.branches[leg]), ca.DM(mechanism.R_WS[leg])
@@ -106,38 +110,20 @@ def _functions(mechanism: Mechanism) -> _Functions:
         ):
             rod = (q - u * ca.vertcat(ca.cos(alpha), ca.sin(alpha), 0)) / length
             e = ca.mtimes(R_WS, rod)
-            legs[kind].append((sine, ca.cross(b, e) / radius, e))
+            legs[kind].append((sine, ca.vertcat(ca.cross(b, e) / radius, e)))
     functions = []
     for kind, arguments in (("pose", [pose]), ("tree", [pose, angles])):
-        sines, moments, forces = zip(*legs[kind], strict=True)
-        measures = ca.vertcat(*sines, _determinant(moments, forces), -ca.fabs(pose[1]))
+        sines, wrenches = zip(*legs[kind], strict=True)
+        # CasADi expands the determinant by minors: no division, so it passes zero smoothly.
+        measures = ca.vertcat(*sines, ca.det(ca.horzcat(*wrenches)), -ca.fabs(pose[1]))
         functions.append(Compiled(ca.Function(kind, arguments, [measures], {"cse": True})))
     return _Functions(*functions)
-
-
-def _determinant(above: Sequence[ca.SX], below: Sequence[ca.SX]) -> ca.SX:
-    """Of the 6 x 6 matrix of columns [above; below], each of three, by Laplace's expansion.
-
-    Sum over the choices S of three columns of sgn(S) det(above_S) det(below_rest): no division, so
-    it passes zero smoothly.
-    """
-
-    def triple(columns: Sequence[ca.SX], chosen: Sequence[int]) -> ca.SX:
-        a, b, c = (columns[i] for i in chosen)
-        return ca.dot(a, ca.cross(b, c))
-
-    total = ca.SX(0)
-    for chosen in combinations(range(NUM_LEGS), 3):
-        rest = [i for i in range(NUM_LEGS) if i not in chosen]
-        sign = (-1) ** (sum(chosen) - 3)  # of the permutation (chosen, rest)
-        total += sign * triple(above, chosen) * triple(below, rest)
-    return total
 
 
 @lru_cache(maxsize=64)
 def home_sign(mechanism: Mechanism) -> float:
     """Sign of `Standing.parallel` at home, which a continuous motion can only change at zero."""
-    return float(np.sign(standing(mechanism, mechanism.home).parallel))
+    return float(np.sign(_measures(mechanism, mechanism.home, None)[NUM_LEGS]))
 
 
 def diagnose(
@@ -146,9 +132,9 @@ def diagnose(
     """The failure at a pose that has left the permitted region, or None inside it."""
     if not np.all(np.isfinite(pose)):
         return Failure(time, None, np.nan, "the simulated state is not finite")
-    if margin(mechanism, pose, crank_angles) > 0:
-        return None
     now, sign = standing(mechanism, pose, crank_angles), home_sign(mechanism)
+    if now.margin > 0:
+        return None
     leg = int(now.sines.argmin())
     if now.sines[leg] <= DEAD_CENTRE_SINE:
         reach = float(mechanism.reach_margins(pose)[leg])

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import LegGeometry, leg_geometry
-from stewart_drake.plant.workspace import home_sign, margin, standing
+from stewart_drake.plant.workspace import home_sign, standing
 
 Array = NDArray[np.float64]
 
@@ -53,18 +53,16 @@ def measure(mechanism: Mechanism, pose: Array) -> Measures:
     """All measures of a pose (6,), which may be out of reach."""
     pose = np.asarray(pose, dtype=np.float64)
     now, sign = standing(mechanism, pose), home_sign(mechanism)
-    inside = margin(mechanism, pose)
     rest = (np.full(6, np.nan), np.nan, np.nan, np.nan)
-    if inside > 0:
+    if now.margin > 0:
         legs = leg_geometry(mechanism, pose)
         W = wrenches(mechanism, legs)
         A = W.T / (mechanism.crank_lengths * legs.transmission)[:, None]
         values = np.linalg.svd(A, compute_uv=False)
         held = float(np.linalg.svd(W, compute_uv=False)[-1])
         rest = (np.abs(legs.transmission), held, values[0] / values[-1], 1 / values[-1])
-    return Measures(
-        mechanism.reach_margins(pose), now.sines, (sign or 1.0) * now.parallel, inside, *rest
-    )
+    parallel = (sign or 1.0) * now.parallel
+    return Measures(mechanism.reach_margins(pose), now.sines, parallel, now.margin, *rest)
 
 
 def wrenches(mechanism: Mechanism, legs: LegGeometry) -> Array:
