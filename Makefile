@@ -17,7 +17,7 @@ export MPLBACKEND := Agg
 # command would otherwise compile all that it imports anew, for seconds. Some packages carry files that
 # are no Python, which is no error here.
 PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
-COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib
+COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null || true
 
 .DEFAULT_GOAL := help
 .PHONY: demo test lint format-check types wheel newest bench soak clean help
@@ -73,11 +73,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
 	@echo "installing stewart-drake and its dependencies into $(VENV) (a few minutes the first time)"
 	@$(PIP_INSTALL) -e '.[train,dev]'
-	@$(COMPILE) >/dev/null || true
+	@$(COMPILE)
 	@touch $@
 
 $(INSTALLED_BENCH): $(INSTALLED)
 	@echo "installing what only the benchmarks need"
 	@$(PIP_INSTALL) -e '.[bench]'
-	@$(COMPILE) >/dev/null || true
+	@$(COMPILE)
 	@touch $@

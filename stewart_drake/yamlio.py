@@ -178,20 +178,11 @@ def _explain(type_: type, error: Any) -> str:
     field = _dotted(loc)
     if error["type"].startswith("unexpected_"):
         name = str(loc[-1])
-        owner = _alternative(_hint_at(type_, loc[:-1]), dataclasses.is_dataclass)
-        known = [f.name for f in dataclasses.fields(owner)] if owner else []
+        known = _fields_at(type_, loc[:-1])
         alike = difflib.get_close_matches(name, known, n=1)
         # A field may have been named without its section.
-        deeper = [
-            f"{section}.{name}"
-            for section in known
-            if (
-                inner := _alternative(
-                    _hint_at(type_, (*loc[:-1], section)), dataclasses.is_dataclass
-                )
-            )
-            and name in {f.name for f in dataclasses.fields(inner)}
-        ]
+        sections = [at for at in known if name in _fields_at(type_, (*loc[:-1], at))]
+        deeper = [f"{section}.{name}" for section in sections]
         meant = alike[0] if alike else deeper[0] if len(deeper) == 1 else None
         hint = f"did you mean {_dotted((*loc[:-1], meant))}?" if meant else ""
         expected = hint or f"expected one of {', '.join(known)}"
@@ -215,6 +206,12 @@ def _dotted(loc: tuple[int | str, ...]) -> str:
     """`("reference", "poses", 2, 0)` as `reference.poses[2][0]`."""
     parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
     return "".join(parts).removeprefix(".")
+
+
+def _fields_at(type_: Any, loc: tuple[int | str, ...]) -> list[str]:
+    """Names of the fields of the section at a place; none where there is no section."""
+    owner = _alternative(_hint_at(type_, loc), dataclasses.is_dataclass)
+    return [f.name for f in dataclasses.fields(owner)] if owner else []
 
 
 def _hint_at(type_: Any, loc: tuple[int | str, ...]) -> Any:

@@ -184,7 +184,9 @@ class DelayLqi:
         n = self._per_period()
         torques, durations, substeps = acting[:n], times[:n], o.substeps_for(acting[:n])
         if o.filter is not None and memory.estimate is not None:
-            period = Period(torques, durations, acting[min(n, len(acting) - 1)], substeps)
+            # Without a delay the torque that acts next is still to be computed: no change is known.
+            following = acting[min(n, len(acting) - 1)]
+            period = Period(torques, durations, following, substeps)
             usable = None if bad else measurement
             estimate = estimator.advance(memory.estimate, self.dynamics, period, usable, o.filter)
             return estimate, estimate.state, bad

@@ -17,7 +17,7 @@ from stewart_drake.report import style
 from stewart_drake.report.style import figure_style, write_figure
 from stewart_drake.report.tuner_figures import shown_until, weights_figure
 from stewart_drake.results import SimulationResult
-from stewart_drake.signals import ANGLES, COORDINATES, LEGS, PARAMETERS, POSE, POSITION
+from stewart_drake.signals import ANGLES, COORDINATES, LEGS, PARAMETERS, POSITION
 from stewart_drake.studies.compare import LABELS
 
 Array = NDArray[np.float64]
@@ -129,7 +129,7 @@ def _write(figures: Mapping[str, Figure], directory: str | Path) -> list[Path]:
 def _states(runs: Mapping[str, SimulationResult], lines: Mapping[str, style.Line]) -> Figure:
     figure, axes = _grid(runs.values())
     wanted = max((run.signals for run in runs.values()), key=lambda s: s.sizes["time"])
-    spans = _FACTORS * np.array([_span(values) for values in wanted.reference.values.T[POSE]])
+    spans = _FACTORS * np.array([_span(values) for values in wanted.reference.values.T])
     least = _LEAST_SPAN * np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
     for k, ax in enumerate(axes):
         reference = _FACTORS[k] * wanted.reference.values[:, k]

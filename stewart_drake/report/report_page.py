@@ -155,7 +155,8 @@ def comparison_rows(found: Collected) -> list[tuple[str, ...]]:
     """A row per controller, the tuner's after those with fixed weights."""
     runs = [(LABELS[name], name, run) for name, run in found.comparison.items()]
     runs += [(f"{LABELS[name]}, tuned", name, run) for name, run in found.tuned.items()]
-    return [_row(label, name, run) for label, name, run in runs]
+    papers = is_papers(found.scenario)
+    return [_row(label, name, run, papers) for label, name, run in runs]
 
 
 def _run_sections(found: Collected, replay: str) -> Iterator[Section]:
@@ -209,7 +210,7 @@ def _comparison(found: Collected) -> Section:
     return Section("The controllers compared", text, [table], pictures)
 
 
-def _row(label: str, name: str, run: SimulationResult) -> tuple[str, ...]:
+def _row(label: str, name: str, run: SimulationResult, papers: bool) -> tuple[str, ...]:
     s = run.summary
     outcome = run.status.replace("_", " ")
     if run.stopped is not None:
@@ -218,7 +219,7 @@ def _row(label: str, name: str, run: SimulationResult) -> tuple[str, ...]:
     torques = (s["peak_torque"], s["rms_torque"], s["torque_variation"])
     return (
         label,
-        *([paper_error(name)] if is_papers(run.scenario) else []),
+        *([paper_error(name)] if papers else []),
         number(s["accumulated_error"]),
         number(s["delay_floor"]),
         outcome,
