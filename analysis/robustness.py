@@ -1,31 +1,25 @@
-"""How the paper's experiment bears what is not known of the machine, from either start.
+"""How well does the paper's experiment bear what is not known of the machine, from either start?
 
-python analysis/robustness.py [RUNS] [OPTION ...]   # 200 runs by default; options of the command
+python analysis/robustness.py [RUNS] [section.field=value ...]
 """
 
 import sys
-from pathlib import Path
 
-from stewart_drake.cli import main as command
+import stewart_drake as sd
 
-STARTS = {
-    "rest": (),
-    "on_reference": ("--set", "start=on_reference", "--set", "queue=reference"),
-}
+STARTS = {"rest": (), "on_reference": ("start=on_reference", "queue=reference")}
 
 
-def main(words: list[str]) -> int:
-    """Run `stewart-drake analyze robustness` for each start, into out/robustness/START."""
-    runs, *options = words or ["200"]
+def main(runs: str = "200", *settings: str, out: str = "out/robustness") -> dict[str, sd.Answer]:
+    """Print the answers, and write them as pages."""
+    answers = {}
     for name, start in STARTS.items():
-        print(f"\n{name}")
-        folder = str(Path("out", "robustness", name))
-        words = ["analyze", "robustness", "paper", *start, "--runs", runs, *options]
-        status = command([*words, "--out", folder])
-        if status:
-            return status
-    return 0
+        scenario = sd.load_scenario("paper", settings=[*start, *settings])
+        answers[name] = sd.analyze_robustness(scenario, int(runs))
+        print(f"\n{name}\n{answers[name]}")
+        print("written to", answers[name].save(f"{out}/{name}"))
+    return answers
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(*sys.argv[1:])

@@ -1,25 +1,20 @@
-"""Workspace pages of some scenarios, and how much larger each reference could be.
+"""How far is a scenario's motion from the ends of its workspace, and which motors does it need?
 
-python analysis/workspace.py [SCENARIO ...]        # by default all that are shipped
+python analysis/workspace.py [SCENARIO] [section.field=value ...]
 """
 
 import sys
-from pathlib import Path
 
-from stewart_drake.cli import main as command
-from stewart_drake.resources import shipped
+import stewart_drake as sd
 
 
-def main(names: list[str]) -> int:
-    """Run `stewart-drake analyze workspace` on each, into out/workspace/NAME."""
-    for name in names or shipped("scenario"):
-        print(f"\n{name}")
-        folder = Path("out", "workspace", Path(name).stem)
-        status = command(["analyze", "workspace", name, "--out", str(folder)])
-        if status:
-            return status
-    return 0
+def main(scenario: str = "paper", *settings: str, out: str = "out/workspace") -> sd.Answer:
+    """Print the answer, and write it as a page."""
+    answer = sd.analyze_workspace(sd.load_scenario(scenario, settings=settings))
+    print(answer)
+    print("written to", answer.save(out))
+    return answer
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(*sys.argv[1:])

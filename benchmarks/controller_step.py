@@ -20,23 +20,27 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 import stewart_drake as sd
-from stewart_drake.design import control_law
-from stewart_drake.design.control_law import DelayLqi
-from stewart_drake.results import versions
+from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.design_models import DesignModel
+from stewart_drake.law.feedforward import Feedforward
+from stewart_drake.law.observers import NoObserver, ParameterObserver
+from stewart_drake.law.predictors import NonlinearPredictor
+from stewart_drake.versions import versions
 
 RESULTS = Path(__file__).parent / "results"
 RUNS = 6
 SCENARIOS = {"paper": ["duration=10.0"], "gravity": ["duration=2.0"]}
 ESTIMATORS = ("parameters", "none")
 PARTS = {
-    "observe, estimate": (DelayLqi, "_observe"),
-    "predict": (DelayLqi, "_ahead"),
-    "linear model": (DelayLqi, "_model"),
-    "sample": (control_law, "delayed_model"),
-    "Riccati gain": (control_law, "reduced_gain"),
-    "feedforward": (DelayLqi, "_feedforward"),
+    "observe": (NoObserver, "observe"),
+    "observe, estimate": (ParameterObserver, "observe"),
+    "predict": (NonlinearPredictor, "ahead"),
+    "feedforward": (Feedforward, "held"),
+    "linear model": (DesignModel, "at"),
+    "sample": (QuadraticCost, "sampled"),
+    "Riccati gain": (QuadraticCost, "gain"),
 }
-"""What a step calls, in order; the rest of it is arithmetic on short vectors."""
+"""What a step of `predictor_lqi` calls, in order; the rest of it is arithmetic on short vectors."""
 
 
 @contextmanager
@@ -81,7 +85,7 @@ def steps() -> tuple[list[list[str]], list[list[str]]]:
                     medians[part].append(float(np.median(milliseconds)))
             least = {part: f"{min(values):.3g}" for part, values in medians.items()}
             totals.append([name, estimator, least["median"], least["worst"]])
-            parts.append([name, estimator, *(least[part] for part in PARTS)])
+            parts.append([name, estimator, *(least.get(part, "") for part in PARTS)])
     return totals, parts
 
 

@@ -25,11 +25,11 @@ from pydrake.systems.primitives import Sine
 from scipy.integrate import solve_ivp
 
 import stewart_drake as sd
-from stewart_drake.diagram import MultibodyStewart
+from stewart_drake.multibody_stewart import MultibodyStewart
 from stewart_drake.plant.exact import ExactPlant
 from stewart_drake.report.style import figure_style, write_figure
-from stewart_drake.results import versions
 from stewart_drake.signals import POSE, RATES
+from stewart_drake.versions import versions
 
 Array = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from stewart_drake.design.delay_model import ChainModel, DelayedModel, chain, de
 from stewart_drake.design.error_model import double_integrators
 from stewart_drake.design.riccati import augmented_gain, full_gain, reduced_gain
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.results import versions
+from stewart_drake.versions import versions
 
 Array = NDArray[np.float64]
 

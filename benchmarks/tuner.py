@@ -20,7 +20,6 @@ import numpy as np
 import stewart_drake as sd
 from stewart_drake.report.tables import number
 from stewart_drake.report.terminal import count_bar
-from stewart_drake.results import versions
 from stewart_drake.scenario_loading import scenario_to_dict
 from stewart_drake.studies.dataset import make_dataset
 from stewart_drake.studies.disturbances import disturbed, draw, with_gain
@@ -28,6 +27,7 @@ from stewart_drake.studies.evaluation import TUNER, Evaluation, evaluate, evalua
 from stewart_drake.studies.jobs import run_jobs
 from stewart_drake.studies.training import Training, train
 from stewart_drake.tuner.network import save_network
+from stewart_drake.versions import versions
 
 RESULTS = Path(__file__).parent / "results"
 WORKERS = 2

@@ -19,7 +19,7 @@ def main(settings: list[str]) -> None:
     """Simulate, and print the pose error once a second."""
     scenario = sd.load_scenario("paper", settings=settings)
     loop = sd.build_closed_loop(scenario)
-    simulator = Simulator(loop, loop.initial_context())
+    simulator = Simulator(loop, loop.CreateDefaultContext())
     context = simulator.get_context()
     print("t in s   pose error: roll pitch yaw in mrad, x y z in mm")
     for t in np.arange(1.0, scenario.duration + 0.5):

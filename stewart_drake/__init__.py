@@ -4,48 +4,108 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from stewart_drake.config import Scenario
+    __version__: str
+    from stewart_drake.config import ControllerConfig, PlantConfig, Scenario
     from stewart_drake.diagram import build_closed_loop
     from stewart_drake.errors import ConfigError
+    from stewart_drake.law_design import DesignedLaw, design_law
     from stewart_drake.mechanism.files import load_mechanism
     from stewart_drake.mechanism.geometry import Mechanism
     from stewart_drake.mechanism.kinematics import ForwardKinematicsError, UnreachablePoseError
     from stewart_drake.plant.dynamics import StewartDynamics
+    from stewart_drake.plant.exact import ExactPlant, set_accuracy
+    from stewart_drake.platforms import AddStewartPlatform, StewartPlatform
+    from stewart_drake.report.api import (
+        Answer,
+        analyze_delay,
+        analyze_hautus,
+        analyze_robustness,
+        analyze_workspace,
+        plot,
+        replay,
+        table,
+    )
     from stewart_drake.results import SimulationResult
     from stewart_drake.scenario_loading import load_scenario
     from stewart_drake.simulation import simulate
+    from stewart_drake.state_space import linear_models
+    from stewart_drake.studies.compare import compare
 
 # Names are imported when first asked for, so that the command answers --help without Drake.
 _MODULES = {
+    "AddStewartPlatform": "platforms",
+    "Answer": "report.api",
     "ConfigError": "errors",
+    "ControllerConfig": "config",
+    "DesignedLaw": "law_design",
+    "ExactPlant": "plant.exact",
     "ForwardKinematicsError": "mechanism.kinematics",
     "Mechanism": "mechanism.geometry",
+    "PlantConfig": "config",
     "Scenario": "config",
     "SimulationResult": "results",
     "StewartDynamics": "plant.dynamics",
+    "StewartPlatform": "platforms",
     "UnreachablePoseError": "mechanism.kinematics",
+    "analyze_delay": "report.api",
+    "analyze_hautus": "report.api",
+    "analyze_robustness": "report.api",
+    "analyze_workspace": "report.api",
     "build_closed_loop": "diagram",
+    "compare": "studies.compare",
+    "design_law": "law_design",
+    "linear_models": "state_space",
     "load_mechanism": "mechanism.files",
     "load_scenario": "scenario_loading",
+    "plot": "report.api",
+    "replay": "report.api",
+    "set_accuracy": "plant.exact",
     "simulate": "simulation",
+    "table": "report.api",
 }
 
 __all__ = [
+    "__version__",
+    "AddStewartPlatform",
+    "Answer",
     "ConfigError",
+    "ControllerConfig",
+    "DesignedLaw",
+    "ExactPlant",
     "ForwardKinematicsError",
     "Mechanism",
+    "PlantConfig",
     "Scenario",
     "SimulationResult",
     "StewartDynamics",
+    "StewartPlatform",
     "UnreachablePoseError",
+    "analyze_delay",
+    "analyze_hautus",
+    "analyze_robustness",
+    "analyze_workspace",
     "build_closed_loop",
+    "compare",
+    "design_law",
+    "linear_models",
     "load_mechanism",
     "load_scenario",
+    "plot",
+    "replay",
+    "report",
+    "set_accuracy",
     "simulate",
+    "table",
 ]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("stewart-drake")
+    if name == "report":  # a package that can be called
+        return import_module(f"{__name__}.report")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
@@ -54,4 +114,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return list(__all__)

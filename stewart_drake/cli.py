@@ -35,6 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         The exit status: 0; 2 for bad input, with one line on stderr; 130 for Ctrl-C.
     """
+    _prepare_surroundings()
     for argument in sys.argv[1:] if arguments is None else arguments:
         if any("\ud800" <= letter <= "\udfff" for letter in argument):  # an undecodable byte
             return _complain(f"{argument!r}: is not UTF-8 text; expected names in UTF-8")
@@ -57,6 +58,21 @@ def main(arguments: list[str] | None = None) -> int:
         return _complain(str(error))
     finally:
         release()
+
+
+def _prepare_surroundings() -> None:
+    """Give closed standard streams a place, and figures Matplotlib's backend for files.
+
+    The first file to be opened would take a closed stream's number, and what Drake says with it.
+    """
+    os.environ["MPLBACKEND"] = "agg"
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            place = os.open(os.devnull, os.O_RDWR)
+            os.dup2(place, number)
+            if place != number:
+                os.close(place)
+            setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))
 
 
 @app.callback(invoke_without_command=True)

@@ -1,85 +1,43 @@
-"""The scenario: one plain dataclass per section, with units, defaults and ranges.
+"""The scenario: one plain dataclass per section and kind, with units, defaults and ranges.
 
 A field is checked alone when it is set; `Scenario.check` checks what several fields share. Nothing
 here needs a mechanism. `scenario_loading` reads scenarios from files.
 """
 
 import dataclasses
-import math
 from dataclasses import field
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from stewart_drake.delay import Delay
 from stewart_drake.errors import ConfigError
-from stewart_drake.timing import METRIC_PERIOD, step_problem
-from stewart_drake.yamlio import brief, validate
-
-KIND_FIELDS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
-    "reference": {
-        "sine": ("amplitude", "offset", "frequency", "frequency_unit"),
-        "hold": ("offset",),
-        "waypoints": ("times", "poses", "file"),
-        "csv": ("file",),
-    },
-    "tuner": {"fixed": (), "ann": ("weights",)},
-}
-"""Section -> kind -> the fields that mean something for this kind, beside `kind` itself."""
-
-_STRICT: Final = ConfigDict(
-    extra="forbid", strict=True, allow_inf_nan=False, validate_assignment=True
+from stewart_drake.fault_config import SensorFault, fault_problem
+from stewart_drake.field_types import (
+    STRICT,
+    Deviation,
+    Fraction,
+    Name,
+    Six,
+    Steps,
+    TorqueLimit,
+    Weight,
 )
-
-# Limits far beyond any platform keep squares and products of what a file says finite.
-Positive = Annotated[float, Field(gt=0, le=1e6)]
-Weight = Annotated[float, Field(gt=0, le=1e12)]
-Seconds = Annotated[float, Field(ge=0, le=1e5)]
-Deviation = Annotated[float, Field(ge=0, le=1e3)]
-Fraction = Annotated[float, Field(ge=0, lt=1)]
-Steps = Annotated[int, Field(ge=0, le=1000)]
-Row = Annotated[list[float], Field(min_length=6, max_length=6)]
-Six = Annotated[list[Annotated[float, Field(ge=-1e3, le=1e3)]], Field(min_length=6, max_length=6)]
-Name = Annotated[str, Field(min_length=1)]
+from stewart_drake.reference_config import ReferenceConfig, SineConfig
+from stewart_drake.schema import ByKind
+from stewart_drake.timing import METRIC_PERIOD, log_problem, step_problem
+from stewart_drake.yamlio import brief, differences, validate
 
 
-@dataclass(config=_STRICT)
-class ReferenceConfig:
-    """The motion that the plate is asked to follow.
-
-    Attributes:
-        kind: `sine`, `hold` (one constant pose), `waypoints` (a smooth motion through poses, at
-            rest in the first and the last) or `csv` (a sampled motion).
-        amplitude: of the sine, [roll, pitch, yaw, x, y, z] in rad and m.
-        offset: of the sine, or the pose to hold, rad and m.
-        frequency: of the sine, in `frequency_unit`.
-        frequency_unit: `rad/s` or `Hz`.
-        times: of the waypoints, s, increasing.
-        poses: of the waypoints, one [roll, pitch, yaw, x, y, z] per time, rad and m.
-        file: for `csv`, a file of time and six columns; for `waypoints`, a YAML file of `times`
-            and `poses`.
-    """
-
-    kind: Literal["sine", "hold", "waypoints", "csv"] = "sine"
-    amplitude: Six = field(
-        default_factory=lambda: [0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]
-    )
-    offset: Six = field(default_factory=lambda: [0.0, 0.0, 0.0, 0.0, 0.0, 0.38])
-    frequency: Annotated[float, Field(gt=0, le=1e4)] = 1.0
-    frequency_unit: Literal["rad/s", "Hz"] = "rad/s"
-    times: Annotated[list[Seconds], Field(min_length=2)] | None = None
-    poses: Annotated[list[Row], Field(min_length=2)] | None = None
-    file: Name | None = None
-
-
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class PlantConfig:
     """The simulated platform; the controller is not told the last three fields.
 
     Attributes:
         kind: `multibody` (MultibodyPlant with constraints, fixed steps) or `exact` (closed-form
             dynamics, error-controlled integration).
-        gravity: whether gravity acts; false stands for a counterbalanced platform.
+        gravity: whether gravity acts, 9.81 m/s^2; false stands for a counterbalanced platform.
         time_step: of the multibody plant, s.
         accuracy: of the exact plant's integrator, relative, 1e-12 to 1e-2.
         payload_mass: a point mass at the plate's centre of mass, kg.
@@ -96,20 +54,20 @@ class PlantConfig:
     joint_damping: Annotated[float, Field(ge=0, le=1e3)] = 0.0
 
 
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class DelayConfig:
     """The true delay between computing a torque and feeling it.
 
     Attributes:
         steps: whole controller periods.
-        fraction: a further part of one period, 0 to below 1.
+        fraction: a further part of one period, 0 to below 1; less than 1e-9 is 0.
     """
 
     steps: Steps = 8
     fraction: Fraction = 0.0
 
 
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class ControllerConfig:
     """The controller and what it believes.
 
@@ -118,8 +76,8 @@ class ControllerConfig:
         integral: whether the error is also integrated.
         delay_steps: whole periods of delay that the controller believes in, 0 for none; null is
             the true delay.
-        delay_fraction: the further part of a period that it believes in; null is the true one
-            where `delay_steps` is null too, else 0.
+        delay_fraction: the further part of a period that it believes in, less than 1e-9 is 0;
+            null is the true one where `delay_steps` is null too, else 0.
         prediction: across the delay, by the `linear` design model or the `nonlinear` dynamics.
         feedforward: `none`, `equilibrium` torque, or `inverse_dynamics` of the reference.
         model: behind gain and prediction, `paper` (massless legs) or `multibody`.
@@ -127,10 +85,9 @@ class ControllerConfig:
         estimator: `none`, or `parameters` (torque bias, payload and damping).
         w_Q: weight of the errors.
         w_R: weight of the torques.
-        weight_scaling: `bryson` (errors and torques by what the reference asks for) or
-            `identity`.
-        catch_up: blend onto the reference after a start from rest, s; null is the shortest one
-            that respects the torque limit, 0 is none.
+        weight_scaling: `bryson` (by what the reference asks for) or `identity`.
+        catch_up: blend onto the reference after a start from rest, s; 0 is none, null the shortest
+            one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
     """
 
     period: Annotated[float, Field(ge=1e-4, le=10)] = 0.1
@@ -148,47 +105,93 @@ class ControllerConfig:
     catch_up: Annotated[float, Field(ge=0, le=10)] | None = None
 
 
-@dataclass(config=_STRICT)
-class ActuatorConfig:
-    """The motors.
+@dataclass(config=STRICT)
+class TorqueActuatorConfig:
+    """Motors that give the torque that arrives, within their limit.
 
     Attributes:
-        torque_limit: of each motor, N m; null is none.
+        kind: `torque`.
+        torque_limit: of each motor, N m; null is the mechanism's `motor.effort_limit`, the text
+            `none` no limit. Only a number is also planned with, see `ControllerConfig.catch_up`.
     """
 
-    torque_limit: Positive | None = None
+    kind: Literal["torque"] = "torque"
+    torque_limit: TorqueLimit = None
 
 
-@dataclass(config=_STRICT)
-class SensorConfig:
+ActuatorConfig = Annotated[TorqueActuatorConfig, ByKind()]
+
+
+@dataclass(config=STRICT)
+class WireConfig:
+    """A link between controller and motors that delays every torque by `delay`, and loses none.
+
+    Attributes:
+        kind: `wire`.
+    """
+
+    kind: Literal["wire"] = "wire"
+
+
+LinkConfig = Annotated[WireConfig, ByKind()]
+
+
+@dataclass(config=STRICT)
+class StateSensorConfig:
     """The measurement of pose and rates.
 
     Attributes:
+        kind: `state`.
         noise_std: of [pose; rates], in rad, m, rad/s and m/s.
-        seed: of the noise; the same seed gives the same run.
+        seed: of the noise and of spikes; the same seed gives the same run.
+        faults: when it measures nothing, the same again, or nonsense; see `fault_config`.
     """
 
+    kind: Literal["state"] = "state"
     noise_std: Annotated[list[Deviation], Field(min_length=12, max_length=12)] = field(
         default_factory=lambda: [0.0] * 12
     )
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    faults: list[SensorFault] = field(default_factory=list)
+
+    def problem(self) -> str | None:
+        """What is wrong with fields that are well formed one by one, or None."""
+        return fault_problem(self.faults)
 
 
-@dataclass(config=_STRICT)
-class TunerConfig:
-    """Who sets w_Q and w_R while the controller runs.
+SensorConfig = Annotated[StateSensorConfig, ByKind()]
+
+
+@dataclass(config=STRICT)
+class FixedTunerConfig:
+    """Nobody sets w_Q and w_R while the controller runs.
 
     Attributes:
-        kind: `fixed` (nobody) or `ann` (a neural network, which starts from the controller's w_Q
-            and w_R and goes back to them where it fails).
+        kind: `fixed`.
+    """
+
+    kind: Literal["fixed"] = "fixed"
+
+
+@dataclass(config=STRICT)
+class AnnTunerConfig:
+    """A neural network sets w_Q and w_R while the controller runs.
+
+    It starts from the controller's w_Q and w_R and goes back to them where it fails.
+
+    Attributes:
+        kind: `ann`.
         weights: the network, a shipped name or a JSON file; null is the shipped `tuner`.
     """
 
-    kind: Literal["fixed", "ann"] = "fixed"
+    kind: Literal["ann"] = "ann"
     weights: Name | None = None
 
 
-@dataclass(config=_STRICT)
+TunerConfig = Annotated[FixedTunerConfig | AnnTunerConfig, ByKind()]
+
+
+@dataclass(config=STRICT)
 class Scenario:
     """One closed-loop experiment; the defaults are the paper's.
 
@@ -198,20 +201,39 @@ class Scenario:
         start: `rest` (at the reference's first pose, zero rates) or `on_reference`.
         queue: torques in flight at t = 0: `zero`, `equilibrium`, or `reference` (the inverse
             dynamics of the reference).
-        reference, plant, delay, controller, actuator, sensor, tuner: the sections.
+        reference, plant, delay, link, controller, actuator, sensor, tuner: the sections; all but
+            plant, delay and controller come in kinds, each a class of its own.
+        log_period: of the recorded signals, s; null is every 20 ms and every sample of the
+            controller. The multibody plant is seen on its own steps only, so that it must be a
+            multiple of `plant.time_step`. What is measured of a run does not depend on it.
     """
 
     mechanism: Name = "paper"
     duration: Annotated[float, Field(gt=0, le=1e5)] = 10.0
     start: Literal["rest", "on_reference"] = "rest"
     queue: Literal["zero", "equilibrium", "reference"] = "zero"
-    reference: ReferenceConfig = field(default_factory=ReferenceConfig)
+    reference: ReferenceConfig = field(default_factory=SineConfig)
     plant: PlantConfig = field(default_factory=PlantConfig)
     delay: DelayConfig = field(default_factory=DelayConfig)
+    link: LinkConfig = field(default_factory=WireConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
-    actuator: ActuatorConfig = field(default_factory=ActuatorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    tuner: TunerConfig = field(default_factory=TunerConfig)
+    actuator: ActuatorConfig = field(default_factory=TorqueActuatorConfig)
+    sensor: SensorConfig = field(default_factory=StateSensorConfig)
+    tuner: TunerConfig = field(default_factory=FixedTunerConfig)
+    log_period: Annotated[float, Field(ge=1e-5, le=1e5)] | None = None
+
+    def __repr__(self) -> str:
+        return f"Scenario({differences(self, Scenario())})"
+
+    @property
+    def true_delay(self) -> Delay:
+        """What the torques wait for, which the controller need not know."""
+        return Delay(self.delay.steps, self.delay.fraction)
+
+    @property
+    def eta(self) -> float:
+        """The true delay in s."""
+        return self.true_delay.eta(self.controller.period)
 
     def check(self, where: str = "scenario") -> None:
         """Checks every field again, and everything that takes several of them.
@@ -224,44 +246,16 @@ class Scenario:
         """
         # Assignment is validated, but a list can also be changed in place.
         validate(Scenario, dataclasses.asdict(self), where)
+        step = self.plant.time_step if self.plant.kind == "multibody" else None
         for problem in (
-            _reference_problem(self.reference),
+            self.reference.problem(),
             _controller_problem(self.controller),
-            self._step_problem(),
+            self.sensor.problem(),
+            step and step_problem(step, self.controller.period, self.delay.fraction),
+            log_problem(self.log_period, self.duration, step),
         ):
             if problem:
                 raise ConfigError(f"{where}: {problem}")
-
-    def _step_problem(self) -> str | None:
-        if self.plant.kind != "multibody":
-            return None
-        return step_problem(self.plant.time_step, self.controller.period, self.delay.fraction)
-
-
-def _reference_problem(reference: ReferenceConfig) -> str | None:
-    if reference.kind in ("sine", "hold"):
-        swing = abs(reference.amplitude[1]) if reference.kind == "sine" else 0.0
-        largest = swing + abs(reference.offset[1])
-        if largest >= math.pi / 2:
-            return (
-                f"reference.offset: the pitch reaches {largest:.4g} rad; expected |offset| + "
-                "|amplitude| of pitch below pi/2, where roll and yaw stay distinct"
-            )
-    elif reference.kind == "csv":
-        if reference.file is None:
-            return "reference.file: got None; expected the CSV file that kind csv reads"
-    elif reference.file is not None:
-        if reference.times is not None or reference.poses is not None:
-            return "reference.file: got both a file and times or poses; expected one of the two"
-    elif reference.times is None or reference.poses is None:
-        missing = "times" if reference.times is None else "poses"
-        return f"reference.{missing}: got None; expected times and poses, or a file"
-    elif len(reference.times) != len(reference.poses):
-        return (
-            f"reference.poses: got {len(reference.poses)} poses; expected "
-            f"{len(reference.times)}, one per time"
-        )
-    return None
 
 
 def _controller_problem(controller: ControllerConfig) -> str | None:

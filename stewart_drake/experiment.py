@@ -1,30 +1,48 @@
 """A scenario made concrete: mechanism, reference, and the control law that it asks for."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.config import Scenario
+from stewart_drake.config import AnnTunerConfig, Scenario
+from stewart_drake.delay import Delay
 from stewart_drake.design.catch_up import plan_catch_up
-from stewart_drake.design.control_law import DelayLqi
 from stewart_drake.design.filter_settings import filter_settings
-from stewart_drake.design.law_types import LawOptions
 from stewart_drake.design.startup import (
+    STILL,
     choose_substeps,
     initial_queue,
+    machine_torque,
     reference_torque,
     weight_scales,
 )
 from stewart_drake.errors import ConfigError
+from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.design_models import DesignModel, MultibodyModel, PaperModel
+from stewart_drake.law.feedforward import (
+    EquilibriumFeedforward,
+    Feedforward,
+    InverseDynamicsFeedforward,
+    NoFeedforward,
+)
+from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.observers import NoObserver, Observer, ParameterObserver
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.predictors import LinearPredictor, NonlinearPredictor, Predictor
+from stewart_drake.law.sensing import StateSensing
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.own import NOTHING, Own, own_motion
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.workspace import Failure, diagnose
 from stewart_drake.resources import resolve
 from stewart_drake.signals import POSITION
-from stewart_drake.trajectories import evaluate, make_reference, peak_to_peak
+from stewart_drake.trajectories import evaluate, make_reference, moved, peak_to_peak
 from stewart_drake.tuner.network import DEFAULT, Network, load_network
 
 Array = NDArray[np.float64]
@@ -52,6 +70,18 @@ class Experiment(NamedTuple):
     """(12,) state at t = 0."""
     network: Network | None
     """What sets the weights, or None."""
+    own: Own = NOTHING
+    """What takes the place of the scenario's."""
+
+    def __repr__(self) -> str:
+        return f"Experiment({self.mechanism}, {self.scenario})"
+
+    @property
+    def torque_limit(self) -> float:
+        """Of each motor, N m, infinite for none: the scenario's, else that of the true machine."""
+        own = self.scenario.actuator.torque_limit
+        limit = self.truth.effort_limit if own is None else own
+        return math.inf if limit is None or limit == "none" else limit
 
     @property
     def scale(self) -> Array:
@@ -59,17 +89,18 @@ class Experiment(NamedTuple):
         return np.where(self.peak_to_peak > 0, self.peak_to_peak, 1.0)
 
 
-def prepare(scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
+def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHING) -> Experiment:
     """Check a scenario against its mechanism.
 
     Args:
         scenario: what to run.
         truth: the machine to simulate where it is not the one that the controller knows.
+        own: controller, reference or disturbance in the place of the scenario's.
 
     Raises:
         ConfigError: one line; also where the reference leaves the workspace, with time and leg.
     """
-    experiment = assemble(scenario, truth)
+    experiment = assemble(scenario, truth, own)
     failure = reference_failure(experiment)
     if failure is not None:
         first = experiment.reference.value(0.0)[:, 0]
@@ -109,7 +140,7 @@ def reference_failure(experiment: Experiment) -> Failure | None:
     return None
 
 
-def assemble(scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
+def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHING) -> Experiment:
     """What `prepare` returns, whether or not the reference stays in the workspace.
 
     Raises:
@@ -118,7 +149,12 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
     scenario.check()
     network = _network(scenario)
     mechanism = load_mechanism(scenario.mechanism)
-    reference = make_reference(scenario.reference, scenario.duration)
+    if own.reference is None:
+        reference = make_reference(scenario.reference, scenario.duration)
+        span = peak_to_peak(scenario.reference, reference, scenario.duration)
+    else:
+        reference = own_motion(own.reference, scenario.duration)
+        span = moved(reference, scenario.duration)
     start = evaluate(reference, 0.0)[:12]
     if scenario.start == "rest":
         start[6:] = 0.0
@@ -127,18 +163,20 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
         mechanism=mechanism,
         truth=mechanism if truth is None else truth,
         reference=reference,
-        peak_to_peak=peak_to_peak(scenario.reference, reference, scenario.duration),
+        peak_to_peak=span,
         nominal=StewartDynamics(mechanism, gravity=scenario.plant.gravity),
         start=start,
         network=network,
+        own=own,
     )
 
 
 def _network(scenario: Scenario) -> Network | None:
-    if scenario.tuner.kind == "fixed":
+    tuner = scenario.tuner
+    if not isinstance(tuner, AnnTunerConfig):
         return None
     try:
-        path = resolve("weights", scenario.tuner.weights or DEFAULT)
+        path = resolve("weights", tuner.weights or DEFAULT)
     except ConfigError as error:
         raise ConfigError(f"tuner.{error}") from None
     return load_network(path)
@@ -155,87 +193,104 @@ def waits_at_rest(scenario: Scenario) -> bool:
     )
 
 
-def believed_delay(scenario: Scenario) -> tuple[int, float]:
-    """Delay steps and fraction that the controller assumes; null means the true ones."""
-    controller, true = scenario.controller, scenario.delay
+def believed_delay(scenario: Scenario) -> Delay:
+    """The delay that the controller assumes; null means the true one."""
+    controller = scenario.controller
     if controller.delay_steps is None:
-        return true.steps, true.fraction
-    return controller.delay_steps, controller.delay_fraction or 0.0
+        return scenario.true_delay
+    return Delay(controller.delay_steps, controller.delay_fraction or 0.0)
 
 
-def believed_queue(experiment: Experiment, options: LawOptions) -> Array:
-    """The torques in flight at t = 0 that the controller believes in."""
-    sc = experiment.scenario
-    return initial_queue(
-        sc.queue,
-        experiment.nominal,
-        experiment.reference,
-        options.period,
-        options.steps,
-        options.fraction,
+def torques_in_flight(experiment: Experiment, delay: Delay) -> Array:
+    """Torques (L, 6) in N m that are under way at t = 0 with such a delay, within the limit."""
+    sc, limit = experiment.scenario, experiment.torque_limit
+    queue = initial_queue(
+        sc.queue, experiment.nominal, experiment.reference, sc.controller.period, delay
     )
+    return np.clip(queue, -limit, limit)
+
+
+def believed_queue(experiment: Experiment, timeline: Timeline) -> Array:
+    """The torques in flight at t = 0 that the controller believes in."""
+    return torques_in_flight(experiment, timeline.delay)
 
 
 def motion_scale(experiment: Experiment) -> Array:
-    """(6,) rad and m: half the reference's peak to peak, 0.1 rad or 0.1 cranks where constant."""
-    still = np.repeat([0.1, 0.1 * experiment.mechanism.crank_lengths.min()], 3)
+    """(6,) rad and m: half the reference's peak to peak, STILL where constant."""
+    still = STILL * np.repeat([1.0, experiment.mechanism.crank_lengths.min()], 3)
     return np.where(experiment.peak_to_peak > 0, experiment.peak_to_peak / 2, still)
 
 
-def control_law(experiment: Experiment) -> tuple[DelayLqi, Trajectory, float]:
-    """The control law, the motion it follows, and the length of the blend onto the reference."""
+def planned_limit(scenario: Scenario) -> float | None:
+    """The limit in N m that plans and priors keep to, or None.
+
+    One that nobody asked for only clips: it makes no plan shorter and no prior narrower.
+    """
+    asked = scenario.actuator.torque_limit
+    return None if asked == "none" else asked
+
+
+def compose_law(experiment: Experiment) -> PredictiveLqi:
+    """The parts that a scenario asks for; the only place that knows their names in it."""
     sc, nominal = experiment.scenario, experiment.nominal
-    c = sc.controller
-    steps, fraction = believed_delay(sc)
-    substeps = choose_substeps(nominal, experiment.reference, c.period, steps, sc.duration)
+    c, motion = sc.controller, motion_scale(experiment)
+    timeline = Timeline(c.period, believed_delay(sc))
+    substeps = choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration)
     peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
-    torque_scale = max(0.1, peak_torque)
-    error_weights, integral_weights, torque_weights = weight_scales(
-        c.weight_scaling, experiment.peak_to_peak, peak_torque
+    torque_scale = max(machine_torque(nominal), peak_torque)
+    errors, integrals, torques = weight_scales(
+        c.weight_scaling, nominal, experiment.peak_to_peak, peak_torque
     )
-    options = LawOptions(
-        period=c.period,
-        steps=steps,
-        fraction=fraction,
-        integral=c.integral,
-        prediction=c.prediction,
-        feedforward=c.feedforward,
-        model=c.model,
-        torque_map=c.torque_map,
-        substeps=substeps,
-        gentle_torque=GENTLE * torque_scale,
-        error_weights=error_weights,
-        integral_weights=integral_weights,
-        torque_weights=torque_weights,
-        torque_limit=sc.actuator.torque_limit,
-        filter=filter_settings(
-            np.array(sc.sensor.noise_std),
-            motion_scale(experiment),
-            experiment.mechanism.plate.mass,
-            torque_scale,
-            sc.actuator.torque_limit,
-            c.period,
-        )
-        if c.estimator == "parameters"
-        else None,
+    plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
+    observers: dict[str, Observer] = {
+        "none": NoObserver(),
+        "parameters": ParameterObserver(
+            filter_settings(motion, plate, torque_scale, asked, c.period)
+        ),
+    }
+    predictors: dict[str, Predictor] = {
+        "linear": LinearPredictor(),
+        "nonlinear": NonlinearPredictor(),
+    }
+    feedforwards: dict[str, Feedforward] = {
+        "none": NoFeedforward(),
+        "equilibrium": EquilibriumFeedforward(),
+        "inverse_dynamics": InverseDynamicsFeedforward(),
+    }
+    models: dict[str, DesignModel] = {
+        "paper": PaperModel(c.torque_map),
+        "multibody": MultibodyModel(),
+    }
+    motors = TorqueLimit(experiment.torque_limit)
+    return PredictiveLqi(
+        timeline=timeline,
+        plant=NominalPlant(nominal, substeps, GENTLE * torque_scale, motors),
+        sensing=StateSensing(np.array(sc.sensor.noise_std), motion),
+        observer=observers[c.estimator],
+        predictor=predictors[c.prediction],
+        feedforward=feedforwards[c.feedforward],
+        model=models[c.model],
+        cost=QuadraticCost(errors, integrals if c.integral else None, torques),
     )
-    law = DelayLqi(options, nominal)
+
+
+def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, float]:
+    """The control law, the motion it follows, and the length of the blend onto the reference."""
+    sc, nominal, law = experiment.scenario, experiment.nominal, compose_law(experiment)
+    law.warm_up()
+    c, timeline = sc.controller, law.timeline
     if sc.start != "rest" or c.catch_up == 0:
         return law, experiment.reference, 0.0
-    state = experiment.start
-    queue, eta = believed_queue(experiment, options), (steps + fraction) * c.period
+    state, queue = experiment.start, believed_queue(experiment, timeline)
     if len(queue):
-        holds = np.full(len(queue), c.period)
-        if fraction > 0:
-            holds[0] = fraction * c.period
-        state = nominal.predict(state, queue, holds, substeps)[-1]
+        state = nominal.predict(state, *timeline.until_next(queue), law.plant.substeps)[-1]
     planned, span = plan_catch_up(
         nominal,
         experiment.reference,
         state,
-        eta,
+        timeline.eta,
         c.period,
         c.catch_up,
-        sc.actuator.torque_limit,
+        planned_limit(sc),
     )
     return law, planned, span

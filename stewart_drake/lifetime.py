@@ -8,8 +8,10 @@ hold nothing, `let_go` opens the other circle where a diagram is no longer neede
 """
 
 import weakref
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+_NOTES: Final = "_pydrake_internal_ref_cycle_peers"
 
 
 def weak(method: Callable[..., Any], *first: Any) -> Callable[..., Any]:
@@ -27,11 +29,22 @@ def weak(method: Callable[..., Any], *first: Any) -> Callable[..., Any]:
     return call
 
 
-def let_go(diagram: Any) -> None:
+def let_go(diagram: Any, kept: Sequence[Any] = (), made: Sequence[Any] = ()) -> None:
     """Take all attributes from a diagram and its subsystems; nobody may use them afterwards.
 
     Among them is what Drake notes there about builders and ports. In C++ nothing changes.
+
+    Args:
+        diagram: that is no longer needed.
+        kept: systems in it that somebody else goes on using: they lose nothing, and keep the
+            diagram.
+        made: systems of somebody else's that lose Drake's notes only.
     """
+    if any(diagram is system for system in kept):
+        return
+    if any(diagram is system for system in made):
+        vars(diagram).pop(_NOTES, None)
+        return
     for system in diagram.GetSystems() if hasattr(diagram, "GetSystems") else ():
-        let_go(system)
+        let_go(system, kept, made)
     vars(diagram).clear()

@@ -24,7 +24,7 @@ def quadratic_cost(
 
     Args:
         error: (n, 6) pose error at the controller's samples.
-        torque: (n, 6) commanded there, N m.
+        torque: (n, 6) sent there, within the motors' limit, N m.
         period: s; z follows from the errors by the trapezoid rule.
         w_Q, w_R: the weights.
         integral: whether the cost sees z, (28).

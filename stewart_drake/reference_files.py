@@ -4,25 +4,32 @@ Readers return `(times, poses)`: times (n,) s, poses (n, 6) [roll, pitch, yaw, x
 """
 
 import csv
+import itertools
 import math
 import re
+from array import array
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from stewart_drake.config import Row, Seconds
 from stewart_drake.errors import ConfigError
+from stewart_drake.field_types import Row, Seconds
 from stewart_drake.fileio import read_bytes
+from stewart_drake.reference_config import WaypointsConfig
+from stewart_drake.smoothness import roughest
 from stewart_drake.yamlio import brief, load_yaml, validate
 
 Array = NDArray[np.float64]
 
 _ANGLES: Final = ("roll", "pitch", "yaw")
 _COLUMNS: Final = ("time", *_ANGLES, "x", "y", "z")
+_POSE: Final = "pose_"
+"""Before a coordinate's name in the files that `export` writes."""
 _UNITS: Final = {
     "time": {"s": 1.0},
     **{name: {"rad": 1.0, "deg": math.pi / 180} for name in _ANGLES},
@@ -36,16 +43,25 @@ _MIN_STEP: Final = 1e-6
 _MAX_GAP: Final = 10
 """Times the median step."""
 _MAX_SIZE: Final = 1e3
-_MAX_KINK: Final = 0.05
-"""Of the largest peak to peak of the angles, or of the positions: see `_roughest`."""
-_LEAST_KINK: Final = 1e-3
-"""rad, m; what stays below is noise of a sensor, not a jump."""
 
 
 @dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
 class _WaypointFile:
     times: Annotated[list[Seconds], Field(min_length=2)]
     poses: Annotated[list[Row], Field(min_length=2)]
+
+
+def waypoints(config: WaypointsConfig) -> tuple[Array, Array]:
+    """The waypoints of a scenario's section, from its lists or its file.
+
+    Raises:
+        ConfigError: see `read_waypoints` and `check_waypoints`.
+    """
+    if config.file is not None:
+        return read_waypoints(config.file)
+    if config.times is None or config.poses is None:
+        raise ConfigError("reference.times: got None; expected times and poses, or a file")
+    return check_waypoints(config.times, config.poses, "reference.")
 
 
 def read_waypoints(path: str | Path) -> tuple[Array, Array]:
@@ -97,38 +113,36 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
     `time[s]`; `roll`, `pitch`, `yaw` in `[rad]` or `[deg]`; `x`, `y`, `z` in `[m]` or `[mm]`.
     Each further line is one sample. Time starts at 0 and increases.
 
+    In a file that `simulate --csv` or `export` wrote, the motion is that of the columns `pose_roll`
+    to `pose_z`, and the others are left alone.
+
     Raises:
         ConfigError: the file breaks one of these rules, has too few rows, a gap, a value that is
             no finite number, an angle that jumps by a turn, or a jump or motion too quick for its
             samples; row and column are named, rows as a spreadsheet counts them.
     """
     path = Path(path)
-    lines, cells = _read_cells(path)
-    names, scales = _read_header(path, cells[0])
-    samples = np.empty((len(cells) - 1, 7))
-    order = [_COLUMNS.index(name) for name in names]
-    labels = [cell.strip() for cell in cells[0]]
-    for index, (line, row) in enumerate(zip(lines[1:], cells[1:], strict=True)):
-        if len(row) != 7:
-            hint = ", with a point for the decimals" if len(row) > 7 else ""
-            raise ConfigError(
-                f"{path}: row {line}: got {len(row)} cells; expected 7, as above{hint}"
-            )
-        for column, text in enumerate(row):
-            place = f"{path}: row {line}, column {labels[column]}"
-            try:
-                value = float(text) * scales[column]
-            except ValueError:
-                raise ConfigError(f"{place}: got {brief(text)}; expected a number") from None
-            target = order[column]
-            before = float(samples[index - 1, target]) if index else None
-            if target == 0:
-                problem = _time_problem(value, before)
-            else:
-                problem = _pose_problem(target - 1, value, before)
-            if problem:
-                raise ConfigError(f"{place}: {problem}")
-            samples[index, target] = value
+    text = _read_lines(path)
+    header = next((row for _, row in _rows(path, text)), None)
+    if header is None:
+        raise ConfigError(f"{path}: is empty; expected a header {_HEADER}")
+    chosen = _motion_columns(header)
+    names, scales = _read_header(path, [header[at] for at in chosen])
+    columns = _Columns(
+        width=len(header),
+        chosen=chosen,
+        labels=[header[at].strip() for at in chosen],
+        order=[_COLUMNS.index(name) for name in names],
+        scales=scales,
+    )
+    lines, values = _read_numbers(path, text, columns)
+    samples = np.empty_like(values)
+    samples[:, columns.order] = values * scales
+    bad = _first_problem(samples)
+    if bad is not None:
+        before = samples[bad - 1] if bad else None
+        _, row = next(itertools.islice(_rows(path, text), bad + 1, None))
+        _check_row(f"{path}: row {lines[bad]}", row, columns, before)
     if len(samples) < _MIN_ROWS:
         plural = "" if len(samples) == 1 else "s"
         raise ConfigError(
@@ -138,36 +152,121 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
     widest, median = int(np.argmax(steps)), float(np.median(steps))
     if steps[widest] > _MAX_GAP * median:
         raise ConfigError(
-            f"{path}: row {lines[widest + 2]}, column time[s]: got a gap of {steps[widest]:.6g} s; "
+            f"{path}: row {lines[widest + 1]}, column time[s]: got a gap of {steps[widest]:.6g} s; "
             f"expected steps near the median of {median:.6g} s, fill the gap by resampling"
         )
     samples[0, 0] = 0.0
-    kink = _roughest(samples[:, 0], samples[:, 1:])
+    kink = roughest(samples[:, 0], samples[:, 1:])
     if kink is not None:
         sample, axis, size = kink
-        column = order.index(axis + 1)
-        size, unit = size / scales[column], labels[column].partition("[")[2].strip(" ]")
+        column = columns.order.index(axis + 1)
+        label = columns.labels[column]
+        size, unit = size / scales[column], label.partition("[")[2].strip(" ]")
         raise ConfigError(
-            f"{path}: row {lines[sample + 1]}, column {labels[column]}: got {size:.3g} {unit} off "
+            f"{path}: row {lines[sample]}, column {label}: got {size:.3g} {unit} off "
             "the cubic through its neighbours; expected a smooth motion with some ten samples per "
             "swing, filter or resample it"
         )
     return samples[:, 0].copy(), samples[:, 1:].copy()
 
 
-def _read_cells(path: Path) -> tuple[list[int], list[list[str]]]:
-    """The rows that hold anything, and the line number of each."""
+def _read_lines(path: Path) -> list[str]:
     raw = read_bytes(path, _MAX_BYTES, "a CSV file of the motion's samples")
     try:
-        reader = csv.reader(raw.decode("utf-8-sig").splitlines(), strict=True)
-        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+        return raw.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: is not UTF-8 text; expected a CSV file") from None
+
+
+def _rows(path: Path, text: list[str]) -> Iterator[tuple[int, list[str]]]:
+    """The rows that hold anything, each with its line number."""
+    reader = csv.reader(text, strict=True)
+    try:
+        for row in reader:
+            if any(map(str.strip, row)):
+                yield reader.line_num, row
     except csv.Error as error:
         raise ConfigError(f"{path}: row {reader.line_num}: is not CSV ({error})") from None
-    if not rows:
-        raise ConfigError(f"{path}: is empty; expected a header {_HEADER}")
-    return [line for line, _ in rows], [row for _, row in rows]
+
+
+class _Columns(NamedTuple):
+    """Where a file has the motion: of its `width` columns those `chosen`, with their labels, their
+    places in a sample and their factors to SI units."""
+
+    width: int
+    chosen: list[int]
+    labels: list[str]
+    order: list[int]
+    scales: list[float]
+
+
+def _read_numbers(path: Path, text: list[str], columns: _Columns) -> tuple[list[int], Array]:
+    """Line numbers (n,) and chosen cells (n, 7) below the header, up to the first row that is of
+    another width or not seven numbers; that row is the last, with NaN."""
+    lines, numbers = list[int](), array("d")
+    whole = columns.chosen == list(range(columns.width))
+    for line, row in itertools.islice(_rows(path, text), 1, None):
+        lines.append(line)
+        try:
+            if len(row) != columns.width:
+                raise ValueError
+            cells = row if whole else [row[at] for at in columns.chosen]
+            numbers.extend([*map(float, cells)])  # whole, or nothing of it
+        except ValueError:
+            numbers.extend([math.nan] * 7)
+            break
+    return lines, np.frombuffer(numbers).reshape(-1, 7)
+
+
+def _first_problem(samples: Array) -> int | None:
+    """The first row of samples (n, 7) in which `_check_row` finds something, or None."""
+    time, poses = samples[:, 0], samples[:, 1:]
+    with np.errstate(invalid="ignore", over="ignore"):
+        wrong = ~np.isfinite(time) | ~(np.abs(poses) < _MAX_SIZE).all(axis=1)
+        wrong |= np.abs(poses[:, 1]) >= math.pi / 2
+        wrong[:1] |= np.abs(time[:1]) > 1e-9
+        wrong[1:] |= np.diff(time) < _MIN_STEP
+        wrong[1:] |= (np.abs(np.diff(poses[:, :3], axis=0)) > math.pi).any(axis=1)
+    return int(wrong.argmax()) if wrong.any() else None
+
+
+def _check_row(where: str, row: list[str], columns: _Columns, before: Array | None) -> None:
+    """Say what is wrong with a row.
+
+    Args:
+        where: what opens the message.
+        row: its cells.
+        columns: of the file.
+        before: the sample (7,) of the row above, or None.
+    """
+    width, chosen, labels, order, scales = columns
+    if len(row) != width:
+        hint = ", with a point for the decimals" if len(row) > width else ""
+        raise ConfigError(f"{where}: got {len(row)} cells; expected {width}, as above{hint}")
+    cells = [row[at] for at in chosen]
+    for label, target, scale, text in zip(labels, order, scales, cells, strict=True):
+        try:
+            value = float(text) * scale
+        except ValueError:
+            raise ConfigError(
+                f"{where}, column {label}: got {brief(text)}; expected a number"
+            ) from None
+        last = None if before is None else float(before[target])
+        if target == 0:
+            problem = _time_problem(value, last)
+        else:
+            problem = _pose_problem(target - 1, value, last, scale)
+        if problem:
+            raise ConfigError(f"{where}, column {label}: {problem}")
+    raise AssertionError("a row that breaks no rule")
+
+
+def _motion_columns(header: list[str]) -> list[int]:
+    """Columns of the motion: all, but of a file that `export` wrote time and pose."""
+    names = [cell.partition("[")[0].strip().lower() for cell in header]
+    if not any(name.startswith(_POSE) for name in names) or set(names) & set(_COLUMNS[1:]):
+        return list(range(len(header)))
+    return [at for at, name in enumerate(names) if name == "time" or name.startswith(_POSE)]
 
 
 def _read_header(path: Path, header: list[str]) -> tuple[list[str], list[float]]:
@@ -184,6 +283,7 @@ def _read_header(path: Path, header: list[str]) -> tuple[list[str], list[float]]
     for cell in header:
         match = re.fullmatch(r"\s*(\w+)\s*\[\s*(\w+)\s*\]\s*", cell)
         name, unit = (part.lower() for part in match.groups()) if match else ("", "")
+        name = name.removeprefix(_POSE)
         if name not in _UNITS or name in names:
             problem = "a second" if name in names else "an unknown"
             raise ConfigError(
@@ -202,35 +302,6 @@ def _read_header(path: Path, header: list[str]) -> tuple[list[str], list[float]]
     return names, scales
 
 
-def _roughest(times: Array, poses: Array) -> tuple[int, int, float] | None:
-    """Row, column and size of the worst kink of samples (n,), (n, 6), or None if all is smooth.
-
-    A sample should lie near the cubic through the two before and the two after it. With equal
-    steps h the difference is the fourth difference over 6, (omega h)^4 / 6 of a sine's amplitude:
-    1.3 % of its peak to peak with ten samples per period, 5 % with seven. A jump shows by half its
-    size, a glitch with all of it. Ends are seen as neighbours only. The share is taken of the
-    largest peak to peak among the angles, or the positions, since one may be still but for noise.
-    """
-    if len(times) < 5:
-        return None
-    near = np.array([-2, -1, 1, 2])
-    at = np.arange(2, len(times) - 2)
-    t = times[at[:, None] + near] - times[at][:, None]
-    weights = np.ones_like(t)  # Lagrange's, at zero
-    for i in range(4):
-        for j in range(4):
-            if i != j:
-                weights[:, i] *= t[:, j] / (t[:, j] - t[:, i])
-    kinks = np.abs(poses[at] - np.einsum("ki,kic->kc", weights, poses[at[:, None] + near]))
-    spans = np.ptp(poses, axis=0)
-    largest = np.repeat([spans[:3].max(), spans[3:].max()], 3)
-    excess = kinks / np.maximum(_MAX_KINK * largest, _LEAST_KINK)
-    row, column = np.unravel_index(excess.argmax(), excess.shape)
-    if excess[row, column] <= 1:
-        return None
-    return int(at[row]), int(column), float(kinks[row, column])
-
-
 def _time_problem(value: float, before: float | None) -> str | None:
     if not math.isfinite(value):
         return f"got {value}; expected a finite number"
@@ -241,11 +312,24 @@ def _time_problem(value: float, before: float | None) -> str | None:
     return None
 
 
-def _pose_problem(column: int, value: float, before: float | None) -> str | None:
+def _pose_problem(
+    column: int, value: float, before: float | None, scale: float = 1.0
+) -> str | None:
+    """What is wrong with a coordinate in rad or m, told in the file's unit, of `scale` SI units."""
+    units = _UNITS[_COLUMNS[1 + column]]
+    unit = next(name for name, factor in units.items() if factor == scale)
+
+    def told(x: float) -> str:
+        return f"{x / scale:.6g}"
+
     if not abs(value) < _MAX_SIZE:  # also true of NaN
-        return f"got {value!r}; expected a finite number below {_MAX_SIZE:g} rad or m"
+        return f"got {value / scale!r}; expected a finite number below {told(_MAX_SIZE)} {unit}"
     if column == 1 and abs(value) >= math.pi / 2:
-        return f"got {value:.6g} rad; expected a pitch within 90 degrees, give deg or rad"
+        degrees = "" if unit == "deg" else ", 90 degrees"
+        return (
+            f"got {told(value)} {unit}; expected a pitch within {told(math.pi / 2)} {unit}{degrees}"
+        )
     if column < 3 and before is not None and abs(value - before) > math.pi:
-        return f"got {value:.6g} rad after {before:.6g}; expected no jump by a turn, unwrap it"
+        change = f"{told(value)} {unit} after {told(before)}"
+        return f"got {change}; expected no jump by a turn, unwrap it"
     return None

@@ -1,17 +1,15 @@
 """What a run leaves behind, in memory and on disk."""
 
-import json
-import platform
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
+from stewart_drake.arrayio import write_netcdf
 from stewart_drake.config import Scenario
-from stewart_drake.fileio import replacing
+from stewart_drake.fileio import remove_partials
+from stewart_drake.jsonio import write_json
 from stewart_drake.plant.workspace import Failure
 
 
@@ -23,10 +21,15 @@ class SimulationResult:
         scenario: as run.
         status: `completed`, `left_workspace`, `solver_failed` or `interrupted`.
         stopped: when and why a run did not complete, or None.
-        signals: over `time` (20 ms): pose, rates, reference, reference_rates, error, integral,
-            torque_commanded, torque_applied, weights, parameters and parameter_std (estimated),
-            density (45). Held signals show the value from that instant on.
-        summary: what `summary.json` holds.
+        signals: over `time` (every 20 ms and every sample of the controller, or the scenario's
+            `log_period`): pose, rates, reference, reference_rates, error, integral,
+            torque_commanded (what the law asked for), torque_applied (what acted of it: within the
+            limit, late), weights, parameters and parameter_std (estimated), density (45),
+            measurement and state_estimate (12, as the controller has them). Held signals show the
+            value from that instant on. Units, long names, the scenario and versions are attributes.
+        summary: what `summary.json` holds: of commanded torques `peak_torque`, `rms_torque` and
+            `torque_variation`, of applied ones `peak_torque_applied`; `cost` counts what the limit
+            let through.
     """
 
     scenario: Scenario
@@ -34,6 +37,10 @@ class SimulationResult:
     stopped: Failure | None
     signals: xr.Dataset
     summary: dict[str, Any]
+
+    def __repr__(self) -> str:
+        status = self.status if self.stopped is None else f"{self.status}: {self.stopped}"
+        return f"SimulationResult({status}, E_ac={self.accumulated_error:.4g}, {self.scenario})"
 
     @property
     def accumulated_error(self) -> float:
@@ -53,37 +60,6 @@ class SimulationResult:
         """
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
-        write_signals(folder / "signals.nc", self.signals)
+        remove_partials(folder)
+        write_netcdf(folder / "signals.nc", self.signals)
         write_json(folder / "summary.json", self.summary)
-
-
-def write_signals(path: Path, signals: xr.Dataset) -> None:
-    """Write NetCDF by way of a temporary file, so that no half file remains."""
-    # Made in memory: HDF5 ends the process where a disk is full.
-    content: Any = signals.to_netcdf(engine="h5netcdf")
-    with replacing(path) as partial:
-        partial.write_bytes(content)
-
-
-def write_json(path: Path, data: Any) -> None:
-    """Write JSON with NaN as null, by way of a temporary file, so that no half file remains."""
-    text = json.dumps(jsonable(data), indent=2, allow_nan=False)
-    with replacing(path) as partial:
-        partial.write_text(text + "\n")
-
-
-def jsonable(data: Any) -> Any:
-    """Plain JSON values: arrays as lists, non-finite numbers as None."""
-    if isinstance(data, dict):
-        return {str(key): jsonable(value) for key, value in data.items()}
-    if isinstance(data, (list, tuple, np.ndarray)):
-        return [jsonable(value) for value in data]
-    if isinstance(data, (float, np.floating)):
-        return float(data) if np.isfinite(data) else None
-    return data.item() if isinstance(data, np.generic) else data
-
-
-def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
-    packages = ("stewart-drake", "drake", "casadi", "numpy", "scipy")
-    return {"python": platform.python_version()} | {name: version(name) for name in packages}

@@ -14,12 +14,14 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.representer import RoundTripRepresenter
 
-from stewart_drake.config import KIND_FIELDS, ControllerConfig, Scenario
+from stewart_drake.config import ControllerConfig, Scenario
 from stewart_drake.errors import ConfigError
 from stewart_drake.resources import absolute_path, is_path, resolve
+from stewart_drake.schema import field_names, sections
 from stewart_drake.yamlio import brief, load_yaml, parse_yaml, validate
 
 _SETTINGS = "settings"
+_KINDS = sections(Scenario)
 
 
 def load_scenario(
@@ -34,27 +36,22 @@ def load_scenario(
             what the file leaves out keeps its default.
         controller: a controller to lay over it, as `load_controller` takes it.
         settings: `section.field=value` or `field=value`, the value in YAML, e.g.
-            `plant.gravity=true`; paths start from the working directory. A setting of
-            `reference.kind` or `tuner.kind` also drops what the file says for another kind.
+            `plant.gravity=true`; paths start from the working directory. A setting of a
+            section's kind also drops what the file says for another kind.
 
     Raises:
         ConfigError: the first problem, in one line.
     """
     path = resolve("scenario", name_or_path)
     data = load_yaml(path)
+    _drop_foreign_nulls(data)
     validate(Scenario, data, str(path))
-    _refuse_foreign_fields(data, str(path))
     _make_paths_absolute(data, path.parent)
     if controller is not None:
         data["controller"] = {**data.get("controller", {}), **load_controller(controller)}
-    overlay = _parse_settings(settings)
-    for section, kinds in KIND_FIELDS.items():
-        if "kind" in overlay.get(section, {}):
-            kept = ("kind", *kinds[overlay[section]["kind"]])
-            data[section] = {k: v for k, v in data.get(section, {}).items() if k in kept}
-    for key, value in overlay.items():
-        data[key] = {**data.get(key, {}), **value} if isinstance(value, dict) else value
-    _refuse_foreign_fields(data, _SETTINGS)
+    overlay = _parse_settings(settings, data)
+    for name, change in overlay.items():
+        data[name] = _laid_over(name, data.get(name), change)
     scenario = validate(Scenario, data, str(path))
     scenario.check(f"{path} with settings" if overlay else str(path))
     return scenario
@@ -84,15 +81,8 @@ def load_controller(name_or_path: str | Path) -> dict[str, Any]:
 
 
 def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
-    """The scenario as plain data that JSON and YAML can hold, and `load_scenario` reads back.
-
-    Fields without a meaning for the chosen kind of reference or tuner are left out.
-    """
-    data = dataclasses.asdict(scenario)
-    for section, kinds in KIND_FIELDS.items():
-        meant = ("kind", *kinds[data[section]["kind"]])
-        data[section] = {k: v for k, v in data[section].items() if k in meant}
-    return data
+    """The scenario as plain data that JSON and YAML can hold, and `load_scenario` reads back."""
+    return dataclasses.asdict(scenario)
 
 
 def scenario_yaml(scenario: Scenario) -> str:
@@ -119,59 +109,81 @@ _Representer.add_representer(type(None), _Representer.null)
 
 def setting_choices() -> list[str]:
     """The beginning of every setting, `plant.time_step=`; whole where values can be counted."""
-    hints: dict[str, Any] = {}
-    for field in dataclasses.fields(Scenario):
-        section = getattr(Scenario(), field.name)
-        if dataclasses.is_dataclass(section):
-            hints |= {
-                f"{field.name}.{leaf.name}": leaf.type for leaf in dataclasses.fields(section)
-            }
-        else:
-            hints[field.name] = field.type
-    choices = []
-    for name, hint in hints.items():
-        values: tuple[Any, ...] = ("",)
-        if hint is bool:
-            values = ("true", "false")
-        elif typing.get_origin(hint) is typing.Literal:
-            values = typing.get_args(hint)
-        choices += [f"{name}={value}" for value in values]
-    return choices
+    choices: dict[str, None] = {}  # kinds have fields in common
+    for name, hint in typing.get_type_hints(Scenario).items():
+        members = [m for m in (*typing.get_args(hint), hint) if dataclasses.is_dataclass(m)]
+        hints = [
+            (f"{name}.{field}", inner)
+            for member in members
+            for field, inner in typing.get_type_hints(member).items()
+        ]
+        for field, inner in hints or [(name, hint)]:
+            values: tuple[Any, ...] = ("",)
+            if inner is bool:
+                values = ("true", "false")
+            elif typing.get_origin(inner) is typing.Literal:
+                values = typing.get_args(inner)
+            choices |= dict.fromkeys(f"{field}={value}" for value in values)
+    return list(choices)
 
 
-def _parse_settings(settings: Iterable[str]) -> dict[str, Any]:
-    """Settings as a partial scenario; of two for one field the later one counts."""
+def _parse_settings(settings: Iterable[str], data: dict[str, Any]) -> dict[str, Any]:
+    """Settings for a scenario's data as a partial one; of two for one field the later one counts.
+
+    The kind of a section that any of them touches is said in what is returned.
+    """
+    changes = [_parse_setting(setting) for setting in settings]
+    for section, kinds in _KINDS.items():
+        touching = [part for c in changes if isinstance(part := c.get(section), dict)]
+        layers = [{"kind": next(iter(kinds))}, data.get(section, {}), *touching]
+        kind = [layer["kind"] for layer in layers if "kind" in layer][-1]
+        for part in touching:
+            part.setdefault("kind", kind)
     overlay: dict[str, Any] = {}
-    for setting in settings:
-        key, equals, text = setting.partition("=")
-        parts = key.strip().split(".")
-        if not equals or not all(parts) or len(parts) > 2:
-            raise ConfigError(
-                f"{_SETTINGS}: got {brief(setting)}; expected section.field=value or field=value"
-            )
-        value = parse_yaml(text, f"{_SETTINGS}: {key}")
-        change: dict[str, Any] = {parts[-1]: value}
-        if len(parts) == 2:
-            change = {parts[0]: change}
+    for change in changes:
+        _drop_foreign_nulls(change)
         validate(Scenario, change, _SETTINGS)
         _make_paths_absolute(change, Path.cwd())
         for name, part in change.items():
-            overlay[name] = {**overlay.get(name, {}), **part} if isinstance(part, dict) else part
+            overlay[name] = _laid_over(name, overlay.get(name), part)
     return overlay
 
 
-def _refuse_foreign_fields(data: dict[str, Any], where: str) -> None:
-    """Refuses fields of another kind: they would have no effect, and nobody would notice."""
-    for section, kinds in KIND_FIELDS.items():
-        given = data.get(section, {})
-        kind = given.get("kind", next(iter(kinds)))
-        for name, value in given.items():
-            if name != "kind" and name not in kinds[kind] and value is not None:
-                meant = ", ".join(kinds[kind]) or "none but kind"
-                raise ConfigError(
-                    f"{where}: {section}.{name}: got {brief(value)}, which kind {kind!r} does not "
-                    f"use; expected only its own fields: {meant}"
-                )
+def _parse_setting(setting: str) -> dict[str, Any]:
+    """One setting as a partial scenario."""
+    key, equals, text = setting.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts) or len(parts) > 2:
+        raise ConfigError(
+            f"{_SETTINGS}: got {brief(setting)}; expected section.field=value or field=value"
+        )
+    value = parse_yaml(text, f"{_SETTINGS}: {key}")
+    change: dict[str, Any] = {parts[-1]: value}
+    return {parts[0]: change} if len(parts) == 2 else change
+
+
+def _laid_over(name: str, below: Any, above: Any) -> Any:
+    """A scenario's field under a checked change; a new kind drops what it does not know."""
+    if not isinstance(above, dict):
+        return above
+    kept = below or {}
+    if name in _KINDS:
+        known = field_names(_KINDS[name][above["kind"]])
+        kept = {field: value for field, value in kept.items() if field in known}
+    return {**kept, **above}
+
+
+def _drop_foreign_nulls(data: dict[str, Any]) -> None:
+    """Forget a null for a field of another kind: it says that there is none, as in older files."""
+    for section, kinds in _KINDS.items():
+        given = data.get(section)
+        if not isinstance(given, dict):
+            continue
+        own = kinds.get(str(given.get("kind", next(iter(kinds)))))
+        foreign = {name for kind in kinds.values() for name in field_names(kind)}
+        for name in foreign - set(field_names(own)) if own else ():
+            if name in given and given[name] is None:
+                del given[name]
 
 
 def _make_paths_absolute(data: dict[str, Any], folder: Path) -> None:

@@ -1,12 +1,46 @@
 """Which steps, periods and delays fit each other."""
 
-from typing import Final
+from collections.abc import Iterator
+from typing import Final, NamedTuple
 
 METRIC_PERIOD: Final = 0.02
 """s; the grid of the accumulated error, which the steps of a discrete plant have to hit."""
+MOST_INSTANTS: Final = 5_000_000
+"""In a log of the user's own period; each takes 1 kB of memory."""
+
+LEAST_FRACTION: Final = 1e-9
+"""Of a period. A delay's part below it is 0: events so close to each other lose their order."""
 
 _EARLY: Final = 1 - 1e-14
 _LOOK: Final = 1 - 5e-15
+
+
+class Instant(NamedTuple):
+    """When to look at a running loop in s, and for whom: the metric, the controller, the log."""
+
+    time: float
+    on_grid: bool
+    sampled: bool
+    logged: bool
+
+
+def instants(end: float, period: float, log_period: float | None) -> Iterator[Instant]:
+    """All instants of a run of `end` s with a controller of this period; the last one is `end`.
+
+    The log has the multiples of `log_period`, or with None the metric's grid and every sample.
+    """
+
+    import numpy as np  # which --help, by way of the scenario's fields, goes without
+
+    def multiples(step: float) -> set[float]:
+        # Grid and samples that agree but for rounding are one instant.
+        return {*np.round(step * np.arange(int(end / step + 1e-9) + 1), 9).tolist()}
+
+    last = {round(end, 9)}
+    grid, samples = multiples(METRIC_PERIOD) | last, multiples(period)
+    log = grid | samples if log_period is None else multiples(log_period) | last
+    for t in sorted(grid | samples | log):
+        yield Instant(min(t, end), t in grid, t in samples, t in log)
 
 
 def event_time(nominal: float) -> float:
@@ -58,6 +92,34 @@ def step_problem(time_step: float, period: float, fraction: float) -> str | None
             f"period, nearest {nearest!r}"
         )
     return None
+
+
+def log_problem(log_period: float | None, duration: float, time_step: float | None) -> str | None:
+    """What is wrong with the period of a log.
+
+    Args:
+        log_period: s, or None for the usual instants.
+        duration: of the run, s.
+        time_step: of a discrete plant, which is seen on its own steps only, or None.
+
+    Returns:
+        None, or the scenario field to change, its value, and what fits.
+    """
+    if log_period is None:
+        return None
+    if duration / log_period > MOST_INSTANTS:
+        least = duration / MOST_INSTANTS
+        return (
+            f"log_period: got {log_period!r}; expected at least {least:.4g} s, {MOST_INSTANTS} "
+            f"instants in duration {duration!r}, or null"
+        )
+    if time_step is None or _is_whole(log_period / time_step):
+        return None
+    nearest = _tidy(max(1, round(log_period / time_step)) * time_step)
+    return (
+        f"log_period: got {log_period!r}; expected a whole number of plant.time_step "
+        f"({time_step!r} s), nearest {nearest!r}, or null"
+    )
 
 
 def _nearest_step(time_step: float, period: float) -> float:

@@ -10,7 +10,6 @@ import json
 import re
 import types
 import typing
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -24,9 +23,12 @@ from ruamel.yaml.nodes import ScalarNode
 
 from stewart_drake.errors import ConfigError
 from stewart_drake.fileio import read_bytes
+from stewart_drake.schema import field_hint, field_names, kinds, place_of
 
 _MAX_BYTES: Final = 100_000
 _MAX_DEPTH: Final = 20
+_MOST_PROBLEMS: Final = 5
+"""That one message tells of."""
 _STR_TAG: Final = "tag:yaml.org,2002:str"
 
 _T = TypeVar("_T")
@@ -129,26 +131,51 @@ def validate(type_: type[_T], data: dict[str, Any], where: str) -> _T:
         where: the file (or other origin) that opens the message.
 
     Raises:
-        ConfigError: `<where>: <section.field>: got <value>; expected <what is accepted>` for the
-            first problem; unknown keys come first and name the nearest known key.
+        ConfigError: `<where>: <section.field>: got <value>; expected <what is accepted>`, one after
+            the other in one line. Unknown keys, each with the nearest known one, keep the others
+            back, for which they may be the reason.
     """
     try:
         # JSON mode is the one in which strict pydantic lets a mapping become a nested dataclass.
         return pydantic.TypeAdapter(type_).validate_json(json.dumps(data))
     except pydantic.ValidationError as caught:
         errors = caught.errors(include_url=False)
-        unknown = [e for e in errors if e["type"].startswith("unexpected_")]
-        first = (unknown or errors)[0]
-        if first["type"] != "json_invalid":  # half a surrogate pair is no JSON text
-            raise ConfigError(f"{where}: {_explain(type_, first)}") from None
+        unknown = [e for e in errors if _is_unknown(e)]
+        if errors[0]["type"] != "json_invalid":  # half a surrogate pair is no JSON text
+            raise ConfigError(f"{where}: {_explain_all(type_, unknown or errors)}") from None
     except (TypeError, ValueError, RecursionError):
         pass
     raise ConfigError(f"{where}: got {brief(data)}; expected plain numbers, text and lists")
 
 
+def one_message(expected: str) -> pydantic.WrapValidator:
+    """For a union in `Annotated`: what it expects, where pydantic complains for each member."""
+
+    def check(value: Any, accept: pydantic.ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return accept(value)
+        except pydantic.ValidationError:
+            raise ValueError(expected) from None
+
+    return pydantic.WrapValidator(check)
+
+
 def brief(value: object) -> str:
     """`repr(value)`, cut to 60 characters."""
     return _cut(repr(value), 60)
+
+
+def differences(given: Any, usual: Any, path: str = "") -> str:
+    """`section.field=value` of every field in which two dataclasses of a kind differ."""
+    parts = []
+    for field in dataclasses.fields(given):
+        name, one = f"{path}{field.name}", getattr(given, field.name)
+        other = getattr(usual, field.name, None)  # which another kind may not have
+        if dataclasses.is_dataclass(one):
+            parts.append(differences(one, other, f"{name}."))
+        elif one != other:
+            parts.append(f"{name}={brief(one)}")
+    return ", ".join(filter(None, parts))
 
 
 def _cut(text: str, length: int) -> str:
@@ -173,23 +200,36 @@ _BOUNDS: Final = {
 }
 
 
+def _is_unknown(error: Any) -> bool:
+    return error["type"] == "extra_forbidden" or error["type"].startswith("unexpected_")
+
+
+def _explain_all(type_: type, errors: list[Any]) -> str:
+    """All that is missing, and the first few of what is wrong."""
+    absent = [error for error in errors if error["type"].startswith("missing")]
+    missing = [_dotted(place_of(type_, error["loc"])[0]) for error in absent]
+    problems = [_explain(type_, error) for error in errors if error not in absent]
+    kept = problems[:_MOST_PROBLEMS]
+    if missing:
+        kept.append(
+            f"{_cut(', '.join(missing), 200)}: {'is' if len(missing) == 1 else 'are'} missing"
+        )
+    if len(problems) > _MOST_PROBLEMS:
+        kept.append(f"and {len(problems) - _MOST_PROBLEMS} more")
+    return "; ".join(kept)
+
+
 def _explain(type_: type, error: Any) -> str:
     loc: tuple[int | str, ...] = error["loc"]
-    field = _dotted(loc)
-    if error["type"].startswith("unexpected_"):
-        name = str(loc[-1])
-        known = _fields_at(type_, loc[:-1])
-        alike = difflib.get_close_matches(name, known, n=1)
-        # A field may have been named without its section.
-        sections = [at for at in known if name in _fields_at(type_, (*loc[:-1], at))]
-        deeper = [f"{section}.{name}" for section in sections]
-        meant = alike[0] if alike else deeper[0] if len(deeper) == 1 else None
-        hint = f"did you mean {_dotted((*loc[:-1], meant))}?" if meant else ""
-        expected = hint or f"expected one of {', '.join(known)}"
-        return f"{_cut(field, 60)}: unknown key; {expected}"
-    if error["type"].startswith("missing"):
-        return f"{field}: is missing"
-    if error["type"] in _EXPECTED:
+    place, hint = place_of(type_, loc)
+    field, value = _dotted(place), error["input"]
+    if _is_unknown(error):
+        return _explain_unknown(type_, error)
+    if error["type"] == "union_tag_invalid":
+        *others, last = map(repr, kinds(hint))
+        field, value = f"{field}.kind", value["kind"] if isinstance(value, dict) else value
+        expected = f"{', '.join(others)} or {last}" if others else last
+    elif error["type"] in _EXPECTED:
         expected = _EXPECTED[error["type"]]
     elif error["type"] in _BOUNDS:
         words, key = _BOUNDS[error["type"]]
@@ -197,37 +237,31 @@ def _explain(type_: type, error: Any) -> str:
     else:
         expected = re.sub(r"^(\w+ should (be|have) |Value error, )", "", error["msg"])
         expected = expected.replace(" after validation", "")
-    if types.NoneType in typing.get_args(_hint_at(type_, loc)):
+    if types.NoneType in typing.get_args(hint):
         expected += ", or null"
-    return f"{field}: got {brief(error['input'])}; expected {expected}"
+    return f"{field}: got {brief(value)}; expected {expected}"
+
+
+def _explain_unknown(type_: type, error: Any) -> str:
+    *above, name = error["loc"]
+    place, section = place_of(type_, above)
+    known, field = field_names(section), _cut(_dotted((*place, name)), 60)
+    union = place_of(type_, above[:-1])[1]
+    if kinds(union) and name in field_names(union):  # of another kind, without an effect
+        own = ", ".join(other for other in known if other != "kind") or "none but kind"
+        return (
+            f"{field}: got {brief(error['input'])}, which kind {section.kind!r} does not use; "
+            f"expected only its own fields: {own}"
+        )
+    alike = difflib.get_close_matches(name, known, n=1)
+    # A field may have been named without its section.
+    deeper = [f"{at}.{name}" for at in known if name in field_names(field_hint(section, at))]
+    meant = alike[0] if alike else deeper[0] if len(deeper) == 1 else None
+    hint = f"did you mean {_dotted((*place, meant))}?" if meant else ""
+    return f"{field}: unknown key; {hint or 'expected one of ' + ', '.join(known)}"
 
 
 def _dotted(loc: tuple[int | str, ...]) -> str:
     """`("reference", "poses", 2, 0)` as `reference.poses[2][0]`."""
     parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
     return "".join(parts).removeprefix(".")
-
-
-def _fields_at(type_: Any, loc: tuple[int | str, ...]) -> list[str]:
-    """Names of the fields of the section at a place; none where there is no section."""
-    owner = _alternative(_hint_at(type_, loc), dataclasses.is_dataclass)
-    return [f.name for f in dataclasses.fields(owner)] if owner else []
-
-
-def _hint_at(type_: Any, loc: tuple[int | str, ...]) -> Any:
-    """The annotation of the field at `loc`, for a path through dataclasses and their lists."""
-    hint = type_
-    for part in loc:
-        if isinstance(part, int):  # the items of a list
-            owner = _alternative(hint, lambda a: typing.get_origin(a) is list)
-            hint = typing.get_args(owner)[0] if owner else None
-        else:
-            owner = _alternative(hint, dataclasses.is_dataclass)
-            hint = typing.get_type_hints(owner).get(part) if owner else None
-    return hint
-
-
-def _alternative(hint: Any, wanted: Callable[[Any], bool]) -> Any:
-    """The member of the union `hint` that is `wanted`; a plain type is a union of one."""
-    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
-    return next((a for a in (typing.get_args(hint) if union else (hint,)) if wanted(a)), None)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from typing_extensions import is_typeddict
 
 from stewart_drake.cli import main
 from stewart_drake.errors import ConfigError
@@ -40,7 +41,7 @@ class Fault(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """What a field holds: number, text, truth, choice, numbers or other; and may it be null?"""
+    """What a field holds: number, text, truth, choice, numbers, mappings or other; null too?"""
 
     name: str
     null: bool
@@ -48,18 +49,25 @@ class Kind(NamedTuple):
 
 
 def fields(type_: type, above: str = "") -> Iterator[tuple[str, Any, bool]]:
-    """Name, annotation and whether it must be given, of every field that is not a section."""
+    """Name, annotation and whether it must be given, of every field that is not a section.
+
+    Of a section that comes in kinds, each name once: of the first kind that has it.
+    """
     hints = typing.get_type_hints(type_)
     for field in dataclasses.fields(type_):
         hint, name = hints[field.name], f"{above}{field.name}"
         required = (
             field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         )
-        section = next((t for t in members(hint) if dataclasses.is_dataclass(t)), None)
-        if section is None:
+        sections = [t for t in members(hint) if dataclasses.is_dataclass(t)]
+        if not sections:
             yield name, hint, required
-        else:
-            yield from fields(typing.cast(type, section), f"{name}.")
+        found = {
+            inner[0]: inner
+            for section in reversed(sections)
+            for inner in fields(typing.cast(type, section), f"{name}.")
+        }
+        yield from found.values()
 
 
 def members(hint: Any) -> tuple[Any, ...]:
@@ -72,7 +80,10 @@ def kind_of(hint: Any) -> Kind:
     """What a field with this annotation holds."""
     plain = [t for t in members(hint) if t is not types.NoneType]
     null = len(plain) < len(members(hint))
-    if any(typing.get_origin(t) is list for t in plain):
+    lists = [t for t in plain if typing.get_origin(t) is list]
+    if lists and is_typeddict(typing.get_args(lists[0])[0]):
+        return Kind("mappings", null)
+    if lists:
         return Kind("numbers", null)
     for type_, name in ((bool, "truth"), (float, "number"), (int, "number"), (str, "text")):
         if plain[0] is type_:
@@ -176,7 +187,15 @@ def complaint(load: Loader, path: Path) -> str:
 
 def check_remedy(said: str) -> None:
     """Fail unless a message says what to do about it."""
-    remedies = ("expected ", "did you mean ", "is missing", "shipped names", "--help", "accepted")
+    remedies = (
+        "expected ",
+        "did you mean ",
+        "is missing",
+        "are missing",
+        "shipped names",
+        "--help",
+        "accepted",
+    )
     assert any(words in said.lower() for words in map(str.lower, remedies)), f"no remedy: {said}"
 
 

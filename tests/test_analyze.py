@@ -12,9 +12,9 @@ from scipy.optimize import brentq
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.config import ReferenceConfig
 from stewart_drake.experiment import prepare
 from stewart_drake.plant.workspace import standing
+from stewart_drake.reference_config import HoldConfig, SineConfig, WaypointsConfig
 from stewart_drake.resources import resolve
 from stewart_drake.studies import delay_limits, delay_map, hautus
 from stewart_drake.studies.delay_loop import loop_margins
@@ -99,6 +99,7 @@ def test_delay_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert fastest["fastest_pole"] == pytest.approx(verdict.pole, rel=0.02)
     assert fastest["amplification"] == pytest.approx(math.exp(0.8 * fastest["fastest_pole"]))
     assert summary["beatable"] == "yes"
+    assert summary["controller_margin"]["stable"]
     assert [m["mu"] for m in summary["loop"]] == [8]
     for limit in summary["largest_delay"]:
         growth = math.exp(limit["delay"] * fastest["fastest_pole"])
@@ -113,7 +114,9 @@ def test_delay_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 def test_delay_under_gravity(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     summary, _ = analyze("delay", tmp_path / "out", *settings("plant.gravity=true"))
     assert summary["beatable"] == "no"
-    assert not capsys.readouterr().out.startswith("Delay 0.8 s, beatable: yes")
+    assert "The delay of 0.8 s alone, under any controller, beatable: no," in " ".join(
+        capsys.readouterr().out.split()
+    )
     checks = summary["growth_checks"]
     assert len(checks) == 5
     for check in checks:
@@ -265,20 +268,18 @@ def test_a_run_that_leaves_the_workspace_says_when() -> None:
 
 
 def test_motions_are_scaled_about_their_start() -> None:
-    sine = scaled_motion(ReferenceConfig(), 0.5)
+    sine = scaled_motion(SineConfig(), 0.5)
     assert sine is not None
-    assert sine.amplitude == pytest.approx(np.array(ReferenceConfig().amplitude) / 2)
-    way = ReferenceConfig(
-        kind="waypoints", times=[0.0, 1.0], poses=[[0, 0, 0, 0, 0, 0.4], [0, 0, 0.2, 0, 0, 0.3]]
-    )
+    assert sine.amplitude == pytest.approx(np.array(SineConfig().amplitude) / 2)
+    way = WaypointsConfig(times=[0.0, 1.0], poses=[[0, 0, 0, 0, 0, 0.4], [0, 0, 0.2, 0, 0, 0.3]])
     half = scaled_motion(way, 0.5)
     assert half is not None
     assert half.poses == [
         pytest.approx([0, 0, 0, 0, 0, 0.4]),
         pytest.approx([0, 0, 0.1, 0, 0, 0.35]),
     ]
-    assert scaled_motion(ReferenceConfig(kind="hold"), 0.5) is None
-    assert scaled_motion(ReferenceConfig(kind="hold"), 1.0) is not None
+    assert scaled_motion(HoldConfig(), 0.5) is None
+    assert scaled_motion(HoldConfig(), 1.0) is not None
 
 
 def test_delays_of_the_map_lie_around_the_own_one() -> None:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from stewart_drake.config import ReferenceConfig
 from stewart_drake.errors import ConfigError
 from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.reference_config import CsvConfig, WaypointsConfig
 from stewart_drake.reference_files import read_csv, read_waypoints
 from stewart_drake.resources import data_root
 from stewart_drake.scenario_loading import load_controller, load_scenario
@@ -208,9 +208,9 @@ def test_files_that_a_scenario_names(setting, name, content, tmp_path, capsys, m
 
 def test_the_last_waypoints_and_samples_still_load(tmp_path):
     """The good files that the faults above are made from."""
-    for kind, file in (("csv", "a.csv"), ("waypoints", "a.yaml")):
-        path = written(tmp_path / file, good_text(kind, tmp_path))
-        make_reference(ReferenceConfig(kind=kind, file=str(path)), 0.5)
+    for kind, file in ((CsvConfig, "a.csv"), (WaypointsConfig, "a.yaml")):
+        path = written(tmp_path / file, good_text(kind.kind, tmp_path))
+        make_reference(kind(file=str(path)), 0.5)
 
 
 def test_a_process_says_the_same(tmp_path):

@@ -160,3 +160,25 @@ def test_panels_leave_the_machine_visible_on_any_screen(tab, page, width, height
     assert about[3] < play[1], "the panels overlap"
     assert (about[2] - about[0]) * (about[3] - about[1]) < 0.35 * width * height
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
+
+
+@pytest.mark.parametrize("width", [1280, 375])
+def test_the_colours_have_their_scale_on_any_screen(tab, page, width):
+    tab.open(page, width, 700)
+    scale, ends = (
+        tab.evaluate(f"document.querySelector('{name}').getBoundingClientRect().toJSON()")
+        for name in ("#run-scale", "#run-ends")
+    )
+    assert scale["width"] > 100 and ends["height"] > 10
+    assert tab.evaluate("document.querySelector('#run-ends').innerText").split()[1] == "0"
+    assert "N m" in tab.evaluate("document.querySelector('#run-about').innerText")
+
+
+def test_the_scene_is_dark_where_the_reader_prefers_it(tab, page):
+    brightness = {}
+    for scheme in ("light", "dark"):
+        tab.open(page, 1000, 700, prefers_color_scheme=scheme)
+        tab.wait("typeof viewer !== 'undefined' && viewer.animator.actions.length > 0 && lit")
+        seek(tab, 0.0)
+        brightness[scheme] = tab.screenshot()[60:200, 800:980].mean()
+    assert brightness["dark"] < 0.5 < 0.85 < brightness["light"]

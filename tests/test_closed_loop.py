@@ -7,6 +7,7 @@ import stewart_drake as sd
 from stewart_drake import metrics
 from stewart_drake.diagram import build_closed_loop
 from stewart_drake.plant.workspace import standing
+from stewart_drake.resources import data_root
 from stewart_drake.signals import LEGS
 from stewart_drake.simulation import make_simulator
 from stewart_drake.timing import look_time
@@ -55,6 +56,52 @@ def test_torques_arrive_after_the_delay_and_not_before(plant: str) -> None:
         sent = np.flatnonzero(time <= t - 0.8 + 1e-9)
         expected = commanded[sent[-1]] if len(sent) else np.zeros(6)
         np.testing.assert_array_equal(torque, expected)
+
+
+@pytest.mark.parametrize(
+    ("controller", "start", "seconds"),
+    [
+        ("delay_lqr", (), 1.73),
+        ("delay_lqi", (), 1.46),
+        ("delay_lqr", ON_REFERENCE, 1.23),
+        ("delay_lqi", ON_REFERENCE, 1.20),
+    ],
+)
+def test_the_tuner_does_not_save_the_faithful_controllers(
+    controller: str, start: tuple[str, ...], seconds: float
+) -> None:
+    """As the README says beside the paper's figures, which were reached with a tuner."""
+    result = run(*start, "tuner.kind=ann", "duration=2.0", controller=controller)
+    assert result.status == "left_workspace" and result.stopped is not None
+    assert result.stopped.time == pytest.approx(seconds, abs=0.0051)
+
+
+def test_theory_tells_what_corrected_holds_reach() -> None:
+    """Rows "corrected" of section 12, four of their columns; tolerance a is w_R = (a/0.03)^2."""
+    text = (data_root() / "docs" / "theory.md").read_text(encoding="utf-8")
+    cells = [row.split("|")[2:-1] for row in text.splitlines() if row.startswith("| corrected |")]
+    tolerances, periods = ([float(cell) for cell in row] for row in cells)
+    for column, tolerance in ((3, 0.3), (5, 3.0), (6, 10.0)):
+        result = run(EXACT, *ON_REFERENCE, f"controller.w_R={(tolerance / 0.03) ** 2}")
+        assert result.accumulated_error == pytest.approx(tolerances[column], abs=5.1e-4)
+    slow = run(EXACT, *ON_REFERENCE, "controller.period=0.2", "delay.steps=4")
+    assert slow.accumulated_error == pytest.approx(periods[0], abs=5.1e-4)
+
+
+def test_nonlinear_prediction_previews_the_reference() -> None:
+    """Without feedforward, with true dynamics: the figures of docs/theory.md, section 11."""
+    law = (EXACT, *ON_REFERENCE, "controller.model=multibody")
+    small = ",".join(f"{0.05 * a}" for a in [np.pi / 12] * 3 + [0.02, 0.02, 0.08])
+    gentle = (*law, "controller.w_Q=2.5", f"reference.amplitude=[{small}]")
+    full = (*law, "controller.w_Q=10", "controller.prediction=nonlinear")
+    linear = run(*gentle, controller="delay_lqr")
+    nonlinear = run(*gentle, "controller.prediction=nonlinear", controller="delay_lqr")
+    assert linear.accumulated_error == pytest.approx(227.8, rel=2e-3)
+    assert nonlinear.accumulated_error == pytest.approx(41.7, rel=2e-3)
+    assert run(*full, controller="delay_lqr").accumulated_error == pytest.approx(20.2, rel=5e-3)
+    assert run(*full, controller="delay_lqi").accumulated_error == pytest.approx(13.7, rel=5e-3)
+    lost = run(*law, "controller.w_Q=10", controller="delay_lqr")
+    assert lost.status == "left_workspace"
 
 
 def test_the_floor_from_rest_is_the_area_above_one_minus_cosine() -> None:

@@ -95,7 +95,10 @@ def verdict(*settings: str, scenario: str = "paper") -> Verdict:
 def test_a_counterbalanced_plate_at_rest_has_no_unstable_pole():
     at_rest = verdict("reference.kind=hold")
     assert at_rest.pole == 0 and at_rest.amplification == 1
-    assert str(at_rest) == ("delay 0.8 s, beatable: yes, prediction errors grow by a factor of 1.0")
+    assert str(at_rest) == (
+        "the delay of 0.8 s alone, under any controller, beatable: yes, prediction errors grow by "
+        "a factor of 1.0"
+    )
 
 
 def test_the_papers_delay_is_beatable_without_gravity_and_not_with_it():

@@ -6,27 +6,32 @@ import json
 import os
 import pickle
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from pydantic.dataclasses import dataclass
 from ruamel.yaml import YAML
 
 from stewart_drake.config import (
+    AnnTunerConfig,
     ControllerConfig,
     DelayConfig,
+    FixedTunerConfig,
     PlantConfig,
-    ReferenceConfig,
     Scenario,
-    TunerConfig,
 )
 from stewart_drake.errors import ConfigError
+from stewart_drake.field_types import STRICT
+from stewart_drake.reference_config import CsvConfig, HoldConfig, SineConfig, WaypointsConfig
 from stewart_drake.resources import resolve, shipped
 from stewart_drake.scenario_loading import load_controller, load_scenario, scenario_to_dict
+from stewart_drake.schema import ByKind
 from stewart_drake.timing import step_problem
-from stewart_drake.yamlio import load_yaml
+from stewart_drake.yamlio import differences, load_yaml, validate
 
 SINE = [0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]
 
@@ -84,9 +89,11 @@ def test_the_defaults_are_the_papers_experiment() -> None:
             "weight_scaling": "bryson",
             "catch_up": None,
         },
-        "actuator": {"torque_limit": None},
-        "sensor": {"noise_std": [0] * 12, "seed": 0},
+        "link": {"kind": "wire"},
+        "actuator": {"kind": "torque", "torque_limit": None},
+        "sensor": {"kind": "state", "noise_std": [0] * 12, "seed": 0, "faults": []},
         "tuner": {"kind": "fixed"},
+        "log_period": None,
     }
 
 
@@ -180,9 +187,92 @@ def test_a_setting_is_yaml_and_the_last_one_counts() -> None:
 def test_a_new_kind_drops_what_the_file_says_for_the_old_one(order: int, tmp_path: Path) -> None:
     changes = ["reference.kind=csv", f"reference.file={tmp_path}/a.csv"][::order]
     scenario = load_scenario("paper", settings=changes)
-    assert scenario.reference == ReferenceConfig(kind="csv", file=f"{tmp_path}/a.csv")
+    assert scenario.reference == CsvConfig(file=f"{tmp_path}/a.csv")
     hold = load_scenario("paper", settings=["reference.kind=hold"])
     assert hold.reference.offset == [0, 0, 0, 0, 0, 0.38]
+
+
+def test_settings_are_checked_for_the_kind_that_the_file_has(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        "reference: {kind: waypoints, times: [0, 1], poses: [[0, 0, 0, 0, 0, 0.4], "
+        "[0, 0, 0, 0, 0, 0.3]]}\ntuner: {kind: ann}\n",
+    )
+    scenario = load_scenario(path, settings=["reference.times=[0, 2]", "tuner.weights=paper"])
+    assert isinstance(scenario.reference, WaypointsConfig)
+    assert scenario.reference.times == [0, 2]
+    assert scenario.tuner == AnnTunerConfig(weights="paper")
+    with pytest.raises(ConfigError, match=r"settings: reference.amplitude.*kind 'waypoints'"):
+        load_scenario(path, settings=["reference.amplitude=[0, 0, 0, 0, 0, 0]"])
+    # The last kind counts, for settings on either side of it.
+    changes = ["reference.kind=csv", "reference.frequency=2", "reference.kind=sine"]
+    assert load_scenario(path, settings=changes).reference == SineConfig(frequency=2.0)
+    assert load_scenario(path, settings=["reference={kind: hold}"]).reference == HoldConfig()
+
+
+def test_a_null_for_a_field_of_another_kind_says_nothing(tmp_path: Path) -> None:
+    path = write(tmp_path, "tuner: {kind: fixed, weights: null}\nreference: {file: null}\n")
+    assert load_scenario(path, settings=["reference.times=null"]) == Scenario()
+    with pytest.raises(ConfigError, match=r"reference\.fil: unknown key"):
+        load_scenario(write(tmp_path, "reference: {fil: null}"))
+
+
+def test_what_a_kind_does_not_have_cannot_be_read_from_it() -> None:
+    hold = load_scenario("paper", settings=["reference.kind=hold"]).reference
+    with pytest.raises(AttributeError):
+        hold.amplitude  # type: ignore[union-attr]  # noqa: B018
+    with pytest.raises(ValidationError):
+        hold.kind = "sine"  # type: ignore[assignment]
+    scenario = Scenario()
+    with pytest.raises(ValidationError):
+        scenario.reference = PlantConfig()  # type: ignore[assignment]
+    with pytest.raises(ValidationError):
+        scenario.tuner = HoldConfig()  # type: ignore[assignment]
+
+
+@dataclass(config=STRICT)
+class Quiet:
+    kind: Literal["quiet"] = "quiet"
+    level: float = 1.0
+
+
+@dataclass(config=STRICT)
+class Loud:
+    kind: Literal["loud"] = "loud"
+    level: float = 2.0
+    horns: int | None = None
+
+
+@dataclass(config=STRICT)
+class Machine:
+    voice: Annotated[Quiet | Loud, ByKind()] = dataclasses.field(default_factory=Quiet)
+    spare: Annotated[Loud, ByKind()] = dataclasses.field(default_factory=Loud)
+
+
+def test_a_kind_is_one_more_class_in_a_union() -> None:
+    assert validate(Machine, {}, "m") == Machine()
+    assert validate(Machine, {"voice": {"level": 3.0}}, "m") == Machine(voice=Quiet(level=3.0))
+    loud = validate(Machine, {"voice": {"kind": "loud", "horns": 2}}, "m")
+    assert loud == Machine(voice=Loud(horns=2))
+    assert validate(Machine, dataclasses.asdict(loud), "m") == loud
+    assert differences(loud, Machine()) == "voice.kind='loud', voice.level=2.0, voice.horns=2"
+    for wrong, said in {
+        "{kind: shrill}": "voice.kind: got 'shrill'; expected 'quiet' or 'loud'",
+        "{kind: [1]}": "voice.kind: got [1]; expected 'quiet' or 'loud'",
+        "{kind: null}": "voice.kind: got None; expected 'quiet' or 'loud'",
+        "{horns: 2}": "voice.horns: got 2, which kind 'quiet' does not use; expected only its own "
+        "fields: level",
+        "{kind: loud, horn: 2}": "voice.horn: unknown key; did you mean voice.horns?",
+        "{kind: loud, horns: 1.5}": "voice.horns: got 1.5; expected a whole number, or null",
+        "7": "voice: got 7; expected a mapping",
+    }.items():
+        with pytest.raises(ConfigError) as caught:
+            validate(Machine, {"voice": YAML(typ="safe").load(wrong)}, "m")
+        assert one_line(caught) == f"m: {said}"
+    with pytest.raises(ConfigError, match=r"^m: spare.kind: got 'quiet'; expected 'loud'$"):
+        validate(Machine, {"spare": {"kind": "quiet"}}, "m")
+    with pytest.raises(ConfigError, match=r"^m: horns: unknown key; expected one of voice, spare$"):
+        validate(Machine, {"horns": 2}, "m")
 
 
 def test_paths_start_where_they_were_written(
@@ -244,7 +334,15 @@ BAD_FILES = {
         "sensor: {noise_std: [0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 0]}",
         ["sensor.noise_std[5]: got -1", "a number of at least 0"],
     ),
-    "unknown kind": ("reference: {kind: square}", ["reference.kind: got 'square'", "'sine'"]),
+    "unknown kind": (
+        "reference: {kind: square}",
+        ["reference.kind: got 'square'", "'sine', 'hold', 'waypoints' or 'csv'"],
+    ),
+    "one kind": ("link: {kind: radio}", ["link.kind: got 'radio'", "'wire'"]),
+    "nearest of its kind": (
+        "reference: {kind: waypoints, pose: []}",
+        ["reference.pose: unknown key", "reference.poses?"],
+    ),
     "unknown start": ("start: now", ["start: got 'now'", "'rest' or 'on_reference'"]),
     "no duration": ("duration: 0", ["duration: got 0", "a number above 0"]),
     "negative delay": ("delay: {steps: -1}", ["delay.steps: got -1"]),
@@ -420,7 +518,7 @@ def test_an_assignment_is_checked() -> None:
     scenario = Scenario()
     scenario.duration = 5.0
     scenario.delay.steps = 3
-    scenario.reference = ReferenceConfig(kind="hold")
+    scenario.reference = HoldConfig()
     scenario.check()
     for bad in (-1.0, float("nan"), "5"):
         with pytest.raises(ValidationError):
@@ -467,21 +565,19 @@ small = st.floats(-1, 1)
 six = st.lists(small, min_size=6, max_size=6)
 references = st.one_of(
     st.builds(
-        ReferenceConfig,
-        kind=st.just("sine"),
+        SineConfig,
         amplitude=st.lists(st.floats(-0.7, 0.7), min_size=6, max_size=6),
         offset=st.lists(st.floats(-0.7, 0.7), min_size=6, max_size=6),
         frequency=st.floats(1e-3, 1e3),
         frequency_unit=st.sampled_from(["rad/s", "Hz"]),
     ),
-    st.builds(ReferenceConfig, kind=st.just("hold"), offset=six),
+    st.builds(HoldConfig, offset=six),
     st.builds(
-        ReferenceConfig,
-        kind=st.just("waypoints"),
+        WaypointsConfig,
         times=st.just([0.0, 1.0]),
         poses=st.lists(six, min_size=2, max_size=2),
     ),
-    st.builds(ReferenceConfig, kind=st.just("csv"), file=st.just("/some/motion.csv")),
+    st.builds(CsvConfig, file=st.just("/some/motion.csv")),
 )
 scenarios = st.builds(
     Scenario,
@@ -506,7 +602,7 @@ scenarios = st.builds(
         catch_up=st.none() | st.just(0.0) | st.floats(1e-3, 10),
         model=st.sampled_from(["paper", "multibody"]),
     ),
-    tuner=st.sampled_from([TunerConfig(), TunerConfig(kind="ann", weights="paper")]),
+    tuner=st.sampled_from([FixedTunerConfig(), AnnTunerConfig(weights="paper")]),
 )
 
 

@@ -9,8 +9,12 @@ import xarray as xr
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.report.csv_file import signals_csv
+from stewart_drake.errors import ConfigError
+from stewart_drake.experiment import prepare
+from stewart_drake.reference_files import read_csv
+from stewart_drake.report.csv_file import signals_csv, write_csv
 
+ON_REFERENCE = ("start=on_reference", "queue=reference")
 SHORT = ("--set", "plant.kind=exact", "--set", "duration=0.3")
 
 
@@ -32,22 +36,63 @@ def test_every_number_of_every_signal_is_there(run):
     assert len(columns) == 1 + sum(signal.shape[1] for signal in run.signals.values())
     assert np.array_equal(columns["time[s]"], run.signals.time.values)
     for name, column, unit in (
-        ("pose", "phi", "rad"),
+        ("pose", "roll", "rad"),
         ("pose", "z", "m"),
-        ("rates", "psi", "rad/s"),
+        ("rates", "yaw", "rad/s"),
         ("integral", "x", "m s"),
-        ("reference", "theta", "rad"),
+        ("reference", "pitch", "rad"),
         ("torque_applied", "3", "N m"),
         ("parameters", "payload_mass", "kg"),
         ("parameter_std", "joint_damping", "N m s/rad"),
         ("weights", "w_R", "-"),
         ("density", "torque_6", "-"),
+        ("measurement", "y", "m"),
+        ("state_estimate", "z_dot", "m/s"),
     ):
         signal = run.signals[name]
         dimension = next(d for d in signal.dims if d != "time")
         labels = [str(label) for label in signal[dimension].values]
-        expected = signal.values[:, labels.index(column)]
+        label = {"roll": "phi", "pitch": "theta", "yaw": "psi"}.get(column, column)
+        expected = signal.values[:, labels.index(label)]
         assert np.allclose(columns[f"{name}_{column}[{unit}]"], expected, rtol=1e-11, atol=0)
+
+
+def test_a_run_comes_back_as_a_motion(run, tmp_path):
+    """What a plate has done, exported, is what the next one is asked for."""
+    path = write_csv(run.signals, tmp_path / "run.csv")
+    settings = ("plant.kind=exact", "duration=0.3", "reference.kind=csv", f"reference.file={path}")
+    reference = prepare(sd.load_scenario("paper", settings=settings)).reference
+    poses = np.array([reference.value(t)[:, 0] for t in run.signals.time.values])
+    np.testing.assert_allclose(poses, run.signals.pose.values, rtol=1e-11, atol=1e-12)
+    inside = run.signals.time.values[:-1]  # at its end a sampled motion stops
+    rates = np.array([reference.EvalDerivative(t)[:, 0] for t in inside])
+    assert np.abs(rates - run.signals.rates.values[:-1]).max() < 1e-3
+    again = sd.simulate(sd.load_scenario("paper", settings=(*settings, *ON_REFERENCE)))
+    assert again.status == "completed" and again.accumulated_error < 0.01
+
+
+@pytest.mark.parametrize("period", [0.03, 0.01])
+def test_a_log_between_the_grid_comes_back_too(period, tmp_path):
+    settings = ("plant.kind=exact", "duration=0.5", f"controller.period={period}", *ON_REFERENCE)
+    signals = sd.simulate(sd.load_scenario("paper", settings=settings)).signals
+    times, poses = read_csv(write_csv(signals, tmp_path / "run.csv"))
+    np.testing.assert_allclose(times, signals.time.values, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(poses, signals.pose.values, rtol=1e-11, atol=1e-12)
+
+
+def test_an_exported_file_must_be_whole_in_its_motion_only(run, tmp_path):
+    path = write_csv(run.signals, tmp_path / "run.csv")
+    lines = path.read_text().splitlines()
+    header = lines[0].split(",")
+    place = header.index("pose_yaw[rad]")
+    path.write_text("\n".join(",".join(np.delete(line.split(","), place)) for line in lines))
+    with pytest.raises(ConfigError, match="row 1: column yaw is missing; expected time"):
+        read_csv(path)
+    emptied = [line.split(",") for line in lines]
+    emptied[3][place] = ""
+    path.write_text("\n".join(map(",".join, emptied)))
+    with pytest.raises(ConfigError, match=r"row 4, column pose_yaw\[rad\]: got ''"):
+        read_csv(path)
 
 
 def test_what_is_not_a_number_is_an_empty_cell(run):
@@ -76,6 +121,14 @@ def test_files_need_a_place(option, capsys):
     assert main(["simulate", *SHORT, option]) == 2
     out, err = capsys.readouterr()
     assert out == "" and option in err and "--out" in err
+
+
+def test_signals_without_their_times_are_refused(run, tmp_path, capsys):
+    """A dimension alone would be counted 0, 1, 2, as if that were seconds."""
+    run.signals.drop_vars("time").to_netcdf(tmp_path / "index.nc", engine="h5netcdf")
+    assert main(["export", str(tmp_path / "index.nc")]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and "the coordinate time is missing" in err
 
 
 def test_what_is_no_signals_file_is_refused_in_one_line(tmp_path, capsys):

@@ -129,7 +129,7 @@ def test_rows_are_the_densities_that_the_loop_records():
     own = densities(samples(result))
     recorded = result.signals.density.values[::5][:100]
     # The loop reads its sample 5e-15 of the time earlier, and an error is a small difference.
-    np.testing.assert_allclose(own, recorded, rtol=1e-8)
+    np.testing.assert_allclose(own, recorded, rtol=1e-8, atol=1e-10)  # of densities around 1
 
 
 def test_a_run_that_ends_early_keeps_its_rows_empty_and_marked(data):

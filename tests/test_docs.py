@@ -33,12 +33,15 @@ from stewart_drake.config import ControllerConfig, Scenario
 from stewart_drake.design.delay_model import chain, delayed_model
 from stewart_drake.design.error_model import double_integrators, linear_model
 from stewart_drake.design.riccati import reduced_gain
+from stewart_drake.diagram import ClosedLoop
 from stewart_drake.errors import ConfigError
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.metrics import accumulated_error
 from stewart_drake.reference_files import read_waypoints
-from stewart_drake.scenario_loading import load_controller
+from stewart_drake.scenario_loading import load_controller, setting_choices
+from stewart_drake.signals import SIGNALS, exported_ports, ports_of
+from stewart_drake.systems.controller import DelayLqiController
 from stewart_drake.trajectories import evaluate, make_reference
 from stewart_drake.yamlio import load_yaml
 from tests.mechanisms import PAPER
@@ -50,7 +53,7 @@ PACKAGE = ROOT / "stewart_drake"
 DOCS = [
     path for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))) if path.exists()
 ]
-CHECKED_NAMES = [path for path in DOCS if path.parent.name == "docs"]
+CHECKED_NAMES = [path for path in DOCS if path.parent == ROOT / "docs"]
 
 FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```[ \t]*$", re.DOTALL | re.MULTILINE)
 CODE = re.compile(r"`([^`\n]+)`")
@@ -115,12 +118,8 @@ def functions_in(path: Path) -> frozenset[str]:
 
 def is_field(dotted: str) -> bool:
     """Whether this is a section or a field of a scenario."""
-    value: Any = Scenario()
-    for part in dotted.split("."):
-        if not dataclasses.is_dataclass(value) or not hasattr(value, part):
-            return False
-        value = getattr(value, part)
-    return True
+    fields = {choice.partition("=")[0] for choice in setting_choices()}
+    return dotted in fields or dotted in {field.partition(".")[0] for field in fields}
 
 
 def is_name(dotted: str) -> bool:
@@ -228,7 +227,7 @@ def test_links_lead_somewhere(path: Path) -> None:
         ("plant.torque", False),
         ("sensor.torque", True),
         ("plant.dynamics.StewartDynamics.predict", False),
-        ("design.law_types.LawOptions.substeps", False),
+        ("law.nominal.NominalPlant.substeps", False),
         ("signals.py", False),
         ("design/", False),
         ("design/nothing.py", True),
@@ -339,7 +338,7 @@ def test_architecture_shows_the_loop_as_it_is() -> None:
 
     def named(system: Any, port: Any) -> str:
         # Drake's own blocks have one port each way, which the table leaves out.
-        one = system.get_name() in ("saturation", "weights")
+        one = system.get_name() in ("saturation", "torque_bias", "weights")
         return system.get_name() if one else f"{system.get_name()}.{port.get_name()}"
 
     built = {
@@ -353,6 +352,36 @@ def test_architecture_shows_the_loop_as_it_is() -> None:
     assert preview % 18 == 0
     exported = {diagram.get_output_port(i).get_name() for i in range(diagram.num_output_ports())}
     assert all(f"`{name}`" in text for name in exported)
+
+
+def port_rows(text: str) -> dict[str, tuple[str, str]]:
+    """Port -> size and unit, of the table of output ports in a text; a row may name several."""
+    table = text.split("with output ports", 1)[1].split("\n\n", 2)[1]
+    rows: dict[str, tuple[str, str]] = {}
+    for line in table.splitlines()[2:]:
+        names, size, unit, _ = (cell.strip() for cell in line.strip("|").split("|"))
+        for name in names.replace("`", "").split(","):
+            assert name.strip() not in rows, f"{name} has two rows"
+            rows[name.strip()] = (size, unit)
+    return rows
+
+
+def test_the_readme_has_the_ports_of_the_table_of_signals() -> None:
+    rows = port_rows((ROOT / "README.md").read_text())
+    assert list(rows) != [] and set(rows) == set(exported_ports())
+    for name, (size, unit) in rows.items():
+        assert int(size) == loop().GetOutputPort(name).size()
+        units = [u for s in SIGNALS.values() if s.exported == name for u in s.quantity.units]
+        expected = ", ".join("-" if u == "1" else u for u in dict.fromkeys(units))
+        # The record has no accelerations, which are the end of the reference.
+        assert unit == expected + (", rad/s^2, m/s^2" if name == "reference" else "")
+
+
+@pytest.mark.parametrize("system", [ClosedLoop, DelayLqiController])
+def test_docstrings_name_the_ports_of_the_table(system: type) -> None:
+    ports = exported_ports() if system is ClosedLoop else ports_of("controller")
+    missing = [name for name in ports if not re.search(rf"\b{name}\b", system.__doc__ or "")]
+    assert not missing
 
 
 def test_architecture_has_a_row_for_every_part_of_the_package() -> None:
@@ -396,10 +425,13 @@ def test_errata_inverse_kinematics() -> None:
     assert np.rad2deg(np.abs(off - angles(right))) == pytest.approx(7.8, abs=0.05)
     assert rod_lengths(pose, off) - rod == pytest.approx(0.0147, abs=1e-4)
 
-    printed = -(np.arcsin(-right / size) - np.arccos(B / size) + np.pi)  # (2), C mended
+    printed = -(np.arcsin(-right / size) - np.arccos(B / size) + np.pi)  # (2) with -C
     gaps = rod_lengths(pose, printed + np.pi) - rod
     assert gaps[1::2] == pytest.approx(0, abs=1e-12)
     assert gaps[::2] == pytest.approx(0.047, abs=5e-4)
+    gaps = rod_lengths(pose, -(np.arcsin(right / size) - np.arccos(B / size) + np.pi)) - rod
+    assert gaps[1::2] == pytest.approx(0, abs=1e-12)
+    assert gaps[::2] == pytest.approx(-0.049, abs=5e-4)
 
 
 def test_errata_desired_acceleration_is_a_disturbance() -> None:
@@ -447,25 +479,33 @@ def test_errata_accumulated_error_is_a_mean_over_six() -> None:
 
 
 @pytest.mark.parametrize(
-    ("integral", "without_delay", "delayed"), [(False, 0.90, 1.27), (True, 0.91, 1.29)]
+    ("integral", "exact", "without_delay", "delayed"),
+    [
+        (False, False, 0.901, 1.339),
+        (True, False, 0.911, 1.360),
+        (False, True, 0.907, 1.266),
+        (True, True, 0.914, 1.288),
+    ],
 )
 def test_errata_delay_destabilises_what_ignores_it(
-    integral: bool, without_delay: float, delayed: float
+    integral: bool, exact: bool, without_delay: float, delayed: float
 ) -> None:
-    """Entry 22: spectral radii with the paper's weights; the delayed plant is the full one."""
+    """Entry 22: spectral radii with equal weights, on the paper's map and on the exact plant."""
     weights = np.eye(12 if integral else 6), np.eye(6)
-    model = delayed_model(
-        double_integrators(torque_map(PAPER, PAPER.home)), 0.1, 0, 0.0, integral=integral
-    )
-    K = reduced_gain(model, *weights)
-    plant = linear_model(*sd.StewartDynamics(PAPER, gravity=False).linearize(PAPER.home))
+    believed = double_integrators(torque_map(PAPER, PAPER.home))
+    K = reduced_gain(delayed_model(believed, 0.1, 0, 0.0, integral=integral), *weights)
+    true = linear_model(*sd.StewartDynamics(PAPER, gravity=False).linearize(PAPER.home))
+    plant = true if exact else believed
+    soon = delayed_model(plant, 0.1, 0, 0.0, integral=integral)
     late = chain(delayed_model(plant, 0.1, 8, 0.0, integral=integral))
     blind = np.hstack([K, np.zeros((6, 48))])
+    text = (ROOT / "docs" / "errata.md").read_text(encoding="utf-8")
     for closed, radius in (
-        (model.A - model.B_new @ K, without_delay),
+        (soon.A - soon.B_new @ K, without_delay),
         (late.A - late.B @ blind, delayed),
     ):
-        assert np.abs(np.linalg.eigvals(closed)).max() == pytest.approx(radius, abs=0.005)
+        assert np.abs(np.linalg.eigvals(closed)).max() == pytest.approx(radius, abs=5.1e-4)
+        assert f"| {radius:.3f} |" in text
 
 
 def test_errata_cranks_of_a_pair_intersect() -> None:

@@ -294,6 +294,6 @@ def test_start_up_needs_no_torch() -> None:
     code = """if True:
         import sys, stewart_drake.mechanism.files as files, stewart_drake.plant.dynamics as plant
         paper = files.load_mechanism("paper")
-        plant.StewartDynamics(paper).accelerations(paper.home, 0.0, 0.0)
+        plant.StewartDynamics(paper).accelerations(paper.home, [0.0] * 6, [0.0] * 6)
         assert "torch" not in sys.modules"""
     subprocess.run([sys.executable, "-c", code], check=True)

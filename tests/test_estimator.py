@@ -11,11 +11,19 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, lsq_linear
 from scipy.stats import chi2
 
-from stewart_drake.design import estimator
-from stewart_drake.design.estimator import PATIENCE, Estimate, Period, advance, start
-from stewart_drake.design.filter_settings import FilterSettings, filter_settings
+from stewart_drake.delay import Delay
+from stewart_drake.design.filter_settings import FilterSettings, ParameterSet, filter_settings
+from stewart_drake.law import parameter_filter
+from stewart_drake.law.belief import Estimate
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.parameter_filter import PATIENCE, ParameterFilter, Period
+from stewart_drake.law.sensing import StateSensing
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.signals import BIAS, DAMPING, PAYLOAD
+from stewart_drake.signals import BIAS, DAMPING, PARAMETER_UNITS, PARAMETERS, PAYLOAD
 from tests.mechanisms import PAPER
 from tests.oracles import central_difference, relative
 
@@ -25,15 +33,40 @@ PERIOD, STEPS, SUBSTEPS = 0.1, 15, 2
 AMPLITUDE = np.array([np.pi / 12] * 3 + [0.02, 0.02, 0.08])
 NOISE = 1e-3 * np.concatenate([AMPLITUDE, AMPLITUDE])
 """A thousandth of the trajectory (46), for rates too."""
-ASSUMED = FilterSettings(
-    noise_std=NOISE,
-    prior_std=np.array([0.03] * 6 + [1.0, 0.01]),
+KNOWN = ParameterSet(
+    PARAMETERS,
+    PARAMETER_UNITS,
+    prior=np.zeros(8),
+    std=np.array([0.03] * 6 + [1.0, 0.01]),
     lower=np.array([-10.0] * 6 + [0.0, 0.0]),
     upper=np.array([10.0] * 6 + [40.0, 10.0]),
+)
+SETTINGS = FilterSettings(
+    parameters=KNOWN,
     model_std=np.full(12, 1e-9),
     timing_std=0.0,
 )
 PLANT = StewartDynamics(PAPER, gravity=False)
+
+
+def filter_of(noise_std: Array, settings: FilterSettings = SETTINGS) -> ParameterFilter:
+    """Of pose and rates, measured with that noise (12,)."""
+    return ParameterFilter(PLANT, StateSensing(noise_std, AMPLITUDE), settings)
+
+
+ASSUMED = filter_of(NOISE)
+
+
+def start(y: Array, assumed: ParameterFilter = ASSUMED) -> Estimate:
+    """From a measurement (12,) alone."""
+    return assumed.start(Measurement.of(y), np.zeros(8))
+
+
+def advance(
+    estimate: Estimate, period: Period, y: Array | None, assumed: ParameterFilter = ASSUMED
+) -> Estimate:
+    """A period, and a measurement (12,) or none at its end."""
+    return assumed.advance(estimate, period, None if y is None else Measurement.of(y))
 
 
 class Run(NamedTuple):
@@ -62,7 +95,7 @@ def motion(t: float, size: float = 0.6) -> tuple[Array, Array, Array]:
 def run(
     truth: Array,
     seed: int,
-    assumed: FilterSettings = ASSUMED,
+    assumed: ParameterFilter = ASSUMED,
     fraction: float = 0.0,
     steps: int = STEPS,
 ) -> Run:
@@ -70,7 +103,8 @@ def run(
     rng = np.random.default_rng(seed)
     now = rng.uniform(0, 2 * np.pi)
     x, last = np.concatenate(motion(now)[:2]), np.zeros(6)
-    states, measurements, inputs = [x], [x + assumed.noise_std * rng.standard_normal(12)], []
+    noise_std = assumed.sensing.noise_std
+    states, measurements, inputs = [x], [x + noise_std * rng.standard_normal(12)], []
     estimates = [start(measurements[0], assumed)]
     for _ in range(steps):
         pose, rates, _ = motion(now)
@@ -82,8 +116,8 @@ def run(
             torques = np.array([last, torque])
             durations = PERIOD * np.array([fraction, 1 - fraction])
         x = PLANT.predict(x, torques, durations, SUBSTEPS, truth)[-1]
-        y = x + assumed.noise_std * rng.standard_normal(12)
-        estimates.append(advance(estimates[-1], PLANT, acted(torques, durations), y, assumed))
+        y = x + noise_std * rng.standard_normal(12)
+        estimates.append(advance(estimates[-1], acted(torques, durations), y, assumed))
         states.append(x)
         measurements.append(y)
         inputs.append((torques, durations))
@@ -127,7 +161,7 @@ def test_transition_equals_central_differences(t: float, gravity: bool) -> None:
 
     def error(period: float) -> float:
         durations = period * np.array([0.3, 0.7])
-        after, F = estimator._transition(dynamics, point, acted(torques, durations, 4))
+        after, F = parameter_filter._transition(dynamics, point, acted(torques, durations, 4))
         expected = central_difference(
             lambda p: dynamics.predict(p[:12], torques, durations, 16, p[12:])[-1], point
         )
@@ -146,7 +180,7 @@ def test_transition_equals_central_differences(t: float, gravity: bool) -> None:
 def test_without_a_measurement_the_model_goes_on_alone() -> None:
     result = run(inside(np.random.default_rng(0)), seed=0)
     estimate, (torques, durations) = result.estimates[-1], result.inputs[-1]
-    after = advance(estimate, PLANT, acted(torques, durations), None, ASSUMED)
+    after = advance(estimate, acted(torques, durations), None)
     expected = PLANT.predict(estimate.state, torques, durations, 8, estimate.parameters)[-1]
     assert np.abs(after.state - expected).max() < 1e-6
     assert np.array_equal(after.parameters, estimate.parameters)
@@ -156,7 +190,7 @@ def test_without_a_measurement_the_model_goes_on_alone() -> None:
         lambda p: PLANT.predict(p[:12], torques, durations, 8, p[12:])[-1],
         np.concatenate([estimate.state, theta]),
     )
-    drift = np.diag(np.concatenate([ASSUMED.model_std**2, np.zeros(8)]))
+    drift = np.diag(np.concatenate([SETTINGS.model_std**2, np.zeros(8)]))
     assert relative(after.covariance, F @ estimate.covariance @ F.T + drift) < 1e-3
     assert np.array_equal(after.covariance, after.covariance.T)
 
@@ -175,7 +209,7 @@ def test_kicks_are_what_early_and_late_torques_do(
     durations = PERIOD * np.array([split, 1 - split])[: 1 if split == 1 else 2]
     period = Period(three[: len(durations)], durations, three[len(durations)], 8)
     after = PLANT.predict(x, period.torques, durations, 8, theta)[-1]
-    kick = estimator._kicks(PLANT, after, theta, period)[0]
+    kick = parameter_filter._kicks(PLANT, after, theta, period)[0]
 
     # The same second in three pieces, the first change `late` after its time.
     parts = [split * PERIOD + late, PERIOD * (1 - split) - late]
@@ -196,7 +230,7 @@ def test_a_period_of_two_torques_is_two_shorter_ones() -> None:
     estimate, (torques, durations) = result.estimates[-1], result.inputs[-1]
 
     def after(e: Estimate, torques: Array, durations: Array, y: Array | None) -> Estimate:
-        return advance(e, PLANT, acted(torques, durations), y, ASSUMED)
+        return advance(e, acted(torques, durations), y)
 
     at_once = after(estimate, torques, durations, None)
     halfway = after(estimate, torques[:1], durations[:1], None)
@@ -220,18 +254,19 @@ def test_filter_is_the_batch_least_squares_estimate_where_noise_is_small(fractio
     What remains grows with the noise: the filter linearises each step about what is known by then.
     With the noise of the other tests one standard deviation is reached.
     """
-    assumed = dataclasses.replace(ASSUMED, noise_std=1e-2 * NOISE)
+    noise_std = 1e-2 * NOISE
+    assumed = filter_of(noise_std)
     result = run(inside(np.random.default_rng(2)), 2, assumed, fraction)
 
     def residuals(unknown: Array) -> Array:
         x, theta = unknown[:12], unknown[12:]
-        rows = [(result.measurements[0] - x) / assumed.noise_std, theta / assumed.prior_std]
+        rows = [(result.measurements[0] - x) / noise_std, theta / KNOWN.std]
         for (torques, durations), y in zip(result.inputs, result.measurements[1:], strict=True):
             x = PLANT.predict(x, torques, durations, SUBSTEPS, theta)[-1]
-            rows.append((y - x) / assumed.noise_std)
+            rows.append((y - x) / noise_std)
         return np.concatenate(rows)
 
-    scale = np.concatenate([assumed.noise_std, result.estimates[-1].parameter_std])
+    scale = np.concatenate([noise_std, result.estimates[-1].parameter_std])
     guess = np.concatenate([result.states[0], result.truth])
     tight = {"method": "lm", "xtol": 1e-15, "ftol": 1e-15, "x_scale": scale}
     batch = least_squares(residuals, guess, **tight)
@@ -259,7 +294,7 @@ def test_errors_of_the_parameters_are_as_large_as_the_filter_says(draw) -> None:
         error = final.parameters - result.truth
         sums += squared(error, final.covariance[12:, 12:])
         deviations.append(error / final.parameter_std)
-        assert all(np.all(e.parameters >= ASSUMED.lower) for e in result.estimates)
+        assert all(np.all(e.parameters >= KNOWN.lower) for e in result.estimates)
         assert not any(e.outliers for e in result.estimates)
     covered = np.mean(np.abs(deviations) < 2, axis=0)
     assert covered.min() >= 0.9
@@ -268,7 +303,8 @@ def test_errors_of_the_parameters_are_as_large_as_the_filter_says(draw) -> None:
 
 
 def test_without_noise_all_parameters_are_found() -> None:
-    assumed = filter_settings(np.zeros(12), AMPLITUDE, PAPER.plate.mass, 0.1, None, PERIOD)
+    known = filter_settings(AMPLITUDE, PAPER.plate.mass, 0.1, None, PERIOD)
+    assumed = filter_of(np.zeros(12), known)
     for fraction in (0.0, 0.3):
         result = run(inside(np.random.default_rng(3)), 3, assumed, fraction)
         error = np.abs(result.estimates[-1].parameters - result.truth)
@@ -279,12 +315,44 @@ def test_without_noise_all_parameters_are_found() -> None:
 
 def test_the_first_estimate_is_measurement_and_prior() -> None:
     y = np.arange(12.0)
-    first = start(y, ASSUMED)
+    first = start(y)
     assert np.array_equal(first.state, y)
     assert not first.parameters.any()
-    expected = np.concatenate([NOISE, ASSUMED.prior_std]) ** 2
+    expected = np.concatenate([NOISE, KNOWN.std]) ** 2
     assert np.array_equal(first.covariance, np.diag(expected))
-    assert np.allclose(first.parameter_std, ASSUMED.prior_std, rtol=1e-15)
+    assert np.allclose(first.parameter_std, KNOWN.std, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"prior": np.array([0.0] * 6 + [50.0, 0.0])}, "payload_mass: got 50 with .* and 40"),
+        ({"std": np.array([0.03] * 7 + [0.0])}, "joint_damping: got 0 with .* 0 N m s/rad"),
+        ({"std": np.array([0.03] * 7 + [np.nan])}, "joint_damping"),
+        ({"lower": np.zeros(7)}, "shorter"),
+    ],
+)
+def test_a_prior_that_cannot_be_names_the_parameter(wrong: dict[str, Array], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(KNOWN, **wrong)
+
+
+def test_a_prior_other_than_zero_is_where_the_filter_begins() -> None:
+    """A payload known to 10 g that is not what was measured stays what it is."""
+    prior = np.eye(8)[PAYLOAD] * 0.5
+    known = dataclasses.replace(KNOWN, prior=prior, std=np.array([0.03] * 6 + [0.01, 0.01]))
+    observer = ParameterObserver(dataclasses.replace(SETTINGS, parameters=known))
+    plant = NominalPlant(PLANT, SUBSTEPS, 10.0, TorqueLimit())
+    sensing = StateSensing(NOISE, AMPLITUDE)
+    belief = observer.start(Timeline(PERIOD, Delay(0, 0.0)), sensing, plant)
+    assert np.array_equal(belief.parameters, prior)
+    result = run(prior, 9)
+    for k, y in enumerate(result.measurements):
+        flew = np.zeros((1, 6)) if k == 0 else result.inputs[k - 1][0]
+        belief = observer.observe(belief, Measurement.of(y), flew, sensing, plant)
+    assert belief.fault is None
+    assert belief.parameters[PAYLOAD] == pytest.approx(0.5, abs=0.03)
+    assert belief.estimate.parameter_std[PAYLOAD] < 0.0101
 
 
 # Bounds.
@@ -299,8 +367,8 @@ def test_bounds_are_kept_by_the_nearest_mean_there_is(seed: int, width: float) -
     covariance = root @ root.T / 20 + 10 ** rng.uniform(-6, -1) * np.eye(20)
     mean = rng.normal(0, 1, 20)
     lower, upper = -width * rng.uniform(0, 1, 8), width * rng.uniform(0, 1, 8)
-    box = dataclasses.replace(ASSUMED, lower=lower, upper=upper)
-    found = estimator._within_bounds(mean, covariance, box)
+    box = dataclasses.replace(KNOWN, lower=lower, upper=upper)
+    found = parameter_filter._within_bounds(mean, covariance, box)
     metric = np.linalg.inv(np.linalg.cholesky(covariance))
     free = np.full(12, np.inf)
     limits = (np.concatenate([-free, lower]), np.concatenate([free, upper]))
@@ -315,7 +383,7 @@ def test_what_was_learnt_about_combinations_survives_a_bound() -> None:
     covariance[12, 18] = covariance[18, 12] = -0.9e-6
     mean = np.zeros(20)
     mean[12], mean[18] = 1e-3, -2e-3
-    found = estimator._within_bounds(mean, covariance, ASSUMED)
+    found = parameter_filter._within_bounds(mean, covariance, KNOWN)
     assert found[18] == 0
     assert found[12] == pytest.approx(1e-3 - 0.9 * 2e-3, rel=1e-12)
 
@@ -327,16 +395,16 @@ def test_what_was_learnt_about_combinations_survives_a_bound() -> None:
 def test_an_outlier_is_passed_over(size: float) -> None:
     result = run(inside(np.random.default_rng(4)), 4)
     before, (torques, durations) = result.estimates[-2], result.inputs[-1]
-    expected = advance(before, PLANT, acted(torques, durations), None, ASSUMED)
+    expected = advance(before, acted(torques, durations), None)
     for channel in (0, 3, 5, 6, 11):
         y = result.measurements[-1].copy()
         y[channel] += size
-        after = advance(before, PLANT, acted(torques, durations), y, ASSUMED)
+        after = advance(before, acted(torques, durations), y)
         assert after.outliers == 1
         assert np.array_equal(after.mean, expected.mean)
         assert np.array_equal(after.covariance, expected.covariance)
         y = PLANT.predict(result.states[-1], torques, durations, SUBSTEPS, result.truth)[-1]
-        again = advance(after, PLANT, acted(torques, durations), y, ASSUMED)
+        again = advance(after, acted(torques, durations), y)
         assert again.outliers == 0
         assert squared(again.parameters - result.truth, again.covariance[12:, 12:]) < 40
 
@@ -349,15 +417,15 @@ def test_after_patience_the_measurement_is_believed() -> None:
     torques, durations = result.inputs[-1]
     for count in range(1, PATIENCE):
         moved = PLANT.predict(moved, torques, durations, SUBSTEPS, result.truth)[-1]
-        estimate = advance(estimate, PLANT, acted(torques, durations), moved, ASSUMED)
+        estimate = advance(estimate, acted(torques, durations), moved)
         assert estimate.outliers == count
         assert abs(estimate.state[3] - moved[3]) > 5e-3
     moved = PLANT.predict(moved, torques, durations, SUBSTEPS, result.truth)[-1]
-    estimate = advance(estimate, PLANT, acted(torques, durations), moved, ASSUMED)
+    estimate = advance(estimate, acted(torques, durations), moved)
     assert estimate.outliers == 0
     assert np.array_equal(estimate.state, moved)
     assert np.array_equal(estimate.parameters, result.estimates[-1].parameters)
-    assert np.allclose(estimate.parameter_std, ASSUMED.prior_std, rtol=1e-15)
+    assert np.allclose(estimate.parameter_std, KNOWN.std, rtol=1e-15)
 
 
 @pytest.mark.parametrize("crazy", [1e3, 1e300])
@@ -370,7 +438,7 @@ def test_a_sensor_gone_crazy_and_well_again_leaves_no_trace(crazy: float) -> Non
         zip(result.inputs, result.measurements[1:], strict=True)
     ):
         seen = np.full(12, crazy) if 1 <= k <= 5 else y
-        estimate = advance(estimate, PLANT, acted(torques, durations), seen, ASSUMED)
+        estimate = advance(estimate, acted(torques, durations), seen)
         estimates.append(estimate)
     assert all(np.all(np.isfinite(e.mean)) for e in estimates)
     assert all(np.all(np.isfinite(e.covariance)) for e in estimates)
@@ -388,6 +456,6 @@ def test_a_payload_put_on_later_is_found() -> None:
     for torques, durations in before.inputs:
         x = PLANT.predict(x, torques, durations, SUBSTEPS, truth)[-1]
         y = x + NOISE * rng.standard_normal(12)
-        estimate = advance(estimate, PLANT, acted(torques, durations), y, ASSUMED)
+        estimate = advance(estimate, acted(torques, durations), y)
     assert estimate.parameters[PAYLOAD] == pytest.approx(1.0, abs=0.1)
     assert squared(estimate.parameters - truth, estimate.covariance[12:, 12:]) < 40

@@ -12,13 +12,17 @@ from pydrake.systems.analysis import (
     SimulatorStatus,
 )
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem, System
-from pydrake.systems.primitives import FirstOrderTaylorApproximation, Linearize
+from pydrake.systems.primitives import (
+    ConstantVectorSource,
+    FirstOrderTaylorApproximation,
+    Linearize,
+)
 
-from stewart_drake.diagram import MultibodyStewart
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.multibody_stewart import MultibodyStewart
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.equations import DEAD_CENTRE_SINE
-from stewart_drake.plant.exact import ExactPlant
+from stewart_drake.plant.exact import ExactPlant, set_accuracy
 from stewart_drake.plant.workspace import (
     PITCH_LIMIT,
     SINGULARITY_LIMIT,
@@ -40,6 +44,7 @@ TIGHT: Scheme = ("runge_kutta5", 1e-10, 0.005, True)
 USUAL: Scheme = ("runge_kutta5", 1e-8, 0.02, True)
 ENDED = SimulatorStatus.ReturnReason.kReachedTerminationCondition
 FREE = StewartDynamics(PAPER, gravity=False)
+AT_HOME = np.concatenate([PAPER.home, np.zeros(6)])
 
 
 def simulator_of(
@@ -109,13 +114,13 @@ def test_energy_is_kept(gravity: bool) -> None:
 
 
 class Sine(LeafSystem):
-    """Torque amplitude * sin(omega t + phase)."""
+    """Torque mean + amplitude * sin(omega t + phase)."""
 
-    def __init__(self, amplitude: Array, omega: float, phase: Array) -> None:
+    def __init__(self, amplitude: Array, omega: float, phase: Array, mean: Array) -> None:
         super().__init__()
 
         def output(context: Context, result: BasicVector) -> None:
-            result.SetFromVector(amplitude * np.sin(omega * context.get_time() + phase))
+            result.SetFromVector(mean + amplitude * np.sin(omega * context.get_time() + phase))
 
         self.DeclareVectorOutputPort("torque", 6, output, {self.time_ticket()})
 
@@ -129,10 +134,10 @@ def test_multibody_plant_converges_to_it_at_first_order(gravity: bool) -> None:
     start = np.concatenate([PAPER.home, rng.normal(0, [0.2] * 3 + [0.02] * 3)])
     parameters = np.concatenate([held, [0.3, 2e-3]])  # the holding torque comes as a bias
 
-    def motion(plant: System) -> Array:
+    def motion(plant: System, added: Array) -> Array:
         builder = DiagramBuilder()
         builder.AddSystem(plant)
-        torque = builder.AddSystem(Sine(*source))
+        torque = builder.AddSystem(Sine(*source, added))
         builder.Connect(torque.get_output_port(), plant.GetInputPort("torque"))
         diagram = builder.Build()
         simulator = Simulator(diagram)
@@ -143,12 +148,12 @@ def test_multibody_plant_converges_to_it_at_first_order(gravity: bool) -> None:
         simulator.AdvanceTo(look_time(0.3))
         return state_of(plant, context)
 
-    expected = motion(ExactPlant(StewartDynamics(PAPER, gravity, parameters)))
+    expected = motion(ExactPlant(StewartDynamics(PAPER, gravity, parameters)), np.zeros(6))
     assert np.abs(expected - start)[:6].max() > 0.02
 
     def error(step: float) -> float:
-        other = {"torque_bias": held, "payload_mass": 0.3, "joint_damping": 2e-3}
-        found = motion(MultibodyStewart(PAPER, step, gravity=gravity, **other))
+        other = {"payload_mass": 0.3, "joint_damping": 2e-3}
+        found = motion(MultibodyStewart(PAPER, step, gravity=gravity, **other), held)
         return float(np.abs(found - expected)[:6].max())
 
     steps = [2e-3, 1e-3, 5e-4, 2e-4, 1e-4]
@@ -417,3 +422,36 @@ def test_a_state_without_numbers_is_named_as_such() -> None:
         failure = diagnose(PAPER, 1.0, pose)
         assert failure is not None
         assert failure.reason == "the simulated state is not finite"
+
+
+# In a diagram of one's own.
+
+
+def test_a_diagram_of_ones_own_ends_where_a_plate_leaves() -> None:
+    """Two machines side by side; the pushed one is found to leave to 1e-8, the other is at home."""
+    builder = DiagramBuilder()
+    pushed, idle = (builder.AddNamedSystem(name, ExactPlant(FREE)) for name in ("pushed", "idle"))
+    for plant, torque in ((pushed, np.full(6, 0.1)), (idle, np.zeros(6))):
+        source = builder.AddSystem(ConstantVectorSource(torque))
+        builder.Connect(source.get_output_port(), plant.GetInputPort("torque"))
+    simulator = Simulator(builder.Build())
+    simulator.set_target_realtime_rate(100.0)
+    set_accuracy(simulator)
+    context = simulator.get_context()
+    status = simulator.AdvanceTo(5.0)
+    assert status.reason() == ENDED and status.system() is pushed
+    assert abs(pushed.margin(pushed.GetMyContextFromRoot(context))) < 1e-5
+    assert idle.margin(idle.GetMyContextFromRoot(context)) > 0.01
+    assert simulator.get_target_realtime_rate() == 100.0
+    assert simulator.get_integrator().get_target_accuracy() == context.get_accuracy() == 1e-8
+    # The same time as with other settings that do, to the accuracy asked for.
+    alone, _ = simulator_of(ExactPlant(FREE), AT_HOME, np.full(6, 0.1), TIGHT)
+    assert alone.AdvanceTo(5.0).reason() == ENDED
+    assert context.get_time() == pytest.approx(alone.get_context().get_time(), abs=1e-5)
+
+
+@pytest.mark.parametrize("accuracy", [0.0, -1e-8, 0.1, 1e-13, np.nan, np.inf])
+def test_an_accuracy_that_means_nothing_is_refused(accuracy: float) -> None:
+    simulator, _ = simulator_of(ExactPlant(FREE), AT_HOME, np.zeros(6), USUAL)
+    with pytest.raises(ValueError, match=r"^accuracy: got .*; expected a number from 1e-12"):
+        set_accuracy(simulator, accuracy)

@@ -79,17 +79,19 @@ def test_a_full_disk_stops_a_data_set_that_then_goes_on(tmp_path, monkeypatch):
 
 
 def test_a_full_disk_leaves_no_half_result(tmp_path):
-    """From no room at all to room for all figures but not for the signals, which come after."""
+    """From no room at all to room for the signals, the summary and some of the figures."""
     arguments = ["simulate", *EXACT, "--quiet", "--out"]
     disk = tmp_path / "disk"
     assert main([*arguments, str(tmp_path / "whole")]) == 0
     pages = {p.name: -(-p.stat().st_size // 4096) for p in (tmp_path / "whole").iterdir()}
-    pictures = [name for name in pages if name.endswith((".png", ".svg"))]
+    pictures = {name for name in pages if name.endswith((".png", ".svg"))}
+    results = {"signals.nc", "summary.json"}
+    needed = 4 * sum(pages[name] for name in results)
     figures = 4 * sum(pages[name] for name in pictures)
     assert pages["signals.nc"] > 4
 
     def body(sized: Callable[[int], None]) -> None:
-        for room in (4, figures // 2, figures + 12):
+        for room in (4, needed // 2, needed + figures // 2):
             sized(room)
             if room == 4:
                 fill(disk)
@@ -101,9 +103,10 @@ def test_a_full_disk_leaves_no_half_result(tmp_path):
             )
             (disk / "filling").unlink(missing_ok=True)
             check_whole(disk)
-            assert not list(disk.glob(".*.part")) and not (disk / "summary.json").exists()
-            there = {path.name for path in disk.iterdir()} & set(pictures)
-            assert (room > figures) == (len(there) == len(pictures))
+            there = {path.name for path in disk.iterdir()}
+            assert not list(disk.glob(".*.part"))
+            assert (results <= there) == (room > needed)
+            assert there & pictures < pictures
         sized(10_000)
         assert main([*arguments, str(disk)]) == 0
         check_whole(disk)
@@ -123,4 +126,6 @@ def test_a_limit_on_file_sizes_is_one_line_as_well(largest, tmp_path):
     _, status = os.waitpid(forked(work), 0)
     assert os.waitstatus_to_exitcode(status) == 2
     check_whole(tmp_path)
-    assert not list(tmp_path.glob(".*.part")) and not (tmp_path / "summary.json").exists()
+    assert not list(tmp_path.glob(".*.part"))
+    there = {path.name for path in tmp_path.iterdir()}
+    assert "states.png" not in there and ("summary.json" in there) <= ("signals.nc" in there)

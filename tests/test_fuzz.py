@@ -4,24 +4,54 @@ Briefly here; `make soak` goes on for five minutes with fresh seeds. What it fin
 of the tables in test_bad_input.py and test_bad_files.py.
 """
 
+import io
 import json
+import os
+import random
+import resource
+import select
+import shutil
+import signal
 import time
+import traceback
+import warnings
+from collections import Counter
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
-from stewart_drake.config import ReferenceConfig
+import stewart_drake as sd
 from stewart_drake.errors import ConfigError
+from stewart_drake.jsonio import jsonable
 from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.reference_config import CsvConfig, WaypointsConfig
 from stewart_drake.reference_files import read_csv, read_waypoints
+from stewart_drake.report.csv_file import read_signals, signals_csv
 from stewart_drake.scenario_loading import load_controller, load_scenario
+from stewart_drake.studies.dataset import assemble, load_dataset, read_run, summarize
+from stewart_drake.studies.grid import paper_runs
+from stewart_drake.studies.jobs import _check_manifest, settings_hash
+from stewart_drake.studies.run_files import read_evaluation, read_outcome
 from stewart_drake.trajectories import evaluate, make_reference
 from stewart_drake.tuner.network import load_network, save_network
 from tests.faults import yaml_text
+from tests.mutations import (
+    NASTY,
+    json_bytes,
+    other_netcdf,
+    other_npz,
+    spoiled_bytes,
+    spoiled_document,
+    yaml_bytes,
+)
 from tests.test_bad_files import SAMPLES, WAYPOINTS
 from tests.test_bad_input import PAPER, WITH_LEGS
 from tests.test_network import small_network
@@ -119,7 +149,7 @@ def network() -> dict[str, Any]:
 def motion(path: Path) -> Any:
     """A CSV file all the way to a reference, which must be finite."""
     read_csv(path)
-    trajectory = make_reference(ReferenceConfig(kind="csv", file=str(path)), 0.1)
+    trajectory = make_reference(CsvConfig(file=str(path)), 0.1)
     assert all(abs(value) < 1e12 for value in evaluate(trajectory, 0.05))
     return trajectory
 
@@ -163,3 +193,260 @@ def test_five_minutes_of_random_files(tmp_path):
         for name in FUZZERS:
             fuzz(name, tmp_path, examples=100, number=number)
         number += 1
+
+
+# ---------------------------------------------------------------- files of every kind, guarded
+
+FILES = 2000
+"""Of each kind, in `make soak`."""
+PATIENCE = 180.0
+"""s that one file may take on a machine that has much else to do."""
+ROOM = 2_000_000_000
+"""Bytes beyond what the process has that reading a file may take."""
+LONGEST = 700
+"""Letters of a message, the path aside."""
+
+
+class Kind(NamedTuple):
+    """How files of a kind are read, and where damaged ones come from."""
+
+    read: Callable[[Path], Any]
+    file: str
+    good: Callable[[Path], bytes]
+    other: Callable[[random.Random], bytes] | None = None
+    """Sound files of another content; None: those of `document`."""
+    document: Any = None
+    write: Callable[[Any, random.Random], bytes] = json_bytes
+    briefly: int = 30
+    """Files of this kind in the ordinary tests."""
+
+
+def exported(path: Path) -> None:
+    """Signals all the way to a table."""
+    rows = signals_csv(read_signals(path)).splitlines()
+    assert len({row.count(",") for row in rows}) == 1
+
+
+def summarized(path: Path) -> None:
+    json.dumps(jsonable(summarize(load_dataset(path))))
+
+
+def resumed(path: Path) -> None:
+    """The manifest of a folder that is gone on with."""
+    _check_manifest(path.parent, MANIFEST_SETTINGS, ".none")
+
+
+def waypoint_motion(path: Path) -> None:
+    make_reference(WaypointsConfig(file=str(path)), 0.1)
+
+
+def mechanism_loads(path: Path) -> None:
+    load_mechanism(path)
+
+
+MANIFEST_SETTINGS = {"scenario": {"duration": 1.0, "poses": [[0.0] * 6]}, "seed": 0}
+MANIFEST_FILE = {"hash": settings_hash(MANIFEST_SETTINGS), "settings": MANIFEST_SETTINGS}
+OUTCOME = {"status": "completed", "reason": "", "leg": None, "time": None, "error": 9.1}
+RUN_FILE = {"draw": {"payload": 0.1}, "outcome": {**OUTCOME, "peak_torque": 0.6}}
+EVALUATION_FILE = {
+    **{"accumulated_error": 9.1, "rms_torque": 0.1, "peak_torque": 0.6, "torque_variation": 3.0},
+    **{"status": "completed", "stopped": None, "tuner_fallbacks": 0},
+}
+RUN_ARRAYS = {
+    **{"samples": np.zeros((100, 18)), "status": np.array("completed"), "stopped": np.nan},
+    **dict.fromkeys(("accumulated_error", "cost", "rms_torque", "peak_torque"), 1.0),
+    "torque_variation": 2.0,
+}
+
+
+def npz_of_a_run() -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, **RUN_ARRAYS)  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+@lru_cache(maxsize=1)
+def some_signals() -> xr.Dataset:
+    """Of a short run."""
+    settings = ("plant.kind=exact", "duration=0.1", "start=on_reference", "queue=reference")
+    return sd.simulate(sd.load_scenario("paper", settings=settings)).signals
+
+
+@lru_cache(maxsize=1)
+def some_data() -> xr.Dataset:
+    """A data set of two runs."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "run.npz"
+        path.write_bytes(npz_of_a_run())
+        runs = dict(list(paper_runs(load_scenario("paper", "delay_lqi")).items())[:2])
+        settings = {"data": "paper", "scenario": {}}
+        return assemble(runs, dict.fromkeys(runs, path), settings)
+
+
+def netcdf(data: xr.Dataset) -> bytes:
+    content: Any = data.to_netcdf(engine="h5netcdf")
+    return bytes(content)
+
+
+def plain(document: Any) -> Callable[[Path], bytes]:
+    return lambda _: json.dumps(document).encode()
+
+
+WAYPOINT_FILE = {"times": [0.0, 1.0], "poses": [[0, 0, 0, 0, 0, 0.38], [0, 0, 0, 0, 0, 0.4]]}
+KINDS: dict[str, Kind] = {
+    "scenario": Kind(load_scenario, "f.yaml", plain(SCENARIO), document=SCENARIO, write=yaml_bytes),
+    "controller": Kind(
+        *(load_controller, "f.yaml", plain(SCENARIO["controller"])),
+        document=SCENARIO["controller"],
+        write=yaml_bytes,
+    ),
+    "mechanism": Kind(
+        mechanism_loads, "f.yaml", plain(PAPER), document=PAPER, write=yaml_bytes, briefly=15
+    ),
+    "waypoints": Kind(
+        *(waypoint_motion, "f.yaml", plain(WAYPOINT_FILE)), document=WAYPOINT_FILE, write=yaml_bytes
+    ),
+    "csv": Kind(motion, "f.csv", lambda _: SAMPLES.encode(), lambda dice: csv_of(dice)),
+    "network": Kind(
+        load_network,
+        "f.json",
+        lambda _: json.dumps(network()).encode(),
+        lambda dice: json_bytes(spoiled_document(network(), dice), dice),
+    ),
+    "robustness run": Kind(read_outcome, "f.json", plain(RUN_FILE), document=RUN_FILE),
+    "evaluation run": Kind(
+        read_evaluation, "f.json", plain(EVALUATION_FILE), document=EVALUATION_FILE
+    ),
+    "manifest": Kind(resumed, "manifest.json", plain(MANIFEST_FILE), document=MANIFEST_FILE),
+    "npz": Kind(
+        read_run, "f.npz", lambda _: npz_of_a_run(), lambda dice: other_npz(RUN_ARRAYS, dice)
+    ),
+    "signals": Kind(
+        *(exported, "f.nc", lambda _: netcdf(some_signals())),
+        lambda dice: other_netcdf(some_signals(), dice),
+        briefly=4,
+    ),
+    "data set": Kind(
+        *(summarized, "f.nc", lambda _: netcdf(some_data())),
+        lambda dice: other_netcdf(some_data(), dice),
+        briefly=4,
+    ),
+}
+
+
+def csv_of(dice: random.Random) -> bytes:
+    """Samples with cells that are something else."""
+    rows = [row.split(",") for row in SAMPLES.splitlines()]
+    for _ in range(dice.choice((1, 2, 3))):
+        row = dice.choice(rows)
+        row[dice.randrange(len(row))] = str(dice.choice(NASTY[:9] + NASTY[11:26]))
+    if dice.random() < 0.2:
+        dice.shuffle(rows)
+    return "\n".join(map(",".join, rows)).encode(errors="surrogatepass")
+
+
+def damaged(kind: Kind, good: bytes, dice: random.Random) -> bytes:
+    """Every other file by bytes, the others by structure."""
+    if dice.random() < 0.5:
+        return spoiled_bytes(good, dice)
+    if kind.other is not None:
+        try:
+            return kind.other(dice)
+        except Exception:  # of three libraries that write
+            return b""  # what not even the writer takes
+    return kind.write(spoiled_document(kind.document, dice), dice)
+
+
+def attempt(kind: Kind, path: Path, content: bytes) -> str:
+    """`read`, or `refused` in one line of a bounded length that names the file."""
+    path.write_bytes(content)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            kind.read(path)
+    except ConfigError as error:
+        said = str(error)
+        assert len(said.splitlines()) == 1 and len(said) < LONGEST + len(str(path)), said
+        # A manifest of other settings is told by its folder.
+        assert str(path) in said or str(path.parent) in said, said
+        return "refused"
+    return "read"
+
+
+def fuzz_files(name: str, folder: Path, numbers: range) -> Counter[str]:
+    """Reads damaged files in copies of this process, which may neither hang nor take much memory.
+
+    Returns:
+        How many were read and how many refused.
+
+    Raises:
+        AssertionError: anything else; it names the file, which is kept.
+    """
+    kind, results = KINDS[name], Counter[str]()
+    good = kind.good(folder)
+    path = folder / kind.file
+    attempt(kind, path, good)
+    start = numbers.start
+    while start < numbers.stop:
+        reader, writer = os.pipe()
+        pid = os.fork()
+        if not pid:
+            try:
+                _try_all(name, good, path, range(start, numbers.stop), writer)
+            finally:
+                os._exit(70)
+        os.close(writer)
+        lines = _lines(reader, pid)
+        _, status = os.waitpid(pid, 0)
+        for line in lines:
+            results[line.partition(" ")[2]] += 1
+        start += len(lines)
+        if start < numbers.stop:
+            shutil.copy(path, folder / f"found{start}{path.suffix}")
+            trace = folder / "trace"
+            told = trace.read_text() if trace.exists() else "hang, crash or memory"
+            raise AssertionError(f"{name} {start}, {path}, status {status}: {told}")
+    return results
+
+
+def _try_all(name: str, good: bytes, path: Path, numbers: range, writer: int) -> None:
+    """In the copy: a line for every file."""
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, resource.RLIM_INFINITY))
+    kind = KINDS[name]
+    try:
+        for number in numbers:
+            content = damaged(kind, good, random.Random(f"{name} {number}"))
+            os.write(writer, f"{number} {attempt(kind, path, content)}\n".encode())
+    except BaseException:
+        (path.parent / "trace").write_text(traceback.format_exc())
+        os._exit(70)
+    os._exit(0)
+
+
+def _lines(reader: int, pid: int) -> list[str]:
+    """What the copy says, until its end or its silence."""
+    said = b""
+    while select.select([reader], [], [], PATIENCE)[0]:
+        piece = os.read(reader, 65536)
+        if not piece:
+            break
+        said += piece
+    else:
+        os.kill(pid, signal.SIGKILL)
+    os.close(reader)
+    return said.decode().splitlines()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_damaged_files_are_read_or_refused(name, tmp_path):
+    kind = KINDS[name]
+    assert fuzz_files(name, tmp_path, range(kind.briefly)).total() == kind.briefly
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("name", KINDS)
+def test_two_thousand_damaged_files_of_each_kind(name, tmp_path):
+    results = fuzz_files(name, tmp_path, range(FILES))
+    print(name, dict(results))
+    assert results.total() == FILES and results["refused"] > FILES / 4

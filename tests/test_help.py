@@ -1,5 +1,6 @@
 """What the command tells those who ask: help with examples, completion, 80 columns."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -13,7 +14,10 @@ from stewart_drake.commands.examples import EXAMPLES
 from stewart_drake.config import Scenario
 from stewart_drake.resources import shipped
 from stewart_drake.scenario_loading import load_scenario, scenario_yaml, setting_choices
-from stewart_drake.yamlio import parse_yaml
+from stewart_drake.schema import field_names, sections
+from stewart_drake.studies.range_units import RANGE_UNITS
+from stewart_drake.studies.uncertainty import Ranges
+from stewart_drake.yamlio import parse_yaml, validate
 from tests import test_docs
 
 main(["--version"])  # which also puts the examples where they belong
@@ -50,6 +54,21 @@ def test_every_example_is_of_a_command_and_parses():
         test_docs.test_commands_parse(
             test_docs.Block(test_docs.ROOT / "examples", 1, "sh", "\n".join(lines))
         )
+
+
+def test_robustness_tells_the_unit_of_everything_that_it_varies(capsys):
+    """In the help, in docs/theory.md, and in the line about a wrong value."""
+    names = {field.name for field in dataclasses.fields(Ranges)}
+    assert set(RANGE_UNITS) == names
+    assert main(["analyze", "robustness", "--help"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    theory = (test_docs.ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
+    for name, unit in RANGE_UNITS.items():
+        assert f"{name}: {unit}" in said
+        assert f"| `{name}` | {unit} |" in theory
+        assert main(["analyze", "robustness", "--vary", f"{name}=-1"]) == 2
+        error = capsys.readouterr().err
+        assert f"{name}: {unit}" in " ".join(error.split()) and len(error.splitlines()) == 1
 
 
 def test_no_summary_is_cut_off_in_the_list_of_commands(capsys):
@@ -105,10 +124,15 @@ def test_every_offered_setting_names_a_field_and_its_values_are_accepted():
     for choice in setting_choices():
         name, _, value = choice.partition("=")
         section, _, field = name.rpartition(".")
-        owner = getattr(Scenario(), section) if section else Scenario()
-        assert hasattr(owner, field)
-        if value:
-            setattr(owner, field, parse_yaml(value, name))  # checked on assignment
+        given = {field: parse_yaml(value, name)} if value else {}
+        if not section:
+            assert hasattr(validate(Scenario, given, name), field)
+            continue
+        # A section's kind may be offered before the rest of what that kind needs.
+        kinds = sections(Scenario).get(section, {})
+        kind = {"kind": next((k for k in kinds if field in field_names(kinds[k])), None)}
+        whole = validate(Scenario, {section: (kind if kinds else {}) | given}, name)
+        assert hasattr(getattr(whole, section), field)
 
 
 # ---------------------------------------------------------------- scenarios as text

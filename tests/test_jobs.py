@@ -169,7 +169,7 @@ def test_two_processes_do_not_share_a_folder(tmp_path):
 
 
 def test_leftovers_are_removed_and_a_full_disk_spoils_nothing(tmp_path, monkeypatch):
-    (tmp_path / ".job1.json.part").write_text("half a fi")
+    (tmp_path / ".job1.json.0123456789abcdef.part").write_text("half a fi")
     run_jobs(numbered(1), text, tmp_path, settings=SETTINGS)
     assert not list(tmp_path.glob(".*.part"))
 

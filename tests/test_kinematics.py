@@ -359,7 +359,7 @@ def test_trajectory_of_the_paper_is_within_reach_and_well_conditioned() -> None:
         rod = (plate_joints(PAPER, pose) - crank_tips(PAPER, angles)) / 0.404
         worst = min(worst, np.abs(np.sum(rod * tangent, axis=1)).min())
     np.testing.assert_allclose(worst, 0.40, atol=0.01)
-    assert closest > 0.005
+    assert closest == pytest.approx(7.4e-3, abs=5e-5)
 
 
 def test_plain_lists_are_accepted() -> None:

@@ -10,7 +10,11 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorC
 
 import stewart_drake as sd
 from stewart_drake.design.delay_model import DelayedModel, chain, delayed_model
-from stewart_drake.design.error_model import ContinuousModel, linear_model
+from stewart_drake.design.error_model import (
+    ContinuousModel,
+    double_integrators,
+    linear_model,
+)
 from stewart_drake.design.limits import (
     amplification,
     closed_loop,
@@ -23,6 +27,7 @@ from stewart_drake.design.limits import (
     spectral_radius,
 )
 from stewart_drake.design.riccati import augmented_gain
+from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.plant.exact import ExactPlant
 from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.delay_limits import error_floor, simulated_growth
@@ -249,6 +254,36 @@ def test_the_faithful_controller_is_unstable_on_the_true_plant() -> None:
     assert m.later == m.earlier == 0
     assert m.motor is None
     assert math.isnan(m.S.value)
+
+
+@pytest.mark.parametrize(
+    ("controller", "weight", "radius"),
+    [
+        ("delay_lqr", 1e-4, 0.990),
+        ("delay_lqi", 1e-6, 0.996),
+        ("delay_lqi", 1e-4, 1.011),
+        ("delay_lqi", 1.0, 1.356),
+    ],
+)
+def test_weights_that_hardly_act_keep_the_faithful_controllers_stable(
+    controller: str, weight: float, radius: float
+) -> None:
+    """At mu = 8, by an eigenvalue problem of its own; unstable for every mu is w_Q = w_R."""
+    integral = controller == "delay_lqi"
+    models = [
+        delayed_model(model, 0.1, 8, integral=integral)
+        for model in (
+            double_integrators(torque_map(PAPER, PAPER.home)),
+            linear_model(*sd.StewartDynamics(PAPER, gravity=False).linearize(PAPER.home)),
+        )
+    ]
+    K = augmented_gain(models[0], weight * np.eye(12 if integral else 6), np.eye(6))
+    true = chain(models[1])
+    found = np.abs(np.linalg.eigvals(true.A - true.B @ K)).max()
+    assert found == pytest.approx(radius, abs=1e-3)
+    settings = ("plant.kind=exact", f"controller.w_Q={weight}")
+    (m,) = loop_margins(basis(sd.load_scenario("paper", controller, settings)), ())
+    assert m.radius == pytest.approx(found, rel=1e-6)
 
 
 def test_zero_delay_cannot_be_shorter() -> None:

@@ -58,11 +58,13 @@ def test_closed_loop_has_named_ports_and_systems(plant: str) -> None:
         "parameters": 8,
         "parameter_std": 8,
         "density": 18,
+        "measurement": 12,
+        "state_estimate": 12,
     }
     found = [loop.get_output_port(i) for i in range(loop.num_output_ports())]
     assert {port.get_name(): port.size() for port in found} == sizes
     assert loop.num_input_ports() == 0
-    names = "reference sensor weights controller saturation delay_chain plant density"
+    names = "reference sensor weights controller saturation delay_chain torque_bias plant density"
     assert {system.get_name() for system in loop.GetSystems()} == set(names.split())
 
 
@@ -105,13 +107,31 @@ def test_applied_torque_is_the_commanded_one_a_delay_ago(
     behind = round((steps + fraction) * 0.1 / GRID)
     assert run.status == "completed"
     assert np.array_equal(applied[behind:], commanded[: len(commanded) - behind])
+    assert run.summary["peak_torque"] == np.abs(commanded).max()
+    assert run.summary["peak_torque_applied"] == np.abs(applied).max()
     assert len(np.unique(commanded[:, 0])) >= 6
     assert behind == 0 or np.all(applied[0] != 0)
 
 
+@pytest.mark.parametrize("tiny", [1e-10, 1e-15, 1e-16])
+def test_a_delay_that_is_next_to_whole_is_whole(tiny: float) -> None:
+    """A release so near to the next event would come before it, or never."""
+    settings = ("duration=2.0", *ON_REFERENCE)
+    run = simulate(scenario(f"delay.fraction={tiny}", *settings))
+    believed = ("controller.delay_steps=8", f"controller.delay_fraction={tiny}")
+    same = simulate(scenario(*believed, *settings))
+    for other in (run, same):
+        assert other.accumulated_error == result(*settings).accumulated_error
+    sc = scenario(*settings)
+    sc.delay.fraction = tiny
+    assert sc.delay.fraction == 0.0
+    sc.delay.fraction = 1e-9
+    assert sc.delay.fraction == 1e-9
+
+
 def test_torque_is_limited_before_the_chain() -> None:
     run = result("duration=1.2", "actuator.torque_limit=0.5", "delay.steps=2")
-    assert run.summary["peak_torque"] <= 0.5
+    assert run.summary["peak_torque_applied"] <= 0.5
     assert np.abs(run.signals.torque_applied.values).max() <= 0.5
     limited = result("duration=0.6", "delay.steps=2", "actuator.torque_limit=0.004", *ON_REFERENCE)
     assert np.abs(limited.signals.torque_applied.values).max() == 0.004
@@ -266,6 +286,11 @@ def test_summary_is_what_the_signals_say() -> None:
     )
     assert set(run.summary["counts"]) == {
         "riccati_failures",
+        "unreachable",
+        "nonfinite_torque",
+        "measurements_missing",
+        "measurements_frozen",
+        "measurements_rejected",
         "bad_measurements",
         "saturated_steps",
         "tuner_fallbacks",
@@ -312,6 +337,20 @@ def test_ctrl_c_keeps_what_there_is() -> None:
     assert run.signals.time.values == pytest.approx(GRID * np.arange(17), abs=1e-12)
     assert np.isnan(run.accumulated_error)
     assert seen == pytest.approx(GRID * np.arange(17), abs=1e-12)
+
+
+@pytest.mark.parametrize("error", [RuntimeError, ValueError])
+def test_what_progress_raises_reaches_the_caller(error: type[Exception]) -> None:
+    """It is the caller's own, not a solver that has failed."""
+    mine = error("mine")
+
+    def progress(time: float, error: float) -> None:
+        if time > 0.05:
+            raise mine
+
+    with pytest.raises(error) as caught:
+        simulate(scenario("duration=0.2", *ON_REFERENCE), progress=progress)
+    assert caught.value is mine
 
 
 # How it ends early.

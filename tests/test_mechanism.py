@@ -2,12 +2,14 @@
 
 import copy
 import dataclasses
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from stewart_drake.errors import ConfigError
@@ -16,6 +18,7 @@ from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.resources import data_root
 from tests.mechanisms import PAPER
 
+Array = NDArray[np.float64]
 Loader = Callable[[dict[str, Any]], Mechanism]
 FILE = data_root() / "models" / "paper.yaml"
 ABSENT = object()
@@ -159,6 +162,14 @@ def test_invalid_fields_are_refused_in_one_line(
         ({"rod": ABSENT}, "rod: is missing"),
         ({"crank.mass": ABSENT}, "crank.mass: is missing"),
         ({"home": ABSENT}, "home: is missing"),
+        (
+            {"crank.mass": ABSENT, "rod.length": ABSENT, "plate.mass": ABSENT},
+            "plate.mass, crank.mass, rod.length: are missing",
+        ),
+        (
+            {"plate.mass": "heavy", "rod.mass": ABSENT},
+            "plate.mass: got 'heavy'; expected a number; rod.mass: is missing",
+        ),
     ],
 )
 def test_unknown_and_missing_keys_are_named(
@@ -167,6 +178,123 @@ def test_unknown_and_missing_keys_are_named(
     with pytest.raises(ConfigError) as caught:
         load(paper_with(edits))
     assert str(caught.value).endswith(f"mine.yaml: {problem}")
+
+
+def test_all_impossible_bodies_are_told_at_once(load: Loader) -> None:
+    edits = {"base.inertia": [1.0, 1.0, 3.0], "crank.mass": 0, "rod.inertia": [0, 1e-3, 1e-3]}
+    with pytest.raises(ConfigError) as caught:
+        load(paper_with(edits))
+    message = str(caught.value)
+    assert "\n" not in message
+    for problem in ("base.inertia: got [1, 1, 3]", "crank.mass: got 0 kg", "rod.inertia: got [0,"):
+        assert problem in message
+
+
+def test_many_problems_are_cut_short(load: Loader) -> None:
+    with pytest.raises(ConfigError, match=r"home\[0\]: .*; and 1 more$"):
+        load(paper_with({"home": ["a"] * 6}))
+
+
+# ------------------------------------------------------------------ moments that nobody measured
+
+
+def rod_by_quadrature(length: float, diameter: float, mass: float) -> Array:
+    """Moments of a uniform cylinder along x by Gauss-Legendre over its volume; exact for them."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    x, along = length / 2 * nodes, weights / 2
+    r, across = diameter / 4 * (1 + nodes), weights / 2 * (1 + nodes)  # r dr over its integral
+    xx, rr = mass * along @ x**2, mass * across @ r**2
+    return np.array([rr, xx + rr / 2, xx + rr / 2])
+
+
+def test_moments_left_out_are_those_of_uniform_bars_and_discs(load: Loader) -> None:
+    cranks = [0.10, 0.11, 0.12, 0.13, 0.14, 0.15]
+    bodies = ("base", "plate", "crank", "rod")
+    edits: dict[str, Any] = {f"{body}.inertia": ABSENT for body in bodies}
+    found = load(paper_with({**edits, "crank.length": cranks}))
+    for link, length in ((found.crank, 0.125), (found.rod, 0.404)):
+        expected = rod_by_quadrature(length, length / 20, link.mass)
+        np.testing.assert_allclose(link.inertia, expected, rtol=1e-13)
+        assert link.inertia[1] == pytest.approx(link.mass * length**2 / 12, rel=2e-3)  # slender
+    # A disc is a stack of rings: the integral of r^2 dm with dm = 2 m r dr / R^2.
+    for body, radius in ((found.base, 0.22), (found.plate, 0.12)):
+        r = np.linspace(0, radius, 20001)
+        polar = np.trapezoid(r**2 * 2 * body.mass * r / radius**2, r)
+        np.testing.assert_allclose(body.inertia, polar * np.array([0.5, 0.5, 1]), rtol=1e-7)
+    np.testing.assert_allclose(found.plate.inertia, [144e-4, 144e-4, 288e-4], rtol=1e-12)
+    assert all(getattr(found, body).estimated for body in bodies)
+    assert not any(getattr(PAPER, body).estimated for body in bodies)
+    massless = load(paper_with({"base": {"mass": 0}}))
+    np.testing.assert_array_equal(massless.base.inertia, 0)
+
+
+def test_moments_of_what_is_not_uniform_have_to_be_given(load: Loader) -> None:
+    with pytest.raises(ConfigError, match=r"rod\.inertia: is missing.* center of 0\.3"):
+        load(paper_with({"rod.inertia": ABSENT, "rod.center": 0.3}))
+
+
+# ------------------------------------------------------------------ files in millimetres
+
+LENGTHS = ["crank.length", "rod.length", "pattern.base_radius", "pattern.plate_radius"]
+LENGTHS += ["pattern.shaft_height"]
+
+
+def enlarged(name: str, factor: float, masses: float, inertias: float) -> dict[str, Any]:
+    """A shipped mechanism's file with all lengths, masses and inertias multiplied."""
+    contents = YAML(typ="safe").load((FILE.parent / f"{name}.yaml").read_text())
+    for field in [*LENGTHS, "pattern.plate_height"]:
+        section, key = field.split(".")
+        if key in contents[section]:
+            contents[section][key] *= factor
+    contents["home"][3:] = [factor * x for x in contents["home"][3:]]
+    for body in ("base", "plate", "crank", "rod"):
+        contents[body]["mass"] *= masses
+        contents[body]["inertia"] = [inertias * x for x in contents[body]["inertia"]]
+    return contents
+
+
+@pytest.mark.parametrize("masses", [1, 1000], ids=["kg", "g"])
+@pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
+def test_a_file_in_millimetres_is_asked_for_metres(name: str, masses: float, load: Loader) -> None:
+    with pytest.raises(
+        ConfigError, match=r"expected .*metres.*\(are these millimetres\?\)"
+    ) as caught:
+        load(enlarged(name, 1000, masses, 1))
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
+@pytest.mark.parametrize("factor", [1e-3, 0.01, 0.1, 1, 5])
+def test_machines_of_any_size_in_metres_are_taken(name: str, factor: float, load: Loader) -> None:
+    """From a tenth of a millimetre to ten metres, masses grown by as little as the square."""
+    masses = factor**2 if factor > 1 else factor**3
+    load(enlarged(name, factor, masses, masses * factor**2))
+
+
+# ------------------------------------------------------------------ a home out of reach
+
+
+@pytest.mark.parametrize("z", [0.6, 0.05, -3.0, 380.0])
+def test_a_reachable_height_is_named(z: float, load: Loader) -> None:
+    """The range that is named is in reach, its outside is not, and the proposal loads."""
+    home = [0.1, -0.05, 0.2, 0.01, 0.0]
+    with pytest.raises(ConfigError, match="within reach") as caught:
+        load(paper_with({"home": [*home, z]}))
+    named = re.search(r"z between (\S+) and (\S+) m, such as (\S+)$", str(caught.value))
+    assert named is not None
+    low, high, middle = map(float, named.groups())
+    load(paper_with({"home": [*home, middle]}))
+    for edge, step in ((low, -1e-3), (high, 1e-3)):
+        assert PAPER.reach_margins(np.array([*home, edge - step])).min() > 0
+        assert PAPER.reach_margins(np.array([*home, edge + step])).min() < 0
+        # The edge itself, to the four digits it is told with.
+        assert abs(PAPER.reach_margins(np.array([*home, edge])).min()) < 2e-4
+
+
+def test_that_no_height_is_reachable_is_said(load: Loader) -> None:
+    for sideways in (0.4, 50.0):
+        with pytest.raises(ConfigError, match="within reach, of which there is none at this x, y"):
+            load(paper_with({"home": [0, 0, 0, sideways, 0, 0.38]}))
 
 
 # ------------------------------------------------------------------ built in Python
@@ -305,3 +433,10 @@ def test_optional_fields_have_defaults(load: Loader) -> None:
     assert mechanism.base.mass == 0
     assert load(paper_with({"motor.effort_limit": None})).effort_limit is None
     assert load(paper_with({"rod.center": 0.25})).rod.center == 0.25
+
+
+def test_an_unknown_key_of_a_section_that_may_be_null_is_told(tmp_path) -> None:
+    path = tmp_path / "machine.yaml"
+    path.write_text(FILE.read_text().replace("plate_offset_deg", "ate_offset_deg"))
+    with pytest.raises(ConfigError, match=r"pattern\.ate_offset_deg: unknown key; did you mean"):
+        load_mechanism(path)

@@ -1,5 +1,6 @@
 """model check and model view: summary, drawing, and a viewer that survives any slider."""
 
+import contextlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +21,7 @@ from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.workspace import diagnose
 from stewart_drake.report.mechanism_figures import mechanism_figure
 from stewart_drake.report.viewer import SLIDERS, STOP, PoseViewer, place, slider_range
-from stewart_drake.resources import shipped
+from stewart_drake.resources import data_root, shipped
 from stewart_drake.studies.mechanism_check import check_mechanism
 from tests.mechanisms import PAPER, random_mechanism
 from tests.singular import parallel_rods, stretched, write_mechanism
@@ -55,6 +56,22 @@ def test_check_tells_what_the_dynamics_say(
     np.testing.assert_allclose((poles**2).sum(), np.trace(A @ A), rtol=1e-9)
     assert poles[0].real == poles.real.max() > 0
     assert len(summary["travel"]) == 6
+
+
+def test_check_marks_moments_that_nobody_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mine.yaml"
+    text = (data_root() / "models" / "paper.yaml").read_text()
+    path.write_text(text.replace(", inertia: [30.0e-4, 30.0e-4, 60.0e-4]", ""))
+    assert main(["model", "check", str(path), "--out", str(tmp_path)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "plate 0.0144, 0.0144, 0.0288 (estimated: uniform disc); crank 1e-06, " in said
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["inertia_estimated"] == ["plate"]
+    np.testing.assert_allclose(summary["inertia"]["plate"], [144e-4, 144e-4, 288e-4])
+    assert main(["model", "check", "paper"]) == 0
+    assert "estimated" not in capsys.readouterr().out
 
 
 def test_check_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
@@ -124,7 +141,8 @@ def test_the_drawing_shows_cranks_and_rods_where_they_are() -> None:
 
 @pytest.fixture(scope="module")
 def viewer() -> Iterator[PoseViewer]:
-    yield PoseViewer(PAPER, Meshcat())
+    with contextlib.closing(PoseViewer(PAPER, Meshcat())) as shown:
+        yield shown
 
 
 def test_the_viewer_starts_at_home_with_a_slider_per_coordinate(viewer: PoseViewer) -> None:
@@ -173,9 +191,9 @@ def test_no_slider_value_crashes(viewer: PoseViewer, values: list[float]) -> Non
 
 @pytest.mark.parametrize("machine", [parallel_rods(), stretched()])
 def test_a_singular_machine_can_be_viewed(machine: Mechanism) -> None:
-    viewer = PoseViewer(machine, Meshcat())
-    assert place(machine, viewer.values()).failure is not None
-    assert viewer.values().shape == (6,)
+    with contextlib.closing(PoseViewer(machine, Meshcat())) as viewer:
+        assert place(machine, viewer.values()).failure is not None
+        assert viewer.values().shape == (6,)
 
 
 def test_the_viewer_follows_the_sliders_until_it_is_stopped(viewer: PoseViewer) -> None:

@@ -11,12 +11,14 @@ import pytest
 from pydrake.geometry import Meshcat, MeshcatParams
 
 import stewart_drake as sd
-from stewart_drake.diagram import build_viewer
+from stewart_drake import scene
+from stewart_drake.lifetime import let_go
+from stewart_drake.multibody_stewart import build_viewer
 from stewart_drake.plant.workspace import Failure
 from stewart_drake.report import replay as replay_module
-from stewart_drake.report.replay import CRANK_PARTS, replay_html, write_replay
-from stewart_drake.report.replay_shapes import pointer, ring
+from stewart_drake.report.replay import replay_html, write_replay
 from stewart_drake.resources import shipped
+from stewart_drake.scene import CRANK_PARTS, crank_paths, pointer, ring
 from stewart_drake.signals import LEGS
 
 PAPER = sd.load_mechanism("paper")
@@ -35,7 +37,7 @@ def data_of(html: str) -> dict:
 
 def test_every_frame_of_an_exact_run_closes_the_loops_of_the_model(run, monkeypatch):
     gaps = []
-    original = replay_module.set_pose
+    original = scene.set_pose
 
     def watched(plant, tree, *args):
         original(plant, tree, *args)
@@ -46,7 +48,7 @@ def test_every_frame_of_an_exact_run_closes_the_loops_of_the_model(run, monkeypa
             )
             gaps.append(np.abs(next(ends) - next(ends)).max())
 
-    monkeypatch.setattr(replay_module, "set_pose", watched)
+    monkeypatch.setattr(scene, "set_pose", watched)
     meshcat = replay_module.replay(run.signals, PAPER)
     assert len(gaps) == 6 * len(run.signals.time)
     assert max(gaps) < 1e-12
@@ -60,11 +62,12 @@ def test_the_viewer_has_what_the_page_colours(name):
     meshcat = Meshcat(MeshcatParams(host="localhost"))
     diagram, plant, _ = build_viewer(mechanism, meshcat)
     diagram.ForcedPublish(diagram.CreateDefaultContext())
-    paths = replay_module._crank_paths(mechanism.name)
+    paths = crank_paths(mechanism.name)
     assert plant.num_actuators() == len(paths) == 6
     for parts in paths:
         assert [part[-1] for part in parts] == list(CRANK_PARTS)
         assert all(meshcat.HasPath("/" + "/".join(part)) for part in parts)
+    let_go(diagram)  # and with it Meshcat, in this thread
 
 
 def test_the_reference_is_shown_as_a_ghost_and_as_a_path(run):
@@ -109,6 +112,15 @@ def test_runs_of_one_instant_or_none_can_be_shown(run):
     for rows in (0, 1):
         short = dataclasses.replace(run, signals=run.signals.isel(time=slice(0, rows)))
         assert len(data_of(replay_html(short, PAPER, "short"))["time"]) == rows
+
+
+def test_a_run_with_one_instant_of_torque_has_colours(run):
+    """The usual torque is none at all: the largest takes the full colour."""
+    signals = run.signals.copy(deep=True)
+    signals["torque_applied"] = 0 * signals.torque_applied
+    signals.torque_applied.values[-1, 2] = -0.5
+    data = data_of(replay_html(dataclasses.replace(run, signals=signals), PAPER, "a blow"))
+    assert data["share"][-1] == [0, 0, -1, 0, 0, 0] and not np.any(data["share"][:-1])
 
 
 def test_a_long_run_is_thinned_out(run, monkeypatch):

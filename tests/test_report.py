@@ -103,6 +103,19 @@ def test_table_ii_has_the_papers_numbers_and_ours(html, summary):
     assert ours == pytest.approx(own, rel=5e-3)
 
 
+def test_commanded_and_applied_torques_are_told_apart(html, summary):
+    """The LQI asks for thirteen times what ever acts, as the plate is lost before it arrives."""
+    rows = re.findall(r"<tr>\s*(.*?)</tr>", html.partition("Table II")[2], re.DOTALL)
+    heads = [text_of(head) for head in re.findall(r"<th[^>]*>(.*?)</th>", rows[0], re.DOTALL)]
+    cells = next(re.findall(r"<td[^>]*>(.*?)</td>", r) for r in rows if LABELS["delay_lqi"] in r)
+    shown = dict(zip((" ".join(head.split()[:2]) for head in heads), cells, strict=True))
+    own = summary["controllers"]["delay_lqi"]
+    assert float(shown["commanded peak"]) == pytest.approx(own["peak_torque"], rel=0.05)
+    assert float(shown["applied peak"]) == pytest.approx(own["peak_torque_applied"], rel=0.05)
+    assert own["peak_torque"] > 10 * own["peak_torque_applied"]
+    assert "applied torques of the delay-aware LQI" in text_of(html)
+
+
 def test_figures_of_the_paper_are_redrawn_with_their_captions(html):
     text = text_of(html)
     for figure in ("5(a)", "5(b)", "7(a)", "7(b)"):

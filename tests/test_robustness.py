@@ -23,12 +23,13 @@ from stewart_drake.cli import main
 from stewart_drake.config import Scenario
 from stewart_drake.errors import ConfigError
 from stewart_drake.experiment import prepare
+from stewart_drake.jsonio import jsonable
 from stewart_drake.mechanism import kinematics
 from stewart_drake.report.page import Provenance
 from stewart_drake.report.robustness_page import robustness_page, robustness_table
-from stewart_drake.results import jsonable
 from stewart_drake.simulation import simulate
 from stewart_drake.studies import robustness, statistics
+from stewart_drake.studies.failures import auc_interval, explain
 from stewart_drake.studies.robustness import run_draw, study_robustness
 from stewart_drake.studies.robustness_result import (
     Outcome,
@@ -234,6 +235,7 @@ def test_the_scenario_changes_as_drawn_and_the_belief_stays() -> None:
     scenario = short()
     scenario.plant.payload_mass, scenario.plant.torque_bias = 0.5, [0.1] * 6
     scenario.sensor.noise_std = [1e-3] * 12
+    scenario.sensor.faults = [{"kind": "frozen", "from": 1.0, "to": 1.5}]
     one = UNDISTURBED._replace(
         payload=0.25, torque_bias=(0.01,) * 6, noise=0.01, damping=0.02, delay=-0.03, seed=7,
         torque_limit=2.0,
@@ -247,13 +249,15 @@ def test_the_scenario_changes_as_drawn_and_the_belief_stays() -> None:
     assert other.actuator.torque_limit == 2.0
     assert other.sensor.noise_std == pytest.approx(1e-3 + 0.01 * np.tile(SCALES.motion, 2))
     assert (other.sensor.seed, scenario.sensor.seed) == (7, 0)
+    assert other.sensor.faults == scenario.sensor.faults != []
     other.check()
 
 
 def test_a_scenarios_own_limit_is_kept() -> None:
     scenario = short()
     scenario.actuator.torque_limit = 1.0
-    limits = [draw(Ranges(), SCALES, scenario, 0, i).torque_limit or 0 for i in range(50)]
+    scales = SCALES._replace(torque_limit=1.0)
+    limits = [draw(Ranges(), scales, scenario, 0, i).torque_limit or 0 for i in range(50)]
     assert max(limits) == 1.0 > min(limits) >= 0.66
     none = draw(Ranges(torque_limit=None), SCALES, scenario, 0, 0)
     assert none.torque_limit == 1.0
@@ -448,11 +452,16 @@ def test_a_cluster_gives_the_same_study(
     assert contents(tmp_path) == contents(folder)
 
 
-def test_a_damaged_file_is_named(tmp_path: Path) -> None:
+def test_a_damaged_file_is_named_and_made_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     study_robustness(short(), tmp_path, runs=1, workers=1)
-    (tmp_path / "runs" / "run000000.json").write_text('{"outcome": {"status": "completed"}}')
-    with pytest.raises(ConfigError, match=r"run000000\.json: is damaged"):
-        study_robustness(short(), tmp_path, runs=1, workers=1)
+    run = tmp_path / "runs" / "run000000.json"
+    whole = run.read_bytes()
+    run.write_text('{"outcome": {"status": "completed"}}')
+    study_robustness(short(), tmp_path, runs=1, workers=1)
+    assert run.read_bytes() == whole
+    assert "run000000.json" in caplog.text and "done again" in caplog.text
 
 
 def test_nothing_drawn_changes_nothing(tmp_path: Path) -> None:
@@ -511,7 +520,120 @@ def test_influences_are_found() -> None:
     for name in ("payload", "torque_bias", "damping", "lengths", "anchors", "torque_limit"):
         assert found[name].error_p > 0.05
         assert found[name].failure_p > 0.05
-    assert "noise of the sensor, delay error." in robustness_table(study).replace("\n  ", " ")
+    told = robustness_table(study).replace("\n  ", " ")
+    assert "What matters for completing: delay error." in told
+    assert "of those that completed: noise of the sensor, delay error." in told
+
+
+def with_failures(failing: Any, n: int = 300) -> RobustnessStudy:
+    """A made-up study in which those draws fail that `failing` says; E_ac follows the noise."""
+    study = made_up(n)
+    rng = np.random.default_rng(7)
+    outcomes = [
+        Outcome("left_workspace", "leg 2 reached the end of its reach", 2, 3.0, math.nan, 1.0)
+        if failing(one, rng.uniform())
+        else Outcome("completed", "", None, math.nan, math.exp(5e3 * one.noise), 1.0)
+        for one in study.draws
+    ]
+    return study._replace(outcomes=outcomes)
+
+
+def told_of(study: RobustnessStudy) -> str:
+    return " ".join(robustness_table(study).split())
+
+
+def median_of(study: RobustnessStudy, name: str) -> float:
+    return float(np.median(factor_values(study.draws)[name]))
+
+
+def test_one_cause_of_failing_is_found_and_counted() -> None:
+    bias = factor_values(made_up(300).draws)["torque_bias"]
+    high = float(np.quantile(bias, 0.6))
+    study = with_failures(
+        lambda one, luck: 1e3 * np.sqrt(np.mean(np.square(one.torque_bias))) > high and luck < 0.7
+    )
+    found = study.explanation
+    (cause,) = found.found
+    assert cause.factor == "torque_bias" and cause.larger
+    assert found.pairs == []
+    # The counts, from the draws themselves.
+    failed, outer = study.failed, bias >= np.quantile(bias, 2 / 3)
+    assert (found.failing, found.others) == (failed.sum(), (~failed).sum())
+    assert (cause.failing, cause.others) == (sum(outer & failed), sum(outer & ~failed))
+    wins = bias[failed][:, None] > bias[~failed]
+    assert cause.auc.value == pytest.approx(wins.mean())
+    assert 0.75 < cause.auc.low < cause.auc.value < cause.auc.high < 1
+    told = told_of(study)
+    assert "What matters for completing: torque bias, rms." in told
+    assert "What matters for E_ac, of those that completed: noise of the sensor." in told
+    counts = f"of which {cause.failing} of the {found.failing} have the outer third"
+    assert counts in told
+    page = robustness_page(study, Provenance("command")).html()
+    assert counts in " ".join(page.split())
+    plain = json.loads(json.dumps(jsonable(study.summary)))["explanation"]
+    assert plain["singles"][0]["factor"] == "torque_bias" and plain["singles"][0]["found"]
+    assert not any(one["found"] for one in plain["singles"][1:])
+
+
+@pytest.mark.parametrize("opposite", [False, True])
+def test_two_causes_that_only_work_together_are_found_as_a_pair(opposite: bool) -> None:
+    """Late and heavy; or as well early and light, so that no quantity alone tells anything."""
+    plain = made_up(600)
+    late, heavy = median_of(plain, "delay"), median_of(plain, "payload")
+
+    def failing(one: Draw, luck: float) -> bool:
+        a, b = 1e3 * one.delay > late, one.payload > heavy
+        return bool(luck < 0.5 and (a == b if opposite else a and b))
+
+    study = with_failures(failing, 600)
+    best = study.explanation.pairs[0]
+    assert set(best.factors) == {"delay", "payload"}
+    assert best.opposite is opposite and best.sides[0] == best.sides[1]
+    assert best.failing == study.failed.sum()
+    told = told_of(study)
+    assert "Two together: large payload with large delay error" in told
+    assert ("or just the opposite" in told) is opposite
+    if opposite:
+        assert study.explanation.found == []
+        assert "No single quantity separates" in told
+        assert "For completing no single quantity matters beyond chance." in told
+
+
+def test_failures_by_chance_are_explained_by_nothing() -> None:
+    """But for the one in twenty that chance is allowed, for single quantities and for pairs."""
+    rng, values = np.random.default_rng(5), factor_values(made_up(300).draws)
+    by_chance = [explain(values, rng.uniform(size=300) < 0.27) for _ in range(40)]
+    assert sum(bool(one.found) for one in by_chance) <= 5
+    assert sum(bool(one.pairs) for one in by_chance) <= 5
+    study = with_failures(lambda one, luck: luck < 0.27)
+    found = study.explanation
+    assert (found.found, found.pairs) == ([], [])
+    told = told_of(study)
+    total = f"the {found.failing} failing runs from the other {found.others}"
+    assert f"No single quantity separates {total}. Nor does a pair of them." in told
+    assert "What matters for completing" not in told
+
+
+def test_the_auc_interval_covers_the_truth() -> None:
+    """Of two shifted normal samples AUC is Phi(d / sqrt 2), missed by 5 % of the intervals."""
+    rng, shift = np.random.default_rng(4), 1.0
+    truth = scipy.stats.norm.cdf(shift / np.sqrt(2))
+    misses = 0
+    for _ in range(400):
+        a, b = rng.normal(shift, 1, 30), rng.normal(0, 1, 90)
+        one = auc_interval(float((a[:, None] > b).mean()), 30, 90)
+        misses += not one.low < truth < one.high
+    assert misses / 400 == pytest.approx(0.05, abs=0.03)
+    clear = auc_interval(1.0, 5, 20)
+    assert 0.5 < clear.low < 1 == clear.high
+
+
+def test_all_failing_or_none_needs_no_explanation() -> None:
+    for fails in (True, False):
+        study = with_failures(lambda one, luck, fails=fails: fails, 20)
+        assert study.explanation.singles == []
+        assert "who fails" not in robustness_table(study)
+        robustness_page(study, Provenance("command")).html()
 
 
 def test_failures_are_counted_and_never_dropped() -> None:

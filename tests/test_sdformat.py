@@ -10,10 +10,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pydrake.geometry import Box, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import Context
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, DiagramBuilder
 
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
@@ -284,6 +287,119 @@ def test_loops_close_at_any_pose_and_rates(seed: int) -> None:
         np.testing.assert_allclose(np.exp(1j * np.array(found)), np.exp(1j * turned), atol=1e-13)
         alpha_dot = [motor.get_angular_rate(context) for motor in motors]
         np.testing.assert_allclose(alpha_dot, mechanism.jacobian(pose) @ rates, atol=1e-12)
+
+
+# ------------------------------------------------------------------ collisions
+
+
+def scene(documents: list[str]) -> tuple[DiagramBuilder, MultibodyPlant, SceneGraph]:
+    """The documents in a plant of somebody else's, not finalized yet."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
+    for document in documents:
+        Parser(plant).AddModelsFromString(document, "sdf")
+    return builder, plant, scene_graph
+
+
+@pytest.mark.parametrize("name", shipped("mechanism"))
+def test_a_box_dropped_on_the_plate_of_a_held_machine_stays_on_it(name: str) -> None:
+    """Shafts locked, under gravity, for 2 s; the box ends half its height above the disc.
+
+    Two flat faces touch in one point only, on which the box may still rock a little.
+    """
+    document = (MODELS / f"{name}.sdf").read_text()
+    disc = ElementTree.fromstring(document).find(".//link[@name='plate']/visual[@name='disc']")
+    assert disc is not None
+    deck = float(disc.findtext("pose", "").split()[2])
+    thickness = float(disc.findtext("geometry/cylinder/length", ""))
+    radius = float(disc.findtext("geometry/cylinder/radius", ""))
+    side = 0.5 * radius
+
+    builder, plant, _ = scene([document])
+    inertia = SpatialInertia.SolidBoxWithMass(0.2, side, side, side)
+    box = plant.AddRigidBody("box", plant.AddModelInstance("load"), inertia)
+    shape, friction = Box(side, side, side), CoulombFriction(0.5, 0.5)
+    plant.RegisterCollisionGeometry(box, RigidTransform(), shape, "box", friction)
+    plant.Finalize()
+    simulator = Simulator(builder.Build())
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    for leg in LEGS:
+        plant.GetJointByName(f"motor_{leg}").Lock(context)
+    plate = plant.GetBodyByName("plate")
+    home = plate.EvalPoseInWorld(context).translation()
+    above = deck + thickness / 2 + side / 2
+    plant.SetFreeBodyPose(context, box, RigidTransform(home + [0, 0, above + 0.02]))
+    plant.get_actuation_input_port().FixValue(context, np.zeros(6))
+    simulator.AdvanceTo(2.0)
+    where = plate.EvalPoseInWorld(context).translation()
+    np.testing.assert_allclose(where, home, atol=1e-3 * radius)  # it is held
+    found = box.EvalPoseInWorld(context).translation() - where
+    np.testing.assert_allclose(found, [0, 0, above], atol=1e-2 * side)
+    contacts = plant.get_contact_results_output_port().Eval(context)
+    touching = {
+        plant.get_body(index).name()
+        for i in range(contacts.num_point_pair_contacts())
+        for index in (
+            contacts.point_pair_contact_info(i).bodyA_index(),
+            contacts.point_pair_contact_info(i).bodyB_index(),
+        )
+    }
+    assert touching <= {"box", "plate"}  # nothing of the machine touches itself
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_machine_collides_with_everything_but_itself(seed: int) -> None:
+    machine = any_machine(seed)
+    _, plant, scene_graph = scene([to_sdformat(machine)])
+    plant.Finalize()
+    assert scene_graph.model_inspector().GetCollisionCandidates() == set()
+
+    pair = [to_sdformat(dataclasses.replace(machine, name=name)) for name in ("left", "right")]
+    _, plant, scene_graph = scene(pair)
+    plant.Finalize()
+    inspector = scene_graph.model_inspector()
+    models = [plant.GetModelInstanceByName(name) for name in ("left", "right")]
+    candidates = set()
+    for pairs in inspector.GetCollisionCandidates():
+        bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(shape)) for shape in pairs]
+        assert sorted(body.model_instance() for body in bodies) == models
+        candidates.add(frozenset(body.name() for body in bodies))
+    links = ["base", "plate", *(f"{part}_{leg}" for part in ("crank", "rod") for leg in LEGS)]
+    # Every link can touch every other link of the neighbour; but bases are both fixed to the world.
+    expected = {frozenset([a, b]) for a in links for b in links} - {frozenset(["base"])}
+    assert candidates == expected
+
+
+def test_what_collides_is_what_is_seen() -> None:
+    root = ElementTree.fromstring(to_sdformat(PAPER))
+    for link in root.iter("link"):
+        shapes = link.findall("collision")
+        assert shapes
+        for shape in shapes:
+            seen = link.find(f"visual[@name='{shape.get('name')}']")
+            assert seen is not None
+            assert seen.findtext("pose") == shape.findtext("pose")
+            sizes = [list(x.find("geometry").itertext()) for x in (seen, shape)]
+            kinds = [[e.tag for e in x.find("geometry").iter()] for x in (seen, shape)]
+            assert kinds[0] == kinds[1] and "".join(sizes[0]).split() == "".join(sizes[1]).split()
+    bare = to_sdformat(PAPER, collision=False)
+    assert "collision" not in bare and "visual" in bare
+
+
+def test_shapes_change_no_run_of_the_machine_alone() -> None:
+    """To the last bit, through a motion in which cranks and rods of the pairs cross."""
+    torque = 1e-3 * np.array([1, -1, 1, -1, 1, -1])
+    states = []
+    for collision in (False, True):
+        builder, plant, _ = scene([])
+        add_mechanism(plant, PAPER, gravity=False, collision=collision)
+        simulator = Simulator(builder.Build())
+        context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+        set_pose(plant, context, PAPER, PAPER.home, np.zeros(6))
+        plant.get_actuation_input_port().FixValue(context, torque)
+        simulator.AdvanceTo(0.3)
+        states.append(plant.GetPositionsAndVelocities(context))
+    np.testing.assert_array_equal(*states)
 
 
 # ------------------------------------------------------------------ Drake's viewer

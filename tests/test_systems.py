@@ -18,9 +18,11 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
-from stewart_drake.design.control_law import DelayLqi
-from stewart_drake.diagram import ClosedLoop, MultibodyStewart, build_closed_loop
+from stewart_drake.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.experiment import control_law, prepare
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.predictive_lqi import PredictiveLqi, Preview
+from stewart_drake.multibody_stewart import MultibodyStewart
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.exact import ExactPlant
 from stewart_drake.scenario_loading import load_scenario
@@ -287,7 +289,7 @@ def test_torques_reach_the_multibody_plant_in_their_own_steps(steps: int, fracti
 
 
 @functools.cache
-def law() -> DelayLqi:
+def law() -> PredictiveLqi:
     settings = ["start=on_reference", "duration=1.0", "delay.steps=2"]
     return control_law(prepare(load_scenario("paper", settings=settings)))[0]
 
@@ -299,6 +301,8 @@ def test_controller_topology_and_initial_state() -> None:
     assert inputs == {"measurement": 12, "preview": 18 * len(law().preview_times), "weights": 2}
     assert outputs == {
         "torque": 6,
+        "measurement_used": 12,
+        "state_estimate": 12,
         "torque_commanded": 6,
         "integral": 6,
         "weights_used": 2,
@@ -344,9 +348,9 @@ def test_controller_output_and_forced_update_are_steps_of_the_law() -> None:
     inputs = fixed(controller, context)
     expected = law().initial_memory(np.zeros((2, 6)))
     for _ in range(3):
-        expected = law().step(
-            expected, inputs["measurement"], inputs["preview"].reshape(-1, 18), inputs["weights"]
-        )
+        preview = Preview(law().preview_times, inputs["preview"].reshape(-1, 18))
+        measurement = Measurement.of(inputs["measurement"])
+        expected = law().step(expected, measurement, preview, inputs["weights"])
         held = controller.GetOutputPort("torque_commanded").Eval(context).copy()
         torque = controller.GetOutputPort("torque").Eval(context)
         assert np.array_equal(torque, expected.torque)
@@ -356,8 +360,8 @@ def test_controller_output_and_forced_update_are_steps_of_the_law() -> None:
             ("torque_commanded", expected.torque),
             ("integral", expected.integral),
             ("weights_used", inputs["weights"]),
-            ("parameters", expected.estimate.parameters),
-            ("parameter_std", expected.estimate.parameter_std),
+            ("parameters", expected.belief.parameters),
+            ("parameter_std", expected.belief.estimate.parameter_std),
         ):
             assert np.array_equal(controller.GetOutputPort(name).Eval(context), value)
 
@@ -372,7 +376,7 @@ def short_loop(plant: str, *settings: str) -> ClosedLoop:
 def test_the_law_is_evaluated_once_per_sample(
     fraction: float, plant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    step, calls = DelayLqi.step, []
+    step, calls = PredictiveLqi.step, []
 
     def counted(self, memory, *inputs):  # type: ignore[no-untyped-def]
         calls.append(memory)
@@ -380,7 +384,7 @@ def test_the_law_is_evaluated_once_per_sample(
 
     loop = short_loop(plant, f"delay.fraction={fraction}", "delay.steps=1")
     simulator = make_simulator(loop)
-    monkeypatch.setattr(DelayLqi, "step", counted)
+    monkeypatch.setattr(PredictiveLqi, "step", counted)
     for samples, until in ((1, 0.05), (2, 0.15), (6, 0.55)):
         simulator.AdvanceTo(until)
         for name in ("torque_commanded", "torque_applied", "integral", "parameters"):

@@ -45,15 +45,17 @@ def toy_data(cells=8, seed=0):
     return xr.Dataset(
         {
             "samples": (("run", "sample", "input"), samples),
+            "density": (("run", "sample", "input"), samples),
             "valid": (("run", "sample"), np.isfinite(samples).all(axis=2)),
             "weights": (("run", "weight"), np.column_stack([q, r])),
-            "delay_steps": ("run", cell),
+            "delay_steps": ("run", cell.astype(int)),
             "frequency": ("run", np.ones(number)),
             "disturbance": ("run", np.full(number, -1)),
             "status": ("run", np.where(np.isnan(error), "left_workspace", "completed")),
+            "stopped": ("run", np.where(np.isnan(error), 1.0, np.nan)),
             **dict.fromkeys(NUMBERS, ("run", error)),
         },
-        {"input": list(TUNER_INPUTS)},
+        {"input": list(TUNER_INPUTS), "run": np.arange(number)},
         {"settings": json.dumps({"data": "toy"})},
     )
 

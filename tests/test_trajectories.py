@@ -3,19 +3,21 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from pydantic.dataclasses import dataclass
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
-from stewart_drake.config import ReferenceConfig
 from stewart_drake.errors import ConfigError
+from stewart_drake.field_types import STRICT
+from stewart_drake.reference_config import CsvConfig, HoldConfig, SineConfig, WaypointsConfig
 from stewart_drake.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.trajectories import (
-    angular_frequency,
     catch_up,
     evaluate,
     make_reference,
@@ -27,17 +29,16 @@ Array = NDArray[np.float64]
 
 HOME = [0.0, 0.0, 0.0, 0.0, 0.0, 0.38]
 HEADER = "time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]"
-WAYPOINTS = ReferenceConfig(
-    kind="waypoints",
+WAYPOINTS = WaypointsConfig(
     times=[0.5, 1.0, 2.5, 3.0],
     poses=[HOME, [0.1, 0.2, -0.1, 0.01, 0, 0.4], [0, 0.1, 0, 0, 0.02, 0.38], HOME],
 )
 
 
-def sample_csv(path: Path, times: Array, motion: Callable[[float], Array]) -> ReferenceConfig:
+def sample_csv(path: Path, times: Array, motion: Callable[[float], Array]) -> CsvConfig:
     rows = [",".join(repr(float(v)) for v in [t, *motion(t)]) for t in times]
     path.write_text("\n".join([HEADER, *rows, ""]))
-    return ReferenceConfig(kind="csv", file=str(path))
+    return CsvConfig(file=str(path))
 
 
 def assert_derivatives_agree(trajectory: Trajectory, t: float) -> None:
@@ -62,8 +63,28 @@ def assert_smooth(trajectory: Trajectory, knots: list[float], atol: float = 1e-4
 # Sine and hold
 
 
+@dataclass(config=STRICT)
+class RampConfig:
+    """A kind of reference that the package does not have."""
+
+    kind: Literal["ramp"] = "ramp"
+    rate: float = 0.01
+
+
+def test_a_kind_of_reference_is_a_class_and_how_to_make_its_motion() -> None:
+    @make_reference.register
+    def _ramp(config: RampConfig, duration: float) -> Trajectory:
+        poses = np.column_stack([[0.0] * 6, [0.0] * 5 + [config.rate]])
+        return PiecewisePolynomial.FirstOrderHold([0.0, 1.0], poses)
+
+    ramp = RampConfig(rate=0.02)
+    assert peak_to_peak(ramp, make_reference(ramp, 0.5), 0.5) == pytest.approx([0] * 5 + [0.01])
+    with pytest.raises(TypeError, match="got a str"):
+        make_reference("sine", 1.0)
+
+
 def test_the_sine_is_the_papers_equation_46() -> None:
-    trajectory = make_reference(ReferenceConfig(), 10.0)
+    trajectory = make_reference(SineConfig(), 10.0)
     amplitude = np.array([0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08])
     for t in (0.0, 0.7, math.pi / 2, 123.4):
         expected = [
@@ -84,10 +105,10 @@ def test_the_sine_is_the_papers_equation_46() -> None:
 def test_the_derivatives_of_a_sine_are_exact(
     frequency: float, unit: str, amplitude: list[float], t: float
 ) -> None:
-    config = ReferenceConfig(amplitude=amplitude, frequency=frequency, frequency_unit=unit)  # type: ignore[arg-type]
+    config = SineConfig(amplitude=amplitude, frequency=frequency, frequency_unit=unit)  # type: ignore[arg-type]
     trajectory = make_reference(config, 10.0)
     assert_derivatives_agree(trajectory, t)
-    omega = angular_frequency(config)
+    omega = config.angular_frequency
     assert omega == pytest.approx(frequency * (2 * math.pi if unit == "Hz" else 1))
     third = trajectory.MakeDerivative(3).value(t)[:, 0]
     np.testing.assert_allclose(
@@ -96,7 +117,7 @@ def test_the_derivatives_of_a_sine_are_exact(
 
 
 def test_a_hold_stands_still_for_ever() -> None:
-    trajectory = make_reference(ReferenceConfig(kind="hold", offset=HOME), 10.0)
+    trajectory = make_reference(HoldConfig(offset=HOME), 10.0)
     for t in (0.0, 3.0, 1e6):
         np.testing.assert_array_equal(evaluate(trajectory, t), HOME + [0.0] * 12)
 
@@ -124,7 +145,7 @@ def test_waypoints_are_joined_with_continuous_acceleration(
 ) -> None:
     times = [float(t) for t in start + np.cumsum([0.0, *gaps])]
     poses = [[v, -v, v, v / 10, 0.0, 0.38] for v in values[: len(times)]]
-    config = ReferenceConfig(kind="waypoints", times=times, poses=poses)
+    config = WaypointsConfig(times=times, poses=poses)
     trajectory = make_reference(config, 10.0)
     assert_smooth(trajectory, [t for t in times if t > 0])
     for middle in (np.array(times[1:]) + times[:-1]) / 2:
@@ -132,7 +153,7 @@ def test_waypoints_are_joined_with_continuous_acceleration(
 
 
 def test_two_waypoints_are_the_minimum_jerk_motion() -> None:
-    config = ReferenceConfig(kind="waypoints", times=[0.0, 2.0], poses=[[0.0] * 6, [0.4] * 6])
+    config = WaypointsConfig(times=[0.0, 2.0], poses=[[0.0] * 6, [0.4] * 6])
     trajectory = make_reference(config, 2.0)
     for s in np.linspace(0, 1, 11):
         expected = 0.4 * (10 * s**3 - 15 * s**4 + 6 * s**5)
@@ -141,9 +162,7 @@ def test_two_waypoints_are_the_minimum_jerk_motion() -> None:
 
 def test_the_plate_dwells_between_two_equal_waypoints() -> None:
     there = [0.1, 0.0, 0.0, 0.0, 0.0, 0.4]
-    config = ReferenceConfig(
-        kind="waypoints", times=[0.0, 1.0, 2.0, 3.0], poses=[HOME, there, there, HOME]
-    )
+    config = WaypointsConfig(times=[0.0, 1.0, 2.0, 3.0], poses=[HOME, there, there, HOME])
     trajectory = make_reference(config, 3.0)
     for t in (1.0, 1.3, 1.9, 2.0):
         np.testing.assert_allclose(evaluate(trajectory, t), there + [0.0] * 12, atol=1e-13)
@@ -153,7 +172,7 @@ def test_waypoints_from_a_file_are_the_same(tmp_path: Path) -> None:
     path = tmp_path / "poses.yaml"
     path.write_text(f"times: {WAYPOINTS.times}\nposes: {WAYPOINTS.poses}\n")
     inline = make_reference(WAYPOINTS, 10.0)
-    from_file = make_reference(ReferenceConfig(kind="waypoints", file=str(path)), 10.0)
+    from_file = make_reference(WaypointsConfig(file=str(path)), 10.0)
     for t in np.linspace(0, 4, 41):
         np.testing.assert_array_equal(evaluate(from_file, t), evaluate(inline, t))
 
@@ -174,8 +193,8 @@ def test_bad_waypoints_are_refused(
     path = tmp_path / "poses.yaml"
     path.write_text(f"times: {times}\nposes: {poses}\n")
     for config, where in [
-        (ReferenceConfig(kind="waypoints", times=times, poses=poses), "reference."),
-        (ReferenceConfig(kind="waypoints", file=str(path)), f"{path}: "),
+        (WaypointsConfig(times=times, poses=poses), "reference."),
+        (WaypointsConfig(file=str(path)), f"{path}: "),
     ]:
         with pytest.raises(ConfigError) as caught:
             make_reference(config, 10.0)
@@ -189,14 +208,14 @@ def test_bad_waypoints_are_refused(
 
 
 def sine_pose(t: float) -> Array:
-    return evaluate(make_reference(ReferenceConfig(), 10.0), t)[POSE]
+    return evaluate(make_reference(SineConfig(), 10.0), t)[POSE]
 
 
 def test_a_sampled_sine_is_the_sine(tmp_path: Path) -> None:
     """Also at t = 0, where it moves already."""
     config = sample_csv(tmp_path / "a.csv", np.linspace(0, 10, 1001), sine_pose)
     sampled = make_reference(config, 10.0)
-    exact = make_reference(ReferenceConfig(), 10.0)
+    exact = make_reference(SineConfig(), 10.0)
     for t in np.linspace(0, 9.999, 301):
         error = np.abs(evaluate(sampled, t) - evaluate(exact, t))
         assert error[POSE].max() < 1e-9
@@ -222,7 +241,7 @@ def test_units_and_the_order_of_columns_are_read_from_the_header(tmp_path: Path)
     rows = [f"{380 + t},{t},0,10,20,30,{t}" for t in range(5)]
     header = "\ufeff Z [mm], Time[s],roll[deg],pitch[deg],yaw[deg],x[mm],y[m]"
     path.write_text("\n".join([header, *rows, "", " , ", ""]), encoding="utf-8")
-    trajectory = make_reference(ReferenceConfig(kind="csv", file=str(path)), 4.0)
+    trajectory = make_reference(CsvConfig(file=str(path)), 4.0)
     expected = [0, math.radians(10), math.radians(20), 0.03, 2, 0.382]
     np.testing.assert_allclose(evaluate(trajectory, 2.0)[POSE], expected, atol=1e-12)
 
@@ -266,6 +285,18 @@ BAD_CSV = {
     "time back": (changed(2, "-1,0,0,0,0,0,0.38"), ["row 4", "time[s]", "-1.0 after 0.1"]),
     "gap": (changed(5, "9,0,0,0,0,0,0.38"), ["row 7", "time[s]", "8.6 s", "resampling"]),
     "pitch in degrees": (changed(1, "0.1,0,5,0,0,0,0.38"), ["row 3", "pitch[rad]", "90 degrees"]),
+    "pitch of 95 degrees": (
+        changed(1, "0.1,0,95,0,0,0,0.38").replace("pitch[rad]", "pitch[deg]"),
+        ["row 3", "pitch[deg]: got 95 deg; expected a pitch within 90 deg"],
+    ),
+    "yaw jumps in degrees": (
+        changed(1, "0.1,0,0,355,0,0,0.38").replace("yaw[rad]", "yaw[deg]"),
+        ["row 3", "yaw[deg]: got 355 deg after 0; expected no jump by a turn"],
+    ),
+    "far in millimetres": (
+        changed(1, "0.1,0,0,0,0,0,-2e6").replace("z[m]", "z[mm]"),
+        ["row 3", "z[mm]: got -2000000.0; expected a finite number below 1e+06 mm"],
+    ),
     "yaw jumps": (changed(1, "0.1,0,0,6.2,0,0,0.38"), ["row 3", "yaw[rad]", "unwrap"]),
     "open quote": (changed(1, '"0.1,0,0,0,0,0,0.38'), ["row 7", "is not CSV"]),
     "moving end": (MOVING, ["last row", " x at 0.5 s", "duration"]),
@@ -299,7 +330,7 @@ def test_a_bad_csv_file_is_refused_in_one_line(case: str, tmp_path: Path) -> Non
     path = tmp_path / "a.csv"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
-        make_reference(ReferenceConfig(kind="csv", file=str(path)), 10.0)
+        make_reference(CsvConfig(file=str(path)), 10.0)
     message = str(caught.value)
     assert len(message.splitlines()) == 1
     assert message.startswith(f"{path}: ")
@@ -334,7 +365,7 @@ def test_what_is_no_csv_file_is_refused(tmp_path: Path) -> None:
     binary.write_bytes(b"\xff\xfe\x00")
     for path in (binary, tmp_path, tmp_path / "none.csv"):
         with pytest.raises(ConfigError, match=f"^{path}: "):
-            make_reference(ReferenceConfig(kind="csv", file=str(path)), 10.0)
+            make_reference(CsvConfig(file=str(path)), 10.0)
 
 
 @given(text=st.text(alphabet='0123456789.,-enaif"\n\r\0 ', max_size=200) | st.binary(max_size=60))
@@ -346,7 +377,7 @@ def test_any_samples_are_a_reference_or_are_refused(
     body = text if isinstance(text, bytes) else text.encode()
     path.write_bytes(HEADER.encode() + b"\n" + body)
     try:
-        trajectory = make_reference(ReferenceConfig(kind="csv", file=str(path)), 10.0)
+        trajectory = make_reference(CsvConfig(file=str(path)), 10.0)
     except ConfigError as error:
         assert len(str(error).splitlines()) == 1
     else:
@@ -357,15 +388,15 @@ def test_any_samples_are_a_reference_or_are_refused(
 
 
 def test_the_peak_to_peak_of_a_sine_is_twice_its_amplitude_however_short_the_run() -> None:
-    config = ReferenceConfig(amplitude=[0.1, -0.2, 0.0, 0.01, 0.0, 0.02], frequency=1e-3)
+    config = SineConfig(amplitude=[0.1, -0.2, 0.0, 0.01, 0.0, 0.02], frequency=1e-3)
     span = peak_to_peak(config, make_reference(config, 0.1), 0.1)
     np.testing.assert_allclose(span, [0.2, 0.4, 0, 0.02, 0, 0.04])
 
 
 def test_the_peak_to_peak_of_a_constant_is_zero() -> None:
-    config = ReferenceConfig(kind="hold")
+    config = HoldConfig()
     np.testing.assert_array_equal(peak_to_peak(config, make_reference(config, 5.0), 5.0), [0] * 6)
-    still = ReferenceConfig(kind="waypoints", times=[0, 1, 3], poses=[[0.3] * 6] * 3)
+    still = WaypointsConfig(times=[0, 1, 3], poses=[[0.3] * 6] * 3)
     np.testing.assert_array_equal(peak_to_peak(still, make_reference(still, 5.0), 5.0), [0] * 6)
 
 
@@ -412,7 +443,7 @@ def test_a_catch_up_leaves_the_start_and_joins_the_reference_smoothly(
     t_start: float, duration: float, start: list[float]
 ) -> None:
     pose, rates = np.array(start[:6]), np.array(start[6:])
-    reference = make_reference(ReferenceConfig(), 10.0)
+    reference = make_reference(SineConfig(), 10.0)
     blend = catch_up(pose, rates, reference, t_start, duration)
     t_end = t_start + duration
     for t in (0.0, t_start / 2, t_start):
@@ -425,7 +456,7 @@ def test_a_catch_up_leaves_the_start_and_joins_the_reference_smoothly(
 
 
 def test_a_catch_up_from_the_first_microsecond_is_one_from_zero() -> None:
-    reference = make_reference(ReferenceConfig(), 10.0)
+    reference = make_reference(SineConfig(), 10.0)
     at_zero, late = (catch_up(HOME, [0.1] * 6, reference, t, 0.5) for t in (0.0, 1e-300))
     for t in (0.0, 0.2, 0.6):
         np.testing.assert_array_equal(evaluate(late, t), evaluate(at_zero, t))
@@ -454,4 +485,4 @@ def test_a_catch_up_refuses_what_has_no_blend(
     pose: list[float], t_start: float, duration: float
 ) -> None:
     with pytest.raises(ValueError, match="expected"):
-        catch_up(pose, [0.0] * 6, make_reference(ReferenceConfig(), 1.0), t_start, duration)
+        catch_up(pose, [0.0] * 6, make_reference(SineConfig(), 1.0), t_start, duration)

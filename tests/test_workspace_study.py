@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from stewart_drake.cli import main
-from stewart_drake.config import ReferenceConfig, Scenario
+from stewart_drake.config import Scenario
 from stewart_drake.errors import ConfigError
 from stewart_drake.experiment import assemble, check_instants, prepare, reference_failure
 from stewart_drake.mechanism.files import load_mechanism
@@ -22,10 +22,12 @@ from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rot
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.equations import DEAD_CENTRE_SINE
 from stewart_drake.plant.workspace import SINGULARITY_LIMIT, margin, standing
+from stewart_drake.reference_config import HoldConfig, SineConfig
 from stewart_drake.resources import shipped
 from stewart_drake.scenario_loading import load_scenario
 from stewart_drake.studies.reach import (
     LARGEST_FACTOR,
+    Factor,
     first_exit,
     largest_factor,
     margins_along,
@@ -45,7 +47,7 @@ seeded = settings(max_examples=30, deadline=None, derandomize=True)
 
 def heave(amplitude: float, frequency: float = 1.0, pose: Array = PAPER.home) -> Scenario:
     """The paper's scenario, but up and down only."""
-    sine = ReferenceConfig(
+    sine = SineConfig(
         amplitude=[0.0] * 5 + [amplitude], offset=list(map(float, pose)), frequency=frequency
     )
     return dataclasses.replace(load_scenario("paper"), reference=sine)
@@ -245,7 +247,8 @@ def test_every_shipped_reference_fits_and_so_does_its_largest_scaling(name: str)
 @pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
 def test_the_table_in_the_theory_is_what_comes_out(name: str) -> None:
     text = (Path(__file__).parents[1] / "docs" / "theory.md").read_text(encoding="utf-8")
-    (row,) = re.findall(rf"^\| `{name}`.*\|$", text, re.MULTILINE)
+    section = text[text.index("largest amplitude factor") :]
+    row = re.findall(rf"^\| `{name}`.*\|$", section, re.MULTILINE)[0]
     numbers = [float(n) for n in re.findall(r"-?\d+\.?\d*", row.replace("−", "-").split("|", 2)[2])]
     experiment = assemble(load_scenario(name))
     mechanism, time = experiment.mechanism, check_instants(experiment.scenario.duration)
@@ -264,10 +267,10 @@ def test_the_table_in_the_theory_is_what_comes_out(name: str) -> None:
 
 def test_factors_at_the_ends_of_what_can_be() -> None:
     time = check_instants(2.0)
-    still = make_reference(ReferenceConfig(kind="hold", offset=list(PAPER.home)), 2.0)
+    still = make_reference(HoldConfig(offset=list(PAPER.home)), 2.0)
     assert math.isnan(largest_factor(PAPER, still, time).value)
     outside = list(map(float, PAPER.home + [0, 0, 0, 0, 0, 0.3]))
-    gone = make_reference(ReferenceConfig(kind="hold", offset=outside), 2.0)
+    gone = make_reference(HoldConfig(offset=outside), 2.0)
     assert largest_factor(PAPER, gone, time) == (0.0, True)
     tiny = make_reference(heave(0.001).reference, 2.0)
     assert largest_factor(PAPER, tiny, time) == (LARGEST_FACTOR, False)
@@ -280,7 +283,7 @@ def test_factors_at_the_ends_of_what_can_be() -> None:
 
 def test_motors_at_rest_hold_the_equilibrium() -> None:
     dynamics = StewartDynamics(PAPER, gravity=True)
-    still = make_reference(ReferenceConfig(kind="hold", offset=list(PAPER.home)), 1.0)
+    still = make_reference(HoldConfig(offset=list(PAPER.home)), 1.0)
     sizing = size_motors(dynamics, still, check_instants(0.1))
     np.testing.assert_allclose(
         sizing.torque, dynamics.equilibrium_torque(PAPER.home)[None] + 0 * sizing.torque
@@ -331,8 +334,20 @@ def test_the_command_writes_a_table_a_page_and_a_summary(
     assert [leg["leg"] for leg in summary["legs"]] == [1, 2, 3, 4, 5, 6]
     assert summary["torque_limit"] == 0.4 and summary["scenario"]["mechanism"] == "desktop"
     page = (tmp_path / "report.html").read_text()
+    told = re.findall(r"amplitude that fits is ([\d.]+) times|<dd>([\d.]+) of this one", page)
+    assert len(told) == 2 and len({"".join(pair) for pair in told}) == 1, (
+        "one number, rounded twice"
+    )
+    rounded = float("".join(told[0]))
+    assert rounded <= summary["largest_factor"] < rounded + 1e-3
     assert "Workspace of desktop" in page and page.count("<img") == 3
     assert "stewart-drake analyze workspace desktop" in page
+
+
+def test_the_largest_amplitude_is_rounded_to_one_that_fits() -> None:
+    assert [Factor(x, True).told for x in (1.0739, 1.0731, 0.9999, 2.0)] == [
+        "1.073", "1.073", "0.999", "2",
+    ]  # fmt: skip
 
 
 @pytest.mark.usefixtures("quick")

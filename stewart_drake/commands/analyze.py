@@ -20,11 +20,13 @@ from stewart_drake.commands.common import (
     Settings,
     Workers,
     check_writable,
+    drawing,
     print_json,
     remove,
     silence,
 )
-from stewart_drake.report.terminal import count_bar, echo
+from stewart_drake.report.terminal import count_bar, echo, working
+from stewart_drake.studies.range_units import RANGE_UNITS
 
 if TYPE_CHECKING:
     from stewart_drake.report.page import Page, Provenance
@@ -49,7 +51,8 @@ def hautus(
 
     check_writable(out)
     started = time.perf_counter()
-    study = study_hautus(load_scenario(scenario, settings=settings or ()))
+    with working("hautus", quiet):
+        study = study_hautus(load_scenario(scenario, settings=settings or ()))
     made = provenance("hautus", scenario, None, settings, out, started)
     return deliver(
         study.summary,
@@ -110,7 +113,8 @@ def workspace(
 
     check_writable(out)
     started = time.perf_counter()
-    study = study_workspace(load_scenario(scenario, settings=settings or ()))
+    with working("workspace", quiet):
+        study = study_workspace(load_scenario(scenario, settings=settings or ()))
     made = provenance("workspace", scenario, None, settings, out, started)
     return deliver(
         study.summary,
@@ -122,19 +126,23 @@ def workspace(
     )
 
 
+Vary = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=VALUE",
+        help="How far off, 0: not at all. Repeatable. "
+        + "; ".join(f"{name}: {unit}" for name, unit in RANGE_UNITS.items())
+        + ". torque_limit takes null too: as the scenario has it.",
+    ),
+]
+
+
 @app.command()
 def robustness(
     scenario: ScenarioName = "paper",
     controller: Controller = None,
     settings: Settings = None,
-    vary: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="How far off: payload, torque_bias, noise, torque_limit, damping, delay, "
-            "delay_steps, lengths, anchors; 0: not at all. Repeatable.",
-        ),
-    ] = None,
+    vary: Vary = None,
     runs: Annotated[int, typer.Option(metavar="N", help="How many machines to draw.")] = 200,
     seed: Seed = 0,
     limit: Annotated[
@@ -241,14 +249,18 @@ def deliver(
     say = silence if quiet or as_json else echo
     say(table)
     if out is not None:
-        from stewart_drake.report.page import write_page
-        from stewart_drake.results import write_json
+        from stewart_drake.jsonio import write_json
 
-        # The summary comes last: where there is one, the page beside it is of the same run.
-        remove(out, ["summary.json"])
-        write_page(page(), out / PAGE)
+        # No page of an earlier run beside this one's numbers, which come first.
+        remove(out, ["summary.json", PAGE])
         write_json(out / "summary.json", summary)
-        say(f"written to {out}: {', '.join(('summary.json', PAGE, *beside))}")
+        written = ["summary.json"]
+        with drawing(PAGE):
+            from stewart_drake.report.page import write_page
+
+            write_page(page(), out / PAGE)
+            written.append(PAGE)
+        say(f"written to {out}: {', '.join((*written, *beside))}")
     if as_json:
         print_json(summary)
     return INTERRUPTED if interrupted else 0

@@ -5,13 +5,15 @@ import fcntl
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from stewart_drake.errors import ConfigError
+from stewart_drake.fileio import remove_partials
+from stewart_drake.report.terminal import echo
 
 if TYPE_CHECKING:
     from stewart_drake.resources import Kind
@@ -81,7 +83,7 @@ def silence(text: str) -> None:
 
 def print_json(summary: dict[str, Any]) -> None:
     """Print a summary as JSON, NaN as null."""
-    from stewart_drake.results import jsonable
+    from stewart_drake.jsonio import jsonable
 
     typer.echo(json.dumps(jsonable(summary), indent=2, allow_nan=False))
 
@@ -109,6 +111,7 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
             lock = os.open(directory, os.O_RDONLY)
             _held.callback(os.close, lock)
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        remove_partials(directory)
     except BlockingIOError:
         raise ConfigError(
             f"--out: got {str(directory)!r}, where another command is writing; wait for it to end, "
@@ -125,10 +128,11 @@ def check_file(path: Path) -> None:
     """Make the directory of a file that `--out` names.
 
     Raises:
-        ConfigError: it is a directory itself, or its own cannot be written to.
+        ConfigError: it is a directory or a device itself, or its own cannot be written to.
     """
-    if path.is_dir():
-        raise ConfigError(f"--out: got {str(path)!r}, a directory; expected a file")
+    if path.exists() and not path.is_file():
+        kind = "a directory" if path.is_dir() else "no regular file"
+        raise ConfigError(f"--out: got {str(path)!r}, {kind}; expected a file")
     check_writable(path.parent, alone=False)
 
 
@@ -147,6 +151,21 @@ def remove(directory: Path, names: Iterable[str]) -> None:
     """Delete files of an earlier run, as far as they exist."""
     for name in names:
         (directory / name).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def drawing(what: str) -> Iterator[None]:
+    """What is drawn in here comes after the results; a failure costs it alone, and is told.
+
+    A file that cannot be written, as on a full disk, is an error as everywhere.
+    """
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        echo(f"warning: {what} could not be drawn ({reason}); everything else is kept", error=True)
 
 
 def open_meshcat() -> Any:

@@ -11,6 +11,7 @@ from stewart_drake.commands.common import (
     Quiet,
     check_file,
     check_writable,
+    drawing,
     open_meshcat,
     print_json,
     remove,
@@ -62,13 +63,18 @@ def check(
     found = check_mechanism(load_mechanism(mechanism))
     say(mechanism_table(found))
     if out is not None:
-        from stewart_drake.report.mechanism_figures import write_mechanism_figure
-        from stewart_drake.results import write_json
+        from stewart_drake.jsonio import write_json
 
-        remove(out, ["summary.json"])
-        write_mechanism_figure(found.mechanism, out)
+        pictures = ("mechanism.png", "mechanism.svg")
+        remove(out, ["summary.json", *pictures])
         write_json(out / "summary.json", found.summary)
-        say(f"written to {out}: summary.json, mechanism.png, mechanism.svg")
+        written = ["summary.json"]
+        with drawing("mechanism"):
+            from stewart_drake.report.mechanism_figures import write_mechanism_figure
+
+            write_mechanism_figure(found.mechanism, out)
+            written += pictures
+        say(f"written to {out}: {', '.join(written)}")
     if as_json:
         print_json(found.summary)
 

@@ -1,6 +1,8 @@
 """Running scenarios: simulate, compare, export."""
 
+import select
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -16,6 +18,7 @@ from stewart_drake.commands.common import (
     Settings,
     check_file,
     check_writable,
+    drawing,
     open_meshcat,
     print_json,
     remove,
@@ -25,11 +28,23 @@ from stewart_drake.errors import ConfigError
 from stewart_drake.report.terminal import echo, progress_bars
 
 if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
+
     from stewart_drake.mechanism.geometry import Mechanism
     from stewart_drake.results import SimulationResult
 
 CSV: Final = "signals.csv"
 REPLAY: Final = "replay.html"
+RUN_FIGURES: Final = ("states", "errors", "torques", "parameters", "weights")
+"""All that `run_figures` may write, and below `comparison_figures`; what is older is removed."""
+COMPARISON_FIGURES: Final = (
+    "states",
+    "errors",
+    "weights",
+    *(f"torques_{name}" for name in ("delay_lqr", "delay_lqi", "predictor_lqi")),
+)
+_POLL: Final = 0.1
+"""s between two looks whether somebody watches."""
 
 
 def simulate(
@@ -48,11 +63,13 @@ def simulate(
     ] = False,
 ) -> int:
     """Run one scenario."""
+    from stewart_drake.cautions import cautions_before
+    from stewart_drake.controller_margin import controller_margin
     from stewart_drake.experiment import prepare
-    from stewart_drake.report.tables import run_table, wrap
+    from stewart_drake.report.tables import run_table, warning_lines, wrap
     from stewart_drake.scenario_loading import load_scenario
     from stewart_drake.simulation import simulate as run
-    from stewart_drake.studies.verdict import delay_verdict
+    from stewart_drake.studies.verdict import Verdict, loop_verdict
 
     for option, given in (("--csv", csv), ("--replay", replay)):
         if given and out is None:
@@ -61,12 +78,16 @@ def simulate(
     experiment = prepare(load_scenario(scenario, controller, settings or ()))
     check_writable(out)
     viewer = open_meshcat() if meshcat else None
-    say(wrap(str(delay_verdict(experiment))))
+    margin = controller_margin(experiment)
+    say(wrap(loop_verdict(margin)))
+    say(wrap(str(Verdict(margin.eta, margin.pole, margin.pole_time))))
+    for line in warning_lines(cautions_before(experiment, margin)):
+        say(line)
     if viewer is not None:
-        say(f"showing it at {viewer.web_url()}")
+        _await_viewer(viewer)
     name = Path(scenario).stem
     with progress_bars([name], experiment.scenario.duration, quiet) as progress:
-        result = run(experiment.scenario, progress=progress[name], meshcat=viewer)
+        result = run(experiment, progress=progress[name], meshcat=viewer, margin=margin)
     say(run_table(result))
     if out is not None:
         written = _write_run(result, experiment.mechanism, out, name, csv, replay or meshcat)
@@ -82,6 +103,18 @@ def simulate(
     return INTERRUPTED if result.status == "interrupted" else 0
 
 
+def _await_viewer(viewer: "Meshcat") -> None:
+    """Tell where to look; a person at a terminal is given the time to open it there."""
+    # A reader needs the address even when everything else is quiet.
+    asked = sys.stdin.isatty()
+    start = ", starts when it is opened there, or with Enter" if asked else ""
+    echo(f"showing it live at {viewer.web_url()}{start}", error=True)
+    while asked and viewer.GetNumActiveConnections() == 0:
+        if select.select([sys.stdin], [], [], _POLL)[0]:
+            sys.stdin.readline()
+            return
+
+
 def _write_run(
     result: "SimulationResult",
     mechanism: "Mechanism",
@@ -91,24 +124,31 @@ def _write_run(
     replay: bool,
 ) -> list[str]:
     """Write what a run leaves behind; what was written, in words."""
-    from stewart_drake.report.figures import run_figures
-
-    # The summary comes last: where there is one, everything beside it is of the same run.
-    remove(out, ["summary.json", CSV, REPLAY])
-    figures = run_figures(result, out)
-    written = ["summary.json", "signals.nc", f"{len(figures)} figures"]
+    # The summary comes last of the results: where there is one, the signals beside it are of the
+    # same run. What is drawn of them comes after that.
+    remove(out, ["summary.json", CSV, REPLAY, *_pictures(RUN_FIGURES)])
+    written = ["summary.json", "signals.nc"]
     if csv:
         from stewart_drake.report.csv_file import write_csv
 
         write_csv(result.signals, out / CSV)
-        written.insert(2, ".csv")
-    if replay:
-        from stewart_drake.report.replay import write_replay
-
-        write_replay(result, mechanism, out / REPLAY, name)
-        written.append(REPLAY)
+        written.append(".csv")
     result.save(out)
+    with drawing("figures"):
+        from stewart_drake.report.figures import run_figures
+
+        written.append(f"{len(run_figures(result, out))} figures")
+    if replay:
+        with drawing(REPLAY):
+            from stewart_drake.report.replay import write_replay
+
+            write_replay(result, mechanism, out / REPLAY, name)
+            written.append(REPLAY)
     return written
+
+
+def _pictures(names: Iterable[str]) -> list[str]:
+    return [f"{name}.{suffix}" for name in names for suffix in ("png", "svg")]
 
 
 def export(
@@ -157,12 +197,15 @@ def compare(
         )
     say(comparison_table(results))
     if out is not None:
-        from stewart_drake.report.figures import comparison_figures
-
-        remove(out, ["summary.json", *(f"{name}.nc" for name in names)])
-        figures = comparison_figures(results, out)
+        stale = ["summary.json", *(f"{name}.nc" for name in names)]
+        remove(out, [*stale, *_pictures(COMPARISON_FIGURES)])
         study.save_comparison(results, out)
-        say(f"written to {out}: summary.json, {len(results)} signal files, {len(figures)} figures")
+        written = f"summary.json, {len(results)} signal files"
+        with drawing("figures"):
+            from stewart_drake.report.figures import comparison_figures
+
+            written += f", {len(comparison_figures(results, out))} figures"
+        say(f"written to {out}: {written}")
     if as_json:
         print_json(study.comparison_summary(results))
     ended = [result.status for result in results.values()]

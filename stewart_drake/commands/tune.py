@@ -18,13 +18,14 @@ from stewart_drake.commands.common import (
     Settings,
     Workers,
     check_writable,
+    drawing,
     print_json,
     remove,
     silence,
 )
 from stewart_drake.config import Scenario
 from stewart_drake.errors import ConfigError
-from stewart_drake.report.terminal import count_bar, echo
+from stewart_drake.report.terminal import count_bar, echo, working
 
 app = typer.Typer(rich_markup_mode=None, help="Data for the neural tuner, its training, its worth.")
 
@@ -71,8 +72,8 @@ def dataset(
     as_json: AsJson = False,
 ) -> int:
     """Run the grid of delays, frequencies and weights, 180 runs."""
+    from stewart_drake.jsonio import write_json
     from stewart_drake.report.tuner_tables import dataset_table
-    from stewart_drake.results import write_json
     from stewart_drake.studies.dataset import make_dataset, summarize
 
     say = silence if quiet or as_json else echo
@@ -118,9 +119,8 @@ def train(
     as_json: AsJson = False,
 ) -> int:
     """Train the network on a data set by Levenberg-Marquardt."""
-    from stewart_drake.report.training_figures import training_figures
+    from stewart_drake.jsonio import write_json
     from stewart_drake.report.tuner_tables import training_table
-    from stewart_drake.results import write_json
     from stewart_drake.studies.dataset import load_dataset
     from stewart_drake.studies.training import summarize
     from stewart_drake.studies.training import train as run
@@ -133,17 +133,24 @@ def train(
     check_writable(folder)
     read = load_dataset(data)
     try:
-        result = run(read, kind=labels.value, split=split.value, density=density.value, seed=seed)
+        with working("training", quiet):
+            result = run(
+                read, kind=labels.value, split=split.value, density=density.value, seed=seed
+            )
     except KeyboardInterrupt:
         echo("stopped; nothing written", error=True)
         return INTERRUPTED
     summary = summarize(result)
     remove(folder, ["summary.json"])
     save_network(result.network, out)
-    figures = training_figures(result, folder)
     write_json(folder / "summary.json", summary)
     say(training_table(summary))
-    say(f"written to {folder}: {out.name}, summary.json, {len(figures)} figures")
+    written = f"{out.name}, summary.json"
+    with drawing("figures"):
+        from stewart_drake.report.training_figures import training_figures
+
+        written += f", {len(training_figures(result, folder))} figures"
+    say(f"written to {folder}: {written}")
     if as_json:
         print_json(summary)
     return 0
@@ -168,8 +175,8 @@ def evaluate(
     as_json: AsJson = False,
 ) -> int:
     """Compare the tuner with every fixed gain on unseen scenarios."""
+    from stewart_drake.jsonio import write_json
     from stewart_drake.report.tuner_tables import evaluation_table
-    from stewart_drake.results import write_json
     from stewart_drake.studies.evaluation import evaluate as run
 
     say = silence if quiet or as_json else echo

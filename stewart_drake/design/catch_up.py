@@ -1,4 +1,4 @@
-"""The way from rest onto a moving reference, planned with torques that are held for a period each.
+"""The way from rest onto a moving reference, planned with torques that are held.
 
 A plan is a sequence of n held torques that takes the nominal plant from its state at the first
 instant a torque can act, exactly onto the reference: 12 equations in 6 n unknowns, n >= 2. Starting
@@ -7,7 +7,9 @@ from the mean torques along a quintic, Newton steps of least norm (a Gauss-Newto
     dT = J^+ (x_reference - x_n(T)),     J = [Phi_n ... Phi_2 Gamma_1, ..., Gamma_n],
 
 change it as little as possible, so that it stays smooth. The controller then follows the response
-to the plan, which held torques can follow without error.
+to the plan, which held torques can follow without error. Each torque is held for one period, and in
+a plan of more than MOST_HOLDS periods for several: that can be followed just as well, and the time
+it takes to plan no longer grows with the number of periods.
 """
 
 import math
@@ -23,10 +25,11 @@ from stewart_drake.design.holds import (
     rates_at_samples,
     torques_at_nodes,
 )
+from stewart_drake.design.startup import sizes
 from stewart_drake.errors import ConfigError
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.workspace import margin
-from stewart_drake.signals import POSE, RATES
+from stewart_drake.signals import NUM_STATE, POSE, RATES
 from stewart_drake.trajectories import Piece, catch_up, evaluate, through_states
 
 Array = NDArray[np.float64]
@@ -36,10 +39,12 @@ DEFAULT_CATCH_UP = 0.3
 LONGEST_CATCH_UP = 10.0
 HEADROOM = 0.95
 """Share of the torque limit that a plan may use; feedback needs the rest."""
+MOST_HOLDS = 100
+"""Torques in a plan."""
 PIECE = 0.025
 """s; longest piece of the planned motion between two states taken from the dynamics."""
 TOLERANCE = 1e-10
-"""rad, m and per s, by which a plan may miss the reference."""
+"""rad, shares of the reach, and per s, by which a plan may miss the reference."""
 
 
 def plan_catch_up(
@@ -74,14 +79,14 @@ def plan_catch_up(
     most = fewest if duration is not None else _periods(LONGEST_CATCH_UP, period)
     limit = math.inf if torque_limit is None or duration is not None else HEADROOM * torque_limit
 
-    def attempt(holds: int) -> Trajectory | None:
-        return _plan(dynamics, reference, start, t_start, period, holds, limit)
+    def attempt(periods: int) -> Trajectory | None:
+        return _plan(dynamics, reference, start, t_start, period, periods, limit)
 
     # What n periods can do, more can do with less torque: double n, then halve the bracket.
-    failed, holds, motion = fewest - 1, fewest, attempt(fewest)
-    while motion is None and holds < most:
-        failed, holds = holds, min(2 * holds, most)
-        motion = attempt(holds)
+    failed, periods, motion = fewest - 1, fewest, attempt(fewest)
+    while motion is None and periods < most:
+        failed, periods = periods, min(2 * periods, most)
+        motion = attempt(periods)
     if motion is None and duration is None:
         return reference, 0.0
     if motion is None:
@@ -89,14 +94,14 @@ def plan_catch_up(
             f"controller.catch_up: got {duration:g} s, with which the plate would leave its "
             "workspace; expected a longer time, or null for the shortest possible"
         )
-    while holds - failed > 1:
-        middle = (failed + holds) // 2
+    while periods - failed > 1:
+        middle = (failed + periods) // 2
         shorter = attempt(middle)
         if shorter is None:
             failed = middle
         else:
-            holds, motion = middle, shorter
-    return motion, holds * period
+            periods, motion = middle, shorter
+    return motion, periods * period
 
 
 def _periods(duration: float, period: float) -> int:
@@ -109,26 +114,28 @@ def _plan(
     start: Array,
     t_start: float,
     period: float,
-    holds: int,
+    periods: int,
     torque_limit: float,
 ) -> Trajectory | None:
-    """The planned motion with so many held torques, or None where there is none."""
-    pieces = math.ceil(period / PIECE)
-    edges = t_start + period * np.arange(holds + 1)
+    """The planned motion over so many periods, or None where there is none."""
+    samples = np.round(np.linspace(0, periods, min(periods, MOST_HOLDS) + 1))
+    edges, holds = t_start + period * samples, period * np.diff(samples)
+    pieces = math.ceil(holds.max() / PIECE)
     target = _target(dynamics, reference, float(edges[-1]), period)
     origin = start[POSE] - t_start * start[RATES]  # where a plate with these rates was at t = 0
-    guess = catch_up(origin, start[RATES], reference, t_start, holds * period)
+    guess = catch_up(origin, start[RATES], reference, t_start, periods * period)
     torques = mean_torques(dynamics, guess, edges[:-1], edges[1:])
+    size = np.tile(sizes(dynamics.mechanism), 2)
     for _ in range(12):
-        states = _response(dynamics, start, torques, period, pieces)
+        states = _response(dynamics, start, torques, holds, pieces)
         if not _inside(dynamics, states):
             return None
-        miss = target - states[-1]
+        miss = (target - states[-1]) / size
         if np.abs(miss).max() <= TOLERANCE:
             if np.abs(torques).max() > torque_limit:
                 return None
-            return _motion(dynamics, reference, states, torques, t_start, period / pieces)
-        J = _sensitivity(dynamics, states, torques, period, pieces)
+            return _motion(dynamics, reference, states, torques, edges)
+        J = _sensitivity(dynamics, states, torques, holds) / size[:, None]
         torques = torques + np.reshape(np.linalg.lstsq(J, miss)[0], torques.shape)
     return None
 
@@ -145,11 +152,11 @@ def _target(dynamics: StewartDynamics, reference: Trajectory, t: float, period: 
 
 
 def _response(
-    dynamics: StewartDynamics, start: Array, torques: Array, period: float, pieces: int
+    dynamics: StewartDynamics, start: Array, torques: Array, holds: Array, pieces: int
 ) -> Array:
-    """States (n pieces + 1, 12) under the held torques (n, 6), the start first."""
+    """States (n pieces + 1, 12) under torques (n, 6) held for `holds` (n,) s, the start first."""
     short = np.repeat(torques, pieces, axis=0)
-    return np.vstack([start, dynamics.predict(start, short, period / pieces)])
+    return np.vstack([start, dynamics.predict(start, short, np.repeat(holds / pieces, pieces))])
 
 
 def _inside(dynamics: StewartDynamics, states: Array) -> bool:
@@ -157,34 +164,32 @@ def _inside(dynamics: StewartDynamics, states: Array) -> bool:
     return all(margin(mechanism, state[POSE]) > 0 for state in states)
 
 
-def _sensitivity(
-    dynamics: StewartDynamics, states: Array, torques: Array, period: float, pieces: int
-) -> Array:
+def _sensitivity(dynamics: StewartDynamics, states: Array, torques: Array, holds: Array) -> Array:
     """J (12, 6 n): last state per torque, linearised half-way through each hold."""
-    columns: list[Array] = []
-    for k, torque in enumerate(torques):
+    pieces = (len(states) - 1) // len(torques)
+    after, columns = np.eye(NUM_STATE), []
+    for k in reversed(range(len(torques))):
         middle = (states[k * pieces] + states[(k + 1) * pieces]) / 2
-        derivatives = dynamics.derivatives(middle[POSE], middle[RATES], torque)
-        Phi, Gamma = sample(derivatives.A, derivatives.B, period)
-        columns = [Phi @ column for column in columns] + [Gamma]
-    return np.hstack(columns)
+        derivatives = dynamics.derivatives(middle[POSE], middle[RATES], torques[k])
+        Phi, Gamma = sample(derivatives.A, derivatives.B, holds[k])
+        columns.append(after @ Gamma)
+        after = after @ Phi
+    return np.hstack(columns[::-1])
 
 
 def _motion(
-    dynamics: StewartDynamics,
-    reference: Trajectory,
-    states: Array,
-    torques: Array,
-    t_start: float,
-    step: float,
+    dynamics: StewartDynamics, reference: Trajectory, states: Array, torques: Array, edges: Array
 ) -> Trajectory:
     pieces: list[Piece] = []
     per_hold = (len(states) - 1) // len(torques)
+    times = np.append(
+        np.linspace(edges[:-1], edges[1:], per_hold, endpoint=False, axis=1), edges[-1]
+    )
     for i in range(len(states) - 1):
         torque = torques[i // per_hold]
         ends = (
             np.concatenate([x, dynamics.accelerations(x[POSE], x[RATES], torque)])
             for x in states[i : i + 2]
         )
-        pieces.append((t_start + i * step, next(ends), t_start + (i + 1) * step, next(ends)))
+        pieces.append((float(times[i]), next(ends), float(times[i + 1]), next(ends)))
     return through_states(pieces, reference)

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from stewart_drake.delay import Delay
 from stewart_drake.design.error_model import ContinuousModel
-from stewart_drake.signals import queue_length
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class DelayedModel:
     @property
     def queue_length(self) -> int:
         """How many torques are in flight at a sampling instant."""
-        return queue_length(self.steps, self.fraction)
+        return Delay(self.steps, self.fraction).queue_length
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,33 @@ def sample(A: Array, B: Array, duration: float) -> tuple[Array, Array]:
     return exponential[:n, :n], exponential[:n, n:]
 
 
+def sample_in_steps(A: Array, B: Array, duration: float, step: float) -> tuple[Array, Array]:
+    """What `sample` becomes for an engine of fixed steps: semi-implicit Euler, duration/step times.
+
+    With x = [pose error; rate error], of A (2k, 2k) and B (2k, m), one step h takes the rates first
+    and then moves the pose with the new ones,
+
+        v' = v + h (A_v x + B_v u),   p' = p + h v',
+
+    so that the pose of a plate under constant acceleration runs h/2 ahead of the truth.
+    """
+    n, m = B.shape
+    once = np.eye(n + m)
+    once[n // 2 : n, :n] += step * A[n // 2 :]
+    once[n // 2 : n, n:] += step * B[n // 2 :]
+    once[: n // 2] += step * once[n // 2 : n]
+    many = np.linalg.matrix_power(once, round(duration / step))
+    return many[:n, :n], many[:n, n:]
+
+
 def delayed_model(
-    model: ContinuousModel, period: float, steps: int, fraction: float = 0.0, *, integral: bool
+    model: ContinuousModel,
+    period: float,
+    steps: int,
+    fraction: float = 0.0,
+    *,
+    integral: bool,
+    step: float | None = None,
 ) -> DelayedModel:
     """Sample [pose error; rate error] with its delayed torque; append the integral's recurrence.
 
@@ -81,30 +106,34 @@ def delayed_model(
         steps: mu, whole periods of delay.
         fraction: eta0 / dt, in [0, 1).
         integral: append z (p), whose rows the cost sees too (28).
+        step: of an engine that moves the plant by semi-implicit Euler, s, in whole numbers of which
+            period and fraction come; None for the motion itself.
 
     Raises:
         ValueError: a delay or a period that cannot be.
     """
     if not 0 < period < np.inf:
         raise ValueError(f"period: got {period}; expected a positive time in s")
-    if steps < 0 or not 0 <= fraction < 1:
-        raise ValueError(
-            f"delay: got {steps} steps and a fraction of {fraction}; expected steps >= 0 and "
-            "0 <= fraction < 1"
-        )
+    Delay(steps, fraction)  # refuses what is none
     eta0 = fraction * period
-    A, B_new = sample(model.A, model.B, period - eta0)
+
+    def sampled(duration: float) -> tuple[Array, Array]:
+        if step is None:
+            return sample(model.A, model.B, duration)
+        return sample_in_steps(model.A, model.B, duration, step)
+
+    A, B_new = sampled(period - eta0)
     B_old = np.zeros_like(B_new)
     if eta0 > 0:
-        A_eta0, B_eta0 = sample(model.A, model.B, eta0)
+        A_eta0, B_eta0 = sampled(eta0)
         A, B_old = A @ A_eta0, A @ B_eta0
     C = model.C
     if integral:
         n, p = A.shape[0], C.shape[0]
         half = period / 2 * C
         # z_{k+1} = z_k + dt/2 C (e_k + A e_k + B_old T_{k-mu-1} + B_new T_{k-mu})
-        sampled, A = A, np.eye(n + p)
-        A[:n, :n], A[n:, :n] = sampled, half + half @ sampled
+        motion, A = A, np.eye(n + p)
+        A[:n, :n], A[n:, :n] = motion, half + half @ motion
         C = np.zeros((2 * p, n + p))
         C[:p, :n], C[p:, n:] = model.C, np.eye(p)
         B_old, B_new = (np.concatenate([B, half @ B]) for B in (B_old, B_new))

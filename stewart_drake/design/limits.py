@@ -32,6 +32,9 @@ _LOWEST: Final = 1e-3
 """Of the Nyquist frequency, where a grid of frequencies begins."""
 _EDGE: Final = 1e-9
 """Distance from the unit circle up to which a loop counts as unstable."""
+_SQUARINGS: Final = 16
+_OVERFLOW: Final = 1e100
+"""Where powers are squared no further."""
 _BISECTIONS: Final = 10
 """After a bracket of a factor of two: 0.1 % of the margin."""
 
@@ -156,6 +159,25 @@ def spectral_radius(A: Array) -> float:
     return float(np.abs(np.linalg.eigvals(A)).max())
 
 
+def is_stable(A: Array) -> bool:
+    """Whether all |lambda| < 1, without eigenvalues where a power of A decides.
+
+    |A^k| < 1 proves that, and |trace A^k| > n, with n eigenvalues, the contrary. Squared again and
+    again, either comes soon unless an eigenvalue is right at the circle.
+    """
+    power = A / (1 - _EDGE)
+    for _ in range(_SQUARINGS):
+        size = float(np.linalg.norm(power))
+        if size < 1:
+            return True
+        if abs(float(np.trace(power))) > len(A):
+            return False
+        if not size < _OVERFLOW:
+            break
+        power = power @ power
+    return spectral_radius(A) < 1 - _EDGE
+
+
 def first_instability(loop: Callable[[float], Array], start: float, limit: float) -> float:
     """The least disturbance at which a loop is no longer stable.
 
@@ -169,17 +191,14 @@ def first_instability(loop: Callable[[float], Array], start: float, limit: float
         Stability that is lost and regained within a factor of two is not seen.
     """
 
-    def stable(size: float) -> bool:
-        return spectral_radius(loop(size)) < 1 - _EDGE
-
-    if not stable(0.0):
+    if not is_stable(loop(0.0)):
         return 0.0
     low, high = 0.0, min(start, limit)
-    while stable(high):
+    while is_stable(loop(high)):
         if high >= limit:
             return math.inf
         low, high = high, min(2 * high, limit)
     for _ in range(_BISECTIONS):
         middle = (low + high) / 2
-        low, high = (middle, high) if stable(middle) else (low, middle)
+        low, high = (middle, high) if is_stable(loop(middle)) else (low, middle)
     return (low + high) / 2

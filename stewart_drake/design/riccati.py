@@ -16,8 +16,12 @@ RESIDUAL = 1e-4
 """Of the Riccati equation, relative to its solution, above which that is none."""
 
 
-class RiccatiError(ValueError):
-    """The Riccati equation has no stabilising solution, or the solver did not find it."""
+class RiccatiError(ArithmeticError):
+    """The Riccati equation has no stabilising solution, or the solver did not find it.
+
+    It is about values. Shapes that do not fit each other are a mistake in a program, and raise a
+    plain ValueError.
+    """
 
 
 def lqr(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
@@ -28,6 +32,7 @@ def lqr(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
 
     Raises:
         RiccatiError: naming the matrix and what is wrong with it, or that no solution was found.
+        ValueError: naming the matrix whose shape does not fit.
     """
     _check(A, B, Q, R)
     try:
@@ -64,7 +69,25 @@ def full_gain(model: DelayedModel, Q: Array, R: Array) -> tuple[Array, Array]:
         RiccatiError: see `lqr`.
     """
     augmented = chain(model)
-    return lqr(augmented.A, augmented.B, augmented.C.T @ Q @ augmented.C, R)
+    A, B, C = augmented.A, augmented.B, augmented.C
+    u = _units(np.zeros_like(R), R)
+    x = np.concatenate([_units(model.A, model.C.T @ Q @ model.C), np.tile(u, model.queue_length)])
+    Q = C.T @ Q @ C
+    K, P = lqr(A * x / x[:, None], B * u / x[:, None], Q * np.outer(x, x), R * np.outer(u, u))
+    return K * u[:, None] / x, P / np.outer(x, x)
+
+
+def _units(A: Array, Q: Array) -> Array:
+    """Size (n,) of each state that costs one now and at the next sample together.
+
+    Metres beside radians, of a machine of 1 mm or of 1 m, make matrices that the solver takes for
+    singular, or not, by their units. With x = diag(units) x~ and T likewise the equation has none:
+    P~ = units P units and K~ = K units / units, whatever the size of the machine.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # what is no number is for `lqr` to refuse
+        cost = np.diag(Q) + np.einsum("ji,ji->i", A, Q @ A)
+    useful = np.isfinite(cost) & (cost > 0)
+    return 1 / np.sqrt(np.where(useful, cost, 1.0))
 
 
 def reduced_gain(model: DelayedModel, Q: Array, R: Array) -> Array:
@@ -128,12 +151,12 @@ def is_contracting(A: Array) -> bool:
 def _check(A: Array, B: Array, Q: Array, R: Array) -> None:
     for name, matrix in (("A", A), ("B", B)):
         if matrix.ndim != 2 or matrix.size == 0:
-            raise RiccatiError(f"{name}: got shape {matrix.shape}; expected rows and columns")
+            raise ValueError(f"{name}: got shape {matrix.shape}; expected rows and columns")
     n, m = B.shape
     expected = {"A": (A, (n, n)), "B": (B, (n, m)), "Q": (Q, (n, n)), "R": (R, (m, m))}
     for name, (matrix, shape) in expected.items():
         if matrix.shape != shape:
-            raise RiccatiError(f"{name}: got shape {matrix.shape}; expected {shape}")
+            raise ValueError(f"{name}: got shape {matrix.shape}; expected {shape}")
         if not np.isfinite(matrix).all():
             raise RiccatiError(f"{name}: has entries that are not finite")
     for name, matrix in (("Q", Q), ("R", R)):

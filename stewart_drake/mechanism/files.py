@@ -1,15 +1,19 @@
-"""Mechanism YAML files: the schema, and how a `pattern` of anchors becomes six legs."""
+"""Mechanism YAML files: the schema, and how a `pattern` of anchors becomes six legs.
+
+Moments of inertia may be left out; `mechanism.inertias` says what stands in for them.
+"""
 
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, PlainValidator
+from pydantic import AfterValidator, ConfigDict, Field, PlainValidator
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.errors import ConfigError
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism
+from stewart_drake.mechanism.inertias import bar_inertia, disc_inertia
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.resources import resolve
 from stewart_drake.signals import LEGS
@@ -22,9 +26,19 @@ _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 _SHORTEST, _LONGEST = 1e-6, 1e3
 _MOST_LEAN = 2e-3
 """rad; directions written with three decimals are off the right angle by less."""
-Coordinate = Annotated[float, Field(ge=-_LONGEST, le=_LONGEST)]
+_PAPER = 0.1
+"""kg/m^2, a sheet of paper; no plate is lighter, but one whose metres are millimetres."""
+
+
+def _in_metres(value: float) -> float:
+    if abs(value) > _LONGEST:
+        raise ValueError(f"metres, {_LONGEST:g} at most (are these millimetres?)")
+    return value
+
+
+Coordinate = Annotated[float, AfterValidator(_in_metres)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
-Radius = Annotated[float, Field(ge=_SHORTEST, le=_LONGEST)]
+Radius = Annotated[float, Field(ge=_SHORTEST), AfterValidator(_in_metres)]
 Mass = Annotated[float, Field(le=1e6)]
 Point = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 Moments = Annotated[list[Mass], Field(min_length=3, max_length=3)]
@@ -36,7 +50,9 @@ def _one_or_six(value: object) -> object:
     # A union of number and list would name its alternatives in the error instead of the field.
     numbers = value if isinstance(value, list) else [value] * 6
     if len(numbers) != 6 or not all(_is_length(v) for v in numbers):
-        raise ValueError(f"a positive number, or a list of six, {_SHORTEST:g} to {_LONGEST:g} m")
+        raise ValueError(
+            f"a positive number, or a list of six, metres of {_SHORTEST:g} to {_LONGEST:g}"
+        )
     return value
 
 
@@ -60,25 +76,28 @@ Length = Annotated[float | list[float], PlainValidator(_one_or_six)]
 
 @dataclass(config=_STRICT)
 class BodySpec:
-    """`mass` in kg, `inertia`: principal moments about the COM in kg m^2."""
+    """`mass` in kg, `inertia`: principal moments about the COM in kg m^2; null: a uniform disc."""
 
     mass: Annotated[float, Field(ge=0, le=1e6)]
-    inertia: Moments
+    inertia: Moments | None = None
 
 
 @dataclass(config=_STRICT)
 class LinkSpec:
-    """`length` in m (one, or one per leg), `center`: where along it the COM lies (0 to 1)."""
+    """`length` in m (one, or one per leg), `center`: where along it the COM lies (0 to 1).
+
+    `inertia` as of a body, along the link first; null: a uniform bar of the mean length.
+    """
 
     length: Length
     mass: Mass
-    inertia: Moments
+    inertia: Moments | None = None
     center: float = 0.5
 
 
 @dataclass(config=_STRICT)
 class MotorSpec:
-    """`effort_limit`: N m, as written to SDFormat; null: none."""
+    """`effort_limit`: N m, each motor's torque limit, also in SDFormat; null: none."""
 
     effort_limit: Annotated[float, Field(le=1e6)] | None = None
 
@@ -146,9 +165,7 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism:
     spec = validate(MechanismSpec, load_yaml(path), str(path))
     try:
         return build_mechanism(spec)
-    except UnreachablePoseError as error:
-        raise ConfigError(f"{path}: {error}; expected a home pose within reach") from None
-    except ConfigError as error:
+    except (UnreachablePoseError, ConfigError) as error:
         raise ConfigError(f"{path}: {error}") from None
 
 
@@ -166,6 +183,12 @@ def build_mechanism(spec: MechanismSpec) -> Mechanism:
     else:
         assert spec.legs is not None
         p_WS, R_WS, p_PQ, branches = _explicit_anchors(spec.legs)
+    base_radius, plate_radius = (np.hypot(p[:, 0], p[:, 1]).max() for p in (p_WS, p_PQ))
+    if plate_radius >= 1 and 0 < spec.plate.mass < _PAPER * np.pi * plate_radius**2:
+        raise ConfigError(
+            f"plate.mass: got {spec.plate.mass:g} kg on a radius of {plate_radius:g} m, lighter "
+            "than paper; expected lengths in metres (are these millimetres?)"
+        )
     return Mechanism(
         name=spec.name,
         home=np.array(spec.home),
@@ -175,16 +198,31 @@ def build_mechanism(spec: MechanismSpec) -> Mechanism:
         crank_lengths=np.broadcast_to(np.array(spec.crank.length), 6),
         rod_lengths=np.broadcast_to(np.array(spec.rod.length), 6),
         branches=branches,
-        base=Body(spec.base.mass, np.array(spec.base.inertia)),
-        plate=Body(spec.plate.mass, np.array(spec.plate.inertia)),
-        crank=_link(spec.crank),
-        rod=_link(spec.rod),
+        base=_disc(spec.base, base_radius),
+        plate=_disc(spec.plate, plate_radius),
+        crank=_bar(spec.crank, "crank"),
+        rod=_bar(spec.rod, "rod"),
         effort_limit=spec.motor.effort_limit,
     )
 
 
-def _link(spec: LinkSpec) -> Link:
-    return Link(spec.mass, np.array(spec.inertia), spec.center)
+def _disc(spec: BodySpec, radius: float) -> Body:
+    """The plate, or the base, out to its joints; of what stands on it nothing is known."""
+    if spec.inertia is None:
+        return Body(spec.mass, disc_inertia(spec.mass, radius), estimated=True)
+    return Body(spec.mass, np.array(spec.inertia))
+
+
+def _bar(spec: LinkSpec, field: str) -> Link:
+    if spec.inertia is not None:
+        return Link(spec.mass, np.array(spec.inertia), spec.center)
+    if spec.center != 0.5:
+        raise ConfigError(
+            f"{field}.inertia: is missing; expected it beside a center of {spec.center:g}, as only "
+            f"that of a uniform {field} is estimated, whose center is 0.5"
+        )
+    moments = bar_inertia(spec.mass, float(np.mean(spec.length)))
+    return Link(spec.mass, moments, spec.center, estimated=True)
 
 
 def _pairs(first_deg: float, separation_deg: float) -> Array:

@@ -12,7 +12,7 @@ Frames, in Drake's monogram notation, leg by leg (leading axis of length six):
 """
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
 from typing import Final
 
@@ -31,37 +31,43 @@ RESERVED_NAMES: Final = ("world", "WorldModelInstance", "DefaultModelInstance")
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body: mass in kg, principal moments of inertia (3,) about its COM in kg m^2."""
+    """A rigid body: mass in kg, principal moments of inertia (3,) about its COM in kg m^2.
+
+    `estimated`: nobody measured the moments, they are those of a uniform body
+    (`mechanism.inertias`); the mathematics does not care.
+    """
 
     mass: float
     inertia: Array
+    _: KW_ONLY
+    estimated: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inertia", _read_only(self.inertia))
 
-    def check(self, field: str, *, massless: bool = False) -> None:
-        """Raise ConfigError unless mass and inertia belong to a rigid body that can exist."""
-        if self.inertia.shape != (3,):
-            raise ConfigError(f"{field}.inertia: got shape {self.inertia.shape}; expected (3,)")
-        if not np.all(np.isfinite([self.mass, *self.inertia])):
-            raise ConfigError(
-                f"{field}: got mass {self.mass:g} kg, inertia {_listed(self.inertia)} kg m^2; "
-                "expected finite numbers"
-            )
-        if not self.mass > 0 and not (massless and self.mass == 0):
-            raise ConfigError(f"{field}.mass: got {self.mass:g} kg; expected a positive mass")
-        if np.any(self.inertia <= 0) and not (massless and self.mass == 0):
-            raise ConfigError(
-                f"{field}.inertia: got {_listed(self.inertia)} kg m^2; expected positive moments"
-            )
+    def problems(self, field: str, *, massless: bool = False) -> list[str]:
+        """Why no rigid body has this mass and inertia: at most one line, opened by `field`."""
+        found, moments = self.inertia, _listed(self.inertia)
+        nothing = massless and self.mass == 0
         # A moment larger than the sum of the other two needs negative mass somewhere.
-        excess = 2 * self.inertia.max() - self.inertia.sum()
-        if excess > 1e-9 * self.inertia.max():
-            raise ConfigError(
-                f"{field}.inertia: got {_listed(self.inertia)} kg m^2, which violates the triangle "
-                f"inequality by {excess:.3g}; expected the largest moment to be at most the sum of "
-                "the other two"
+        if found.shape != (3,):
+            problem = f".inertia: got shape {found.shape}; expected (3,)"
+        elif not np.all(np.isfinite([self.mass, *found])):
+            problem = (
+                f": got mass {self.mass:g} kg, inertia {moments} kg m^2; expected finite numbers"
             )
+        elif not self.mass > 0 and not nothing:
+            problem = f".mass: got {self.mass:g} kg; expected a positive mass"
+        elif np.any(found <= 0) and not nothing:
+            problem = f".inertia: got {moments} kg m^2; expected positive moments"
+        elif (excess := 2 * found.max() - found.sum()) > 1e-9 * found.max():
+            problem = (
+                f".inertia: got {moments} kg m^2, which violates the triangle inequality by "
+                f"{excess:.3g}; expected the largest moment to be at most the sum of the other two"
+            )
+        else:
+            return []
+        return [field + problem]
 
 
 @dataclass(frozen=True)
@@ -73,6 +79,16 @@ class Link(Body):
     """
 
     center: float = 0.5
+
+    def problems(self, field: str, *, massless: bool = False) -> list[str]:
+        """As for any body; and a centre of mass beyond the ends."""
+        found = super().problems(field, massless=massless)
+        if not 0 <= self.center <= 1:
+            found.append(
+                f"{field}.center: got {self.center:g}; expected a fraction of the length "
+                "between 0 and 1"
+            )
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +104,8 @@ class Mechanism:
         crank_lengths, rod_lengths: (6,) m.
         branches: (6,) of -1 or +1, which of the two crank solutions a leg uses.
         base, plate, crank, rod: masses and inertias; the six cranks are alike, so are the rods.
-        effort_limit: torque limit of the motors in N m as written to SDFormat, or None.
+        effort_limit: of each motor in N m, written to SDFormat and the default of a scenario's
+            `actuator.torque_limit`; or None.
 
     Raises:
         ConfigError: naming the field, its value and what is allowed.
@@ -126,6 +143,13 @@ class Mechanism:
                 raise ConfigError(f"{field}: got {_listed(value)}; expected finite numbers")
             object.__setattr__(self, field, value)
         self._check()
+
+    def __repr__(self) -> str:
+        cranks, rods = (
+            " to ".join(f"{1e3 * length:.4g}" for length in sorted({values.min(), values.max()}))
+            for values in (self.crank_lengths, self.rod_lengths)
+        )
+        return f"Mechanism({self.name!r}, cranks {cranks} mm, rods {rods} mm)"
 
     @cached_property
     def _key(self) -> tuple[object, ...]:
@@ -172,15 +196,7 @@ class Mechanism:
             raise ConfigError(
                 f"home: got a pitch of {self.home[1]:g} rad; expected less than pi/2 in magnitude"
             )
-        self.base.check("base", massless=True)
-        self.plate.check("plate")
-        for field, link in (("crank", self.crank), ("rod", self.rod)):
-            link.check(field)
-            if not 0 <= link.center <= 1:
-                raise ConfigError(
-                    f"{field}.center: got {link.center:g}; expected a fraction of the length "
-                    "between 0 and 1"
-                )
+        self._check_bodies()
         if self.effort_limit is not None and not self.effort_limit > 0:
             raise ConfigError(
                 f"motor.effort_limit: got {self.effort_limit:g} N m; expected a positive torque "
@@ -190,39 +206,75 @@ class Mechanism:
             self.crank_angles(self.home)
         except kinematics.UnreachablePoseError as error:
             raise kinematics.UnreachablePoseError(
-                error.margins, prefix=f"home: got {_listed(self.home)}, out of reach"
+                error.margins,
+                prefix=f"home: got {_listed(self.home)}, out of reach",
+                suffix=f"; expected a home pose within reach, {self._reachable_z()}",
             ) from None
 
-    def crank_angles(self, pose: Array) -> Array:
+    def _check_bodies(self) -> None:
+        # All four are looked at, so that a file is mended in one go.
+        problems = [
+            *self.base.problems("base", massless=True),
+            *self.plate.problems("plate"),
+            *self.crank.problems("crank"),
+            *self.rod.problems("rod"),
+        ]
+        if problems:
+            raise ConfigError("; ".join(problems))
+
+    def _reachable_z(self) -> str:
+        """What z would do for home, in words."""
+        where = "at this x, y and orientation"
+        found = kinematics.reachable_heights(self, self.home)
+        if found is None:
+            return f"of which there is none {where}"
+        low, high = found
+        return f"{where} z between {low:.4g} and {high:.4g} m, such as {(low + high) / 2:.4g}"
+
+    def crank_angles(self, pose: ArrayLike) -> Array:
         """Inverse kinematics, equations (1)-(5): crank angles (6,) in rad at a pose (6,).
+
+        This and the methods below take what numpy makes six numbers of; else a ValueError.
 
         Raises:
             UnreachablePoseError: naming the legs and by how much each falls short.
         """
-        return kinematics.crank_angles(self, pose)
+        return kinematics.crank_angles(self, _six("pose", pose))
 
-    def reach_margins(self, pose: Array) -> Array:
+    def reach_margins(self, pose: ArrayLike) -> Array:
         """Distance (6,) in m that each leg has left to reach its plate joint; < 0 out of reach."""
-        return kinematics.reach_margins(self, pose)
+        return kinematics.reach_margins(self, _six("pose", pose))
 
-    def forward_kinematics(self, crank_angles: Array, guess: Array | None = None) -> Array:
+    def forward_kinematics(self, crank_angles: ArrayLike, guess: ArrayLike | None = None) -> Array:
         """Pose (6,) of the assembly nearest to `guess` (default: home) with these crank angles.
 
         Raises:
             ForwardKinematicsError: Newton did not converge, or found another crank branch.
         """
-        return kinematics.forward_kinematics(
-            self, crank_angles, self.home if guess is None else guess
-        )
+        guess = self.home if guess is None else _six("guess", guess)
+        return kinematics.forward_kinematics(self, _six("crank_angles", crank_angles), guess)
 
-    def jacobian(self, pose: Array) -> Array:
+    def jacobian(self, pose: ArrayLike) -> Array:
         """d crank_angles / d pose (6, 6), in closed form.
 
         Raises:
             UnreachablePoseError: the pose is out of reach.
             SingularPoseError: a leg is at its dead centre, where the derivative does not exist.
         """
-        return kinematics.jacobian(self, pose)
+        return kinematics.jacobian(self, _six("pose", pose))
+
+
+def _six(name: str, values: ArrayLike) -> Array:
+    """Six numbers; fewer would be broadcast, or end in a message about arrays."""
+    numbers = np.asarray(values, dtype=np.float64)
+    if numbers.shape != (6,):
+        what = (
+            "six crank angles in rad"
+            if name == "crank_angles"
+            else ("[roll, pitch, yaw, x, y, z] in rad and m")
+        )
+        raise ValueError(f"{name}: got shape {numbers.shape}; expected (6,), {what}")
+    return numbers
 
 
 def _read_only(values: ArrayLike) -> Array:

@@ -31,7 +31,7 @@ square root of the rounding, 1.5e-8 rad: quotients by less than this have no cor
 class UnreachablePoseError(ValueError):
     """A pose out of reach; `legs` numbered from one, `margins` (6,) in m, negative where short."""
 
-    def __init__(self, margins: Array, prefix: str = "pose out of reach") -> None:
+    def __init__(self, margins: Array, prefix: str = "pose out of reach", suffix: str = "") -> None:
         self.margins = np.asarray(margins)
         self.legs = tuple(leg for leg, m in zip(LEGS, self.margins, strict=True) if not m >= 0)
         by = {leg: f"short by {-1e3 * self.margins[leg - 1]:.3g} mm" for leg in self.legs}
@@ -39,7 +39,7 @@ class UnreachablePoseError(ValueError):
             short = f"all legs {by[LEGS[0]]}"
         else:
             short = ", ".join(f"leg {leg} {text}" for leg, text in by.items())
-        super().__init__(f"{prefix}: {short}")
+        super().__init__(f"{prefix}: {short}{suffix}")
 
 
 class SingularPoseError(ValueError):
@@ -115,6 +115,41 @@ def _margins(mechanism: "Mechanism", p_SQ_S: Array) -> Array:
 def reach_margins(mechanism: "Mechanism", pose: Array) -> Array:
     """Distance (6,) in m by which the rod end can still be moved before leg i cannot be closed."""
     return _margins(mechanism, _shaft_to_joint(mechanism, np.asarray(pose, dtype=np.float64))[1])
+
+
+def reachable_heights(mechanism: "Mechanism", pose: Array) -> tuple[float, float] | None:
+    """The range of z in m nearest to a pose's own within which all legs reach; None without one.
+
+    x, y and the orientation stay those of the pose. No leg reaches further than crank and rod
+    together, |z + p_PQ_W - p_WS| <= u + l in z, so that the heights worth a look are bounded; among
+    them a scan finds the ranges, and bisection their ends. A range narrower than the scan's step
+    of a thousandth may be missed.
+    """
+    pose = np.array(pose, dtype=np.float64)
+    offset = (mechanism.p_WS - mechanism.p_PQ @ rotation(pose[ANGLES]).T)[:, 2]
+    stretched = mechanism.crank_lengths + mechanism.rod_lengths
+    low, high = (offset - stretched).max(), (offset + stretched).min()
+
+    def reached(z: float) -> bool:
+        return bool(np.all(reach_margins(mechanism, np.array([*pose[:5], z])) > 0))
+
+    def edge(inside: float, outside: float) -> float:
+        for _ in range(40):
+            middle = (inside + outside) / 2
+            inside, outside = (middle, outside) if reached(middle) else (inside, middle)
+        return inside
+
+    if low >= high:
+        return None
+    heights = np.linspace(low, high, 1000)
+    # At both ends some leg is stretched at least, so that every range lies between two scanned z.
+    hit = 1 + np.flatnonzero([reached(z) for z in heights[1:-1]])
+    if len(hit) == 0:
+        return None
+    ranges = np.split(hit, np.flatnonzero(np.diff(hit) > 1) + 1)
+    nearest = min(ranges, key=lambda r: np.abs(heights[r] - pose[5]).min())
+    first, last = nearest[0], nearest[-1]
+    return edge(heights[first], heights[first - 1]), edge(heights[last], heights[last + 1])
 
 
 def leg_geometry(mechanism: "Mechanism", pose: Array) -> LegGeometry:

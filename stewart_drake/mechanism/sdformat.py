@@ -1,4 +1,4 @@
-"""Writes a `Mechanism` as SDFormat for Drake: links, joints, visuals, a ball constraint per leg."""
+"""Writes a `Mechanism` as SDFormat for Drake: links, joints, shapes, a ball constraint per leg."""
 
 from collections.abc import Iterable
 from xml.etree import ElementTree as ET
@@ -20,26 +20,44 @@ JOINT_COLOR = (0.30, 0.32, 0.36, 1.0)
 PLATE_COLOR = (0.13, 0.42, 0.70, 1.0)
 
 
-def to_sdformat(mechanism: Mechanism) -> str:
+def to_sdformat(mechanism: Mechanism, *, collision: bool = True, weld: bool = True) -> str:
     """The mechanism as an SDFormat 1.9 document, assembled at its home pose.
 
     Links: `base`, `plate`, `crank_i`, `rod_i`; joints: `base_weld`, `motor_i` (revolute, actuated),
     `universal_i`; a frame at every joint: `shaft_i`, `tip_i`, `rod_end_i`, `plate_joint_i`. Legs i
     count from 1.
     The loops are closed by `drake:ball_constraint` between `rod_i` and `plate`.
+
+    Discs, motors, posts, crank arms and rod tubes collide with whatever else is in the scene, the
+    collision filter group `machine` with nothing of the same machine: cranks and rods of a pair may
+    cross, and joints overlap. Without collisions (`collision` false) shapes are only drawn. Without
+    `weld` there is no `base_weld`, which fixes the base in the world: the base is free.
     """
     home = assemble(mechanism, mechanism.home)
     sdf = ET.Element("sdf", {"version": "1.9", "xmlns:drake": "http://drake.mit.edu"})
     model = _add(sdf, "model", name=mechanism.name)
-    _base(model, mechanism)
+    _base(model, mechanism, weld)
     _plate(model, mechanism, home)
     for leg in LEGS:
         _leg(model, mechanism, home, leg)
+    if collision:
+        _filter_own(model)
+    else:
+        for link in model.iter("link"):
+            for shape in link.findall("collision"):
+                link.remove(shape)
     ET.indent(sdf, " " * 2)
     return '<?xml version="1.0"?>\n' + ET.tostring(sdf, encoding="unicode") + "\n"
 
 
-def _base(model: ET.Element, mechanism: Mechanism) -> None:
+def _filter_own(model: ET.Element) -> None:
+    group = _add(model, "drake:collision_filter_group", name="machine")
+    for link in model.iter("link"):
+        _add(group, "drake:member", link.get("name"))
+    _add(group, "drake:ignored_collision_filter_group", "machine")
+
+
+def _base(model: ET.Element, mechanism: Mechanism, weld: bool) -> None:
     link = _add(model, "link", name="base")
     if mechanism.base.mass > 0:
         _inertial(link, mechanism.base, np.zeros(3))
@@ -53,18 +71,19 @@ def _base(model: ET.Element, mechanism: Mechanism) -> None:
     bottom = (centres[:, 2] - reach).min() - 0.2 * size["motor_radius"]
     top = bottom + 0.6 * size["motor_radius"]
     disc = _cylinder(radius, top - bottom)
-    _visual(link, "disc", _pose([0, 0, (top + bottom) / 2]), disc, BASE_COLOR)
+    _solid(link, "disc", _pose([0, 0, (top + bottom) / 2]), disc, BASE_COLOR)
     for leg, p_WS, R_WS, centre in zip(LEGS, mechanism.p_WS, mechanism.R_WS, centres, strict=True):
         motor = _cylinder(size["motor_radius"], size["motor_length"])
-        _visual(link, f"motor_{leg}", _pose(centre, R_WS), motor, MOTOR_COLOR)
+        _solid(link, f"motor_{leg}", _pose(centre, R_WS), motor, MOTOR_COLOR)
         height = centre[2] - top
         post = _cylinder(0.7 * size["motor_radius"], height)
         foot = [centre[0], centre[1], top + height / 2]
-        _visual(link, f"post_{leg}", _pose(foot), post, BASE_COLOR)
+        _solid(link, f"post_{leg}", _pose(foot), post, BASE_COLOR)
         _frame(model, f"shaft_{leg}", "base", _pose(p_WS, R_WS))
-    weld = _add(model, "joint", name="base_weld", type="fixed")
-    _add(weld, "parent", "world")
-    _add(weld, "child", "base")
+    if weld:
+        joint = _add(model, "joint", name="base_weld", type="fixed")
+        _add(joint, "parent", "world")
+        _add(joint, "child", "base")
 
 
 def _plate(model: ET.Element, mechanism: Mechanism, home: Assembly) -> None:
@@ -75,7 +94,7 @@ def _plate(model: ET.Element, mechanism: Mechanism, home: Assembly) -> None:
     radius = 1.08 * np.hypot(mechanism.p_PQ[:, 0], mechanism.p_PQ[:, 1]).max()
     disc = _cylinder(radius, size["plate"])
     deck = float(mechanism.p_PQ[:, 2].mean())
-    _visual(link, "disc", _pose([0, 0, deck + size["plate"]]), disc, PLATE_COLOR)
+    _solid(link, "disc", _pose([0, 0, deck + size["plate"]]), disc, PLATE_COLOR)
     # A pointer along x shows the yaw that a disc would hide.
     bar = _box([0.85 * radius, 0.06 * radius, 0.4 * size["plate"]])
     above = deck + 1.6 * size["plate"]
@@ -95,7 +114,7 @@ def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> N
     _add(crank, "pose", _pose(mechanism.p_WS[i], home.R_WC[i]))
     _inertial(crank, mechanism.crank, np.array([mechanism.crank.center * u, 0, 0]))
     arm = _box([u, 1.6 * size["crank"], size["crank"]])
-    _visual(crank, "arm", _pose([u / 2, 0, 0]), arm, CRANK_COLOR)
+    _solid(crank, "arm", _pose([u / 2, 0, 0]), arm, CRANK_COLOR)
     hub = _cylinder(1.2 * size["crank"], 1.5 * size["crank"])
     _visual(crank, "hub", _pose([0, 0, 0]), hub, CRANK_COLOR)
     _visual(crank, "tip", _pose([u, 0, 0]), _sphere(1.6 * size["rod"]), JOINT_COLOR)
@@ -106,7 +125,7 @@ def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> N
     _inertial(rod, mechanism.rod, np.array([mechanism.rod.center * length, 0, 0]))
     along_x = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     tube = _cylinder(size["rod"], length)
-    _visual(rod, "tube", _pose([length / 2, 0, 0], along_x), tube, ROD_COLOR)
+    _solid(rod, "tube", _pose([length / 2, 0, 0], along_x), tube, ROD_COLOR)
     _frame(model, f"rod_end_{leg}", f"rod_{leg}", _pose([length, 0, 0]))
 
     motor = _add(model, "joint", name=f"motor_{leg}", type="revolute")
@@ -190,6 +209,16 @@ def _axis(joint: ET.Element, tag: str, xyz: Array) -> ET.Element:
     axis = _add(joint, tag)
     _add(axis, "xyz", _numbers(xyz))
     return axis
+
+
+def _solid(
+    link: ET.Element, name: str, pose: str, geometry: ET.Element, color: tuple[float, ...]
+) -> None:
+    """A shape that is seen and collides."""
+    _visual(link, name, pose, geometry, color)
+    collision = _add(link, "collision", name=name)
+    _add(collision, "pose", pose)
+    _add(collision, "geometry").append(geometry)
 
 
 def _visual(

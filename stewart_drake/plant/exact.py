@@ -5,6 +5,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.systems.analysis import ApplySimulatorConfig, ExtractSimulatorConfig, Simulator
 from pydrake.systems.framework import (
     BasicVector_,
     EventStatus,
@@ -17,7 +18,8 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 from stewart_drake.lifetime import weak
 from stewart_drake.plant.dynamics import StewartDynamics
 from stewart_drake.plant.workspace import margin
-from stewart_drake.signals import NUM_STATE, NUM_TORQUES, POSE, RATES
+from stewart_drake.signals import NUM_TORQUES, POSE, RATES
+from stewart_drake.timing import METRIC_PERIOD
 
 Array = NDArray[np.float64]
 
@@ -29,7 +31,8 @@ def ExactPlant_(T):
     class Impl(LeafSystem_[T]):
         """A mechanism's plate under motor torques, loops closed exactly.
 
-        Dynamics:  d[pose; rates]/dt = [rates; accelerations(pose, rates, torque)].
+        Dynamics:  d[pose; rates]/dt = [rates; accelerations(pose, rates, torque)], and what a
+                   wrench adds to that, `StewartDynamics.wrench_accelerations`.
         Witness:   the least of the margins of `plant.workspace.margin`; the simulation ends
                    where it passes zero: a leg at a dead centre, a parallel singularity, a pitch
                    of 85 degrees.
@@ -37,20 +40,24 @@ def ExactPlant_(T):
         | port | direction | size | unit | rate |
         | --- | --- | --- | --- | --- |
         | torque | input | 6 | N m | continuous |
+        | wrench | input | 6 | N m, N, in W at the plate's COM | continuous, only if asked for |
         | state | output | 12 | rad, m, rad/s, m/s | continuous |
 
-        Any Drake integrator does; set its accuracy on the context too, or the witness is only
-        looked at between steps. With AutoDiffXd, derivatives are exact and end at first order.
+        In a diagram of your own, call `set_accuracy` on its simulator: Drake finds out when the
+        plate leaves only where the accuracy is set on the context too, and stops with an error
+        otherwise. With AutoDiffXd, derivatives are exact and end at first order.
 
         Args:
             dynamics: equations of motion, with gravity and the true parameters.
             initial_state: (12,) default of the continuous state; at home and at rest if None.
+            wrench: whether there is an input for a wrench on the plate; unconnected it is zero.
         """
 
         def _construct(
             self,
             dynamics: StewartDynamics,
             initial_state: ArrayLike | None = None,
+            wrench: bool = False,
             converter=None,
         ) -> None:
             super().__init__(converter=converter)
@@ -61,6 +68,9 @@ def ExactPlant_(T):
             default = BasicVector_[T]([T(value) for value in self._initial])
             state = self.DeclareContinuousState(default, 6, 6, 0)
             self._torque = self.DeclareVectorInputPort("torque", NUM_TORQUES)
+            # Without the port nothing is paid for it: asking an input whether it has a value costs
+            # a tenth of the derivatives.
+            self._wrench = self.DeclareVectorInputPort("wrench", 6) if wrench else None
             self.DeclareStateOutputPort("state", state)
             if T is float:
                 self._witness = self.MakeWitnessFunction(
@@ -71,22 +81,39 @@ def ExactPlant_(T):
                 )
 
         def _construct_copy(self, other, converter=None) -> None:
-            Impl._construct(self, other.dynamics, other._initial, converter=converter)
+            wrench = other._wrench is not None
+            Impl._construct(self, other.dynamics, other._initial, wrench, converter=converter)
 
         def DoCalcTimeDerivatives(self, context, derivatives) -> None:
             x = context.get_continuous_state_vector().CopyToVector()
             torque = self._torque.Eval(context)
-            d = self.dynamics
+            wrench = None
+            if self._wrench is not None and self._wrench.HasValue(context):
+                wrench = self._wrench.Eval(context)
             if T is float:
-                change = np.concatenate([x[RATES], d.accelerations(x[POSE], x[RATES], torque)])
-            else:  # d(x_dot) = A dx + B dT
-                value, tau = ExtractValue(x).ravel(), ExtractValue(torque).ravel()
-                at = d.derivatives(value[POSE], value[RATES], tau)
-                both = ExtractGradient(np.concatenate([x, torque]))
-                gradient = at.A @ both[:NUM_STATE] + at.B @ both[NUM_STATE:]
-                a = d.accelerations(value[POSE], value[RATES], tau)
-                change = InitializeAutoDiff(np.concatenate([value[RATES], a]), gradient).ravel()
+                a = self.dynamics.accelerations_unchecked(x[POSE], x[RATES], torque)
+                if wrench is not None:
+                    a += self.dynamics.wrench_accelerations(x[POSE], wrench)
+                change = np.concatenate([x[RATES], a])
+            else:
+                change = self._with_gradient(x, torque, wrench)
             derivatives.get_mutable_vector().SetFromVector(change)
+
+        def _with_gradient(self, x, torque, wrench):
+            """d(x_dot) = A dx + B dT + (M N)^-1 dF, F the wrench."""
+            value, tau, d = ExtractValue(x).ravel(), ExtractValue(torque).ravel(), self.dynamics
+            pose, rates = value[POSE], value[RATES]
+            force = None if wrench is None else ExtractValue(wrench).ravel()
+            at = d.derivatives(pose, rates, tau, wrench=force)
+            inputs, maps = [x, torque], [at.A, at.B]
+            a = d.accelerations(pose, rates, tau)
+            if force is not None:
+                a += d.wrench_accelerations(pose, force)
+                columns = [d.wrench_accelerations(pose, unit) for unit in np.eye(6)]
+                inputs.append(wrench)
+                maps.append(np.vstack([np.zeros((6, 6)), np.column_stack(columns)]))
+            gradient = np.hstack(maps) @ ExtractGradient(np.concatenate(inputs))
+            return InitializeAutoDiff(np.concatenate([rates, a]), gradient).ravel()
 
         def set_state(self, context, state) -> None:
             """Put the plate, in this system's context, into [pose; rates] (12,)."""
@@ -107,3 +134,27 @@ def ExactPlant_(T):
 
 
 ExactPlant = ExactPlant_[None]
+
+
+def set_accuracy(simulator: Simulator, accuracy: float = 1e-8) -> None:
+    """Make the simulator of any diagram with exact plants in it integrate as these need it.
+
+    That is a Runge-Kutta method of fifth order with error control, steps of at most 20 ms, and the
+    accuracy set on the integrator and on the context, so that the simulation ends, with
+    `kReachedTerminationCondition`, where a plate leaves its workspace. The simulator's other
+    settings stay.
+
+    Args:
+        simulator: before it starts, or between two calls of `AdvanceTo`.
+        accuracy: relative, 1e-12 to 1e-2.
+
+    Raises:
+        ValueError: another accuracy.
+    """
+    if not 1e-12 <= accuracy <= 1e-2:
+        raise ValueError(f"accuracy: got {accuracy!r}; expected a number from 1e-12 to 1e-2")
+    config = ExtractSimulatorConfig(simulator)
+    config.integration_scheme, config.use_error_control = "runge_kutta5", True
+    config.accuracy, config.max_step_size = accuracy, METRIC_PERIOD
+    ApplySimulatorConfig(config, simulator)
+    simulator.get_mutable_context().SetAccuracy(accuracy)

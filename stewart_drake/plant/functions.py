@@ -1,6 +1,6 @@
 """The equations of motion of a mechanism, compiled into CasADi functions on first use."""
 
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Final
 
 import casadi as ca
@@ -10,6 +10,7 @@ from stewart_drake.plant import equations
 from stewart_drake.plant.compiled import Compiled
 from stewart_drake.plant.derivatives import residual_derivatives
 from stewart_drake.signals import NUM_PARAMETERS, NUM_STATE
+from stewart_drake.threads import BUILDING, built_once
 
 _UNROLLED: Final = 64
 """Steps in one piece of a prediction; longer ones are loops of such pieces, because one piece of n
@@ -18,10 +19,7 @@ steps takes memory like n^2, 10 GB for 4000."""
 
 @lru_cache(maxsize=64)
 def compiled_functions(mechanism: Mechanism) -> "DynamicsFunctions":
-    """The functions of a mechanism, shared by all who ask for it in this process.
-
-    They hold their arguments in buffers: one thread at a time.
-    """
+    """The functions of a mechanism, shared by all who ask for it in this process."""
     return DynamicsFunctions(mechanism)
 
 
@@ -32,11 +30,11 @@ class DynamicsFunctions:
         self.mechanism = mechanism
         self._many: dict[int, Compiled] = {}
 
-    @cached_property
+    @built_once
     def _symbols(self) -> dict[str, ca.SX]:
         return equations.symbols()
 
-    @cached_property
+    @built_once
     def _motion(self) -> equations.Motion:
         s = self._symbols
         return equations.equations_of_motion(
@@ -48,7 +46,7 @@ class DynamicsFunctions:
         inputs = [self._symbols[argument] for argument in arguments.split()]
         return Compiled(ca.Function(name, inputs, dense, {"cse": True}))
 
-    @cached_property
+    @built_once
     def _force(self) -> ca.SX:
         """B torque - h, the generalised force (6,) beside M nu_dot."""
         torque = equations.shaft_torque(
@@ -56,7 +54,7 @@ class DynamicsFunctions:
         )
         return ca.mtimes(self._motion.arm.T, torque) - self._motion.bias
 
-    @cached_property
+    @built_once
     def _nu_dot(self) -> ca.SX:
         """nu_dot (6,) that belongs to the accelerations of the pose."""
         return (
@@ -64,7 +62,7 @@ class DynamicsFunctions:
             + self._motion.nu_dot_bias
         )
 
-    @cached_property
+    @built_once
     def accelerations(self) -> Compiled:
         """(pose, rates, torque, parameters, gravity) -> accelerations (6,)."""
         motion = self._motion
@@ -72,7 +70,7 @@ class DynamicsFunctions:
         accelerations = ca.solve(motion.rates_map, nu_dot - motion.nu_dot_bias)
         return self._compile("accelerations", "pose rates torque parameters gravity", accelerations)
 
-    @cached_property
+    @built_once
     def inverse_dynamics(self) -> Compiled:
         """(pose, rates, accelerations, parameters, gravity) -> torque (6,)."""
         # Without motor torque `force` is what bias, friction and h exert.
@@ -83,12 +81,12 @@ class DynamicsFunctions:
             "inverse_dynamics", "pose rates accelerations parameters gravity", torque
         )
 
-    @cached_property
+    @built_once
     def energy(self) -> Compiled:
         """(pose, rates, parameters, gravity) -> J."""
         return self._compile("energy", "pose rates parameters gravity", self._motion.energy)
 
-    @cached_property
+    @built_once
     def terms(self) -> Compiled:
         """(pose, rates, parameters, gravity) -> M, bias and B in pose coordinates."""
         motion = self._motion
@@ -101,7 +99,7 @@ class DynamicsFunctions:
             ca.mtimes(N.T, motion.arm.T),
         )
 
-    @cached_property
+    @built_once
     def residual_derivatives(self) -> Compiled:
         """Derivatives of F = M nu_dot + h - B torque; see `StewartDynamics.derivatives`."""
         return self._compile(
@@ -110,7 +108,7 @@ class DynamicsFunctions:
             *residual_derivatives(self.mechanism, self._symbols),
         )
 
-    @cached_property
+    @built_once
     def _runge_kutta4(self) -> ca.Function:
         """One step of the classical method: (state, torque, parameters, gravity, h) -> state."""
         accelerations = self.accelerations.function
@@ -131,7 +129,11 @@ class DynamicsFunctions:
 
     def many_steps(self, steps: int) -> Compiled:
         """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12), one call."""
-        if steps not in self._many:
-            accumulated = self._runge_kutta4.mapaccum("predict", steps, {"base": _UNROLLED})
-            self._many[steps] = Compiled(accumulated)
-        return self._many[steps]
+        found = self._many.get(steps)
+        if found is None:
+            with BUILDING:
+                step = self._runge_kutta4
+                accumulated = step.mapaccum("predict", steps, {"base": _UNROLLED})
+                # Whoever has been here meanwhile has made the same.
+                found = self._many.setdefault(steps, Compiled(accumulated))
+        return found

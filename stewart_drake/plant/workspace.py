@@ -12,6 +12,7 @@ from stewart_drake.plant import equations
 from stewart_drake.plant.compiled import Compiled
 from stewart_drake.plant.equations import DEAD_CENTRE_SINE
 from stewart_drake.signals import LEGS, NUM_LEGS
+from stewart_drake.threads import BUILDING
 
 Array = NDArray[np.float64]
 
@@ -89,7 +90,12 @@ class _Functions(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _functions(mechanism: Mechanism) -> _Functions:
-    """Compiled, because every integration step asks; one thread at a time, see `Compiled`."""
+    """Compiled, because every integration step asks."""
+    with BUILDING:
+        return _compile(mechanism)
+
+
+def _compile(mechanism: Mechanism) -> _Functions:
     pose, angles = ca.SX.sym("pose", 6), ca.SX.sym("angles", 6)
     R_WP = equations.rotation(pose[:3])
     # Forces along the rods, and their moments over the plate's mean radius, are free of units.

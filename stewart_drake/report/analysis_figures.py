@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from stewart_drake.report.style import Line, figure_style
+from stewart_drake.delay import Delay
+from stewart_drake.report.style import DATA_INK, DATA_PAPER, Line, figure_style
 from stewart_drake.studies.delay_limits import DelayStudy
 from stewart_drake.studies.delay_map import Cell
 from stewart_drake.studies.hautus import HautusStudy, System
@@ -160,7 +161,7 @@ def map_figure(study: DelayStudy) -> Figure:
         period = study.basis.experiment.scenario.controller.period
         fraction = study.basis.experiment.scenario.delay.fraction
         ax.set_xticks(
-            range(len(steps)), [f"{(s + fraction) * period:.3g} s\nμ = {s}" for s in steps]
+            range(len(steps)), [f"{Delay(s, fraction).eta(period):.3g} s\nμ = {s}" for s in steps]
         )
         ax.set_yticks(range(len(factors)), [f"{100 * factor:.0f} %" for factor in factors])
         ax.set(xlim=(-0.5, len(steps) - 0.5), ylim=(-0.5, len(factors) - 0.5))
@@ -181,7 +182,7 @@ def _draw_cell(ax: Axes, cell: Cell, x: int, y: int, floor: float) -> None:
     }
     # What is above the floor, on a scale on which 30 % s is dark; text stays readable on it.
     shade = 0.55 * min(1.0, np.sqrt(max(0.0, cell.error - floor) / 30)) if done else 0.0
-    color = (1 - shade, 1 - 0.55 * shade, 1 - 0.3 * shade) if done else (1, 1, 1)
+    color = (1 - shade, 1 - 0.55 * shade, 1 - 0.3 * shade) if shade > 0 else DATA_PAPER
     hatch = None if done else "////"
     box = Rectangle((x - 0.47, y - 0.45), 0.94, 0.9, fc=color, ec="#9AA3AD", hatch=hatch, lw=0.8)
     ax.add_patch(box)
@@ -192,7 +193,8 @@ def _draw_cell(ax: Axes, cell: Cell, x: int, y: int, floor: float) -> None:
         ha="center",
         va="center",
         fontsize=8,
-        bbox=None if done else {"fc": "white", "ec": "none", "pad": 1.5},
+        color=DATA_INK,
+        bbox=None if done else {"fc": DATA_PAPER, "ec": "none", "pad": 1.5},
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 
-from stewart_drake.config import Scenario
+from stewart_drake.config import AnnTunerConfig, Scenario
 from stewart_drake.errors import ConfigError
 from stewart_drake.experiment import assemble, reference_failure
 from stewart_drake.plant.workspace import Failure
@@ -104,10 +104,10 @@ def collect(
 
 def has_network(scenario: Scenario) -> bool:
     """Whether there is a network whose weights can be shown beside the scenario's fixed ones."""
-    if scenario.tuner.kind == "ann":
+    if isinstance(scenario.tuner, AnnTunerConfig):
         return False  # the comparison itself has them
     try:
-        resolve("weights", scenario.tuner.weights or DEFAULT)
+        resolve("weights", DEFAULT)
     except ConfigError:
         return False
     return True

@@ -9,41 +9,35 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from stewart_drake.arrayio import load_netcdf
 from stewart_drake.errors import ConfigError
 from stewart_drake.fileio import replacing
-from stewart_drake.signals import COORDINATE_UNITS, PARAMETER_UNITS
+from stewart_drake.signals import COORDINATE_NAMES, COORDINATES, SIGNALS
+from stewart_drake.yamlio import brief
 
 Array = NDArray[np.float64]
 
-_PER_SECOND: Final = tuple(f"{unit}/s" for unit in COORDINATE_UNITS)
-_UNITS: Final[dict[str, tuple[str, ...]]] = {
-    "pose": COORDINATE_UNITS,
-    "rates": _PER_SECOND,
-    "reference": COORDINATE_UNITS,
-    "reference_rates": _PER_SECOND,
-    "error": COORDINATE_UNITS,
-    "integral": tuple(f"{unit} s" for unit in COORDINATE_UNITS),
-    "torque_commanded": ("N m",) * 6,
-    "torque_applied": ("N m",) * 6,
-    "parameters": PARAMETER_UNITS,
-    "parameter_std": PARAMETER_UNITS,
-}
-"""Of the components; a signal that is not listed is a plain number."""
+_SPOKEN: Final = dict(zip(COORDINATES, COORDINATE_NAMES, strict=True))
+_EXPECTED: Final = "a file that simulate saved (.nc)"
 
 
 def signals_csv(signals: xr.Dataset) -> str:
-    """A header as `time[s],pose_phi[rad],...`, then a line per instant, empty where not a number.
+    """A header as `time[s],pose_roll[rad],...`, then a line per instant, empty where not a number.
+
+    A reference of `kind: csv` reads it as a motion, that of its columns `pose_...`.
 
     Args:
         signals: of a `SimulationResult`, over `time`.
     """
     header, columns = ["time[s]"], [signals.time.values[:, None]]
     for name, signal in signals.data_vars.items():
-        (dimension,) = (d for d in signal.dims if d != "time")
-        labels = [str(label) for label in signal[dimension].values]
-        units = _UNITS.get(str(name), ("-",) * len(labels))
-        header += [f"{name}_{label}[{unit}]" for label, unit in zip(labels, units, strict=True)]
-        columns.append(signal.transpose("time", dimension).values)
+        others = [dimension for dimension in signal.dims if dimension != "time"]
+        labels = [f"_{_spoken(str(label))}" for other in others for label in signal[other].values]
+        known = SIGNALS.get(str(name))
+        units = ("1",) * len(labels or [""]) if known is None else known.quantity.units
+        for label, unit in zip(labels or [""], units, strict=True):
+            header.append(f"{name}{label}[{'-' if unit == '1' else unit}]")
+        columns.append(signal.transpose("time", *others).values.reshape(len(signal.time), -1))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
@@ -69,22 +63,47 @@ def read_signals(path: Path) -> xr.Dataset:
     Raises:
         ConfigError: there is no such file, or it is none of theirs.
     """
-    if not path.is_file():
-        raise ConfigError(f"signals: no file {str(path)!r}; expected one that simulate saved (.nc)")
+    if not path.exists():
+        raise ConfigError(f"signals: no file {str(path)!r}; expected {_EXPECTED}")
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as signals:
-            loaded = signals.load()
-    except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(
-            f"signals: got {str(path)!r}, which cannot be read ({error}); expected a file that "
-            "simulate saved (.nc)"
-        ) from None
-    if "time" not in loaded.dims or not set(loaded.data_vars) >= {"pose", "torque_applied"}:
-        raise ConfigError(
-            f"signals: got {str(path)!r} without poses and torques over time; expected a file "
-            "that simulate saved"
-        )
+        loaded = load_netcdf(path, _EXPECTED)
+    except ConfigError as error:
+        raise ConfigError(f"signals: {error}") from None
+    problem = _problem(loaded)
+    if problem:
+        raise ConfigError(f"signals: got {str(path)!r}, where {problem}; expected {_EXPECTED}")
     return loaded
+
+
+def _problem(signals: xr.Dataset) -> str | None:
+    """What tells signals from those of a run, or None."""
+    missing = [name for name in ("pose", "torque_applied") if name not in signals.data_vars]
+    if missing:
+        return f"{missing[0]} is missing"
+    # What is no coordinate can be asked for as well, and is an index then.
+    if "time" not in signals.coords or signals.time.dims != ("time",):
+        return "the coordinate time is missing"
+    time = signals.time
+    for name, signal in {"time": time, **signals.data_vars}.items():
+        if signal.dtype.kind not in "fiu" or " since " in str(signal.attrs.get("units")):
+            return f"{name} is no number"
+        others = [dimension for dimension in signal.dims if dimension != "time"]
+        known = SIGNALS.get(str(name))
+        single = name == "time" if known is None else known.quantity.dimension is None
+        if "time" not in signal.dims or len(others) != (not single):
+            return f"{name} is over {', '.join(map(str, signal.dims)) or 'nothing'}"
+        if known is not None and others and signal.sizes[others[0]] != known.size:
+            return f"{name} has {signal.sizes[others[0]]} components"
+    if time.attrs.get("units", "s") != "s":
+        return f"time is in {brief(time.attrs['units'])}"
+    if not np.all(np.diff(time.values) > 0) or not np.isfinite(time.values).all():
+        return "time does not increase"
+    return None
+
+
+def _spoken(label: str) -> str:
+    """`error_phi` as `error_roll`, the names of scenario and reference files."""
+    return "_".join(_SPOKEN.get(word, word) for word in label.split("_"))
 
 
 def _cell(value: float) -> str:

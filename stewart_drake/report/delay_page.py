@@ -3,12 +3,15 @@
 import math
 from typing import Final
 
+from stewart_drake.controller_margin import ControllerMargin
+from stewart_drake.delay import Delay
 from stewart_drake.report.analysis_figures import growth_figure, loop_figure, map_figure
 from stewart_drake.report.page import Page, Picture, Provenance, Section, Table, Tone
 from stewart_drake.report.tables import number, rows, wrap
 from stewart_drake.studies.delay_limits import DelayStudy
 from stewart_drake.studies.delay_loop import LoopMargins
 from stewart_drake.studies.delay_map import Cell
+from stewart_drake.studies.verdict import loop_verdict, milliseconds
 
 _TONES: Final[dict[str, Tone]] = {"yes": "good", "hardly": "fair", "no": "bad"}
 
@@ -27,12 +30,13 @@ _FLOOR_TEXT: Final = (
     "collects by then is a floor that no controller goes below."
 )
 _LOOP_TEXT: Final = (
-    "The delayed LQI loop, linearised at the reference's first pose and cut at the motors. S is "
+    "The scenario's loop, linearised at the reference's first pose and cut at the motors. S is "
     "the sensitivity, T the complementary one; 1 / max |T| is the relative error of the motors, of "
     "any kind, that the loop bears for certain. The tolerable errors of gain and delay are found "
     "by the eigenvalues of the loop, all six motors being wrong by the same amount; for one motor "
     "alone they are its classical gain and phase margins. Feedforward and estimator have no part "
-    "in this; an estimator may narrow the margins.",
+    "in this; an estimator may narrow the margins. The sentence on top is about the worst instant "
+    "along the reference.",
 )
 _MAP_TEXT: Final = (
     "Simulations on the exact plant, everything else as in the scenario. E_ac in % s, relative to "
@@ -45,17 +49,16 @@ def verdict(study: DelayStudy) -> tuple[str, Tone]:
     obstacles = " ".join(study.basis.obstacles)
     if study.verdict is None:
         return f"{obstacles} There is no motion along which a delay could be judged.", "bad"
-    text = str(study.verdict)
-    text = text[0].upper() + text[1:] + "."
-    loop = study.loop
+    loop, tone = study.controller, _TONES[study.verdict.beatable]
+    sentences = [*study.basis.obstacles]
     if loop is not None:
-        text += " " + _loop_sentence(loop, study.eta)
-    tone = _TONES[study.verdict.beatable]
-    if loop is not None and loop.radius >= 1:
-        tone = "bad"
-    elif loop is not None and tone == "good" and _tolerance(loop) < FRAGILE * study.eta:
-        tone = "fair"
-    return f"{obstacles} {text}".strip(), "bad" if obstacles else tone
+        sentences.append(f"{_capital(loop_verdict(loop))}.{_knowledge(loop)}")
+        if loop.stable is False:
+            tone = "bad"
+        elif loop.stable and tone == "good" and loop.delay_margin < FRAGILE * study.eta:
+            tone = "fair"
+    sentences.append(_capital(str(study.verdict)) + ".")
+    return " ".join(sentences), "bad" if obstacles else tone
 
 
 def delay_table(study: DelayStudy) -> str:
@@ -74,13 +77,19 @@ def delay_table(study: DelayStudy) -> str:
             f"peak of S {number(loop.S.value)} at {number(loop.S.frequency)} rad/s, of T "
             f"{number(loop.T.value)} at {number(loop.T.frequency)} rad/s"
         )
-        entries["gain margin"] = f"all motors {_gains(loop.gain_down, loop.gain_up)}" + (
-            f", one motor {_gains(loop.motor.gain_down, loop.motor.gain_up)}, "
-            f"phase {number(loop.motor.phase)} deg"
-            if loop.motor
-            else ""
+        entries["gain margin"] = (
+            f"at the first pose, all motors {_gains(loop.gain_down, loop.gain_up)}"
+            + (
+                f", one motor {_gains(loop.motor.gain_down, loop.motor.gain_up)}, "
+                f"phase {number(loop.motor.phase)} deg"
+                if loop.motor
+                else ""
+            )
         )
-        entries["delay margin"] = f"{_ms(loop.later)} longer, {_ms(loop.earlier)} shorter"
+        entries["delay margin"] = (
+            f"at the first pose, {milliseconds(loop.later)} longer, "
+            f"{milliseconds(loop.earlier)} shorter"
+        )
     if study.loop_problem:
         entries["closed loop"] = study.loop_problem
     lines = [wrap(verdict(study)[0]), "", rows(entries)]
@@ -90,6 +99,8 @@ def delay_table(study: DelayStudy) -> str:
             "E_ac in % s over the delay of mu periods and the amplitude, exact plant",
             _map_table(study),
         ]
+        if any(cell.status != "completed" for cell in study.cells):
+            lines.append("no reach: the motion leaves the workspace, left: the plate does, after s")
     if study.interrupted:
         lines.append("interrupted: not all simulations were run")
     return "\n".join(lines)
@@ -132,30 +143,18 @@ def delay_page(study: DelayStudy, made: Provenance) -> Page:
         f"w_Q = {c.w_Q:g}, w_R = {c.w_R:g}",
         "start": f"{sc.start.replace('_', ' ')}, torques in flight: {sc.queue}",
     }
-    return Page("Can this delay be beaten?", text, sections, made, tone, facts)
+    return Page("Does this loop bear its delay?", text, sections, made, tone, facts)
 
 
-def _loop_sentence(loop: LoopMargins, eta: float) -> str:
-    if loop.radius >= 1:
-        return (
-            "The closed loop as designed is unstable on the true plant at the first pose "
-            f"(spectral radius {loop.radius:.3g})."
-        )
-    return (
-        f"The closed loop bears a delay that is {_ms(loop.later)} longer or {_ms(loop.earlier)} "
-        f"shorter than believed{_knowledge(loop, eta)}."
-    )
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
-def _tolerance(loop: LoopMargins) -> float:
-    """s, error of the delay that is borne in either direction."""
-    return min(loop.later, loop.earlier)
-
-
-def _knowledge(loop: LoopMargins, eta: float) -> str:
-    if eta == 0 or not math.isfinite(_tolerance(loop)):
+def _knowledge(loop: ControllerMargin) -> str:
+    """How well the delay must be known, of a stable loop."""
+    if not loop.stable or loop.eta == 0 or not math.isfinite(loop.delay_margin):
         return ""
-    return f": it must be known to {number(100 * _tolerance(loop) / eta, 2)} %"
+    return f" The delay must be known to {number(100 * loop.delay_margin / loop.eta, 2)} %."
 
 
 def _growth_section(study: DelayStudy) -> Section:
@@ -187,7 +186,7 @@ def _floor_section(study: DelayStudy) -> Section:
     table = Table(
         ("μ", "delay  [s]", "floor of E_ac  [% s]"),
         [
-            (str(s), f"{(s + sc.delay.fraction) * sc.controller.period:.4g}", f"{value:.2f}")
+            (str(s), f"{Delay(s, sc.delay.fraction).eta(sc.controller.period):.4g}", f"{value:.2f}")
             for s, value in sorted(study.floors.items())
         ],
     )
@@ -250,7 +249,3 @@ def _gains(down: float, up: float) -> str:
 
 def _seconds(value: float) -> str:
     return f"{value:.3g} s" if math.isfinite(value) else "any delay"
-
-
-def _ms(seconds: float) -> str:
-    return f"{1e3 * seconds:.3g} ms" if math.isfinite(seconds) else "any time"

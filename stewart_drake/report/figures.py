@@ -13,12 +13,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from stewart_drake.config import FixedTunerConfig
 from stewart_drake.report import style
 from stewart_drake.report.style import figure_style, write_figure
 from stewart_drake.report.tuner_figures import shown_until, weights_figure
 from stewart_drake.results import SimulationResult
 from stewart_drake.signals import ANGLES, COORDINATES, LEGS, PARAMETERS, POSITION
 from stewart_drake.studies.compare import LABELS
+from stewart_drake.studies.compare import label as spoken
 
 Array = NDArray[np.float64]
 
@@ -69,15 +71,16 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
     """The figures that `comparison_figures` writes, by name; none without results."""
     if not results:
         return {}
-    lines = {LABELS[name]: style.CONTROLLER_LINES[name] for name in results}
-    runs = {LABELS[name]: result for name, result in results.items()}
-    aware = {name: results[name] for name in TORQUE_CONTROLLERS if name in results}
+    lines = {spoken(name): style.controller_line(name) for name in results}
+    runs = {spoken(name): result for name, result in results.items()}
+    shown = (*TORQUE_CONTROLLERS, *(name for name in results if name not in LABELS))
+    aware = {name: results[name] for name in shown if name in results}
     with figure_style():
         figures = {"states": _states(runs, lines), "errors": _errors(runs, lines)}
         for name, result in aware.items():
-            line = style.CONTROLLER_LINES[name]
-            figures[f"torques_{name}"] = _torques(result, LABELS[name], line)
-        tuned = {LABELS[n]: run for n, run in aware.items() if run.scenario.tuner.kind == "ann"}
+            line = style.controller_line(name)
+            figures[f"torques_{name}"] = _torques(result, spoken(name), line)
+        tuned = {spoken(n): run for n, run in aware.items() if _is_tuned(run)}
         if tuned:
             figures["weights"] = weights_figure(tuned)
         return figures
@@ -113,9 +116,13 @@ def draw_run(result: SimulationResult) -> dict[str, Figure]:
         }
         if np.isfinite(result.signals.parameter_std.values).any():
             figures["parameters"] = _parameters(result)
-        if result.scenario.tuner.kind == "ann":
+        if _is_tuned(result):
             figures["weights"] = weights_figure({"weights that the tuner set": result})
         return figures
+
+
+def _is_tuned(run: SimulationResult) -> bool:
+    return not isinstance(run.scenario.tuner, FixedTunerConfig)
 
 
 def _write(figures: Mapping[str, Figure], directory: str | Path) -> list[Path]:
@@ -166,7 +173,7 @@ def _torques(
             ax.plot(time, values, label="commanded", **steps, **style.COMMANDED._asdict())
         values = run.signals.torque_applied.values[:, k]
         _plot(ax, {label: run}, {label: line}, {label: values}, **steps)
-        ax.set_ylabel(f"motor {LEGS[k]}  [N m]")
+        ax.set_ylabel(f"motor {LEGS[k]}{'' if commanded else ' applied'}  [N m]")
     return _with_legend(figure, axes)
 
 

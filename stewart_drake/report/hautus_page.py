@@ -85,7 +85,7 @@ def hautus_page(study: HautusStudy, made: Provenance) -> Page:
     """The analysis as a page."""
     text, tone = verdict(study)
     sc, found = study.basis.experiment.scenario, study.basis
-    sections = [Section("How it is tested", _METHOD)]
+    sections = []
     chains = [system for name in _CHAINS for system in study.family(name)]
     if chains:
         sections.append(
@@ -104,12 +104,13 @@ def hautus_page(study: HautusStudy, made: Provenance) -> Page:
         )
     plants = [*study.family("error model"), *study.family("plant")]
     if plants:
+        shown = [*study.family("error model"), *_typical_plants(study)]
         sections.append(
             Section(
                 "The plant and the paper's error model",
                 ("The plant is held still at poses along the reference; the outputs are the pose.",)
                 + tuple(_deficiencies(plants)),
-                tables=[_systems_table(plants, "")],
+                tables=[_systems_table(shown, "At home, and where the margin is least.")],
                 pictures=[
                     Picture(plant_figure(study), "Margins of the plant along the reference.")
                 ],
@@ -117,7 +118,10 @@ def hautus_page(study: HautusStudy, made: Provenance) -> Page:
         )
     if study.skipped:
         sections.append(Section("Left out", tables=[Table(("model", "reason"), study.skipped)]))
-    sections.append(Section("Drake's answers", (_drake_text(study),), tables=_drake_tables(study)))
+    sections.append(Section("Drake's answers", (_drake_text(study),)))
+    if different := _drake_tables(study):
+        sections.append(Section("Where Drake disagrees", tables=different, folded=True))
+    sections.append(Section("How it is tested", _METHOD, folded=True))
     sections.append(Section("Every mode", tables=[_modes_table(study.systems)], folded=True))
     sections.append(Section("Every model", tables=[_systems_table(study.systems, "")], folded=True))
     motion = ", ".join(f"{value:.3g}" for value in found.motion)
@@ -137,11 +141,26 @@ def _chosen(study: HautusStudy) -> list[System]:
     chosen = study.family("error model")
     for name in _CHAINS:
         chosen += _landmarks(study.family(name), own)
+    return chosen + [worst for _, worst in _extremes(study)]
+
+
+def _typical_plants(study: HautusStudy) -> list[System]:
+    """Without and under gravity, the plant at home, which comes first, and where it is worst."""
+    return [
+        system
+        for first, worst in _extremes(study)
+        for system in ((first,) if first is worst else (first, worst))
+    ]
+
+
+def _extremes(study: HautusStudy) -> list[tuple[System, System]]:
+    """First and worst plant without gravity and under it."""
+    found = []
     for where in ("without", "under"):
         some = [s for s in study.family("plant") if s.name.startswith(f"plant {where} gravity")]
         if some:
-            chosen.append(min(some, key=lambda system: system.margins["controllable"]))
-    return chosen
+            found.append((some[0], min(some, key=lambda system: system.margins["controllable"])))
+    return found
 
 
 def _landmarks(chains: list[System], own: int) -> list[System]:

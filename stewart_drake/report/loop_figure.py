@@ -17,15 +17,16 @@ from stewart_drake.report.style import figure_style
 
 Point = tuple[float, float]
 
-_SIZE: Final = (10.0, 4.4)
+_SIZE: Final = (10.0, 5.2)
 """Inches, in which everything here is measured."""
 _BOX: Final = (1.24, 0.62)
 _PLACES: Final[dict[str, Point]] = {
-    "reference": (0.78, 3.75),
-    "controller": (2.89, 3.75),
-    "saturation": (5.0, 3.75),
-    "delay_chain": (7.11, 3.75),
-    "plant": (9.22, 3.75),
+    "reference": (0.78, 4.65),
+    "controller": (2.89, 4.65),
+    "saturation": (5.0, 4.65),
+    "delay_chain": (7.11, 4.65),
+    "torque_bias": (9.22, 4.65),
+    "plant": (9.22, 3.475),
     "sensor": (9.22, 2.3),
     "density": (6.2, 1.05),
     "tuner": (2.89, 1.05),
@@ -50,15 +51,16 @@ class _Route(NamedTuple):
 
 
 _ROUTES: Final[dict[tuple[str, str], _Route]] = {
-    ("reference", "controller"): _Route(("right", 0), ("left", 0), (1.83, 3.75)),
-    ("controller", "saturation"): _Route(("right", 0), ("left", 0), (3.94, 3.75)),
-    ("saturation", "delay_chain"): _Route(("right", 0), ("left", 0), (6.05, 3.75)),
-    ("delay_chain", "plant"): _Route(("right", 0), ("left", 0), (8.16, 3.75)),
-    ("plant", "sensor"): _Route(("bottom", 0), ("top", 0), (9.22, 3.03)),
+    ("reference", "controller"): _Route(("right", 0), ("left", 0), (1.83, 4.65)),
+    ("controller", "saturation"): _Route(("right", 0), ("left", 0), (3.94, 4.65)),
+    ("saturation", "delay_chain"): _Route(("right", 0), ("left", 0), (6.05, 4.65)),
+    ("delay_chain", "torque_bias"): _Route(("right", 0), ("left", 0), (8.16, 4.65)),
+    ("torque_bias", "plant"): _Route(("bottom", 0), ("top", 0), (9.22, 4.07)),
+    ("plant", "sensor"): _Route(("bottom", 0), ("top", 0), (9.22, 2.89)),
     ("sensor", "controller"): _Route(("left", 0), ("bottom", 0.3), (5.6, 2.3)),
     ("sensor", "density"): _Route(("bottom", 0), ("right", 0), (8.0, 1.05)),
     ("controller", "density"): _Route(
-        ("right", 0), ("top", 0), (4.75, 1.68), ((3.66, 3.75), (3.66, 1.68), (6.2, 1.68)), True
+        ("right", 0), ("top", 0), (4.75, 1.68), ((3.66, 4.65), (3.66, 1.68), (6.2, 1.68)), True
     ),
     ("reference", "density"): _Route(
         ("bottom", 0), ("bottom", 0), (3.5, 0.3), ((0.78, 0.3), (6.2, 0.3))

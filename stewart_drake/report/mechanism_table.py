@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.plant.workspace import SINGULARITY_LIMIT
 from stewart_drake.report.tables import number, rows, wrap
 from stewart_drake.report.workspace_page import travel_text
@@ -18,6 +19,7 @@ def mechanism_table(check: MechanismCheck) -> str:
     entries = {
         "name": mechanism.name,
         "lengths": f"cranks {cranks} mm, rods {rods} mm",
+        "inertias": _inertias(mechanism),
         "crank angles": _six(np.rad2deg(check.crank_angles), "deg"),
         "reach margin": _six(1e3 * measures.reach, "mm"),
         "sine off dead centre": _six(measures.sines, ""),
@@ -35,6 +37,20 @@ def mechanism_table(check: MechanismCheck) -> str:
             "from home alone": travel_text(check.travel),
         }
     return "\n".join([wrap(check.verdict), rows(entries)])
+
+
+def _inertias(mechanism: Mechanism) -> str:
+    """Principal moments of what moves, and which of them nobody measured."""
+    parts = []
+    for name, body, shape in (
+        ("plate", mechanism.plate, "disc"),
+        ("crank", mechanism.crank, "bar"),
+        ("rod", mechanism.rod, "bar"),
+    ):
+        moments = ", ".join(f"{value:.3g}" for value in body.inertia)
+        note = f" (estimated: uniform {shape})" if body.estimated else ""
+        parts.append(f"{name} {moments}{note}")
+    return "; ".join(parts) + " kg m^2"
 
 
 def _six(values: Array, unit: str) -> str:

@@ -17,8 +17,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from stewart_drake.fileio import replacing
-from stewart_drake.report.style import figure_style
-from stewart_drake.results import versions
+from stewart_drake.report.style import figure_style, for_dark_too
+from stewart_drake.versions import versions
 
 Tone = Literal["good", "fair", "bad", "plain"]
 """What a verdict amounts to; shown by a word and a bar, so that grey print tells it too."""
@@ -74,22 +74,25 @@ class Picture:
     Attributes:
         figure: drawn inside `style.figure_style`.
         caption: what it shows.
-        dense: embed as a bitmap; else as vectors, which stay sharp but grow with the data.
     """
 
     figure: Figure
     caption: str
-    dense: bool = False
 
     @property
     def source(self) -> str:
-        """The figure as a data URI."""
-        kind, mime = ("png", "image/png") if self.dense else ("svg", "image/svg+xml")
+        """The figure as a data URI: vectors, sharp when enlarged, readable on light and dark."""
         data = io.BytesIO()
         with figure_style():
-            metadata = None if self.dense else {"Date": None}
-            self.figure.savefig(data, format=kind, metadata=metadata)
-        return f"data:{mime};base64,{base64.b64encode(data.getvalue()).decode()}"
+            self.figure.savefig(data, format="svg", metadata={"Date": None})
+        content = for_dark_too(data.getvalue())
+        return f"data:image/svg+xml;base64,{base64.b64encode(content).decode()}"
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in the pixels of a browser, 96 per inch."""
+        width, height = 96 * self.figure.get_size_inches()
+        return round(width), round(height)
 
 
 @dataclass(frozen=True)

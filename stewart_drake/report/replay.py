@@ -1,56 +1,34 @@
-"""A finished run shown again in Meshcat, through the SDFormat model, beside its reference.
-
-The reference is a ring with a pointer along its x axis: where the ring is, the plate should be. In
-the self-contained page each crank also takes the colour of its motor's torque.
-"""
+"""A finished run shown again in Meshcat, through the SDFormat model, beside its reference."""
 
 import logging
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from pydrake.geometry import Cylinder, Meshcat, MeshcatParams, Rgba, Role, SceneGraph
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import Diagram
+from pydrake.geometry import Meshcat, MeshcatParams, Rgba
+from pydrake.math import RotationMatrix
 
-from stewart_drake.diagram import build_viewer
 from stewart_drake.fileio import replacing
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import UnreachablePoseError, rotation
-from stewart_drake.plant.multibody import set_pose
+from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.report.page import environment
-from stewart_drake.report.replay_shapes import pointer, ring
 from stewart_drake.report.tables import number
-from stewart_drake.results import SimulationResult, versions
+from stewart_drake.results import SimulationResult
+from stewart_drake.scene import TORQUE_COLORS, Scene, crank_paths, full_color, torque_shares
 from stewart_drake.signals import ANGLES, LEGS, POSITION
+from stewart_drake.versions import versions
 
 if TYPE_CHECKING:
     from jinja2 import Template
 
 Array = NDArray[np.float64]
 
-_VISUALIZER: Final = ("drake", "visualizer")
-"""Where Drake's MeshcatVisualizer puts a model."""
-CRANK_PARTS: Final = ("arm", "hub")
-"""Of the SDFormat model, what takes the torque's colour."""
-_GHOST: Final = "/reference"
-_GHOST_COLOR: Final = Rgba(0.0, 0.62, 0.45, 0.55)
 _PATH_COLORS: Final = {"reference": Rgba(0.0, 0.62, 0.45), "plate": Rgba(0.0, 0.45, 0.70)}
-_USUAL: Final = 95
-"""Percentile, over time, of the largest torque that takes the full colour: a short peak, such as a
-catch-up's, would leave nothing of the colours for the rest."""
 _MAX_FRAMES: Final = 1500
 """A long run is thinned out to this many frames; Meshcat interpolates between them."""
-_VIEW: Final = np.array([0.62, -0.70, 0.36])
-"""Where the camera stands as seen from the machine."""
-_DISTANCE: Final = 1.3
-"""Of the camera, in units of the machine's extent."""
-_FLOOR: Final = -0.06
-"""Height of the floor's lines in the same units, below what is drawn of the base."""
 
 
 def replay(signals: xr.Dataset, mechanism: Mechanism, meshcat: Meshcat | None = None) -> Meshcat:
@@ -65,28 +43,18 @@ def replay(signals: xr.Dataset, mechanism: Mechanism, meshcat: Meshcat | None = 
         The Meshcat; `StaticHtml()` of it is a file that plays without a server.
     """
     meshcat = meshcat or _quiet_meshcat()
-    diagram, plant, _ = build_viewer(mechanism, meshcat)
-    disc, radius = _drawn_plate(diagram, plant)
-    context = diagram.CreateDefaultContext()
-    tree = plant.GetMyMutableContextFromRoot(context)
-    diagram.ForcedPublish(context)
-    _arrange(meshcat, mechanism)
-    shown = _thinned(signals)
-    _draw_reference(meshcat, radius, shown)
+    scene, shown = Scene(mechanism, meshcat), _thinned(signals)
+    _draw_paths(meshcat, shown)
     period = _period(shown)
     meshcat.StartRecording(1 / period, set_visualizations_while_recording=False)
     frames = zip(shown.time.values, shown.pose.values, shown.reference.values, strict=True)
     for t, pose, wanted in frames:
-        try:
-            set_pose(plant, tree, mechanism, pose, np.zeros(6))
-        except UnreachablePoseError:
-            break  # a multibody run may end a hair outside
         # Meshcat rounds down to a frame; a hair later, rounding does not lose one.
-        context.SetTime(t + 1e-3 * period)
-        diagram.ForcedPublish(context)
-        meshcat.SetTransform(_GHOST, _placed(wanted) @ disc, context.get_time())
+        if not scene.show(pose, wanted, t + 1e-3 * period):
+            break
     meshcat.StopRecording()
     meshcat.PublishRecording()
+    scene.close()
     return meshcat
 
 
@@ -103,7 +71,7 @@ def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> s
     e = shown.error.values
     torque = shown.torque_applied.values
     largest = np.abs(torque).max(axis=1, initial=0.0)
-    full = float(np.percentile(largest, _USUAL)) if largest.any() else 1.0
+    full = full_color(largest)
     outcome = result.status.replace("_", " ")
     if result.stopped is not None:
         outcome += f" at {result.stopped.time:.2f} s"
@@ -113,8 +81,8 @@ def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> s
         "time": np.round(shown.time.values, 4).tolist(),
         "position": np.round(1e3 * np.linalg.norm(e[:, POSITION], axis=1), 4).tolist(),
         "angle": np.round(np.rad2deg(_turns(shown)), 4).tolist(),
-        "share": np.round(np.clip(torque / full, -1, 1), 3).tolist(),
-        "cranks": _crank_paths(mechanism.name),
+        "share": np.round(torque_shares(torque, full), 3).tolist(),
+        "cranks": crank_paths(mechanism.name),
     }
     overlay = _template().render(
         title=title,
@@ -123,6 +91,7 @@ def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> s
         peak=number(float(largest.max(initial=0.0)), 2),
         data=data,
         legs=LEGS,
+        colors=TORQUE_COLORS,
         drake=versions()["drake"],
     )
     page = meshcat.StaticHtml()
@@ -159,50 +128,16 @@ def _thinned(signals: xr.Dataset) -> xr.Dataset:
 
 
 def _period(signals: xr.Dataset) -> float:
-    """s between two frames."""
+    """s between two frames: the least, because samples may lie between the steps of the grid."""
     steps = np.diff(signals.time.values)
-    return float(np.median(steps)) if len(steps) else 1.0
+    return float(steps.min()) if len(steps) else 1.0
 
 
-def _arrange(meshcat: Meshcat, mechanism: Mechanism) -> None:
-    """A camera that sees the whole machine, whatever its size, over a floor of round squares."""
-    joints = mechanism.p_PQ @ rotation(mechanism.home[ANGLES]).T + mechanism.home[POSITION]
-    points = np.vstack([mechanism.p_WS, joints])
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle, extent = (low + high) / 2, float(np.linalg.norm(high - low))
-    meshcat.SetCameraPose(middle + _DISTANCE * extent * _VIEW, middle)
-    square = 10.0 ** np.floor(np.log10(extent))
-    meshcat.SetProperty("/Grid", "scale", [square] * 3)
-    meshcat.SetProperty("/Grid", "position", [0.0, 0.0, _FLOOR * extent])
-    meshcat.SetProperty("/Grid", "opacity", 0.25)
-    meshcat.SetProperty("/Axes", "visible", False)
-    meshcat.SetProperty("/Background", "top_color", [1.0, 1.0, 1.0])
-    meshcat.SetProperty("/Background", "bottom_color", [0.86, 0.88, 0.91])
-
-
-def _drawn_plate(diagram: Diagram, plant: MultibodyPlant) -> tuple[RigidTransform, float]:
-    """Where in the plate's frame its disc is drawn, and the disc's radius in m."""
-    scene_graph = cast(SceneGraph, diagram.GetSubsystemByName("scene_graph"))
-    inspector = scene_graph.model_inspector()
-    frame = plant.GetBodyFrameIdOrThrow(plant.GetBodyByName("plate").index())
-    for geometry in inspector.GetGeometries(frame, Role.kIllustration):
-        if inspector.GetName(geometry).endswith("disc"):
-            shape = cast(Cylinder, inspector.GetShape(geometry))
-            return inspector.GetPoseInFrame(geometry), shape.radius()
-    raise AssertionError("the model draws no plate")
-
-
-def _draw_reference(meshcat: Meshcat, radius: float, signals: xr.Dataset) -> None:
-    for name, (vertices, faces) in (("ring", ring(radius)), ("pointer", pointer(radius))):
-        meshcat.SetTriangleMesh(f"{_GHOST}/{name}", vertices, faces, _GHOST_COLOR)
+def _draw_paths(meshcat: Meshcat, signals: xr.Dataset) -> None:
     for name, signal in (("reference", "reference"), ("plate", "pose")):
         path = signals[signal].values[:, POSITION].T
         if path.shape[1] > 1:
             meshcat.SetLine(f"/paths/{name}", path, 1.5, _PATH_COLORS[name])
-
-
-def _placed(pose: Array) -> RigidTransform:
-    return RigidTransform(RollPitchYaw(pose[ANGLES]), pose[POSITION])
 
 
 def _turns(signals: xr.Dataset) -> Array:
@@ -214,13 +149,6 @@ def _turns(signals: xr.Dataset) -> Array:
             for p, q in pairs
         ]
     )
-
-
-def _crank_paths(name: str) -> list[list[list[str]]]:
-    """Of every leg the parts of the crank in Meshcat's tree, each as the names that lead there."""
-    return [
-        [[*_VISUALIZER, name, f"crank_{leg}", name, part] for part in CRANK_PARTS] for leg in LEGS
-    ]
 
 
 @lru_cache(maxsize=1)

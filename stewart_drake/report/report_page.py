@@ -14,7 +14,7 @@ from stewart_drake.config import Scenario
 from stewart_drake.report.collect import ANALYSES, Analysis, Collected
 from stewart_drake.report.figures import draw_comparison, draw_run
 from stewart_drake.report.page import Page, Picture, Provenance, Section, Table, Tone
-from stewart_drake.report.tables import number, paper_error
+from stewart_drake.report.tables import loops_sentence, number, paper_error, shared_warnings
 from stewart_drake.report.tuner_figures import weights_figure
 from stewart_drake.results import SimulationResult
 from stewart_drake.scenario_loading import scenario_yaml
@@ -25,16 +25,16 @@ GOOD: Final = 5.0
 """% of peak to peak: a mean error up to here, once torques can act, is called good."""
 
 _QUESTIONS: Final = {
-    "delay": "Can the delay be beaten?",
+    "delay": "Does the loop bear its delay?",
     "hautus": "Can the models be controlled and observed?",
     "workspace": "Does the motion fit the machine?",
 }
 _CAPTIONS: Final = {
     "states": "The plate's six coordinates.",
     "errors": "Their errors.",
-    "torques_delay_lqr": "Torques of the delay-aware LQR, without integral action.",
-    "torques_delay_lqi": "Torques of the delay-aware LQI, with integral action.",
-    "torques_predictor_lqi": "Torques of the LQI with nonlinear prediction.",
+    "torques_delay_lqr": "Applied torques of the delay-aware LQR, without integral action.",
+    "torques_delay_lqi": "Applied torques of the delay-aware LQI, with integral action.",
+    "torques_predictor_lqi": "Applied torques of the LQI with nonlinear prediction.",
     "weights": "The weights that the tuner's network sets online.",
 }
 _PAPER_FIGURES: Final = {
@@ -48,7 +48,7 @@ _PAPER_FIGURES: Final = {
 _RUN_CAPTIONS: Final = {
     "states": "Where the plate was, and where it should have been.",
     "errors": "The difference.",
-    "torques": "Torques as computed, and as they acted after the delay.",
+    "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay.",
     "parameters": "What the controller found out about the plant, which nobody told it.",
     "weights": "The weights that the tuner set.",
 }
@@ -59,7 +59,8 @@ _COLUMNS: Final = (
     "floor [%\u00a0s]",
     "outcome",
     "cost",
-    "peak [N\u00a0m]",
+    "commanded peak [N\u00a0m]",
+    "applied peak [N\u00a0m]",
     "rms [N\u00a0m]",
     "var. [N\u00a0m]",
     "step [ms]",
@@ -146,7 +147,7 @@ def verdict(found: Collected) -> tuple[str, Tone]:
 def mean_error(run: SimulationResult) -> float:
     """% of peak to peak, over the time in which torques can act; NaN if the run ended early."""
     s, sc = run.summary, run.scenario
-    blind = (sc.delay.steps + sc.delay.fraction) * sc.controller.period if s["delay_floor"] else 0.0
+    blind = sc.eta if s["delay_floor"] else 0.0
     left = sc.duration - blind
     return float((s["accumulated_error"] - s["delay_floor"]) / left) if left > 0 else np.nan
 
@@ -172,14 +173,17 @@ def _run_sections(found: Collected, replay: str) -> Iterator[Section]:
             (f"peak error, {name}", f"{number(value)} % of peak to peak")
             for name, value in zip(COORDINATE_NAMES, s["peak_error"], strict=True)
         ),
-        ("torque, peak and rms", f"{number(s['peak_torque'])} and {number(s['rms_torque'])} N m"),
+        ("commanded torque, peak", f"{number(s['peak_torque'])} N m"),
+        ("commanded torque, rms", f"{number(s['rms_torque'])} N m"),
+        ("applied torque, peak", f"{number(s['peak_torque_applied'])} N m"),
         ("controller step, median", f"{number(s['controller_step_ms']['median'])} ms"),
     ]
     if replay:
         text = "Drag to look around. The ring is where the plate should be."
         yield Section("Replay", (text,), frame=replay)
+    warnings = [f"Warning: {sentence(text)}" for text in s["warnings"]]
     pictures = _pictures(draw_run(found.run), _RUN_CAPTIONS)
-    yield Section("The run", (_ERROR_IS,), [Table(("", "value"), entries)], pictures)
+    yield Section("The run", (_ERROR_IS, *warnings), [Table(("", "value"), entries)], pictures)
 
 
 def _comparison(found: Collected) -> Section:
@@ -187,8 +191,12 @@ def _comparison(found: Collected) -> Section:
     text = [
         "The same scenario under each of the shipped controllers. The floor is what the delay "
         "alone adds to E_ac; the cost sums squared errors and torques, weighted by w_Q and w_R; "
-        "torques are as commanded, their total variation (var.) tells trembling.",
+        "rms and total variation (var.), which tells trembling, are of the commanded torques. "
+        "Applied, as in the figures, is what is left of them within the motors' limit and after "
+        "the delay: of a run that ends early the last ones never acted.",
     ]
+    text.append(sentence(loops_sentence(found.comparison)))
+    text += [f"Warning: {sentence(text)}" for text in shared_warnings(found.comparison)]
     if papers:
         text.append(
             "The paper's numbers are those of its Table II; its delay-aware controllers had the "
@@ -216,7 +224,7 @@ def _row(label: str, name: str, run: SimulationResult, papers: bool) -> tuple[st
     if run.stopped is not None:
         leg = "" if run.stopped.leg is None else f", leg {run.stopped.leg}"
         outcome += f" at {run.stopped.time:.2f} s{leg}"
-    torques = (s["peak_torque"], s["rms_torque"], s["torque_variation"])
+    names = ("peak_torque", "peak_torque_applied", "rms_torque", "torque_variation")
     return (
         label,
         *([paper_error(name)] if papers else []),
@@ -224,7 +232,7 @@ def _row(label: str, name: str, run: SimulationResult, papers: bool) -> tuple[st
         number(s["delay_floor"]),
         outcome,
         number(s["cost"]),
-        *(number(value, 2) for value in torques),
+        *(number(s[name], 2) for name in names),
         number(s["controller_step_ms"]["median"], 2),
     )
 
@@ -247,12 +255,11 @@ def _pictures(figures: Mapping[str, Any], captions: Mapping[str, str]) -> list[P
 
 
 def _facts(scenario: Scenario) -> dict[str, str]:
-    c, delay, plant = scenario.controller, scenario.delay, scenario.plant
-    eta = (delay.steps + delay.fraction) * c.period
+    c, plant = scenario.controller, scenario.plant
     return {
         "mechanism": Path(scenario.mechanism).stem,
         "reference": f"{scenario.reference.kind}, {scenario.duration:g} s",
-        "delay": f"{eta:.4g} s, {delay.steps + delay.fraction:g} periods of {c.period:g} s",
+        "delay": f"{scenario.eta:.4g} s, {scenario.true_delay.periods:g} periods of {c.period:g} s",
         "plant": f"{plant.kind}, {'with' if plant.gravity else 'without'} gravity",
         "controller": f"{c.prediction} prediction, feedforward {c.feedforward}, "
         f"estimator {c.estimator}".replace("_", " "),

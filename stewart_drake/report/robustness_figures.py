@@ -9,7 +9,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from stewart_drake.report.style import BAND_ALPHA, RUN, TRUTH, Line, figure_style
+from stewart_drake.report.style import (
+    BAND_ALPHA,
+    RUN,
+    TRUTH,
+    Line,
+    figure_style,
+    plain_log_ticks,
+)
 from stewart_drake.studies.robustness_result import (
     FACTORS,
     Influence,
@@ -34,6 +41,8 @@ SIGNIFICANT: Final = 0.05
 """Adjusted p-value below which an influence counts as found."""
 LIMIT: Final = Line("#8A2B0B", "-", 0.9)
 _SOFT: Final = "#666666"
+# Of many points, which are a bitmap that a dark page cannot change: readable on both.
+_SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
 _WIDTH: Final = 9.0
 """Inches."""
 
@@ -70,6 +79,7 @@ def distribution_figure(study: RobustnessStudy) -> Figure:
         if study.limit is not None:
             ax.axvline(study.limit, color=LIMIT.color, ls=":", label="limit")
         ax.set(xscale="log", ylim=(0, 103))
+        plain_log_ticks(ax.xaxis)
         ax.set(xlabel="accumulated error E_ac  [% s]", ylabel="share of all runs  [%]")
         figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
         return figure
@@ -98,10 +108,10 @@ def runs_figure(study: RobustnessStudy) -> Figure:
         for ax, (name, unit) in zip(axes.ravel(), FACTORS.items(), strict=True):
             x = values[name]
             kept = done & ~study.failed
-            _scatter(ax, x[kept], study.errors[kept], "o", RUN.color, "success")
+            _scatter(ax, x[kept], study.errors[kept], "o", _SUCCESS, "success")
             above = done & study.failed
             if above.any():
-                _scatter(ax, x[above], study.errors[above], "s", "#E69F00", "above the limit")
+                _scatter(ax, x[above], study.errors[above], "s", _ABOVE, "above the limit")
             ax.set(yscale="log", xlabel=f"{TITLES[name]}  [{unit}]")
             if not np.isfinite(x).all():
                 ax.text(0.5, 0.5, "none", transform=ax.transAxes, ha="center", color=_SOFT)
@@ -114,7 +124,8 @@ def runs_figure(study: RobustnessStudy) -> Figure:
             # Spread over the strip by the number of the run, so that marks do not hide each other.
             spread = (np.arange(len(done)) * 0.618034) % 1 * 0.8 + 0.1
             y = strip * (top / strip) ** spread[~done]
-            _scatter(ax, values[name][~done], y, "x", LIMIT.color, "did not complete")
+            _scatter(ax, values[name][~done], y, "x", _FAILED, "did not complete")
+        plain_log_ticks(axes[0, 0].yaxis)  # which all share
         for ax in axes[:, 0]:
             ax.set_ylabel("E_ac  [% s]")
         handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -154,7 +165,8 @@ def _dots(ax: Axes, found: Sequence[tuple[Correlation, float]], label: str) -> N
 
 def _scatter(ax: Axes, x: Array, y: Array, marker: str, color: str, label: str) -> None:
     style = {"linewidths": 0.9} if marker == "x" else {"edgecolors": "none"}
-    ax.scatter(x, y, s=11, marker=marker, color=color, alpha=0.75, label=label, **style)
+    ax.scatter(x, y, s=11, marker=marker, color=color, alpha=0.75, label=label, rasterized=True,
+               **style)  # fmt: skip
 
 
 def _log_range(errors: Array) -> tuple[float, float]:

@@ -5,6 +5,7 @@ from typing import Final
 
 import numpy as np
 
+from stewart_drake.report.failures_table import failures_sentence, failures_tables
 from stewart_drake.report.page import Page, Picture, Provenance, Section, Table, Tone
 from stewart_drake.report.robustness_figures import (
     SIGNIFICANT,
@@ -22,6 +23,7 @@ from stewart_drake.studies.robustness_result import (
     Influence,
     RobustnessStudy,
     factor_values,
+    unit_of,
 )
 from stewart_drake.studies.statistics import Correlation, Interval, wilson_interval
 
@@ -55,21 +57,33 @@ def verdict(study: RobustnessStudy) -> tuple[str, Tone]:
     text = f"{kept} of {total} runs {aim}: {percent(study.success)}. {_median(study)}"
     if study.undisturbed.status != "completed":
         text += " The undisturbed run failed already: " + study.undisturbed.reason + "."
-    strong = found(study.influences())
+    explanation = study.explanation
+    strong = [title(one.factor) for one in explanation.found]
     if strong:
-        text += f" What matters most: {', '.join(strong[:3])}."
+        text += f" What matters for {_aim(study)}: {', '.join(strong[:3])}."
+    elif explanation.failing and explanation.others:
+        text += f" For {_aim(study)} no single quantity matters beyond chance."
+    errors = found(study.influences())
+    if errors:
+        text += f" What matters for E_ac, of those that completed: {', '.join(errors[:3])}."
     low = study.success.low
     return text, "good" if low >= _GOOD else "fair" if low >= _FAIR else "bad"
 
 
 def found(influences: list[Influence]) -> list[str]:
-    """Quantities whose influence is beyond chance, the strongest first, each once."""
-    names = [
-        title(one.factor.strip("|"))
-        for one in influences
-        if min(_or_one(one.error_p), _or_one(one.failure_p)) < SIGNIFICANT
-    ]
-    return list(dict.fromkeys(names))
+    """Quantities whose influence on E_ac is beyond chance, the strongest first, each once."""
+    strong = [one for one in influences if _or_one(one.error_p) < SIGNIFICANT]
+    strong.sort(key=lambda one: -abs(one.error.rho))
+    return list(dict.fromkeys(title(one.factor.strip("|")) for one in strong))
+
+
+def _aim(study: RobustnessStudy) -> str:
+    return "completing" if study.limit is None else "staying within the limit"
+
+
+def _told(study: RobustnessStudy) -> str:
+    """How the failing runs differ."""
+    return failures_sentence(study.explanation, title, unit_of)
 
 
 def robustness_table(study: RobustnessStudy) -> str:
@@ -80,6 +94,8 @@ def robustness_table(study: RobustnessStudy) -> str:
     }
     if study.reasons:
         entries["failures"] = "; ".join(f"{reason} {n}" for reason, n in study.reasons.items())
+    if told := _told(study):
+        entries["who fails"] = told
     influences = study.influences()
     lines = [
         wrap(verdict(study)[0]),
@@ -125,7 +141,6 @@ def robustness_page(study: RobustnessStudy, made: Provenance) -> Page:
                     runs_figure(study),
                     "Every run over every drawn quantity; in the strip on top, runs that did not "
                     "complete. Quantities with a sign are true less believed.",
-                    dense=True,
                 ),
             ],
         ),
@@ -139,7 +154,7 @@ def robustness_page(study: RobustnessStudy, made: Provenance) -> Page:
     facts = {
         "mechanism": study.experiment.mechanism.name,
         "start": f"{sc.start.replace('_', ' ')}, torques in flight: {sc.queue}",
-        "delay": f"{(sc.delay.steps + sc.delay.fraction) * sc.controller.period:g} s",
+        "delay": f"{sc.eta:g} s",
         "runs": f"{len(study.outcomes)}, seed {study.seed}, {sc.plant.kind} plant",
         "undisturbed E_ac": f"{number(study.undisturbed.error)} % s",
     }
@@ -249,7 +264,11 @@ def _failures(study: RobustnessStudy) -> Section:
     columns = ("reason", "runs", "share of all", "median time, s", "legs")
     early = any(one.status != "completed" for one in study.outcomes)
     pictures = [Picture(times_figure(study), "When runs ended early.")] if early else []
-    return Section("Failures", tables=[Table(columns, table_rows)], pictures=pictures)
+    tables = [Table(columns, table_rows)]
+    told = _told(study)
+    if told:
+        tables += failures_tables(study.explanation, title, unit_of)
+    return Section("Failures", (told,) if told else (), tables, pictures)
 
 
 def _range_table(study: RobustnessStudy) -> Table:

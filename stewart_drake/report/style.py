@@ -1,4 +1,4 @@
-"""How every figure looks: one line per controller, also told apart in grey print."""
+"""How every figure looks: one line per controller, also told apart in grey print, light or dark."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import matplotlib
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from stewart_drake.fileio import replacing
 
@@ -27,6 +29,7 @@ CONTROLLER_LINES: Final = {
     "delay_lqi": Line("#0072B2", (0, (3, 1.2)), 1.6),
     "predictor_lqi": Line("#000000", "-", 1.3),
 }
+_OWN_COLORS: Final = ("#CC79A7", "#56B4E9", "#F0E442")
 REFERENCE: Final = Line("#BBBBBB", "-", 4.0)
 RUN: Final = Line("#0072B2", "-", 1.5)
 """A single run."""
@@ -34,6 +37,29 @@ COMMANDED: Final = Line("#D55E00", "--", 1.0)
 TRUTH: Final = Line("#D55E00", "--", 1.2)
 BAND_ALPHA: Final = 0.2
 """Opacity of an uncertainty band, in the colour of its line."""
+
+DATA_INK: Final = "#111111"
+DATA_PAPER: Final = "#FDFDFD"
+"""On and between fields whose colour is a value, which a dark page does not change."""
+DARK: Final = {
+    "#ffffff": "#16191d",  # the page's paper
+    "#000000": "#e6e9ed",  # and ink
+    "#1b1f24": "#e6e9ed",
+    "#333333": "#d0d6dc",
+    "#444444": "#c5ccd3",
+    "#666666": "#a3adb8",
+    "#888888": "#8f99a3",
+    "#bbbbbb": "#5c6670",
+    "#e4e4e4": "#2e353d",
+    "#f1eae6": "#2b2622",
+    "#f2f2f2": "#22272d",
+    "#0072b2": "#56b4e9",
+    "#009e73": "#2fc79a",
+    "#8a2b0b": "#e8805c",
+    "#b00020": "#ff6e7f",
+    "#d55e00": "#f08a4b",
+}
+"""What our lines and letters become on a dark page. Any other colour is data and stays."""
 
 FORMATS: Final = ("png", "svg")
 _RC: Final[dict[Any, Any]] = {
@@ -60,6 +86,13 @@ _RC: Final[dict[Any, Any]] = {
 }
 
 
+def controller_line(name: str) -> Line:
+    """Of a shipped controller, or of one of the user's own, the same whenever it has this name."""
+    if name in CONTROLLER_LINES:
+        return CONTROLLER_LINES[name]
+    return Line(_OWN_COLORS[sum(name.encode()) % len(_OWN_COLORS)], "-", 1.3)
+
+
 @contextmanager
 def figure_style() -> Iterator[None]:
     """Matplotlib's settings for our figures, whatever the user's own are."""
@@ -67,6 +100,21 @@ def figure_style() -> Iterator[None]:
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_RC)
         yield
+
+
+class _RoundTicks(LogLocator):
+    """1, 2, 5 and so on; of less than half a decade, where these are few, evenly spaced."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        narrow = max(vmin, vmax) < 3 * min(vmin, vmax)
+        return MaxNLocator(5).tick_values(vmin, vmax) if narrow else super().tick_values(vmin, vmax)
+
+
+def plain_log_ticks(axis: Axis) -> None:
+    """Ticks such as 20 and 50 on a logarithmic axis, not powers of ten with a factor."""
+    axis.set_major_locator(_RoundTicks(subs=(1, 2, 5)))
+    axis.set_major_formatter(FormatStrFormatter("%g"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def write_figure(figure: Figure, directory: Path, name: str) -> list[Path]:
@@ -83,3 +131,19 @@ def write_figure(figure: Figure, directory: Path, name: str) -> list[Path]:
             figure.savefig(partial, format=suffix, metadata=metadata)
         paths.append(path)
     return paths
+
+
+def for_dark_too(svg: bytes) -> bytes:
+    """A figure as matplotlib writes it, with the colours of DARK where its reader prefers dark.
+
+    Matplotlib puts colours into style attributes, lower case, and leaves out a black fill.
+    """
+    rules = "".join(
+        f'[style*="{what}: {light}"]{{{what}:{dark}!important}}'
+        for light, dark in DARK.items()
+        for what in ("fill", "stroke")
+    )
+    style = f"@media(prefers-color-scheme:dark){{svg{{fill:{DARK['#000000']}}}{rules}}}"
+    before, end, after = svg.partition(b"<defs>")
+    assert end, "a figure without definitions"
+    return b"".join((before, b"<style>", style.encode(), b"</style>", end, after))

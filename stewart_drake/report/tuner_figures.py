@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from stewart_drake.report import style
@@ -86,9 +85,7 @@ def _draw_weights(above: Axes, below: Axes, run: SimulationResult) -> None:
     below.axhline(c.w_Q / c.w_R, label="fixed weights", color="#888888", ls=":", lw=1.2)
     for ax in (above, below) if len(time) else ():
         ax.set_yscale("log")
-        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-        ax.yaxis.set_minor_formatter(NullFormatter())
+        style.plain_log_ticks(ax.yaxis)
         if run.stopped is not None and run.status != "interrupted":
             end = (weights[-1, 0], ratio[-1])[ax is below]
             ax.plot(run.stopped.time, end, "x", color=_INK, ms=7, mew=2, clip_on=False)

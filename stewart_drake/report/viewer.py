@@ -9,9 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
-from stewart_drake.diagram import build_viewer
+from stewart_drake.lifetime import let_go
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import rotation
+from stewart_drake.multibody_stewart import build_viewer
 from stewart_drake.plant.multibody import set_pose
 from stewart_drake.plant.workspace import Failure, diagnose
 from stewart_drake.signals import LEGS
@@ -97,6 +98,10 @@ class PoseViewer:
         for name, low, high, value in zip(SLIDERS, *slider_range(mechanism), home, strict=True):
             meshcat.AddSlider(name, low, high, 0.1, value)
         self.step(home)
+
+    def close(self) -> None:
+        """See `scene.Scene.close`."""
+        let_go(self._diagram)
 
     def values(self) -> Array:
         """The sliders' values (6,) in degrees and mm."""

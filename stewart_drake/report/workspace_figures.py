@@ -1,6 +1,6 @@
 """Figures of a workspace study: margins along the reference, sections, and the motors' work."""
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib import colormaps
@@ -11,6 +11,7 @@ from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from stewart_drake.plant.equations import DEAD_CENTRE_SINE
@@ -37,6 +38,10 @@ _LEVELS: Final = (1, 2, 3, 5, 8, 13, 30, 100)
 """Of the condition number."""
 _CMAP: Final = colormaps["cividis_r"]
 _OUTSIDE: Final = "#F2F2F2"
+_HALO: Final = (withStroke(linewidth=3, foreground="#FFFFFF"),)
+"""Of black lines over colours of any darkness; on a dark page it is the lines that are light."""
+_PATH: Final[dict[str, Any]] = {"color": "#000000", "lw": 1.2, "path_effects": _HALO}
+_HOME: Final[dict[str, Any]] = {**_PATH, "marker": "+", "ls": "", "ms": 9, "mew": 1.5}
 _UNITS: Final = ("deg",) * 3 + ("mm",) * 3
 _FACTORS: Final = (180 / np.pi,) * 3 + (1e3,) * 3
 
@@ -100,8 +105,8 @@ def sections_figure(sections: list[Section], home: Array, poses: Array) -> Figur
         scale.set_label("condition number of A  [-], light is good")
         handles = [
             Line2D([], [], color=LIMIT.color, lw=1.8),
-            Line2D([], [], color="#000000", lw=1.2),
-            Line2D([], [], color="#000000", marker="+", ls="", ms=9, mew=1.5),
+            Line2D([], [], **_PATH),
+            Line2D([], [], **_HOME),
         ]
         labels = ["border of the workspace", "reference, projected", "home"]
         figure.legend(handles, labels, loc="upper center", ncols=3)
@@ -163,8 +168,9 @@ def _section(ax: Axes, section: Section, home: Array, poses: Array, norm: Bounda
     ax.contourf(x, y, border, levels=[-1e9, 0.0], colors=_OUTSIDE)
     if (border > 0).any():
         ax.contour(x, y, border, [0.0], colors=LIMIT.color, linewidths=1.8)
-    ax.plot(*(f * poses[:, k] for f, k in zip(factors, pair, strict=True)), color="#000000", lw=1.2)
-    ax.plot(*(f * home[k] for f, k in zip(factors, pair, strict=True)), "k+", ms=9, mew=1.5)
+    ax.plot(*(f * poses[:, k] for f, k in zip(factors, pair, strict=True)), **_PATH)
+    ax.plot(*(f * home[k] for f, k in zip(factors, pair, strict=True)), **_HOME)
+    ax.grid(False)
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[0], y[-1])
     ax.set_xlabel(f"{COORDINATE_NAMES[pair[0]]}  [{_UNITS[pair[0]]}]")

@@ -210,10 +210,10 @@ def _sine(leg: dict[str, Any], digits: int = 3) -> str:
 
 
 def _factor(study: WorkspaceStudy) -> str:
-    value, limited = study.factor
-    if np.isnan(value):
+    factor = study.factor
+    if np.isnan(factor.value):
         return "-"
-    return f"{'' if limited else 'more than '}{number(value, 4)} of this one"
+    return f"{'' if factor.limited else 'more than '}{factor.told} of this one"
 
 
 def _unit(coordinate: int) -> tuple[float, str]:

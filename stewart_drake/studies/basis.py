@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.config import Scenario
-from stewart_drake.design.startup import LEAST_TORQUE_SCALE, reference_torques
+from stewart_drake.design.startup import least_torque, reference_torques
 from stewart_drake.experiment import (
     REACH_CHECK_PERIOD,
     Experiment,
@@ -73,7 +73,7 @@ def basis(scenario: Scenario) -> Basis:
         failure=failure,
         home_failure=diagnose(mechanism, 0.0, mechanism.home),
         motion=motion_scale(experiment),
-        torque=max(torque, LEAST_TORQUE_SCALE),
+        torque=max(torque, least_torque(experiment.nominal)),
     )
 
 

@@ -1,8 +1,9 @@
-"""The shipped controllers on one scenario."""
+"""The shipped controllers on one scenario, and the user's own."""
 
 import math
+import pickle
 import signal
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -12,11 +13,17 @@ from typing import Any, Final
 import joblib
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.framework import System
+from pydrake.trajectories import Trajectory
 
+from stewart_drake.arrayio import write_netcdf
 from stewart_drake.config import Scenario
 from stewart_drake.errors import ConfigError
+from stewart_drake.fileio import remove_partials
+from stewart_drake.jsonio import write_json
+from stewart_drake.own import OwnReference
 from stewart_drake.resources import resolve
-from stewart_drake.results import SimulationResult, write_json, write_signals
+from stewart_drake.results import SimulationResult
 from stewart_drake.scenario_loading import load_scenario
 from stewart_drake.simulation import simulate
 
@@ -41,29 +48,56 @@ _POLL = 0.1
 """s between two looks at the runs."""
 
 
+class Comparison(dict[str, SimulationResult]):
+    """Results by controller."""
+
+    def __repr__(self) -> str:
+        return f"Comparison({', '.join(f'{name}: {run.status}' for name, run in self.items())})"
+
+
 def compare(
-    scenario_name: str | Path, settings: Iterable[str] = (), progress: Progress | None = None
-) -> dict[str, SimulationResult]:
-    """Run every shipped controller on a scenario, on all cores.
+    scenario_name: str | Path,
+    settings: Iterable[str] = (),
+    progress: Progress | None = None,
+    *,
+    controllers: Mapping[str, Callable[[], System]] | None = None,
+    reference: OwnReference | None = None,
+    disturbance: Callable[[], System] | None = None,
+) -> Comparison:
+    """Run every shipped controller on a scenario, and controllers of your own, on all cores.
 
     Ctrl-C ends the runs that have begun, with status `interrupted`, and leaves out the others.
+    Systems of your own are given as functions that make one, such as their class: each run is in a
+    process of its own.
 
     Args:
         scenario_name: a shipped name or a path; its start, plant and tuner stay as they are.
         settings: as `load_scenario` takes them.
         progress: called for each run that got on, ten times a second.
+        controllers: of your own by name, with the ports that `simulate` tells.
+        reference, disturbance: for all runs, as of `simulate`.
 
     Returns:
-        Results by controller, in the order of CONTROLLERS.
+        Results by controller, in the order of CONTROLLERS, then your own.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
     """
-    settings = tuple(settings)
+    settings, controllers = tuple(settings), dict(controllers or {})
+    _check_makers(controllers, reference, disturbance)
     scenarios = {name: load_scenario(scenario_name, name, settings) for name in CONTROLLERS}
+    scenarios |= {name: load_scenario(scenario_name, settings=settings) for name in controllers}
+    given = {
+        name: {
+            "controller": controllers.get(name),
+            "reference": reference,
+            "disturbance": disturbance,
+        }
+        for name in scenarios
+    }
     with TemporaryDirectory() as folder, ThreadPoolExecutor(1) as thread:
         board = _Board(Path(folder) / "board", len(scenarios), new=True)
-        runs = thread.submit(_run_all, scenarios, board.path)
+        runs = thread.submit(_run_all, scenarios, given, board.path)
         try:
             while not runs.done():
                 try:
@@ -77,17 +111,41 @@ def compare(
         finally:
             board.stop()
         results = zip(scenarios, runs.result(), strict=True)
-    return {name: result for name, result in results if result is not None}
+    return Comparison({name: result for name, result in results if result is not None})
+
+
+def label(name: str) -> str:
+    """What tables and legends call a controller."""
+    return LABELS.get(name, name)
+
+
+def _check_makers(controllers: Mapping[str, Any], reference: Any, disturbance: Any) -> None:
+    for name in controllers:
+        if name in CONTROLLERS:
+            raise ConfigError(f"controllers: got {name!r}, a shipped one; expected another name")
+    systems = {f"controllers[{name!r}]": maker for name, maker in controllers.items()}
+    for what, maker in (systems | {"disturbance": disturbance}).items():
+        if isinstance(maker, System):
+            raise ConfigError(
+                f"{what}: got an instance, which serves one run; expected a function that makes one"
+            )
+    if isinstance(reference, Trajectory):
+        try:
+            pickle.dumps(reference)
+        except (TypeError, pickle.PicklingError):
+            raise ConfigError(
+                f"reference: got a {type(reference).__name__}, which cannot be sent to other "
+                "processes; expected a function that makes one"
+            ) from None
 
 
 def is_papers(scenario: Scenario) -> bool:
     """Whether the paper's numbers are about this scenario: its mechanism, motion and delay."""
-    own, delay = Scenario(), scenario.delay
-    eta = (delay.steps + delay.fraction) * scenario.controller.period
+    own = Scenario()
     return (
         resolve("mechanism", scenario.mechanism) == resolve("mechanism", own.mechanism)
         and scenario.reference == own.reference
-        and math.isclose(eta, PAPER_DELAY)
+        and math.isclose(scenario.eta, PAPER_DELAY)
     )
 
 
@@ -99,8 +157,9 @@ def save_comparison(results: dict[str, SimulationResult], directory: str | Path)
     """
     folder = Path(directory)
     folder.mkdir(parents=True, exist_ok=True)
+    remove_partials(folder)
     for name, result in results.items():
-        write_signals(folder / f"{name}.nc", result.signals)
+        write_netcdf(folder / f"{name}.nc", result.signals)
     write_json(folder / "summary.json", comparison_summary(results))
 
 
@@ -131,7 +190,9 @@ class _Board:
         return self._rows[:-1, 0], self._rows[:-1, 1]
 
 
-def _run_all(scenarios: dict[str, Scenario], board: Path) -> list[SimulationResult | None]:
+def _run_all(
+    scenarios: dict[str, Scenario], given: dict[str, dict[str, Any]], board: Path
+) -> list[SimulationResult | None]:
     # Ctrl-C is for the main thread, which tells the processes by the board: in the middle of an
     # import it would break them. They inherit the mask of this thread; the resource tracker comes
     # first, because some Pythons unblock the signal when they start it.
@@ -139,13 +200,15 @@ def _run_all(scenarios: dict[str, Scenario], board: Path) -> list[SimulationResu
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     number = min(joblib.cpu_count(), len(scenarios))
     jobs = (
-        joblib.delayed(_run)(name, scenario, board, run, len(scenarios))
+        joblib.delayed(_run)(name, scenario, given[name], board, run, len(scenarios))
         for run, (name, scenario) in enumerate(scenarios.items())
     )
     return list(joblib.Parallel(n_jobs=number, backend="loky", batch_size=1)(jobs))
 
 
-def _run(name: str, scenario: Scenario, path: Path, run: int, runs: int) -> SimulationResult | None:
+def _run(
+    name: str, scenario: Scenario, own: dict[str, Any], path: Path, run: int, runs: int
+) -> SimulationResult | None:
     board = _Board(path, runs)
 
     def progress(time: float, error: float) -> None:
@@ -156,6 +219,6 @@ def _run(name: str, scenario: Scenario, path: Path, run: int, runs: int) -> Simu
     if board.stopped:
         return None
     try:
-        return simulate(scenario, progress=progress)
+        return simulate(scenario, progress=progress, **own)
     except ConfigError as error:
         raise ConfigError(f"{name}: {error}") from None

@@ -5,10 +5,11 @@ belongs to a run with its delay, frequency, disturbance and weights. The rows of
 early stay, empty (NaN) and not valid, so that runs are never dropped quietly.
 """
 
+import dataclasses
 import hashlib
 import io
 import json
-import zipfile
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -17,22 +18,40 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from stewart_drake.arrayio import load_netcdf, load_npz, write_netcdf
 from stewart_drake.config import Scenario
 from stewart_drake.errors import ConfigError
-from stewart_drake.results import SimulationResult, versions, write_signals
+from stewart_drake.fileio import remove_partials
+from stewart_drake.results import SimulationResult
 from stewart_drake.scenario_loading import scenario_to_dict
 from stewart_drake.signals import TUNER_INPUTS, WEIGHTS
 from stewart_drake.simulation import simulate
 from stewart_drake.studies.disturbances import draw
 from stewart_drake.studies.grid import PAPER_ROWS, SAMPLES, Run, disturbed_runs, paper_runs
 from stewart_drake.studies.jobs import Progress, run_jobs
-from stewart_drake.systems.sensor import Sensor
-from stewart_drake.timing import METRIC_PERIOD
 from stewart_drake.tuner.density import densities
+from stewart_drake.versions import versions
+from stewart_drake.yamlio import brief
 
 Array = NDArray[np.float64]
 
 _NUMBERS: Final = ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_variation")
+_STATUSES: Final = ("completed", "left_workspace", "solver_failed")
+_EXPECTED: Final = "what `tune dataset --out` has written"
+_SAMPLE: Final = ("run", "sample", "input")
+_VARIABLES: Final[dict[str, tuple[tuple[str, ...], str]]] = {
+    "samples": (_SAMPLE, "f"),
+    "density": (_SAMPLE, "f"),
+    "valid": (("run", "sample"), "b"),
+    "weights": (("run", "weight"), "f"),
+    "delay_steps": (("run",), "iu"),
+    "frequency": (("run",), "f"),
+    "disturbance": (("run",), "iu"),
+    "status": (("run",), "OUT"),
+    "stopped": (("run",), "f"),
+    **dict.fromkeys(_NUMBERS, (("run",), "f")),
+}
+"""Dimensions and kind of number of what a data set holds."""
 
 
 def make_dataset(
@@ -82,19 +101,22 @@ def make_dataset(
         workers=workers,
         scheduler=scheduler,
         progress=progress,
+        check=read_run,
     )
     dataset = assemble(runs, files, settings | {"draws": [one._asdict() for one in draws]})
     if not disturbances and dataset.sizes["run"] * dataset.sizes["sample"] != PAPER_ROWS:
         raise AssertionError(f"the paper's data set has {PAPER_ROWS} rows")
     # A summary that is there speaks of the data set beside it.
     (directory / "summary.json").unlink(missing_ok=True)
-    write_signals(directory / "dataset.nc", dataset)
+    remove_partials(directory)
+    write_netcdf(directory / "dataset.nc", dataset)
     return dataset
 
 
 def sample_run(scenario: Scenario) -> bytes:
     """One run as the bytes of an .npz file: the samples, and how the run ended."""
-    result = simulate(scenario)
+    # A log of one's own period need not hold the samples.
+    result = simulate(dataclasses.replace(scenario, log_period=None), margin=False)
     if result.status == "interrupted":
         raise KeyboardInterrupt
     buffer = io.BytesIO()
@@ -111,19 +133,16 @@ def sample_run(scenario: Scenario) -> bytes:
 def samples(result: SimulationResult) -> Array:
     """(100, 18) of a run: [measurement - reference (12); commanded torque (6)], NaN after its end.
 
-    In rad, m, rad/s, m/s and N m. The measurement is the state with the sensor's own noise.
+    In rad, m, rad/s, m/s and N m. The log must hold every sample, as it does by default.
     """
-    sc, signals = result.scenario, result.signals
-    period, sensor = sc.controller.period, sc.sensor
-    noise = Sensor(np.array(sensor.noise_std), sensor.seed, period)
+    signals = result.signals
     rows = np.full((SAMPLES, len(TUNER_INPUTS)), np.nan)
     # Held signals show the value from an instant on, so that of k dt is T_k.
-    every = round(period / METRIC_PERIOD)
-    state = np.hstack([signals.pose, signals.rates])[::every][:SAMPLES]
-    wanted = np.hstack([signals.reference, signals.reference_rates])[::every][:SAMPLES]
-    torque = signals.torque_commanded.values[::every][:SAMPLES]
-    measured = state + np.array([noise.noise(k) for k in range(len(state))]).reshape(state.shape)
-    rows[: len(state)] = np.hstack([measured - wanted, torque])
+    at = result.scenario.controller.period * np.arange(SAMPLES)
+    at = at[at <= signals.time.values[-1] + 1e-9] if signals.sizes["time"] else at[:0]
+    kept = signals.sel(time=at, method="nearest")
+    wanted = np.hstack([kept.reference, kept.reference_rates])
+    rows[: len(at)] = np.hstack([kept.measurement - wanted, kept.torque_commanded])
     return rows
 
 
@@ -135,7 +154,7 @@ def assemble(
     Raises:
         ConfigError: a file is damaged.
     """
-    read = [_read(files[key]) for key in runs]
+    read = [read_run(files[key]) for key in runs]
     rows = np.array([one["samples"] for one in read]).reshape(-1, SAMPLES, len(TUNER_INPUTS))
     valid = np.isfinite(rows).all(axis=2)
     rho = np.array([densities(one) for one in rows]).reshape(rows.shape)
@@ -164,22 +183,41 @@ def load_dataset(path: str | Path) -> xr.Dataset:
     """
     path = Path(path)
     path = path / "dataset.nc" if path.is_dir() else path
-    try:
-        with xr.open_dataset(path, engine="h5netcdf") as file:
-            dataset = file.load()
-    except FileNotFoundError:
-        raise ConfigError(
-            f"data: no file {str(path)!r}; expected what `tune dataset --out` has written"
-        ) from None
-    except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(
-            f"{path}: cannot be read ({reason}); expected what `tune dataset` has written"
-        ) from None
-    missing = {"samples", "valid", "weights", "accumulated_error"} - set(dataset)
-    if missing or dataset.sizes.get("input") != len(TUNER_INPUTS):
-        raise ConfigError(f"{path}: is not a data set; expected what `tune dataset` has written")
+    if not path.exists():
+        raise ConfigError(f"data: no file {str(path)!r}; expected {_EXPECTED}")
+    dataset = load_netcdf(path, _EXPECTED)
+    problem = _problem(dataset)
+    if problem:
+        raise ConfigError(f"{path}: is not a data set ({problem}); expected {_EXPECTED}")
     return dataset
+
+
+def _problem(dataset: xr.Dataset) -> str | None:
+    """What tells a file from one that `make_dataset` has written, or None."""
+    for name, (dimensions, kinds) in _VARIABLES.items():
+        if name not in dataset.data_vars:
+            return f"it has no {name}"
+        if dataset[name].dims != dimensions or dataset[name].dtype.kind not in kinds:
+            return f"{name} is {dataset[name].dtype} over {dataset[name].dims}"
+    sizes = dataset.sizes
+    if not (sizes["run"] and sizes["sample"]) or "run" not in dataset.coords:
+        return "it has no runs"
+    if (sizes["input"], sizes["weight"]) != (len(TUNER_INPUTS), len(WEIGHTS)):
+        return f"a sample has {sizes['input']} values and {sizes['weight']} weights"
+    samples, valid, weights = dataset.samples.values, dataset.valid.values, dataset.weights.values
+    if not np.array_equal(np.isfinite(samples).all(axis=2), valid) or np.isinf(samples).any():
+        return "valid is not where its samples are finite"
+    if not np.all((weights > 0) & np.isfinite(weights)):
+        return "a weight is no positive number"
+    done = dataset.status.values == "completed"
+    error = dataset.accumulated_error.values
+    if not np.array_equal(np.isfinite(error), done) or np.any(error[done] < 0):
+        return "E_ac is not where its runs are completed"
+    try:
+        settings = json.loads(dataset.attrs["settings"])
+        return None if isinstance(settings["data"], str) else "its settings are damaged"
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return "its settings are damaged"
 
 
 def data_hash(dataset: xr.Dataset) -> str:
@@ -213,9 +251,31 @@ def summarize(dataset: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in ("samples", "status", "stopped", *_NUMBERS)}
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
-        raise ConfigError(f"{path}: is damaged; delete it and start again") from None
+def read_run(path: Path) -> dict[str, Any]:
+    """What `sample_run` has kept of a run.
+
+    Raises:
+        ConfigError: the file is damaged; one line.
+    """
+    shapes: dict[str, tuple[str, tuple[int, ...]]] = {
+        "samples": ("f", (SAMPLES, len(TUNER_INPUTS))),
+        "status": ("U", ()),
+        "stopped": ("f", ()),
+        **dict.fromkeys(_NUMBERS, ("f", ())),
+    }
+    run = load_npz(path, shapes, "the file of one run of `tune dataset`")
+    numbers = {name: float(run[name]) for name in ("stopped", *_NUMBERS)}
+    status, there = str(run["status"]), np.isfinite(run["samples"]).all(axis=1)
+    done = status == "completed"
+    problem = None
+    if status not in _STATUSES:
+        problem = f"status: got {brief(status)}; expected one of {', '.join(_STATUSES)}"
+    elif any(math.isinf(value) or value < 0 for value in numbers.values()):
+        problem = "a number of it is infinite or negative; expected NaN or what is measured"
+    elif math.isnan(numbers["stopped"]) != done or math.isnan(numbers["accumulated_error"]) == done:
+        problem = f"stopped and E_ac do not go with status {status}"
+    elif there.sum() < SAMPLES and (done or not np.isnan(run["samples"][~there]).all()):
+        problem = "samples: some are missing; expected all of a run that completed"
+    if problem:
+        raise ConfigError(f"{path}: {problem}")
+    return {"samples": run["samples"], "status": status, **numbers}

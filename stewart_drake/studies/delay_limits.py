@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from stewart_drake.config import Scenario
+from stewart_drake.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.delay import Delay
 from stewart_drake.design.limits import amplification, fastest_pole, largest_delay
 from stewart_drake.design.riccati import RiccatiError
 from stewart_drake.experiment import waits_at_rest
@@ -67,6 +69,8 @@ class DelayStudy:
 
     Attributes:
         basis: what was analysed.
+        controller: the scenario's own loop at its worst along the reference, as far as that can be
+            followed; None where it has no first instant.
         eta: total delay, s.
         poles: along the reference, as far as it can be followed.
         growths: e^(p eta) checked by simulation; none where nothing grows.
@@ -78,6 +82,7 @@ class DelayStudy:
     """
 
     basis: Basis
+    controller: ControllerMargin | None
     eta: float
     poles: tuple[PolePoint, ...]
     growths: tuple[Growth, ...]
@@ -89,7 +94,7 @@ class DelayStudy:
 
     @property
     def verdict(self) -> Verdict | None:
-        """Whether the delay can be beaten; None where the motion has no first instant."""
+        """Whether the delay alone can be beaten; None where the motion has no first instant."""
         if not self.poles:
             return None
         worst = max(self.poles, key=lambda point: point.moving)
@@ -121,6 +126,7 @@ class DelayStudy:
         return {
             "eta": self.eta,
             "obstacles": self.basis.obstacles,
+            "controller_margin": None if self.controller is None else self.controller.summary,
             "verdict": None if self.verdict is None else str(self.verdict),
             "beatable": None if self.verdict is None else self.verdict.beatable,
             "poses": [
@@ -173,10 +179,13 @@ def study_delay(
         wanted = {scenario.delay.steps, *map_delays(scenario.delay.steps)}
         return DelayStudy(
             basis=found,
-            eta=(scenario.delay.steps + fraction) * period,
+            controller=controller_margin(found.experiment, found.followed_until) if poles else None,
+            eta=scenario.eta,
             poles=tuple(poles),
-            growths=tuple(_growths(found, poles, (scenario.delay.steps + fraction) * period)),
-            floors={steps: error_floor(found, (steps + fraction) * period) for steps in wanted},
+            growths=tuple(_growths(found, poles, scenario.eta)),
+            floors={
+                steps: error_floor(found, Delay(steps, fraction).eta(period)) for steps in wanted
+            },
             loops=tuple(loops),
             loop_problem=problem,
             cells=tuple(cells),

@@ -8,20 +8,18 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.config import Scenario
-from stewart_drake.design.delay_model import DelayedModel, delayed_model
-from stewart_drake.design.error_model import ContinuousModel, double_integrators, linear_model
+from stewart_drake.controller_margin import true_dynamics
+from stewart_drake.design.delay_model import DelayedModel
+from stewart_drake.design.error_model import double_integrators, linear_model
 from stewart_drake.design.limits import (
     Peak,
-    closed_loop,
-    first_instability,
     frequency_grid,
     loop_gain,
     peaks,
     sensitivity,
     spectral_radius,
 )
-from stewart_drake.design.riccati import augmented_gain
+from stewart_drake.design.linear_loop import LinearLoop, law_gain, worst_margins
 from stewart_drake.design.startup import weight_scales
 from stewart_drake.experiment import believed_delay
 from stewart_drake.mechanism.torque_map import torque_map
@@ -34,10 +32,6 @@ Complex = NDArray[np.complex128]
 
 DELAYS: Final = (0, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 25, 30)
 """Whole periods of delay for which the loop is designed and judged, beside the scenario's own."""
-_LONGEST_ERROR: Final = 30
-"""Periods; a true delay longer than believed by more than this is not looked at."""
-_GAIN_LIMIT: Final = 100.0
-"""Motors stronger by more than this factor are not looked at."""
 _POINTS: Final = 800
 """Frequencies at which a motor's loop is handed to python-control, beside some low ones."""
 _BEYOND: Final = 1.1
@@ -100,59 +94,51 @@ def loop_margins(found: Basis, delays: Iterable[int] = DELAYS) -> list[LoopMargi
     """The loop linearised at the reference's first pose, held still, over the delay.
 
     For some delays mu, the scenario's own among them. Designed as the scenario's controller is
-    (model, weights, what it believes of the delay), closed around the true plant. The estimator
-    and the feedforward have no part in it.
+    (model, prediction, weights, what it believes of the delay), closed around the true plant. The
+    feedforward has no part in it; an estimator is taken to have found payload and friction.
 
     Raises:
         RiccatiError: there is no gain.
         numpy.linalg.LinAlgError: no torques hold the plate at that pose.
     """
-    sc, mechanism = found.experiment.scenario, found.experiment.mechanism
-    c, pose = sc.controller, evaluate(found.experiment.reference, 0.0)[POSE]
-    plant = linear_model(*found.experiment.nominal.linearize(pose))
-    design = plant
+    experiment, sc = found.experiment, found.experiment.scenario
+    c, pose = sc.controller, evaluate(experiment.reference, 0.0)[POSE]
+    plant = linear_model(*true_dynamics(experiment).linearize(pose))
+    known = experiment.nominal if c.estimator == "none" else true_dynamics(experiment)
+    predictor = design = linear_model(*known.linearize(pose))
     if c.model == "paper":
-        design = double_integrators(torque_map(mechanism, pose, c.torque_map))
+        design = double_integrators(torque_map(experiment.mechanism, pose, c.torque_map))
+    if c.prediction == "linear":
+        predictor = design
     errors, integrals, torques = weight_scales(
-        c.weight_scaling, found.experiment.peak_to_peak, found.torque
+        c.weight_scaling, experiment.nominal, experiment.peak_to_peak, found.torque
     )
     Q = c.w_Q * np.diag(np.concatenate([errors, integrals] if c.integral else [errors]))
     R = c.w_R * np.diag(torques)
-    return [_judge(sc, plant, design, Q, R, steps) for steps in sorted({*delays, sc.delay.steps})]
+    judged = []
+    for steps in sorted({*delays, sc.delay.steps}):
+        believed = believed_delay(replace(sc, delay=replace(sc.delay, steps=steps)))
+        K = law_gain(design, predictor, c.period, believed, (Q, R))
+        loop = LinearLoop(plant, K, c.period, steps, sc.delay.fraction, c.integral)
+        judged.append(_judge(loop))
+    return judged
 
 
-def _judge(
-    sc: Scenario, plant: ContinuousModel, design: ContinuousModel, Q: Array, R: Array, steps: int
-) -> LoopMargins:
-    c, fraction = sc.controller, sc.delay.fraction
-    believed = believed_delay(replace(sc, delay=replace(sc.delay, steps=steps)))
-    K = augmented_gain(delayed_model(design, c.period, *believed, integral=c.integral), Q, R)
-    true = delayed_model(plant, c.period, steps, fraction, integral=c.integral)
-
-    def late(by: float) -> Array:
-        """The closed loop with the delay longer by so many s."""
-        periods = max(0.0, steps + fraction + by / c.period)
-        whole = int(periods + 1e-9)
-        share = max(0.0, periods - whole)
-        model = delayed_model(plant, c.period, whole, share, integral=c.integral)
-        return closed_loop(model, K)
-
-    radius = spectral_radius(closed_loop(true, K))
+def _judge(loop: LinearLoop) -> LoopMargins:
+    radius, true = spectral_radius(loop.matrix()), loop.sampled()
     unknown = Peak(math.nan, math.nan)
-    S, T = peaks(true, K, c.period) if radius < 1 else (unknown, unknown)
-    up = first_instability(lambda by: closed_loop(true, K, 1 + by), 1e-3, _GAIN_LIMIT)
-    down = first_instability(lambda by: closed_loop(true, K, 1 - by), 1e-3, 1.0)
-    eta, finest = (steps + fraction) * c.period, 1e-4 * c.period
+    S, T = peaks(true, loop.K, loop.period) if radius < 1 else (unknown, unknown)
+    margins = worst_margins([loop])
     return LoopMargins(
-        steps=steps,
+        steps=loop.steps,
         radius=radius,
         S=S,
         T=T,
-        gain_up=1 + up,
-        gain_down=max(0.0, 1 - down),
-        motor=_motor_margins(true, K, c.period) if radius < 1 else None,
-        later=first_instability(late, finest, _LONGEST_ERROR * c.period),
-        earlier=first_instability(lambda by: late(-by), finest, eta) if eta > 0 else math.inf,
+        gain_up=margins.gain_up,
+        gain_down=margins.gain_down,
+        motor=_motor_margins(true, loop.K, loop.period) if radius < 1 else None,
+        later=margins.longer,
+        earlier=margins.shorter,
     )
 
 

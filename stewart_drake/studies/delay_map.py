@@ -4,19 +4,19 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
+from functools import singledispatch
 from tempfile import TemporaryDirectory
 from typing import Final, NamedTuple
 
-import numpy as np
-
-from stewart_drake.config import ReferenceConfig, Scenario
+from stewart_drake.config import Scenario
 from stewart_drake.experiment import assemble, reference_failure
-from stewart_drake.reference_files import read_waypoints
-from stewart_drake.results import jsonable
+from stewart_drake.jsonio import jsonable
+from stewart_drake.reference_config import ReferenceConfig, SineConfig, WaypointsConfig
+from stewart_drake.reference_files import waypoints
 from stewart_drake.scenario_loading import scenario_to_dict
 from stewart_drake.simulation import simulate
 from stewart_drake.studies.jobs import finished, run_jobs
+from stewart_drake.studies.run_files import read_cell
 
 FACTORS: Final = (0.5, 0.75, 1.0, 1.25)
 """Of the reference's amplitude."""
@@ -51,16 +51,22 @@ def scaled_motion(reference: ReferenceConfig, factor: float) -> ReferenceConfig 
 
     None where it has no amplitude to scale: a constant pose, or a file of samples.
     """
-    if factor == 1:
-        return reference
-    if reference.kind == "sine":
-        return replace(reference, amplitude=[factor * a for a in reference.amplitude])
-    if reference.kind != "waypoints":
-        return None
-    if reference.file is not None:
-        times, poses = read_waypoints(reference.file)
-    else:
-        times, poses = np.array(reference.times), np.array(reference.poses)
+    return reference if factor == 1 else _scaled(reference, factor)
+
+
+@singledispatch
+def _scaled(reference: ReferenceConfig, factor: float) -> ReferenceConfig | None:
+    return None
+
+
+@_scaled.register
+def _scaled_sine(reference: SineConfig, factor: float) -> SineConfig:
+    return replace(reference, amplitude=[factor * a for a in reference.amplitude])
+
+
+@_scaled.register
+def _scaled_way(reference: WaypointsConfig, factor: float) -> WaypointsConfig:
+    times, poses = waypoints(reference)
     way = poses[0] + factor * (poses - poses[0])
     return replace(reference, file=None, times=times.tolist(), poses=way.tolist())
 
@@ -101,21 +107,16 @@ def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[lis
         except KeyboardInterrupt:
             paths, interrupted = finished(jobs, folder), True
         for key, path in paths.items():
-            cells[key] = _with_outcome(cells[key], path)
+            status, error, time = read_cell(path)
+            cells[key] = cells[key]._replace(status=status, error=error, time=time)
     return list(cells.values()), interrupted
 
 
 def run_cell(scenario: Scenario) -> bytes:
     """Status, E_ac in % s and time of the end in s of one simulation, as JSON."""
-    result = simulate(scenario)
+    result = simulate(scenario, margin=False)
     if result.status == "interrupted":
         raise KeyboardInterrupt
     time = math.nan if result.stopped is None else result.stopped.time
     found = {"status": result.status, "error": result.accumulated_error, "time": time}
     return json.dumps(jsonable(found)).encode()
-
-
-def _with_outcome(cell: Cell, path: Path) -> Cell:
-    data = json.loads(path.read_text(encoding="utf-8"))
-    error, time = (math.nan if data[key] is None else data[key] for key in ("error", "time"))
-    return cell._replace(status=data["status"], error=error, time=time)

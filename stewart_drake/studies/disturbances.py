@@ -12,6 +12,7 @@ from stewart_drake.config import Scenario
 from stewart_drake.design.startup import reference_torque
 from stewart_drake.errors import ConfigError
 from stewart_drake.experiment import motion_scale, prepare
+from stewart_drake.reference_config import SineConfig
 
 DELAYS: Final = (0, 15)
 """Whole periods, uniform, both included."""
@@ -53,17 +54,18 @@ class Disturbance(NamedTuple):
     seed: int
 
 
-def require_sine(scenario: Scenario) -> None:
-    """Refuse a reference without frequency and amplitude.
+def sine_of(scenario: Scenario) -> SineConfig:
+    """The scenario's reference, which has a frequency and an amplitude.
 
     Raises:
         ConfigError: it is not a sine.
     """
-    if scenario.reference.kind != "sine":
+    if not isinstance(scenario.reference, SineConfig):
         raise ConfigError(
             f"reference.kind: got {scenario.reference.kind!r}; expected 'sine', whose frequency "
             "and amplitude are varied"
         )
+    return scenario.reference
 
 
 def draw(
@@ -80,7 +82,6 @@ def draw(
     Raises:
         ConfigError: the scenario cannot be prepared, or its reference is not a sine.
     """
-    require_sine(scenario)
     standard = _with_motion(scenario, 1.0, 1.0)
     experiment = prepare(standard)
     torque = reference_torque(experiment.nominal, experiment.reference, standard.duration)
@@ -125,6 +126,7 @@ def with_gain(scenario: Scenario, w_Q: float, w_R: float) -> Scenario:
 
 def _with_motion(scenario: Scenario, frequency: float, share: float) -> Scenario:
     result = copy.deepcopy(scenario)
-    result.reference.frequency, result.reference.frequency_unit = frequency, "rad/s"
-    result.reference.amplitude = [share * a for a in scenario.reference.amplitude]
+    sine = sine_of(result)
+    sine.frequency, sine.frequency_unit = frequency, "rad/s"
+    sine.amplitude = [share * a for a in sine.amplitude]
     return result

@@ -5,10 +5,10 @@ scenarios that every candidate completes, failures are counted apart, and the fi
 tuner is compared with is the one that did best on these very scenarios.
 """
 
-import copy
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -16,16 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from stewart_drake.config import Scenario
+from stewart_drake.config import AnnTunerConfig, Scenario
 from stewart_drake.errors import ConfigError
+from stewart_drake.fileio import read_bytes
+from stewart_drake.jsonio import jsonable
 from stewart_drake.resources import resolve
-from stewart_drake.results import jsonable
 from stewart_drake.scenario_loading import scenario_to_dict
 from stewart_drake.simulation import simulate
-from stewart_drake.studies.disturbances import disturbed, draw, with_gain
+from stewart_drake.studies.disturbances import Disturbance, disturbed, draw, with_gain
 from stewart_drake.studies.grid import PAIRS
 from stewart_drake.studies.jobs import Job, Progress, run_jobs
-from stewart_drake.tuner.network import DEFAULT, load_network
+from stewart_drake.studies.run_files import EvaluationOutcome, read_evaluation
+from stewart_drake.tuner.network import DEFAULT, EXPECTED, MAX_BYTES, load_network
 
 Array = NDArray[np.float64]
 
@@ -84,7 +86,7 @@ def evaluate(
         raise ConfigError(f"--scenarios: got {scenarios}; expected 2 or more")
     path = resolve("weights", weights or DEFAULT)
     network = load_network(path)
-    content = hashlib.sha256(path.read_bytes()).hexdigest()
+    content = hashlib.sha256(read_bytes(path, MAX_BYTES, EXPECTED)).hexdigest()
     draws = draw(scenario, scenarios, seed, "evaluation")
     cells = [disturbed(scenario, one) for one in draws]
     fixed: dict[str, Job] = {
@@ -116,17 +118,26 @@ def evaluate(
             workers=workers,
             scheduler=scheduler,
             progress=counted,
+            check=read_evaluation,
         )
         done += len(jobs)
-    runs = {key: _read(file) for key, file in files.items()}
-    candidates = (*GAINS, TUNER)
-    per_candidate = len(cells), len(GAINS)
-    table = [[runs[key] for key in fixed][i :: per_candidate[1]] for i in range(per_candidate[1])]
+    runs = {key: read_evaluation(file) for key, file in files.items()}
+    # The fixed runs go through all gains, one scenario after the other.
+    table = [[runs[key] for key in fixed][i :: len(GAINS)] for i in range(len(GAINS))]
     table.append([runs[key] for key in tuned])
-    error = np.array([[_number(run["accumulated_error"]) for run in row] for row in table])
+    about = {"file": path.name, "sha256": content, "card": dict(network.card)}
+    return _evaluation(table, draws, settings | {"network": about})
+
+
+def _evaluation(
+    table: list[list[EvaluationOutcome]], draws: Sequence[Disturbance], settings: dict[str, Any]
+) -> Evaluation:
+    """What runs (candidates x scenarios) say together, the tuner's last."""
+    candidates = (*GAINS, TUNER)
+    error = np.array([[run.error for run in row] for row in table])
     summary = {
-        **compare(candidates, error, seed),
-        "fallbacks": sum(run["tuner_fallbacks"] for run in table[-1]),
+        **compare(candidates, error, settings["seed"]),
+        "fallbacks": sum(run.tuner_fallbacks for run in table[-1]),
         "scenarios": [
             {
                 **one._asdict(),
@@ -135,15 +146,15 @@ def evaluate(
             for number, one in enumerate(draws)
         ],
         "base": settings["scenario"],
-        "seed": seed,
-        "network": {"file": path.name, "sha256": content, "card": dict(network.card)},
+        "seed": settings["seed"],
+        "network": settings["network"],
     }
     return Evaluation(candidates, error, summary)
 
 
 def evaluation_run(scenario: Scenario) -> bytes:
     """One run as JSON: how it ended, its error and torques, the tuner's fallbacks."""
-    result = simulate(scenario)
+    result = simulate(scenario, margin=False)
     if result.status == "interrupted":
         raise KeyboardInterrupt
     data = {name: result.summary[name] for name in _KEPT} | {
@@ -205,18 +216,4 @@ def compare(candidates: tuple[str, ...], error: Array, seed: int) -> dict[str, A
 
 
 def _with_tuner(scenario: Scenario, path: Path) -> Scenario:
-    result = copy.deepcopy(scenario)
-    result.tuner.kind, result.tuner.weights = "ann", str(path)
-    return result
-
-
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else value
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return {name: data[name] for name in (*_KEPT, "status", "stopped", "tuner_fallbacks")}
-    except (ValueError, KeyError, TypeError):
-        raise ConfigError(f"{path}: is damaged; delete it and start again") from None
+    return replace(scenario, tuner=AnnTunerConfig(weights=str(path)))

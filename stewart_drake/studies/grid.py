@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 from stewart_drake.config import Scenario
 from stewart_drake.errors import ConfigError
-from stewart_drake.studies.disturbances import Disturbance, disturbed, require_sine, with_gain
+from stewart_drake.studies.disturbances import Disturbance, disturbed, sine_of, with_gain
 from stewart_drake.timing import METRIC_PERIOD
 
 LEVELS: Final = (0.1, 1.0, 4.0)
@@ -42,7 +42,8 @@ def paper_runs(scenario: Scenario) -> dict[str, Run]:
     for steps, frequency in itertools.product(DELAYS, FREQUENCIES):
         cell = copy.deepcopy(scenario)
         cell.delay.steps = steps
-        cell.reference.frequency, cell.reference.frequency_unit = frequency, "rad/s"
+        sine = sine_of(cell)
+        sine.frequency, sine.frequency_unit = frequency, "rad/s"
         runs |= _pairs(cell, f"delay{steps:02d}_frequency{frequency:g}", steps, frequency, -1)
     return runs
 
@@ -68,7 +69,7 @@ def check(scenario: Scenario) -> None:
         ConfigError: its reference is not a sine, it is too short for 100 samples, or its period is
             not on the grid on which a run is recorded.
     """
-    require_sine(scenario)
+    sine_of(scenario)
     every = scenario.controller.period / METRIC_PERIOD
     if round(every) < 1 or abs(every - round(every)) > 1e-9:
         raise ConfigError(

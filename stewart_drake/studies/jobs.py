@@ -8,6 +8,7 @@ same folder does what is missing. Only this process writes, so workers need no c
 import fcntl
 import hashlib
 import json
+import logging
 import os
 import re
 import signal
@@ -22,12 +23,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import joblib
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
 
 from stewart_drake.errors import ConfigError
-from stewart_drake.fileio import replacing
-from stewart_drake.results import jsonable
+from stewart_drake.fileio import remove_partials, replacing
+from stewart_drake.jsonio import jsonable, load_json
 from stewart_drake.studies.cluster import dask_backend
-from stewart_drake.yamlio import brief
+from stewart_drake.yamlio import brief, validate
 
 MANIFEST: Final = "manifest.json"
 """The settings that all jobs of a folder share, and their hash."""
@@ -38,9 +41,17 @@ Progress = Callable[[int, int], None]
 """Called with the number of finished jobs and of all jobs."""
 
 _LOCK: Final = ".lock"
+_MAX_MANIFEST: Final = 10_000_000
 _KEY: Final = re.compile(r"[A-Za-z0-9_+-][A-Za-z0-9_.+-]{0,199}")
 _WATCH: Final = 0.5
 """s between two looks of a worker whether the process that started it is still there."""
+_log: Final = logging.getLogger("stewart_drake")
+
+
+@dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+class _Manifest:
+    hash: str
+    settings: dict[str, Any]
 
 
 def run_jobs(
@@ -53,8 +64,9 @@ def run_jobs(
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
+    check: Callable[[Path], object] | None = None,
 ) -> dict[str, Path]:
-    """Call `function(*jobs[key])` for every key whose file is not there yet.
+    """Call `function(*jobs[key])` for every key whose file is not there yet, or is damaged.
 
     Ctrl-C stops the jobs in flight and raises KeyboardInterrupt; `function` must let it through.
 
@@ -69,6 +81,8 @@ def run_jobs(
         workers: processes on this machine, with one numerical thread each; all cores by default.
         scheduler: address of a Dask scheduler, whose workers are used instead.
         progress: called at the start and for each finished job.
+        check: reads a file that an earlier start has left; where it raises ConfigError, that job is
+            done again, which a warning of the package's logger tells in one line.
 
     Returns:
         The file of every job, in the order of `jobs`.
@@ -89,10 +103,9 @@ def run_jobs(
     folder.mkdir(parents=True, exist_ok=True)
     paths = {key: folder / f"{key}{suffix}" for key in jobs}
     with _locked(folder):
-        for partial in folder.glob(".*.part"):
-            partial.unlink()
+        remove_partials(folder)
         _check_manifest(folder, settings, suffix)
-        missing = {key: job for key, job in jobs.items() if not paths[key].exists()}
+        missing = _missing(jobs, paths, check)
         done = len(jobs) - len(missing)
         if progress is not None:
             progress(done, len(jobs))
@@ -112,6 +125,23 @@ def finished(jobs: Mapping[str, Job], folder: str | Path, suffix: str = ".json")
     return {key: path for key, path in paths.items() if path.exists()}
 
 
+def _missing(
+    jobs: Mapping[str, Job], paths: Mapping[str, Path], check: Callable[[Path], object] | None
+) -> dict[str, Job]:
+    """What is to be done: a file that is damaged is as good as none."""
+    damaged: dict[str, ConfigError] = {}
+    for key, path in paths.items():
+        try:
+            if check is not None and path.exists():
+                check(path)
+        except ConfigError as error:
+            damaged[key] = error
+    if damaged:
+        more = f" (and {len(damaged) - 1} more)" if len(damaged) > 1 else ""
+        _log.warning("%s; this run is done again%s", next(iter(damaged.values())), more)
+    return {k: job for k, job in jobs.items() if k in damaged or not paths[k].exists()}
+
+
 def settings_hash(settings: Mapping[str, Any]) -> str:
     """SHA-256 over the settings as canonical JSON: keys sorted, numbers by their shortest text."""
     return hashlib.sha256(_canonical(settings).encode()).hexdigest()
@@ -123,10 +153,8 @@ def write_atomically(path: Path, data: bytes) -> None:
     Raises:
         OSError: it cannot be written; nothing is left behind.
     """
-    with replacing(path) as partial, partial.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    with replacing(path) as partial:
+        partial.write_bytes(data)
 
 
 def _named(key: str, function: Callable[..., bytes], job: Job) -> tuple[str, bytes]:
@@ -139,7 +167,8 @@ def _named(key: str, function: Callable[..., bytes], job: Job) -> tuple[str, byt
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Keep other processes out; the lock ends with this process, however that ends."""
-    with (folder / _LOCK).open("a") as file:
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    with open(os.open(folder / _LOCK, flags, 0o666), "rb", buffering=0) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -161,18 +190,12 @@ def _check_manifest(folder: Path, settings: Mapping[str, Any], suffix: str) -> N
         text = json.dumps({"hash": settings_hash(settings), "settings": mine}, indent=2)
         write_atomically(path, (text + "\n").encode())
         return
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        found, theirs = manifest["hash"], manifest["settings"]
-    except (ValueError, TypeError, KeyError):
+    expected = "the manifest of the runs beside it (choose another folder, or delete this one)"
+    manifest = validate(_Manifest, load_json(path, _MAX_MANIFEST, expected), str(path))
+    if manifest.hash != settings_hash(settings):
         raise ConfigError(
-            f"{path}: is damaged; expected the manifest of the runs beside it (choose another "
-            "folder, or delete this one)"
-        ) from None
-    if found != settings_hash(settings):
-        raise ConfigError(
-            f"{folder}: belongs to other settings ({_difference(theirs, mine)}); expected the same "
-            "settings as before, or another folder"
+            f"{folder}: belongs to other settings ({_difference(manifest.settings, mine)}); "
+            "expected the same settings as before, or another folder"
         )
 
 

@@ -1,6 +1,6 @@
 """What a mechanism is, before anybody moves it: reach, torque, poles and singularity at home."""
 
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,8 @@ from stewart_drake.studies.singularity import Measures, characteristic_length, m
 from stewart_drake.studies.workspace_map import Travel, travel
 
 Array = NDArray[np.float64]
+
+BODIES: Final = ("base", "plate", "crank", "rod")
 
 
 class MechanismCheck(NamedTuple):
@@ -51,6 +53,10 @@ class MechanismCheck(NamedTuple):
             "verdict": self.verdict,
             "failure": None if self.failure is None else self.failure._asdict(),
             "home": self.mechanism.home,
+            "inertia": {name: getattr(self.mechanism, name).inertia for name in BODIES},
+            "inertia_estimated": [
+                name for name in BODIES if getattr(self.mechanism, name).estimated
+            ],
             "crank_angles": self.crank_angles,
             "characteristic_length": characteristic_length(self.mechanism),
             "measures": self.measures._asdict(),

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.design.hautus import Mode
-from stewart_drake.signals import COORDINATES, NUM_TORQUES
+from stewart_drake.signals import COORDINATE_NAMES, NUM_TORQUES
 
 _TORQUE: Final = "torque "
 _SHOWN: Final = 0.01
@@ -14,7 +14,7 @@ _SHOWN: Final = 0.01
 
 
 class Label(NamedTuple):
-    """A state's group, `pose error`, `torque T(k-8)`, and its name within, `phi`, `motor 1`."""
+    """A state's group, `pose error`, `torque T(k-8)`, and its name within, `roll`, `motor 1`."""
 
     group: str
     name: str
@@ -22,8 +22,8 @@ class Label(NamedTuple):
 
 def state_labels(n: int) -> list[Label]:
     """Of 12 states of the plant, 18 of the error model, or those and torques in flight."""
-    groups = ("pose error", "rate error", "integral")[: min(n // len(COORDINATES), 3)]
-    labels = [Label(group, name) for group in groups for name in COORDINATES]
+    groups = ("pose error", "rate error", "integral")[: min(n // len(COORDINATE_NAMES), 3)]
+    labels = [Label(group, name) for group in groups for name in COORDINATE_NAMES]
     length = (n - len(labels)) // NUM_TORQUES
     for place in range(length):
         group = f"{_TORQUE}T(k-{length - place})"

@@ -49,6 +49,11 @@ class Factor(NamedTuple):
     value: float
     limited: bool
 
+    @property
+    def told(self) -> str:
+        """In words, rounded down, so that the motion that is told does fit."""
+        return f"{np.floor(1e3 * self.value) / 1e3:g}"
+
 
 def margins_along(mechanism: Mechanism, reference: Trajectory, time: Array) -> Margins:
     """All margins of a reference at the instants (n,) in s."""

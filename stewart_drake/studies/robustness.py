@@ -9,15 +9,17 @@ from typing import Any
 from stewart_drake.config import Scenario
 from stewart_drake.errors import ConfigError
 from stewart_drake.experiment import assemble, prepare
+from stewart_drake.fileio import remove_partials
+from stewart_drake.jsonio import jsonable
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.plant.workspace import diagnose
-from stewart_drake.results import jsonable
 from stewart_drake.scenario_loading import scenario_to_dict
 from stewart_drake.signals import POSE
 from stewart_drake.simulation import simulate
 from stewart_drake.studies.jobs import Progress, run_jobs, write_atomically
 from stewart_drake.studies.robustness_result import Outcome, RobustnessStudy, table
+from stewart_drake.studies.run_files import read_outcome
 from stewart_drake.studies.uncertainty import (
     UNDISTURBED,
     Draw,
@@ -70,15 +72,19 @@ def study_robustness(
         },
         "workers": workers,
         "scheduler": scheduler,
+        "check": read_outcome,
     }
     first = {"undisturbed": (scenario, (0.0,) * 6, UNDISTURBED)}
-    undisturbed = _read(run_jobs(first, run_draw, directory / "runs", **common)["undisturbed"])
+    undisturbed = read_outcome(
+        run_jobs(first, run_draw, directory / "runs", **common)["undisturbed"]
+    )
     scales = scales_of(experiment, undisturbed.peak_torque)
     draws = [draw(ranges, scales, scenario, seed, index) for index in range(runs)]
     jobs = {f"run{i:06d}": (scenario, scales.motion, one) for i, one in enumerate(draws)}
     files = run_jobs(jobs, run_draw, directory / "runs", progress=progress, **common)
-    outcomes = [_read(path) for path in files.values()]
+    outcomes = [read_outcome(path) for path in files.values()]
     study = RobustnessStudy(experiment, ranges, scales, seed, limit, undisturbed, draws, outcomes)
+    remove_partials(directory)
     write_atomically(directory / "runs.csv", table(study).encode())
     return study
 
@@ -107,7 +113,7 @@ def _run(scenario: Scenario, motion: tuple[float, ...], one: Draw) -> Outcome:
         outside = diagnose(truth, 0.0, start[POSE])
         if outside is not None:
             return Outcome("left_workspace", outside.reason, outside.leg, 0.0, math.nan, math.nan)
-        result = simulate(variant, truth=truth)
+        result = simulate(variant, truth=truth, margin=False)
     except ConfigError as error:
         return Outcome("refused", str(error), None, 0.0, math.nan, math.nan)
     if result.status == "interrupted":
@@ -116,13 +122,3 @@ def _run(scenario: Scenario, motion: tuple[float, ...], one: Draw) -> Outcome:
     if stopped is None:
         return Outcome(result.status, "", None, math.nan, result.accumulated_error, torque)
     return Outcome(result.status, stopped.reason, stopped.leg, stopped.time, math.nan, torque)
-
-
-def _read(path: Path) -> Outcome:
-    """The outcome in a file of `run_draw`; null is NaN where a number belongs."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))["outcome"]
-        numbers = (math.nan if found[n] is None else found[n] for n in Outcome._fields[3:])
-        return Outcome(found["status"], found["reason"], found["leg"], *map(float, numbers))
-    except (ValueError, KeyError, TypeError):
-        raise ConfigError(f"{path}: is damaged; delete it and start again") from None

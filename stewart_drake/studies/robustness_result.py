@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.experiment import Experiment
-from stewart_drake.results import versions
 from stewart_drake.scenario_loading import scenario_to_dict
+from stewart_drake.studies.failures import Explanation, explain
 from stewart_drake.studies.sizing import rms
 from stewart_drake.studies.statistics import (
     Correlation,
@@ -24,6 +24,7 @@ from stewart_drake.studies.statistics import (
     wilson_interval,
 )
 from stewart_drake.studies.uncertainty import Draw, Ranges, Scales
+from stewart_drake.versions import versions
 
 Array = NDArray[np.float64]
 
@@ -130,10 +131,15 @@ class RobustnessStudy(NamedTuple):
         error_p = holm([one.p_value for one in error.values()])
         failure_p = holm([one.p_value for one in failure.values()])
         found = [
-            Influence(name, FACTORS[name.strip("|")], error[name], p, failure[name], q)
+            Influence(name, unit_of(name), error[name], p, failure[name], q)
             for name, p, q in zip(values, error_p, failure_p, strict=True)
         ]
         return sorted(found, key=lambda one: -_strength(one))
+
+    @property
+    def explanation(self) -> Explanation:
+        """How the failing runs differ from the others."""
+        return explain(factor_values(self.draws), self.failed)
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -155,12 +161,18 @@ class RobustnessStudy(NamedTuple):
             if done.any()
             else None,
             "influences": [_influence_summary(one) for one in self.influences()],
+            "explanation": self.explanation.summary,
             "undisturbed": self.undisturbed._asdict(),
             "ranges": dataclasses.asdict(self.ranges),
             "scales": self.scales._asdict(),
             "scenario": scenario_to_dict(self.experiment.scenario),
             "versions": versions(),
         }
+
+
+def unit_of(factor: str) -> str:
+    """Unit of a factor, or of its size."""
+    return FACTORS[factor.strip("|")]
 
 
 def factor_values(draws: list[Draw]) -> dict[str, Array]:

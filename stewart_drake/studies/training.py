@@ -10,12 +10,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from stewart_drake.errors import ConfigError
-from stewart_drake.results import versions
 from stewart_drake.studies.dataset import data_hash
 from stewart_drake.studies.labels import Labels, cells, labels
 from stewart_drake.studies.levenberg import TorchModel, fit, initial_theta, unpack
 from stewart_drake.tuner.density import NUM_INPUTS, Kind, densities
 from stewart_drake.tuner.network import Network
+from stewart_drake.versions import versions
 
 Array = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ def train(
         evaluations,
     )
     outputs = model.outputs(found.theta, test[0])
-    W1, b1, W2, b2 = unpack(found.theta, NUM_INPUTS, hidden)
+    weights = unpack(found.theta, NUM_INPUTS, hidden)
     card = {
         "data_sha256": data_hash(dataset),
         "data_made_with": json.loads(dataset.attrs["settings"])["data"],
@@ -123,18 +123,8 @@ def train(
         },
         "versions": versions() | {"torch": version("torch")},
     }
-    network = Network(
-        input_mean=mean,
-        input_scale=scale,
-        W1=W1,
-        b1=b1,
-        W2=W2,
-        b2=b2,
-        bounds=_bounds(dataset, kind),
-        output=_output(kind),
-        density=density,
-        card=card,
-    )
+    bounds, output = _bounds(dataset, kind), _output(kind)
+    network = Network(mean, scale, *weights, bounds, output, density, card)
     return Training(network, found.curve, test[1], outputs)
 
 

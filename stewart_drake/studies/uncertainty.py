@@ -6,6 +6,7 @@ motion, so that the same shares suit any mechanism.
 
 import dataclasses
 import math
+import re
 from collections.abc import Iterable
 from typing import Annotated, Any, NamedTuple
 
@@ -20,6 +21,7 @@ from stewart_drake.errors import ConfigError
 from stewart_drake.experiment import Experiment, believed_delay, motion_scale
 from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.signals import NUM_LEGS, NUM_TORQUES
+from stewart_drake.studies.range_units import RANGE_UNITS
 from stewart_drake.studies.sizing import size_motors
 from stewart_drake.trajectories import spread_instants
 from stewart_drake.yamlio import brief, parse_yaml, validate
@@ -42,7 +44,8 @@ class Ranges:
         noise: standard deviation of the measured pose (rates: per second), share of half the
             reference's peak to peak, uniform from 0.
         torque_limit: of the motors, least and most, in units of the largest torque that the
-            undisturbed run commands, uniform; the scenario's own limit is never exceeded.
+            undisturbed run commands, uniform; what limits that run, the scenario's number or the
+            mechanism's motors, is never exceeded.
         damping: friction torque of a crank at its highest speed on the reference, share of the
             largest torque that the reference takes, uniform from 0.
         delay: true delay less the believed one, periods, uniform in +-.
@@ -82,6 +85,8 @@ class Scales(NamedTuple):
     """Of the controller, s."""
     commanded: float
     """Largest torque that the undisturbed run commands, N m."""
+    torque_limit: float = math.inf
+    """That of the undisturbed run, N m, infinite for none."""
 
 
 class Draw(NamedTuple):
@@ -120,13 +125,26 @@ def read_ranges(settings: Iterable[str]) -> Ranges:
     for setting in settings:
         name, equals, text = setting.partition("=")
         if not equals or not name.strip():
-            raise ConfigError(f"--vary: got {brief(setting)}; expected name=value")
+            raise ConfigError(f"--vary: got {brief(setting)}; expected name=value{_units(setting)}")
         given[name.strip()] = parse_yaml(text, f"--vary: {name.strip()}")
-    ranges = validate(Ranges, given, "--vary")
+    try:
+        ranges = validate(Ranges, given, "--vary")
+    except ConfigError as error:
+        raise ConfigError(f"{error}{_units(str(error), given)}") from None
     limit = ranges.torque_limit
     if limit is not None and limit[0] > limit[1]:
-        raise ConfigError(f"--vary: torque_limit: got {limit!r}; expected the lesser one first")
+        raise ConfigError(
+            f"--vary: torque_limit: got {limit!r}; expected the lesser one first"
+            f"{_units('torque_limit')}"
+        )
     return ranges
+
+
+def _units(message: str, names: Iterable[str] = RANGE_UNITS) -> str:
+    """What the numbers mean of those `names` that a message speaks of."""
+    spoken = set(re.findall(r"\w+", message))
+    told = [f"{name}: {RANGE_UNITS[name]}" for name in names if name in spoken & set(RANGE_UNITS)]
+    return f" ({'; '.join(told)})" if told else ""
 
 
 def scales_of(experiment: Experiment, commanded: float) -> Scales:
@@ -147,6 +165,7 @@ def scales_of(experiment: Experiment, commanded: float) -> Scales:
         crank=float(experiment.mechanism.crank_lengths.mean()),
         period=sc.controller.period,
         commanded=commanded,
+        torque_limit=experiment.torque_limit,
     )
 
 
@@ -168,7 +187,7 @@ def draw(ranges: Ranges, scales: Scales, scenario: Scenario, seed: int, index: i
     if scenario.plant.kind == "multibody":  # which sees torques change at its own steps only
         late = round(late * s.period / scenario.plant.time_step) * scenario.plant.time_step
         late /= s.period
-    own = scenario.delay.steps + scenario.delay.fraction
+    own = scenario.true_delay.periods
     return Draw(
         payload=float(payload),
         torque_bias=bias,
@@ -206,12 +225,13 @@ def disturbed(scenario: Scenario, motion: tuple[float, ...], one: Draw) -> Scena
         "steps": sc.delay.steps + whole,
         "fraction": round(max(0.0, fraction - whole), 12),
     }
-    data["controller"]["delay_steps"], data["controller"]["delay_fraction"] = believed_delay(sc)
+    believed = believed_delay(sc)
+    data["controller"] |= {"delay_steps": believed.steps, "delay_fraction": believed.fraction}
     if one.torque_limit is not None:
         data["actuator"]["torque_limit"] = one.torque_limit
     if one.noise != 0:
         std = np.array(sc.sensor.noise_std) + one.noise * np.tile(motion, 2)
-        data["sensor"] = {"noise_std": std.tolist(), "seed": one.seed}
+        data["sensor"] |= {"noise_std": std.tolist(), "seed": one.seed}
     return validate(Scenario, data, "drawn")
 
 
@@ -247,10 +267,11 @@ def _of_random_size(rng: np.random.Generator, number: int, largest: float) -> tu
     return tuple((size * np.sqrt(number) / np.linalg.norm(direction) * direction).tolist())
 
 
-def _limit(ranges: Ranges, scales: Scales, strength: float, own: float | None) -> float | None:
+def _limit(
+    ranges: Ranges, scales: Scales, strength: float, own: float | str | None
+) -> float | None:
     # Where the undisturbed run takes no torque, as at rest without gravity, a limit has no scale.
     if ranges.torque_limit is None or scales.commanded == 0:
-        return own
+        return own if isinstance(own, float) else None
     low, high = ranges.torque_limit
-    limit = scales.commanded * (low + (high - low) * strength)
-    return limit if own is None else min(limit, own)
+    return min(scales.commanded * (low + (high - low) * strength), scales.torque_limit)

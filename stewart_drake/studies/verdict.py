@@ -1,15 +1,14 @@
-"""Whether a delay can be beaten at all, told before anything is simulated."""
+"""What is told before anything is simulated: of this loop first, then of its delay alone."""
 
 import math
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
+from stewart_drake.controller_margin import ControllerMargin, true_dynamics, true_model
 from stewart_drake.design.limits import amplification, fastest_pole
 from stewart_drake.experiment import Experiment
-from stewart_drake.signals import ACCELERATIONS, POSE, RATES
-from stewart_drake.trajectories import evaluate
 
 INSTANTS: Final = 30
 """Poles are looked at this often along the reference; 29 steps, a prime, since a round number of
@@ -21,7 +20,7 @@ NO: Final = 1e3
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the delay does to an error of the prediction.
+    """What the delay does to an error of the prediction, whatever the controller.
 
     Attributes:
         eta: true total delay, s.
@@ -46,13 +45,43 @@ class Verdict:
         return "hardly" if self.amplification >= HARDLY else "yes"
 
     def __str__(self) -> str:
-        opening = f"delay {self.eta:.4g} s, beatable: {self.beatable}"
+        opening = f"the delay of {self.eta:.4g} s alone, under any controller, beatable: "
         if self.beatable == "yes":
-            return f"{opening}, prediction errors grow by a factor of {self.amplification:.1f}"
+            factor = f"{self.amplification:.1f}"
+            return f"{opening}yes, prediction errors grow by a factor of {factor}"
         return (
-            f"{opening}, prediction errors grow e^(p eta) = {_power(self.pole * self.eta)} fold "
-            f"at t = {self.time:.1f} s (pole {self.pole:.3g} /s)"
+            f"{opening}{self.beatable}, prediction errors grow e^(p eta) = "
+            f"{_power(self.pole * self.eta)} fold at t = {self.time:.1f} s "
+            f"(pole {self.pole:.3g} /s)"
         )
+
+
+def loop_verdict(loop: ControllerMargin) -> str:
+    """Whether this controller on this plant is stable, and by how much, in one sentence."""
+    if loop.problem:
+        return f"this loop is not judged: {loop.problem}"
+    where = "linearised along the reference"
+    if not loop.stable:
+        return (
+            f"this loop is unstable: {where}, errors grow {loop.radius:.3g} fold per period of "
+            f"{loop.period:g} s at t = {loop.time:.1f} s{_left_out(loop)}"
+        )
+    m = loop.margins
+    up = f"{m.gain_up:.4g}" if math.isfinite(m.gain_up) else "any"
+    return (
+        f"this loop is stable: {where}, it bears a true delay {milliseconds(m.shorter)} shorter "
+        f"to {milliseconds(m.longer)} longer and motors {m.gain_down:.3g} to {up} times as "
+        f"strong{_left_out(loop)}"
+    )
+
+
+def loop_word(margin: dict[str, Any] | None) -> str:
+    """The same in a few words, of `controller_margin` in a run's summary."""
+    if margin is None or margin["stable"] is None:
+        return "not judged"
+    if not margin["stable"]:
+        return f"unstable, {margin['spectral_radius']:.3g} fold per period"
+    return f"stable, bears a delay wrong by {milliseconds(min(margin['delay_margin_s']))}"
 
 
 def delay_verdict(experiment: Experiment) -> Verdict:
@@ -60,18 +89,30 @@ def delay_verdict(experiment: Experiment) -> Verdict:
     sc, times = experiment.scenario, np.linspace(0.0, experiment.scenario.duration, INSTANTS)
     poles = [pole_in_motion(experiment, t) for t in times]
     worst = int(np.argmax(poles))
-    eta = (sc.delay.steps + sc.delay.fraction) * sc.controller.period
-    return Verdict(eta=eta, pole=poles[worst], time=float(times[worst]))
+    return Verdict(eta=sc.eta, pole=poles[worst], time=float(times[worst]))
 
 
 def pole_in_motion(experiment: Experiment, time: float) -> float:
-    """Fastest pole of the nominal plant, 1/s, 0 without a growing one, about the moving reference.
+    """Fastest pole of the true plant, 1/s, 0 without a growing one, about the moving reference.
 
     `time` in s; the torque is the one that follows the reference then.
     """
-    x, plant = evaluate(experiment.reference, time), experiment.nominal
-    torque = plant.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
-    return fastest_pole(plant.derivatives(x[POSE], x[RATES], torque).A)
+    return fastest_pole(true_model(experiment, true_dynamics(experiment), time).A)
+
+
+def milliseconds(seconds: float) -> str:
+    """Three digits of a time; `any time` where it is not limited."""
+    return f"{1e3 * seconds:.3g} ms" if math.isfinite(seconds) else "any time"
+
+
+def _left_out(loop: ControllerMargin) -> str:
+    """What the judgement supposes, where there is something to suppose."""
+    supposed = []
+    if loop.estimated:
+        supposed.append("the estimator left out, payload and friction taken as found")
+    if loop.tuned:
+        supposed.append("with the weights that the tuner starts from")
+    return f" ({'; '.join(supposed)})" if supposed else ""
 
 
 def _power(exponent: float) -> str:

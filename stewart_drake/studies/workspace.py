@@ -1,6 +1,7 @@
 """A reference against the workspace: margins, singularity, the largest amplitude, motor sizing."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,8 +58,8 @@ class WorkspaceStudy:
     @property
     def torque_limit(self) -> float | None:
         """The scenario's, else the mechanism's, N m."""
-        limit = self.experiment.scenario.actuator.torque_limit
-        return self.experiment.mechanism.effort_limit if limit is None else limit
+        limit = self.experiment.torque_limit
+        return limit if math.isfinite(limit) else None
 
     @property
     def worst(self) -> tuple[float, int, float]:
@@ -99,7 +100,7 @@ class WorkspaceStudy:
             )
         if not self.factor.limited:
             return f"{value:g} times the amplitude fits, more was not tried"
-        return f"the largest amplitude that fits is {np.floor(1e3 * value) / 1e3:g} times this one"
+        return f"the largest amplitude that fits is {self.factor.told} times this one"
 
     @property
     def summary(self) -> dict[str, Any]:

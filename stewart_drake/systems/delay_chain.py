@@ -4,8 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
+from stewart_drake.delay import Delay
 from stewart_drake.lifetime import weak
-from stewart_drake.signals import NUM_TORQUES, queue_length
+from stewart_drake.signals import NUM_TORQUES
 from stewart_drake.timing import event_time
 
 Array = NDArray[np.float64]
@@ -43,7 +44,7 @@ class DelayChain(LeafSystem):
 
     def __init__(self, period: float, steps: int, fraction: float, queue: Array) -> None:
         super().__init__()
-        length = queue_length(steps, fraction)
+        length = Delay(steps, fraction).queue_length
         queue = np.asarray(queue, dtype=np.float64)
         if queue.shape != (length, NUM_TORQUES):
             raise ValueError(f"queue: got shape {queue.shape}; expected {(length, NUM_TORQUES)}")

@@ -7,12 +7,10 @@ A network lives in one JSON file, read as strictly as a scenario.
 
 import dataclasses
 import json
-import math
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path
-from typing import Any, Final, Literal, NoReturn
+from typing import Any, Final, Literal
 
 import numpy as np
 import pydantic.dataclasses
@@ -21,7 +19,8 @@ from pydantic import ConfigDict
 from scipy.special import expit
 
 from stewart_drake.errors import ConfigError
-from stewart_drake.fileio import read_bytes, replacing
+from stewart_drake.fileio import replacing
+from stewart_drake.jsonio import load_json
 from stewart_drake.resources import resolve
 from stewart_drake.signals import WEIGHTS
 from stewart_drake.tuner.density import NUM_INPUTS
@@ -33,7 +32,9 @@ DEFAULT: Final = "tuner"
 """The shipped network."""
 NUM_OUTPUTS: Final = len(WEIGHTS)
 
-_MAX_BYTES: Final = 10_000_000
+MAX_BYTES: Final = 10_000_000
+EXPECTED: Final = "the JSON file of one network"
+"""In words, where a file is none."""
 _ARRAYS: Final = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds")
 
 
@@ -180,10 +181,7 @@ def load_network(name_or_path: str | Path) -> Network:
             of them once, finite and of the right shape. One line, naming file and field.
     """
     path = resolve("weights", name_or_path)
-    data = _read(path)
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: holds {brief(data)}; expected a JSON object")
-    file = validate(_File, data, str(path))
+    file = validate(_File, load_json(path, MAX_BYTES, EXPECTED), str(path))
     for name in _ARRAYS:
         rows = getattr(file, name)
         if rows and isinstance(rows[0], list) and len({len(row) for row in rows}) > 1:
@@ -192,40 +190,3 @@ def load_network(name_or_path: str | Path) -> Network:
         return Network(**vars(file))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-
-
-def _read(path: Path) -> Any:
-    """Strict JSON: no NaN, no key twice."""
-    raw = read_bytes(path, _MAX_BYTES, "the JSON file of one network")
-    try:
-        return json.loads(
-            raw.decode("utf-8"),
-            parse_constant=_no_constant,
-            parse_float=_finite,
-            object_pairs_hook=_unique,
-        )
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text; expected a JSON file") from None
-    except (ValueError, RecursionError) as error:
-        problem = "nested too deep" if isinstance(error, RecursionError) else str(error)
-        raise ConfigError(
-            f"{path}: is not readable as JSON ({problem}); expected the file of one network"
-        ) from None
-
-
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not a number that JSON has")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{brief(text)} is larger than any float")
-    return value
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    for key, number in Counter(key for key, _ in pairs).items():
-        if number > 1:
-            raise ValueError(f"key {brief(key)} given {number} times")
-    return dict(pairs)

@@ -1,0 +1,40 @@
+"""The delay between a torque and its effect, as a value: what is true of it, or believed."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Delay:
+    """A delay eta = (steps + fraction) dt of a loop that is sampled every dt.
+
+    Attributes:
+        steps: mu, whole periods.
+        fraction: eta0 / dt, the further part of a period, in [0, 1).
+
+    Raises:
+        ValueError: steps or fraction outside their range.
+    """
+
+    steps: int
+    fraction: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.steps < 0 or not 0 <= self.fraction < 1:
+            raise ValueError(
+                f"delay: got {self.steps} steps and a fraction of {self.fraction}; expected "
+                "steps >= 0 and 0 <= fraction < 1"
+            )
+
+    @property
+    def periods(self) -> float:
+        """The whole of it in periods."""
+        return self.steps + self.fraction
+
+    def eta(self, period: float) -> float:
+        """The whole of it in s, for a period in s."""
+        return self.periods * period
+
+    @property
+    def queue_length(self) -> int:
+        """Torques of earlier samples that still act, or will: mu, one more when eta0 > 0."""
+        return self.steps + (1 if self.fraction > 0 else 0)

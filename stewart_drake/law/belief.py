@@ -1,0 +1,95 @@
+"""What an observer believes: state, parameters, their covariance, delay, what it rejected."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.law.timeline import Timeline
+from stewart_drake.signals import NUM_STATE
+
+Array = NDArray[np.float64]
+THETA = slice(NUM_STATE, None)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is known of [state; p parameters].
+
+    Attributes:
+        mean: (12 + p,); a state of NaN before there is any.
+        covariance: (12 + p, 12 + p); NaN where nothing is estimated.
+        outlier: (m,) the last outlier, NaN without one.
+        outliers: how many in a row, up to the last measurement, bear each other out.
+        unseen: periods since a measurement was last used.
+    """
+
+    mean: Array
+    covariance: Array
+    outlier: Array
+    outliers: int = 0
+    unseen: int = 0
+
+    @property
+    def state(self) -> Array:
+        """(12,)."""
+        return self.mean[:NUM_STATE]
+
+    @property
+    def parameters(self) -> Array:
+        """(p,)."""
+        return self.mean[THETA]
+
+    @property
+    def parameter_std(self) -> Array:
+        """(p,); NaN where nothing is estimated."""
+        return np.sqrt(np.diag(self.covariance)[THETA])
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether there is a covariance."""
+        return not np.isnan(self.covariance[0, 0])
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What an observer hands to the law, and gets back at the next sample.
+
+    Attributes:
+        estimate: of state and parameters.
+        timeline: the delay that it believes in.
+        measured: (m,) last value of each measured quantity that was there; NaN before any.
+        fault: why the model stood in for the last measurement, as the name of a count, or None.
+    """
+
+    estimate: Estimate
+    timeline: Timeline
+    measured: Array
+    fault: str | None = None
+
+    @classmethod
+    def nothing(cls, timeline: Timeline, size: int, parameters: Array) -> "Belief":
+        """Before any of m = `size` values were measured, with parameters (p,) for a guess."""
+        mean = np.concatenate([np.full(NUM_STATE, np.nan), parameters])
+        unknown = np.full((len(mean), len(mean)), np.nan)
+        return cls(Estimate(mean, unknown, np.full(size, np.nan)), timeline, np.full(size, np.nan))
+
+    @property
+    def state(self) -> Array:
+        """(12,); NaN before there is any."""
+        return self.estimate.state
+
+    @property
+    def parameters(self) -> Array:
+        """(p,)."""
+        return self.estimate.parameters
+
+    @property
+    def has_state(self) -> bool:
+        """Whether there is a state to go on with."""
+        return bool(np.all(np.isfinite(self.state)))
+
+    def at(self, state: Array) -> "Belief":
+        """The same in another state (12,)."""
+        mean = np.concatenate([state, self.parameters])
+        return replace(self, estimate=replace(self.estimate, mean=mean))

@@ -1,0 +1,65 @@
+"""The cost that the gain minimises, and the gain."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.design.delay_model import DelayedModel, delayed_model
+from stewart_drake.design.error_model import ContinuousModel
+from stewart_drake.design.riccati import reduced_gain
+from stewart_drake.law.timeline import Timeline
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class QuadraticCost:
+    """w_Q [e; z]' Q [e; z] + w_R T' R T, with diagonal Q and R.
+
+    Attributes:
+        errors: (6,) scale of the pose error, 1 / s^2.
+        integrals: (6,) scale of its integral, or None for a law that does not integrate.
+        torques: (6,) scale of the torques.
+    """
+
+    errors: Array
+    integrals: Array | None
+    torques: Array
+
+    @property
+    def integrates(self) -> bool:
+        """Whether the law has an integral."""
+        return self.integrals is not None
+
+    def sees(self, integral: Array) -> Array:
+        """What the gain multiplies of an integral (6,): all or nothing."""
+        return integral if self.integrates else np.empty(0)
+
+    def matrices(self, weights: Array) -> tuple[Array, Array]:
+        """w_Q Q and w_R R, of w_Q and w_R (2,)."""
+        Q, R = self._unweighted
+        return weights[0] * Q, weights[1] * R
+
+    @cached_property
+    def _unweighted(self) -> tuple[Array, Array]:
+        scales = [self.errors] if self.integrals is None else [self.errors, self.integrals]
+        return np.diag(np.concatenate(scales)), np.diag(self.torques)
+
+    def sampled(self, model: ContinuousModel, timeline: Timeline) -> DelayedModel:
+        """`design.delay_model.delayed_model`, with the integral if there is one.
+
+        Raises:
+            FloatingPointError: the model cannot be sampled.
+        """
+        period, steps, fraction = timeline.period, timeline.steps, timeline.fraction
+        return delayed_model(model, period, steps, fraction, integral=self.integrates)
+
+    def gain(self, model: DelayedModel, weights: Array) -> Array:
+        """`design.riccati.reduced_gain` of what `sampled` returned.
+
+        Raises:
+            RiccatiError: there is no gain.
+        """
+        return reduced_gain(model, *self.matrices(weights))

@@ -1,0 +1,75 @@
+"""A, B of the error, which the gain is designed for."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.design.error_model import ContinuousModel, double_integrators, linear_model
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import UnreachablePoseError
+from stewart_drake.mechanism.torque_map import TorqueMap, torque_map
+from stewart_drake.plant.equations import DEAD_CENTRE_SINE
+from stewart_drake.plant.workspace import standing
+from stewart_drake.signals import POSE, RATES
+
+Array = NDArray[np.float64]
+
+
+class DesignModel(ABC):
+    """A kind of model. Instances are immutable."""
+
+    def at(
+        self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
+    ) -> ContinuousModel:
+        """The error model about a state (12,) under a torque (6,), with parameters (8,).
+
+        Raises:
+            UnreachablePoseError: the plate cannot be there, or not be moved there.
+        """
+        require_reach(plant.mechanism, state[POSE])
+        return self.about(state, torque, parameters, plant)
+
+    @abstractmethod
+    def about(
+        self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
+    ) -> ContinuousModel:
+        """`at`, of a pose that is known to be within reach."""
+
+
+def require_reach(mechanism: Mechanism, pose: Array) -> None:
+    """Raises UnreachablePoseError for a pose (6,) out of reach or at a dead centre."""
+    margins = mechanism.reach_margins(pose)
+    if not np.all(margins > 0) or standing(mechanism, pose).sines.min() < DEAD_CENTRE_SINE:
+        raise UnreachablePoseError(margins)
+
+
+@dataclass(frozen=True)
+class PaperModel(DesignModel):
+    """Six double integrators behind the paper's torque map.
+
+    Attributes:
+        form: which of the torque maps.
+    """
+
+    form: TorqueMap = "virtual_work"
+
+    def about(
+        self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
+    ) -> ContinuousModel:
+        """By the pose alone."""
+        return double_integrators(torque_map(plant.mechanism, state[POSE], self.form))
+
+
+@dataclass(frozen=True)
+class MultibodyModel(DesignModel):
+    """The equations of motion, linearised."""
+
+    def about(
+        self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
+    ) -> ContinuousModel:
+        """By `StewartDynamics.derivatives`."""
+        derivatives = plant.dynamics.derivatives(state[POSE], state[RATES], torque, parameters)
+        return linear_model(derivatives.A, derivatives.B)

@@ -1,0 +1,78 @@
+"""What the control law carries from one sample to the next."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.law.belief import Belief
+
+Array = NDArray[np.float64]
+
+
+class Counts(NamedTuple):
+    """Things that went wrong and were survived, by cause.
+
+    Attributes:
+        riccati_failures: samples without a new gain.
+        unreachable: samples without a model: a plate at the predicted pose cannot be regulated.
+        nonfinite_torque: samples whose torque was no number, so that the last one was sent again.
+        measurements_missing: measurements with values that are no numbers.
+        measurements_frozen: measurements that only repeat the last one.
+        measurements_rejected: measurements that the plate cannot have, or that the filter takes
+            for outliers.
+        saturated_steps: samples with a torque at the limit.
+    """
+
+    riccati_failures: int = 0
+    unreachable: int = 0
+    nonfinite_torque: int = 0
+    measurements_missing: int = 0
+    measurements_frozen: int = 0
+    measurements_rejected: int = 0
+    saturated_steps: int = 0
+
+    def plus(self, *causes: str | None) -> "Counts":
+        """One more of each cause that is not None."""
+        return self._replace(**{cause: getattr(self, cause) + 1 for cause in causes if cause})
+
+    @property
+    def bad_measurements(self) -> int:
+        """Samples at which the model stood in for the measurement."""
+        return self.measurements_missing + self.measurements_frozen + self.measurements_rejected
+
+    def summary(self) -> dict[str, int]:
+        """Every count by its name, `bad_measurements` too."""
+        return self._asdict() | {"bad_measurements": self.bad_measurements}
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What the controller carries from one sample to the next.
+
+    The shapes never change, but that of the gain with the delay that is believed in.
+
+    Attributes:
+        in_flight: (n > L, 6) torques, oldest first; the last is the newest. The last L are the
+            queue; the one before them (and, where eta0 > 0, the first of them) acted during the
+            last period. They are what the limit has let through.
+        belief: of the observer, at the last sample.
+        measurement: (m,) at the last sample, as it came; NaN before the first.
+        error: (6,) pose error at the last sample.
+        integral: (6,) of the pose error.
+        gain: (6, g) last good feedback gain; NaN before there is one.
+        torque: (6,) last torque as asked for, which may be beyond the limit.
+        weights: (2,) w_Q and w_R that were used.
+        counts: see `Counts`.
+    """
+
+    in_flight: Array
+    belief: Belief
+    measurement: Array
+    error: Array
+    integral: Array
+    gain: Array
+    torque: Array
+    weights: Array
+    counts: Counts

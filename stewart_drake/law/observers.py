@@ -1,0 +1,128 @@
+"""Where the plate is, and what it is: from measurements and from the torques that acted."""
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.design.filter_settings import FilterSettings
+from stewart_drake.law.belief import Belief
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.parameter_filter import ParameterFilter, Period
+from stewart_drake.law.sensing import Sensing
+from stewart_drake.law.timeline import Timeline
+
+Array = NDArray[np.float64]
+
+
+class Observer(Protocol):
+    """A kind of observer: belief in, belief out. Instances are immutable."""
+
+    def start(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Belief:
+        """What is believed before the first sample, with the delay that is assumed then."""
+        ...
+
+    def observe(
+        self,
+        belief: Belief,
+        measurement: Measurement,
+        in_flight: Array,
+        sensing: Sensing,
+        plant: NominalPlant,
+    ) -> Belief:
+        """One period, then a measurement at its end.
+
+        Args:
+            belief: after the last sample.
+            measurement: of this one, as it came.
+            in_flight: (n, 6) as of `memory.Memory`, before this sample's torque.
+            sensing: what is measured.
+            plant: as it is known.
+
+        Returns:
+            The new belief, its `measured` and its `fault` too. Its state may be NaN only as long as
+            there was no measurement without a fault; the law then takes the reference's.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class NoObserver:
+    """Takes the measurement as it is, and goes on by the model where it has a fault."""
+
+    def start(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Belief:
+        """The parameters are what is known of the plant, for good."""
+        return Belief.nothing(timeline, sensing.size, plant.dynamics.parameters)
+
+    def observe(
+        self,
+        belief: Belief,
+        measurement: Measurement,
+        in_flight: Array,
+        sensing: Sensing,
+        plant: NominalPlant,
+    ) -> Belief:
+        """See `Observer.observe`."""
+        after = _told(belief, measurement, sensing, plant)
+        if after.fault is None:
+            return after.at(sensing.start(measurement).state)
+        return after.at(_moved(belief, in_flight, plant)) if belief.has_state else after
+
+
+@dataclass(frozen=True)
+class ParameterObserver:
+    """The filter of `law.parameter_filter` over state and parameters.
+
+    Attributes:
+        settings: what it assumes.
+    """
+
+    settings: FilterSettings
+
+    def start(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Belief:
+        """The parameters are those of the prior, until the first measurement."""
+        return Belief.nothing(timeline, sensing.size, self.settings.parameters.prior)
+
+    def observe(
+        self,
+        belief: Belief,
+        measurement: Measurement,
+        in_flight: Array,
+        sensing: Sensing,
+        plant: NominalPlant,
+    ) -> Belief:
+        """See `Observer.observe`."""
+        after = _told(belief, measurement, sensing, plant)
+        ekf = ParameterFilter(plant.dynamics, sensing, self.settings)
+        usable = measurement if after.fault is None else None
+        if not belief.estimate.uncertain:
+            if usable is not None:
+                return replace(after, estimate=ekf.start(usable, belief.parameters))
+            return after.at(_moved(belief, in_flight, plant)) if belief.has_state else after
+        acting, following = belief.timeline.last_period(in_flight)
+        period = Period(*acting, following, plant.substeps_for(acting.torques))
+        estimate, fault = ekf.advance(belief.estimate, period, usable), after.fault
+        if estimate.outliers > 0:
+            fault = "measurements_rejected"
+            # Such a one said so before: it is no second witness.
+            if np.array_equal(measurement.values, belief.measured):
+                fault, estimate = "measurements_frozen", replace(estimate, outliers=0)
+        return replace(after, estimate=estimate, fault=fault)
+
+
+def _told(
+    belief: Belief, measurement: Measurement, sensing: Sensing, plant: NominalPlant
+) -> Belief:
+    """The belief with what was measured, and what is wrong with that, and nothing made of it."""
+    measurement.require_fresh()
+    period = belief.timeline.period
+    fault = sensing.fault(measurement, belief.measured, period, plant.mechanism)
+    return replace(belief, measured=measurement.after(belief.measured), fault=fault)
+
+
+def _moved(belief: Belief, in_flight: Array, plant: NominalPlant) -> Array:
+    """The state (12,) a period later, by the model alone."""
+    acting, _ = belief.timeline.last_period(in_flight)
+    return plant.predict(belief.state, acting)[-1]

@@ -1,0 +1,263 @@
+"""Extended Kalman filter over the state and constant parameters of the plant.
+
+The parameters theta (torque bias, payload, joint damping; `design.filter_settings.ParameterSet`)
+never change, the state obeys the exact dynamics under the torques that are known to act:
+
+    [x_{k+1}; theta] = [f(x_k, T, theta); theta] + noise,    y_k = h(x_k) + measurement noise.
+
+Linearised, F = [[Phi, S], [0, 1]] with Phi = df/dx and S = df/dtheta. One-step prediction errors
+drive the filter: y_k corrects x_{k-1} and theta, and x_k follows by the model. The error of one
+step of the model counts as noise of y_k there, and widens the covariance of x_k. h is that of the
+`sensing.Sensing`.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from scipy.special import chdtri
+
+from stewart_drake.design.filter_settings import FilterSettings, ParameterSet
+from stewart_drake.design.holds import GAUSS_NODES
+from stewart_drake.law.belief import THETA, Estimate
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.sensing import FirstState, Sensing
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.signals import NUM_STATE, POSE, RATES
+
+Array = NDArray[np.float64]
+OUTLIER = 1e-6
+"""Share of the measurements, were all as the filter believes, that are taken for outliers."""
+ITERATIONS = 4
+"""At the most; one does once the parameters are roughly known."""
+MIDPOINT = np.array([0.5])
+SMALL = 0.1
+"""A correction so many standard deviations long needs no second look."""
+KNOWN = 0.01
+"""A parameter is known when its standard deviation is this share of the prior's."""
+PATIENCE = 3
+"""After so many outliers in a row that bear each other out the plate must be where they say."""
+
+
+class Period(NamedTuple):
+    """What acted between two samples, as far as the delay is what it is believed to be."""
+
+    torques: Array
+    """(n, 6) N m, one after the other."""
+    durations: Array
+    """(n,) s."""
+    following: Array
+    """(6,) N m, acts next."""
+    substeps: int
+    """Integration steps per torque."""
+
+
+@cache
+def gate(size: int) -> float:
+    """Squared innovation of so many values, in units of its covariance, that makes an outlier."""
+    return float(chdtri(size, OUTLIER))
+
+
+@dataclass(frozen=True)
+class ParameterFilter:
+    """The filter for one plant and sensor.
+
+    Attributes:
+        dynamics: of the plant.
+        sensing: what is measured of it.
+        settings: what else is assumed.
+    """
+
+    dynamics: StewartDynamics
+    sensing: Sensing
+    settings: FilterSettings
+
+    def start(self, measurement: Measurement, parameters: Array) -> Estimate:
+        """The estimate from one measurement alone, with parameters (p,) for a guess."""
+        return self._from(self.sensing.start(measurement), parameters)
+
+    def advance(
+        self, estimate: Estimate, period: Period, measurement: Measurement | None
+    ) -> Estimate:
+        """One period, then a measurement at its end, or none.
+
+        The first steps move the parameters far: linearising once is not enough. The mean xi of
+        [previous state; parameters] is found by Gauss-Newton iterations of
+
+            min (xi - mean)' P^-1 (xi - mean) + (y - h(f(xi)))' R^-1 (y - h(f(xi))),
+
+        the iterated filter over one transition; one iteration is the extended Kalman filter. A
+        measurement that does not fit (an outlier, iterations that diverge) is left out and the
+        model goes on alone. The plate may have been moved by hand, though: outliers that follow
+        from one another as the model has it tell of a plate, not of a broken sensor, and after
+        PATIENCE of them, or where the model cannot go on, the measurement is believed. So is the
+        first one that fits after PATIENCE or more periods without any, if the parameters were not
+        known by then: linearised along a way that is only guessed, the covariance is worth nothing.
+        """
+        if measurement is None:
+            alone = self._attempt(estimate, period, None)
+            return replace(estimate if alone is None else alone, unseen=estimate.unseen + 1)
+        y = measurement.values
+        after = self._attempt(estimate, period, y)
+        if after is not None:
+            lost = estimate.unseen >= PATIENCE and not self._known(estimate)
+            return self.start(measurement, estimate.parameters) if lost else after
+        alone = self._attempt(estimate, period, None)
+        outliers = 1
+        if estimate.outliers > 0:
+            before = self.start(Measurement.of(estimate.outlier), estimate.parameters)
+            if self._attempt(before, period, y) is not None:
+                outliers += estimate.outliers
+        if alone is None or outliers >= PATIENCE:
+            return self.start(measurement, estimate.parameters)
+        return replace(alone, outliers=outliers, outlier=y, unseen=estimate.unseen + 1)
+
+    def _from(self, first: FirstState, parameters: Array) -> Estimate:
+        mean = np.concatenate([first.state, parameters])
+        covariance = np.diag(np.concatenate([np.zeros(NUM_STATE), self.settings.parameters.std**2]))
+        covariance[:NUM_STATE, :NUM_STATE] = first.covariance
+        return Estimate(mean, covariance, self._no_outlier())
+
+    def _no_outlier(self) -> Array:
+        return np.full(self.sensing.size, np.nan)
+
+    def _known(self, estimate: Estimate) -> bool:
+        return bool(np.all(estimate.parameter_std <= KNOWN * self.settings.parameters.std))
+
+    def _attempt(self, estimate: Estimate, period: Period, y: Array | None) -> Estimate | None:
+        """`advance` for values (m,) that fit; None for an outlier, or without a finite result."""
+        try:
+            with np.errstate(all="ignore"):
+                after = self._filter(estimate, period, y)
+        except (np.linalg.LinAlgError, ArithmeticError):
+            return None
+        if after is None or not np.all(np.isfinite(after.covariance)):
+            return None
+        return after if np.all(np.isfinite(after.mean)) else None
+
+    def _filter(self, estimate: Estimate, period: Period, y: Array | None) -> Estimate | None:
+        dynamics, sensing, settings = self.dynamics, self.sensing, self.settings
+        prior, P = estimate.mean, estimate.covariance
+        xi = prior
+        # Corrections of parameters that are known already are too small to need F to fourth order.
+        nodes = MIDPOINT if self._known(estimate) else GAUSS_NODES
+        after, F = _transition(dynamics, xi, period, nodes)
+        kicks = _kicks(dynamics, after, xi[THETA], period)
+        drift = np.diag(settings.model_std**2 + settings.timing_std**2 * np.sum(kicks**2, axis=0))
+        if y is not None:
+            R = np.diag(sensing.noise_std**2)
+            R = R + sensing.through(after, sensing.through(after, drift).T)
+            small = SMALL * np.sqrt(np.diag(R))
+            for _ in range(ITERATIONS):
+                H = sensing.through(after, F[:NUM_STATE])
+                innovation = y - sensing.seen(after) - H @ (prior - xi)
+                S = H @ P @ H.T + R
+                gain = np.linalg.solve(S, H @ P).T
+                keep = np.eye(len(xi)) - gain @ H
+                posterior = keep @ P @ keep.T + gain @ R @ gain.T  # Joseph's form stays positive
+                moved = _within_bounds(prior + gain @ innovation, posterior, settings.parameters)
+                shift, xi = F[:NUM_STATE] @ (moved - xi), moved
+                linear = after + shift
+                # What linearising leaves out is of second order: nothing beside a small correction.
+                if np.all(np.abs(sensing.through(after, shift)) <= small):
+                    after = linear
+                    break
+                after = _integrate(dynamics, xi, period)[-1]
+                if np.all(np.abs(sensing.through(after, after - linear)) <= small):
+                    break
+                after, F = _transition(dynamics, xi, period, nodes)
+            if not innovation @ np.linalg.solve(S, innovation) <= gate(len(y)):  # or NaN
+                return None
+            P = posterior
+        P = F @ P @ F.T
+        P[:NUM_STATE, :NUM_STATE] += drift
+        return Estimate(np.concatenate([after, xi[THETA]]), (P + P.T) / 2, self._no_outlier())
+
+
+def _kicks(dynamics: StewartDynamics, state: Array, theta: Array, period: Period) -> Array:
+    """(n, 12) change of the last state per s by which one of the n changes of torque comes early.
+
+    To first order: for that time the acceleration differs by B dT, which stays in the rates, and
+    moves the pose for what is left of the period.
+    """
+    pose, rates = state[POSE], state[RATES]
+    torques = (*period.torques, period.following)
+    changes = np.diff([dynamics.accelerations(pose, rates, T, theta) for T in torques], axis=0)
+    left = period.durations.sum() - np.cumsum(period.durations)
+    return np.hstack([left[:, None] * changes, changes])
+
+
+def _integrate(dynamics: StewartDynamics, xi: Array, period: Period) -> Array:
+    """States (n, 12) after each of n torques, from [state; parameters] (12 + p,)."""
+    torques, durations, substeps = period.torques, period.durations, period.substeps
+    return dynamics.predict(xi[:NUM_STATE], torques, durations, substeps, xi[THETA])
+
+
+def _transition(
+    dynamics: StewartDynamics, xi: Array, period: Period, nodes: Array = GAUSS_NODES
+) -> tuple[Array, Array]:
+    """State (12,) after the torques, and F (12 + p, 12 + p) of [state; parameters].
+
+    F = exp(Omega) solves F_dot = [[A, G], [0, 0]] F to fourth order with A and G at the two Gauss
+    nodes: Omega = h/2 (L_1 + L_2) + sqrt(3)/12 h^2 [L_2, L_1] (Magnus); MIDPOINT is of second. The
+    filter divides tiny innovations by F: such an error would already look like a disturbance.
+    """
+    x, theta = xi[:NUM_STATE], xi[THETA]
+    total = np.eye(len(xi))
+    ends = _integrate(dynamics, xi, period)
+    for torque, h, end in zip(period.torques, period.durations, ends, strict=True):
+        L = np.zeros((len(nodes), *total.shape))
+        for place, node in zip(L, nodes, strict=True):
+            pose, rates = _within_hold(x, end, h, node)
+            derivatives = dynamics.derivatives(pose, rates, torque, theta)
+            place[:NUM_STATE, :NUM_STATE], place[:NUM_STATE, THETA] = derivatives.A, derivatives.G
+        omega = h * L.mean(axis=0)
+        if len(nodes) == 2:
+            omega += np.sqrt(3) / 12 * h**2 * (L[1] @ L[0] - L[0] @ L[1])
+        x, total = end, expm(omega) @ total
+    return x, total
+
+
+def _within_hold(start: Array, end: Array, h: float, s: float) -> tuple[Array, Array]:
+    """Pose and rates (6,) when the share s of h seconds is over: the cubic through both states."""
+    rise, v_0, v_1 = (end[POSE] - start[POSE]) / h, start[RATES], end[RATES]
+    a, b = v_0 - rise, v_1 - rise
+    left = 1 - s
+    pose = left * start[POSE] + s * end[POSE] + h * s * left * (left * a - s * b)
+    return pose, rise + left * (1 - 3 * s) * a + s * (3 * s - 2) * b
+
+
+def _within_bounds(mean: Array, covariance: Array, parameters: ParameterSet) -> Array:
+    """The mean nearest to `mean`, as the covariance measures it, with each parameter in bounds.
+
+    Fixing components at bounds moves all that is correlated with them along their columns of P, so
+    that what the measurements have told about combinations of parameters is kept. Which ones are
+    fixed is found by adding the one furthest out and freeing those that are held back from inside.
+    The covariance stays: a parameter at its bound may leave it again.
+    """
+    fixed: dict[int, float] = {}
+    moved = mean
+    for _ in range(4 * len(parameters.names)):
+        within = np.clip(moved[THETA], parameters.lower, parameters.upper)
+        excess = (moved[THETA] - within) / np.sqrt(np.diag(covariance)[THETA])
+        worst = int(np.argmax(np.abs(excess)))
+        if np.abs(excess[worst]) <= 1e-9:
+            break
+        fixed[NUM_STATE + worst] = within[worst]
+        while True:
+            at = list(fixed)
+            push = np.linalg.solve(covariance[np.ix_(at, at)], mean[at] - list(fixed.values()))
+            if not (fixed and np.all(np.isfinite(push))):
+                raise np.linalg.LinAlgError("the covariance is not positive definite")
+            upper = np.array([fixed[i] == parameters.upper[i - NUM_STATE] for i in at])
+            inwards = np.where(upper, push, -push)
+            if inwards.min() >= 0:
+                break
+            del fixed[at[int(inwards.argmin())]]
+        moved = mean - covariance[:, at] @ push
+    moved = moved.copy()
+    moved[THETA] = np.clip(moved[THETA], parameters.lower, parameters.upper)
+    return moved

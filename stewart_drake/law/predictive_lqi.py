@@ -1,0 +1,247 @@
+"""The predictive LQI control law as a pure function: memory and what is new in, memory out.
+
+At t = k dt the torques in flight are known, so the state at the instant from which the next torque
+acts is predicted, and (42) is applied there:
+
+    T_k = T_ff - K [e; z; ...],   e = predicted pose and rate error, z = predicted integral,
+
+with K from `design.riccati.reduced_gain` and T_ff the feedforward of the hold interval
+[t + eta, t + eta + dt), see `design.holds`. Linear prediction multiplies [e_k; z_k; queue] by
+`prediction_matrix`, which is the paper's K_aug e_dis; nonlinear prediction integrates the exact
+dynamics through the queue. Torques enter the linear parts as deviations from their feedforward.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.law.belief import Belief
+from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.design_models import DesignModel
+from stewart_drake.law.feedforward import Feedforward
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.memory import Counts, Memory
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.observers import Observer
+from stewart_drake.law.predictors import Ahead, Predictor
+from stewart_drake.law.sensing import Sensing
+from stewart_drake.law.timeline import Timeline
+from stewart_drake.mechanism.kinematics import UnreachablePoseError
+from stewart_drake.signals import (
+    NUM_COORDINATES,
+    NUM_REFERENCE,
+    NUM_STATE,
+    NUM_TORQUES,
+    POSE,
+    RATES,
+)
+
+Array = NDArray[np.float64]
+Motion = Callable[[Array], Array]
+"""The reference (p, 18), pose, rates and accelerations, at instants (p,) in s from now; some of
+them may be negative."""
+
+
+@dataclass(frozen=True)
+class Preview:
+    """A motion that is known at some instants only, those that a law asks for.
+
+    Attributes:
+        times: (p,) s from now.
+        reference: (p, 18) there.
+    """
+
+    times: Array
+    reference: Array
+
+    def __call__(self, times: Array) -> Array:
+        """The reference at all of `times`.
+
+        Raises:
+            ValueError: at other instants than those.
+        """
+        asked = times is self.times or np.array_equal(times, self.times)
+        if not asked or len(self.reference) != len(times):
+            raise ValueError(
+                f"preview: got {len(self.reference)} rows for {len(self.times)} instants; "
+                f"expected the {len(times)} that the law asks for"
+            )
+        return self.reference
+
+
+@dataclass(frozen=True)
+class PredictiveLqi:
+    """The control law for one machine, made of parts; `dataclasses.replace` swaps one.
+
+    Attributes:
+        timeline: the controller's clock, and the delay that it assumes at the start. Later it is
+            the observer's belief that counts.
+        plant: the machine as it is known.
+        sensing: what is measured.
+        observer: what it makes of measurements.
+        predictor: error and integral where the next torque acts.
+        feedforward: what the reference takes.
+        model: of the error, for the gain.
+        cost: what the gain minimises.
+    """
+
+    timeline: Timeline
+    plant: NominalPlant
+    sensing: Sensing
+    observer: Observer
+    predictor: Predictor
+    feedforward: Feedforward
+    model: DesignModel
+    cost: QuadraticCost
+
+    @cached_property
+    def preview_times(self) -> Array:
+        """`times_for` the delay that is assumed at the start."""
+        return self.times_for(self.timeline)
+
+    def times_for(self, timeline: Timeline) -> Array:
+        """Times (p,) from now, s, at which the reference must be known; some may be negative."""
+        nodes = self.feedforward.nodes(timeline, self.predictor.pending(timeline))
+        return np.concatenate([[0.0], self.predictor.samples(timeline), nodes])
+
+    def warm_up(self) -> None:
+        """Take two samples at home, so that no later one waits for functions to be compiled."""
+        home = np.concatenate([self.plant.mechanism.home, np.zeros(NUM_COORDINATES)])
+        wanted = np.concatenate([home, np.zeros(NUM_REFERENCE - NUM_STATE)])
+        said = Measurement.of(self.sensing.seen(home))
+        for torque in (0.0, 2 * self.plant.gentle_torque):
+            queue = np.full((self.timeline.queue_length, NUM_TORQUES), torque)
+            memory = self.initial_memory(queue)
+            for _ in range(2):
+                memory = self.step(
+                    memory, said, lambda times: np.tile(wanted, (len(times), 1)), np.ones(2)
+                )
+
+    def initial_memory(self, queue: Array) -> Memory:
+        """Before the first sample.
+
+        Args:
+            queue: (n >= L, 6) torques in flight, oldest first, L by the delay at the start; more
+                of them than that for an observer that may come to believe in a longer one.
+        """
+        nothing = np.zeros(NUM_TORQUES)
+        return Memory(
+            in_flight=np.vstack([nothing, queue]),
+            belief=self.observer.start(self.timeline, self.sensing, self.plant),
+            measurement=np.full(self.sensing.size, np.nan),
+            error=np.zeros(NUM_COORDINATES),
+            integral=np.zeros(NUM_COORDINATES),
+            gain=self._no_gain(self.timeline),
+            torque=queue[-1] if len(queue) else nothing,
+            weights=np.full(2, np.nan),
+            counts=Counts(),
+        )
+
+    @np.errstate(over="ignore", invalid="ignore")  # its outcome is checked and counted instead
+    def step(
+        self, memory: Memory, measurement: Measurement, motion: Motion, weights: Array
+    ) -> Memory:
+        """One sample.
+
+        Args:
+            memory: after the last sample.
+            measurement: of `sensing`; the model stands in for one that has a fault.
+            motion: to follow. It is asked once, for `times_for` the delay that is believed in.
+            weights: (2,) w_Q and w_R.
+
+        Returns:
+            The new memory; its torque (6,) is finite. What limits it stands behind the law: in
+            flight is what that lets through, by which the law also judges the past and the future.
+
+        Raises:
+            ValueError: a shape that does not fit. What numbers can do is survived and counted.
+        """
+        belief = self.observer.observe(
+            memory.belief, measurement, memory.in_flight, self.sensing, self.plant
+        )
+        samples = 1 + len(self.predictor.samples(belief.timeline))
+        as_assumed = belief.timeline == self.timeline
+        times = self.preview_times if as_assumed else self.times_for(belief.timeline)
+        preview = motion(times)
+        wanted, nodes = preview[:samples, :NUM_STATE], preview[samples:]
+        if not belief.has_state:  # nothing else to go on with
+            belief = belief.at(wanted[0])
+        error = belief.state[POSE] - wanted[0, POSE]
+        integral = self._integrate(memory, error, belief.timeline)
+        queue = belief.timeline.queue(memory.in_flight)
+        ahead = self.predictor.ahead(belief, integral, queue, wanted, self.plant)
+        held, changes = self.feedforward.held(nodes, self.plant.dynamics, belief.parameters)
+        error_ahead, gain, trouble = self._design(memory, belief, ahead, held[-1], changes, weights)
+        torque = held[-1]
+        if _is_there(gain):
+            pending = (queue[len(queue) - len(held) + 1 :] - held[:-1]).ravel()
+            seen = self.cost.sees(ahead.integral)
+            torque = torque - gain @ np.concatenate([error_ahead, seen, pending])
+        nonfinite = not np.all(np.isfinite(torque))
+        if nonfinite:
+            torque = memory.torque
+        limited = self.plant.motors.let_through(torque)
+        saturated = bool(np.any(limited != torque))
+        return Memory(
+            in_flight=np.vstack([memory.in_flight[1:], limited]),
+            belief=belief,
+            measurement=measurement.values,
+            error=error,
+            integral=integral,
+            gain=gain if _is_there(gain) else memory.gain,
+            torque=torque,
+            weights=np.array(weights),
+            counts=memory.counts.plus(
+                belief.fault,
+                trouble,
+                "nonfinite_torque" if nonfinite else None,
+                "saturated_steps" if saturated else None,
+            ),
+        )
+
+    def _design(
+        self,
+        memory: Memory,
+        belief: Belief,
+        ahead: Ahead,
+        torque: Array,
+        changes: Array,
+        weights: Array,
+    ) -> tuple[Array, Array, str | None]:
+        """Error (12,) to be fed back, gain, NaN for no feedback, and what went wrong, or None."""
+        error = ahead.error
+        try:
+            model = self.model.at(ahead.point, torque, belief.parameters, self.plant)
+            error = error - self.feedforward.offset(changes, model.B[RATES], belief.timeline)
+            delayed = self.cost.sampled(model, belief.timeline)
+            K = self.cost.gain(delayed, weights)
+            return error, self.predictor.gain(K, delayed), None
+        except UnreachablePoseError:  # nothing to regulate: the feedforward goes on alone
+            return error, self._no_gain(belief.timeline), "unreachable"
+        except (ArithmeticError, np.linalg.LinAlgError):  # RiccatiError is one
+            none = self._no_gain(belief.timeline)
+            last = memory.gain if memory.gain.shape == none.shape else none  # of another delay
+            return error, last, "riccati_failures"
+
+    def _no_gain(self, timeline: Timeline) -> Array:
+        """NaN in the shape of a gain: on error, integral and pending torques."""
+        integral = self.cost.sees(np.zeros(NUM_COORDINATES))
+        pending = NUM_TORQUES * self.predictor.pending(timeline)
+        return np.full((NUM_TORQUES, NUM_STATE + len(integral) + pending), np.nan)
+
+    def _integrate(self, memory: Memory, error: Array, timeline: Timeline) -> Array:
+        """z_k = z_{k-1} + dt/2 (e_{k-1} + e_k), but not while a motor is at its limit."""
+        if not self.cost.integrates or not memory.belief.has_state:
+            return memory.integral
+        acting, _ = timeline.last_period(memory.in_flight)
+        if self.plant.motors.reached(acting.torques):
+            return memory.integral
+        return memory.integral + timeline.period / 2 * (memory.error + error)
+
+
+def _is_there(gain: Array) -> bool:
+    """Before there is a gain, or without a model, it is NaN."""
+    return not np.all(np.isnan(gain))

@@ -1,0 +1,128 @@
+"""Torques of every shipped scenario with every controller on both plants, kept beside the tests.
+
+    python -m tests.recorded.runs                       # what has no row yet
+    python -m tests.recorded.runs paper/lqi/exact ...   # these rows anew, after a deliberate change
+
+A row holds what the controller was given and what it answered at its first samples, so that the
+law can be checked step by step without a plant, and the loop as a whole.
+"""
+
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.analysis import Simulator
+from threadpoolctl import threadpool_info
+
+import stewart_drake as sd
+from stewart_drake.diagram import ClosedLoop, build_closed_loop
+from stewart_drake.resources import shipped
+from stewart_drake.simulation import make_simulator
+from stewart_drake.timing import event_time, look_time
+
+Array = NDArray[np.float64]
+FILE = Path(__file__).with_name("torques.npz")
+SAMPLES = 60
+"""At the most; a plate that leaves its workspace ends the row."""
+ROWS = tuple(
+    f"{scenario}/{controller}/{kind}"
+    for scenario in shipped("scenario")
+    for controller in shipped("controller")
+    for kind in ("exact", "multibody")
+)
+
+
+def closed_loop(row: str) -> ClosedLoop:
+    """The loop of a row."""
+    scenario, controller, kind = row.split("/")
+    settings = (f"plant.kind={kind}",)
+    return build_closed_loop(sd.load_scenario(scenario, controller, settings))
+
+
+def run(row: str) -> tuple[Array, Array]:
+    """Measurements (n, 12) and torques (n, 6) at the controller's first samples."""
+    loop = closed_loop(row)
+    simulator = make_simulator(loop)
+    context = simulator.get_context()
+    period = loop.experiment.scenario.controller.period
+    simulator.Initialize()
+    measurements, torques = [], []
+    for k in range(SAMPLES):
+        if k > 0:
+            outcome = simulator.AdvanceTo(look_time(k * period))
+            if outcome.reason() == outcome.ReturnReason.kReachedTerminationCondition:
+                break
+        measurements.append(loop.GetOutputPort("measurement").Eval(context))
+        torques.append(loop.GetOutputPort("torque_commanded").Eval(context))
+    return np.array(measurements), np.array(torques)
+
+
+def answers(row: str, measurements: Array) -> Array:
+    """Torques (n, 6) that the controller of a row, alone, answers to measurements (n, 12)."""
+    loop = closed_loop(row)
+    whole = loop.CreateDefaultContext()
+    period = loop.experiment.scenario.controller.period
+    controller = loop.GetSubsystemByName("controller")
+    reference = loop.GetSubsystemByName("reference")
+    settings = loop.experiment.scenario.controller
+    weights = np.array([settings.w_Q, settings.w_R])
+    context = controller.CreateDefaultContext()
+    simulator = None
+    torques = []
+    for k, measurement in enumerate(measurements):
+        early = event_time(period)
+        whole.SetTime(early + (k - 1) * early if k else 0.0)  # as Drake computes it
+        controller.GetInputPort("measurement").FixValue(context, measurement)
+        preview = reference.GetOutputPort("preview").Eval(reference.GetMyContextFromRoot(whole))
+        controller.GetInputPort("preview").FixValue(context, preview)
+        controller.GetInputPort("weights").FixValue(context, weights)
+        if simulator is None:
+            simulator = Simulator(controller, context)
+            simulator.Initialize()
+        else:
+            simulator.AdvanceTo(look_time(k * period))
+        torques.append(controller.GetOutputPort("torque_commanded").Eval(context))
+    return np.array(torques)
+
+
+def made_with() -> str:
+    """What rounding depends on: releases, and the processor as linear algebra sees it."""
+    releases = [f"{name} {version(name)}" for name in ("drake", "numpy", "scipy", "casadi")]
+    blas = {str(pool.get("architecture")) for pool in threadpool_info()}
+    return ", ".join([*releases, *sorted(blas)])
+
+
+def same_rounding() -> bool:
+    """Whether the record was made with what is here."""
+    with np.load(FILE) as arrays:
+        return str(arrays["made_with"]) == made_with()
+
+
+def load() -> dict[str, tuple[Array, Array]]:
+    """Row -> measurements and torques."""
+    if not FILE.exists():
+        return {}
+    with np.load(FILE) as arrays:
+        return {
+            row: (arrays[f"{row}/measurement"], arrays[f"{row}/torque"])
+            for row in ROWS
+            if f"{row}/torque" in arrays
+        }
+
+
+def main(rows: list[str]) -> None:
+    """Record rows anew; without any, those that are missing."""
+    kept = load()
+    for row in rows or [row for row in ROWS if row not in kept]:
+        kept[row] = run(row)
+        print(row, len(kept[row][1]), "samples")
+    arrays = {}
+    for row, (measurements, torques) in kept.items():
+        arrays |= {f"{row}/measurement": measurements, f"{row}/torque": torques}
+    np.savez_compressed(FILE, made_with=made_with(), **arrays)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

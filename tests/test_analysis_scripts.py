@@ -1,0 +1,46 @@
+"""The scripts of `analysis/`, each on something small; those with own systems are run elsewhere."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "analysis"
+
+
+def script(name):
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def check(folder, answer):
+    assert (folder / "report.html").read_text().count(answer.verdict[:30])
+    assert json.loads((folder / "summary.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("name", "less"), [("delay", {"simulations": False}), ("hautus", {}), ("workspace", {})]
+)
+def test_a_script_answers_its_question(name, less, tmp_path, capsys):
+    small = ("plant.kind=exact", "duration=0.5", "delay.steps=2", "controller.catch_up=0")
+    answer = script(name).main("paper", *small, out=str(tmp_path), **less)
+    assert str(answer) in capsys.readouterr().out
+    check(tmp_path, answer)
+
+
+def test_robustness_from_either_start(tmp_path, capsys):
+    answers = script("robustness").main("2", "duration=0.3", out=str(tmp_path))
+    printed = capsys.readouterr().out
+    for start, answer in answers.items():
+        assert f"{start}\n{answer}" in printed
+        check(tmp_path / start, answer)
+    assert set(answers) == {"rest", "on_reference"}
+
+
+def test_every_script_is_run_by_a_test():
+    tests = "".join(path.read_text() for path in Path(__file__).parent.glob("test_*.py"))
+    for path in [*FOLDER.glob("*.py"), *FOLDER.glob("*.ipynb")]:
+        assert f'"{path.stem}"' in tests or path.name in tests, path.name

@@ -1,0 +1,143 @@
+"""What the commands do, from Python and in a notebook."""
+
+import ast
+import importlib.metadata
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import LeafSystem
+from pydrake.trajectories import FunctionHandleTrajectory
+
+import stewart_drake as sd
+from stewart_drake.jsonio import jsonable
+from stewart_drake.report.api import Answer, Figures, Replay
+
+ROOT = Path(__file__).resolve().parents[1]
+SHORT = ("plant.kind=exact", "duration=0.3")
+
+
+@pytest.fixture(scope="module")
+def run():
+    return sd.simulate(sd.load_scenario("paper", settings=SHORT))
+
+
+class Still(LeafSystem):
+    """No torque at all."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorInputPort("measurement", 12)
+        self.DeclareVectorOutputPort("torque", 6, lambda _, output: output.SetFromVector([0.0] * 6))
+
+
+class Push(LeafSystem):
+    """Down, all the time."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorOutputPort(
+            "wrench", 6, lambda _, output: output.SetFromVector([0.0] * 5 + [-1.0])
+        )
+
+
+def test_version_and_types_are_told():
+    assert sd.__version__ == importlib.metadata.version("stewart-drake")
+    assert (Path(sd.__file__).parent / "py.typed").is_file()
+
+
+def test_report_is_there_whatever_was_imported_first():
+    for first in ("import stewart_drake.report.page", "sd.plot", "sd.simulate"):
+        code = f"import stewart_drake as sd; {first}; assert callable(sd.report); sd.report.page"
+        if first.startswith("sd."):
+            code = code.replace("; sd.report.page", "")
+        subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_figures_of_a_run(run, tmp_path):
+    figures = sd.plot(run, tmp_path / "new")
+    assert {"states", "errors", "torques"} <= set(figures)
+    assert {path.stem for path in (tmp_path / "new").iterdir()} == set(figures)
+    assert isinstance(figures, Figures) and "states" in repr(figures)
+    assert figures._repr_html_().count('<img src="data:image/svg+xml;base64,') == len(figures)
+
+
+def test_replay_as_a_file_in_a_notebook_or_in_meshcat(run, tmp_path):
+    path = sd.replay(run, tmp_path / "new" / "film.html", title="a film")
+    text = path.read_text()
+    assert "a film" in text
+    shown = sd.replay(run)
+    assert isinstance(shown, Replay) and "MB" in repr(shown)
+    assert shown._repr_html_().startswith("<iframe srcdoc=")
+
+    from pydrake.geometry import Meshcat, MeshcatParams
+
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    assert sd.replay(run, meshcat=meshcat) is meshcat
+    assert "/reference/ring" in meshcat.StaticHtml() or meshcat.HasPath("/reference/ring")
+
+
+def test_analyses_are_answers_that_can_be_printed_shown_and_saved(tmp_path):
+    found = sd.analyze_workspace(sd.load_scenario("paper"))
+    assert isinstance(found, Answer) and "\n" in str(found)
+    assert found.verdict in repr(found) and len(repr(found)) < 500
+    assert found._repr_html_().startswith("<iframe srcdoc=") and "&lt;html" in found._repr_html_()
+    found.save(tmp_path / "new")
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {"report.html", "summary.json"}
+    saved = json.loads((tmp_path / "new" / "summary.json").read_text())
+    assert saved == jsonable(found.summary)
+
+
+def test_compare_takes_own_controllers_and_disturbances(tmp_path):
+    results = sd.compare("paper", SHORT, controllers={"nothing": Still}, disturbance=Push)
+    assert list(results)[-1] == "nothing" and len(results) == 6
+    own = results["nothing"].summary["own"]
+    assert own == {"controller": "Still", "disturbance": "Push"}
+    assert results["lqr"].summary["own"] == {"disturbance": "Push"}
+    assert float(np.abs(results["nothing"].signals.torque_applied).max()) == 0
+    # Pushed down from rest by 1 N for 0.3 s.
+    assert float(results["nothing"].signals.rates.sel(coordinate="z")[-1]) < -0.01
+    table = sd.table(results)
+    assert "nothing" in table and max(map(len, table.splitlines())) <= 80
+    assert "torques_nothing" in sd.plot(results)
+    assert "nothing: completed" in repr(results)
+
+
+def test_the_notebook_runs_and_shows_something():
+    """Every cell in turn, as a notebook does: the last expression of a cell is what it shows."""
+    notebook = json.loads((ROOT / "analysis" / "tour.ipynb").read_text())
+    names, shown = {}, []
+    for cell in notebook["cells"]:
+        if cell["cell_type"] != "code":
+            continue
+        assert cell["outputs"] == [] and cell["execution_count"] is None
+        tree = ast.parse("".join(cell["source"]))
+        last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+        exec(compile(tree, "cell", "exec"), names)
+        if last is not None:
+            value = eval(compile(ast.Expression(last.value), "cell", "eval"), names)
+            shown.append(getattr(value, "_repr_html_", value.__repr__)())
+    assert len(shown) >= 5
+    assert sum("<img" in text for text in shown) == 1
+    assert sum("<iframe" in text for text in shown) == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"controllers": {"lqr": Still}}, "got 'lqr', a shipped one"),
+        ({"disturbance": "made"}, "got an instance, which serves one run"),
+        ({"reference": "handle"}, "cannot be sent to other processes"),
+    ],
+)
+def test_what_compare_cannot_run_is_told_in_one_line(given, message):
+    if given.get("disturbance"):
+        given = {"disturbance": Push()}
+    if given.get("reference"):
+        given = {"reference": FunctionHandleTrajectory(lambda t: np.zeros((6, 1)), 6, 1)}
+    with pytest.raises(sd.ConfigError) as refused:
+        sd.compare("paper", SHORT, **given)
+    assert message in str(refused.value) and "\n" not in str(refused.value)

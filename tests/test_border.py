@@ -1,0 +1,143 @@
+"""The public border: shapes and values that are refused, and what can be copied and sent."""
+
+import copy
+import multiprocessing
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stewart_drake as sd
+from stewart_drake.errors import ConfigError
+from stewart_drake.mechanism.geometry import Mechanism
+from tests.mechanisms import PAPER
+
+HOME, REST = PAPER.home, np.zeros(6)
+DYNAMICS = sd.StewartDynamics(PAPER, gravity=True, parameters=np.linspace(0.0, 0.07, 8))
+
+
+@pytest.mark.parametrize("wrong", [0.0, [0.0], np.zeros(5), np.zeros((6, 1)), np.zeros((1, 6))])
+@pytest.mark.parametrize(
+    ("method", "good"),
+    [
+        ("accelerations", (HOME, REST, REST)),
+        ("inverse_dynamics", (HOME, REST, REST)),
+        ("energy", (HOME, REST)),
+        ("mass_matrix", (HOME,)),
+        ("bias", (HOME, REST)),
+        ("actuation_map", (HOME,)),
+        ("equilibrium_torque", (HOME,)),
+        ("derivatives", (HOME, REST, REST)),
+        ("linearize", (HOME, REST, REST)),
+        ("predict", (np.append(HOME, REST), np.zeros((2, 6)), [0.1, 0.1])),
+    ],
+)
+def test_one_number_does_not_stand_for_six(method, good, wrong) -> None:
+    call = getattr(DYNAMICS, method)
+    call(*good)
+    call(*(np.asarray(argument).tolist() for argument in good))
+    for place in range(len(good)):
+        if method == "predict" and place == 2 and np.ndim(wrong) == 0:
+            continue  # one duration is for all
+        with pytest.raises(ValueError, match=r"^\w+: got shape .*; expected \(") as refused:
+            call(*good[:place], wrong, *good[place + 1 :])
+        assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("method", ["accelerations", "inverse_dynamics", "derivatives"])
+def test_parameters_are_eight(method) -> None:
+    with pytest.raises(ValueError, match=r"parameters: got shape \(\); expected \(8,\)"):
+        getattr(DYNAMICS, method)(HOME, REST, REST, 0.0)
+
+
+@pytest.mark.parametrize("gravity", [np.nan, np.inf, [9.81, 0.0], "down", None])
+def test_a_gravity_that_is_none_is_refused(gravity) -> None:
+    with pytest.raises(ConfigError, match=r"^gravity: got .*; expected"):
+        sd.StewartDynamics(PAPER, gravity=gravity)
+
+
+@pytest.mark.parametrize("parameters", [0.0, np.zeros(7), np.full(8, np.nan), "none"])
+def test_parameters_of_the_machine_are_checked(parameters) -> None:
+    with pytest.raises(ConfigError, match=r"^parameters: got .*; expected"):
+        sd.StewartDynamics(PAPER, parameters=parameters)
+
+
+def test_gravity_is_a_switch_or_a_number() -> None:
+    found = [sd.StewartDynamics(PAPER, gravity=g).gravity for g in (True, False, 1, 0, 1.62)]
+    assert found == [9.81, 0.0, 1.0, 0.0, 1.62]
+
+
+@pytest.mark.parametrize("wrong", [[0, 0, 0.18], 0.38, np.zeros((2, 6)), []])
+def test_a_pose_has_six_coordinates(wrong) -> None:
+    for method in (PAPER.crank_angles, PAPER.reach_margins, PAPER.jacobian):
+        with pytest.raises(ValueError, match=r"^pose: got shape .*; expected \(6,\), \[roll"):
+            method(wrong)
+    with pytest.raises(ValueError, match=r"^crank_angles: got shape"):
+        PAPER.forward_kinematics(wrong)
+    with pytest.raises(ValueError, match=r"^guess: got shape"):
+        PAPER.forward_kinematics(REST, wrong)
+
+
+def test_a_pose_may_be_a_list() -> None:
+    np.testing.assert_array_equal(PAPER.crank_angles(HOME.tolist()), PAPER.crank_angles(HOME))
+    np.testing.assert_array_equal(PAPER.jacobian(list(HOME)), PAPER.jacobian(HOME))
+
+
+# Copies.
+
+
+def work(dynamics: sd.StewartDynamics) -> list[np.ndarray]:
+    rates, torque = np.linspace(-0.1, 0.1, 6), np.linspace(0.0, 0.5, 6)
+    return [
+        dynamics.accelerations(HOME, rates, torque),
+        dynamics.inverse_dynamics(HOME, rates, torque),
+        *dynamics.derivatives(HOME, rates, torque),
+        dynamics.predict(np.append(HOME, rates), np.tile(torque, (3, 1)), 0.01),
+    ]
+
+
+@pytest.mark.parametrize(
+    "again", [copy.copy, copy.deepcopy, lambda d: pickle.loads(pickle.dumps(d))]
+)
+def test_a_copy_of_the_dynamics_is_as_good(again) -> None:
+    for dynamics in (DYNAMICS, sd.StewartDynamics(PAPER, gravity=1.62)):
+        other = again(dynamics)
+        assert other is not dynamics and other.mechanism == PAPER
+        assert other.gravity == dynamics.gravity
+        for a, b in zip(work(dynamics), work(other), strict=True):
+            np.testing.assert_array_equal(a, b)
+        other.parameters[0] = 7.0
+        assert dynamics.parameters[0] == 0.0
+
+
+def test_the_dynamics_can_be_sent_to_another_process() -> None:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        (sent,) = pool.map(work, [DYNAMICS])
+    for a, b in zip(work(DYNAMICS), sent, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_mechanism_that_was_sent_is_the_same() -> None:
+    sent: Mechanism = pickle.loads(pickle.dumps(PAPER))
+    assert sent == PAPER and hash(sent) == hash(PAPER)
+
+
+# simulate
+
+
+def test_simulate_takes_a_name_or_a_path(tmp_path: Path) -> None:
+    text = "duration: 0.1\nplant: {kind: exact}\n"
+    path = tmp_path / "short.yaml"
+    path.write_text(text)
+    expected = sd.simulate(sd.load_scenario(path)).signals
+    for given in (path, str(path)):
+        assert sd.simulate(given).signals.identical(expected)
+    with pytest.raises(ConfigError, match="papre"):
+        sd.simulate("papre")
+
+
+@pytest.mark.parametrize("given", [None, 3, {"duration": 1.0}])
+def test_simulate_says_what_it_takes(given) -> None:
+    with pytest.raises(TypeError, match=r"^scenario: got a .*; expected a Scenario, or the name"):
+        sd.simulate(given)

@@ -1,0 +1,272 @@
+"""Results that are read back: a damaged one is refused or done again, never believed."""
+
+import json
+import logging
+import os
+import random
+import resource
+import time
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import h5netcdf
+import numpy as np
+import pytest
+import xarray as xr
+
+from stewart_drake import arrayio
+from stewart_drake.arrayio import write_netcdf
+from stewart_drake.errors import ConfigError
+from stewart_drake.studies.dataset import load_dataset, read_run
+from stewart_drake.studies.jobs import MANIFEST, run_jobs
+from stewart_drake.studies.robustness import study_robustness
+from stewart_drake.studies.run_files import read_cell, read_evaluation, read_outcome
+from tests.faults import put, refusal, written
+from tests.mutations import other_npz
+from tests.test_fuzz import (
+    EVALUATION_FILE,
+    RUN_ARRAYS,
+    RUN_FILE,
+    netcdf,
+    npz_of_a_run,
+    some_data,
+    some_signals,
+)
+from tests.test_jobs import SETTINGS, numbered, text
+from tests.test_robustness import contents, short
+
+DEEP = "[" * 50_000 + "]" * 50_000
+
+# ---------------------------------------------------------------- run files of studies
+
+BAD_OUTCOMES: list[tuple[str, Any]] = [
+    ("outcome.status", None),
+    ("outcome.status", "interrupted"),
+    ("outcome.reason", None),
+    ("outcome.reason", "out of reach"),
+    ("outcome.leg", [1]),
+    ("outcome.leg", 7),
+    ("outcome.leg", 3),
+    ("outcome.time", 1.0),
+    ("outcome.error", None),
+    ("outcome.error", -1.0),
+    ("outcome.error", 10**400),
+    ("outcome.error", True),
+    ("outcome.error", "9.1"),
+    ("outcome.peak_torque", float("inf")),
+    ("outcome", [1]),
+    ("draw", None),
+    ("draw.note", "\ud800"),
+]
+
+
+@pytest.mark.parametrize(("field", "value"), BAD_OUTCOMES, ids=str)
+def test_a_damaged_outcome_is_refused(field, value, tmp_path):
+    path = written(tmp_path / "run000000.json", json.dumps(put(RUN_FILE, field, value)))
+    with pytest.raises(ConfigError) as caught:
+        read_outcome(path)
+    said = str(caught.value)
+    assert said.startswith(str(path)) and len(said.splitlines()) == 1 and len(said) < 400
+    if field.startswith("outcome."):
+        assert field.partition(".")[2] in said or "any float" in said or "JSON" in said
+
+
+def test_a_sound_outcome_is_read(tmp_path):
+    path = written(tmp_path / "run.json", json.dumps(RUN_FILE))
+    one = read_outcome(path)
+    assert one.status == "completed" and one.error == 9.1 and np.isnan(one.time)
+    failed = {"status": "left_workspace", "reason": "leg 3 out of reach", "leg": 3, "time": 0.5}
+    failed |= {"error": None, "peak_torque": None}
+    one = read_outcome(written(path, json.dumps({"draw": {}, "outcome": failed})))
+    assert one.leg == 3 and np.isnan(one.error) and one.time == 0.5
+    for field, value in (("reason", ""), ("error", 1.0), ("time", None)):
+        wrong = {"draw": {}, "outcome": failed | {field: value}}
+        with pytest.raises(ConfigError, match=field):
+            read_outcome(written(path, json.dumps(wrong)))
+
+
+@pytest.mark.parametrize("load", [read_outcome, read_evaluation, read_cell])
+@pytest.mark.parametrize(
+    "content", ["", DEEP, '{"outcome": ' + DEEP + "}", "null", "[1]", "{}", "NaN"]
+)
+def test_what_is_no_run_file(load, content, tmp_path):
+    path = written(tmp_path / "run.json", content)
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
+
+
+def test_an_evaluation_that_completed_has_an_error(tmp_path):
+    path = tmp_path / "run.json"
+    read_evaluation(written(path, json.dumps(EVALUATION_FILE)))
+    for field, value in (("accumulated_error", None), ("stopped", 1.0), ("status", "refused")):
+        with pytest.raises(ConfigError, match=field):
+            read_evaluation(written(path, json.dumps(EVALUATION_FILE | {field: value})))
+
+
+def test_a_damaged_run_is_done_again_with_a_word(tmp_path, caplog):
+    """A run of status null and no reason was a success: "100 % completed"."""
+    study_robustness(short(), tmp_path, runs=3, workers=1)
+    whole = contents(tmp_path)
+    runs = tmp_path / "runs"
+    good = json.loads((runs / "run000001.json").read_text())
+    nothing = put(put(good, "outcome.status", None), "outcome.reason", "")
+    written(runs / "run000001.json", json.dumps(nothing))
+    written(runs / "run000002.json", DEEP)
+    (runs / "run000000.json").unlink()
+    os.mkfifo(runs / "run000000.json")
+    with caplog.at_level(logging.WARNING, "stewart_drake"):
+        study = study_robustness(short(), tmp_path, runs=3, workers=1)
+    assert contents(tmp_path) == whole and len(study.outcomes) == 3
+    (record,) = caplog.records
+    said = record.getMessage()
+    assert "run000000.json" in said and "done again (and 2 more)" in said and "\n" not in said
+
+
+def test_a_damaged_manifest_is_refused(tmp_path):
+    for content in (DEEP, '{"hash": 1, "settings": ' + DEEP + "}", '{"hash": "0", "settings": 1}'):
+        written(tmp_path / MANIFEST, content)
+        with pytest.raises(ConfigError, match=MANIFEST) as caught:
+            run_jobs(numbered(1), text, tmp_path, settings=SETTINGS)
+        assert len(str(caught.value).splitlines()) == 1
+    (tmp_path / MANIFEST).unlink()
+    os.mkfifo(tmp_path / MANIFEST)
+    with pytest.raises(ConfigError, match="is not a file"):
+        run_jobs(numbered(1), text, tmp_path, settings=SETTINGS)
+
+
+# ---------------------------------------------------------------- arrays
+
+
+def test_a_sound_run_of_the_data_set_is_read(tmp_path):
+    run = read_run(written(tmp_path / "run.npz", npz_of_a_run()))
+    assert run["status"] == "completed" and run["samples"].shape == (100, 18)
+
+
+def saved(folder: Path, **changes: Any) -> Path:
+    """A run's file with some arrays changed; None leaves one out."""
+    arrays = {k: v for k, v in ({**RUN_ARRAYS, **changes}).items() if v is not None}
+    np.savez(folder / "run.npz", **arrays)
+    return folder / "run.npz"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"samples": np.zeros((3, 18))},
+        {"samples": np.full((100, 18), "text")},
+        {"samples": np.full((100, 18), np.inf)},
+        {"samples": np.full((100, 18), np.nan)},
+        {"samples": np.array([{"a": 1}], dtype=object)},
+        {"samples": None},
+        {"status": np.array("nonsense")},
+        {"status": np.array("left_workspace")},
+        {"status": np.zeros(())},
+        {"stopped": 1.0},
+        {"accumulated_error": np.nan},
+        {"cost": -1.0},
+        {"peak_torque": np.array([1.0, 2.0])},
+        {"extra": 1.0},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_a_run_of_another_content_is_refused(changes, tmp_path):
+    refused(read_run, saved(tmp_path, **changes))
+
+
+def refused(load: Any, path: Path) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    said = str(caught.value)
+    assert str(path) in said and len(said.splitlines()) == 1
+    return said
+
+
+def test_a_zip_that_grows_is_not_unpacked(tmp_path):
+    """Of 2 GB of zeros in 2 MB, and one that lies about its size, nothing is unpacked."""
+    path = tmp_path / "run.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name in RUN_ARRAYS:
+            with file.open(f"{name}.npy", "w", force_zip64=True) as member:
+                for _ in range(200 if name == "samples" else 0):
+                    member.write(bytes(10_000_000))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    started = time.process_time()
+    assert "too large when unpacked" in refused(read_run, path)
+    assert time.process_time() - started < 1.0
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+    for number in range(60):
+        path.write_bytes(other_npz(RUN_ARRAYS, random.Random(number)))
+        try:
+            read_run(path)
+        except ConfigError as error:
+            assert len(str(error).splitlines()) == 1
+
+
+DATE = np.datetime64("2020-01-01", "ns")
+OTHER_SIGNALS: dict[str, Any] = {
+    "a dimension more": lambda s: s.assign(pose=s.pose.expand_dims(extra=2)),
+    "a dimension less": lambda s: s.assign(pose=s.pose.isel(coordinate=0, drop=True)),
+    "text poses": lambda s: s.assign(pose=s.pose.astype("U9")),
+    "dates": lambda s: s.assign(pose=(s.pose.dims, np.full(s.pose.shape, DATE))),
+    "times of the clock": lambda s: s.assign_coords(
+        time=DATE + np.arange(s.sizes["time"]) * np.timedelta64(20, "ms")
+    ),
+    "times in ms": lambda s: s.assign_coords(time=("time", s.time.values, {"units": "ms"})),
+    "no time": lambda s: s.drop_vars("time"),
+    "time that goes back": lambda s: s.isel(time=slice(None, None, -1)),
+    "five legs": lambda s: s.isel(leg=slice(0, 5)),
+    "no poses": lambda s: s.drop_vars("pose"),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_SIGNALS)
+def test_signals_of_another_structure_are_refused(name, tmp_path, capsys):
+    path = tmp_path / "other.nc"
+    write_netcdf(path, OTHER_SIGNALS[name](some_signals()))
+    assert "other.nc" in refusal(["export", str(path)], capsys)
+
+
+def test_a_file_that_hdf5_never_gets_through_is_given_up(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "signals.nc"
+    write_netcdf(path, some_signals())
+    trial, reading = arrayio._TRIAL.read_text(), "                one[...]\n"
+    assert reading in trial
+    endless = trial.replace(reading, "                while True:\n                    pass\n")
+    monkeypatch.setattr(arrayio, "_TRIAL", written(tmp_path / "endless.py", endless))
+    monkeypatch.setattr(arrayio, "_SECONDS", 1)
+    assert "does not get through" in refusal(["export", str(path)], capsys)
+
+
+@pytest.mark.parametrize("words", [["export"], ["tune", "train"]])
+def test_pipes_and_endless_devices_do_not_hang(words, tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe.nc")
+    os.symlink("/dev/zero", tmp_path / "zero.nc")
+    for name in ("pipe.nc", "zero.nc"):
+        assert "is not a file" in refusal([*words, str(tmp_path / name)], capsys)
+
+
+def test_a_file_that_declares_a_huge_array_is_refused(tmp_path):
+    path = tmp_path / "dataset.nc"
+    with h5netcdf.File(path, "w") as file:
+        file.dimensions = {"run": 10**6, "sample": 10**6, "input": 18}
+        file.create_variable("samples", ("run", "sample", "input"), "f8", chunks=(1, 10, 18))
+    assert path.stat().st_size < 100_000
+    assert "MB" in refused(load_dataset, path)
+
+
+def test_a_data_set_that_is_not_whole_is_refused(tmp_path):
+    data, path = some_data(), tmp_path / "dataset.nc"
+    load_dataset(written(path, netcdf(data)))
+    wrong: dict[str, xr.Dataset] = {
+        "status": data.drop_vars("status"),
+        "a weight": data.assign(weights=-data.weights),
+        "valid": data.assign(valid=~data.valid),
+        "E_ac": data.assign(accumulated_error=np.nan * data.accumulated_error),
+        "settings": data.assign_attrs(settings="{"),
+        "samples": data.assign(samples=data.samples.astype("U9")),
+        "sample": data.isel(input=slice(0, 5)),
+    }
+    for word, one in wrong.items():
+        assert word in refused(load_dataset, written(path, netcdf(one)))

@@ -1,0 +1,212 @@
+"""Reading up to a limit, writing whole or not: kinds of file, temporary names, permissions."""
+
+import csv
+import errno
+import os
+import re
+import signal
+import stat
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stewart_drake.errors import ConfigError
+from stewart_drake.fileio import read_bytes, remove_partials, replacing
+from stewart_drake.jsonio import write_json
+from stewart_drake.reference_config import CsvConfig
+from stewart_drake.studies.jobs import run_jobs
+from stewart_drake.trajectories import make_reference
+from tests.faults import forked, tree
+from tests.test_jobs import SETTINGS, numbered, text
+
+PARTIAL = re.compile(r"\.out\.json\.[0-9a-f]{16}\.part")
+
+
+def hidden(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.name.startswith("."))
+
+
+# ---------------------------------------------------------------- reading
+
+
+def test_only_regular_files_are_read_and_up_to_a_limit(tmp_path):
+    (tmp_path / "file").write_bytes(b"x" * 1000)
+    os.symlink("file", tmp_path / "link")
+    assert read_bytes(tmp_path / "link", 1000, "a file") == b"x" * 1000
+    os.mkfifo(tmp_path / "pipe")
+    os.symlink("/dev/zero", tmp_path / "zero")
+    os.symlink("/dev/stdin", tmp_path / "stdin")
+    for name in (".", "pipe", "zero"):
+        with pytest.raises(ConfigError, match="is not a file; expected a file"):
+            read_bytes(tmp_path / name, 1000, "a file")
+    with pytest.raises(ConfigError, match="is larger than 0 kB"):
+        read_bytes(tmp_path / "file", 999, "a file")
+
+
+def test_a_file_that_is_larger_than_it_says_is_refused():
+    """Those of /proc have no size."""
+    path = Path("/proc/self/maps")
+    if not path.exists():
+        pytest.skip("there is no /proc here")
+    assert len(read_bytes(path, 10_000_000, "maps")) > 1000
+    with pytest.raises(ConfigError, match="larger than 1 kB"):
+        read_bytes(path, 1000, "maps")
+
+
+# ---------------------------------------------------------------- temporary names
+
+
+def test_no_planted_link_is_followed(tmp_path):
+    """Whoever may write to the folder could have any file of the user overwritten."""
+    precious, folder = tmp_path / "precious", tmp_path / "out"
+    precious.write_text("mine")
+    folder.mkdir()
+    for name in (".out.json.part", ".manifest.json.part", ".job0.json.part"):
+        os.symlink(precious, folder / name)
+    write_json(folder / "out.json", {"a": 1})
+    run_jobs(numbered(1), text, folder / "runs", settings=SETTINGS, workers=1)
+    assert precious.read_text() == "mine"
+
+
+def test_a_planted_lock_is_not_followed(tmp_path):
+    os.symlink(tmp_path / "made", tmp_path / ".lock")
+    with pytest.raises(OSError, match="symbolic link"):
+        run_jobs(numbered(1), text, tmp_path, settings=SETTINGS)
+    assert not (tmp_path / "made").exists()
+
+
+def test_names_differ_and_are_new(tmp_path):
+    seen = set()
+    for _ in range(20):
+        with replacing(tmp_path / "out.json") as partial:
+            assert PARTIAL.fullmatch(partial.name) and not partial.is_symlink()
+            seen.add(partial.name)
+            partial.write_text("new")
+    assert len(seen) == 20 and (tmp_path / "out.json").read_text() == "new"
+    assert not hidden(tmp_path)
+    with replacing(tmp_path / ("é" * 120)) as partial:  # 240 bytes, of 255 that a name may have
+        partial.write_text("long")
+
+
+def test_writers_at_the_same_time_do_not_meet(tmp_path):
+    contents = [str(number) * 100_000 for number in range(8)]
+
+    def write(content: str) -> None:
+        for _ in range(10):
+            with replacing(tmp_path / "out.json") as partial:
+                partial.write_text(content)
+            remove_partials(tmp_path)
+            assert (tmp_path / "out.json").read_text() in contents
+
+    threads = [threading.Thread(target=write, args=(content,)) for content in contents]
+    failed = []
+    hook, threading.excepthook = threading.excepthook, lambda args: failed.append(args)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        threading.excepthook = hook
+    assert not failed and not hidden(tmp_path)
+
+
+def test_permissions_are_the_usual_ones(tmp_path):
+    path = tmp_path / "out.json"
+    before = os.umask(0o027)
+    try:
+        write_json(path, 1)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o640
+        for mode in (0o600, 0o664, 0o444, 0o755):
+            path.chmod(mode)
+            write_json(path, mode)
+            assert stat.S_IMODE(path.stat().st_mode) == mode
+            assert path.read_text() == f"{mode}\n"
+    finally:
+        os.umask(before)
+
+
+def test_errors_name_the_file_and_leave_the_old_one(tmp_path, monkeypatch):
+    path = tmp_path / "out.json"
+    path.write_text("old")
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"), replacing(path) as partial:
+        partial.write_text("new")
+    monkeypatch.undo()
+    with pytest.raises(OSError, match=r"out\.json'$") as caught, replacing(path) as partial:
+        partial.unlink()
+        partial.read_text()
+    assert ".part" not in str(caught.value)
+    with pytest.raises(FileNotFoundError, match=r"nowhere/out\.json'$"):
+        write_json(tmp_path / "nowhere" / "out.json", 1)
+    assert tree(tmp_path) == {"out.json": b"old"}
+
+
+def test_what_kill_9_leaves_is_cleared_and_what_is_being_written_is_not(tmp_path):
+    def work() -> None:
+        with replacing(tmp_path / "out.json"):
+            (tmp_path / "ready").touch()
+            time.sleep(60)
+
+    children = []
+    for _ in range(3):
+        children.append(forked(work))
+        limit = time.monotonic() + 20
+        while not (tmp_path / "ready").exists():
+            assert time.monotonic() < limit
+            time.sleep(0.01)
+        (tmp_path / "ready").unlink()
+    for pid in children[:2]:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+    mine = tmp_path / ".mine.part"
+    mine.touch()
+    os.symlink(mine, tmp_path / ".out.json.0123456789abcdef.part")
+    assert len(hidden(tmp_path)) == 5
+    remove_partials(tmp_path)
+    kept = hidden(tmp_path)
+    assert len(kept) == 3 and mine.exists(), "a link is no leftover of ours"
+    os.kill(children[2], signal.SIGKILL)
+    os.waitpid(children[2], 0)
+    remove_partials(tmp_path)
+    assert len(hidden(tmp_path)) == 2
+
+
+# ---------------------------------------------------------------- a long file of samples
+
+
+def test_a_long_csv_file_takes_little_more_than_its_parsing(tmp_path):
+    """A million rows took 45 s to read and 35 s and 4 GB to make a trajectory of."""
+    path, rows = tmp_path / "long.csv", 100_000
+    time_s = np.arange(rows) * 1e-3
+    poses = np.column_stack([0.1 * np.sin(time_s + k) for k in range(5)] + [0.38 + 0 * time_s])
+    with path.open("w") as file:
+        file.write("time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]\n")
+        np.savetxt(file, np.column_stack([time_s, poses]), fmt="%.5f", delimiter=",")
+
+    def parse() -> None:
+        for row in csv.reader(path.read_text().splitlines()):
+            len([cell.strip() for cell in row])
+
+    def seconds(work: object) -> float:
+        start = time.process_time()
+        work()  # type: ignore[operator]
+        return time.process_time() - start
+
+    config = CsvConfig(file=str(path))
+    make_reference(config, 1.0)
+    ours, plain = (
+        min(seconds(work) for _ in range(3))
+        for work in (lambda: make_reference(config, 1.0), parse)
+    )
+    assert ours < 12 * plain, f"{ours:.2f} s against {plain:.2f} s"
+    at = rows // 2
+    value = make_reference(config, 1.0).value(time_s[at])[:, 0]
+    assert np.allclose(value, np.round(poses[at], 5), rtol=0, atol=1e-12)

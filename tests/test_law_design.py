@@ -1,0 +1,97 @@
+"""A law without a scenario, in a diagram of one's own."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.trajectories import PiecewisePolynomial
+
+import stewart_drake as sd
+from stewart_drake.errors import ConfigError
+from stewart_drake.signals import POSE
+from stewart_drake.systems.delay_chain import DelayChain
+from stewart_drake.trajectories import make_reference
+
+PAPER = sd.load_mechanism("paper")
+
+
+def law_of(scenario, **changes):
+    dynamics = sd.StewartDynamics(PAPER, scenario.plant.gravity)
+    delay = (scenario.delay.steps + scenario.delay.fraction) * scenario.controller.period
+    reference = make_reference(scenario.reference, scenario.duration)
+    start = np.concatenate([reference.value(0.0)[:, 0], np.zeros(6)])
+    given = {"start": start, "horizon": scenario.duration, "options": scenario.controller}
+    period = scenario.controller.period
+    return sd.design_law(dynamics, reference, period, delay, **(given | changes))
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.5])
+def test_it_is_the_law_of_the_scenario(fraction):
+    """The loop of a scenario, made by hand from public parts, gives the same torques."""
+    settings = ("plant.kind=exact", "duration=2", f"delay.fraction={fraction}", "delay.steps=4")
+    scenario = sd.load_scenario("paper", settings=settings)
+    # As a trajectory too, whose size is its range within the duration.
+    motion = make_reference(scenario.reference, scenario.duration)
+    shipped = sd.simulate(scenario, reference=motion)
+
+    law = law_of(scenario)
+    builder = DiagramBuilder()
+    config = sd.PlantConfig(kind="exact")
+    start = scenario.reference.offset
+    platform = sd.AddStewartPlatform(builder, "paper", config, start=start)
+    controller = law.AddToBuilder(builder)
+    chain = builder.AddSystem(DelayChain(0.1, 4, fraction, law.queue))
+    builder.Connect(platform.GetOutputPort("state"), controller.GetInputPort("measurement"))
+    builder.Connect(controller.GetOutputPort("torque"), chain.get_input_port())
+    builder.Connect(chain.get_output_port(), platform.GetInputPort("torque"))
+    builder.ExportOutput(controller.GetOutputPort("torque_commanded"), "torque")
+    builder.ExportOutput(platform.GetOutputPort("state"), "state")
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    sd.set_accuracy(simulator)
+    peak = float(np.abs(shipped.signals.torque_commanded).max())
+    for t in (0.05, 0.55, 1.05, 1.95):
+        simulator.AdvanceTo(t)
+        context = simulator.get_context()
+        torque = diagram.GetOutputPort("torque").Eval(context)
+        expected = shipped.signals.torque_commanded.sel(time=t, method="pad")
+        np.testing.assert_allclose(torque, expected, atol=1e-6 * peak)
+    wanted = law.reference.value(1.95)[:, 0]
+    assert np.abs(diagram.GetOutputPort("state").Eval(context)[POSE] - wanted).max() < 0.1
+
+
+def test_repr_and_parts():
+    law = law_of(sd.load_scenario("paper"))
+    assert repr(law).startswith("DesignedLaw(every 0.1 s, delay 0.8 s, ")
+    assert law.law.timeline.steps == 8 and law.law.timeline.fraction == 0
+    assert law.controller().GetInputPort("measurement").size() == 12
+
+
+def test_without_a_start_it_begins_on_the_reference():
+    law = law_of(sd.load_scenario("paper"), start=None)
+    np.testing.assert_array_equal(law.planned.value(0.3), law.reference.value(0.3))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"delay": -0.1}, "delay: got -0.1"),
+        ({"delay": np.nan}, "delay: got nan"),
+        ({"period": 0.0}, "period: got 0.0"),
+        ({"start": np.zeros(6)}, "start: got shape (6,); expected (12,)"),
+        ({"reference": PiecewisePolynomial(np.zeros((3, 1)))}, "got shape (3, 1)"),
+        ({"noise_std": [0.0]}, "noise_std"),
+        ({"options": sd.ControllerConfig(torque_map="printed")}, "controller.torque_map"),
+    ],
+)
+def test_bad_input_is_one_line(changes, message):
+    sc = sd.Scenario()
+    given = {
+        "dynamics": sd.StewartDynamics(PAPER),
+        "reference": make_reference(sc.reference, 10.0),
+        "period": 0.1,
+        "delay": 0.2,
+    }
+    with pytest.raises(ConfigError) as refused:
+        sd.design_law(**(given | changes))
+    assert message in str(refused.value) and "\n" not in str(refused.value)

@@ -1,0 +1,553 @@
+"""The parts of the control law, each alone, and parts of one's own put in from outside."""
+
+import dataclasses
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
+
+from stewart_drake.delay import Delay
+from stewart_drake.design.error_model import double_integrators
+from stewart_drake.design.holds import held_torques, means_and_changes
+from stewart_drake.experiment import control_law, prepare
+from stewart_drake.law.belief import Belief
+from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.design_models import MultibodyModel, PaperModel
+from stewart_drake.law.feedforward import (
+    EquilibriumFeedforward,
+    Feedforward,
+    InverseDynamicsFeedforward,
+    NoFeedforward,
+)
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.memory import Memory
+from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.law.nominal import VIGOROUS, NominalPlant
+from stewart_drake.law.observers import NoObserver, ParameterObserver
+from stewart_drake.law.predictive_lqi import Preview
+from stewart_drake.law.sensing import FirstState, Sensing, StateSensing
+from stewart_drake.law.timeline import Timeline
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import UnreachablePoseError
+from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.systems.controller import DelayLqiController
+from tests.mechanisms import PAPER
+from tests.oracles import relative
+from tests.test_control_law import HOME, WEIGHTS, Loop, law_of, nominal_queue, sine
+
+Array = NDArray[np.float64]
+
+HEAVY = StewartDynamics(PAPER, gravity=True)
+PLANT = NominalPlant(HEAVY, 2, 0.5, TorqueLimit(2.0))
+ZERO = np.zeros(8)
+
+
+# Time.
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.3])
+@pytest.mark.parametrize("steps", [0, 1, 4])
+def test_what_acts_when_is_what_the_delay_says(steps: int, fraction: float) -> None:
+    """Looked up at instants: T_k acts during [k dt + eta, (k + 1) dt + eta)."""
+    dt, timeline = 0.1, Timeline(0.1, Delay(steps, fraction))
+    count = timeline.queue_length + 1
+    in_flight = np.arange(1.0, count + 1)[:, None] * np.ones(6)
+    # The newest was computed at -dt, the sample is now at 0.
+    computed = dt * np.arange(-count, 0)
+
+    def at(t: float) -> float:
+        (found,) = [
+            torque[0]
+            for torque, begin in zip(in_flight, computed + timeline.eta, strict=True)
+            if begin - 1e-9 <= t < begin + dt - 1e-9
+        ]
+        return float(found)
+
+    # One torque more than fly covers the last period too.
+    begin = -dt
+    torques, durations = timeline.acting(in_flight)
+    assert len(torques) == len(durations)
+    for torque, duration in zip(torques, durations, strict=True):
+        for share in (0.01, 0.5, 0.99):
+            assert at(begin + share * duration) == torque[0]
+        begin += duration
+    assert begin == pytest.approx(steps * dt, abs=1e-12)  # where the next torque is not needed yet
+    (acted, for_so_long), following = timeline.last_period(in_flight)
+    assert for_so_long.sum() == pytest.approx(dt)
+    assert [at(-0.99 * dt), at(-0.01 * dt)] == [acted[0, 0], acted[-1, 0]]
+    if steps or fraction:
+        assert following[0] == at(0.01 * dt)
+    assert np.array_equal(timeline.queue(in_flight), in_flight[1:])
+    assert np.allclose(timeline.samples, dt * np.arange(1, steps + 1))
+    assert timeline.holds(-1, 1) == pytest.approx(timeline.eta + dt * np.array([-1, 0, 1]))
+
+
+def test_older_torques_than_the_delay_needs_change_nothing() -> None:
+    timeline, rng = Timeline(0.1, Delay(2, 0.4)), np.random.default_rng(0)
+    many = rng.normal(0, 1, (9, 6))
+    assert np.array_equal(timeline.queue(many), many[-3:])
+    one, other = timeline.last_period(many), timeline.last_period(many[-4:])
+    assert np.array_equal(one[0].torques, other[0].torques)
+    assert np.array_equal(one[0].durations, other[0].durations)
+    assert np.array_equal(one[1], other[1])
+
+
+# The plant as it is known.
+
+
+def test_motors_let_through_what_is_within_their_limit() -> None:
+    motors = TorqueLimit(0.5)
+    asked = np.array([-1.0, -0.5, 0.0, 0.2, 0.5, 3.0])
+    assert np.array_equal(motors.let_through(asked), [-0.5, -0.5, 0.0, 0.2, 0.5, 0.5])
+    assert motors.reached(motors.let_through(asked)) and not motors.reached(np.full(6, 0.49))
+    assert np.array_equal(TorqueLimit().let_through(1e300 * asked), 1e300 * asked)
+    assert not TorqueLimit().reached(1e300 * asked)
+
+
+def test_strong_torques_are_integrated_in_finer_steps() -> None:
+    for size, steps in ((0.5, 2), (0.51, 2 * VIGOROUS)):
+        torques = np.zeros((3, 6))
+        torques[1, 4] = -size
+        assert PLANT.substeps_for(torques) == steps
+        expected = HEAVY.predict(HOME[:12], torques, np.full(3, 0.02), steps)
+        found = PLANT.predict(HOME[:12], Timeline(0.02, Delay(3, 0.0)).acting(torques))
+        assert np.array_equal(found, expected)
+    assert PLANT.substeps_for(np.zeros((0, 6))) == 2
+
+
+# What is measured.
+
+
+def test_a_measurement_marks_what_is_lost() -> None:
+    values = np.array([1.0, np.nan, 3.0, np.inf])
+    measurement = Measurement.of(values)
+    assert np.array_equal(measurement.valid, [True, False, True, False])
+    assert not measurement.complete and Measurement.of(np.ones(4)).complete
+    assert np.array_equal(measurement.after(np.array([0.0, 7.0, 0.0, 8.0])), [1.0, 7.0, 3.0, 8.0])
+    values[0] = 5.0  # what it came from may be used again
+    assert measurement.values[0] == 1.0
+
+
+@pytest.mark.parametrize("observer", ["none", "parameters"])
+def test_who_takes_values_for_those_of_now_refuses_old_ones(observer: str) -> None:
+    law = law_of(f"controller.estimator={observer}", "delay.steps=0")
+    old = Measurement.of(HOME[:12], age=0.1)
+    memory = law.initial_memory(np.zeros((0, 6)))
+    with pytest.raises(ValueError, match=r"got an age of 0\.1 s; expected 0"):
+        law.step(memory, old, lambda times: np.tile(HOME, (len(times), 1)), WEIGHTS)
+
+
+def test_a_loss_is_told_by_the_mask_alone() -> None:
+    """A number in its place is not looked at."""
+    law = law_of("controller.estimator=none", "delay.steps=0")
+    valid = np.ones(12, bool)
+    valid[4] = False
+    lost = Measurement(HOME[:12] + 1e-3 * np.eye(12)[4], valid)
+    memory = law.initial_memory(np.zeros((0, 6)))
+
+    def home(times: Array) -> Array:
+        return np.tile(HOME, (len(times), 1))
+
+    memory = law.step(memory, Measurement.of(HOME[:12]), home, WEIGHTS)
+    memory = law.step(memory, lost, home, WEIGHTS)
+    assert memory.counts.measurements_missing == 1
+    assert np.abs(memory.belief.state - HOME[:12]).max() < 1e-12
+    assert memory.belief.measured[4] == HOME[4]
+
+
+@pytest.mark.parametrize(
+    ("fault", "change"),
+    [
+        (None, {}),
+        ("measurements_missing", {3: np.nan}),
+        ("measurements_rejected", {1: 1.6}),
+        ("measurements_rejected", {5: 1.0}),
+        ("measurements_frozen", {6: 0.5}),  # moves on, but its pose does not
+    ],
+)
+def test_each_fault_of_a_state_by_hand(fault: str | None, change: dict[int, float]) -> None:
+    sensing = StateSensing(np.zeros(12), np.ones(6))
+    last = HOME[:12]
+    values = last.copy()
+    for place, value in change.items():
+        values[place] += value
+    assert sensing.fault(Measurement.of(values), last, 0.1, PAPER) == fault
+    noisy = replace(sensing, noise_std=np.full(12, 1e-3))
+    if fault is None:  # noise never comes twice
+        assert noisy.fault(Measurement.of(values), last, 0.1, PAPER) == "measurements_frozen"
+    assert sensing.seen(values) is values and sensing.through(values, last) is last
+
+
+@dataclass(frozen=True)
+class Twice:
+    """Pose and rates in units of their own, each measured by two sensors."""
+
+    unit: Array
+    std: Array
+
+    @property
+    def size(self) -> int:
+        return 24
+
+    @property
+    def noise_std(self) -> Array:
+        return np.tile(np.sqrt(2) * self.std / self.unit, 2)
+
+    def seen(self, state: Array) -> Array:
+        return np.tile(state / self.unit, 2)
+
+    def through(self, state: Array, changes: Array) -> Array:
+        scaled = (changes.T / self.unit).T
+        return np.concatenate([scaled, scaled])
+
+    def fault(
+        self, measurement: Measurement, last: Array, period: float, mechanism: Mechanism
+    ) -> str | None:
+        return None if measurement.complete else "measurements_missing"
+
+    def start(self, measurement: Measurement) -> FirstState:
+        state = self.unit * measurement.values.reshape(2, 12).mean(axis=0)
+        return FirstState(state, np.diag(self.std**2))
+
+
+def test_two_sensors_with_the_noise_of_two_are_one() -> None:
+    """Another kind of sensing, other units, other size: the same estimates, the same torques."""
+    law, reference, rng = law_of("delay.steps=2"), sine(0.5), np.random.default_rng(3)
+    std = 1e-4 * np.repeat([0.3, 0.03, 0.3, 0.03], 3)
+    single = replace(law, sensing=StateSensing(std, np.ones(6)))
+    double: Sensing = Twice(10.0 ** rng.integers(-2, 3, 12), std)
+    noise = [std * rng.standard_normal(12) for _ in range(12)]
+    away = [std * rng.standard_normal(12) for _ in range(12)]
+    queue, truth = nominal_queue(law, reference), np.array([0.01] * 6 + [0.3, 1e-3])
+
+    def both(k: int, x: Array) -> Array:
+        if k == 7:
+            return np.full(24, np.nan)
+        two = [x + noise[k] + away[k], x + noise[k] - away[k]]
+        return np.concatenate([double.seen(state)[:12] for state in two])
+
+    one = Loop(single, reference, truth, queue)
+    one.run(12, lambda k, x: np.full(12, np.nan) if k == 7 else x + noise[k])
+    other = Loop(replace(law, sensing=double), reference, truth, queue).run(12, both)
+    for a, b in zip(one.memories, other.memories, strict=True):
+        deviation = (a.belief.estimate.mean - b.belief.estimate.mean) / np.sqrt(
+            np.diag(a.belief.estimate.covariance)
+        )
+        assert np.abs(deviation).max() < 1e-5
+        assert relative(b.belief.estimate.covariance, a.belief.estimate.covariance) < 1e-6
+        assert np.abs(a.torque - b.torque).max() < 1e-6 * np.abs(a.torque).max()
+        assert b.measurement.shape == b.belief.measured.shape == (24,)
+        assert a.counts == b.counts
+    assert other.memory.counts.measurements_missing == 1
+
+
+# Feedforward, model, cost.
+
+
+def nodes_of(feedforward: Feedforward, timeline: Timeline) -> Array:
+    """The reference (n, 18) at the nodes, of a motion that is no symmetric one."""
+    reference = sine(0.7)
+    return np.array([reference(1.0 + t) for t in feedforward.nodes(timeline, 2)])
+
+
+def test_nodes_are_those_of_the_holds_and_their_neighbours() -> None:
+    timeline = Timeline(0.1, Delay(3, 0.5))
+    nodes = NoFeedforward().nodes(timeline, 2).reshape(-1, 2)
+    begins = timeline.eta + 0.1 * np.array([-3, -2, -1, 0, 1])
+    assert nodes.mean(axis=1) == pytest.approx(begins + 0.05)
+    assert np.ptp(nodes, axis=1) == pytest.approx(0.1 / np.sqrt(3))
+
+
+def test_each_feedforward_holds_what_it_says() -> None:
+    timeline = Timeline(0.1, Delay(3, 0.4))
+    nodes = nodes_of(NoFeedforward(), timeline)
+    still = nodes * np.repeat([1.0, 0.0, 0.0], 6)
+
+    def by_hand(rows: Array) -> tuple[Array, Array]:
+        torques = [HEAVY.inverse_dynamics(*np.split(row, 3), ZERO) for row in rows]
+        return means_and_changes(np.reshape(torques, (-1, 2, 6)))
+
+    nothing = NoFeedforward().held(nodes, HEAVY, ZERO)
+    assert nothing.torques.shape == (3, 6) and nothing.changes.shape == (5, 6)
+    assert not nothing.torques.any() and not nothing.changes.any()
+    equilibrium = EquilibriumFeedforward().held(nodes, HEAVY, ZERO)
+    assert np.array_equal(equilibrium.torques, by_hand(still)[0][1:-1])
+    moving = InverseDynamicsFeedforward().held(nodes, HEAVY, ZERO)
+    assert np.array_equal(moving.torques, held_torques(*by_hand(nodes)))
+    assert np.abs(moving.torques - equilibrium.torques).max() > 1e-3
+    at_rest = InverseDynamicsFeedforward().held(np.tile(still[:1], (10, 1)), HEAVY, ZERO)
+    assert at_rest.torques == pytest.approx(
+        np.tile(HEAVY.equilibrium_torque(still[0, :6]), (3, 1)), abs=1e-12
+    )
+    B = np.diag(np.arange(1.0, 7))
+    for kind in (NoFeedforward(), EquilibriumFeedforward()):
+        assert not kind.offset(moving.changes, B, timeline).any()
+    assert InverseDynamicsFeedforward().offset(moving.changes, B, timeline).all()
+
+
+def test_a_model_is_refused_where_the_plate_cannot_be() -> None:
+    far = HOME[:12] + 0.3 * np.eye(12)[5]
+    for kind in (PaperModel(), MultibodyModel()):
+        with pytest.raises(UnreachablePoseError):
+            kind.at(far, np.zeros(6), ZERO, PLANT)
+        kind.at(HOME[:12], np.zeros(6), ZERO, PLANT)
+
+
+def test_the_papers_model_is_made_of_its_torque_map() -> None:
+    x = HOME[:12] + 1e-2
+    for form in ("virtual_work", "printed"):
+        expected = double_integrators(torque_map(PAPER, x[:6], form))
+        found = PaperModel(form).at(x, np.ones(6), ZERO, PLANT)
+        assert np.array_equal(found.A, expected.A) and np.array_equal(found.B, expected.B)
+
+
+def test_the_cost_has_an_integral_or_not() -> None:
+    both = QuadraticCost(np.arange(1.0, 7), np.arange(7.0, 13), np.full(6, 2.0))
+    Q, R = both.matrices(np.array([3.0, 5.0]))
+    assert np.array_equal(Q, np.diag(3 * np.arange(1.0, 13)))
+    assert np.array_equal(R, 10 * np.eye(6))
+    errors = replace(both, integrals=None)
+    assert np.array_equal(errors.matrices(np.array([3.0, 5.0]))[0], Q[:6, :6])
+    z, model = np.ones(6), PaperModel().at(HOME[:12], np.zeros(6), ZERO, PLANT)
+    timeline = Timeline(0.1, Delay(3, 0.5))
+    for cost, rows in ((both, 6), (errors, 0)):
+        assert cost.integrates == (rows > 0)
+        assert len(cost.sees(z)) == rows
+        gain = cost.gain(cost.sampled(model, timeline), np.ones(2))
+        assert gain.shape == (6, 12 + rows + 6)  # a fraction: the last torque is still to act
+
+
+# Memory.
+
+
+def arrays(value: Any, name: str = "memory") -> dict[str, tuple[int, ...]]:
+    """Shapes of all that a memory is made of, by name; numbers have none."""
+    if isinstance(value, np.ndarray):
+        return {name: value.shape}
+    if isinstance(value, Timeline | str | None):
+        return {}
+    parts = value._asdict() if hasattr(value, "_asdict") else getattr(value, "__dict__", None)
+    if parts is None:
+        return {name: np.shape(value)}
+    return {k: v for p, inner in parts.items() for k, v in arrays(inner, f"{name}.{p}").items()}
+
+
+@pytest.mark.parametrize("settings", [(), ("delay.fraction=0.4",), ("controller.integral=false",)])
+@pytest.mark.parametrize("controller", ["lqr", "delay_lqi", "predictor_lqi"])
+def test_shapes_never_change_whatever_happens(controller: str, settings: tuple[str, ...]) -> None:
+    law = law_of("delay.steps=2", *settings, controller=controller)
+    reference = sine(0.3)
+
+    def seen(k: int, x: Array) -> Array:
+        return {0: np.full(12, np.nan), 3: x + 0.01, 4: x + 100.0}.get(k, x)
+
+    loop = Loop(law, reference, queue=nominal_queue(law, reference))
+    first = arrays(loop.memory)
+    assert first["memory.gain"][0] == 6 and "memory.belief.estimate.covariance" in first
+    loop.run(8, seen)
+    assert all(arrays(memory) == first for memory in loop.memories)
+    assert loop.memory.counts.bad_measurements >= 2
+    names = {field.name for field in dataclasses.fields(Memory)}
+    assert not names & {"seconds", "time", "clock"}
+
+
+def test_the_same_sample_leaves_the_same_memory() -> None:
+    """Nothing in it depends on when it was computed, or on what a part saw before."""
+    law = law_of("delay.steps=2")
+
+    def once() -> list[Array]:
+        loop = Loop(law, sine(0.3)).run(3)
+        memory, estimate = loop.memory, loop.memory.belief.estimate
+        return [memory.torque, memory.gain, memory.in_flight, estimate.mean, estimate.covariance]
+
+    assert all(np.array_equal(a, b) for a, b in zip(once(), once(), strict=True))
+
+
+def test_a_preview_of_other_instants_is_a_mistake() -> None:
+    law = law_of("delay.steps=2")
+    memory, times = law.initial_memory(np.zeros((2, 6))), law.preview_times
+    for wrong in (times[:-1], times + 0.01):
+        preview = Preview(wrong, np.tile(HOME, (len(wrong), 1)))
+        with pytest.raises(ValueError, match=f"expected the {len(times)} that the law asks for"):
+            law.step(memory, Measurement.of(HOME[:12]), preview, WEIGHTS)
+
+
+# Parts of one's own.
+
+
+@dataclass(frozen=True)
+class Blend:
+    """A fourth observer: the model, and a share of what the measurement says beside it."""
+
+    share: float
+
+    def start(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Belief:
+        return Belief.nothing(timeline, sensing.size, plant.dynamics.parameters)
+
+    def observe(
+        self,
+        belief: Belief,
+        measurement: Measurement,
+        in_flight: Array,
+        sensing: Sensing,
+        plant: NominalPlant,
+    ) -> Belief:
+        if not belief.has_state:
+            return belief.at(measurement.values) if measurement.complete else belief
+        acting, _ = belief.timeline.last_period(in_flight)
+        x = plant.predict(belief.state, acting)[-1]
+        beside = np.where(measurement.valid, measurement.values - x, 0.0)
+        return belief.at(x + self.share * beside)
+
+
+def test_a_fourth_observer_needs_no_change_of_the_package() -> None:
+    """It smooths noise, goes on where values are lost, and holds the plate on the reference."""
+    law, reference, rng = law_of("delay.steps=2"), sine(0.5), np.random.default_rng(0)
+    noise = 1e-4 * rng.standard_normal((40, 12))
+
+    def seen(k: int, x: Array) -> Array:
+        lost = k in (0, 9) or (k == 20) & (np.arange(12) < 3)
+        return np.where(lost, np.nan, x + noise[k])
+
+    errors = {}
+    for observer in (Blend(0.2), NoObserver()):
+        mine = replace(law, observer=observer)
+        loop = Loop(mine, reference, queue=nominal_queue(law, reference)).run(40, seen)
+        believed = np.array([memory.belief.state for memory in loop.memories])
+        errors[observer] = np.std(believed[10:] - loop.states[10:-1])
+        assert np.abs(loop.states[-1][:6] - reference(4.0)[:6]).max() < 2e-3
+    assert errors[Blend(0.2)] < 0.5 * errors[NoObserver()]
+
+
+def test_a_fourth_observer_in_a_diagram() -> None:
+    settings = ["start=on_reference", "duration=1.0", "delay.steps=2"]
+    law = control_law(prepare(load_scenario("paper", settings=settings)))[0]
+    assert isinstance(law.observer, ParameterObserver)
+    mine = replace(law, observer=Blend(0.5))
+    system = DelayLqiController(mine, np.zeros((2, 6)))
+    context = system.CreateDefaultContext()
+    preview = np.tile(HOME, (len(law.preview_times), 1))
+    values = {"measurement": HOME[:12] + 1e-3, "preview": preview.ravel(), "weights": WEIGHTS}
+    for name, value in values.items():
+        system.GetInputPort(name).FixValue(context, value)
+    expected, at = mine.initial_memory(np.zeros((2, 6))), Preview(law.preview_times, preview)
+    simulator = Simulator(system, context)
+    for k in range(4):
+        expected = mine.step(expected, Measurement.of(values["measurement"]), at, WEIGHTS)
+        simulator.AdvanceTo(0.1 * k + 0.05)
+        found = system.GetOutputPort("state_estimate").Eval(context)
+        assert np.array_equal(found, expected.belief.state)
+        assert np.array_equal(
+            system.GetOutputPort("torque_commanded").Eval(context), expected.torque
+        )
+        assert system.sample(context).seconds > 0
+
+
+@dataclass(frozen=True)
+class Told(NoObserver):
+    """Begins with the delay that the law assumes, and is told another one at the first sample."""
+
+    other: Timeline
+
+    def observe(self, belief: Belief, *rest: Any) -> Belief:
+        return super().observe(replace(belief, timeline=self.other), *rest)
+
+
+@pytest.mark.parametrize("assumed", [0, 1, 4])
+@pytest.mark.parametrize("prediction", ["linear", "nonlinear"])
+def test_the_law_believes_in_the_delay_that_its_observer_believes_in(
+    prediction: str, assumed: int
+) -> None:
+    """With torques kept for the longest delay, it is the law that knew it from the start."""
+    known = law_of(
+        "delay.steps=2", "controller.estimator=none", f"controller.prediction={prediction}"
+    )
+    reference = sine(0.5)
+    queue = nominal_queue(known, reference)
+    expected = Loop(known, reference, queue=queue).run(8)
+    law = replace(
+        known, timeline=replace(known.timeline, delay=Delay(assumed)), observer=Told(known.timeline)
+    )
+    loop = Loop(known, reference, queue=queue)
+    loop.law = law
+    loop.memory = law.initial_memory(np.vstack([np.ones((4, 6)), queue]))
+    loop.run(8)
+    for one, other in zip(loop.memories, expected.memories, strict=True):
+        assert np.array_equal(one.torque, other.torque)
+        assert np.array_equal(one.integral, other.integral)
+
+
+@pytest.mark.parametrize(("prediction", "kept"), [("linear", False), ("nonlinear", True)])
+def test_a_gain_for_another_delay_is_used_only_where_it_fits(prediction: str, kept: bool) -> None:
+    """The Riccati equation fails at the very sample at which another delay is believed in."""
+    known = law_of(
+        "delay.steps=2", "controller.estimator=none", f"controller.prediction={prediction}"
+    )
+    timeline = replace(known.timeline, delay=Delay(3))
+    before = replace(known, timeline=timeline)
+    law = replace(before, observer=Told(known.timeline))
+    away = HOME[:12] + 1e-3
+
+    def home(times: Array) -> Array:
+        return np.tile(HOME, (len(times), 1))
+
+    memory = before.step(
+        before.initial_memory(np.zeros((3, 6))), Measurement.of(away), home, WEIGHTS
+    )
+    after = law.step(memory, Measurement.of(away + 1e-4), home, np.array([np.nan, 1.0]))
+    assert after.counts.riccati_failures == 1
+    assert np.any(np.abs(after.torque) > 1e-6) == kept  # else the feedforward alone, none at home
+    good = law.step(after, Measurement.of(away), home, WEIGHTS)
+    assert np.isfinite(good.gain).all() and np.abs(good.torque).max() > 1e-6
+
+
+def test_a_delay_longer_than_what_is_kept_is_refused() -> None:
+    known = law_of("delay.steps=2", "controller.estimator=none")
+    law = replace(known, observer=Told(replace(known.timeline, delay=Delay(3))))
+    with pytest.raises(ValueError, match="2 torques are kept in flight; expected at least the 3"):
+        Loop(law, lambda t: HOME).run(1)
+
+
+class Cautious(LeafSystem):
+    """A source of weights: the errors count less the larger they are."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._measurement = self.DeclareVectorInputPort("measurement", 12)
+        self.DeclareVectorOutputPort("weights", 2, self._weigh)
+
+    def _weigh(self, context: Context, output: BasicVector) -> None:
+        error = np.abs(self._measurement.Eval(context) - HOME[:12]).max()
+        output.SetFromVector([1 / (1 + 1e3 * error), 1.0])
+
+
+def test_a_source_of_weights_needs_no_change_of_the_package() -> None:
+    law = law_of("delay.steps=2")
+    builder = DiagramBuilder()
+    controller = builder.AddSystem(DelayLqiController(law, np.zeros((2, 6))))
+    weights = builder.AddSystem(Cautious())
+    builder.Connect(weights.get_output_port(), controller.GetInputPort("weights"))
+    builder.ExportInput(controller.GetInputPort("preview"), "preview")
+    measured = builder.ExportInput(controller.GetInputPort("measurement"), "measurement")
+    builder.ConnectInput(measured, weights.GetInputPort("measurement"))
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    root = simulator.get_mutable_context()
+    rows = np.tile(HOME, (len(law.preview_times), 1))
+    diagram.GetInputPort("preview").FixValue(root, rows.ravel())
+    memory, preview = law.initial_memory(np.zeros((2, 6))), Preview(law.preview_times, rows)
+    for k, error in enumerate((1e-3, 3e-3, 0.5e-3)):
+        y = HOME[:12] + error * np.linspace(0.1, 1, 12)
+        diagram.GetInputPort("measurement").FixValue(root, y)
+        simulator.AdvanceTo(0.1 * k + 0.05)
+        wanted = np.array([1 / (1 + 1e3 * np.abs(y - HOME[:12]).max()), 1.0])
+        memory = law.step(memory, Measurement.of(y), preview, wanted)
+        found = controller.memory(controller.GetMyContextFromRoot(root))
+        assert np.array_equal(found.weights, wanted)
+        assert np.array_equal(found.torque, memory.torque)

@@ -1,0 +1,92 @@
+"""Short periods and long delays: what is prepared before a run takes no longer for them."""
+
+import time
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stewart_drake.design.catch_up import MOST_HOLDS, plan_catch_up
+from stewart_drake.design.holds import mean_torques
+from stewart_drake.design.startup import BLOCK, choose_substeps
+from stewart_drake.experiment import prepare
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.trajectories import evaluate
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture
+def work(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    """Linearisations and integration steps since the test began."""
+    done = {"derivatives": 0, "steps": 0}
+    derivatives, predict = StewartDynamics.derivatives, StewartDynamics.predict
+
+    def linearised(self: StewartDynamics, *arguments: object) -> object:
+        done["derivatives"] += 1
+        return derivatives(self, *arguments)  # type: ignore[arg-type]
+
+    def predicted(
+        self: StewartDynamics, x: Array, T: Array, h: Array, substeps: int = 1, *more: Array
+    ) -> Array:
+        done["steps"] += substeps * len(T)
+        return predict(self, x, T, h, substeps, *more)
+
+    monkeypatch.setattr(StewartDynamics, "derivatives", linearised)
+    monkeypatch.setattr(StewartDynamics, "predict", predicted)
+    return done
+
+
+@pytest.mark.parametrize("period", [0.1, 0.003, 0.0007, 1e-4])
+@pytest.mark.parametrize("duration", [0.3, 0.31])
+def test_a_plan_of_many_periods_is_followed_period_by_period(
+    period: float, duration: float, work: dict[str, int]
+) -> None:
+    """Onto the reference, by the torques that its own inverse dynamics gives for each period."""
+    experiment = prepare(
+        load_scenario("paper", None, ("plant.kind=exact", f"controller.period={period}"))
+    )
+    plant, reference, begin = experiment.nominal, experiment.reference, 0.8
+    start = np.concatenate([experiment.mechanism.home, np.zeros(6)])
+    planned, span = plan_catch_up(plant, reference, start, begin, period, duration, None)
+    assert work["derivatives"] <= 13 * MOST_HOLDS
+    assert duration <= span < duration + period * (1 + 1e-9)
+    n = round(span / period)
+    assert n * period == pytest.approx(span)
+    edges = begin + period * np.arange(n + 1)
+    torques = mean_torques(plant, planned, edges[:-1], edges[1:])
+    jumps = np.abs(np.diff(torques, axis=0)).max(axis=1) > 1e-5
+    assert jumps.sum() < MOST_HOLDS
+    end = plant.predict(start, torques, period, 1 if period < 0.01 else 4)[-1]
+    wanted = evaluate(planned, begin + span)
+    assert np.abs(wanted[:6] - evaluate(reference, begin + span)[:6]).max() < 1e-9
+    assert np.abs(end[:6] - wanted[:6]).max() < (2e-5 if period == 0.1 else 1e-6)
+
+
+def test_the_shortest_plan_within_a_limit_is_found_in_a_few_steps(work: dict[str, int]) -> None:
+    period, limit = 1e-3, 0.5
+    experiment = prepare(
+        load_scenario("paper", None, ("plant.kind=exact", f"controller.period={period}"))
+    )
+    start = np.concatenate([experiment.mechanism.home, np.zeros(6)])
+    spans = [
+        plan_catch_up(experiment.nominal, experiment.reference, start, 0.8, dt, None, limit)[1]
+        for dt in (period, 0.02)
+    ]
+    assert spans[0] == pytest.approx(spans[1], abs=0.021)
+    assert work["derivatives"] < 3e4
+
+
+def test_a_long_delay_is_compared_no_further_than_the_prediction_is_of_use(
+    work: dict[str, int],
+) -> None:
+    """Torques held for 0.1 s lead away from the reference long before 100 s are over."""
+    experiment = prepare(load_scenario("paper"))
+    began = time.perf_counter()
+    substeps = choose_substeps(experiment.nominal, experiment.reference, 0.1, 1000, 10.0)
+    assert substeps == 8
+    # Whole horizons of 8 instants, 3 n steps for n = 1, 2, 4 and 8, were 360 thousand.
+    assert work["steps"] < 8 * 3 * 15 * 1000 / 2
+    assert time.perf_counter() - began < 120
+    assert BLOCK < 1000

@@ -1,0 +1,331 @@
+"""Controllers, references and disturbances of one's own in the loop of a scenario."""
+
+import gc
+import importlib.util
+import json
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource
+from pydrake.trajectories import FunctionHandleTrajectory, PiecewisePolynomial
+
+import stewart_drake as sd
+from stewart_drake.experiment import prepare
+from stewart_drake.trajectories import make_reference
+
+ROOT = Path(__file__).resolve().parents[1]
+FAST = ("plant.kind=exact", "delay.steps=0", "controller.period=0.01", "start=on_reference")
+"""No delay, so that a controller which knows of none can hold the plate."""
+
+
+def example(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "analysis" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def scenario(*settings):
+    return sd.load_scenario("paper", settings=(*FAST, *settings))
+
+
+class Constant(LeafSystem):
+    """Any ports; every output is constant."""
+
+    def __init__(self, inputs=(), outputs=(), value=0.0):
+        super().__init__()
+        for name, size in inputs:
+            self.DeclareVectorInputPort(name, size)
+        for name, size in outputs:
+            self.DeclareVectorOutputPort(
+                name, size, lambda context, output, n=size: output.SetFromVector(np.full(n, value))
+            )
+
+
+def controller(inputs=(("measurement", 12),), outputs=(("torque", 6),), value=0.0):
+    return Constant(inputs, outputs, value)
+
+
+def disturbance(name="torque", size=6, value=0.0):
+    return Constant((), ((name, size),), value)
+
+
+# ------------------------------------------------------------------ the examples
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+def test_own_computed_torque_controller_with_table_figures_and_replay(tmp_path, capsys, plant):
+    result = example("own_controller").main(str(tmp_path), "duration=2", f"plant.kind={plant}")
+    table = capsys.readouterr().out
+    assert "completed" in table and "ComputedTorque" in table
+    assert result.summary["own"] == {"controller": "ComputedTorque"}
+    # Poles of the error at -10 /s, sampled a hundred times a second: it follows to a millimetre.
+    assert np.abs(result.signals.error.values).max() < 1e-3
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"states.png", "errors.svg", "torques.png", "signals.nc", "replay.html"} <= names
+    assert "parameters.png" not in names, "nobody estimated any"
+    saved = json.loads((tmp_path / "summary.json").read_text())
+    assert saved["controller_margin"] is None
+    assert any("not judged" in line for line in saved["warnings"])
+
+
+def test_example_is_short():
+    lines = (ROOT / "analysis" / "own_controller.py").read_text().splitlines()
+    code = [line for line in lines if line.strip() and not line.lstrip().startswith('"""')]
+    assert len(code) < 30
+
+
+def test_own_kick_moves_the_plate_at_three_seconds(capsys):
+    results = example("own_disturbance").main("plant.kind=exact", "duration=4")
+    assert "kicked: E_ac" in capsys.readouterr().out
+    calm, kicked = (results[name].signals.pose.sel(coordinate="x") for name in ("calm", "kicked"))
+    moved = np.abs(kicked - calm)
+    assert moved.sel(time=slice(0, 2.999)).max() == 0
+    assert moved.sel(time=slice(3.05, 3.4)).max() > 1e-3
+    assert results["kicked"].summary["own"] == {"disturbance": "Kick"}
+
+
+def test_a_wrench_gives_the_momentum_of_its_impulse():
+    """A free plate, no gravity: right after a short push M rates = N' integral of the wrench."""
+    kick, settings = example("own_disturbance").Kick, ("reference.kind=hold", "duration=0.002")
+    sc = scenario(*settings, "plant.accuracy=1e-12")
+    start = np.array(sc.reference.offset)
+    force = (30.0, -20.0, 40.0)
+    result = sd.simulate(sc, controller=controller, disturbance=lambda: kick(force, 0.0))
+    rates = result.signals.rates.values[-1]
+    dynamics = sd.StewartDynamics(sd.load_mechanism("paper"), gravity=False)
+    momentum = dynamics.mass_matrix(start) @ rates
+    np.testing.assert_allclose(momentum, [0, 0, 0, *0.002 * np.array(force)], atol=2e-5)
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+def test_disturbing_torque_is_the_same_as_a_bias(plant):
+    settings = ("duration=0.3", f"plant.kind={plant}")
+    bias = np.array([0.02, -0.01, 0.03, 0.0, 0.01, -0.02])
+    biased = sd.simulate(scenario(*settings, f"plant.torque_bias={bias.tolist()}"))
+    system = ConstantVectorSource(bias)
+    with pytest.raises(sd.ConfigError, match="output port 'torque'"):
+        sd.simulate(scenario(*settings), disturbance=system)  # its port has another name
+
+    class Pushed(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorOutputPort("torque", 6, lambda _, output: output.SetFromVector(bias))
+
+    pushed = sd.simulate(scenario(*settings), disturbance=Pushed)
+    np.testing.assert_allclose(pushed.signals.pose, biased.signals.pose, atol=1e-12)
+
+
+@pytest.mark.parametrize("port", ["torque", "wrench"])
+def test_a_disturbance_of_nothing_changes_nothing(port):
+    sc = sd.load_scenario("paper", settings=("plant.kind=multibody", "duration=1"))
+    plain = sd.simulate(sc)
+    pushed = sd.simulate(sc, disturbance=disturbance(port))
+    np.testing.assert_array_equal(pushed.signals.pose, plain.signals.pose)
+
+
+# ------------------------------------------------------------------ sampling, counts, exceptions
+
+
+def test_own_torque_is_sampled_held_limited_and_delayed():
+    class Ramp(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("measurement", 12)
+            self.DeclareVectorOutputPort("torque", 6, self.calc)
+
+        def calc(self, context, output):
+            output.SetFromVector(np.full(6, context.get_time()))
+
+    sc = scenario(
+        "controller.period=0.1",
+        "delay.steps=2",
+        "delay.fraction=0.5",
+        "actuator.torque_limit=0.25",
+        "reference.kind=hold",
+        "duration=0.9",
+    )
+    s = sd.simulate(sc, controller=Ramp).signals.sel(leg=1)
+    held = 0.1 * np.floor(s.time.values / 0.1 + 1e-6)
+    np.testing.assert_allclose(s.torque_commanded, held, atol=1e-9)
+    late = 0.1 * np.floor((s.time.values - 0.25) / 0.1 + 1e-6)
+    np.testing.assert_allclose(s.torque_applied, np.clip(late, 0, 0.25), atol=1e-9)
+
+
+def test_what_is_no_number_is_sent_as_before_and_counted():
+    class Broken(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("measurement", 12)
+            self.DeclareVectorOutputPort("torque", 6, self.calc)
+
+        def calc(self, context, output):
+            t = context.get_time()
+            output.SetFromVector(np.full(6, np.nan if 0.045 < t < 0.075 else 1e-3))
+
+    faults = "sensor.faults=[{kind: missing, from: 0.02, to: 0.04}]"
+    result = sd.simulate(scenario("duration=0.1", faults), controller=Broken)
+    counts = result.summary["counts"]
+    assert counts["nonfinite_torque"] == 3 and counts["measurements_missing"] == 2
+    assert (result.signals.torque_commanded == 1e-3).all()
+    for name in ("integral", "weights", "parameters", "state_estimate"):
+        assert np.isnan(result.signals[name]).all()
+
+
+def test_a_mistake_in_a_system_is_an_exception():
+    class Wrong(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("measurement", 12)
+            self.DeclareVectorOutputPort("torque", 6, self.calc)
+
+        def calc(self, context, output):
+            raise RuntimeError("my own mistake")
+
+    with pytest.raises(RuntimeError, match="my own mistake"):
+        sd.simulate(scenario("duration=0.1"), controller=Wrong)
+
+
+# ------------------------------------------------------------------ the border
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"controller": 3}, "controller: got a int; expected a Drake system"),
+        ({"controller": lambda: "x"}, "controller: got a str; expected a Drake system"),
+        ({"controller": lambda: controller(())}, "no input port 'measurement'; expected measur"),
+        (
+            {"controller": lambda: controller((("measurement", 6),))},
+            "input port 'measurement': got 6 values; expected 12",
+        ),
+        (
+            {"controller": lambda: controller((("measurement", 12), ("state", 12)))},
+            "got an input port 'state'; expected measurement (12) and, if wanted, reference (18)",
+        ),
+        ({"controller": lambda: controller(outputs=())}, "got no output port; expected"),
+        (
+            {"controller": lambda: controller(outputs=(("torque", 3),))},
+            "output port 'torque': got 3 values; expected 6",
+        ),
+        ({"disturbance": lambda: disturbance("force")}, "'torque' (6) or 'wrench' (6)"),
+        ({"disturbance": lambda: disturbance("wrench", 3)}, "got 3 values; expected 6"),
+        ({"disturbance": controller}, "got an input port 'measurement'; expected none"),
+        ({"reference": np.zeros(6)}, "reference: got a ndarray; expected a Drake trajectory"),
+        (
+            {"reference": PiecewisePolynomial(np.zeros((3, 1)))},
+            "got shape (3, 1); expected (6, 1), the pose",
+        ),
+        (
+            {"reference": FunctionHandleTrajectory(lambda t: np.zeros((6, 1)), 6, 1, 0.0, 9.0)},
+            "expected derivatives of order 1 and 2",
+        ),
+        (
+            {"reference": PiecewisePolynomial.FirstOrderHold([0, 0.05], np.eye(6, 2))},
+            "an end at 0.05 s with rates",
+        ),
+        (
+            {"reference": PiecewisePolynomial.FirstOrderHold([0, 0.05, 1], np.eye(6, 3))},
+            "got a jump of 21.1 in the rates at 0.05 s",
+        ),
+        (
+            {"reference": PiecewisePolynomial.ZeroOrderHold([0, 0.05, 1], np.eye(6, 3))},
+            "got a jump of 1 in the pose at 0.05 s",
+        ),
+        (
+            {"reference": PiecewisePolynomial.ZeroOrderHold([0.05, 1], np.zeros((6, 2)))},
+            "a start at 0.05 s; expected one at 0 s or before",
+        ),
+        (
+            {"reference": PiecewisePolynomial(np.full((6, 1), np.nan))},
+            "expected finite numbers",
+        ),
+        ({"reference": PiecewisePolynomial(np.zeros((6, 1)))}, "expected a motion within reach"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(given, message):
+    with pytest.raises(sd.ConfigError) as refused:
+        sd.simulate(scenario("duration=0.1"), **given)
+    assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_an_instance_serves_one_run():
+    system = controller()
+    sd.simulate(scenario("duration=0.02"), controller=system)
+    with pytest.raises(sd.ConfigError, match="an instance that has been in a loop already"):
+        sd.simulate(scenario("duration=0.02"), controller=system)
+    for _ in range(2):
+        sd.simulate(scenario("duration=0.02"), controller=controller)
+    spared = controller()
+    with pytest.raises(sd.ConfigError, match="within reach"):
+        sd.simulate(scenario("reference.offset=[0, 0, 0, 0, 0, 9]"), controller=spared)
+    sd.simulate(scenario("duration=0.02"), controller=spared)  # it was in no loop yet
+
+
+def test_a_tuner_needs_the_shipped_controller():
+    with pytest.raises(sd.ConfigError, match="with a controller of your own; expected 'fixed'"):
+        sd.simulate(scenario("duration=0.1", "tuner.kind=ann"), controller=controller)
+
+
+def test_what_a_system_noted_is_still_there_and_a_loop_that_made_its_own_is_not():
+    class Noting(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.noted = []
+            self.DeclareVectorInputPort("measurement", 12)
+            self.DeclareVectorOutputPort("torque", 6, self.calc)
+
+        def calc(self, context, output):
+            self.noted.append(context.get_time())
+            output.SetFromVector(np.zeros(6))
+
+    system, seen = Noting(), []
+    original = sd.simulation.make_simulator
+
+    def watched(loop):
+        seen.append(weakref.ref(loop.GetSubsystemByName("controller")))
+        return original(loop)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sd.simulation, "make_simulator", watched)
+        sd.simulate(scenario("duration=0.05"), controller=system)
+        sd.simulate(scenario("duration=0.05"), controller=Noting)
+    np.testing.assert_allclose(np.unique(np.round(system.noted, 9)), np.arange(6) * 0.01)
+    gc.collect()
+    assert seen[1]() is None
+
+
+# ------------------------------------------------------------------ reference
+
+
+def test_own_reference_is_followed_like_the_same_one_of_a_scenario():
+    sc = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=2"))
+    same = make_reference(sc.reference, sc.duration)
+    own = sd.simulate(sc, reference=same)
+    other = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=2"))
+    other.reference.amplitude = [0.0] * 6
+    replaced = sd.simulate(other, reference=same)
+    np.testing.assert_array_equal(own.signals.pose, replaced.signals.pose)
+    assert own.summary["own"] == {"reference": "FunctionHandleTrajectory"}
+    shipped = sd.simulate(sc)
+    assert shipped.summary["own"] == {}
+    # What it is measured by, the range within 2 s, is all that differs.
+    scale = np.abs(own.signals.error.values - shipped.signals.error.values).max()
+    assert scale < 1e-3
+
+
+def test_own_reference_that_ends_is_held_there():
+    knots = np.tile([[0.0], [0], [0], [0], [0], [0.38]], (1, 2)) + np.outer(
+        [0] * 5 + [0.01], [0, 1]
+    )
+    still = np.zeros(6)
+    motion = PiecewisePolynomial.CubicHermite([0, 0.5], knots, np.column_stack([still, still]))
+    experiment = prepare(scenario("duration=2"), own=sd.own.take(None, motion, None))
+    reference = experiment.reference
+    for t in (0.5, 0.7, 5.0):
+        np.testing.assert_allclose(reference.value(t)[:, 0], knots[:, 1])
+    np.testing.assert_array_equal(reference.EvalDerivative(0.7, 1), np.zeros((6, 1)))
+    np.testing.assert_allclose(experiment.peak_to_peak, [0, 0, 0, 0, 0, 0.01], atol=1e-12)

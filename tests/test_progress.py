@@ -1,0 +1,123 @@
+"""How far a command has got: bars on a terminal, plain lines elsewhere."""
+
+import fcntl
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import pytest
+
+from stewart_drake.report import terminal
+
+ROOT = Path(__file__).resolve().parents[1]
+STUDY = ["analyze", "robustness", "--runs", "4", "--set", "duration=0.3", "--workers", "1"]
+
+
+def said_by(script: str, stderr: int | None = subprocess.PIPE) -> str:
+    """What a few lines of Python print to stderr."""
+    lines = f"import time\nfrom stewart_drake.report import terminal as t\nt.EVERY = 0.05\n{script}"
+    done = subprocess.run(
+        [sys.executable, "-c", lines], stderr=stderr, stdout=subprocess.PIPE, text=True, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stderr or ""
+
+
+def test_a_pipe_gets_a_line_now_and_then():
+    said = said_by(
+        "with t.count_bar('runs', False) as show:\n"
+        "    time.sleep(0.12)\n    show(40, 200)\n    time.sleep(0.2)\n"
+        "    show(60, 200)\n    time.sleep(0.2)\n"
+    )
+    lines = said.splitlines()
+    assert lines[0] == "runs: preparing, after 0 s"
+    assert any(re.fullmatch(r"runs: 40 of 200, after 0 s", line) for line in lines)
+    # Twenty in 0.2 to 0.4 s leaves 1.4 to 2.8 s for 140; the forty of an earlier start took none.
+    assert re.fullmatch(r"runs: 60 of 200, about [1-9] s left, after \d s", lines[-1]), said
+    assert "\r" not in said and "\x1b" not in said
+
+
+def test_simulations_tell_their_time():
+    said = said_by(
+        "with t.progress_bars(['lqr', 'lqi'], 20.0, False) as show:\n"
+        "    time.sleep(0.12)\n    show['lqr'](1.5, 0.1)\n    time.sleep(0.12)\n"
+        "    show['lqi'](2.0, 0.1)\n    time.sleep(0.12)\n"
+    )
+    lines = said.splitlines()
+    assert lines[0] == "lqr, lqi: preparing, after 0 s"
+    assert "lqr 1.5 of 20 s, after 0 s" in lines and "lqr 1.5, lqi 2.0 of 20 s" in lines[-1]
+
+
+@pytest.mark.parametrize("how", ["t.count_bar('a', True)", "t.progress_bars(['a'], 1.0, True)"])
+def test_quiet_is_quiet(how):
+    assert said_by(f"with {how}:\n    time.sleep(0.3)\n") == ""
+
+
+def test_a_closed_stderr_costs_nothing():
+    script = "with t.count_bar('runs', False) as show:\n    show(0, 3)\n    time.sleep(0.3)\n"
+    lines = f"import time\nfrom stewart_drake.report import terminal as t\nt.EVERY = 0.05\n{script}"
+    shell = f'{sys.executable} -c "$0" 2>&-'
+    done = subprocess.run(
+        ["bash", "-c", shell, lines + "print('done')"], capture_output=True, cwd=ROOT
+    )
+    assert (done.returncode, done.stdout) == (0, b"done\n")
+
+
+def test_a_long_command_speaks_when_its_output_goes_to_a_file(tmp_path):
+    """Which it did not for as long as it took."""
+    script = (
+        "import sys\nfrom stewart_drake.report import terminal\nterminal.EVERY = 0.2\n"
+        "from stewart_drake.cli import main\nsys.exit(main(sys.argv[1:]))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, *STUDY, "--out", str(tmp_path / "new")],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    assert lines[0].startswith("runs: preparing") and any(" of 4" in line for line in lines)
+    assert all(line.startswith("runs: ") for line in lines)
+
+
+def test_the_bar_never_counts_to_zero():
+    """It starts without a number, then has the right one at once, and the time that is left."""
+    leader, follower = pty.openpty()
+    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    script = (
+        "import time\nfrom stewart_drake.report import terminal as t\n"
+        "with t.count_bar('runs', False) as show:\n    show(3, 10)\n    time.sleep(0.3)\n"
+        "    show(4, 10)\n    time.sleep(0.3)\n    show(9, 10)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], stderr=follower, cwd=ROOT)
+    os.close(follower)
+    said, limit = b"", time.monotonic() + 60
+    while time.monotonic() < limit:
+        try:
+            said += os.read(leader, 4096)
+        except OSError:  # its other end is closed
+            break
+    os.close(leader)
+    assert process.wait(10) == 0
+    text = said.decode()
+    assert not re.search(r"of 0\b|\b0 of", text) and "preparing" in text, text
+    assert "3 of 10" in text and re.search(r"4 of 10, 00:0\d left", text), text
+
+
+def test_durations_are_short():
+    seconds = (0.4, 59, 89, 100, 3600, 7200)
+    assert [terminal._duration(s) for s in seconds] == [
+        "0 s",
+        "59 s",
+        "89 s",
+        "2 min",
+        "60 min",
+        "2.0 h",
+    ]

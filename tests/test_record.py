@@ -1,0 +1,267 @@
+"""The log of a run: which instants, what it says about itself, what it does not change."""
+
+import dataclasses
+import json
+import tracemalloc
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import stewart_drake as sd
+from stewart_drake.diagram import build_closed_loop
+from stewart_drake.errors import ConfigError
+from stewart_drake.jsonio import jsonable
+from stewart_drake.recording import Table
+from stewart_drake.report.csv_file import read_signals, signals_csv
+from stewart_drake.scenario_loading import scenario_yaml
+from stewart_drake.signals import (
+    COORDINATE_UNITS,
+    DIMENSIONS,
+    LEGS,
+    RATE_UNITS,
+    SIGNALS,
+    Quantity,
+    Signal,
+    exported_ports,
+    ports_of,
+)
+from stewart_drake.studies.dataset import sample_run
+from stewart_drake.systems.controller import HELD
+from stewart_drake.systems.sensor import Sensor
+from stewart_drake.timing import instants
+
+ON_REFERENCE = ("start=on_reference", "queue=reference")
+NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-3,1e-3,1e-3,1e-4,1e-4,1e-4]"
+
+
+def scenario(*settings: str, plant: str = "exact", start: tuple[str, ...] = ON_REFERENCE):
+    return sd.load_scenario("paper", settings=(f"plant.kind={plant}", *start, *settings))
+
+
+def run(*settings: str, plant: str = "exact") -> sd.SimulationResult:
+    return sd.simulate(scenario(*settings, plant=plant))
+
+
+# Instants.
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+@pytest.mark.parametrize("period", [0.01, 0.005, 0.03])
+def test_no_torque_is_lost(period: float, plant: str) -> None:
+    """The law's own torques, taken at its samples, are those of the log."""
+    sc = scenario(f"controller.period={period}", "duration=0.3", "delay.steps=3", plant=plant)
+    result = sd.simulate(sc)
+    number = round(0.3 / period) + 1
+    at = period * np.arange(number)
+    logged = result.signals.sel(time=at, method="nearest")
+    np.testing.assert_allclose(logged.time, at, atol=1e-12)
+    torques = logged.torque_commanded.values
+    assert len(np.unique(torques[:, 0])) == number, "each sample has a torque of its own"
+    # Equation (40) of the summary is over all samples; here it is taken of the log.
+    assert result.summary["rms_torque"] == pytest.approx(np.sqrt(np.mean(torques**2)), rel=1e-12)
+    variation = np.abs(np.diff(torques, axis=0)).sum(axis=0).mean()
+    assert result.summary["torque_variation"] == pytest.approx(variation, rel=1e-12)
+    np.testing.assert_array_equal(logged.torque_applied.values[3:], torques[:-3])
+
+
+def test_the_usual_instants_are_the_grid_and_every_sample() -> None:
+    found = run("controller.period=0.03", "duration=0.1").signals.time.values
+    np.testing.assert_allclose(found, [0, 0.02, 0.03, 0.04, 0.06, 0.08, 0.09, 0.1], atol=1e-12)
+
+
+@pytest.mark.parametrize(("period", "number"), [(0.005, 61), (0.1, 4), (0.25, 3), (10.0, 2)])
+def test_a_log_has_the_period_that_is_asked_for(period: float, number: int) -> None:
+    found = run(f"log_period={period}", "duration=0.3").signals.time.values
+    expected = np.append(period * np.arange(number - 1), 0.3)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_what_is_measured_of_a_run_does_not_depend_on_its_log() -> None:
+    """The multibody plant steps as it does anyway: its numbers are the same to the last digit."""
+
+    def numbers(result: sd.SimulationResult) -> dict[str, object]:
+        left_out = ("wall_s", "controller_step_ms", "scenario")
+        return {
+            key: value for key, value in jsonable(result.summary).items() if key not in left_out
+        }
+
+    start = ("duration=0.9", "delay.steps=2", "start=rest", "queue=zero")
+    usual = run(*start, plant="multibody")
+    assert usual.accumulated_error > 0 and usual.summary["delay_floor"] > 0
+    for period in ("0.001", "0.05", "5"):
+        own = run(*start, f"log_period={period}", plant="multibody")
+        assert numbers(own) == numbers(usual)
+        shared = np.intersect1d(usual.signals.time.values, own.signals.time.values)
+        assert own.signals.sel(time=shared).pose.equals(usual.signals.sel(time=shared).pose)
+    # The integrator of the exact plant has to stop where it is looked at.
+    exact = run(*start)
+    assert run(*start, "log_period=0.04").accumulated_error == exact.accumulated_error
+    finer = run(*start, "log_period=0.003").accumulated_error
+    assert finer == pytest.approx(exact.accumulated_error, rel=1e-6)
+
+
+def test_a_data_set_needs_the_samples_whatever_the_log() -> None:
+    sc = sd.load_scenario("paper", settings=("plant.kind=exact", "delay.steps=1", *ON_REFERENCE))
+    rows = [sample_run(dataclasses.replace(sc, log_period=period)) for period in (None, 0.05)]
+    assert rows[0] == rows[1]
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (("log_period=0",), "log_period"),
+        (("log_period=-0.1",), "log_period"),
+        (("log_period=often",), "log_period"),
+        (("log_period=.nan",), "log_period"),
+        (("plant.kind=multibody", "log_period=0.0015"), "whole number of plant.time_step"),
+        (("duration=1000", "log_period=1e-4"), "at least 0.0002 s"),
+    ],
+)
+def test_periods_that_do_not_fit_are_refused(settings: tuple[str, ...], said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as refused:
+        sd.load_scenario("paper", settings=("plant.kind=exact", *settings))
+    assert "\n" not in str(refused.value) and "log_period" in str(refused.value)
+    assert "expected" in str(refused.value)
+
+
+def test_the_last_instant_is_the_end_once() -> None:
+    found = list(instants(0.3, 0.1, None))
+    assert [one.time for one in found] == pytest.approx(0.02 * np.arange(16), abs=1e-12)
+    assert found[-1] == (0.3, True, True, True)
+    assert [one.time for one in instants(0.25, 1.0, 0.1) if one.logged] == [0, 0.1, 0.2, 0.25]
+
+
+# What the controller got, and what it made of it.
+
+
+def test_measurement_and_estimate_are_the_controllers() -> None:
+    result = run(NOISE, "duration=0.5", "delay.steps=2", "controller.period=0.02")
+    signals, sc = result.signals, result.scenario
+    sensor = Sensor(np.array(sc.sensor.noise_std), sc.sensor.seed, 0.02)
+    state = np.hstack([signals.pose, signals.rates])
+    noise = np.array([sensor.noise(k) for k in range(len(state))])
+    np.testing.assert_allclose(signals.measurement, state + noise, rtol=0, atol=1e-12)
+    estimate = signals.state_estimate.values
+    np.testing.assert_array_equal(estimate[0], signals.measurement[0])
+    off = np.abs(estimate - state)[5:].mean(axis=0)
+    assert np.all(off < np.abs(noise)[5:].mean(axis=0)), "the filter knows better than the sensor"
+    assert list(signals.state.values[[0, 3, 6, 11]]) == ["phi", "x", "phi_dot", "z_dot"]
+
+
+def test_measurements_are_held_between_samples_and_kept_where_they_are_missing() -> None:
+    """With a bad reading, the log shows it as it came, and the model's state beside it."""
+    loop = build_closed_loop(scenario("duration=0.5"))
+    port = loop.GetOutputPort("measurement")
+    assert np.isnan(port.Eval(loop.CreateDefaultContext())).all(), "nothing was measured yet"
+    signals = run("duration=0.25").signals
+    values = signals.measurement.values
+    for first, last in ((0, 4), (5, 9)):
+        assert np.all(values[first : last + 1] == values[first])
+    assert np.any(values[4] != values[5])
+
+
+# What the file says.
+
+
+def test_the_file_says_what_is_in_it(tmp_path) -> None:
+    result = run("duration=0.3", "controller.w_R=3")
+    result.save(tmp_path)
+    plain = xr.load_dataset(tmp_path / "signals.nc")
+    for read in (plain, read_signals(tmp_path / "signals.nc")):
+        assert read.identical(result.signals)
+        assert set(read.data_vars) == set(SIGNALS)
+        for name in (*read.data_vars, *read.coords):
+            assert read[name].attrs["long_name"]
+        for name, signal in SIGNALS.items():
+            labels = read.sizes[signal.quantity.dimension]
+            units = read[name].attrs["units"].split(", ")
+            assert len(units) in (1, labels) and signal.size == labels
+            assert list(signal.quantity.units) in (units, units * labels)
+        assert read.time.attrs["units"] == "s"
+        assert read.pose.attrs["units"] == ", ".join(COORDINATE_UNITS)
+        assert read.rates.attrs["units"] == ", ".join(RATE_UNITS)
+        assert read.torque_applied.attrs["units"] == "N m"
+        assert json.loads(read.attrs["versions"])["drake"]
+    again = tmp_path / "again.yaml"
+    again.write_text(plain.attrs["scenario"])
+    assert sd.load_scenario(again) == result.scenario
+    assert plain.attrs["scenario"] == scenario_yaml(result.scenario)
+
+
+def test_labels_of_the_file_are_those_of_the_first_release() -> None:
+    signals = run("duration=0.1").signals
+    for name, dimension in DIMENSIONS.items():
+        assert list(signals[name].values) == list(dimension.labels)
+    assert signals.pose.sel(coordinate="phi").dims == ("time",)
+
+
+# The table of signals.
+
+
+NEW = (
+    Signal("effort", Quantity("leg", ("N^2 m^2",) * 6), "squared torque", "controller"),
+    Signal("effort_sum", Quantity(None, ("N^2 m^2",)), "all of it", "controller", "effort_now"),
+)
+
+
+def test_a_new_signal_is_a_line_of_the_table_and_where_it_comes_from(tmp_path, monkeypatch) -> None:
+    """It is a port of controller and loop, in the record, the file and the CSV with its unit."""
+    before = run("duration=0.3").signals
+    for signal in NEW:
+        monkeypatch.setitem(SIGNALS, signal.name, signal)
+    monkeypatch.setitem(HELD, "effort", lambda memory: memory.torque**2)
+    monkeypatch.setitem(HELD, "effort_sum", lambda memory: [sum(memory.torque**2)])
+    loop = build_closed_loop(scenario("duration=0.3"))
+    assert loop.GetOutputPort("effort").size() == 6
+    assert loop.GetOutputPort("effort_now").size() == 1
+    result = run("duration=0.3")
+    squares = result.signals.torque_commanded.values**2
+    assert np.array_equal(result.signals.effort.values, squares) and squares.max() > 0
+    assert result.signals.effort_sum.dims == ("time",)
+    np.testing.assert_allclose(result.signals.effort_sum, squares.sum(axis=1), rtol=1e-12)
+    assert result.signals.effort_sum.attrs == {"units": "N^2 m^2", "long_name": "all of it"}
+    assert result.signals.drop_vars(["effort", "effort_sum"]).equals(before)
+    result.save(tmp_path)
+    saved = read_signals(tmp_path / "signals.nc")
+    assert saved.identical(result.signals)
+    header, first, *_ = signals_csv(saved).splitlines()
+    columns = header.split(",")
+    assert columns[-7:] == [*(f"effort_{leg}[N^2 m^2]" for leg in LEGS), "effort_sum[N^2 m^2]"]
+    assert first.split(",")[-1] == f"{squares[0].sum():.12g}"
+
+
+def test_every_signal_of_the_controller_has_a_value_and_no_other() -> None:
+    assert set(HELD) == {signal.name for signal in ports_of("controller").values()}
+    assert all(signal.size == (len(signal.labels) or 1) for signal in SIGNALS.values())
+
+
+def test_the_ports_are_those_of_the_table() -> None:
+    loop = build_closed_loop(scenario())
+    ports = {loop.get_output_port(n).get_name() for n in range(loop.num_output_ports())}
+    assert ports == set(exported_ports())
+    for signal in SIGNALS.values():
+        if signal.source:
+            port = loop.GetOutputPort(signal.exported)
+            assert len(range(port.size())[signal.part]) == signal.size
+
+
+# What it costs.
+
+
+def test_a_table_grows_without_being_copied() -> None:
+    """A row of 100 numbers takes 800 bytes and little more, also at the peak."""
+    tracemalloc.start()
+    table = Table(100)
+    for number in range(10_000):
+        table.append(np.full(99, float(number)), 1.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1.2 * 8e6
+    assert len(table) == 10_000 and table.columns(slice(0, 2)).shape == (10_000, 2)
+    np.testing.assert_array_equal(table.column(0), np.arange(10_000.0))
+    assert table.columns(slice(0, 3)).flags.c_contiguous
+
+
+def test_an_empty_table_has_its_columns() -> None:
+    assert len(Table(5)) == 0 and Table(5).columns(slice(1, 4)).shape == (0, 3)

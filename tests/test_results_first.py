@@ -1,0 +1,117 @@
+"""Results are on disk before anything is drawn; after that, only pictures or text can be lost."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from stewart_drake.cli import main
+from stewart_drake.commands import run as run_command
+from stewart_drake.report import (
+    figures,
+    hautus_page,
+    mechanism_figures,
+    replay,
+    report_page,
+)
+from stewart_drake.studies.compare import CONTROLLERS
+
+EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.3", "--set", "delay.steps=1")
+COMMAND = (sys.executable, "-c", "import sys; from stewart_drake.cli import main; sys.exit(main())")
+
+
+def broken(folder: Path) -> Callable[..., None]:
+    """Stands for whatever draws; the results must be there before it is called."""
+
+    def draw(*_: object, **__: object) -> None:
+        assert (folder / "summary.json").exists()
+        raise ZeroDivisionError("no ink\nleft")
+
+    return draw
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "module", "name", "kept"),
+    [
+        (("simulate", *EXACT), figures, "draw_run", {"signals.nc"}),
+        (("simulate", *EXACT, "--replay"), replay, "replay_html", {"signals.nc", "states.png"}),
+        (("compare", *EXACT), figures, "draw_comparison", {f"{name}.nc" for name in CONTROLLERS}),
+        (("analyze", "hautus"), hautus_page, "hautus_page", set()),
+        (("model", "check", "paper"), mechanism_figures, "mechanism_figure", set()),
+    ],
+)
+def test_a_failure_while_drawing_costs_the_figures_only(
+    arguments, module, name, kept, tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.setattr(module, name, broken(tmp_path))
+    assert main([*arguments, "--quiet", "--out", str(tmp_path)]) == 0
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1
+    assert err.startswith("warning: ") and "ZeroDivisionError: no ink left" in err
+    assert names(tmp_path) >= {"summary.json"} | kept
+    assert json.loads((tmp_path / "summary.json").read_text())
+
+
+def test_a_report_that_cannot_be_drawn_leaves_its_numbers(tmp_path, monkeypatch, capsys) -> None:
+    found = type("Found", (), {"run": None, "analyses": {}, "comparison": {}})()
+    monkeypatch.setattr("stewart_drake.report.collect.collect", lambda *_: found)
+    monkeypatch.setattr(report_page, "report_summary", lambda _: {"all": 1})
+    monkeypatch.setattr(report_page, "report_page", broken(tmp_path))
+    assert main(["report", "--quiet", "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().err.startswith("warning: report.html could not be drawn")
+    assert names(tmp_path) == {"summary.json"}
+
+
+def test_figures_of_an_earlier_run_do_not_stay_beside_new_results(tmp_path, monkeypatch) -> None:
+    arguments = ["simulate", *EXACT, "--quiet", "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    drawn = {name for name in names(tmp_path) if name.endswith((".png", ".svg"))}
+    assert len(drawn) == 8 and drawn <= set(run_command._pictures(run_command.RUN_FIGURES))
+    monkeypatch.setattr(figures, "draw_run", broken(tmp_path))
+    assert main(arguments) == 0
+    assert names(tmp_path) == {"summary.json", "signals.nc"}
+
+
+def test_all_figures_of_a_comparison_are_known_to_be_removed() -> None:
+    controllers = {name for name in run_command.COMPARISON_FIGURES if name.startswith("torques_")}
+    assert controllers == {f"torques_{name}" for name in figures.TORQUE_CONTROLLERS}
+
+
+def start(folder: Path, redirection: str = "", **environment: str) -> subprocess.CompletedProcess:
+    """`simulate` from a shell."""
+    arguments = " ".join(("simulate", *EXACT, "--out", str(folder)))
+    line = f'"$0" -c "$1" {arguments} {redirection}'
+    return subprocess.run(
+        ["bash", "-o", "pipefail", "-c", line, COMMAND[0], COMMAND[2]],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environment},
+        timeout=120,
+    )
+
+
+def test_figures_do_not_depend_on_the_backend_of_the_surroundings(tmp_path) -> None:
+    usual = start(tmp_path / "usual", MPLBACKEND="Agg")
+    other = start(tmp_path / "other", MPLBACKEND="nonsense")
+    assert usual.returncode == other.returncode == 0 and other.stderr == ""
+    assert names(tmp_path / "usual") == names(tmp_path / "other")
+    for name in ("states.png", "torques.svg"):
+        one, two = ((tmp_path / folder / name).read_bytes() for folder in ("usual", "other"))
+        assert one == two
+
+
+@pytest.mark.parametrize("redirection", ["2>&-", ">&-", "<&- >&- 2>&-", "| true"])
+def test_a_closed_stream_costs_its_text_only(redirection: str, tmp_path) -> None:
+    done = start(tmp_path / "out", redirection)
+    assert done.returncode == 0 and "Traceback" not in done.stderr
+    assert names(tmp_path / "out") >= {"summary.json", "signals.nc", "states.png"}
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["status"] == "completed"
+    assert ("E_ac" in done.stdout) == (redirection == "2>&-")

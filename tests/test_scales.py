@@ -1,0 +1,198 @@
+"""A machine of another size and mass, with everything in proportion, is controlled alike.
+
+With lengths times s, masses times m and times as they are, inertias and torques go with m s^2 and
+the equations of motion stay what they were. Any number with a unit in the law would show.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+
+from stewart_drake import experiment as experiment_module
+from stewart_drake.design.riccati import full_gain, lqr
+from stewart_drake.design.startup import machine_torque
+from stewart_drake.experiment import control_law, prepare
+from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import Body, Link, Mechanism
+from stewart_drake.plant.dynamics import StewartDynamics
+from stewart_drake.resources import data_root
+from stewart_drake.results import SimulationResult
+from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.simulation import simulate
+from tests.mechanisms import PAPER
+from tests.oracles import relative
+from tests.test_riccati import STEPS, UNIT, delayed
+
+Array = NDArray[np.float64]
+
+SIZES = [(0.1, 1e-3), (0.01, 1e-6), (10.0, 1e3), (1.0, 100.0)]
+"""Factors of length and mass; the second makes a crank of 1.1 mm and a plate of 4 mg."""
+ON = ("start=on_reference", "queue=reference")
+
+
+def scaled(s: float, m: float) -> Mechanism:
+    def body(b: Body) -> Body:
+        return Body(m * b.mass, m * s**2 * b.inertia)
+
+    def link(b: Link) -> Link:
+        return Link(m * b.mass, m * s**2 * b.inertia, b.center)
+
+    return dataclasses.replace(
+        PAPER,
+        home=PAPER.home * np.repeat([1, s], 3),
+        p_WS=s * PAPER.p_WS,
+        p_PQ=s * PAPER.p_PQ,
+        crank_lengths=s * PAPER.crank_lengths,
+        rod_lengths=s * PAPER.rod_lengths,
+        base=body(PAPER.base),
+        plate=body(PAPER.plate),
+        crank=link(PAPER.crank),
+        rod=link(PAPER.rod),
+        effort_limit=None,
+    )
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, s: float, m: float, *settings: str
+) -> tuple[SimulationResult, Array]:
+    """On the exact plant; and the torques in units of m s^2."""
+    sc = load_scenario("paper", None, ("plant.kind=exact", *settings))
+    for field in {"amplitude", "offset"} & set(vars(sc.reference)):  # a hold has one of them
+        values = np.array(getattr(sc.reference, field)) * np.repeat([1, s], 3)
+        setattr(sc.reference, field, values.tolist())
+    if sc.actuator.torque_limit is not None:
+        sc.actuator.torque_limit *= m * s**2
+    sc.plant.torque_bias = [m * s**2 * bias for bias in sc.plant.torque_bias]
+    mechanism = scaled(s, m)
+    monkeypatch.setattr(experiment_module, "load_mechanism", lambda _: mechanism)
+    if sc.plant.gravity:  # goes with lengths too, as times stay
+
+        def dynamics(machine: Mechanism, gravity: float, *more: Array) -> StewartDynamics:
+            return StewartDynamics(machine, 9.81 * s * gravity, *more)
+
+        monkeypatch.setattr(experiment_module, "StewartDynamics", dynamics)
+        monkeypatch.setattr("stewart_drake.diagram.StewartDynamics", dynamics)
+    result = simulate(sc)
+    return result, result.signals.torque_commanded.values / (m * s**2)
+
+
+CASES = {
+    "from rest": ("duration=3",),
+    "on the reference": (*ON, "duration=4"),
+    "torque bias": (*ON, "duration=4", "plant.torque_bias=[3e-4, -3e-4, 3e-4, -3e-4, 3e-4, -3e-4]"),
+    "torque limit": ("duration=3", "actuator.torque_limit=0.4"),
+    "gravity": (*ON, "duration=2", "plant.gravity=true", "delay.steps=2", "controller.period=0.02"),
+    "hold": (
+        "reference.kind=hold",
+        "duration=4",
+        "plant.torque_bias=[1e-5, 0, 0, 0, 0, 0]",
+        "delay.steps=2",
+    ),
+    "yaw alone": (*ON, "reference.amplitude=[0, 0, 0.2, 0, 0, 0]", "duration=3"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(("s", "m"), SIZES)
+def test_a_scaled_machine_moves_alike(
+    case: str, s: float, m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To six digits of the torques: the integrator's own tolerance is all that is not in scale."""
+    one, torques = run(monkeypatch, 1.0, 1.0, *CASES[case])
+    other, also = run(monkeypatch, s, m, *CASES[case])
+    assert one.status == other.status == "completed"
+    assert other.summary["counts"]["riccati_failures"] == 0
+    assert other.summary["counts"] == one.summary["counts"]
+    assert np.abs(also - torques).max() < 1e-5 * np.abs(torques).max()
+    errors = (r.signals.error.values / np.repeat([1, z], 3) for r, z in ((one, 1.0), (other, s)))
+    error, scaled_error = errors
+    assert np.abs(scaled_error - error).max() < 1e-5 * np.abs(error).max() + 1e-12
+
+
+@pytest.mark.parametrize(("s", "m"), SIZES)
+def test_the_machines_torque_is_in_proportion(s: float, m: float) -> None:
+    """And it is what inverse dynamics asks for: 2 cranks per s^2 along the axis that takes most."""
+    expected = machine_torque(StewartDynamics(PAPER, False))
+    found = machine_torque(StewartDynamics(scaled(s, m), True))
+    assert found == pytest.approx(m * s**2 * expected, rel=1e-9)
+    plant = StewartDynamics(PAPER, False)
+    pushes = 2 * np.diag(np.repeat([1.0, 0.11], 3))
+    torques = [plant.inverse_dynamics(PAPER.home, np.zeros(6), push) for push in pushes]
+    assert expected == pytest.approx(np.abs(torques).max(), rel=1e-9)
+
+
+def test_a_file_may_describe_a_machine_of_a_few_millimetres(tmp_path: Path) -> None:
+    s, m = 0.01, 1e-6
+    yaml = YAML(typ="safe")
+    data = yaml.load((data_root() / "models" / "paper.yaml").read_text())
+    data["home"] = [*data["home"][:3], *(s * v for v in data["home"][3:])]
+    for name in ("base_radius", "plate_radius", "shaft_height"):
+        data["pattern"][name] *= s
+    for name in ("base", "plate", "crank", "rod"):
+        part = data[name]
+        part["mass"] *= m
+        part["inertia"] = [m * s**2 * moment for moment in part["inertia"]]
+        if "length" in part:
+            part["length"] *= s
+    data["motor"]["effort_limit"] *= m * s**2
+    path = tmp_path / "small.yaml"
+    with path.open("w") as file:
+        yaml.dump(data, file)
+    assert relative(load_mechanism(path).p_WS, scaled(s, m).p_WS) < 1e-12
+    settings = ("plant.kind=exact", "duration=2", *ON)
+    sc = load_scenario("paper", None, (f"mechanism={path}", *settings))
+    one = simulate(load_scenario("paper", None, settings))
+    for field in ("amplitude", "offset"):
+        values = np.array(getattr(sc.reference, field)) * np.repeat([1, s], 3)
+        setattr(sc.reference, field, values.tolist())
+    result = simulate(sc)
+    assert result.status == "completed"
+    assert result.summary["counts"]["riccati_failures"] == 0
+    # A_i is 2 amplitudes, but for rounding in the file all is the same.
+    assert result.accumulated_error == pytest.approx(one.accumulated_error, rel=1e-6)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.5])
+@pytest.mark.parametrize("steps", STEPS[:4])
+@pytest.mark.parametrize("name", ["paper", "gravity"])
+def test_units_change_no_gain(name: str, steps: int, fraction: float) -> None:
+    """Metres or millimetres, N m or mN m: the gain in one unit follows from that in the other."""
+    model, (Q, R) = delayed(name, steps, fraction), UNIT
+    K, P = full_gain(model, Q, R)
+    x, y = np.tile(np.repeat([1.0, 1e3], 3), 3), np.tile(np.repeat([1.0, 1e3], 3), 2)
+    u = 1e6
+    other = dataclasses.replace(
+        model,
+        A=model.A * x[:, None] / x,
+        B_old=model.B_old * x[:, None] / u,
+        B_new=model.B_new * x[:, None] / u,
+        C=model.C * y[:, None] / x,
+    )
+    found, cost = full_gain(other, Q / np.outer(y, y), R / u**2)
+    chain = np.concatenate([x, np.full(6 * model.queue_length, u)])
+    assert relative(found * chain / u, K) < 1e-8
+    assert relative(cost * np.outer(chain, chain), P) < 1e-8
+
+
+def test_the_gain_of_scaled_states_is_drakes_own() -> None:
+    """Where the units are sensible already, nothing but rounding comes of the scaling."""
+    for name in ("paper", "gravity"):
+        model, (Q, R) = delayed(name, 0, 0.0), UNIT
+        K, P = lqr(model.A, model.B_new, model.C.T @ Q @ model.C, R)
+        found, cost = full_gain(model, Q, R)
+        assert relative(found, K) < 1e-9
+        assert relative(cost, P) < 1e-9
+
+
+def test_what_the_law_believes_of_the_paper_is_in_its_order_of_magnitude() -> None:
+    """The torque of the reference is 0.013 N m, of the catch-up 0.66."""
+    law, _, _ = control_law(prepare(load_scenario("paper")))
+    machine = machine_torque(law.plant.dynamics)
+    assert 0.03 < machine < 0.1
+    assert isinstance(law.observer, ParameterObserver)
+    assert law.plant.gentle_torque == pytest.approx(3 * machine)

@@ -1,0 +1,329 @@
+"""Sensors that lie: noticed, counted by cause, replaced by the model; and no false alarms."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import stewart_drake.diagram as diagram_module
+from stewart_drake.config import Scenario
+from stewart_drake.design.filter_settings import FilterSettings
+from stewart_drake.diagram import build_closed_loop
+from stewart_drake.errors import ConfigError
+from stewart_drake.law.memory import Counts
+from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.parameter_filter import PATIENCE
+from stewart_drake.law.sensing import StateSensing
+from stewart_drake.results import SimulationResult
+from stewart_drake.scenario_loading import load_scenario, scenario_to_dict, scenario_yaml
+from stewart_drake.simulation import simulate
+from stewart_drake.systems.sensor import Sensor
+from stewart_drake.yamlio import parse_yaml
+from tests.mechanisms import PAPER
+from tests.test_control_law import HOME, Loop, law_of, nominal_queue, sine, step
+
+Array = NDArray[np.float64]
+
+CONTROLLERS = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
+SHIPPED = ("paper", "gravity", "desktop", "motion_base")
+COUNT = {
+    "frozen": "measurements_frozen",
+    "missing": "measurements_missing",
+    "spike": "measurements_rejected",
+}
+AMPLITUDES = [0.2617993878] * 3 + [0.02, 0.02, 0.08]
+NOISE = f"sensor.noise_std={[1e-3 * a for a in AMPLITUDES * 2]}"
+"""A thousandth of the motion, and that per s."""
+
+
+def on_reference(*settings: str, controller: str | None = None) -> Scenario:
+    """The paper's experiment on the exact plant, from its reference on."""
+    mine = ("plant.kind=exact", "start=on_reference", "queue=reference")
+    return load_scenario("paper", controller, (*mine, *settings))
+
+
+def fault(kind: str, start: float = 4.0, end: float = 5.0, **more: Any) -> str:
+    inside = "".join(f", {name}: {value}" for name, value in more.items())
+    return f"sensor.faults=[{{kind: {kind}, from: {start}, to: {end}{inside}}}]"
+
+
+def bad(run: SimulationResult) -> dict[str, int]:
+    """The measurements that were not used, by cause."""
+    counts = run.summary["counts"]
+    found = {name: counts[name] for name in COUNT.values() if counts[name]}
+    assert counts["bad_measurements"] == sum(found.values())
+    return found
+
+
+@pytest.mark.parametrize(
+    ("estimator", "bound"), [("parameters", 0.0275), ("none", 0.0255)], ids=["filter", "alone"]
+)
+@pytest.mark.parametrize("kind", COUNT)
+def test_a_second_of_it_is_survived(kind: str, estimator: str, bound: float) -> None:
+    """E_ac 0.0271 with the filter (0.0260 undisturbed), 0.0254 without it (0.0254)."""
+    run = simulate(on_reference(f"controller.estimator={estimator}", fault(kind)))
+    assert run.status == "completed"
+    assert bad(run) == {COUNT[kind]: 10}
+    assert run.accumulated_error < bound
+
+
+@pytest.mark.parametrize("size", [0.01, 0.1, 1.0, 1e3])
+def test_spikes_of_all_sizes_are_told_from_motion(size: float) -> None:
+    """Also within reach, and ten in a row: they do not bear each other out."""
+    run = simulate(on_reference(fault("spike", size=size)))
+    assert run.status == "completed"
+    assert bad(run) == {"measurements_rejected": 10}
+    assert run.accumulated_error < 0.03
+
+
+@pytest.mark.parametrize("kind", COUNT)
+def test_the_same_under_noise(kind: str) -> None:
+    well, ill = (simulate(on_reference(NOISE, *more)) for more in ((), (fault(kind),)))
+    assert not bad(well)
+    assert ill.status == "completed"
+    assert bad(ill) == {COUNT[kind]: 10}
+    assert ill.accumulated_error < 1.1 * well.accumulated_error
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS[:4])
+def test_the_papers_controllers_count_them_too(controller: str) -> None:
+    """Without a delay, where they keep the plate."""
+    slow = ("delay.steps=0", "reference.amplitude=[0.02, 0.02, 0.02, 0.002, 0.002, 0.008]")
+    for kind in COUNT:
+        far = {"size": 1e3} if kind == "spike" else {}  # without a filter, out of reach only
+        run = simulate(on_reference(*slow, fault(kind, 2.0, 2.5, **far), controller=controller))
+        assert run.stopped is None or run.stopped.time > 2.5
+        assert bad(run) == {COUNT[kind]: 5}
+
+
+def test_a_sensor_that_froze_at_rest_is_found_by_the_filter() -> None:
+    """Then its pose and rates agree with each other, but not with the torques that act."""
+    sc = on_reference("start=rest", "queue=zero", fault("frozen", 0.0, 1.4))
+    run = simulate(sc)
+    assert run.status == "completed"
+    # Up to 0.8 s nothing acts; from 0.9 s to 1.3 s the plate moves.
+    assert bad(run) == {"measurements_frozen": 5}
+    assert run.accumulated_error < 21.2
+
+
+def test_one_stuck_value_is_enough() -> None:
+    law, reference = law_of("delay.steps=2", "controller.estimator=none"), sine(0.5)
+    first: list[Array] = []
+
+    def stuck(k: int, x: Array) -> Array:
+        first.append(x)
+        return np.where(np.arange(12) == 1, first[min(k, 3)], x)  # the pitch, from sample 3 on
+
+    loop = Loop(law, reference, queue=nominal_queue(law, reference)).run(10, stuck)
+    assert loop.memory.counts == Counts(measurements_frozen=6)
+
+
+@pytest.mark.parametrize("estimator", ["parameters", "none"])
+def test_a_sample_of_zeros_is_rejected_and_counted(
+    estimator: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Zero(Sensor):
+        def _measure(self, context: Any, output: Any) -> None:
+            super()._measure(context, output)
+            if round(context.get_time() / 0.1) == 20:
+                output.SetFromVector(np.zeros(12))
+
+    monkeypatch.setattr(diagram_module, "Sensor", Zero)
+    run = simulate(on_reference(f"controller.estimator={estimator}", "duration=4"))
+    assert run.status == "completed"
+    assert bad(run) == {"measurements_rejected": 1}
+    assert run.accumulated_error < 0.025
+
+
+def test_a_sensor_that_comes_back_is_believed_again() -> None:
+    """At once, and with it the plate: the outage was longer than the filter's patience."""
+    law, reference = law_of("delay.steps=2"), sine(0.5)
+    sent: list[Array] = []
+
+    def frozen(k: int, x: Array) -> Array:
+        sent.append(sent[-1] if 5 <= k < 5 + 4 * PATIENCE else x)
+        return sent[-1]
+
+    loop = Loop(law, reference, queue=nominal_queue(law, reference))
+    loop.run(5 + 4 * PATIENCE, frozen)
+    assert loop.memory.counts == Counts(measurements_frozen=4 * PATIENCE)
+    assert loop.memory.belief.estimate.unseen == 4 * PATIENCE
+    loop.run(1, frozen)
+    estimate = loop.memory.belief.estimate
+    assert estimate.unseen == estimate.outliers == 0
+    assert loop.memory.counts == Counts(measurements_frozen=4 * PATIENCE)
+    assert np.abs(loop.memory.belief.state - sent[-1]).max() < 1e-6
+
+
+def test_a_plate_that_was_put_elsewhere_is_believed_in_the_end() -> None:
+    """By hand, 1 mm away: outliers that follow from one another are no broken sensor."""
+    law, reference = law_of("delay.steps=2"), sine(0.3)
+    loop = Loop(law, reference, queue=nominal_queue(law, reference)).run(8)
+    loop.states[-1] = loop.states[-1] + 1e-3 * np.eye(12)[3]
+    loop.run(12)
+    assert loop.memory.counts == Counts(measurements_rejected=PATIENCE - 1)
+    assert np.abs(loop.states[-1][:6] - reference(2.0)[:6]).max() < 1e-3
+
+
+# No false alarms.
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("name", SHIPPED)
+def test_no_shipped_scenario_has_a_bad_measurement(name: str, controller: str) -> None:
+    """Also where the controller loses the plate, and where one that is not aware of the delay
+    wonders for 0.8 s why the plate does not move."""
+    settings = ("plant.kind=exact", "duration=3")
+    assert not bad(simulate(load_scenario(name, controller, settings)))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_nor_on_the_multibody_plant(name: str) -> None:
+    assert not bad(simulate(load_scenario(name, None, ("duration=1.5",))))
+
+
+@pytest.mark.parametrize("estimator", ["parameters", "none"])
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+def test_a_plate_at_rest_is_not_frozen(plant: str, estimator: str) -> None:
+    """Exactly the same pose and rates, sample for sample."""
+    settings = ("reference.kind=hold", "duration=2", f"plant.kind={plant}")
+    run = simulate(load_scenario("paper", None, (*settings, f"controller.estimator={estimator}")))
+    assert np.ptp(run.signals.pose.values[::5], axis=0).max() < 1e-12
+    assert not bad(run)
+
+
+@pytest.mark.parametrize("std", [1e-3, 1e-9, 1e-15, 1e-17])
+def test_noise_at_rest_is_not_frozen_unless_it_repeats(std: float) -> None:
+    """Noise that is lost in the last digit of a pose repeats, and is no noise."""
+    law = law_of("controller.estimator=none", "delay.steps=0")
+    sensing = dataclasses.replace(law.sensing, noise_std=std * np.eye(12)[5])
+    law = dataclasses.replace(law, sensing=sensing)
+    rng, preview = np.random.default_rng(0), np.tile(HOME, (len(law.preview_times), 1))
+    memory = law.initial_memory(np.zeros((0, 6)))
+    for _ in range(50):
+        y = HOME[:12] + law.sensing.noise_std * rng.standard_normal(12)
+        memory = step(law, memory, y, preview)
+    assert memory.counts.bad_measurements == 0
+    again = step(law, memory, y, preview)
+    assert again.counts.measurements_frozen == (std > 1e-12)
+
+
+# The sensor, and what scenarios say of it.
+
+
+def test_the_sensors_faults_by_hand() -> None:
+    motion = np.arange(1.0, 7.0)
+    faults = [
+        {"kind": "frozen", "from": 0.2, "to": 0.4},
+        {"kind": "missing", "from": 0.5, "to": 0.6},
+        {"kind": "spike", "from": 0.7, "to": 0.9, "size": 2.0},
+    ]
+    sensor = Sensor(np.zeros(12), 3, 0.1, faults, motion)
+    context = sensor.CreateDefaultContext()
+    seen = []
+    for k in range(10):
+        context.SetTime(0.1 * k * (1 - 1e-14))
+        sensor.get_input_port().FixValue(context, np.full(12, float(k)))
+        seen.append(np.array(sensor.get_output_port().Eval(context)))
+        values = sensor.EvalUniquePeriodicDiscreteUpdate(context)
+        context.SetDiscreteState(values)
+    for k in (0, 1, 4, 6, 9):
+        assert np.array_equal(seen[k], np.full(12, float(k)))
+    assert np.array_equal(seen[2], seen[1]) and np.array_equal(seen[3], seen[1])
+    assert np.isnan(seen[5]).all()
+    draws = [(seen[k] - k) / (2.0 * np.tile(motion, 2)) for k in (7, 8)]
+    assert not np.any(draws[0] == draws[1])
+    assert 0.5 < np.std(draws) < 1.5
+    assert Sensor(np.zeros(12), 0, 0.1).CreateDefaultContext().num_total_states() == 0
+
+
+def test_a_loop_with_a_frozen_sensor_can_be_run_twice() -> None:
+    sc = on_reference(fault("frozen", 0.5, 1.0), "duration=1.5")
+    loop = build_closed_loop(sc)
+    assert loop.GetSubsystemByName("sensor").num_discrete_state_groups() == 1
+    one, other = simulate(sc), simulate(sc)
+    assert np.array_equal(one.signals.pose, other.signals.pose)
+
+
+def test_faults_in_a_scenario_come_back_as_they_were_written() -> None:
+    given = [{"kind": "frozen", "from": 4.0, "to": 5.0}, {"kind": "spike", "from": 1.0, "to": 2.0}]
+    sc = load_scenario("paper")
+    assert sc.sensor.faults == []
+    sc.sensor.faults = given  # type: ignore[assignment]
+    sc.check()
+    assert scenario_to_dict(sc)["sensor"]["faults"] == given
+    assert parse_yaml(scenario_yaml(sc), "text")["sensor"]["faults"] == given
+    assert dataclasses.asdict(sc)["sensor"]["faults"] == given
+
+
+@pytest.mark.parametrize(
+    ("text", "where", "expected"),
+    [
+        ("{kind: frozen, from: 5, to: 4}", "[0].to: got 4 s", "more than from, 5 s"),
+        ("{kind: frozen, from: 5, to: 5}", "[0].to: got 5 s", "more than from, 5 s"),
+        ("{kind: gone, from: 1, to: 4}", "[0].kind: got 'gone'", "'frozen', 'missing' or 'spike'"),
+        ("{kind: frozen, from: 1, to: 4, leg: 3}", "[0].leg: got 3", "expected null"),
+        ("{kind: frozen, from: 1, to: 4, leg: 7}", "[0].leg: got 7", "of at most 6"),
+        ("{kind: frozen, frm: 1, to: 4}", "[0].frm: unknown key", "sensor.faults[0].from"),
+        ("{kind: frozen, to: 4}", "[0].from: is missing", ""),
+        ("{kind: frozen, from: -1, to: 4}", "[0].from: got -1", "of at least 0"),
+        ("{kind: frozen, from: 1, to: .nan}", "[0].to: got nan", "a finite number"),
+        ("{kind: missing, from: 1, to: 4, size: 3}", "[0].size: got 3.0", "with kind 'spike'"),
+        ("{kind: spike, from: 1, to: 4, size: 0}", "[0].size: got 0", "above 0"),
+        ("3", "[0]: got 3", "a mapping"),
+    ],
+)
+def test_faults_that_cannot_be_are_one_clear_line(text: str, where: str, expected: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_scenario("paper", None, (f"sensor.faults=[{text}]",))
+    assert f"sensor.faults{where}" in str(caught.value)
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+# What is a mistake in a program reaches its author.
+
+
+@pytest.mark.parametrize("wrong", ["errors", "torques", "noise", "parameters"])
+def test_a_wrong_shape_is_an_exception(wrong: str) -> None:
+    """It was a counted Riccati failure, or an outlier."""
+    law = law_of("delay.steps=2")
+    parts: dict[str, Any] = {
+        "errors": {"cost": dataclasses.replace(law.cost, errors=np.ones(5))},
+        "torques": {"cost": dataclasses.replace(law.cost, torques=np.ones(5))},
+        "noise": {"sensing": StateSensing(np.zeros(11), np.ones(6))},
+        "parameters": {"observer": ParameterObserver(seven(law.observer))},
+    }
+    law.warm_up()
+    with pytest.raises(ValueError):
+        dataclasses.replace(law, **parts[wrong]).warm_up()
+
+
+def seven(observer: Any) -> FilterSettings:
+    """Without the last parameter of the equations of motion."""
+    known = observer.settings.parameters
+    fewer = {f.name: getattr(known, f.name)[:7] for f in dataclasses.fields(known)}
+    return dataclasses.replace(observer.settings, parameters=dataclasses.replace(known, **fewer))
+
+
+def test_a_measurement_of_a_wrong_shape_is_an_exception() -> None:
+    law = law_of("delay.steps=2")
+    memory = law.initial_memory(np.zeros((2, 6)))
+    preview = np.tile(HOME, (len(law.preview_times), 1))
+    with pytest.raises(ValueError):
+        step(law, memory, np.append(PAPER.home, np.zeros(5)), preview)
+
+
+def test_the_causes_are_counted_apart() -> None:
+    assert Counts().plus("unreachable", None, "measurements_frozen") == Counts(
+        unreachable=1, measurements_frozen=1
+    )
+    counts = Counts(1, 2, 3, 4, 5, 6, 7)
+    assert counts.bad_measurements == counts.summary()["bad_measurements"] == 15
+    assert list(simulate(on_reference("duration=0.1")).summary["counts"]) == [
+        *Counts._fields,
+        "bad_measurements",
+        "tuner_fallbacks",
+    ]

@@ -1,0 +1,107 @@
+"""Runs in several threads of one process give, bit for bit, what each gives alone."""
+
+import dataclasses
+import itertools
+import threading
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import xarray as xr
+from threadpoolctl import OpenBLASController, threadpool_info, threadpool_limits
+
+import stewart_drake as sd
+from stewart_drake import simulation
+from stewart_drake.experiment import Experiment
+from stewart_drake.plant.compiled import Compiled
+from stewart_drake.plant.functions import compiled_functions
+from tests.mechanisms import PAPER
+
+ON_REFERENCE = ("start=on_reference", "queue=reference")
+
+
+def variants(duration: float) -> Iterable[tuple[str, ...]]:
+    """Both plants, delays of whole periods and parts, with and without noise, four gains."""
+    delays = (("delay.steps=2",), ("delay.steps=1", "delay.fraction=0.5"))
+    noises = ((), ("sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,0,0,0,0,0,0]",))
+    plants = (("plant.kind=exact",), ("plant.kind=multibody",))
+    # The plants turn over first: neighbours, which run at the same time, are as unlike as can be.
+    for w_R, delay, noise, plant in itertools.product(range(1, 6), delays, noises, plants):
+        own = (f"duration={duration}", f"controller.w_R={w_R}", f"sensor.seed={w_R}")
+        yield (*plant, *delay, *noise, *own, *ON_REFERENCE)
+
+
+def run(settings: tuple[str, ...]) -> xr.Dataset:
+    return sd.simulate(sd.load_scenario("paper", settings=settings)).signals
+
+
+def differing(settings: list[tuple[str, ...]], threads: int) -> list[tuple[str, ...]]:
+    """Of the runs, those whose signals are not the same in threads as alone."""
+    compiled_functions.cache_clear()  # so that the threads also compile at the same time
+    with ThreadPoolExecutor(threads) as pool:
+        together = list(pool.map(run, settings))
+    alone = [run(one) for one in settings]
+    pairs = zip(settings, alone, together, strict=True)
+    return [one for one, a, b in pairs if not a.identical(b)]
+
+
+def test_runs_in_threads_are_those_alone() -> None:
+    assert differing(list(itertools.islice(variants(0.4), 6)), threads=3) == []
+
+
+@pytest.mark.soak
+def test_forty_runs_in_eight_threads_are_those_alone() -> None:
+    settings = list(variants(1.0))
+    assert len(settings) == 40
+    assert differing(settings, threads=8) == []
+
+
+def blas_threads() -> set[int]:
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+def test_linear_algebra_stays_on_one_thread_until_the_last_run_ends(monkeypatch) -> None:
+    """Of two runs that overlap, neither the first to begin nor the first to end decides alone."""
+    begun, both = threading.Event(), threading.Event()
+    seen = []
+
+    def run(experiment: Experiment, *_: object) -> None:
+        seen.append(blas_threads())
+        if experiment.scenario.duration == 1.0:
+            begun.set()
+            assert both.wait(10)
+        else:
+            both.set()
+            first.result(10)  # it has ended meanwhile
+            seen.append(blas_threads())
+
+    monkeypatch.setattr(simulation, "_run", run)
+    with ThreadPoolExecutor(2) as pool:
+        pool.submit(set_blas_threads, 2).result(10)
+        assert blas_threads() == {2}
+        first = pool.submit(simulation.simulate, sd.Scenario(duration=1.0), margin=False)
+        assert begun.wait(10)
+        pool.submit(simulation.simulate, sd.Scenario(duration=2.0), margin=False).result(10)
+        assert seen == [{1}] * 3
+        assert blas_threads() == {2}
+
+
+def set_blas_threads(number: int) -> None:
+    threadpool_limits(number, user_api="blas")
+    OpenBLASController.clear_controlling_thread()
+
+
+def test_a_mechanism_is_compiled_by_one_thread_for_all() -> None:
+    """The threads meet where nothing is compiled yet, and all get the one function."""
+    longer = dataclasses.replace(PAPER, rod_lengths=PAPER.rod_lengths + 1e-5)
+    meeting = threading.Barrier(4)
+
+    functions = compiled_functions(longer)
+
+    def compiled(_: int) -> tuple[Compiled, Compiled]:
+        meeting.wait(10)
+        return functions.many_steps(3), functions.accelerations
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(compiled, range(4)))
+    assert all(one == found[0] for one in found)
