@@ -115,7 +115,7 @@ def comparison_table(results: Mapping[str, SimulationResult]) -> str:
         lines.append(
             f"{label(name):<16.16}{paper_error(name) if papers else '':>5}{outcome}"
             + "".join(f"{number(value, 2):>7}" for value in torques)
-            + f"{number(s['controller_step_ms']['median'], 2):>5}"
+            + f"{number(round(s['controller_step_ms']['median'], 2), 2):>5}"
         )
     lines += [_NOTE, wrap(loops_sentence(results)), *warning_lines(shared_warnings(results))]
     return "\n".join(lines)
