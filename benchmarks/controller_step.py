@@ -20,12 +20,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 import stewart_drake as sd
+from stewart_drake.files.versions import versions
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
 from stewart_drake.law.observers import NoObserver, ParameterObserver
 from stewart_drake.law.predictors import NonlinearPredictor
-from stewart_drake.versions import versions
 
 RESULTS = Path(__file__).parent / "results"
 RUNS = 6

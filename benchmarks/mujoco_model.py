@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 import stewart_drake as sd
+from stewart_drake.dynamics.equations import STANDARD_GRAVITY
 from stewart_drake.mechanism.assembly import assemble, joint_state
 from stewart_drake.mechanism.geometry import Body, Mechanism
-from stewart_drake.plant.equations import STANDARD_GRAVITY
-from stewart_drake.signals import LEGS, POSE, RATES
+from stewart_drake.scenario.signals import LEGS, POSE, RATES
 
 Array = NDArray[np.float64]
 Torque = Callable[[float], Array]

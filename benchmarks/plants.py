@@ -25,11 +25,11 @@ from pydrake.systems.primitives import Sine
 from scipy.integrate import solve_ivp
 
 import stewart_drake as sd
-from stewart_drake.multibody_stewart import MultibodyStewart
-from stewart_drake.plant.exact import ExactPlant
+from stewart_drake.files.versions import versions
+from stewart_drake.loop.exact import ExactPlant
+from stewart_drake.loop.multibody_stewart import MultibodyStewart
 from stewart_drake.report.style import figure_style, write_figure
-from stewart_drake.signals import POSE, RATES
-from stewart_drake.versions import versions
+from stewart_drake.scenario.signals import POSE, RATES
 
 Array = NDArray[np.float64]
 

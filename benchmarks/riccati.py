@@ -18,11 +18,11 @@ from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from scipy.linalg import solve_discrete_are
 
 import stewart_drake as sd
-from stewart_drake.design.delay_model import ChainModel, DelayedModel, chain, delayed_model
-from stewart_drake.design.error_model import double_integrators
-from stewart_drake.design.riccati import augmented_gain, full_gain, reduced_gain
+from stewart_drake.files.versions import versions
+from stewart_drake.law.delay_model import ChainModel, DelayedModel, chain, delayed_model
+from stewart_drake.law.error_model import double_integrators
+from stewart_drake.law.riccati import augmented_gain, full_gain, reduced_gain
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.versions import versions
 
 Array = NDArray[np.float64]
 

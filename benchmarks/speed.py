@@ -19,13 +19,13 @@ from plants import reference as plant_reference
 from riccati import comparison
 
 import stewart_drake as sd
+from stewart_drake.files.versions import versions
+from stewart_drake.loop.exact import ExactPlant
+from stewart_drake.loop.multibody_stewart import MultibodyStewart
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.multibody_stewart import MultibodyStewart
-from stewart_drake.plant.exact import ExactPlant
-from stewart_drake.signals import POSE
-from stewart_drake.studies.dataset import sample_run
+from stewart_drake.scenario.signals import POSE
 from stewart_drake.studies.jobs import run_jobs
-from stewart_drake.versions import versions
+from stewart_drake.tuning.dataset import sample_run
 
 Rows = list[list[str]]
 

@@ -16,9 +16,9 @@ import numpy as np
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
-from stewart_drake.results import SimulationResult
-from stewart_drake.signals import PARAMETERS
-from stewart_drake.versions import versions
+from stewart_drake.files.versions import versions
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.scenario.signals import PARAMETERS
 
 RESULTS = Path(__file__).parent / "results"
 EXACT = "plant.kind=exact"

@@ -18,16 +18,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 import stewart_drake as sd
+from stewart_drake.files.versions import versions
 from stewart_drake.report.tables import number
 from stewart_drake.report.terminal import count_bar
-from stewart_drake.scenario_loading import scenario_to_dict
-from stewart_drake.studies.dataset import make_dataset
+from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.disturbances import disturbed, draw, with_gain
-from stewart_drake.studies.evaluation import TUNER, Evaluation, evaluate, evaluation_run
 from stewart_drake.studies.jobs import run_jobs
-from stewart_drake.studies.training import Training, train
 from stewart_drake.tuner.network import save_network
-from stewart_drake.versions import versions
+from stewart_drake.tuning.dataset import make_dataset
+from stewart_drake.tuning.evaluation import TUNER, Evaluation, evaluate, evaluation_run
+from stewart_drake.tuning.training import Training, train
 
 RESULTS = Path(__file__).parent / "results"
 WORKERS = 2

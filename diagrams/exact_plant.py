@@ -8,9 +8,9 @@ import sys
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
 import stewart_drake as sd
-from stewart_drake.plant.exact import ExactPlant
-from stewart_drake.plant.workspace import diagnose
-from stewart_drake.signals import POSE
+from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.loop.exact import ExactPlant
+from stewart_drake.scenario.signals import POSE
 
 
 def main(scheme: str = "runge_kutta5") -> None:

@@ -11,8 +11,8 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 import stewart_drake as sd
-from stewart_drake.signals import POSE
-from stewart_drake.timing import look_time
+from stewart_drake.scenario.signals import POSE
+from stewart_drake.scenario.timing import look_time
 
 
 def main(settings: list[str]) -> None:

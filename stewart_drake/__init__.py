@@ -5,16 +5,18 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     __version__: str
-    from stewart_drake.config import ControllerConfig, PlantConfig, Scenario
-    from stewart_drake.diagram import build_closed_loop
-    from stewart_drake.errors import ConfigError
-    from stewart_drake.law_design import DesignedLaw, design_law
+    from stewart_drake.dynamics.stewart import StewartDynamics
+    from stewart_drake.files.errors import ConfigError
+    from stewart_drake.loop.diagram import build_closed_loop
+    from stewart_drake.loop.exact import ExactPlant, set_accuracy
+    from stewart_drake.loop.law_design import DesignedLaw, design_law
+    from stewart_drake.loop.platforms import AddStewartPlatform, StewartPlatform
+    from stewart_drake.loop.results import SimulationResult
+    from stewart_drake.loop.simulation import simulate
+    from stewart_drake.loop.state_space import linear_models
     from stewart_drake.mechanism.files import load_mechanism
     from stewart_drake.mechanism.geometry import Mechanism
     from stewart_drake.mechanism.kinematics import ForwardKinematicsError, UnreachablePoseError
-    from stewart_drake.plant.dynamics import StewartDynamics
-    from stewart_drake.plant.exact import ExactPlant, set_accuracy
-    from stewart_drake.platforms import AddStewartPlatform, StewartPlatform
     from stewart_drake.report.api import (
         Answer,
         analyze_delay,
@@ -25,42 +27,40 @@ if TYPE_CHECKING:
         replay,
         table,
     )
-    from stewart_drake.results import SimulationResult
-    from stewart_drake.scenario_loading import load_scenario
-    from stewart_drake.simulation import simulate
-    from stewart_drake.state_space import linear_models
+    from stewart_drake.scenario.config import ControllerConfig, PlantConfig, Scenario
+    from stewart_drake.scenario.loading import load_scenario
     from stewart_drake.studies.compare import compare
 
 # Names are imported when first asked for, so that the command answers --help without Drake.
 _MODULES = {
-    "AddStewartPlatform": "platforms",
+    "AddStewartPlatform": "loop.platforms",
     "Answer": "report.api",
-    "ConfigError": "errors",
-    "ControllerConfig": "config",
-    "DesignedLaw": "law_design",
-    "ExactPlant": "plant.exact",
+    "ConfigError": "files.errors",
+    "ControllerConfig": "scenario.config",
+    "DesignedLaw": "loop.law_design",
+    "ExactPlant": "loop.exact",
     "ForwardKinematicsError": "mechanism.kinematics",
     "Mechanism": "mechanism.geometry",
-    "PlantConfig": "config",
-    "Scenario": "config",
-    "SimulationResult": "results",
-    "StewartDynamics": "plant.dynamics",
-    "StewartPlatform": "platforms",
+    "PlantConfig": "scenario.config",
+    "Scenario": "scenario.config",
+    "SimulationResult": "loop.results",
+    "StewartDynamics": "dynamics.stewart",
+    "StewartPlatform": "loop.platforms",
     "UnreachablePoseError": "mechanism.kinematics",
     "analyze_delay": "report.api",
     "analyze_hautus": "report.api",
     "analyze_robustness": "report.api",
     "analyze_workspace": "report.api",
-    "build_closed_loop": "diagram",
+    "build_closed_loop": "loop.diagram",
     "compare": "studies.compare",
-    "design_law": "law_design",
-    "linear_models": "state_space",
+    "design_law": "loop.law_design",
+    "linear_models": "loop.state_space",
     "load_mechanism": "mechanism.files",
-    "load_scenario": "scenario_loading",
+    "load_scenario": "scenario.loading",
     "plot": "report.api",
     "replay": "report.api",
-    "set_accuracy": "plant.exact",
-    "simulate": "simulation",
+    "set_accuracy": "loop.exact",
+    "simulate": "loop.simulation",
     "table": "report.api",
 }
 

@@ -17,7 +17,7 @@ import pytest
 from typing_extensions import is_typeddict
 
 from stewart_drake.cli import main
-from stewart_drake.errors import ConfigError
+from stewart_drake.files.errors import ConfigError
 
 Loader = Callable[[Path], Any]
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.errors import ConfigError
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, leg_geometry

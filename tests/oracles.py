@@ -40,7 +40,7 @@ from scipy.integrate import solve_ivp
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, leg_geometry
 from stewart_drake.mechanism.sdformat import to_sdformat
-from stewart_drake.signals import ANGLES, BIAS, DAMPING, LEGS, PAYLOAD, POSITION
+from stewart_drake.scenario.signals import ANGLES, BIAS, DAMPING, LEGS, PAYLOAD, POSITION
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from scipy.optimize import brentq
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.experiment import prepare
-from stewart_drake.plant.workspace import standing
-from stewart_drake.reference_config import HoldConfig, SineConfig, WaypointsConfig
-from stewart_drake.resources import resolve
+from stewart_drake.dynamics.workspace import standing
+from stewart_drake.files.resources import resolve
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.scenario.reference_config import HoldConfig, SineConfig, WaypointsConfig
 from stewart_drake.studies import delay_limits, delay_map, hautus
 from stewart_drake.studies.delay_loop import loop_margins
 from stewart_drake.studies.delay_map import Cell, map_delays, run_cell, scaled_motion

@@ -13,7 +13,7 @@ from pydrake.systems.framework import LeafSystem
 from pydrake.trajectories import FunctionHandleTrajectory
 
 import stewart_drake as sd
-from stewart_drake.jsonio import jsonable
+from stewart_drake.files.jsonio import jsonable
 from stewart_drake.report.api import Answer, Figures, Replay
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from stewart_drake.errors import ConfigError
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import data_root
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.reference_config import CsvConfig, WaypointsConfig
-from stewart_drake.reference_files import read_csv, read_waypoints
-from stewart_drake.resources import data_root
-from stewart_drake.scenario_loading import load_controller, load_scenario
-from stewart_drake.trajectories import make_reference
+from stewart_drake.scenario.loading import load_controller, load_scenario
+from stewart_drake.scenario.reference_config import CsvConfig, WaypointsConfig
+from stewart_drake.scenario.reference_files import read_csv, read_waypoints
+from stewart_drake.scenario.trajectories import make_reference
 from stewart_drake.tuner.network import load_network, save_network
 from tests.faults import Loader, complaint, refusal, tree, written
 from tests.test_cli import command

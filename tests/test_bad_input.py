@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from stewart_drake.config import ControllerConfig, Scenario
+from stewart_drake.files.resources import data_root
 from stewart_drake.mechanism.files import LegSpec, MechanismSpec, load_mechanism
-from stewart_drake.resources import data_root
-from stewart_drake.scenario_loading import load_controller
+from stewart_drake.scenario.config import ControllerConfig, Scenario
+from stewart_drake.scenario.loading import load_controller
 from stewart_drake.tuner.network import _File as NetworkFile
 from stewart_drake.tuner.network import load_network, save_network
 from tests.faults import (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import stewart_drake as sd
-from stewart_drake.errors import ConfigError
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.geometry import Mechanism
 from tests.mechanisms import PAPER
 

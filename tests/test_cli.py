@@ -15,12 +15,12 @@ import pytest
 import xarray as xr
 
 from stewart_drake.cli import main
-from stewart_drake.experiment import assemble, prepare
+from stewart_drake.files.resources import KINDS, shipped
+from stewart_drake.loop.experiment import assemble, prepare
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
-from stewart_drake.resources import KINDS, shipped
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.simulation import simulate
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 
 EXACT = ("--set", "plant.kind=exact")
@@ -52,7 +52,7 @@ def test_a_scenario_is_prepared_once(tmp_path, monkeypatch) -> None:
         prepared.append(scenario)
         return assemble(scenario, *more)
 
-    monkeypatch.setattr("stewart_drake.experiment.assemble", counted)
+    monkeypatch.setattr("stewart_drake.loop.experiment.assemble", counted)
     assert main(["simulate", *SHORT, "--quiet", "--out", str(tmp_path)]) == 0
     assert len(prepared) == 1
     experiment = prepare(prepared[0])

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 import stewart_drake as sd
-from stewart_drake import metrics
-from stewart_drake.diagram import build_closed_loop
-from stewart_drake.plant.workspace import standing
-from stewart_drake.resources import data_root
-from stewart_drake.signals import LEGS
-from stewart_drake.simulation import make_simulator
-from stewart_drake.timing import look_time
+from stewart_drake.dynamics.workspace import standing
+from stewart_drake.files.resources import data_root
+from stewart_drake.loop import metrics
+from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.simulation import make_simulator
+from stewart_drake.scenario.signals import LEGS
+from stewart_drake.scenario.timing import look_time
 
 EXACT = "plant.kind=exact"
 ON_REFERENCE = ("start=on_reference", "queue=reference")

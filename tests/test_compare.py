@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from stewart_drake.errors import ConfigError
-from stewart_drake.experiment import prepare
-from stewart_drake.resources import shipped
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.simulation import simulate
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import shipped
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS, compare, save_comparison
 from stewart_drake.studies.verdict import Verdict, delay_verdict
 

@@ -16,7 +16,11 @@ from pydantic import ValidationError
 from pydantic.dataclasses import dataclass
 from ruamel.yaml import YAML
 
-from stewart_drake.config import (
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import resolve, shipped
+from stewart_drake.files.schema import ByKind
+from stewart_drake.files.yamlio import differences, load_yaml, validate
+from stewart_drake.scenario.config import (
     AnnTunerConfig,
     ControllerConfig,
     DelayConfig,
@@ -24,14 +28,15 @@ from stewart_drake.config import (
     PlantConfig,
     Scenario,
 )
-from stewart_drake.errors import ConfigError
-from stewart_drake.field_types import STRICT
-from stewart_drake.reference_config import CsvConfig, HoldConfig, SineConfig, WaypointsConfig
-from stewart_drake.resources import resolve, shipped
-from stewart_drake.scenario_loading import load_controller, load_scenario, scenario_to_dict
-from stewart_drake.schema import ByKind
-from stewart_drake.timing import step_problem
-from stewart_drake.yamlio import differences, load_yaml, validate
+from stewart_drake.scenario.field_types import STRICT
+from stewart_drake.scenario.loading import load_controller, load_scenario, scenario_to_dict
+from stewart_drake.scenario.reference_config import (
+    CsvConfig,
+    HoldConfig,
+    SineConfig,
+    WaypointsConfig,
+)
+from stewart_drake.scenario.timing import step_problem
 
 SINE = [0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]
 

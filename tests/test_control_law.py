@@ -9,33 +9,33 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stewart_drake.design.delay_model import delayed_model
-from stewart_drake.design.error_model import (
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law import cost as cost_module
+from stewart_drake.law.delay_model import delayed_model
+from stewart_drake.law.design_models import MultibodyModel
+from stewart_drake.law.error_model import (
     ContinuousModel,
     double_integrators,
     linear_model,
 )
-from stewart_drake.design.holds import (
+from stewart_drake.law.holds import (
     GAUSS_NODES,
     held_torques,
     means_and_changes,
     rates_at_samples,
     state_within_hold,
 )
-from stewart_drake.design.riccati import RiccatiError, full_gain
-from stewart_drake.design.startup import weight_scales
-from stewart_drake.experiment import assemble, control_law, motion_scale, prepare
-from stewart_drake.law import cost as cost_module
-from stewart_drake.law.design_models import MultibodyModel
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.predictive_lqi import PredictiveLqi, Preview
 from stewart_drake.law.predictors import Ahead, LinearPredictor, NonlinearPredictor
+from stewart_drake.law.riccati import RiccatiError, full_gain
+from stewart_drake.law.startup import weight_scales
+from stewart_drake.loop.experiment import assemble, control_law, motion_scale, prepare
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.trajectories import evaluate, make_reference
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.trajectories import evaluate, make_reference
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 

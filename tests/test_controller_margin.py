@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 
 import stewart_drake as sd
-from stewart_drake.cautions import cautions_after, cautions_before, coarse_step
 from stewart_drake.cli import main
-from stewart_drake.config import Scenario
-from stewart_drake.controller_margin import ControllerMargin, controller_margin, true_dynamics
-from stewart_drake.design.delay_model import sample, sample_in_steps
-from stewart_drake.design.limits import is_stable, spectral_radius
-from stewart_drake.experiment import believed_queue, control_law, prepare
+from stewart_drake.files.resources import resolve
+from stewart_drake.law.delay_model import sample, sample_in_steps
+from stewart_drake.law.limits import is_stable, spectral_radius
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.predictive_lqi import Preview
-from stewart_drake.multibody_stewart import MultibodyStewart
-from stewart_drake.resources import resolve
-from stewart_drake.signals import NUM_TORQUES, POSE
+from stewart_drake.loop.cautions import cautions_after, cautions_before, coarse_step
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin, true_dynamics
+from stewart_drake.loop.experiment import believed_queue, control_law, prepare
+from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.signals import NUM_TORQUES, POSE
+from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.basis import basis
 from stewart_drake.studies.compare import CONTROLLERS
 from stewart_drake.studies.delay_loop import loop_margins
-from stewart_drake.trajectories import evaluate
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]
@@ -215,7 +215,7 @@ def test_only_the_predictor_is_stable_on_the_papers_experiment() -> None:
 
 def test_twice_as_many_instants_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     usual = judged(scenario("plant.kind=exact")).margins
-    monkeypatch.setattr("stewart_drake.controller_margin.INSTANTS", 60)
+    monkeypatch.setattr("stewart_drake.loop.controller_margin.INSTANTS", 60)
     assert usual == pytest.approx(judged(scenario("plant.kind=exact")).margins, rel=0.1)
 
 

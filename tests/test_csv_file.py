@@ -9,10 +9,10 @@ import xarray as xr
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.errors import ConfigError
-from stewart_drake.experiment import prepare
-from stewart_drake.reference_files import read_csv
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.loop.experiment import prepare
 from stewart_drake.report.csv_file import signals_csv, write_csv
+from stewart_drake.scenario.reference_files import read_csv
 
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 SHORT = ("--set", "plant.kind=exact", "--set", "duration=0.3")

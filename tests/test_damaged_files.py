@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from stewart_drake import arrayio
-from stewart_drake.arrayio import write_netcdf
-from stewart_drake.errors import ConfigError
-from stewart_drake.studies.dataset import load_dataset, read_run
+from stewart_drake.files import arrayio
+from stewart_drake.files.arrayio import write_netcdf
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.studies.jobs import MANIFEST, run_jobs
 from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.studies.run_files import read_cell, read_evaluation, read_outcome
+from stewart_drake.tuning.dataset import load_dataset, read_run
 from tests.faults import put, refusal, written
 from tests.mutations import other_npz
 from tests.test_fuzz import (

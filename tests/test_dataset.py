@@ -9,25 +9,26 @@ import pytest
 import xarray as xr
 
 from stewart_drake.cli import main
-from stewart_drake.design.delay_model import delayed_model
-from stewart_drake.design.error_model import linear_model
-from stewart_drake.design.riccati import reduced_gain
-from stewart_drake.errors import ConfigError
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.delay_model import delayed_model
+from stewart_drake.law.error_model import linear_model
+from stewart_drake.law.riccati import reduced_gain
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.simulation import simulate
-from stewart_drake.studies import dataset as module
-from stewart_drake.studies import grid
-from stewart_drake.studies.dataset import (
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.studies.disturbances import disturbed, draw
+from stewart_drake.tuner.density import WINDOW, densities
+from stewart_drake.tuning import dataset as module
+from stewart_drake.tuning import grid
+from stewart_drake.tuning.dataset import (
     data_hash,
     load_dataset,
     make_dataset,
     sample_run,
     samples,
 )
-from stewart_drake.studies.disturbances import disturbed, draw
-from stewart_drake.studies.grid import (
+from stewart_drake.tuning.grid import (
     DELAYS,
     FREQUENCIES,
     PAIRS,
@@ -35,8 +36,7 @@ from stewart_drake.studies.grid import (
     disturbed_runs,
     paper_runs,
 )
-from stewart_drake.studies.labels import cells, labels
-from stewart_drake.tuner.density import WINDOW, densities
+from stewart_drake.tuning.labels import cells, labels
 
 # The paper's own controller costs little, keeps a small motion in the workspace at some delays and
 # loses it at others.

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stewart_drake.config import ControllerConfig, DelayConfig, Scenario
-from stewart_drake.delay import Delay
+from stewart_drake.scenario.config import ControllerConfig, DelayConfig, Scenario
+from stewart_drake.scenario.delay import Delay
 
 
 @given(

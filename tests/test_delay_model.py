@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
-from stewart_drake.design.delay_model import chain, delayed_model, sample
-from stewart_drake.design.error_model import (
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.delay_model import chain, delayed_model, sample
+from stewart_drake.law.error_model import (
     ContinuousModel,
     double_integrators,
     linear_model,
     with_integral,
 )
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.plant.dynamics import StewartDynamics
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 

@@ -2,7 +2,7 @@
 
 Conventions of `docs/*.md`, so that names can be checked:
 
-* a dotted name in code type is relative to the package (`design.riccati.lqr`), a field of a
+* a dotted name in code type is relative to the package (`law.riccati.lqr`), a field of a
   scenario (`plant.gravity`) or a port of the loop (`plant.torque`);
 * a path in code type is relative to the repository or to the package; `file.py::name` is a test;
 * a word in code type with an underscore or an inner capital occurs in the package's source, its
@@ -28,22 +28,22 @@ import pytest
 from numpy.typing import NDArray
 
 import stewart_drake as sd
-from stewart_drake import resources
-from stewart_drake.config import ControllerConfig, Scenario
-from stewart_drake.design.delay_model import chain, delayed_model
-from stewart_drake.design.error_model import double_integrators, linear_model
-from stewart_drake.design.riccati import reduced_gain
-from stewart_drake.diagram import ClosedLoop
-from stewart_drake.errors import ConfigError
+from stewart_drake.files import resources
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.yamlio import load_yaml
+from stewart_drake.law.delay_model import chain, delayed_model
+from stewart_drake.law.error_model import double_integrators, linear_model
+from stewart_drake.law.riccati import reduced_gain
+from stewart_drake.loop.controller import DelayLqiController
+from stewart_drake.loop.diagram import ClosedLoop
+from stewart_drake.loop.metrics import accumulated_error
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.metrics import accumulated_error
-from stewart_drake.reference_files import read_waypoints
-from stewart_drake.scenario_loading import load_controller, setting_choices
-from stewart_drake.signals import SIGNALS, exported_ports, ports_of
-from stewart_drake.systems.controller import DelayLqiController
-from stewart_drake.trajectories import evaluate, make_reference
-from stewart_drake.yamlio import load_yaml
+from stewart_drake.scenario.config import ControllerConfig, Scenario
+from stewart_drake.scenario.loading import load_controller, setting_choices
+from stewart_drake.scenario.reference_files import read_waypoints
+from stewart_drake.scenario.signals import SIGNALS, exported_ports, ports_of
+from stewart_drake.scenario.trajectories import evaluate, make_reference
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]
@@ -219,18 +219,18 @@ def test_links_lead_somewhere(path: Path) -> None:
 @pytest.mark.parametrize(
     ("code", "wrong"),
     [
-        ("design.riccati.lqr", False),
-        ("design.riccati.lqrr", True),
-        ("design.nothing", True),
+        ("law.riccati.lqr", False),
+        ("law.riccati.lqrr", True),
+        ("law.nothing", True),
         ("plant.gravity: false", False),
         ("plant.gravitas", True),
         ("plant.torque", False),
         ("sensor.torque", True),
-        ("plant.dynamics.StewartDynamics.predict", False),
+        ("dynamics.stewart.StewartDynamics.predict", False),
         ("law.nominal.NominalPlant.substeps", False),
-        ("signals.py", False),
-        ("design/", False),
-        ("design/nothing.py", True),
+        ("scenario/signals.py", False),
+        ("law/", False),
+        ("law/nothing.py", True),
         ("tests/test_docs.py::test_the_documents_exist", False),
         ("tests/test_docs.py::test_nothing", True),
         ("tests/test_none.py::test_nothing", True),

@@ -10,10 +10,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE, STANDARD_GRAVITY
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.equations import DEAD_CENTRE_SINE, STANDARD_GRAVITY
-from stewart_drake.signals import BIAS, DAMPING
+from stewart_drake.scenario.signals import BIAS, DAMPING
 from tests.mechanisms import PAPER, SPREAD, random_mechanism, random_pose
 from tests.oracles import (
     PartitionedTree,
@@ -292,7 +292,7 @@ def test_derivatives_stay_finite_far_out_of_reach(index: int) -> None:
 
 def test_start_up_needs_no_torch() -> None:
     code = """if True:
-        import sys, stewart_drake.mechanism.files as files, stewart_drake.plant.dynamics as plant
+        import sys, stewart_drake.mechanism.files as files, stewart_drake.dynamics.stewart as plant
         paper = files.load_mechanism("paper")
         plant.StewartDynamics(paper).accelerations(paper.home, [0.0] * 6, [0.0] * 6)
         assert "torch" not in sys.modules"""

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, lsq_linear
 from scipy.stats import chi2
 
-from stewart_drake.delay import Delay
-from stewart_drake.design.filter_settings import FilterSettings, ParameterSet, filter_settings
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law import parameter_filter
 from stewart_drake.law.belief import Estimate
+from stewart_drake.law.filter_settings import FilterSettings, ParameterSet, filter_settings
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
@@ -22,8 +22,8 @@ from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.parameter_filter import PATIENCE, ParameterFilter, Period
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.signals import BIAS, DAMPING, PARAMETER_UNITS, PARAMETERS, PAYLOAD
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.signals import BIAS, DAMPING, PARAMETER_UNITS, PARAMETERS, PAYLOAD
 from tests.mechanisms import PAPER
 from tests.oracles import central_difference, relative
 

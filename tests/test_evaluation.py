@@ -7,12 +7,12 @@ import pytest
 from scipy import stats
 
 from stewart_drake.cli import main
-from stewart_drake.errors import ConfigError
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.report.tuner_tables import evaluation_table
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.studies.evaluation import GAINS, TUNER, Evaluation, compare, evaluate
-from stewart_drake.studies.grid import PAIRS
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.tuner.network import Network, save_network
+from stewart_drake.tuning.evaluation import GAINS, TUNER, Evaluation, compare, evaluate
+from stewart_drake.tuning.grid import PAIRS
 
 NAMES = ("a", "b", TUNER)
 SMALL = (

@@ -18,12 +18,9 @@ from pydrake.systems.primitives import (
     Linearize,
 )
 
-from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.multibody_stewart import MultibodyStewart
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.equations import DEAD_CENTRE_SINE
-from stewart_drake.plant.exact import ExactPlant, set_accuracy
-from stewart_drake.plant.workspace import (
+from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import (
     PITCH_LIMIT,
     SINGULARITY_LIMIT,
     Failure,
@@ -32,7 +29,10 @@ from stewart_drake.plant.workspace import (
     margin,
     standing,
 )
-from stewart_drake.timing import look_time
+from stewart_drake.loop.exact import ExactPlant, set_accuracy
+from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.scenario.timing import look_time
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.oracles import relative, size
 

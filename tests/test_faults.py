@@ -18,9 +18,9 @@ import pytest
 import xarray as xr
 
 from stewart_drake.cli import main
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.studies.dataset import data_hash, load_dataset, make_dataset
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.robustness import study_robustness
+from stewart_drake.tuning.dataset import data_hash, load_dataset, make_dataset
 from tests.faults import killed
 from tests.test_cli import command
 from tests.test_dataset import shrink

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from stewart_drake.plant.workspace import Failure
+from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.report import figures
 from stewart_drake.report.figures import comparison_figures, run_figures
 from stewart_drake.report.style import CONTROLLER_LINES
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.simulation import simulate
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stewart_drake.errors import ConfigError
-from stewart_drake.fileio import read_bytes, remove_partials, replacing
-from stewart_drake.jsonio import write_json
-from stewart_drake.reference_config import CsvConfig
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import read_bytes, remove_partials, replacing
+from stewart_drake.files.jsonio import write_json
+from stewart_drake.scenario.reference_config import CsvConfig
+from stewart_drake.scenario.trajectories import make_reference
 from stewart_drake.studies.jobs import run_jobs
-from stewart_drake.trajectories import make_reference
 from tests.faults import forked, tree
 from tests.test_jobs import SETTINGS, numbered, text
 

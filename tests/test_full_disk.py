@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from stewart_drake.cli import main
-from stewart_drake.studies.dataset import data_hash, load_dataset
+from stewart_drake.tuning.dataset import data_hash, load_dataset
 from tests.faults import forked
 from tests.test_dataset import shrink
 from tests.test_faults import EXACT, check_whole, finished_runs, little_dataset

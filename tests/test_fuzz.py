@@ -29,19 +29,19 @@ from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
 import stewart_drake as sd
-from stewart_drake.errors import ConfigError
-from stewart_drake.jsonio import jsonable
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.jsonio import jsonable
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.reference_config import CsvConfig, WaypointsConfig
-from stewart_drake.reference_files import read_csv, read_waypoints
 from stewart_drake.report.csv_file import read_signals, signals_csv
-from stewart_drake.scenario_loading import load_controller, load_scenario
-from stewart_drake.studies.dataset import assemble, load_dataset, read_run, summarize
-from stewart_drake.studies.grid import paper_runs
+from stewart_drake.scenario.loading import load_controller, load_scenario
+from stewart_drake.scenario.reference_config import CsvConfig, WaypointsConfig
+from stewart_drake.scenario.reference_files import read_csv, read_waypoints
+from stewart_drake.scenario.trajectories import evaluate, make_reference
 from stewart_drake.studies.jobs import _check_manifest, settings_hash
 from stewart_drake.studies.run_files import read_evaluation, read_outcome
-from stewart_drake.trajectories import evaluate, make_reference
 from stewart_drake.tuner.network import load_network, save_network
+from stewart_drake.tuning.dataset import assemble, load_dataset, read_run, summarize
+from stewart_drake.tuning.grid import paper_runs
 from tests.faults import yaml_text
 from tests.mutations import (
     NASTY,

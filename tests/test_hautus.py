@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from pydrake.systems.primitives import IsControllable, LinearSystem
 from scipy.linalg import block_diag, expm
 
-from stewart_drake.design.delay_model import chain, delayed_model, sample
-from stewart_drake.design.error_model import double_integrators, with_integral
-from stewart_drake.design.hautus import TOLERANCE, cluster, hautus, scaled
+from stewart_drake.law.delay_model import chain, delayed_model, sample
+from stewart_drake.law.error_model import double_integrators, with_integral
+from stewart_drake.law.hautus import TOLERANCE, cluster, hautus, scaled
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.studies.mode_words import describe, state_labels
 from tests.mechanisms import PAPER

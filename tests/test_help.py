@@ -10,14 +10,14 @@ import pytest
 import typer
 
 from stewart_drake.cli import app, main
-from stewart_drake.commands.examples import EXAMPLES
-from stewart_drake.config import Scenario
-from stewart_drake.resources import shipped
-from stewart_drake.scenario_loading import load_scenario, scenario_yaml, setting_choices
-from stewart_drake.schema import field_names, sections
+from stewart_drake.cli.examples import EXAMPLES
+from stewart_drake.files.resources import shipped
+from stewart_drake.files.schema import field_names, sections
+from stewart_drake.files.yamlio import parse_yaml, validate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import load_scenario, scenario_yaml, setting_choices
 from stewart_drake.studies.range_units import RANGE_UNITS
 from stewart_drake.studies.uncertainty import Ranges
-from stewart_drake.yamlio import parse_yaml, validate
 from tests import test_docs
 
 main(["--version"])  # which also puts the examples where they belong

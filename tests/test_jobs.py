@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from stewart_drake.errors import ConfigError
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.studies import jobs as module
 from stewart_drake.studies.jobs import (
     MANIFEST,

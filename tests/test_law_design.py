@@ -7,10 +7,10 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 import stewart_drake as sd
-from stewart_drake.errors import ConfigError
-from stewart_drake.signals import POSE
-from stewart_drake.systems.delay_chain import DelayChain
-from stewart_drake.trajectories import make_reference
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.loop.delay_chain import DelayChain
+from stewart_drake.scenario.signals import POSE
+from stewart_drake.scenario.trajectories import make_reference
 
 PAPER = sd.load_mechanism("paper")
 

@@ -10,19 +10,18 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 
-from stewart_drake.delay import Delay
-from stewart_drake.design.error_model import double_integrators
-from stewart_drake.design.holds import held_torques, means_and_changes
-from stewart_drake.experiment import control_law, prepare
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import MultibodyModel, PaperModel
+from stewart_drake.law.error_model import double_integrators
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
     Feedforward,
     InverseDynamicsFeedforward,
     NoFeedforward,
 )
+from stewart_drake.law.holds import held_torques, means_and_changes
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motors import TorqueLimit
@@ -31,12 +30,13 @@ from stewart_drake.law.observers import NoObserver, ParameterObserver
 from stewart_drake.law.predictive_lqi import Preview
 from stewart_drake.law.sensing import FirstState, Sensing, StateSensing
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.loop.controller import DelayLqiController
+from stewart_drake.loop.experiment import control_law, prepare
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.systems.controller import DelayLqiController
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.loading import load_scenario
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 from tests.test_control_law import HOME, WEIGHTS, Loop, law_of, nominal_queue, sine

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
 import stewart_drake as sd
-from stewart_drake.design.delay_model import DelayedModel, chain, delayed_model
-from stewart_drake.design.error_model import (
+from stewart_drake.law.delay_model import DelayedModel, chain, delayed_model
+from stewart_drake.law.error_model import (
     ContinuousModel,
     double_integrators,
     linear_model,
 )
-from stewart_drake.design.limits import (
+from stewart_drake.law.limits import (
     amplification,
     closed_loop,
     fastest_pole,
@@ -26,13 +26,13 @@ from stewart_drake.design.limits import (
     sensitivity,
     spectral_radius,
 )
-from stewart_drake.design.riccati import augmented_gain
+from stewart_drake.law.riccati import augmented_gain
+from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.plant.exact import ExactPlant
+from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.delay_limits import error_floor, simulated_growth
 from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
-from stewart_drake.trajectories import evaluate
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]

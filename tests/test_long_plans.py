@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stewart_drake.design.catch_up import MOST_HOLDS, plan_catch_up
-from stewart_drake.design.holds import mean_torques
-from stewart_drake.design.startup import BLOCK, choose_substeps
-from stewart_drake.experiment import prepare
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.trajectories import evaluate
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.catch_up import MOST_HOLDS, plan_catch_up
+from stewart_drake.law.holds import mean_torques
+from stewart_drake.law.startup import BLOCK, choose_substeps
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.trajectories import evaluate
 
 Array = NDArray[np.float64]
 

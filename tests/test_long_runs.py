@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
 
-from stewart_drake.diagram import build_closed_loop
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.signals import LEGS, POSE
-from stewart_drake.simulation import make_simulator, simulate
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.signals import LEGS, POSE
 from tests.mechanisms import PAPER
 
 ON_REFERENCE = ("start=on_reference", "queue=reference")

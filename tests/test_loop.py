@@ -12,18 +12,18 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 from scipy.integrate import quad_vec
 
-from stewart_drake import metrics
-from stewart_drake.config import Scenario
-from stewart_drake.diagram import build_closed_loop
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.loop import metrics
+from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.multibody import add_mechanism, set_pose
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.multibody import add_mechanism, set_pose
-from stewart_drake.results import SimulationResult
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.signals import LEGS
-from stewart_drake.simulation import make_simulator, simulate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.signals import LEGS
+from stewart_drake.scenario.trajectories import evaluate, make_reference
 from stewart_drake.studies.delay_limits import study_delay
-from stewart_drake.trajectories import evaluate, make_reference
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]

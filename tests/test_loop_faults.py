@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import stewart_drake.diagram as diagram_module
 import stewart_drake.law.cost as cost_module
-from stewart_drake.config import Scenario
-from stewart_drake.design.riccati import RiccatiError
-from stewart_drake.metrics import accumulated_error
-from stewart_drake.results import SimulationResult
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.simulation import simulate
-from stewart_drake.systems.sensor import Sensor
+import stewart_drake.loop.diagram as diagram_module
+from stewart_drake.law.riccati import RiccatiError
+from stewart_drake.loop.metrics import accumulated_error
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.sensor import Sensor
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import load_scenario
 
 Array = NDArray[np.float64]
 Spoil = Callable[[int, Array, dict[int, Array]], Array]

@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from stewart_drake.errors import ConfigError
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import data_root
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Body, Mechanism
-from stewart_drake.resources import data_root
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]

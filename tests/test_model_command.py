@@ -14,14 +14,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from pydrake.geometry import Meshcat
 
 from stewart_drake.cli import main
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.files.resources import data_root, shipped
 from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.workspace import diagnose
 from stewart_drake.report.mechanism_figures import mechanism_figure
 from stewart_drake.report.viewer import SLIDERS, STOP, PoseViewer, place, slider_range
-from stewart_drake.resources import data_root, shipped
 from stewart_drake.studies.mechanism_check import check_mechanism
 from tests.mechanisms import PAPER, random_mechanism
 from tests.singular import parallel_rods, stretched, write_mechanism

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from stewart_drake.errors import ConfigError
-from stewart_drake.resources import shipped
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import shipped
 from stewart_drake.tuner.network import Network, load_network, save_network
 
 Array = NDArray[np.float64]

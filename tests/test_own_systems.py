@@ -13,8 +13,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.trajectories import FunctionHandleTrajectory, PiecewisePolynomial
 
 import stewart_drake as sd
-from stewart_drake.experiment import prepare
-from stewart_drake.trajectories import make_reference
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.scenario.trajectories import make_reference
 
 ROOT = Path(__file__).resolve().parents[1]
 FAST = ("plant.kind=exact", "delay.steps=0", "controller.period=0.01", "start=on_reference")

@@ -12,7 +12,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 import stewart_drake as sd
-from stewart_drake.errors import ConfigError
+from stewart_drake.files.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1] / "diagrams"
 PAPER = sd.load_mechanism("paper")

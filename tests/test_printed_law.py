@@ -12,11 +12,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from stewart_drake.design.delay_model import DelayedModel, delayed_model
-from stewart_drake.design.error_model import double_integrators
-from stewart_drake.design.riccati import augmented_gain
+from stewart_drake.law.delay_model import DelayedModel, delayed_model
+from stewart_drake.law.error_model import double_integrators
+from stewart_drake.law.riccati import augmented_gain
+from stewart_drake.loop.metrics import accumulated_error
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.metrics import accumulated_error
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]

@@ -3,7 +3,7 @@
 import pytest
 
 import stewart_drake as sd
-from stewart_drake.experiment import prepare
+from stewart_drake.loop.experiment import prepare
 
 SETTINGS = ("plant.kind=exact", "duration=0.1")
 

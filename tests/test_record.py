@@ -9,13 +9,15 @@ import pytest
 import xarray as xr
 
 import stewart_drake as sd
-from stewart_drake.diagram import build_closed_loop
-from stewart_drake.errors import ConfigError
-from stewart_drake.jsonio import jsonable
-from stewart_drake.recording import Table
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.jsonio import jsonable
+from stewart_drake.loop.controller import HELD
+from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.recording import Table
+from stewart_drake.loop.sensor import Sensor
 from stewart_drake.report.csv_file import read_signals, signals_csv
-from stewart_drake.scenario_loading import scenario_yaml
-from stewart_drake.signals import (
+from stewart_drake.scenario.loading import scenario_yaml
+from stewart_drake.scenario.signals import (
     COORDINATE_UNITS,
     DIMENSIONS,
     LEGS,
@@ -26,10 +28,8 @@ from stewart_drake.signals import (
     exported_ports,
     ports_of,
 )
-from stewart_drake.studies.dataset import sample_run
-from stewart_drake.systems.controller import HELD
-from stewart_drake.systems.sensor import Sensor
-from stewart_drake.timing import instants
+from stewart_drake.scenario.timing import instants
+from stewart_drake.tuning.dataset import sample_run
 
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-3,1e-3,1e-3,1e-4,1e-4,1e-4]"

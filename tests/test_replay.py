@@ -11,15 +11,15 @@ import pytest
 from pydrake.geometry import Meshcat, MeshcatParams
 
 import stewart_drake as sd
-from stewart_drake import scene
-from stewart_drake.lifetime import let_go
-from stewart_drake.multibody_stewart import build_viewer
-from stewart_drake.plant.workspace import Failure
+from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.files.resources import shipped
+from stewart_drake.loop import scene
+from stewart_drake.loop.lifetime import let_go
+from stewart_drake.loop.multibody_stewart import build_viewer
+from stewart_drake.loop.scene import CRANK_PARTS, crank_paths, pointer, ring
 from stewart_drake.report import replay as replay_module
 from stewart_drake.report.replay import replay_html, write_replay
-from stewart_drake.resources import shipped
-from stewart_drake.scene import CRANK_PARTS, crank_paths, pointer, ring
-from stewart_drake.signals import LEGS
+from stewart_drake.scenario.signals import LEGS
 
 PAPER = sd.load_mechanism("paper")
 

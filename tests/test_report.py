@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 
 from stewart_drake.cli import main
+from stewart_drake.files.yamlio import load_yaml
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.report import collect as collect_module
 from stewart_drake.report.collect import ANALYSES, Analysis, collect
 from stewart_drake.report.page import Page, Provenance
 from stewart_drake.report.report_page import comparison_rows, mean_error, report_page
 from stewart_drake.report.tables import comparison_table
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.simulation import simulate
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from stewart_drake.tuner.network import save_network
-from stewart_drake.yamlio import load_yaml
 from tests.browser import browser, needs_chromium
 from tests.test_network import small_network
 

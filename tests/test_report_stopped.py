@@ -27,7 +27,7 @@ def started(code: str, folder: Path) -> subprocess.Popen:
 
 def test_ctrl_c_ends_it_with_nothing_written(tmp_path):
     code = (
-        "import sys, stewart_drake.simulation; from stewart_drake.cli import main;"
+        "import sys, stewart_drake.loop.simulation; from stewart_drake.cli import main;"
         "print('ready', file=sys.stderr, flush=True);"
         f"sys.exit(main(['report', *{SETTINGS!r}, '--out', sys.argv[1]]))"
     )

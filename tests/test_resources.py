@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from stewart_drake import resources
-from stewart_drake.errors import ConfigError
+from stewart_drake.files import resources
+from stewart_drake.files.errors import ConfigError
 
 
 def test_the_shipped_names_of_each_kind() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stewart_drake.cli import main
-from stewart_drake.commands import run as run_command
+from stewart_drake.cli import run as run_command
 from stewart_drake.report import (
     figures,
     hautus_page,

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from stewart_drake.design import riccati
-from stewart_drake.design.delay_model import DelayedModel, chain, delayed_model
-from stewart_drake.design.error_model import double_integrators, linear_model
-from stewart_drake.design.riccati import RiccatiError, augmented_gain, full_gain, lqr, reduced_gain
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law import riccati
+from stewart_drake.law.delay_model import DelayedModel, chain, delayed_model
+from stewart_drake.law.error_model import double_integrators, linear_model
+from stewart_drake.law.riccati import RiccatiError, augmented_gain, full_gain, lqr, reduced_gain
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.plant.dynamics import StewartDynamics
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 

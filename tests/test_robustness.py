@@ -20,14 +20,14 @@ from hypothesis import strategies as st
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.config import Scenario
-from stewart_drake.errors import ConfigError
-from stewart_drake.experiment import prepare
-from stewart_drake.jsonio import jsonable
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.jsonio import jsonable
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism import kinematics
 from stewart_drake.report.page import Provenance
 from stewart_drake.report.robustness_page import robustness_page, robustness_table
-from stewart_drake.simulation import simulate
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies import robustness, statistics
 from stewart_drake.studies.failures import auc_interval, explain
 from stewart_drake.studies.robustness import run_draw, study_robustness

@@ -12,18 +12,18 @@ import pytest
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from stewart_drake import experiment as experiment_module
-from stewart_drake.design.riccati import full_gain, lqr
-from stewart_drake.design.startup import machine_torque
-from stewart_drake.experiment import control_law, prepare
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.resources import data_root
 from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.riccati import full_gain, lqr
+from stewart_drake.law.startup import machine_torque
+from stewart_drake.loop import experiment as experiment_module
+from stewart_drake.loop.experiment import control_law, prepare
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.resources import data_root
-from stewart_drake.results import SimulationResult
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.simulation import simulate
+from stewart_drake.scenario.loading import load_scenario
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 from tests.test_riccati import STEPS, UNIT, delayed
@@ -76,7 +76,7 @@ def run(
             return StewartDynamics(machine, 9.81 * s * gravity, *more)
 
         monkeypatch.setattr(experiment_module, "StewartDynamics", dynamics)
-        monkeypatch.setattr("stewart_drake.diagram.StewartDynamics", dynamics)
+        monkeypatch.setattr("stewart_drake.loop.diagram.StewartDynamics", dynamics)
     result = simulate(sc)
     return result, result.signals.torque_commanded.values / (m * s**2)
 

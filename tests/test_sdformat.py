@@ -18,11 +18,11 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 
+from stewart_drake.files.resources import data_root, shipped
+from stewart_drake.loop.multibody import add_mechanism, set_pose
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
-from stewart_drake.plant.multibody import add_mechanism, set_pose
-from stewart_drake.resources import data_root, shipped
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
 Array = NDArray[np.float64]

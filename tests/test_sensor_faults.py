@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import stewart_drake.diagram as diagram_module
-from stewart_drake.config import Scenario
-from stewart_drake.design.filter_settings import FilterSettings
-from stewart_drake.diagram import build_closed_loop
-from stewart_drake.errors import ConfigError
+import stewart_drake.loop.diagram as diagram_module
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.yamlio import parse_yaml
+from stewart_drake.law.filter_settings import FilterSettings
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.parameter_filter import PATIENCE
 from stewart_drake.law.sensing import StateSensing
-from stewart_drake.results import SimulationResult
-from stewart_drake.scenario_loading import load_scenario, scenario_to_dict, scenario_yaml
-from stewart_drake.simulation import simulate
-from stewart_drake.systems.sensor import Sensor
-from stewart_drake.yamlio import parse_yaml
+from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.sensor import Sensor
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import load_scenario, scenario_to_dict, scenario_yaml
 from tests.mechanisms import PAPER
 from tests.test_control_law import HOME, Loop, law_of, nominal_queue, sine, step
 

@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from stewart_drake.experiment import prepare
+from stewart_drake.files.resources import data_root, shipped
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.reference_files import read_csv, read_waypoints
-from stewart_drake.resources import data_root, shipped
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.simulation import simulate
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.reference_files import read_csv, read_waypoints
 from stewart_drake.studies.verdict import delay_verdict
 
 OWN = ("desktop", "motion_base")

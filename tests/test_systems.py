@@ -18,21 +18,21 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
-from stewart_drake.diagram import ClosedLoop, build_closed_loop
-from stewart_drake.experiment import control_law, prepare
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.predictive_lqi import PredictiveLqi, Preview
-from stewart_drake.multibody_stewart import MultibodyStewart
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.exact import ExactPlant
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.simulation import make_simulator
-from stewart_drake.systems.controller import DelayLqiController
-from stewart_drake.systems.delay_chain import DelayChain
-from stewart_drake.systems.reference import Reference
-from stewart_drake.systems.sensor import Sensor
-from stewart_drake.timing import look_time
-from stewart_drake.trajectories import evaluate, make_reference
+from stewart_drake.loop.controller import DelayLqiController
+from stewart_drake.loop.delay_chain import DelayChain
+from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
+from stewart_drake.loop.exact import ExactPlant
+from stewart_drake.loop.experiment import control_law, prepare
+from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.loop.reference import Reference
+from stewart_drake.loop.sensor import Sensor
+from stewart_drake.loop.simulation import make_simulator
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.timing import look_time
+from stewart_drake.scenario.trajectories import evaluate, make_reference
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]

@@ -11,10 +11,10 @@ import xarray as xr
 from threadpoolctl import OpenBLASController, threadpool_info, threadpool_limits
 
 import stewart_drake as sd
-from stewart_drake import simulation
-from stewart_drake.experiment import Experiment
-from stewart_drake.plant.compiled import Compiled
-from stewart_drake.plant.functions import compiled_functions
+from stewart_drake.dynamics.compiled import Compiled
+from stewart_drake.dynamics.functions import compiled_functions
+from stewart_drake.loop import simulation
+from stewart_drake.loop.experiment import Experiment
 from tests.mechanisms import PAPER
 
 ON_REFERENCE = ("start=on_reference", "queue=reference")

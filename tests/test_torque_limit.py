@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stewart_drake.config import Scenario
-from stewart_drake.diagram import build_closed_loop
-from stewart_drake.errors import ConfigError
-from stewart_drake.experiment import assemble
-from stewart_drake.multibody_stewart import MultibodyStewart
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.resources import resolve
-from stewart_drake.results import SimulationResult
-from stewart_drake.scenario_loading import load_scenario, scenario_yaml
-from stewart_drake.simulation import make_simulator, simulate
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import resolve
+from stewart_drake.files.yamlio import load_yaml
+from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.experiment import assemble
+from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.simulation import make_simulator, simulate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import load_scenario, scenario_yaml
 from stewart_drake.studies.uncertainty import Ranges, draw, scales_of
-from stewart_drake.yamlio import load_yaml
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.mechanism.geometry import Link, Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, leg_geometry
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.plant.dynamics import StewartDynamics
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
 Array = NDArray[np.float64]

@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from stewart_drake.cli import main
-from stewart_drake.commands import tune
-from stewart_drake.errors import ConfigError
-from stewart_drake.signals import TUNER_INPUTS
-from stewart_drake.studies import labels, levenberg, training
-from stewart_drake.studies.dataset import data_hash
-from stewart_drake.studies.grid import PAIRS
-from stewart_drake.studies.levenberg import TorchModel, fit, initial_theta, unpack
-from stewart_drake.studies.training import summarize, train, training_rows
+from stewart_drake.cli import main, tune
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.scenario.signals import TUNER_INPUTS
 from stewart_drake.tuner.density import Kind
 from stewart_drake.tuner.network import load_network, save_network
+from stewart_drake.tuning import labels, levenberg, training
+from stewart_drake.tuning.dataset import data_hash
+from stewart_drake.tuning.grid import PAIRS
+from stewart_drake.tuning.levenberg import TorchModel, fit, initial_theta, unpack
+from stewart_drake.tuning.training import summarize, train, training_rows
 
 pytest.importorskip("torch")
 

@@ -13,11 +13,16 @@ from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
-from stewart_drake.errors import ConfigError
-from stewart_drake.field_types import STRICT
-from stewart_drake.reference_config import CsvConfig, HoldConfig, SineConfig, WaypointsConfig
-from stewart_drake.signals import ACCELERATIONS, POSE, RATES
-from stewart_drake.trajectories import (
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.scenario.field_types import STRICT
+from stewart_drake.scenario.reference_config import (
+    CsvConfig,
+    HoldConfig,
+    SineConfig,
+    WaypointsConfig,
+)
+from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
+from stewart_drake.scenario.trajectories import (
     catch_up,
     evaluate,
     make_reference,

@@ -14,8 +14,8 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 import stewart_drake as sd
-from stewart_drake import resources
-from stewart_drake.plant.workspace import Failure
+from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.files import resources
 from stewart_drake.report.figures import comparison_figures, run_figures
 from stewart_drake.report.loop_figure import loop_figure
 from stewart_drake.report.tables import shipped_table

@@ -13,18 +13,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from stewart_drake.cli import main
-from stewart_drake.config import Scenario
-from stewart_drake.errors import ConfigError
-from stewart_drake.experiment import assemble, check_instants, prepare, reference_failure
+from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, margin, standing
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import shipped
+from stewart_drake.loop.experiment import assemble, check_instants, prepare, reference_failure
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.equations import DEAD_CENTRE_SINE
-from stewart_drake.plant.workspace import SINGULARITY_LIMIT, margin, standing
-from stewart_drake.reference_config import HoldConfig, SineConfig
-from stewart_drake.resources import shipped
-from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.reference_config import HoldConfig, SineConfig
+from stewart_drake.scenario.trajectories import make_reference
 from stewart_drake.studies.reach import (
     LARGEST_FACTOR,
     Factor,
@@ -36,7 +37,6 @@ from stewart_drake.studies.singularity import characteristic_length, measure, wr
 from stewart_drake.studies.sizing import size_motors
 from stewart_drake.studies.workspace import study_workspace
 from stewart_drake.studies.workspace_map import last_inside, sections, travel
-from stewart_drake.trajectories import make_reference
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.singular import parallel_rods, stretched, write_mechanism
 

@@ -19,8 +19,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
+from stewart_drake.loop.multibody import add_mechanism, set_pose
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.plant.multibody import add_mechanism, set_pose
 
 OFFSET = np.array([0.14, -0.16, 0.12, 0.02, 0.01, 0.03])
 """From the home pose, so that one sees that the plate moves: roll, pitch, yaw in rad, xyz in m."""

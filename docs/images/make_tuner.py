@@ -3,10 +3,10 @@
 import sys
 from pathlib import Path
 
-from stewart_drake.diagram import build_closed_loop
+from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.report.loop_figure import loop_figure
 from stewart_drake.report.tuner_figures import network_figure
-from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.tuner.network import DEFAULT, load_network
 
 weights = sys.argv[1] if len(sys.argv) > 1 else DEFAULT

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.signals import NUM_STATE
+from stewart_drake.scenario.signals import NUM_STATE
 
 Array = NDArray[np.float64]
 THETA = slice(NUM_STATE, None)

@@ -6,9 +6,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.design.delay_model import DelayedModel, delayed_model
-from stewart_drake.design.error_model import ContinuousModel
-from stewart_drake.design.riccati import reduced_gain
+from stewart_drake.law.delay_model import DelayedModel, delayed_model
+from stewart_drake.law.error_model import ContinuousModel
+from stewart_drake.law.riccati import reduced_gain
 from stewart_drake.law.timeline import Timeline
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ class QuadraticCost:
         return np.diag(np.concatenate(scales)), np.diag(self.torques)
 
     def sampled(self, model: ContinuousModel, timeline: Timeline) -> DelayedModel:
-        """`design.delay_model.delayed_model`, with the integral if there is one.
+        """`law.delay_model.delayed_model`, with the integral if there is one.
 
         Raises:
             FloatingPointError: the model cannot be sampled.
@@ -57,7 +57,7 @@ class QuadraticCost:
         return delayed_model(model, period, steps, fraction, integral=self.integrates)
 
     def gain(self, model: DelayedModel, weights: Array) -> Array:
-        """`design.riccati.reduced_gain` of what `sampled` returned.
+        """`law.riccati.reduced_gain` of what `sampled` returned.
 
         Raises:
             RiccatiError: there is no gain.

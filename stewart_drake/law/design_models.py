@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.design.error_model import ContinuousModel, double_integrators, linear_model
+from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
+from stewart_drake.dynamics.workspace import standing
+from stewart_drake.law.error_model import ContinuousModel, double_integrators, linear_model
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.mechanism.torque_map import TorqueMap, torque_map
-from stewart_drake.plant.equations import DEAD_CENTRE_SINE
-from stewart_drake.plant.workspace import standing
-from stewart_drake.signals import POSE, RATES
+from stewart_drake.scenario.signals import POSE, RATES
 
 Array = NDArray[np.float64]
 

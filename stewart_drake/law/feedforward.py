@@ -1,4 +1,4 @@
-"""The torque that the reference takes, held for a period each: see `design.holds`."""
+"""The torque that the reference takes, held for a period each: see `law.holds`."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.design.holds import (
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.holds import (
     GAUSS_NODES,
     held_torques,
     means_and_changes,
@@ -15,8 +16,7 @@ from stewart_drake.design.holds import (
     state_within_hold,
 )
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.signals import (
+from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     NUM_COORDINATES,
     NUM_STATE,

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.timeline import Acting
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.plant.dynamics import StewartDynamics
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.design.filter_settings import FilterSettings
 from stewart_drake.law.belief import Belief
+from stewart_drake.law.filter_settings import FilterSettings
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.parameter_filter import ParameterFilter, Period

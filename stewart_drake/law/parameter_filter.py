@@ -1,6 +1,6 @@
 """Extended Kalman filter over the state and constant parameters of the plant.
 
-The parameters theta (torque bias, payload, joint damping; `design.filter_settings.ParameterSet`)
+The parameters theta (torque bias, payload, joint damping; `law.filter_settings.ParameterSet`)
 never change, the state obeys the exact dynamics under the torques that are known to act:
 
     [x_{k+1}; theta] = [f(x_k, T, theta); theta] + noise,    y_k = h(x_k) + measurement noise.
@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.special import chdtri
 
-from stewart_drake.design.filter_settings import FilterSettings, ParameterSet
-from stewart_drake.design.holds import GAUSS_NODES
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import THETA, Estimate
+from stewart_drake.law.filter_settings import FilterSettings, ParameterSet
+from stewart_drake.law.holds import GAUSS_NODES
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.sensing import FirstState, Sensing
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.signals import NUM_STATE, POSE, RATES
+from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
 
 Array = NDArray[np.float64]
 OUTLIER = 1e-6

@@ -5,8 +5,8 @@ acts is predicted, and (42) is applied there:
 
     T_k = T_ff - K [e; z; ...],   e = predicted pose and rate error, z = predicted integral,
 
-with K from `design.riccati.reduced_gain` and T_ff the feedforward of the hold interval
-[t + eta, t + eta + dt), see `design.holds`. Linear prediction multiplies [e_k; z_k; queue] by
+with K from `law.riccati.reduced_gain` and T_ff the feedforward of the hold interval
+[t + eta, t + eta + dt), see `law.holds`. Linear prediction multiplies [e_k; z_k; queue] by
 `prediction_matrix`, which is the paper's K_aug e_dis; nonlinear prediction integrates the exact
 dynamics through the queue. Torques enter the linear parts as deviations from their feedforward.
 """
@@ -30,7 +30,7 @@ from stewart_drake.law.predictors import Ahead, Predictor
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.signals import (
+from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
     NUM_REFERENCE,
     NUM_STATE,

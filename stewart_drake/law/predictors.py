@@ -6,13 +6,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.design.delay_model import DelayedModel
-from stewart_drake.design.error_model import ContinuousModel, linear_model
-from stewart_drake.design.riccati import prediction_matrix
 from stewart_drake.law.belief import Belief
+from stewart_drake.law.delay_model import DelayedModel
+from stewart_drake.law.error_model import ContinuousModel, linear_model
 from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.riccati import prediction_matrix
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.signals import POSE, RATES
+from stewart_drake.scenario.signals import POSE, RATES
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.signals import NUM_STATE, POSE, RATES
+from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
 
 Array = NDArray[np.float64]
 

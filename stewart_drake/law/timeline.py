@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.delay import Delay
+from stewart_drake.scenario.delay import Delay
 
 Array = NDArray[np.float64]
 

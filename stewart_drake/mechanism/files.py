@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field, PlainValidator
 from pydantic.dataclasses import dataclass
 
-from stewart_drake.errors import ConfigError
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import resolve
+from stewart_drake.files.yamlio import load_yaml, validate
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism
 from stewart_drake.mechanism.inertias import bar_inertia, disc_inertia
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.resources import resolve
-from stewart_drake.signals import LEGS
-from stewart_drake.yamlio import load_yaml, validate
+from stewart_drake.scenario.signals import LEGS
 
 Array = NDArray[np.float64]
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)

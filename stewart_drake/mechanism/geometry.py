@@ -19,9 +19,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stewart_drake.errors import ConfigError
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism import kinematics
-from stewart_drake.signals import LEGS, NUM_LEGS
+from stewart_drake.scenario.signals import LEGS, NUM_LEGS
 
 Array = NDArray[np.float64]
 

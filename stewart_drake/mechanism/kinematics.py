@@ -9,15 +9,12 @@ must lie at distance l from the joint,
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.signals import ANGLES, LEGS, POSITION
-
-if TYPE_CHECKING:
-    from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
 
 Array = NDArray[np.float64]
 
@@ -26,6 +23,34 @@ FORWARD_KINEMATICS_TOLERANCE = 1e-13
 DEAD_CENTRE_TRANSMISSION = 1e-7
 """|rod . tangent| that counts as zero. Next to a dead centre acos resolves the crank angle to the
 square root of the rounding, 1.5e-8 rad: quotients by less than this have no correct digit."""
+
+
+class Legs(Protocol):
+    """What kinematics needs of a machine; `mechanism.geometry.Mechanism` has it."""
+
+    @property
+    def p_WS(self) -> Array:
+        """Motor shaft centres (6, 3) in m."""
+
+    @property
+    def R_WS(self) -> Array:
+        """Motor frames (6, 3, 3); columns x, y and the motor axis z."""
+
+    @property
+    def p_PQ(self) -> Array:
+        """Plate joints (6, 3) in m."""
+
+    @property
+    def crank_lengths(self) -> Array:
+        """(6,) m."""
+
+    @property
+    def rod_lengths(self) -> Array:
+        """(6,) m."""
+
+    @property
+    def branches(self) -> Array:
+        """(6,) of -1 or +1, the crank solution that a leg uses."""
 
 
 class UnreachablePoseError(ValueError):
@@ -97,14 +122,14 @@ class LegGeometry:
     transmission: Array
 
 
-def _shaft_to_joint(mechanism: "Mechanism", pose: Array) -> tuple[Array, Array]:
+def _shaft_to_joint(mechanism: Legs, pose: Array) -> tuple[Array, Array]:
     """p_PQ_W (6, 3) and p_SQ_S (6, 3), the latter in each motor frame."""
     p_PQ_W = mechanism.p_PQ @ rotation(pose[ANGLES]).T
     p_SQ_W = pose[POSITION] + p_PQ_W - mechanism.p_WS
     return p_PQ_W, np.einsum("lij,li->lj", mechanism.R_WS, p_SQ_W)
 
 
-def _margins(mechanism: "Mechanism", p_SQ_S: Array) -> Array:
+def _margins(mechanism: Legs, p_SQ_S: Array) -> Array:
     # The crank tip runs on a circle; Q lies at distance h from its plane and rho from its axis, so
     # that the tip's distance from Q covers [hypot(rho - u, h), hypot(rho + u, h)].
     rho, h = np.hypot(p_SQ_S[:, 0], p_SQ_S[:, 1]), p_SQ_S[:, 2]
@@ -112,12 +137,12 @@ def _margins(mechanism: "Mechanism", p_SQ_S: Array) -> Array:
     return np.minimum(rod - np.hypot(rho - u, h), np.hypot(rho + u, h) - rod)
 
 
-def reach_margins(mechanism: "Mechanism", pose: Array) -> Array:
+def reach_margins(mechanism: Legs, pose: Array) -> Array:
     """Distance (6,) in m by which the rod end can still be moved before leg i cannot be closed."""
     return _margins(mechanism, _shaft_to_joint(mechanism, np.asarray(pose, dtype=np.float64))[1])
 
 
-def reachable_heights(mechanism: "Mechanism", pose: Array) -> tuple[float, float] | None:
+def reachable_heights(mechanism: Legs, pose: Array) -> tuple[float, float] | None:
     """The range of z in m nearest to a pose's own within which all legs reach; None without one.
 
     x, y and the orientation stay those of the pose. No leg reaches further than crank and rod
@@ -152,7 +177,7 @@ def reachable_heights(mechanism: "Mechanism", pose: Array) -> tuple[float, float
     return edge(heights[first], heights[first - 1]), edge(heights[last], heights[last + 1])
 
 
-def leg_geometry(mechanism: "Mechanism", pose: Array) -> LegGeometry:
+def leg_geometry(mechanism: Legs, pose: Array) -> LegGeometry:
     """All six legs at a pose (6,).
 
     Raises:
@@ -184,12 +209,12 @@ def leg_geometry(mechanism: "Mechanism", pose: Array) -> LegGeometry:
     )
 
 
-def crank_angles(mechanism: "Mechanism", pose: Array) -> Array:
+def crank_angles(mechanism: Legs, pose: Array) -> Array:
     """See `Mechanism.crank_angles`."""
     return leg_geometry(mechanism, pose).crank_angles
 
 
-def jacobian(mechanism: "Mechanism", pose: Array) -> Array:
+def jacobian(mechanism: Legs, pose: Array) -> Array:
     """See `Mechanism.jacobian`.
 
     The rod keeps its length: rod . (v_Q - v_T) = 0 with v_T = u alpha_dot tangent and
@@ -201,7 +226,7 @@ def jacobian(mechanism: "Mechanism", pose: Array) -> Array:
     return np.hstack([moment, legs.rod]) / levers(mechanism, legs)[:, None]
 
 
-def levers(mechanism: "Mechanism", legs: LegGeometry) -> Array:
+def levers(mechanism: Legs, legs: LegGeometry) -> Array:
     """u rod . tangent (6,) in m: speed of the plate joint along the rod per crank rate.
 
     Raises:
@@ -214,7 +239,7 @@ def levers(mechanism: "Mechanism", legs: LegGeometry) -> Array:
 
 
 def forward_kinematics(
-    mechanism: "Mechanism", angles: Array, guess: Array, max_iterations: int = 50
+    mechanism: Legs, angles: Array, guess: Array, max_iterations: int = 50
 ) -> Array:
     """See `Mechanism.forward_kinematics`.
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.mechanism.assembly import Assembly, assemble
 from stewart_drake.mechanism.geometry import Body, Mechanism
-from stewart_drake.signals import LEGS
+from stewart_drake.scenario.signals import LEGS
 
 Array = NDArray[np.float64]
 

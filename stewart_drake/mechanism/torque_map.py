@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, levers, rotation
-from stewart_drake.signals import ANGLES
+from stewart_drake.scenario.signals import ANGLES
 
 Array = NDArray[np.float64]
 TorqueMap = Literal["virtual_work", "printed"]

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from stewart_drake.delay import Delay
 from stewart_drake.report.style import DATA_INK, DATA_PAPER, Line, figure_style
+from stewart_drake.scenario.delay import Delay
 from stewart_drake.studies.delay_limits import DelayStudy
 from stewart_drake.studies.delay_map import Cell
 from stewart_drake.studies.hautus import HautusStudy, System

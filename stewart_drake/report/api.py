@@ -12,8 +12,8 @@ from typing import Any
 from matplotlib.figure import Figure
 from pydrake.geometry import Meshcat
 
-from stewart_drake.config import Scenario
-from stewart_drake.jsonio import write_json
+from stewart_drake.files.jsonio import write_json
+from stewart_drake.loop.results import SimulationResult
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.report import delay_page, hautus_page, robustness_page, workspace_page
@@ -24,8 +24,8 @@ from stewart_drake.report.replay import replay as animate
 from stewart_drake.report.replay import replay_html, write_replay
 from stewart_drake.report.report_page import report_page, report_summary
 from stewart_drake.report.tables import comparison_table, run_table
-from stewart_drake.results import SimulationResult
-from stewart_drake.scenario_loading import load_scenario
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.delay_limits import study_delay
 from stewart_drake.studies.hautus import study_hautus
 from stewart_drake.studies.robustness import study_robustness

@@ -7,17 +7,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 
-from stewart_drake.config import AnnTunerConfig, Scenario
-from stewart_drake.errors import ConfigError
-from stewart_drake.experiment import assemble, reference_failure
-from stewart_drake.plant.workspace import Failure
+from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import resolve
+from stewart_drake.loop.experiment import assemble, reference_failure
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.report import delay_page, hautus_page, workspace_page
 from stewart_drake.report.figures import TORQUE_CONTROLLERS
 from stewart_drake.report.page import Page, Provenance, Tone
-from stewart_drake.resources import resolve
-from stewart_drake.results import SimulationResult
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.simulation import simulate
+from stewart_drake.scenario.config import AnnTunerConfig, Scenario
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS
 from stewart_drake.studies.delay_limits import study_delay
 from stewart_drake.studies.hautus import study_hautus

@@ -9,11 +9,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from stewart_drake.arrayio import load_netcdf
-from stewart_drake.errors import ConfigError
-from stewart_drake.fileio import replacing
-from stewart_drake.signals import COORDINATE_NAMES, COORDINATES, SIGNALS
-from stewart_drake.yamlio import brief
+from stewart_drake.files.arrayio import load_netcdf
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import replacing
+from stewart_drake.files.yamlio import brief
+from stewart_drake.scenario.signals import COORDINATE_NAMES, COORDINATES, SIGNALS
 
 Array = NDArray[np.float64]
 

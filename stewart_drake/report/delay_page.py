@@ -3,11 +3,11 @@
 import math
 from typing import Final
 
-from stewart_drake.controller_margin import ControllerMargin
-from stewart_drake.delay import Delay
+from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.report.analysis_figures import growth_figure, loop_figure, map_figure
 from stewart_drake.report.page import Page, Picture, Provenance, Section, Table, Tone
 from stewart_drake.report.tables import number, rows, wrap
+from stewart_drake.scenario.delay import Delay
 from stewart_drake.studies.delay_limits import DelayStudy
 from stewart_drake.studies.delay_loop import LoopMargins
 from stewart_drake.studies.delay_map import Cell

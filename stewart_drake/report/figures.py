@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from stewart_drake.config import FixedTunerConfig
+from stewart_drake.loop.results import SimulationResult
 from stewart_drake.report import style
 from stewart_drake.report.style import figure_style, write_figure
 from stewart_drake.report.tuner_figures import shown_until, weights_figure
-from stewart_drake.results import SimulationResult
-from stewart_drake.signals import ANGLES, COORDINATES, LEGS, PARAMETERS, POSITION
+from stewart_drake.scenario.config import FixedTunerConfig
+from stewart_drake.scenario.signals import ANGLES, COORDINATES, LEGS, PARAMETERS, POSITION
 from stewart_drake.studies.compare import LABELS
 from stewart_drake.studies.compare import label as spoken
 

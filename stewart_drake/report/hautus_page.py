@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import Final
 
-from stewart_drake.design.hautus import Hautus
+from stewart_drake.law.hautus import Hautus
 from stewart_drake.report.analysis_figures import chain_figure, plant_figure
 from stewart_drake.report.page import Page, Picture, Provenance, Section, Table, Tone
 from stewart_drake.report.tables import wrap

@@ -72,7 +72,7 @@ _ROUTES: Final[dict[tuple[str, str], _Route]] = {
 
 
 def loop_figure(loop: Diagram) -> Figure:
-    """The block diagram of a closed loop, see `diagram.build_closed_loop`.
+    """The block diagram of a closed loop, see `loop.diagram.build_closed_loop`.
 
     Raises:
         ValueError: a block or a connection that has no place in the drawing.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.report.style import Line, figure_style, write_figure
-from stewart_drake.signals import LEGS
+from stewart_drake.scenario.signals import LEGS
 
 Array = NDArray[np.float64]
 

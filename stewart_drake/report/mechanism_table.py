@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.plant.workspace import SINGULARITY_LIMIT
 from stewart_drake.report.tables import number, rows, wrap
 from stewart_drake.report.workspace_page import travel_text
 from stewart_drake.studies.mechanism_check import MechanismCheck

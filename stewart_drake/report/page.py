@@ -16,9 +16,9 @@ from typing import Final, Literal
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from stewart_drake.fileio import replacing
+from stewart_drake.files.fileio import replacing
+from stewart_drake.files.versions import versions
 from stewart_drake.report.style import figure_style, for_dark_too
-from stewart_drake.versions import versions
 
 Tone = Literal["good", "fair", "bad", "plain"]
 """What a verdict amounts to; shown by a word and a bar, so that grey print tells it too."""

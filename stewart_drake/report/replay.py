@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatParams, Rgba
 from pydrake.math import RotationMatrix
 
-from stewart_drake.fileio import replacing
+from stewart_drake.files.fileio import replacing
+from stewart_drake.files.versions import versions
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.scene import TORQUE_COLORS, Scene, crank_paths, full_color, torque_shares
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.report.page import environment
 from stewart_drake.report.tables import number
-from stewart_drake.results import SimulationResult
-from stewart_drake.scene import TORQUE_COLORS, Scene, crank_paths, full_color, torque_shares
-from stewart_drake.signals import ANGLES, LEGS, POSITION
-from stewart_drake.versions import versions
+from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
 
 if TYPE_CHECKING:
     from jinja2 import Template

@@ -10,15 +10,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from stewart_drake.config import Scenario
+from stewart_drake.loop.results import SimulationResult
 from stewart_drake.report.collect import ANALYSES, Analysis, Collected
 from stewart_drake.report.figures import draw_comparison, draw_run
 from stewart_drake.report.page import Page, Picture, Provenance, Section, Table, Tone
 from stewart_drake.report.tables import loops_sentence, number, paper_error, shared_warnings
 from stewart_drake.report.tuner_figures import weights_figure
-from stewart_drake.results import SimulationResult
-from stewart_drake.scenario_loading import scenario_yaml
-from stewart_drake.signals import COORDINATE_NAMES
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import scenario_yaml
+from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.studies.compare import LABELS, is_papers
 
 GOOD: Final = 5.0

@@ -10,7 +10,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from stewart_drake.fileio import replacing
+from stewart_drake.files.fileio import replacing
 
 
 class Line(NamedTuple):

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-from stewart_drake.resources import Kind, resolve, shipped
-from stewart_drake.results import SimulationResult
-from stewart_drake.signals import COORDINATE_NAMES
+from stewart_drake.files.resources import Kind, resolve, shipped
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.studies.compare import PAPER_ERRORS, is_papers, label
 from stewart_drake.studies.verdict import loop_word
 from stewart_drake.tuner.density import NUM_INPUTS

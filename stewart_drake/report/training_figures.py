@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from stewart_drake.report import style
 from stewart_drake.report.style import figure_style, write_figure
-from stewart_drake.studies.training import Training
+from stewart_drake.tuning.training import Training
 
 _TEST: Final = style.Line("#D55E00", "--", 1.5)
 _MOST_LEVELS: Final = 12

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from stewart_drake.loop.results import SimulationResult
 from stewart_drake.report import style
 from stewart_drake.report.style import figure_style
-from stewart_drake.results import SimulationResult
-from stewart_drake.signals import COORDINATES, LEGS, WEIGHTS
+from stewart_drake.scenario.signals import COORDINATES, LEGS, WEIGHTS
 from stewart_drake.tuner.network import Network
 
 Array = NDArray[np.float64]

@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 
 from stewart_drake.report.tables import number, rows, wrap
-from stewart_drake.studies.evaluation import TUNER, Evaluation
-from stewart_drake.studies.labels import cells
+from stewart_drake.tuning.evaluation import TUNER, Evaluation
+from stewart_drake.tuning.labels import cells
 
 
 def dataset_table(dataset: xr.Dataset) -> str:

@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
-from stewart_drake.lifetime import let_go
+from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.loop.lifetime import let_go
+from stewart_drake.loop.multibody import set_pose
+from stewart_drake.loop.multibody_stewart import build_viewer
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import rotation
-from stewart_drake.multibody_stewart import build_viewer
-from stewart_drake.plant.multibody import set_pose
-from stewart_drake.plant.workspace import Failure, diagnose
-from stewart_drake.signals import LEGS
+from stewart_drake.scenario.signals import LEGS
 from stewart_drake.studies.workspace_map import travel
 
 Array = NDArray[np.float64]
@@ -100,7 +100,7 @@ class PoseViewer:
         self.step(home)
 
     def close(self) -> None:
-        """See `scene.Scene.close`."""
+        """See `loop.scene.Scene.close`."""
         let_go(self._diagram)
 
     def values(self) -> Array:

@@ -14,10 +14,10 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from stewart_drake.plant.equations import DEAD_CENTRE_SINE
-from stewart_drake.plant.workspace import SINGULARITY_LIMIT, Failure
+from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
+from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, Failure
 from stewart_drake.report.style import Line, figure_style
-from stewart_drake.signals import COORDINATE_NAMES, LEGS
+from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
 from stewart_drake.studies.reach import Margins
 from stewart_drake.studies.sizing import Sizing
 from stewart_drake.studies.workspace_map import Section

@@ -4,8 +4,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from stewart_drake.plant.equations import DEAD_CENTRE_SINE
-from stewart_drake.plant.workspace import SINGULARITY_LIMIT
+from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
+from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.report.page import Page, Picture, Provenance, Section, Table
 from stewart_drake.report.tables import number, rows, wrap
 from stewart_drake.report.workspace_figures import (
@@ -13,7 +13,7 @@ from stewart_drake.report.workspace_figures import (
     motors_figure,
     sections_figure,
 )
-from stewart_drake.signals import COORDINATE_NAMES
+from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.studies.sizing import Sizing
 from stewart_drake.studies.workspace import WorkspaceStudy
 from stewart_drake.studies.workspace_map import Travel

@@ -5,16 +5,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.config import Scenario
-from stewart_drake.design.startup import least_torque, reference_torques
-from stewart_drake.experiment import (
+from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.law.startup import least_torque, reference_torques
+from stewart_drake.loop.experiment import (
     REACH_CHECK_PERIOD,
     Experiment,
     assemble,
     motion_scale,
     reference_failure,
 )
-from stewart_drake.plant.workspace import Failure, diagnose
+from stewart_drake.scenario.config import Scenario
 
 Array = NDArray[np.float64]
 

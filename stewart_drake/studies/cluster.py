@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import joblib
 
-from stewart_drake.errors import ConfigError
+from stewart_drake.files.errors import ConfigError
 
 _CONNECT_TIMEOUT: Final = 10.0
 """s to wait for a scheduler."""

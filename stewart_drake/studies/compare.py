@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import System
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.arrayio import write_netcdf
-from stewart_drake.config import Scenario
-from stewart_drake.errors import ConfigError
-from stewart_drake.fileio import remove_partials
-from stewart_drake.jsonio import write_json
-from stewart_drake.own import OwnReference
-from stewart_drake.resources import resolve
-from stewart_drake.results import SimulationResult
-from stewart_drake.scenario_loading import load_scenario
-from stewart_drake.simulation import simulate
+from stewart_drake.files.arrayio import write_netcdf
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import remove_partials
+from stewart_drake.files.jsonio import write_json
+from stewart_drake.files.resources import resolve
+from stewart_drake.loop.own import OwnReference
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import load_scenario
 
 CONTROLLERS: Final = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
 """Shipped names, in the order of tables and legends: the paper's four, and ours."""

@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from stewart_drake.config import Scenario
-from stewart_drake.controller_margin import ControllerMargin, controller_margin
-from stewart_drake.delay import Delay
-from stewart_drake.design.limits import amplification, fastest_pole, largest_delay
-from stewart_drake.design.riccati import RiccatiError
-from stewart_drake.experiment import waits_at_rest
-from stewart_drake.metrics import delay_floor
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.workspace import diagnose
-from stewart_drake.signals import POSE
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.law.limits import amplification, fastest_pole, largest_delay
+from stewart_drake.law.riccati import RiccatiError
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.loop.experiment import waits_at_rest
+from stewart_drake.loop.metrics import delay_floor
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.signals import POSE
 from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
 from stewart_drake.studies.delay_map import Cell, Progress, delay_map, map_delays

@@ -8,10 +8,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.controller_margin import true_dynamics
-from stewart_drake.design.delay_model import DelayedModel
-from stewart_drake.design.error_model import double_integrators, linear_model
-from stewart_drake.design.limits import (
+from stewart_drake.law.delay_model import DelayedModel
+from stewart_drake.law.error_model import double_integrators, linear_model
+from stewart_drake.law.limits import (
     Peak,
     frequency_grid,
     loop_gain,
@@ -19,13 +18,14 @@ from stewart_drake.design.limits import (
     sensitivity,
     spectral_radius,
 )
-from stewart_drake.design.linear_loop import LinearLoop, law_gain, worst_margins
-from stewart_drake.design.startup import weight_scales
-from stewart_drake.experiment import believed_delay
+from stewart_drake.law.linear_loop import LinearLoop, law_gain, worst_margins
+from stewart_drake.law.startup import weight_scales
+from stewart_drake.loop.controller_margin import true_dynamics
+from stewart_drake.loop.experiment import believed_delay
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.signals import POSE
+from stewart_drake.scenario.signals import POSE
+from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.basis import Basis
-from stewart_drake.trajectories import evaluate
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -8,13 +8,13 @@ from functools import singledispatch
 from tempfile import TemporaryDirectory
 from typing import Final, NamedTuple
 
-from stewart_drake.config import Scenario
-from stewart_drake.experiment import assemble, reference_failure
-from stewart_drake.jsonio import jsonable
-from stewart_drake.reference_config import ReferenceConfig, SineConfig, WaypointsConfig
-from stewart_drake.reference_files import waypoints
-from stewart_drake.scenario_loading import scenario_to_dict
-from stewart_drake.simulation import simulate
+from stewart_drake.files.jsonio import jsonable
+from stewart_drake.loop.experiment import assemble, reference_failure
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import scenario_to_dict
+from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig, WaypointsConfig
+from stewart_drake.scenario.reference_files import waypoints
 from stewart_drake.studies.jobs import finished, run_jobs
 from stewart_drake.studies.run_files import read_cell
 

@@ -8,11 +8,11 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from stewart_drake.config import Scenario
-from stewart_drake.design.startup import reference_torque
-from stewart_drake.errors import ConfigError
-from stewart_drake.experiment import motion_scale, prepare
-from stewart_drake.reference_config import SineConfig
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.startup import reference_torque
+from stewart_drake.loop.experiment import motion_scale, prepare
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.reference_config import SineConfig
 
 DELAYS: Final = (0, 15)
 """Whole periods, uniform, both included."""

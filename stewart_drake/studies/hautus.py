@@ -20,19 +20,19 @@ from pydrake.systems.primitives import (
 )
 from threadpoolctl import threadpool_limits
 
-from stewart_drake.config import Scenario
-from stewart_drake.design.delay_model import chain, delayed_model
-from stewart_drake.design.error_model import (
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, Failure, diagnose, standing
+from stewart_drake.law.delay_model import chain, delayed_model
+from stewart_drake.law.error_model import (
     ContinuousModel,
     double_integrators,
     linear_model,
     with_integral,
 )
-from stewart_drake.design.hautus import TOLERANCE, Hautus, hautus, scaled
+from stewart_drake.law.hautus import TOLERANCE, Hautus, hautus, scaled
 from stewart_drake.mechanism.torque_map import torque_map
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.workspace import SINGULARITY_LIMIT, Failure, diagnose, standing
-from stewart_drake.signals import NUM_TORQUES
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.mode_words import mode_words, state_labels
 

@@ -26,11 +26,11 @@ import joblib
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from stewart_drake.errors import ConfigError
-from stewart_drake.fileio import remove_partials, replacing
-from stewart_drake.jsonio import jsonable, load_json
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import remove_partials, replacing
+from stewart_drake.files.jsonio import jsonable, load_json
+from stewart_drake.files.yamlio import brief, validate
 from stewart_drake.studies.cluster import dask_backend
-from stewart_drake.yamlio import brief, validate
 
 MANIFEST: Final = "manifest.json"
 """The settings that all jobs of a folder share, and their hash."""

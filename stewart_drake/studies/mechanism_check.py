@@ -5,9 +5,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.plant.workspace import Failure, diagnose
 from stewart_drake.studies.singularity import Measures, characteristic_length, measure
 from stewart_drake.studies.workspace_map import Travel, travel
 

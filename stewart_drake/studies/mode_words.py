@@ -5,8 +5,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.design.hautus import Mode
-from stewart_drake.signals import COORDINATE_NAMES, NUM_TORQUES
+from stewart_drake.law.hautus import Mode
+from stewart_drake.scenario.signals import COORDINATE_NAMES, NUM_TORQUES
 
 _TORQUE: Final = "torque "
 _SHOWN: Final = 0.01

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.dynamics.workspace import Failure, diagnose, margin
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.plant.workspace import Failure, diagnose, margin
 from stewart_drake.studies.singularity import measure
 
 Array = NDArray[np.float64]

@@ -6,17 +6,17 @@ import math
 from pathlib import Path
 from typing import Any
 
-from stewart_drake.config import Scenario
-from stewart_drake.errors import ConfigError
-from stewart_drake.experiment import assemble, prepare
-from stewart_drake.fileio import remove_partials
-from stewart_drake.jsonio import jsonable
+from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import remove_partials
+from stewart_drake.files.jsonio import jsonable
+from stewart_drake.loop.experiment import assemble, prepare
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.plant.workspace import diagnose
-from stewart_drake.scenario_loading import scenario_to_dict
-from stewart_drake.signals import POSE
-from stewart_drake.simulation import simulate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import scenario_to_dict
+from stewart_drake.scenario.signals import POSE
 from stewart_drake.studies.jobs import Progress, run_jobs, write_atomically
 from stewart_drake.studies.robustness_result import Outcome, RobustnessStudy, table
 from stewart_drake.studies.run_files import read_outcome

@@ -11,8 +11,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.experiment import Experiment
-from stewart_drake.scenario_loading import scenario_to_dict
+from stewart_drake.files.versions import versions
+from stewart_drake.loop.experiment import Experiment
+from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.failures import Explanation, explain
 from stewart_drake.studies.sizing import rms
 from stewart_drake.studies.statistics import (
@@ -24,7 +25,6 @@ from stewart_drake.studies.statistics import (
     wilson_interval,
 )
 from stewart_drake.studies.uncertainty import Draw, Ranges, Scales
-from stewart_drake.versions import versions
 
 Array = NDArray[np.float64]
 

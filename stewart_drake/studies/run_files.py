@@ -11,10 +11,10 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, TypeVar
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from stewart_drake.errors import ConfigError
-from stewart_drake.jsonio import load_json
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.jsonio import load_json
+from stewart_drake.files.yamlio import brief, validate
 from stewart_drake.studies.robustness_result import Outcome
-from stewart_drake.yamlio import brief, validate
 
 _MAX_BYTES: Final = 1_000_000
 _EXPECTED: Final = "the file of one run of a study"

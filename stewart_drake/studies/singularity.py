@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.dynamics.workspace import home_sign, standing
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import LegGeometry, leg_geometry
-from stewart_drake.plant.workspace import home_sign, standing
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ class Measures(NamedTuple):
     parallel: float
     """det W with its sign at home made positive, 0 at a parallel singularity."""
     margin: float
-    """Positive inside the workspace, see `plant.workspace.margin`."""
+    """Positive inside the workspace, see `dynamics.workspace.margin`."""
     transmission: Array
     """(6,) |r . tangent|: share of a crank's push that goes along its rod."""
     held: float

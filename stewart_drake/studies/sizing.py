@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.plant.dynamics import StewartDynamics
-from stewart_drake.signals import ACCELERATIONS, LEGS, POSE, RATES
-from stewart_drake.trajectories import evaluate
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.scenario.signals import ACCELERATIONS, LEGS, POSE, RATES
+from stewart_drake.scenario.trajectories import evaluate
 
 Array = NDArray[np.float64]
 

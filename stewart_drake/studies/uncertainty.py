@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from stewart_drake.config import Scenario
-from stewart_drake.design.startup import INSTANTS
-from stewart_drake.errors import ConfigError
-from stewart_drake.experiment import Experiment, believed_delay, motion_scale
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.yamlio import brief, parse_yaml, validate
+from stewart_drake.law.startup import INSTANTS
+from stewart_drake.loop.experiment import Experiment, believed_delay, motion_scale
 from stewart_drake.mechanism.geometry import Body, Mechanism
-from stewart_drake.signals import NUM_LEGS, NUM_TORQUES
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
+from stewart_drake.scenario.trajectories import spread_instants
 from stewart_drake.studies.range_units import RANGE_UNITS
 from stewart_drake.studies.sizing import size_motors
-from stewart_drake.trajectories import spread_instants
-from stewart_drake.yamlio import brief, parse_yaml, validate
 
 Array = NDArray[np.float64]
 Share = Annotated[float, Field(ge=0, lt=1)]

@@ -6,9 +6,9 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from stewart_drake.controller_margin import ControllerMargin, true_dynamics, true_model
-from stewart_drake.design.limits import amplification, fastest_pole
-from stewart_drake.experiment import Experiment
+from stewart_drake.law.limits import amplification, fastest_pole
+from stewart_drake.loop.controller_margin import ControllerMargin, true_dynamics, true_model
+from stewart_drake.loop.experiment import Experiment
 
 INSTANTS: Final = 30
 """Poles are looked at this often along the reference; 29 steps, a prime, since a round number of

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.config import Scenario
-from stewart_drake.experiment import (
+from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.loop.experiment import (
     Experiment,
     assemble,
     check_instants,
     first_pose_text,
 )
-from stewart_drake.plant.workspace import Failure, diagnose
-from stewart_drake.signals import COORDINATES, LEGS
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.signals import COORDINATES, LEGS
 from stewart_drake.studies.reach import (
     Factor,
     Margins,

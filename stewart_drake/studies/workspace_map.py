@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from stewart_drake.dynamics.workspace import diagnose, margin
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.plant.workspace import diagnose, margin
-from stewart_drake.signals import COORDINATES, NUM_COORDINATES
+from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES
 from stewart_drake.studies.singularity import measure
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class Section(NamedTuple):
     """A section of the workspace through home; arrays (len(y), len(x)).
 
     `condition` is NaN outside the part that is connected with home within the section; `margin` is
-    positive in that part and zero on its border, see `plant.workspace.margin`.
+    positive in that part and zero on its border, see `dynamics.workspace.margin`.
     """
 
     first: int

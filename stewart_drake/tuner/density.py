@@ -18,7 +18,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stewart_drake.signals import TUNER_INPUTS
+from stewart_drake.scenario.signals import TUNER_INPUTS
 
 Array = NDArray[np.float64]
 Kind = Literal["magnitude", "signed"]

@@ -18,13 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict
 from scipy.special import expit
 
-from stewart_drake.errors import ConfigError
-from stewart_drake.fileio import replacing
-from stewart_drake.jsonio import load_json
-from stewart_drake.resources import resolve
-from stewart_drake.signals import WEIGHTS
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import replacing
+from stewart_drake.files.jsonio import load_json
+from stewart_drake.files.resources import resolve
+from stewart_drake.files.yamlio import brief, validate
+from stewart_drake.scenario.signals import WEIGHTS
 from stewart_drake.tuner.density import NUM_INPUTS
-from stewart_drake.yamlio import brief, validate
 
 Array = NDArray[np.float64]
 

@@ -17,10 +17,10 @@ from pydrake.systems.analysis import Simulator
 from threadpoolctl import threadpool_info
 
 import stewart_drake as sd
-from stewart_drake.diagram import ClosedLoop, build_closed_loop
-from stewart_drake.resources import shipped
-from stewart_drake.simulation import make_simulator
-from stewart_drake.timing import event_time, look_time
+from stewart_drake.files.resources import shipped
+from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
+from stewart_drake.loop.simulation import make_simulator
+from stewart_drake.scenario.timing import event_time, look_time
 
 Array = NDArray[np.float64]
 FILE = Path(__file__).with_name("torques.npz")

@@ -1,0 +1,123 @@
+"""The stewart-drake command. Drake is imported by the commands that need it, not for --help."""
+
+import os
+import sys
+from typing import Annotated, Any, Final
+
+import typer
+
+from stewart_drake.cli import analyze, model, report, run, tune
+from stewart_drake.cli.common import INTERRUPTED, release
+from stewart_drake.cli.examples import add_examples
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.report.terminal import echo
+
+_BAD_INPUT: Final = 2
+# Releases of typer keep their usage errors in different places; all derive from this class.
+_UsageError: Final[Any] = typer.BadParameter.__mro__[1]
+
+app = typer.Typer(rich_markup_mode=None)
+app.command()(run.simulate)
+app.command()(run.compare)
+app.command()(run.export)
+app.command()(report.report)
+app.add_typer(model.app, name="model")
+app.add_typer(analyze.app, name="analyze")
+app.add_typer(tune.app, name="tune")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command.
+
+    Args:
+        arguments: those of the command line by default.
+
+    Returns:
+        The exit status: 0; 2 for bad input, with one line on stderr; 130 for Ctrl-C.
+    """
+    _prepare_surroundings()
+    for argument in sys.argv[1:] if arguments is None else arguments:
+        if any("\ud800" <= letter <= "\udfff" for letter in argument):  # an undecodable byte
+            return _complain(f"{argument!r}: is not UTF-8 text; expected names in UTF-8")
+    add_examples(app)
+    command = typer.main.get_command(app)
+    try:
+        return command.main(arguments, "stewart-drake", standalone_mode=False) or 0
+    except _UsageError as error:
+        return _complain(_usage_message(error))
+    except typer.Abort:  # Ctrl-C in a command that has nothing to keep
+        return INTERRUPTED
+    except ImportError as error:  # what Drake makes of a Ctrl-C while it is loaded
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            return INTERRUPTED
+        raise
+    except BrokenPipeError:  # whoever read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except _bad_input() as error:
+        return _complain(str(error))
+    finally:
+        release()
+
+
+def _prepare_surroundings() -> None:
+    """Give closed standard streams a place, and figures Matplotlib's backend for files.
+
+    The first file to be opened would take a closed stream's number, and what Drake says with it.
+    """
+    os.environ["MPLBACKEND"] = "agg"
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            place = os.open(os.devnull, os.O_RDWR)
+            os.dup2(place, number)
+            if place != number:
+                os.close(place)
+            setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    show_version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    """Delay-aware control of rotary Stewart platforms, simulated with Drake."""
+    if show_version:
+        from importlib.metadata import version
+
+        typer.echo(f"stewart-drake {version('stewart-drake')}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@app.command("list")
+def list_shipped() -> None:
+    """List the shipped models, scenarios and so on."""
+    from stewart_drake.files.resources import KINDS, shipped
+    from stewart_drake.report.tables import shipped_table
+
+    for kind, heading in KINDS.items():
+        if shipped(kind):
+            typer.echo(heading)
+            typer.echo(shipped_table(kind))
+
+
+def _bad_input() -> tuple[type[Exception], ...]:
+    from stewart_drake.mechanism.kinematics import SingularPoseError, UnreachablePoseError
+
+    return ConfigError, UnreachablePoseError, SingularPoseError, OSError
+
+
+def _complain(message: str) -> int:
+    echo("error: " + " ".join(message.split()), error=True)
+    return _BAD_INPUT
+
+
+def _usage_message(error: Any) -> str:
+    if getattr(error, "possibilities", None):
+        return f"{error.message}; did you mean {error.possibilities[0]}?"
+    message = error.format_message().rstrip(".")
+    if message.endswith("?"):
+        return message
+    command = "stewart-drake" if error.ctx is None else error.ctx.command_path
+    return f"{message}; see {command} --help"

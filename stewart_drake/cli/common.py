@@ -1,0 +1,175 @@
+"""What the commands share: their usual options, and how they answer."""
+
+import contextlib
+import fcntl
+import json
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import remove_partials
+from stewart_drake.report.terminal import echo
+
+if TYPE_CHECKING:
+    from stewart_drake.files.resources import Kind
+
+INTERRUPTED: Final = 130
+"""Exit status after Ctrl-C."""
+
+_held: Final = contextlib.ExitStack()
+"""What is to be undone when the running command ends."""
+
+
+def _shipped(kind: "Kind") -> Callable[[str], list[str]]:
+    """What a shell offers for an argument: the shipped names that go on from what is typed."""
+
+    def complete(incomplete: str) -> list[str]:
+        from stewart_drake.files.resources import shipped
+
+        return [name for name in shipped(kind) if name.startswith(incomplete)]
+
+    return complete
+
+
+def complete_setting(incomplete: str) -> list[str]:
+    """What a shell offers for `--set`: fields, and where a field has few values, these."""
+    from stewart_drake.scenario.loading import setting_choices
+
+    return [text for text in setting_choices() if text.startswith(incomplete)]
+
+
+ScenarioName = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENARIO", help="Shipped name or file.", autocompletion=_shipped("scenario")
+    ),
+]
+MechanismName = Annotated[
+    str,
+    typer.Argument(
+        metavar="MECHANISM", help="Shipped name or file.", autocompletion=_shipped("mechanism")
+    ),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="FIELD=VALUE",
+        help="E.g. plant.gravity=true; repeatable.",
+        autocompletion=complete_setting,
+    ),
+]
+Controller = Annotated[
+    str | None, typer.Option(metavar="NAME|FILE", help="Laid over the scenario's own.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")]
+Workers = Annotated[int | None, typer.Option(metavar="N", help="Processes; all cores by default.")]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to run on instead.")
+]
+Out = Annotated[Path | None, typer.Option(metavar="DIR", help="For summary, signals, figures.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
+
+
+def silence(text: str) -> None:
+    """Print nothing."""
+
+
+def print_json(summary: dict[str, Any]) -> None:
+    """Print a summary as JSON, NaN as null."""
+    from stewart_drake.files.jsonio import jsonable
+
+    typer.echo(json.dumps(jsonable(summary), indent=2, allow_nan=False))
+
+
+def check_writable(directory: Path | None, *, alone: bool = True) -> None:
+    """Make the directory of `--out` if there is none; see also `release`.
+
+    Args:
+        directory: or None.
+        alone: whether no other command may write there until this one ends.
+
+    Raises:
+        ConfigError: it cannot be written to, or another command is writing there.
+    """
+    if directory is None:
+        return
+    try:
+        made = [path for path in (directory, *directory.parents) if not path.exists()]
+        directory.mkdir(parents=True, exist_ok=True)
+        _held.callback(_remove_empty, made)
+        with tempfile.TemporaryFile(dir=directory):
+            pass
+        if alone:
+            # A lock on the directory itself leaves no file, and ends with the process in any case.
+            lock = os.open(directory, os.O_RDONLY)
+            _held.callback(os.close, lock)
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        remove_partials(directory)
+    except BlockingIOError:
+        raise ConfigError(
+            f"--out: got {str(directory)!r}, where another command is writing; wait for it to end, "
+            "or choose another directory"
+        ) from None
+    except (OSError, ValueError) as error:  # a ValueError for a zero byte in the name
+        raise ConfigError(
+            f"--out: got {str(directory)!r}; expected a directory that can be written "
+            f"({getattr(error, 'strerror', None) or error})"
+        ) from None
+
+
+def check_file(path: Path) -> None:
+    """Make the directory of a file that `--out` names.
+
+    Raises:
+        ConfigError: it is a directory or a device itself, or its own cannot be written to.
+    """
+    if path.exists() and not path.is_file():
+        kind = "a directory" if path.is_dir() else "no regular file"
+        raise ConfigError(f"--out: got {str(path)!r}, {kind}; expected a file")
+    check_writable(path.parent, alone=False)
+
+
+def release() -> None:
+    """End what `check_writable` has begun: unlock, remove made directories that stayed empty."""
+    _held.close()
+
+
+def _remove_empty(directories: list[Path]) -> None:
+    with contextlib.suppress(OSError):
+        for path in directories:
+            path.rmdir()
+
+
+def remove(directory: Path, names: Iterable[str]) -> None:
+    """Delete files of an earlier run, as far as they exist."""
+    for name in names:
+        (directory / name).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def drawing(what: str) -> Iterator[None]:
+    """What is drawn in here comes after the results; a failure costs it alone, and is told.
+
+    A file that cannot be written, as on a full disk, is an error as everywhere.
+    """
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        echo(f"warning: {what} could not be drawn ({reason}); everything else is kept", error=True)
+
+
+def open_meshcat() -> Any:
+    """A Meshcat server, on a free port."""
+    from pydrake.geometry import Meshcat
+
+    return Meshcat()

@@ -1,0 +1,105 @@
+"""Looking at mechanisms: model check, model sdf, model view."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stewart_drake.cli.common import (
+    AsJson,
+    MechanismName,
+    Quiet,
+    check_file,
+    check_writable,
+    drawing,
+    open_meshcat,
+    print_json,
+    remove,
+    silence,
+)
+from stewart_drake.files.fileio import replacing
+from stewart_drake.report.terminal import echo
+
+app = typer.Typer(rich_markup_mode=None, help="Look at a mechanism.")
+
+
+@app.command()
+def sdf(
+    mechanism: MechanismName,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Instead of standard output.")
+    ] = None,
+) -> None:
+    """Write a mechanism as SDFormat."""
+    from stewart_drake.mechanism.files import load_mechanism
+    from stewart_drake.mechanism.sdformat import to_sdformat
+
+    text = to_sdformat(load_mechanism(mechanism))
+    if out is None:
+        typer.echo(text, nl=False)
+        return
+    check_file(out)
+    with replacing(out) as partial:
+        partial.write_text(text)
+    echo(f"written to {out}")
+
+
+@app.command()
+def check(
+    mechanism: MechanismName,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="For summary and a drawing.")
+    ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Check a mechanism and describe it at its home pose, under gravity."""
+    from stewart_drake.mechanism.files import load_mechanism
+    from stewart_drake.report.mechanism_table import mechanism_table
+    from stewart_drake.studies.mechanism_check import check_mechanism
+
+    check_writable(out)
+    say = silence if quiet or as_json else echo
+    found = check_mechanism(load_mechanism(mechanism))
+    say(mechanism_table(found))
+    if out is not None:
+        from stewart_drake.files.jsonio import write_json
+
+        pictures = ("mechanism.png", "mechanism.svg")
+        remove(out, ["summary.json", *pictures])
+        write_json(out / "summary.json", found.summary)
+        written = ["summary.json"]
+        with drawing("mechanism"):
+            from stewart_drake.report.mechanism_figures import write_mechanism_figure
+
+            write_mechanism_figure(found.mechanism, out)
+            written += pictures
+        say(f"written to {out}: {', '.join(written)}")
+    if as_json:
+        print_json(found.summary)
+
+
+@app.command()
+def view(
+    mechanism: MechanismName,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="For a page of the home pose; then end.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Show a mechanism in a browser, with sliders for its pose."""
+    from stewart_drake.mechanism.files import load_mechanism
+    from stewart_drake.report.viewer import STOP, PoseViewer
+
+    check_writable(out)
+    say = silence if quiet else echo
+    viewer = PoseViewer(load_mechanism(mechanism), open_meshcat())
+    if out is not None:
+        text = viewer.meshcat.StaticHtml()
+        with replacing(out / "view.html") as partial:
+            partial.write_text(text)
+        say(f"written to {out}: view.html")
+        return
+    # A reader needs the address even when everything else is quiet.
+    echo(f"showing it at {viewer.meshcat.web_url()}, ends with {STOP!r} there or Ctrl-C")
+    viewer.run(say)

@@ -1,0 +1,212 @@
+"""Running scenarios: simulate, compare, export."""
+
+import select
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from stewart_drake.cli.common import (
+    INTERRUPTED,
+    AsJson,
+    Controller,
+    Out,
+    Quiet,
+    ScenarioName,
+    Settings,
+    check_file,
+    check_writable,
+    drawing,
+    open_meshcat,
+    print_json,
+    remove,
+    silence,
+)
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.report.terminal import echo, progress_bars
+
+if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
+
+    from stewart_drake.loop.results import SimulationResult
+    from stewart_drake.mechanism.geometry import Mechanism
+
+CSV: Final = "signals.csv"
+REPLAY: Final = "replay.html"
+RUN_FIGURES: Final = ("states", "errors", "torques", "parameters", "weights")
+"""All that `run_figures` may write, and below `comparison_figures`; what is older is removed."""
+COMPARISON_FIGURES: Final = (
+    "states",
+    "errors",
+    "weights",
+    *(f"torques_{name}" for name in ("delay_lqr", "delay_lqi", "predictor_lqi")),
+)
+_POLL: Final = 0.1
+"""s between two looks whether somebody watches."""
+
+
+def simulate(
+    scenario: ScenarioName = "paper",
+    controller: Controller = None,
+    settings: Settings = None,
+    out: Out = None,
+    csv: Annotated[bool, typer.Option("--csv", help="Write signals.csv too; needs --out.")] = False,
+    replay: Annotated[
+        bool, typer.Option("--replay", help="Write replay.html, a 3-D animation; needs --out.")
+    ] = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    meshcat: Annotated[
+        bool, typer.Option("--meshcat", help="Show it in a browser, live and as a replay.")
+    ] = False,
+) -> int:
+    """Run one scenario."""
+    from stewart_drake.loop.cautions import cautions_before
+    from stewart_drake.loop.controller_margin import controller_margin
+    from stewart_drake.loop.experiment import prepare
+    from stewart_drake.loop.simulation import simulate as run
+    from stewart_drake.report.tables import run_table, warning_lines, wrap
+    from stewart_drake.scenario.loading import load_scenario
+    from stewart_drake.studies.verdict import Verdict, loop_verdict
+
+    for option, given in (("--csv", csv), ("--replay", replay)):
+        if given and out is None:
+            raise ConfigError(f"{option}: got it without --out; expected --out DIR to write into")
+    say = silence if quiet or as_json else echo
+    experiment = prepare(load_scenario(scenario, controller, settings or ()))
+    check_writable(out)
+    viewer = open_meshcat() if meshcat else None
+    margin = controller_margin(experiment)
+    say(wrap(loop_verdict(margin)))
+    say(wrap(str(Verdict(margin.eta, margin.pole, margin.pole_time))))
+    for line in warning_lines(cautions_before(experiment, margin)):
+        say(line)
+    if viewer is not None:
+        _await_viewer(viewer)
+    name = Path(scenario).stem
+    with progress_bars([name], experiment.scenario.duration, quiet) as progress:
+        result = run(experiment, progress=progress[name], meshcat=viewer, margin=margin)
+    say(run_table(result))
+    if out is not None:
+        written = _write_run(result, experiment.mechanism, out, name, csv, replay or meshcat)
+        say(f"written to {out}: {', '.join(written)}")
+    if as_json:
+        print_json(result.summary)
+    if viewer is not None:
+        from stewart_drake.report.replay import replay as play
+
+        play(result.signals, experiment.mechanism, viewer)
+        if sys.stdin.isatty():
+            input(f"replay at {viewer.web_url()}, Enter ends")
+    return INTERRUPTED if result.status == "interrupted" else 0
+
+
+def _await_viewer(viewer: "Meshcat") -> None:
+    """Tell where to look; a person at a terminal is given the time to open it there."""
+    # A reader needs the address even when everything else is quiet.
+    asked = sys.stdin.isatty()
+    start = ", starts when it is opened there, or with Enter" if asked else ""
+    echo(f"showing it live at {viewer.web_url()}{start}", error=True)
+    while asked and viewer.GetNumActiveConnections() == 0:
+        if select.select([sys.stdin], [], [], _POLL)[0]:
+            sys.stdin.readline()
+            return
+
+
+def _write_run(
+    result: "SimulationResult",
+    mechanism: "Mechanism",
+    out: Path,
+    name: str,
+    csv: bool,
+    replay: bool,
+) -> list[str]:
+    """Write what a run leaves behind; what was written, in words."""
+    # The summary comes last of the results: where there is one, the signals beside it are of the
+    # same run. What is drawn of them comes after that.
+    remove(out, ["summary.json", CSV, REPLAY, *_pictures(RUN_FIGURES)])
+    written = ["summary.json", "signals.nc"]
+    if csv:
+        from stewart_drake.report.csv_file import write_csv
+
+        write_csv(result.signals, out / CSV)
+        written.append(".csv")
+    result.save(out)
+    with drawing("figures"):
+        from stewart_drake.report.figures import run_figures
+
+        written.append(f"{len(run_figures(result, out))} figures")
+    if replay:
+        with drawing(REPLAY):
+            from stewart_drake.report.replay import write_replay
+
+            write_replay(result, mechanism, out / REPLAY, name)
+            written.append(REPLAY)
+    return written
+
+
+def _pictures(names: Iterable[str]) -> list[str]:
+    return [f"{name}.{suffix}" for name in names for suffix in ("png", "svg")]
+
+
+def export(
+    signals: Annotated[Path, typer.Argument(metavar="FILE.nc", help="Saved by a simulation.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Instead of standard output.")
+    ] = None,
+) -> None:
+    """Convert saved signals to CSV.
+
+    A line per instant; the header names each column's unit.
+    """
+    from stewart_drake.report.csv_file import read_signals, signals_csv, write_csv
+
+    dataset = read_signals(signals)
+    if out is None:
+        typer.echo(signals_csv(dataset), nl=False)
+        return
+    check_file(out)
+    write_csv(dataset, out)
+    echo(f"written to {out}")
+
+
+def compare(
+    scenario: ScenarioName = "paper",
+    settings: Settings = None,
+    out: Out = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> int:
+    """Run the five shipped controllers on a scenario, as a table."""
+    from stewart_drake.loop.experiment import prepare
+    from stewart_drake.report.tables import comparison_table, wrap
+    from stewart_drake.scenario.loading import load_scenario
+    from stewart_drake.studies import compare as study
+    from stewart_drake.studies.verdict import delay_verdict
+
+    say = silence if quiet or as_json else echo
+    experiment = prepare(load_scenario(scenario, settings=settings or ()))
+    check_writable(out)
+    say(wrap(str(delay_verdict(experiment))))
+    names = study.CONTROLLERS
+    with progress_bars(names, experiment.scenario.duration, quiet) as progress:
+        results = study.compare(
+            scenario, settings or (), lambda name, time, error: progress[name](time, error)
+        )
+    say(comparison_table(results))
+    if out is not None:
+        stale = ["summary.json", *(f"{name}.nc" for name in names)]
+        remove(out, [*stale, *_pictures(COMPARISON_FIGURES)])
+        study.save_comparison(results, out)
+        written = f"summary.json, {len(results)} signal files"
+        with drawing("figures"):
+            from stewart_drake.report.figures import comparison_figures
+
+            written += f", {len(comparison_figures(results, out))} figures"
+        say(f"written to {out}: {written}")
+    if as_json:
+        print_json(study.comparison_summary(results))
+    ended = [result.status for result in results.values()]
+    return INTERRUPTED if "interrupted" in ended or len(ended) < len(names) else 0

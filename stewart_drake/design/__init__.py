@@ -1,1 +1,0 @@
-"""Design of the delayed LQI controller: pure functions of matrices, no LeafSystem."""

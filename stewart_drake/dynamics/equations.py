@@ -1,0 +1,290 @@
+"""The equations of motion as CasADi expressions: the legs reduced to their plate joints.
+
+With nu = (w, v), the plate's angular velocity and the velocity of its COM in W, the mechanism obeys
+
+    M(q) nu_dot + h(q, nu) = B(q) torque.                                                  (EOM)
+
+A leg has three degrees of freedom and touches the plate in one point Q, whose position q and
+velocity w, taken in the leg's motor frame S, fix the motion of crank and rod. By virtual power
+(Jourdain's principle) a leg is therefore a 3 x 3 mass m, a bias c and a torque arm g at Q:
+
+    m = sum J' I J,   c = sum J' (I J_dot w + omega x I omega) - J' f_gravity,   alpha_dot = g' w,
+
+summed over crank and rod, their twists being J w. With b = p_PQ_W,  v_Q = v + w x b  and
+v_Q_dot = v_dot + w_dot x b + w x (w x b), so that a force f at Q enters (EOM) as [b x f; f].
+The same elimination of closed loops, for any tree: Wehage & Haug (1982).
+"""
+
+from typing import NamedTuple
+
+import casadi as ca
+
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.scenario.signals import BIAS, DAMPING, NUM_LEGS, NUM_PARAMETERS, PAYLOAD
+
+STANDARD_GRAVITY = 9.81
+"""m/s^2, along -z of W; Drake's default."""
+
+DEAD_CENTRE_SINE = 0.01
+"""Sine of the crank's angle off dead centre at which a leg counts as out of reach.
+
+At a dead centre pose coordinates are singular: alpha_dot grows like 1 / sine.
+"""
+
+
+class Leg(NamedTuple):
+    """One leg seen from its plate joint; all in its motor frame S."""
+
+    mass: ca.SX
+    """m (3, 3) kg."""
+    bias: ca.SX
+    """c (3,) N, gravity included."""
+    arm: ca.SX
+    """g (3,) 1/m: crank rate alpha_dot = g' w, and force at Q per torque on the crank."""
+    potential: ca.SX
+    """J."""
+
+
+class Motion(NamedTuple):
+    """(EOM) at symbolic pose, rates, parameters and gravity, and what belongs to it."""
+
+    mass: ca.SX
+    """M (6, 6)."""
+    bias: ca.SX
+    """h (6,)."""
+    arm: ca.SX
+    """B' (6, 6): d alpha_dot / d nu."""
+    nu: ca.SX
+    """(6,)."""
+    nu_dot_bias: ca.SX
+    """(6,): nu_dot at zero accelerations of the pose."""
+    rates_map: ca.SX
+    """N (6, 6): nu = N rates."""
+    energy: ca.SX
+    """J, kinetic plus potential."""
+
+
+def cross_matrix(a: ca.SX) -> ca.SX:
+    """(3, 3) with cross_matrix(a) b = a x b."""
+    return ca.skew(a)
+
+
+def _held_above(x: ca.SX, threshold: float) -> ca.SX:
+    """x above the threshold, three times differentiable everywhere, at least half the threshold.
+
+    Integrator stages step past the workspace boundary before its witness sees it, where sin^2
+    becomes negative. With y = x / threshold in [0, 1] the slope is the quintic smoothstep, whose
+    integral is 5/2 y^4 - 3 y^5 + y^6.
+    """
+    y = x / threshold
+    inside = ca.fmin(ca.fmax(y, 0.0), 1.0)
+    held = 0.5 + inside**4 * (2.5 + inside * (inside - 3.0))
+    return threshold * (held + ca.fmax(y - 1.0, 0.0))
+
+
+def leg_at_joint(mechanism: Mechanism, leg: int) -> ca.Function:
+    """Crank and rod of leg `leg` (0 to 5) reduced to Q: (q, w, gravity) in S -> `Leg`.
+
+    Crank tip T at u c, its direction of motion t = n x c, rod direction r, all unit vectors, n the
+    motor axis (z of S). The rod's length gives r.(w - v_T) = 0 with v_T = u alpha_dot t, so
+    alpha_dot = g.w with g = r / (u r.t).  With d = w - v_T = D w, D = 1 - u t g', r_dot = d / l:
+
+    * its derivative, at zero acceleration of Q:  alpha_acc = (d.d / l + u alpha_dot^2 r.c)/(u r.t),
+      a_T = u (alpha_acc t - alpha_dot^2 c);
+    * the rod's points move with v_T + s d, 0 <= s <= 1. Its mass, lateral inertia I_t and COM are
+      those of a line mass with the moments mu_0 = m, mu_1 = m f, mu_2 = m f^2 + I_t / l^2 in s;
+    * besides, it spins about itself with rate k.w: the universal joint leaves it no angular
+      velocity along n x (n x r), so k = D'(n x r) r_z / (l (1 - r_z^2)). Axial inertia I_a adds
+      the angular momentum I_a (k.w) r, whose rate does virtual power with J_omega;
+    * I_y, about the universal joint's second axis y, may differ from I_t = I_z: a rank-one rest.
+    """
+    q, w, gravity = ca.SX.sym("q", 3), ca.SX.sym("w", 3), ca.SX.sym("gravity", 3)
+    u, length = float(mechanism.crank_lengths[leg]), float(mechanism.rod_lengths[leg])
+    c, t = crank_directions(q, u, length, float(mechanism.branches[leg]))
+    r = q - u * c
+    r /= ca.norm_2(r)  # which is the rod's length, but out of reach
+    g = r / (u * ca.dot(r, t))
+
+    alpha_dot = ca.dot(g, w)
+    d = w - u * alpha_dot * t
+    alpha_acc = (ca.sumsqr(d) / length + u * alpha_dot**2 * ca.dot(r, c)) / (u * ca.dot(r, t))
+    a_T = u * (alpha_acc * t - alpha_dot**2 * c)
+
+    crank, rod = mechanism.crank, mechanism.rod
+    I_a, I_y, I_t = (float(moment) for moment in rod.inertia)
+    mu_0, mu_1 = rod.mass, rod.mass * rod.center
+    mu_2 = mu_1 * rod.center + I_t / length**2
+    tip_mass, coupling = mu_0 - 2 * mu_1 + mu_2, mu_1 - mu_2
+    shaft_inertia = float(crank.inertia[2]) + crank.mass * (crank.center * u) ** 2
+    tg = u * ca.mtimes(t, g.T)
+    mass = (
+        (shaft_inertia + tip_mass * u**2) * ca.mtimes(g, g.T)
+        + coupling * (tg + tg.T)
+        + mu_2 * ca.SX.eye(3)
+    )
+    lever = crank.mass * crank.center + mu_0 - mu_1  # mass that the crank tip carries, kg
+    bias = (
+        g
+        * (shaft_inertia * alpha_acc + u**2 * tip_mass * alpha_acc - u * lever * ca.dot(t, gravity))
+        + coupling * a_T
+        - mu_1 * gravity
+    )
+
+    def at_Q(x: ca.SX) -> ca.SX:  # D' x
+        return x - u * ca.dot(t, x) * g
+
+    across = ca.vertcat(-r[1], r[0], 0)  # n x r
+    horizontal = ca.sumsqr(across)  # 1 - r_z^2
+    per_radian = r[2] / (length * horizontal)
+    spin = per_radian * ca.dot(across, d)
+    per_radian_dot = (1 + r[2] ** 2) / (length * horizontal) ** 2 * d[2]
+    spin_acc = per_radian_dot * ca.dot(across, d) - per_radian * ca.dot(across, a_T)
+    k = per_radian * at_Q(across)
+    mass += I_a * ca.mtimes(k, k.T)
+    bias += I_a * (k * spin_acc - spin / length**2 * at_Q(ca.cross(r, d)))
+    if I_y != I_t:
+        extra_mass, extra_bias = _unequal_sides(I_y - I_t, r, across, horizontal, d, a_T, length)
+        mass += ca.mtimes([ca.SX.eye(3) - tg.T, extra_mass, ca.SX.eye(3) - tg])
+        bias += at_Q(extra_bias)
+
+    potential = -ca.dot(gravity, u * lever * c + mu_1 * q)
+    mass = _symmetric(mass)
+    return ca.Function("leg", [q, w, gravity], [mass, bias, g, potential], {"cse": True})
+
+
+def swing_cosine(q: ca.SX, u: float, length: float) -> ca.SX:
+    """cos(delta) = C / hypot(A, B); beyond [-1, 1] the leg does not reach q."""
+    return (ca.sumsqr(q) + u**2 - length**2) / (2 * u * ca.sqrt(q[0] ** 2 + q[1] ** 2))
+
+
+def crank_directions(q: ca.SX, u: float, length: float, branch: float) -> tuple[ca.SX, ca.SX]:
+    """Directions c of the crank and t of its tip's motion, equation (2) without its angles.
+
+    alpha = azimuth of Q + branch * delta with cos(delta) = C / hypot(A, B).
+    """
+    rho = ca.sqrt(q[0] ** 2 + q[1] ** 2)
+    cos_delta = swing_cosine(q, u, length)
+    sin2_delta = 1 - cos_delta**2
+    held = _held_above(sin2_delta, DEAD_CENTRE_SINE**2)
+    # The factor, 1 within reach, lets the sine not fall below its threshold far out of reach.
+    sin_delta = ca.sqrt(held * (1 + held - sin2_delta))
+    unit = ca.sqrt(cos_delta**2 + sin_delta**2)  # 1 but for rounding within reach
+    cos_delta, sin_delta = cos_delta / unit, branch * sin_delta / unit
+    cos = (q[0] * cos_delta - q[1] * sin_delta) / rho
+    sin = (q[1] * cos_delta + q[0] * sin_delta) / rho
+    return ca.vertcat(cos, sin, 0), ca.vertcat(-sin, cos, 0)
+
+
+def _unequal_sides(
+    inertia: float, r: ca.SX, across: ca.SX, horizontal: ca.SX, d: ca.SX, a_T: ca.SX, length: float
+) -> tuple[ca.SX, ca.SX]:
+    """Mass (3, 3) and bias (3,), before D', of a moment of inertia about y = n x r / |n x r|.
+
+    omega_y = y.(r x d) / l = z.d with z = (y x r) / l. The angular momentum I omega_y y has the
+    rate I (omega_y_dot y + omega_y y_dot). The second part does no virtual power: y stays
+    perpendicular to n, so that y_dot lies along n x y, about which the rod cannot turn.
+    """
+    y = across / ca.sqrt(horizontal)
+    z = ca.cross(y, r) / length
+    across_dot = ca.vertcat(-d[1], d[0], 0) / length
+    y_dot = (across_dot - y * ca.dot(y, across_dot)) / ca.sqrt(horizontal)
+    z_dot = (ca.cross(y_dot, r) + ca.cross(y, d / length)) / length
+    omega_y_acc = ca.dot(z_dot, d) - ca.dot(z, a_T)
+    return inertia * ca.mtimes(z, z.T), inertia * z * omega_y_acc
+
+
+def rotation(angles: ca.SX) -> ca.SX:
+    """R_WP (3, 3) = Rz(psi) Ry(theta) Rx(phi)."""
+    (cf, ct, cp), (sf, st, sp) = (ca.vertsplit(f(angles)) for f in (ca.cos, ca.sin))
+    return ca.vertcat(
+        ca.horzcat(cp * ct, cp * st * sf - sp * cf, cp * st * cf + sp * sf),
+        ca.horzcat(sp * ct, sp * st * sf + cp * cf, sp * st * cf - cp * sf),
+        ca.horzcat(-st, ct * sf, ct * cf),
+    )
+
+
+def angle_rate_map(angles: ca.SX) -> ca.SX:
+    """E (3, 3): angular velocity in W = E d(roll, pitch, yaw)/dt."""
+    (_, ct, cp), (_, st, sp) = (ca.vertsplit(f(angles)) for f in (ca.cos, ca.sin))
+    return ca.vertcat(
+        ca.horzcat(cp * ct, -sp, 0), ca.horzcat(sp * ct, cp, 0), ca.horzcat(-st, 0, 1)
+    )
+
+
+def equations_of_motion(
+    mechanism: Mechanism, pose: ca.SX, rates: ca.SX, parameters: ca.SX, gravity: ca.SX
+) -> Motion:
+    """(EOM) of the whole mechanism; `gravity` in m/s^2 along -z, `parameters` as in signals."""
+    angles, position = pose[:3], pose[3:]
+    R_WP, E = rotation(angles), angle_rate_map(angles)
+    w, v = ca.mtimes(E, rates[:3]), rates[3:]
+    E_dot_rates = ca.jtimes(w, angles, rates[:3])
+    g_W = ca.vertcat(0, 0, -gravity)
+
+    plate_mass = mechanism.plate.mass + parameters[PAYLOAD]
+    I_W = ca.mtimes([R_WP, ca.diag(ca.DM(mechanism.plate.inertia)), R_WP.T])
+    M_ww, M_wv, M_vv = I_W, ca.SX.zeros(3, 3), plate_mass * ca.SX.eye(3)
+    h_w, h_v = ca.cross(w, ca.mtimes(I_W, w)), -plate_mass * g_W
+    energy = (ca.dot(w, ca.mtimes(I_W, w)) + plate_mass * ca.sumsqr(v)) / 2 - plate_mass * ca.dot(
+        g_W, position
+    )
+
+    arms = []
+    for leg in range(NUM_LEGS):
+        R_WS = ca.DM(mechanism.R_WS[leg])
+        b = ca.mtimes(R_WP, ca.DM(mechanism.p_PQ[leg]))
+        v_Q = v + ca.cross(w, b)
+        q = ca.mtimes(R_WS.T, position + b - ca.DM(mechanism.p_WS[leg]))
+        reduced = leg_at_joint(mechanism, leg)
+        at_joint = Leg(*reduced(q, ca.mtimes(R_WS.T, v_Q), ca.mtimes(R_WS.T, g_W)))
+        m = _symmetric(ca.mtimes([R_WS, at_joint.mass, R_WS.T]))
+        f = ca.mtimes(R_WS, at_joint.bias) + ca.mtimes(m, ca.cross(w, ca.cross(w, b)))
+        bx_m = ca.mtimes(cross_matrix(b), m)
+        M_ww += ca.mtimes(bx_m, cross_matrix(b).T)
+        M_wv += bx_m
+        M_vv += m
+        h_w += ca.cross(b, f)
+        h_v += f
+        arm = ca.mtimes(R_WS, at_joint.arm)
+        arms.append(ca.horzcat(ca.cross(b, arm).T, arm.T))
+        energy += ca.dot(v_Q, ca.mtimes(m, v_Q)) / 2 + at_joint.potential
+
+    return Motion(
+        mass=_symmetric(ca.vertcat(ca.horzcat(M_ww, M_wv), ca.horzcat(M_wv.T, M_vv))),
+        bias=ca.vertcat(h_w, h_v),
+        arm=ca.vertcat(*arms),
+        nu=ca.vertcat(w, v),
+        nu_dot_bias=ca.vertcat(E_dot_rates, ca.SX.zeros(3)),
+        rates_map=ca.diagcat(E, ca.SX.eye(3)),
+        energy=energy,
+    )
+
+
+def _symmetric(matrix: ca.SX) -> ca.SX:
+    """Both triangles from the lower one, which halves the work of products known symmetric."""
+    return ca.tril2symm(ca.tril(matrix))
+
+
+def shaft_torque(motion: Motion, torque: ca.SX, parameters: ca.SX) -> ca.SX:
+    """Torque (6,) that reaches the cranks: the motors' plus bias less viscous friction."""
+    return torque + parameters[BIAS] - parameters[DAMPING] * ca.mtimes(motion.arm, motion.nu)
+
+
+def solve_symmetric(matrix: ca.SX, right: ca.SX) -> ca.SX:
+    """matrix^-1 right for a symmetric positive definite matrix (n, n), by Cholesky, unrolled."""
+    upper = ca.chol(matrix)  # matrix = upper' upper
+    n = matrix.shape[0]
+    x = ca.SX(right)
+    for i in range(n):
+        x[i, :] = (x[i, :] - ca.mtimes(upper[:i, i].T, x[:i, :])) / upper[i, i]
+    for i in reversed(range(n)):
+        x[i, :] = (x[i, :] - ca.mtimes(upper[i, i + 1 :], x[i + 1 :, :])) / upper[i, i]
+    return x
+
+
+def symbols() -> dict[str, ca.SX]:
+    """Fresh symbols for every argument of the equations."""
+    sizes = {"pose": 6, "rates": 6, "accelerations": 6, "torque": 6, "parameters": NUM_PARAMETERS}
+    return {name: ca.SX.sym(name, size) for name, size in sizes.items()} | {
+        "gravity": ca.SX.sym("gravity")
+    }

@@ -1,0 +1,1 @@
+"""Files: read up to a limit and strictly, written whole or not at all."""

@@ -1,0 +1,267 @@
+"""Strict YAML in front of typed configuration: nothing is guessed, nothing is executed.
+
+`load_yaml` turns a file into plain dicts, lists, strings, numbers and booleans; `validate` turns
+these into a pydantic dataclass. Both report the first problem as a one-line `ConfigError`.
+"""
+
+import dataclasses
+import difflib
+import json
+import re
+import types
+import typing
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import pydantic
+from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer
+from ruamel.yaml.constructor import SafeConstructor
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import AliasEvent
+from ruamel.yaml.nodes import ScalarNode
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import read_bytes
+from stewart_drake.files.schema import field_hint, field_names, kinds, place_of
+
+_MAX_BYTES: Final = 100_000
+_MAX_DEPTH: Final = 20
+_MOST_PROBLEMS: Final = 5
+"""That one message tells of."""
+_STR_TAG: Final = "tag:yaml.org,2002:str"
+
+_T = TypeVar("_T")
+
+
+class _StrictComposer(Composer):
+    """Refuses what makes a short file large (anchors), typed (tags) or irregular (odd keys)."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event = self.parser.peek_event()
+        if isinstance(event, AliasEvent) or event.anchor is not None:
+            _refuse(f"anchors and aliases ({event.anchor}) are not accepted", event)
+        if event.tag is not None:
+            _refuse(f"tags ({event.tag}) are not accepted", event)
+        return super().compose_node(parent, index)
+
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        node = super().compose_mapping_node(anchor)
+        for key, _ in node.value:
+            if not (isinstance(key, ScalarNode) and str(key.tag) == _STR_TAG):
+                _refuse("a key must be a word", key)
+        return node
+
+
+class _PlainConstructor(SafeConstructor):
+    """Leaves dates as the text they were written as."""
+
+
+_PlainConstructor.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
+
+
+def _refuse(problem: str, at: Any) -> typing.NoReturn:
+    raise MarkedYAMLError(problem=problem, problem_mark=at.start_mark)
+
+
+def load_yaml(path: str | Path) -> dict[str, Any]:
+    """Reads one YAML mapping from a file.
+
+    Args:
+        path: a UTF-8 file of at most 100 kB.
+
+    Returns:
+        The mapping, of plain dicts, lists, strings, numbers, booleans and None.
+
+    Raises:
+        ConfigError: the file cannot be read or decoded; it is empty, is not a mapping, holds
+            several documents, duplicate keys, anchors or tags, or is not YAML. The message names
+            the file, and the line where there is one.
+    """
+    path = Path(path)
+    raw = read_bytes(path, _MAX_BYTES, "a small YAML file")
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise ConfigError(f"{path}: line {line}: is not UTF-8 text; expected YAML") from None
+    data = parse_yaml(text, str(path))
+    if data is None:
+        raise ConfigError(f"{path}: is empty; expected a YAML mapping")
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: holds {brief(data)}; expected a YAML mapping")
+    return data
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """Parses one YAML value under the rules of `load_yaml`.
+
+    Args:
+        text: the YAML text; it may be a mapping, a list or a single value.
+        where: what the text is, opening every message.
+
+    Raises:
+        ConfigError: the text breaks one of the rules.
+    """
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = _MAX_DEPTH
+    yaml.Composer = _StrictComposer
+    yaml.Constructor = _PlainConstructor
+    try:
+        return yaml.load(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f"line {mark.line + 1}: " if mark else ""
+        problem = str(error.problem or error.context).strip().splitlines()[0]
+        problem = problem.partition(", if necessary")[0]  # advice to programmers
+        raise ConfigError(f"{where}: {line}{_cut(problem, 160)}; expected plain YAML") from None
+    # Numbers of thousands of digits end in ValueError, deep nesting in RecursionError, and some
+    # malformed directives in whatever the parser trips over.
+    except (YAMLError, ValueError, RecursionError, AssertionError, LookupError) as error:
+        problem = _cut((str(error).strip() or type(error).__name__).splitlines()[0], 160)
+        raise ConfigError(f"{where}: is not YAML ({problem}); expected plain YAML") from None
+
+
+def validate(type_: type[_T], data: dict[str, Any], where: str) -> _T:
+    """Builds a pydantic dataclass, sections nested to any depth, from plain data.
+
+    Args:
+        type_: the dataclass.
+        data: as `load_yaml` returns it.
+        where: the file (or other origin) that opens the message.
+
+    Raises:
+        ConfigError: `<where>: <section.field>: got <value>; expected <what is accepted>`, one after
+            the other in one line. Unknown keys, each with the nearest known one, keep the others
+            back, for which they may be the reason.
+    """
+    try:
+        # JSON mode is the one in which strict pydantic lets a mapping become a nested dataclass.
+        return pydantic.TypeAdapter(type_).validate_json(json.dumps(data))
+    except pydantic.ValidationError as caught:
+        errors = caught.errors(include_url=False)
+        unknown = [e for e in errors if _is_unknown(e)]
+        if errors[0]["type"] != "json_invalid":  # half a surrogate pair is no JSON text
+            raise ConfigError(f"{where}: {_explain_all(type_, unknown or errors)}") from None
+    except (TypeError, ValueError, RecursionError):
+        pass
+    raise ConfigError(f"{where}: got {brief(data)}; expected plain numbers, text and lists")
+
+
+def one_message(expected: str) -> pydantic.WrapValidator:
+    """For a union in `Annotated`: what it expects, where pydantic complains for each member."""
+
+    def check(value: Any, accept: pydantic.ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return accept(value)
+        except pydantic.ValidationError:
+            raise ValueError(expected) from None
+
+    return pydantic.WrapValidator(check)
+
+
+def brief(value: object) -> str:
+    """`repr(value)`, cut to 60 characters."""
+    return _cut(repr(value), 60)
+
+
+def differences(given: Any, usual: Any, path: str = "") -> str:
+    """`section.field=value` of every field in which two dataclasses of a kind differ."""
+    parts = []
+    for field in dataclasses.fields(given):
+        name, one = f"{path}{field.name}", getattr(given, field.name)
+        other = getattr(usual, field.name, None)  # which another kind may not have
+        if dataclasses.is_dataclass(one):
+            parts.append(differences(one, other, f"{name}."))
+        elif one != other:
+            parts.append(f"{name}={brief(one)}")
+    return ", ".join(filter(None, parts))
+
+
+def _cut(text: str, length: int) -> str:
+    return text if len(text) <= length else f"{text[: length - 3]}..."
+
+
+_EXPECTED: Final = {
+    "bool_type": "true or false",
+    "dataclass_type": "a mapping",
+    "dict_type": "a mapping",
+    "finite_number": "a finite number",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "list_type": "a list",
+    "string_type": "text",
+}
+_BOUNDS: Final = {
+    "greater_than": ("above", "gt"),
+    "greater_than_equal": ("of at least", "ge"),
+    "less_than": ("below", "lt"),
+    "less_than_equal": ("of at most", "le"),
+}
+
+
+def _is_unknown(error: Any) -> bool:
+    return error["type"] == "extra_forbidden" or error["type"].startswith("unexpected_")
+
+
+def _explain_all(type_: type, errors: list[Any]) -> str:
+    """All that is missing, and the first few of what is wrong."""
+    absent = [error for error in errors if error["type"].startswith("missing")]
+    missing = [_dotted(place_of(type_, error["loc"])[0]) for error in absent]
+    problems = [_explain(type_, error) for error in errors if error not in absent]
+    kept = problems[:_MOST_PROBLEMS]
+    if missing:
+        kept.append(
+            f"{_cut(', '.join(missing), 200)}: {'is' if len(missing) == 1 else 'are'} missing"
+        )
+    if len(problems) > _MOST_PROBLEMS:
+        kept.append(f"and {len(problems) - _MOST_PROBLEMS} more")
+    return "; ".join(kept)
+
+
+def _explain(type_: type, error: Any) -> str:
+    loc: tuple[int | str, ...] = error["loc"]
+    place, hint = place_of(type_, loc)
+    field, value = _dotted(place), error["input"]
+    if _is_unknown(error):
+        return _explain_unknown(type_, error)
+    if error["type"] == "union_tag_invalid":
+        *others, last = map(repr, kinds(hint))
+        field, value = f"{field}.kind", value["kind"] if isinstance(value, dict) else value
+        expected = f"{', '.join(others)} or {last}" if others else last
+    elif error["type"] in _EXPECTED:
+        expected = _EXPECTED[error["type"]]
+    elif error["type"] in _BOUNDS:
+        words, key = _BOUNDS[error["type"]]
+        expected = f"a number {words} {error['ctx'][key]:.12g}"
+    else:
+        expected = re.sub(r"^(\w+ should (be|have) |Value error, )", "", error["msg"])
+        expected = expected.replace(" after validation", "")
+    if types.NoneType in typing.get_args(hint):
+        expected += ", or null"
+    return f"{field}: got {brief(value)}; expected {expected}"
+
+
+def _explain_unknown(type_: type, error: Any) -> str:
+    *above, name = error["loc"]
+    place, section = place_of(type_, above)
+    known, field = field_names(section), _cut(_dotted((*place, name)), 60)
+    union = place_of(type_, above[:-1])[1]
+    if kinds(union) and name in field_names(union):  # of another kind, without an effect
+        own = ", ".join(other for other in known if other != "kind") or "none but kind"
+        return (
+            f"{field}: got {brief(error['input'])}, which kind {section.kind!r} does not use; "
+            f"expected only its own fields: {own}"
+        )
+    alike = difflib.get_close_matches(name, known, n=1)
+    # A field may have been named without its section.
+    deeper = [f"{at}.{name}" for at in known if name in field_names(field_hint(section, at))]
+    meant = alike[0] if alike else deeper[0] if len(deeper) == 1 else None
+    hint = f"did you mean {_dotted((*place, meant))}?" if meant else ""
+    return f"{field}: unknown key; {hint or 'expected one of ' + ', '.join(known)}"
+
+
+def _dotted(loc: tuple[int | str, ...]) -> str:
+    """`("reference", "poses", 2, 0)` as `reference.poses[2][0]`."""
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
+    return "".join(parts).removeprefix(".")

@@ -1,0 +1,165 @@
+"""Sampling with a delayed input, equations (29)-(39).
+
+The torque T_k computed at t = k dt acts during [(k + mu) dt + eta0, (k + 1 + mu) dt + eta0). Over
+one period the old torque acts for eta0, the new one for the rest:
+
+    e_{k+1} = A e_k + B_old T_{k-mu-1} + B_new T_{k-mu},
+    A = exp(A_c dt),  B_old = int_0^eta0 exp(A_c (dt - s)) B_c ds,
+    B_new = int_eta0^dt exp(A_c (dt - s)) B_c ds.                                      (32), (35)
+
+Integral states are not sampled from (24) but follow the recurrence that the controller itself can
+compute, the trapezoid rule z_{k+1} = z_k + dt/2 (y_k + y_{k+1}), y = C_bar e_bar.
+
+The chain appends the torques in flight, oldest first (33)-(39). T_{k-mu-1} is a state only when
+eta0 > 0; the paper always carries it, which adds an unobservable block when eta0 = 0.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from stewart_drake.law.error_model import ContinuousModel
+from stewart_drake.scenario.delay import Delay
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DelayedModel:
+    """e_{k+1} = A e_k + B_old T_{k-mu-1} + B_new T_{k-mu}; the cost sees y = C e.
+
+    A (n, n), B_old and B_new (n, m), C (p, n); `steps` is mu; `fraction` is eta0 / dt in [0, 1).
+    """
+
+    A: Array
+    B_old: Array
+    B_new: Array
+    C: Array
+    steps: int
+    fraction: float
+
+    @property
+    def queue_length(self) -> int:
+        """How many torques are in flight at a sampling instant."""
+        return Delay(self.steps, self.fraction).queue_length
+
+
+@dataclass(frozen=True)
+class ChainModel:
+    """(38)-(39): x_{k+1} = A x_k + B T_k, y = C x, with x = [e; queue, oldest torque first]."""
+
+    A: Array
+    B: Array
+    C: Array
+
+
+def sample(A: Array, B: Array, duration: float) -> tuple[Array, Array]:
+    """exp(A t) (n, n) and int_0^t exp(A s) B ds (n, m), by one matrix exponential (Van Loan).
+
+    Raises:
+        FloatingPointError: the exponential overflows.
+    """
+    n, m = B.shape
+    block = np.zeros((n + m, n + m))
+    block[:n, :n], block[:n, n:] = A * duration, B * duration
+    # Next to a dead centre A grows without bound; an overflow is an error, not a warning.
+    with np.errstate(over="raise", invalid="raise"):
+        exponential = expm(block)
+    return exponential[:n, :n], exponential[:n, n:]
+
+
+def sample_in_steps(A: Array, B: Array, duration: float, step: float) -> tuple[Array, Array]:
+    """What `sample` becomes for an engine of fixed steps: semi-implicit Euler, duration/step times.
+
+    With x = [pose error; rate error], of A (2k, 2k) and B (2k, m), one step h takes the rates first
+    and then moves the pose with the new ones,
+
+        v' = v + h (A_v x + B_v u),   p' = p + h v',
+
+    so that the pose of a plate under constant acceleration runs h/2 ahead of the truth.
+    """
+    n, m = B.shape
+    once = np.eye(n + m)
+    once[n // 2 : n, :n] += step * A[n // 2 :]
+    once[n // 2 : n, n:] += step * B[n // 2 :]
+    once[: n // 2] += step * once[n // 2 : n]
+    many = np.linalg.matrix_power(once, round(duration / step))
+    return many[:n, :n], many[:n, n:]
+
+
+def delayed_model(
+    model: ContinuousModel,
+    period: float,
+    steps: int,
+    fraction: float = 0.0,
+    *,
+    integral: bool,
+    step: float | None = None,
+) -> DelayedModel:
+    """Sample [pose error; rate error] with its delayed torque; append the integral's recurrence.
+
+    Args:
+        model: A (n, n), B (n, m), C (p, n) without integral states.
+        period: dt in s.
+        steps: mu, whole periods of delay.
+        fraction: eta0 / dt, in [0, 1).
+        integral: append z (p), whose rows the cost sees too (28).
+        step: of an engine that moves the plant by semi-implicit Euler, s, in whole numbers of which
+            period and fraction come; None for the motion itself.
+
+    Raises:
+        ValueError: a delay or a period that cannot be.
+    """
+    if not 0 < period < np.inf:
+        raise ValueError(f"period: got {period}; expected a positive time in s")
+    Delay(steps, fraction)  # refuses what is none
+    eta0 = fraction * period
+
+    def sampled(duration: float) -> tuple[Array, Array]:
+        if step is None:
+            return sample(model.A, model.B, duration)
+        return sample_in_steps(model.A, model.B, duration, step)
+
+    A, B_new = sampled(period - eta0)
+    B_old = np.zeros_like(B_new)
+    if eta0 > 0:
+        A_eta0, B_eta0 = sampled(eta0)
+        A, B_old = A @ A_eta0, A @ B_eta0
+    C = model.C
+    if integral:
+        n, p = A.shape[0], C.shape[0]
+        half = period / 2 * C
+        # z_{k+1} = z_k + dt/2 C (e_k + A e_k + B_old T_{k-mu-1} + B_new T_{k-mu})
+        motion, A = A, np.eye(n + p)
+        A[:n, :n], A[n:, :n] = motion, half + half @ motion
+        C = np.zeros((2 * p, n + p))
+        C[:p, :n], C[p:, n:] = model.C, np.eye(p)
+        B_old, B_new = (np.concatenate([B, half @ B]) for B in (B_old, B_new))
+    return DelayedModel(A, B_old, B_new, C, steps, fraction)
+
+
+def chain(model: DelayedModel, *, always_extra: bool = False) -> ChainModel:
+    """The delay chain (37)-(39) as one undelayed system.
+
+    Args:
+        model: the delayed model.
+        always_extra: carry T_{k-mu-1} also when eta0 = 0, as the paper does.
+    """
+    n, m = model.B_new.shape
+    extra = always_extra or model.fraction > 0
+    length = model.steps + int(extra)
+    if length == 0:
+        return ChainModel(model.A, model.B_new, model.C)
+    A = np.zeros((n + m * length, n + m * length))
+    B = np.zeros((n + m * length, m))
+    A[:n, :n] = model.A
+    torques = [*([model.B_old] if extra else []), model.B_new]  # oldest first; the last may be T_k
+    for place, column in enumerate(torques):
+        target = A[:n, n + m * place :] if place < length else B[:n]
+        target[:, :m] += column
+    A[n : n + m * (length - 1), n + m :] = np.eye(m * (length - 1))
+    B[n + m * (length - 1) :] = np.eye(m)
+    C = np.hstack([model.C, np.zeros((model.C.shape[0], m * length))])
+    return ChainModel(A, B, C)

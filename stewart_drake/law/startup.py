@@ -1,0 +1,162 @@
+"""What is fixed before the loop starts: torques in flight, weights, steps of the prediction.
+
+No number here is a torque or a length by itself: a machine of other size and mass, with everything
+else in proportion, gets the same law. Lengths are measured against its `reach`, torques against its
+`machine_torque`; times are those of the person who wants the motion, in s.
+"""
+
+import functools
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.trajectories import Trajectory
+
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.holds import mean_torques
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
+    NUM_STATE,
+    NUM_TORQUES,
+    POSE,
+    RATES,
+)
+from stewart_drake.scenario.trajectories import evaluate, spread_instants
+
+Array = NDArray[np.float64]
+
+PREDICTION_BUDGET = 2e-5
+"""rad, and shares of the reach, by which integrating over the delay may move the predicted pose."""
+ASTRAY = 0.3
+"""rad, and crank lengths, from the reference on which a prediction is of no use."""
+STILL = 0.1
+"""rad, and crank lengths, by which a coordinate that is only held is thought to move."""
+BLOCK = 64
+"""Holds that are predicted at a time; over a long delay the comparison may end with the first."""
+INSTANTS = 200
+"""At which the torques along a reference are looked at."""
+TOLERANCE = 0.03
+"""Pose error that is tolerable, as a share of half the reference's peak to peak.
+
+It sets the bandwidth of the loop, about (peak acceleration / tolerance)^(1/2): see docs/theory.md.
+"""
+
+
+def initial_queue(
+    kind: Literal["zero", "equilibrium", "reference"],
+    dynamics: StewartDynamics,
+    reference: Trajectory,
+    period: float,
+    delay: Delay,
+) -> Array:
+    """Torques (L, 6) in flight at t = 0, oldest first: nothing, what holds still, what follows."""
+    length = delay.queue_length
+    if kind == "zero" or length == 0:
+        return np.zeros((length, NUM_TORQUES))
+    if kind == "equilibrium":
+        return np.tile(dynamics.equilibrium_torque(evaluate(reference, 0.0)[POSE]), (length, 1))
+    ends = delay.eta(period) - period * np.arange(length - 1, -1, -1)
+    return mean_torques(dynamics, reference, np.maximum(ends - period, 0.0), ends)
+
+
+def sizes(mechanism: Mechanism) -> Array:
+    """(6,) 1 rad, and the longest a leg reaches, crank and rod in line, in m."""
+    return np.repeat([1.0, (mechanism.crank_lengths + mechanism.rod_lengths).max()], 3)
+
+
+def machine_torque(dynamics: StewartDynamics) -> float:
+    """Motor torque in N m that the machine's own inertia takes when it moves briskly.
+
+    At constant acceleration a plate goes from rest s = a T^2 / 2 in the time T. This is the torque
+    for one rad or one crank length from home in 1 s, about or along the axis that takes most:
+    max |B^-1 M 2 s|, without gravity.
+    """
+    mechanism = dynamics.mechanism
+    s = np.diag(np.repeat([1.0, mechanism.crank_lengths.min()], 3))
+    M, B = dynamics.mass_matrix(mechanism.home), dynamics.actuation_map(mechanism.home)
+    torques = np.linalg.lstsq(B, 2 * M @ s, rcond=1e-6)[0]  # home may be next to a singularity
+    return float(np.abs(torques).max())
+
+
+def least_torque(dynamics: StewartDynamics) -> float:
+    """N m; the torque that goes with STILL, for a reference that takes none."""
+    return STILL * machine_torque(dynamics)
+
+
+def weight_scales(
+    kind: Literal["bryson", "identity"],
+    dynamics: StewartDynamics,
+    peak_to_peak: Array,
+    peak_torque: float,
+) -> tuple[Array, Array, Array]:
+    """Weights (6,) of the pose error, its integral and the torques in the cost, before w_Q, w_R.
+
+    Bryson's rule, one over the square of what is tolerable: of the error TOLERANCE times half the
+    reference's peak to peak (`sizes` where that is 0), that for 1 s of the integral, and the torque
+    in N m that the reference takes, or `least_torque`. The paper's choice (41) is `identity`.
+    """
+    if kind == "identity":
+        return np.ones(6), np.ones(6), np.ones(6)
+    still = sizes(dynamics.mechanism)
+    tolerable = TOLERANCE * np.where(peak_to_peak > 0, peak_to_peak / 2, still)
+    peak = max(least_torque(dynamics), peak_torque)
+    return 1 / tolerable**2, 1 / tolerable**2, np.full(NUM_TORQUES, 1 / peak**2)
+
+
+def reference_torques(dynamics: StewartDynamics, reference: Trajectory, duration: float) -> Array:
+    """Largest of the six motor torques (INSTANTS,) in N m along the reference."""
+    states = (evaluate(reference, t) for t in spread_instants(duration, INSTANTS))
+    torques = [dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in states]
+    return np.abs(torques).max(axis=1)
+
+
+def reference_torque(dynamics: StewartDynamics, reference: Trajectory, duration: float) -> float:
+    """Largest motor torque in N m that following the reference takes."""
+    return float(reference_torques(dynamics, reference, duration).max())
+
+
+def choose_substeps(
+    dynamics: StewartDynamics, reference: Trajectory, period: float, steps: int, duration: float
+) -> int:
+    """Least number of Runge-Kutta steps per period that keeps the prediction within its budget.
+
+    Along the reference, the pose predicted over the delay with n steps per period is compared with
+    that of 2 n steps; their difference is 15/16 of the error with n. Torques held for long periods
+    may lead far away from the reference, where no number of steps would do: there the comparison
+    ends.
+    """
+    crank, size = dynamics.mechanism.crank_lengths.min(), sizes(dynamics.mechanism)
+    near, horizon = ASTRAY * np.repeat([1.0, crank], 3), max(steps, 1)
+    instants = spread_instants(duration, 8)
+
+    @functools.cache
+    def block(t: float, first: int) -> tuple[Array, Array]:
+        """Torques and the poses they are for, (n, 6), of up to BLOCK holds."""
+        holds = period * np.arange(first, min(first + BLOCK, horizon))
+        wanted = np.array([reference.value(t + hold + period)[:, 0] for hold in holds])
+        return mean_torques(dynamics, reference, t + holds, t + holds + period), wanted
+
+    def within_budget(substeps: int) -> bool:
+        for t in instants:
+            coarse = fine = evaluate(reference, t)[None, :NUM_STATE]
+            for first in range(0, horizon, BLOCK):
+                torques, wanted = block(t, first)
+                coarse, fine = (
+                    dynamics.predict(before[-1], torques, period, n)
+                    for before, n in ((coarse, substeps), (fine, 2 * substeps))
+                )
+                away = np.abs(fine[:, POSE] - wanted)
+                useful = np.logical_and.accumulate(np.all(away < near, axis=1))
+                moved = np.abs((coarse - fine)[:, POSE] / size)[useful]
+                if moved.max(initial=0.0) > PREDICTION_BUDGET:
+                    return False
+                if not useful.all():
+                    break
+        return True
+
+    substeps = 1
+    while substeps < 64 and not within_budget(substeps):
+        substeps *= 2
+    return substeps

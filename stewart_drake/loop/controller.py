@@ -1,0 +1,142 @@
+"""The control law as a Drake system."""
+
+import time
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue, Value
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    EventStatus,
+    LeafSystem,
+    State,
+    ValueProducer,
+)
+
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.memory import Memory
+from stewart_drake.law.predictive_lqi import PredictiveLqi, Preview
+from stewart_drake.loop.lifetime import weak
+from stewart_drake.scenario.signals import (
+    NUM_REFERENCE,
+    NUM_TORQUES,
+    WEIGHTS,
+    ports_of,
+)
+from stewart_drake.scenario.timing import event_time
+
+Array = NDArray[np.float64]
+
+
+HELD: Final[dict[str, Callable[[Memory], Array]]] = {
+    "torque_commanded": lambda memory: memory.torque,
+    "integral": lambda memory: memory.integral,
+    "weights": lambda memory: memory.weights,
+    "measurement": lambda memory: memory.measurement,
+    "state_estimate": lambda memory: memory.belief.state,
+    "parameters": lambda memory: memory.belief.parameters,
+    "parameter_std": lambda memory: memory.belief.estimate.parameter_std,
+}
+"""Signal of the table `scenario.signals.SIGNALS` -> what the controller's memory has of it."""
+
+
+class Sample(NamedTuple):
+    """What one step of the law left behind."""
+
+    memory: Memory
+    seconds: float
+    """Time that it took to compute; 0 before the first."""
+
+
+class DelayLqiController(LeafSystem):
+    """Predictive LQI, whatever parts its law is made of.
+
+    With m the memory (`law.memory.Memory`) and `step` the law (`law.predictive_lqi.PredictiveLqi`):
+
+    Initialise: m holds the torques in flight at t = 0 and nothing else.
+    Update:     every period m <- step(m, measurement, preview, weights), and the time it took
+    Output:     torque        = step(m, measurement, preview, weights).torque, to be taken at the
+                samples, where the update happens too: one step serves both.
+                the others    = parts of m, as of the last sample.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | measurement | input | 12 | rad, m, rad/s, m/s | read every period; NaN is lost |
+    | preview | input | 18 p | rad, m and time derivatives | read every period |
+    | weights | input | 2 | w_Q, w_R | read every period |
+    | torque | output | 6 | N m | direct feedthrough |
+    | torque_commanded | output | 6 | N m | held |
+    | integral | output | 6 | rad s, m s | held |
+    | weights_used | output | 2 | - | held, NaN before the first sample |
+    | measurement_used | output | 12 | as measurement | held, NaN before the first sample |
+    | state_estimate | output | 12 | rad, m, rad/s, m/s | held, NaN before the first sample |
+    | parameters | output | 8 | N m, kg, N m s/rad | held; as the law believes |
+    | parameter_std | output | 8 | the same | held; NaN without estimator |
+
+    Args:
+        law: the control law.
+        queue: (L, 6) torques in flight at t = 0 in N m, oldest first, as the controller believes.
+    """
+
+    def __init__(self, law: PredictiveLqi, queue: Array) -> None:
+        super().__init__()
+        self._law = law
+        first = Sample(law.initial_memory(queue), 0.0)
+        self._memory = self.DeclareAbstractState(Value(first))
+        self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
+        self._times = law.preview_times
+        preview_size = NUM_REFERENCE * len(self._times)
+        self._preview = self.DeclareVectorInputPort("preview", preview_size)
+        self._weights = self.DeclareVectorInputPort("weights", len(WEIGHTS))
+        memory_ticket = self.abstract_state_ticket(self._memory)
+        self._step = self.DeclareCacheEntry(
+            "step",
+            ValueProducer(allocate=lambda: Value(first), calc=weak(self._calc_step)),
+            {self.all_input_ports_ticket(), memory_ticket},
+        )
+        self.DeclareVectorOutputPort(
+            "torque", NUM_TORQUES, weak(self._torque), {self._step.ticket()}
+        )
+        for port, signal in ports_of("controller").items():
+            part = HELD[signal.name]  # whose size is the law's: its parameters, what it senses
+            size = len(part(first.memory))
+            self.DeclareVectorOutputPort(port, size, weak(self._held, part), {memory_ticket})
+        # The first sample before all periodic events, as `DelayChain` does.
+        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._update_first))
+        early = event_time(law.timeline.period)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._update))
+
+    def sample(self, context: Context) -> Sample:
+        """What the last step left in a context of this system."""
+        value: Any = context.get_abstract_state(int(self._memory))
+        return value.get_value()
+
+    def memory(self, context: Context) -> Memory:
+        """The memory in a context of this system."""
+        return self.sample(context).memory
+
+    def _held(self, part: Callable[[Memory], Array], context: Context, output: BasicVector) -> None:
+        output.SetFromVector(part(self.memory(context)))
+
+    def _calc_step(self, context: Context, result: AbstractValue) -> None:
+        reference = np.reshape(np.asarray(self._preview.Eval(context)), (-1, NUM_REFERENCE))
+        measurement = Measurement.of(np.asarray(self._measurement.Eval(context)))
+        weights = np.asarray(self._weights.Eval(context))
+        memory, preview = self.memory(context), Preview(self._times, reference)
+        started = time.perf_counter()
+        after = self._law.step(memory, measurement, preview, weights)
+        result.set_value(Sample(after, time.perf_counter() - started))
+
+    def _torque(self, context: Context, output: BasicVector) -> None:
+        sample: Any = self._step.Eval(context)
+        output.SetFromVector(sample.memory.torque)
+
+    def _update_first(self, context: Context, state: State) -> EventStatus:
+        self._update(context, state)
+        return EventStatus.Succeeded()
+
+    def _update(self, context: Context, state: State) -> None:
+        state.get_mutable_abstract_state(int(self._memory)).set_value(self._step.Eval(context))

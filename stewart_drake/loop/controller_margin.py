@@ -1,0 +1,240 @@
+"""Whether this controller on this plant is stable along the reference, and with what margins.
+
+At instants along the reference law and plant are linearised there and the loop is judged as if
+reference and plant stood still in that state of motion ("frozen"): `law.linear_loop`. The plant
+is the true one, with its payload, friction, dimensions and delay; the law is as it is, with the
+delay it believes in, its model, prediction and the weights it starts with. What this leaves out:
+
+- the estimator: a law that has one is judged with torque bias, payload and friction already found;
+  how the estimate gets there, and what the filter adds to the loop, is no part of it;
+- a tuner, which would change the weights on the way; torque limits; the catch-up from rest;
+- that reference and gain change while an error lives.
+"""
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import margin
+from stewart_drake.law.error_model import ContinuousModel, linear_model
+from stewart_drake.law.limits import amplification, fastest_pole, is_stable, spectral_radius
+from stewart_drake.law.linear_loop import LinearLoop, Margins, law_gain, worst_margins
+from stewart_drake.law.observers import NoObserver
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.riccati import RiccatiError
+from stewart_drake.loop.experiment import Experiment, compose_law
+from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
+    BIAS,
+    DAMPING,
+    NUM_PARAMETERS,
+    NUM_TORQUES,
+    PAYLOAD,
+    POSE,
+    RATES,
+)
+from stewart_drake.scenario.trajectories import evaluate
+
+Array = NDArray[np.float64]
+
+INSTANTS: Final = 30
+"""Looked at along the reference; 29 steps, a prime, since a round number of them may be in step
+with the motion. Twice as many change the margins of the shipped scenarios by less than a tenth."""
+_COSTLY: Final = 150
+"""Rows of a loop above which it is looked at less often: an eigenvalue problem takes rows^3."""
+_LARGEST: Final = 330
+"""Rows of a loop above which it is not judged: fifty periods of delay, seconds."""
+_FEWEST: Final = 6
+
+
+@dataclass(frozen=True)
+class ControllerMargin:
+    """The loop at its worst along the reference.
+
+    Attributes:
+        period: of the controller, s.
+        eta: true total delay, s.
+        radius: largest spectral radius of the loop, the factor by which what remains of an error is
+            multiplied each period; NaN where `problem` says why the loop was not judged.
+        time: s, when it is there.
+        margins: the least of each kind; NaN with a `problem`.
+        pole: fastest unstable pole of the open loop, 1/s, 0 without one.
+        pole_time: s, when it is there.
+        estimated: whether an estimator was taken to have found what nobody told the controller.
+        tuned: whether a tuner will change the weights.
+        problem: why the loop was not judged, or empty.
+        loops: that were judged, in the order of time, evenly over `span` s; none with a `problem`.
+        span: s.
+    """
+
+    period: float
+    eta: float
+    radius: float
+    time: float
+    margins: Margins
+    pole: float
+    pole_time: float
+    estimated: bool
+    tuned: bool
+    problem: str = ""
+    loops: tuple[LinearLoop, ...] = field(default=(), repr=False)
+    span: float = 0.0
+    _growths: dict[float, float] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def stable(self) -> bool | None:
+        """None where the loop was not judged."""
+        return None if self.problem else self.radius < 1
+
+    @property
+    def delay_margin(self) -> float:
+        """s, error of the delay that is borne in either direction."""
+        return min(self.margins.shorter, self.margins.longer)
+
+    @property
+    def growth(self) -> float:
+        """e^(pole eta) of an error of the prediction, infinite where that overflows."""
+        return amplification(self.pole, self.eta)
+
+    def growth_in_steps(self, step: float) -> float:
+        """Most that an error grows over any stretch of the motion, moved in steps of so many s.
+
+        The plant is moved by semi-implicit Euler (`law.delay_model.sample_in_steps`), and each
+        loop's spectral radius counted for the periods until the next one: above 1 this only where
+        some loop is unstable with that step. Infinite where it overflows.
+        """
+        if step not in self._growths:
+            self._growths[step] = self._growth_in_steps(step)
+        return self._growths[step]
+
+    def _growth_in_steps(self, step: float) -> float:
+        periods = self.span / self.period / max(len(self.loops) - 1, 1)
+        so_far = most = 0.0
+        for loop in self.loops:
+            matrix = loop.matrix(step=step)
+            if so_far == 0 and is_stable(matrix):
+                continue
+            so_far = max(0.0, so_far + periods * math.log(spectral_radius(matrix)))
+            most = max(most, so_far)
+        return math.exp(most) if most < 700 else math.inf
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What `summary.json` holds; a margin without a limit is infinite, null in the file."""
+        m = self.margins
+        return {
+            "stable": self.stable,
+            "spectral_radius": self.radius,
+            "delay_margin_s": [m.shorter, m.longer],
+            "gain_margin": [m.gain_down, m.gain_up],
+            "growth": self.growth,
+        }
+
+
+def controller_margin(experiment: Experiment, until: float | None = None) -> ControllerMargin:
+    """Judge a scenario's loop along its reference, up to `until` in s, by default its duration.
+
+    Costs 0.2 s for a delay of ten periods.
+    """
+    sc = experiment.scenario
+    end = sc.duration if until is None else until
+    truth, law = true_dynamics(experiment), compose_law(experiment)
+    times = np.linspace(0.0, end, INSTANTS)
+    poses = [evaluate(experiment.reference, t)[POSE] for t in times]
+    inside = [margin(truth.mechanism, pose) > 0 for pose in poses]
+    models = [
+        true_model(experiment, truth, t) for t, within in zip(times, inside, strict=True) if within
+    ]
+    poles = [fastest_pole(model.A) for model in models]
+    fastest = int(np.argmax(poles)) if poles else 0
+    queue = max(sc.delay.steps + 1, law.timeline.queue_length)
+    rows = 12 + 6 * law.cost.integrates + 6 * queue
+    radius, time, margins = math.nan, math.nan, Margins(*[math.nan] * 4)
+    problem, loops = "", list[LinearLoop]()
+    if not all(inside):
+        problem = "the true machine does not reach all of the reference"
+    elif rows > _LARGEST:
+        problem = f"with {sc.delay.steps} periods of delay it has {rows} states, too many to judge"
+    else:
+        every = math.ceil((max(rows, _COSTLY) / _COSTLY) ** 3)
+        chosen = times[:: min(every, INSTANTS // _FEWEST)]
+        loops = _loops(experiment, truth, law, chosen)
+        radii = [spectral_radius(loop.matrix()) for loop in loops]
+        worst = int(np.argmax(radii))
+        radius, time = radii[worst], float(chosen[worst])
+        order = np.argsort(radii)[::-1]
+        margins = worst_margins([loops[i] for i in order])
+    return ControllerMargin(
+        period=sc.controller.period,
+        eta=sc.eta,
+        radius=radius,
+        time=time,
+        margins=margins,
+        pole=poles[fastest] if poles else 0.0,
+        pole_time=float(times[fastest]),
+        estimated=_estimates(law),
+        tuned=experiment.network is not None,
+        problem=problem,
+        loops=tuple(loops),
+        span=end,
+    )
+
+
+def true_dynamics(experiment: Experiment) -> StewartDynamics:
+    """The plant as it is simulated, closed exactly whatever engine moves it."""
+    plant, parameters = experiment.scenario.plant, np.empty(NUM_PARAMETERS)
+    parameters[BIAS], parameters[PAYLOAD] = plant.torque_bias, plant.payload_mass
+    parameters[DAMPING] = plant.joint_damping
+    return StewartDynamics(experiment.truth, plant.gravity, parameters)
+
+
+def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> ContinuousModel:
+    """The plant about the moving reference at `time` in s, under the torque that follows it."""
+    x = evaluate(experiment.reference, time)
+    torque = truth.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
+    return linear_model(*truth.derivatives(x[POSE], x[RATES], torque)[:2])
+
+
+def loop_at(experiment: Experiment, time: float) -> LinearLoop:
+    """The loop of a scenario about its reference at `time` in s."""
+    truth, law = true_dynamics(experiment), compose_law(experiment)
+    return _loops(experiment, truth, law, np.array([time]))[0]
+
+
+def _loops(
+    experiment: Experiment, truth: StewartDynamics, law: PredictiveLqi, times: Array
+) -> list[LinearLoop]:
+    sc, loops, integrates = experiment.scenario, [], law.cost.integrates
+    states = 12 + 6 * integrates
+    gain = np.zeros((NUM_TORQUES, states + NUM_TORQUES * law.timeline.queue_length))
+    for t in times:
+        # Without a new gain the law goes on with its last one, and before the first with none.
+        with suppress(RiccatiError, np.linalg.LinAlgError, ArithmeticError):
+            gain = _gain(experiment, truth, law, t)
+        plant = true_model(experiment, truth, t)
+        delay = (sc.delay.steps, sc.delay.fraction)
+        loops.append(LinearLoop(plant, gain, law.timeline.period, *delay, integrates))
+    return loops
+
+
+def _estimates(law: PredictiveLqi) -> bool:
+    return not isinstance(law.observer, NoObserver)
+
+
+def _gain(experiment: Experiment, truth: StewartDynamics, law: PredictiveLqi, time: float) -> Array:
+    """`law_gain` of a law about the reference at `time`."""
+    plant, timeline, c = law.plant, law.timeline, experiment.scenario.controller
+    theta = truth.parameters if _estimates(law) else plant.dynamics.parameters
+    x = evaluate(experiment.reference, time)
+    # The torques in flight are those that move the true plant, the model's is the feedforward.
+    acting = truth.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
+    forward = law.feedforward.at(x, plant.dynamics, theta)
+    design = law.model.about(x, forward, theta, plant)
+    predictor = law.predictor.model(design, x, acting, theta, plant)
+    weights = law.cost.matrices(np.array([c.w_Q, c.w_R]))
+    return law_gain(design, predictor, timeline.period, timeline.delay, weights)

@@ -1,0 +1,90 @@
+"""The delay between computing a torque and feeling it."""
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+
+from stewart_drake.loop.lifetime import weak
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.signals import NUM_TORQUES
+from stewart_drake.scenario.timing import event_time
+
+Array = NDArray[np.float64]
+
+
+class DelayChain(LeafSystem):
+    """Holds torques back for eta = mu dt + eta0.
+
+    With T_k the input at t = k dt:
+
+    Initialise: queue = [T_{-mu}, ..., T_{-1}], preceded by T_{-mu-1} when eta0 > 0; the oldest
+                acts first.
+    Update:     at k dt        queue <- [queue without its oldest; T_k], T_k joining at the end,
+                at k dt + eta0 applied <- T_{k-mu}.
+    Output:     torque = applied, hence T_k during [(k + mu) dt + eta0, (k + 1 + mu) dt + eta0).
+
+    Updates of one instant all read what was there before, and a multibody plant's step is one of
+    them. So these come slightly earlier (`scenario.timing.event_time`), the first at
+    initialisation: a plant
+    that steps at t feels the torque released at t.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | commanded | input | 6 | N m | read every period |
+    | torque | output | 6 | N m | piecewise constant |
+
+    Args:
+        period: dt in s.
+        steps: mu.
+        fraction: eta0 / dt, in [0, 1).
+        queue: (L, 6) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
+
+    Raises:
+        ValueError: a queue of the wrong shape.
+    """
+
+    def __init__(self, period: float, steps: int, fraction: float, queue: Array) -> None:
+        super().__init__()
+        length = Delay(steps, fraction).queue_length
+        queue = np.asarray(queue, dtype=np.float64)
+        if queue.shape != (length, NUM_TORQUES):
+            raise ValueError(f"queue: got shape {queue.shape}; expected {(length, NUM_TORQUES)}")
+        # `line` is [applied; waiting ...]: T_{k-mu} ... T_k after the update at k dt, with the
+        # applied torque kept apart because it changes eta0 later than the rest.
+        self._fraction = fraction
+        applied = queue[0] if length > 0 else np.zeros(NUM_TORQUES)
+        waiting = queue[1:] if fraction > 0 else queue
+        self._applied = self.DeclareDiscreteState(applied)
+        self._waiting = self.DeclareDiscreteState(
+            np.vstack([np.zeros(NUM_TORQUES), waiting]).ravel()
+        )
+        self._commanded = self.DeclareVectorInputPort("commanded", NUM_TORQUES)
+        self.DeclareVectorOutputPort(
+            "torque", NUM_TORQUES, weak(self._output), {self.discrete_state_ticket(self._applied)}
+        )
+        # At t = 0 ahead of all periodic events: nothing is earlier than a plant's first step.
+        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._take_first))
+        early = event_time(period)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._take))
+        if fraction > 0:
+            self.DeclarePeriodicUnrestrictedUpdateEvent(
+                early, event_time(fraction * period), weak(self._release)
+            )
+
+    def _take_first(self, context: Context, state: State) -> EventStatus:
+        self._take(context, state)
+        return EventStatus.Succeeded()
+
+    def _take(self, context: Context, state: State) -> None:
+        waiting = context.get_discrete_state(self._waiting).value()
+        moved = np.concatenate([waiting[NUM_TORQUES:], self._commanded.Eval(context)])
+        state.get_mutable_discrete_state(self._waiting).SetFromVector(moved)
+        if self._fraction == 0:
+            state.get_mutable_discrete_state(self._applied).SetFromVector(moved[:NUM_TORQUES])
+
+    def _release(self, context: Context, state: State) -> None:
+        waiting = context.get_discrete_state(self._waiting).value()
+        state.get_mutable_discrete_state(self._applied).SetFromVector(waiting[:NUM_TORQUES])
+
+    def _output(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(self._applied).value())

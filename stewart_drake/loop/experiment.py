@@ -1,0 +1,296 @@
+"""A scenario made concrete: mechanism, reference, and the control law that it asks for."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.trajectories import Trajectory
+
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import resolve
+from stewart_drake.law.catch_up import plan_catch_up
+from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.design_models import DesignModel, MultibodyModel, PaperModel
+from stewart_drake.law.feedforward import (
+    EquilibriumFeedforward,
+    Feedforward,
+    InverseDynamicsFeedforward,
+    NoFeedforward,
+)
+from stewart_drake.law.filter_settings import filter_settings
+from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.observers import NoObserver, Observer, ParameterObserver
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.predictors import LinearPredictor, NonlinearPredictor, Predictor
+from stewart_drake.law.sensing import StateSensing
+from stewart_drake.law.startup import (
+    STILL,
+    choose_substeps,
+    initial_queue,
+    machine_torque,
+    reference_torque,
+    weight_scales,
+)
+from stewart_drake.law.timeline import Timeline
+from stewart_drake.loop.own import NOTHING, Own, own_motion
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.scenario.config import AnnTunerConfig, Scenario
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.signals import POSITION
+from stewart_drake.scenario.trajectories import evaluate, make_reference, moved, peak_to_peak
+from stewart_drake.tuner.network import DEFAULT, Network, load_network
+
+Array = NDArray[np.float64]
+
+GENTLE = 3.0
+"""Torques up to so many times the reference's are predicted with the usual steps."""
+REACH_CHECK_PERIOD = 0.02
+"""s between the instants at which a reference is checked against the workspace."""
+
+
+class Experiment(NamedTuple):
+    """A scenario made concrete: what the loop and everything that judges it are built from."""
+
+    scenario: Scenario
+    mechanism: Mechanism
+    """As the controller knows it."""
+    truth: Mechanism
+    """The machine that is simulated."""
+    reference: Trajectory
+    peak_to_peak: Array
+    """(6,) of the reference, rad and m, 0 where it is constant."""
+    nominal: StewartDynamics
+    """The plant as the controller knows it."""
+    start: Array
+    """(12,) state at t = 0."""
+    network: Network | None
+    """What sets the weights, or None."""
+    own: Own = NOTHING
+    """What takes the place of the scenario's."""
+
+    def __repr__(self) -> str:
+        return f"Experiment({self.mechanism}, {self.scenario})"
+
+    @property
+    def torque_limit(self) -> float:
+        """Of each motor, N m, infinite for none: the scenario's, else that of the true machine."""
+        own = self.scenario.actuator.torque_limit
+        limit = self.truth.effort_limit if own is None else own
+        return math.inf if limit is None or limit == "none" else limit
+
+    @property
+    def scale(self) -> Array:
+        """(6,) A_i of equation (47): the peak to peak, 1 where the reference is constant."""
+        return np.where(self.peak_to_peak > 0, self.peak_to_peak, 1.0)
+
+
+def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHING) -> Experiment:
+    """Check a scenario against its mechanism.
+
+    Args:
+        scenario: what to run.
+        truth: the machine to simulate where it is not the one that the controller knows.
+        own: controller, reference or disturbance in the place of the scenario's.
+
+    Raises:
+        ConfigError: one line; also where the reference leaves the workspace, with time and leg.
+    """
+    experiment = assemble(scenario, truth, own)
+    failure = reference_failure(experiment)
+    if failure is not None:
+        first = experiment.reference.value(0.0)[:, 0]
+        raise ConfigError(
+            f"reference: {failure.reason} at t = {failure.time:.2f} s"
+            + (f", short by {-1e3 * failure.margin:.3g} mm" if failure.margin < 0 else "")
+            + "; expected a motion within reach"
+            + (
+                ", such as one of smaller amplitude"
+                if failure.time > 0
+                else f": {first_pose_text(first, experiment.mechanism)}"
+            )
+        )
+    return experiment
+
+
+def first_pose_text(pose: Array, mechanism: Mechanism) -> str:
+    """Where a reference begins, and home: a wrong unit shows, and a height counted from home."""
+    first, home = (
+        ", ".join(f"{1e3 * value:.6g}" for value in where[POSITION])
+        for where in (pose, mechanism.home)
+    )
+    return f"it begins at x, y, z = {first} mm, home is at {home} mm"
+
+
+def check_instants(duration: float) -> Array:
+    """Where a reference is checked against the workspace, s: every REACH_CHECK_PERIOD, and last."""
+    return np.append(np.arange(0.0, duration - 1e-9, REACH_CHECK_PERIOD), duration)
+
+
+def reference_failure(experiment: Experiment) -> Failure | None:
+    """Where and why the reference first leaves the workspace, or None."""
+    for t in check_instants(experiment.scenario.duration):
+        failure = diagnose(experiment.mechanism, t, experiment.reference.value(t)[:, 0])
+        if failure is not None:
+            return failure
+    return None
+
+
+def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHING) -> Experiment:
+    """What `prepare` returns, whether or not the reference stays in the workspace.
+
+    Raises:
+        ConfigError: one line.
+    """
+    scenario.check()
+    network = _network(scenario)
+    mechanism = load_mechanism(scenario.mechanism)
+    if own.reference is None:
+        reference = make_reference(scenario.reference, scenario.duration)
+        span = peak_to_peak(scenario.reference, reference, scenario.duration)
+    else:
+        reference = own_motion(own.reference, scenario.duration)
+        span = moved(reference, scenario.duration)
+    start = evaluate(reference, 0.0)[:12]
+    if scenario.start == "rest":
+        start[6:] = 0.0
+    return Experiment(
+        scenario=scenario,
+        mechanism=mechanism,
+        truth=mechanism if truth is None else truth,
+        reference=reference,
+        peak_to_peak=span,
+        nominal=StewartDynamics(mechanism, gravity=scenario.plant.gravity),
+        start=start,
+        network=network,
+        own=own,
+    )
+
+
+def _network(scenario: Scenario) -> Network | None:
+    tuner = scenario.tuner
+    if not isinstance(tuner, AnnTunerConfig):
+        return None
+    try:
+        path = resolve("weights", tuner.weights or DEFAULT)
+    except ConfigError as error:
+        raise ConfigError(f"tuner.{error}") from None
+    return load_network(path)
+
+
+def waits_at_rest(scenario: Scenario) -> bool:
+    """Whether the nominal plate stays where it is until the first torque of the controller acts.
+
+    The floor of E_ac (`loop.metrics.delay_floor`) supposes that.
+    """
+    held = scenario.queue == "equilibrium"
+    return scenario.start == "rest" and (
+        held or (scenario.queue == "zero" and not scenario.plant.gravity)
+    )
+
+
+def believed_delay(scenario: Scenario) -> Delay:
+    """The delay that the controller assumes; null means the true one."""
+    controller = scenario.controller
+    if controller.delay_steps is None:
+        return scenario.true_delay
+    return Delay(controller.delay_steps, controller.delay_fraction or 0.0)
+
+
+def torques_in_flight(experiment: Experiment, delay: Delay) -> Array:
+    """Torques (L, 6) in N m that are under way at t = 0 with such a delay, within the limit."""
+    sc, limit = experiment.scenario, experiment.torque_limit
+    queue = initial_queue(
+        sc.queue, experiment.nominal, experiment.reference, sc.controller.period, delay
+    )
+    return np.clip(queue, -limit, limit)
+
+
+def believed_queue(experiment: Experiment, timeline: Timeline) -> Array:
+    """The torques in flight at t = 0 that the controller believes in."""
+    return torques_in_flight(experiment, timeline.delay)
+
+
+def motion_scale(experiment: Experiment) -> Array:
+    """(6,) rad and m: half the reference's peak to peak, STILL where constant."""
+    still = STILL * np.repeat([1.0, experiment.mechanism.crank_lengths.min()], 3)
+    return np.where(experiment.peak_to_peak > 0, experiment.peak_to_peak / 2, still)
+
+
+def planned_limit(scenario: Scenario) -> float | None:
+    """The limit in N m that plans and priors keep to, or None.
+
+    One that nobody asked for only clips: it makes no plan shorter and no prior narrower.
+    """
+    asked = scenario.actuator.torque_limit
+    return None if asked == "none" else asked
+
+
+def compose_law(experiment: Experiment) -> PredictiveLqi:
+    """The parts that a scenario asks for; the only place that knows their names in it."""
+    sc, nominal = experiment.scenario, experiment.nominal
+    c, motion = sc.controller, motion_scale(experiment)
+    timeline = Timeline(c.period, believed_delay(sc))
+    substeps = choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration)
+    peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
+    torque_scale = max(machine_torque(nominal), peak_torque)
+    errors, integrals, torques = weight_scales(
+        c.weight_scaling, nominal, experiment.peak_to_peak, peak_torque
+    )
+    plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
+    observers: dict[str, Observer] = {
+        "none": NoObserver(),
+        "parameters": ParameterObserver(
+            filter_settings(motion, plate, torque_scale, asked, c.period)
+        ),
+    }
+    predictors: dict[str, Predictor] = {
+        "linear": LinearPredictor(),
+        "nonlinear": NonlinearPredictor(),
+    }
+    feedforwards: dict[str, Feedforward] = {
+        "none": NoFeedforward(),
+        "equilibrium": EquilibriumFeedforward(),
+        "inverse_dynamics": InverseDynamicsFeedforward(),
+    }
+    models: dict[str, DesignModel] = {
+        "paper": PaperModel(c.torque_map),
+        "multibody": MultibodyModel(),
+    }
+    motors = TorqueLimit(experiment.torque_limit)
+    return PredictiveLqi(
+        timeline=timeline,
+        plant=NominalPlant(nominal, substeps, GENTLE * torque_scale, motors),
+        sensing=StateSensing(np.array(sc.sensor.noise_std), motion),
+        observer=observers[c.estimator],
+        predictor=predictors[c.prediction],
+        feedforward=feedforwards[c.feedforward],
+        model=models[c.model],
+        cost=QuadraticCost(errors, integrals if c.integral else None, torques),
+    )
+
+
+def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, float]:
+    """The control law, the motion it follows, and the length of the blend onto the reference."""
+    sc, nominal, law = experiment.scenario, experiment.nominal, compose_law(experiment)
+    law.warm_up()
+    c, timeline = sc.controller, law.timeline
+    if sc.start != "rest" or c.catch_up == 0:
+        return law, experiment.reference, 0.0
+    state, queue = experiment.start, believed_queue(experiment, timeline)
+    if len(queue):
+        state = nominal.predict(state, *timeline.until_next(queue), law.plant.substeps)[-1]
+    planned, span = plan_catch_up(
+        nominal,
+        experiment.reference,
+        state,
+        timeline.eta,
+        c.period,
+        c.catch_up,
+        planned_limit(sc),
+    )
+    return law, planned, span

@@ -1,0 +1,258 @@
+"""A platform in a diagram of one's own: `AddStewartPlatform`, for either engine."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import Frame, ModelInstanceIndex
+from pydrake.systems.framework import (
+    Context,
+    DiagramBuilder,
+    InputPort,
+    OutputPort,
+    System,
+)
+from pydrake.systems.primitives import AffineSystem
+
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.loop.exact import ExactPlant
+from stewart_drake.loop.multibody import (
+    PlateState,
+    PlateWrench,
+    add_model,
+    set_pose,
+)
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.scenario.config import PlantConfig
+from stewart_drake.scenario.signals import (
+    BIAS,
+    DAMPING,
+    NUM_PARAMETERS,
+    NUM_STATE,
+    NUM_TORQUES,
+    PAYLOAD,
+    POSE,
+    RATES,
+)
+
+Array = NDArray[np.float64]
+
+_INPUTS: Final = ("torque", "wrench")
+_STATE: Final = "state"
+_CRANKS: Final = "crank_angles"
+
+
+class StewartPlatform:
+    """A platform that `AddStewartPlatform` added to a diagram, by its ports.
+
+    | port | direction | size | unit |
+    | --- | --- | --- | --- |
+    | torque | input | 6 | N m, at the shafts |
+    | wrench | input | 6, moment then force, at the plate's COM | N m, N, in the world |
+    | state | output | 12, pose and rates relative to the base | rad, m, rad/s, m/s |
+    | crank_angles | output | 6, of a multibody plant only | rad |
+
+    The wrench may stay unconnected, and is zero then. A multibody plant ends the simulation where
+    the plate leaves its workspace, as the exact one does, once one of the outputs was asked for.
+
+    Attributes:
+        mechanism: the machine.
+        plant: the system that moves it, an `ExactPlant` or a `MultibodyPlant`.
+        model: which model of the MultibodyPlant it is; None of the exact plant.
+        scene_graph: that came with a MultibodyPlant that was added too, else None.
+    """
+
+    def __init__(
+        self,
+        builder: DiagramBuilder,
+        mechanism: Mechanism,
+        plant: Any,
+        model: ModelInstanceIndex | None = None,
+        scene_graph: SceneGraph | None = None,
+        torque_bias: ArrayLike = (0.0,) * NUM_TORQUES,
+    ) -> None:
+        self.mechanism, self.plant, self.model = mechanism, plant, model
+        self.scene_graph = scene_graph
+        self._builder, self._bias = builder, np.array(torque_bias)
+        self._added: dict[str, Any] = {}
+
+    def __repr__(self) -> str:
+        engine = "exact" if self.model is None else "multibody"
+        return f"StewartPlatform({self.mechanism}, {engine})"
+
+    def GetInputPort(self, name: str) -> InputPort:
+        """`torque` or `wrench`.
+
+        Raises:
+            ConfigError: another name, or a MultibodyPlant that is not finalized yet.
+        """
+        if name not in _INPUTS:
+            raise ConfigError(f"input port: got {name!r}; expected {' or '.join(_INPUTS)}")
+        if self.model is None:
+            return self.plant.GetInputPort(name)
+        if name == "wrench":
+            self._check_finalized()
+            forces = self.plant.get_applied_spatial_force_input_port()
+            return self._before(forces, name, lambda: PlateWrench(self.plant, self.model))
+        self._check_finalized()
+        actuation = self.plant.get_actuation_input_port(self.model)
+        if not self._bias.any():
+            return actuation
+        return self._before(actuation, "torque_bias", lambda: add_to_torque(self._bias))
+
+    def GetOutputPort(self, name: str) -> OutputPort:
+        """`state`, or `crank_angles` of a multibody plant.
+
+        Raises:
+            ConfigError: another name, or a MultibodyPlant that is not finalized yet.
+        """
+        names = (_STATE,) if self.model is None else (_STATE, _CRANKS)
+        if name not in names:
+            raise ConfigError(f"output port: got {name!r}; expected {' or '.join(names)}")
+        source = self.plant if self.model is None else self._plate_state()
+        return source.GetOutputPort(name)
+
+    def SetState(self, context: Context, state: ArrayLike) -> None:
+        """Put the platform, in its diagram's root context, into [pose; rates] (12,).
+
+        Raises:
+            ConfigError: another shape.
+            UnreachablePoseError, SingularPoseError: see `loop.multibody.set_pose`.
+        """
+        x = np.asarray(state, dtype=np.float64)
+        if x.shape != (NUM_STATE,):
+            raise ConfigError(f"state: got shape {x.shape}; expected ({NUM_STATE},)")
+        own = self.plant.GetMyMutableContextFromRoot(context)
+        if self.model is None:
+            self.plant.set_state(own, x)
+        else:
+            set_pose(self.plant, own, self.mechanism, x[POSE], x[RATES], self.model)
+
+    def _check_finalized(self) -> None:
+        if not self.plant.is_finalized():
+            raise ConfigError(
+                "plant: got one that is not finalized; expected its ports to be asked for after "
+                "plant.Finalize()"
+            )
+
+    def _add(self, name: str, make: Callable[[], System]) -> Any:
+        self._check_finalized()
+        system = self._builder.AddSystem(make())
+        system.set_name(f"{self.plant.GetModelInstanceName(self.model)}_{name}")
+        self._added[name] = system
+        return system
+
+    def _plate_state(self) -> Any:
+        name = "plate_state"
+        if name not in self._added:
+            system = self._add(name, lambda: PlateState(self.plant, self.mechanism, self.model))
+            self._builder.Connect(self.plant.get_state_output_port(), system.get_input_port())
+        return self._added[name]
+
+    def _before(self, port: InputPort, name: str, make: Callable[[], System]) -> InputPort:
+        """The input of a system, made once, whose output is connected to `port`."""
+        if name not in self._added:
+            if self._builder.IsConnectedOrExported(port):
+                raise ConfigError(
+                    f"{name}: got a plant whose {port.get_name()} is connected; "
+                    "expected it to be free"
+                )
+            system = self._add(name, make)
+            self._builder.Connect(system.get_output_port(), port)
+        return self._added[name].get_input_port()
+
+
+def add_to_torque(bias: Array) -> AffineSystem:
+    """y = u + bias (6,), in Drake's words y = C x + D u + y0 without a state x."""
+    nothing = np.empty((0, 0)), np.empty((0, NUM_TORQUES)), np.empty(0)
+    return AffineSystem(*nothing, np.empty((NUM_TORQUES, 0)), np.eye(NUM_TORQUES), bias)
+
+
+def AddStewartPlatform(
+    builder: DiagramBuilder,
+    mechanism: Mechanism | str,
+    config: PlantConfig | None = None,
+    *,
+    plant: MultibodyPlant | None = None,
+    parent: Frame | None = None,
+    X_PB: RigidTransform | None = None,
+    collision: bool = False,
+    start: ArrayLike | None = None,
+) -> StewartPlatform:
+    """Add a platform to a diagram of one's own.
+
+    With a `plant` of one's own the machine becomes a model in it, among other bodies; it is added
+    before `plant.Finalize()`, which stays the caller's, and its ports are asked for after that.
+    Otherwise a plant is added: an `ExactPlant`, or a MultibodyPlant with a SceneGraph, finalized.
+    The simulator of a diagram with exact plants needs `sd.set_accuracy`.
+
+    Args:
+        builder: of the diagram, to which systems may still be added.
+        mechanism: the machine, or what `load_mechanism` takes.
+        config: kind, gravity, time step and what loads the machine, as a scenario's `plant`; of a
+            plant of one's own `time_step` is that plant's, and gravity is switched off for the
+            machine alone. By default as `PlantConfig()`, which is without gravity.
+        plant: a MultibodyPlant that is not finalized, registered with a SceneGraph.
+        parent: frame of `plant` that the base is welded to, the world's if None.
+        X_PB: pose of the base in that frame, none if None.
+        collision: whether plate, base, cranks and rods touch other bodies of `plant`; never each
+            other.
+        start: (6,) pose by default, home if None.
+
+    Raises:
+        ConfigError: bad input: a plant that is finalized, or given for kind exact.
+        UnreachablePoseError: a start out of reach.
+    """
+    machine = mechanism if isinstance(mechanism, Mechanism) else load_mechanism(mechanism)
+    config = PlantConfig() if config is None else config
+    pose = machine.home if start is None else np.asarray(start, dtype=np.float64)
+    if pose.shape != (6,):
+        raise ConfigError(f"start: got shape {pose.shape}; expected (6,), a pose")
+    machine.crank_angles(pose)  # or it is out of reach
+    if config.kind == "exact":
+        for name, given in (("plant", plant), ("parent", parent), ("X_PB", X_PB)):
+            if given is not None:
+                raise ConfigError(
+                    f"{name}: got it for plant.kind exact; expected kind multibody, which alone "
+                    "can be among other bodies"
+                )
+        parameters = np.zeros(NUM_PARAMETERS)
+        parameters[BIAS], parameters[PAYLOAD] = config.torque_bias, config.payload_mass
+        parameters[DAMPING] = config.joint_damping
+        dynamics = StewartDynamics(machine, config.gravity, parameters)
+        exact = ExactPlant(dynamics, np.concatenate([pose, np.zeros(6)]), wrench=True)
+        exact.set_name(machine.name)
+        return StewartPlatform(builder, machine, builder.AddSystem(exact))
+    scene_graph = None
+    if plant is not None and plant.is_finalized():
+        raise ConfigError(
+            "plant: got one that is finalized; expected one to which a machine can be added"
+        )
+    own = plant is None
+    if plant is None:
+        plant, scene_graph = AddMultibodyPlant(
+            MultibodyPlantConfig(time_step=config.time_step, discrete_contact_approximation="sap"),
+            builder,
+        )
+    model = add_model(
+        plant,
+        dataclasses.replace(machine, effort_limit=None),
+        payload_mass=config.payload_mass,
+        joint_damping=config.joint_damping,
+        collision=collision,
+        parent=parent,
+        X_PB=X_PB,
+        start=pose,
+    )
+    if not config.gravity:
+        plant.set_gravity_enabled(model, False)
+    if own:
+        plant.Finalize()
+    return StewartPlatform(builder, machine, plant, model, scene_graph, config.torque_bias)

@@ -1,0 +1,205 @@
+"""Collecting the signals of a running loop, and summing them up."""
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from pydrake.systems.framework import Context
+
+from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.files.versions import versions
+from stewart_drake.law.memory import Counts
+from stewart_drake.loop import metrics
+from stewart_drake.loop.diagram import ClosedLoop
+from stewart_drake.loop.experiment import Experiment, waits_at_rest
+from stewart_drake.scenario.loading import scenario_yaml
+from stewart_drake.scenario.signals import (
+    DIMENSIONS,
+    NUM_STATE,
+    POSE,
+    SIGNALS,
+    Signal,
+    exported_ports,
+)
+from stewart_drake.scenario.timing import Instant
+
+Array = NDArray[np.float64]
+
+_CHUNK = 1024
+
+
+class Table:
+    """Rows of numbers, 8 bytes each, that grow without being copied."""
+
+    def __init__(self, width: int) -> None:
+        self._width, self._chunks, self._used = width, list[Array](), _CHUNK
+
+    def __len__(self) -> int:
+        return _CHUNK * (len(self._chunks) - 1) + self._used
+
+    def append(self, *parts: Array | float) -> None:
+        """Add a row that consists of these parts."""
+        if self._used == _CHUNK:
+            self._chunks.append(np.empty((_CHUNK, self._width)))
+            self._used = 0
+        np.concatenate([np.atleast_1d(part) for part in parts], out=self._chunks[-1][self._used])
+        self._used += 1
+
+    def columns(self, part: slice) -> Array:
+        """(rows, columns), contiguous."""
+        rows = [chunk[:, part] for chunk in self._chunks]
+        return np.concatenate([np.empty((0, self._width))[:, part], *rows])[: len(self)]
+
+    def column(self, place: int) -> Array:
+        """(rows,)."""
+        return self.columns(slice(place, place + 1))[:, 0]
+
+
+class Recorder:
+    """Collects signals of the loop: `look` at the plant, then `keep` that and the held signals.
+
+    Attributes:
+        on_grid: time, pose error (6) and reference (6) on the metric's grid, and where a run ended.
+        samples: at each of the controller's samples: pose error (6), the torque that the law asks
+            for (6), what the limit lets through of it (6), computing time.
+        peak_applied: largest torque that acted, N m.
+        counts: what went wrong and was survived, as of the last sample.
+        tuner_fallbacks: samples at which the tuner passed its network over.
+    """
+
+    def __init__(self, loop: ClosedLoop) -> None:
+        self._loop = loop
+        self._ports: dict[str, Any] = {}
+        self._controller: Any = loop.GetSubsystemByName("controller")
+        self._tuner: Any = (
+            loop.GetSubsystemByName("tuner") if loop.HasSubsystemNamed("tuner") else None
+        )
+        self._scale = loop.experiment.scale
+        self._instant = 0.0
+        self._state, self._wanted, self._error = np.empty(0), np.empty(0), np.empty(0)
+        self._recorded = [signal for signal in SIGNALS.values() if signal.source]
+        self._log = Table(1 + sum(signal.size for signal in self._recorded))
+        self.on_grid, self.samples = Table(13), Table(19)
+        self.peak_applied = 0.0
+        self.counts, self.tuner_fallbacks = Counts(), 0
+
+    def _port(self, context: Context, name: str) -> Array:
+        if name not in self._ports:
+            self._ports[name] = self._loop.GetOutputPort(name)
+        return np.array(self._ports[name].Eval(context))
+
+    def look(self, context: Context, time: float) -> None:
+        """Read plant and reference at the nominal time in s."""
+        self._instant = time
+        self._state = self._port(context, "state")
+        self._wanted = self._port(context, "reference")[:NUM_STATE]
+        self._error = self._state[POSE] - self._wanted[POSE]
+
+    def keep(self, context: Context, instant: Instant) -> None:
+        """Add what was seen to the log, the metric's grid or the controller's samples."""
+        applied = self._port(context, "torque_applied")
+        self.peak_applied = max(self.peak_applied, float(np.abs(applied).max()))
+        if instant.sampled:
+            controller_context = self._controller.GetMyContextFromRoot(context)
+            memory, seconds = self._controller.sample(controller_context)
+            self.counts = memory.counts
+            if self._tuner is not None:
+                tuner_context = self._tuner.GetMyContextFromRoot(context)
+                self.tuner_fallbacks = self._tuner.fallbacks(tuner_context)
+            self.samples.append(self._error, memory.torque, memory.in_flight[-1], seconds)
+        if instant.on_grid:
+            self.on_grid.append(self._instant, self._error, self._wanted[POSE])
+        if instant.logged:
+            # Plant and reference as they were looked at: the plant may have gone on since.
+            seen = {"state": self._state, "reference": self._wanted}
+            seen |= {n: self._port(context, n) for n in exported_ports() if n not in seen}
+            row = [seen[signal.exported][signal.part] for signal in self._recorded]
+            self._log.append(self._instant, *row)
+
+    def current_error(self) -> float:
+        """Mean pose error in % of peak to peak."""
+        return float(100 * np.mean(np.abs(self._error) / self._scale))
+
+    def dataset(self) -> xr.Dataset:
+        """The log, see `SimulationResult.signals`."""
+        values, start = {}, 1
+        for signal in self._recorded:
+            stop = start + signal.size
+            values[signal.name], start = self._log.columns(slice(start, stop)), stop
+        values["error"] = values["pose"] - values["reference"]
+        variables = {name: _variable(signal, values[name]) for name, signal in SIGNALS.items()}
+        coordinates: dict[str, Any] = {
+            name: (name, list(dimension.labels), {"long_name": dimension.long_name})
+            for name, dimension in DIMENSIONS.items()
+        }
+        time = self._log.column(0)
+        coordinates["time"] = ("time", time, {"units": "s", "long_name": "time"})
+        attributes = {
+            "title": "closed loop of a rotary Stewart platform with delayed torques",
+            "scenario": scenario_yaml(self._loop.experiment.scenario),
+            "versions": json.dumps(versions()),
+        }
+        return xr.Dataset(variables, coordinates, attributes)
+
+
+def _variable(signal: Signal, values: Array) -> tuple[tuple[str, ...], Array, dict[str, str]]:
+    """Dimensions, values and attributes of a signal in the record."""
+    dimension = signal.quantity.dimension
+    attributes = {"units": signal.unit, "long_name": signal.long_name}
+    if dimension is None:
+        return ("time",), values[:, 0], attributes
+    return ("time", dimension), values, attributes
+
+
+def summarize(
+    experiment: Experiment,
+    recorder: Recorder,
+    status: str,
+    stopped: Failure | None,
+    wall: float,
+) -> dict[str, Any]:
+    """What `summary.json` holds; NaN where a run that did not complete has no value."""
+    sc, nan = experiment.scenario, float("nan")
+    done = status == "completed"
+    # Not from the log, whose instants are the scenario's choice.
+    time, error = recorder.on_grid.column(0), recorder.on_grid.columns(slice(1, 7))
+    reference = recorder.on_grid.columns(slice(7, 13))
+    errors, torques, sent = (recorder.samples.columns(slice(n, n + 6)) for n in (0, 6, 12))
+    seconds = recorder.samples.column(18)
+    some = len(torques) > 0
+    c = sc.controller
+    return {
+        "status": status,
+        "accumulated_error": metrics.accumulated_error(time, error, experiment.scale)
+        if done
+        else nan,
+        "failure": None if stopped is None else stopped._asdict(),
+        "cost": metrics.quadratic_cost(errors, sent, c.period, c.w_Q, c.w_R, c.integral)
+        if done
+        else nan,
+        "peak_torque": np.abs(torques).max() if some else nan,
+        "peak_torque_applied": recorder.peak_applied if some else nan,
+        "rms_torque": np.sqrt(np.mean(torques**2)) if some else nan,
+        "torque_variation": metrics.total_variation(torques) if some else nan,
+        "peak_error": metrics.peak_error(error, experiment.scale) if len(error) else [nan] * 6,
+        "delay_floor": _floor(experiment, time, reference),
+        "controller_step_ms": {
+            "median": 1e3 * np.median(seconds) if some else nan,
+            "worst": 1e3 * seconds.max() if some else nan,
+        },
+        "wall_s": wall,
+        "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
+        "own": experiment.own.names,
+        "scenario": dataclasses.asdict(sc),
+        "versions": versions(),
+    }
+
+
+def _floor(experiment: Experiment, time: Array, reference: Array) -> float:
+    sc = experiment.scenario
+    if not waits_at_rest(sc):
+        return 0.0
+    return metrics.delay_floor(time, reference, experiment.scale, sc.eta)

@@ -1,0 +1,227 @@
+"""Running a scenario."""
+
+import time as clock
+from collections.abc import Callable
+from pathlib import Path
+from traceback import walk_tb
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Meshcat
+from pydrake.systems.analysis import Simulator, SimulatorStatus
+from pydrake.systems.framework import Context
+
+from stewart_drake.dynamics.threads import one_blas_thread
+from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.loop.cautions import cautions_after, cautions_before
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
+from stewart_drake.loop.exact import set_accuracy
+from stewart_drake.loop.experiment import Experiment, prepare
+from stewart_drake.loop.lifetime import let_go
+from stewart_drake.loop.own import OwnReference, OwnSystem, take
+from stewart_drake.loop.recording import Recorder, summarize
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.scene import Live
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.signals import POSE
+from stewart_drake.scenario.timing import instants, look_time
+
+Array = NDArray[np.float64]
+
+_PACKAGE: Final = __name__.partition(".")[0]
+Progress = Callable[[float, float], None]
+"""Called with simulated time in s and the current pose error in % of peak to peak."""
+
+
+def simulate(
+    scenario: Scenario | Experiment | str | Path,
+    *,
+    controller: OwnSystem | None = None,
+    reference: OwnReference | None = None,
+    disturbance: OwnSystem | None = None,
+    progress: Progress | None = None,
+    meshcat: Meshcat | None = None,
+    truth: Mechanism | None = None,
+    margin: ControllerMargin | bool = True,
+) -> SimulationResult:
+    """Run a scenario from t = 0 to its duration, or until the plate leaves its workspace.
+
+    Ctrl-C ends the run with what has been computed, status `interrupted`.
+
+    Systems of your own are given as an instance, which serves one run, or as what makes one, such
+    as their class. `own` of the summary names them. What only the shipped controller has, estimates
+    and weights among it, is then NaN on record, its counts are 0, and the loop is not judged.
+
+    Args:
+        scenario: what to run, or what `prepare` made of it, or a shipped name or file as
+            `load_scenario` takes it.
+        controller: a Drake system in the place of the shipped controller, with the inputs
+            `measurement` (12: pose and rates as the sensor has them, rad, m and per s) and, if it
+            wants, `reference` (18: pose, rates, accelerations that the plate shall have now), and
+            the output `torque` (6, N m), which is read every `controller.period`, held, limited and
+            delayed like any other.
+        reference: a 6 x 1 Drake Trajectory of the pose with derivatives of order 1 and 2, in the
+            place of the scenario's. It is held where it ends.
+        disturbance: a Drake system with the output `torque` (6, N m), added at the shafts, or
+            `wrench` (6: moment in N m, force in N, in the world, at the plate's COM), or both.
+            Nobody is told of it.
+        progress: called every 20 ms of simulated time; what it raises reaches the caller.
+        meshcat: where the machine, its reference and the torques are shown live, or None; the run
+            then takes at least as long as its duration.
+        truth: the machine to simulate where it is not the one that the controller knows.
+        margin: whether to judge the loop beforehand (`controller_margin`, tenths of a second), for
+            `controller_margin` and `warnings` of the summary; or how it was judged already. Without
+            it, as where many runs are asked for, `controller_margin` is None.
+
+    Raises:
+        ConfigError: bad input, an unreachable reference.
+        TypeError: what is no scenario at all, or a truth beside what was prepared with one.
+    """
+    if isinstance(scenario, str | Path):
+        scenario = load_scenario(scenario)
+    if isinstance(scenario, Experiment):
+        own = {"controller": controller, "reference": reference, "disturbance": disturbance}
+        for name, given in ({"truth": truth} | own).items():
+            if given is not None:
+                raise TypeError(
+                    f"{name}: got one with an Experiment, which has its own; expected None"
+                )
+    if not isinstance(scenario, Scenario | Experiment):
+        raise TypeError(
+            f"scenario: got a {type(scenario).__name__}; expected a Scenario, or the name or path "
+            "of one"
+        )
+    # Matrices of twenty rows are slower on several threads, fifty times so where cores are busy.
+    with one_blas_thread:
+        if isinstance(scenario, Experiment):
+            experiment = scenario
+        else:
+            experiment = prepare(scenario, truth, take(controller, reference, disturbance))
+        if isinstance(margin, bool):
+            judgeable = margin and experiment.own.controller is None
+            judged = controller_margin(experiment) if judgeable else None
+        else:
+            judged = margin
+        return _run(experiment, judged, progress, meshcat)
+
+
+def _run(
+    experiment: Experiment,
+    margin: ControllerMargin | None,
+    progress: Progress | None,
+    meshcat: Meshcat | None,
+) -> SimulationResult:
+    started, scenario = clock.perf_counter(), experiment.scenario
+    loop = build_closed_loop(experiment)
+    simulator = make_simulator(loop)
+    live = None if meshcat is None else Live(loop, meshcat)
+    if live is not None:
+        progress = _shown(simulator, live, progress)
+    recorder = Recorder(loop)
+    try:
+        status, stopped = _advance(simulator, recorder, loop, progress)
+        wall = clock.perf_counter() - started
+        signals = recorder.dataset()
+    finally:
+        if live is not None:
+            live.close()
+        let_go(loop, experiment.own.instances, experiment.own.systems)
+    summary = summarize(experiment, recorder, status, stopped, wall)
+    summary["controller_margin"] = None if margin is None else margin.summary
+    summary["warnings"] = cautions_before(experiment, margin) + cautions_after(experiment, summary)
+    return SimulationResult(
+        scenario=scenario,
+        status=status,
+        stopped=stopped,
+        signals=signals,
+        summary=summary,
+    )
+
+
+def _advance(
+    simulator: Simulator, recorder: Recorder, loop: ClosedLoop, progress: Progress | None
+) -> tuple[str, Failure | None]:
+    """Run to the end and record; how it ended, and what stopped it before."""
+    sc, context = loop.experiment.scenario, simulator.get_context()
+    try:
+        for instant in instants(sc.duration, sc.controller.period, sc.log_period):
+            t = instant.time
+            # Only here: a RuntimeError of `progress` is not one of Drake's.
+            try:
+                left = _advance_to(t, simulator, recorder)
+            except RuntimeError as error:
+                if _raised_elsewhere(error):
+                    raise
+                # Drake's solver gives up where constraints and dynamics contradict each other.
+                return "solver_failed", Failure(context.get_time(), None, np.nan, _one_line(error))
+            if left:
+                return "left_workspace", _failure(loop, context)
+            recorder.keep(context, instant)
+            if progress is not None and instant.on_grid:
+                progress(t, recorder.current_error())
+    except KeyboardInterrupt:
+        return "interrupted", Failure(context.get_time(), None, np.nan, "interrupted")
+    return "completed", None
+
+
+def _raised_elsewhere(error: Exception) -> bool:
+    """Whether it came through Python code that is not ours, that of a user's own system."""
+    frames = walk_tb(error.__traceback__)
+    return any(not str(f.f_globals.get("__name__")).startswith(_PACKAGE) for f, _ in frames)
+
+
+def _advance_to(t: float, simulator: Simulator, recorder: Recorder) -> bool:
+    """Simulate to t in s and look at the plant there; true if the plate left before."""
+    if t == 0:
+        simulator.Initialize()
+    else:
+        outcome = simulator.AdvanceTo(look_time(t))
+        if outcome.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
+            return True
+    recorder.look(simulator.get_context(), t)
+    if t == 0:  # only here are the events of the instant still to come
+        simulator.AdvancePendingEvents()
+    return False
+
+
+def _shown(simulator: Simulator, live: Live, progress: Progress | None) -> Progress:
+    """Progress that also shows the loop, of a simulator that now keeps to real time."""
+    context = simulator.get_context()
+    simulator.set_target_realtime_rate(1.0)
+
+    def show(time: float, error: float) -> None:
+        live.show(context)
+        if progress is not None:
+            progress(time, error)
+
+    return show
+
+
+def make_simulator(loop: ClosedLoop) -> Simulator:
+    """A simulator of the loop at its initial context, integrating as the scenario says."""
+    plant = loop.experiment.scenario.plant
+    context = loop.CreateDefaultContext()
+    simulator = Simulator(loop, context)
+    if plant.kind == "exact":
+        set_accuracy(simulator, plant.accuracy)
+    return simulator
+
+
+def _failure(loop: ClosedLoop, context: Context) -> Failure:
+    plant: Any = loop.GetSubsystemByName("plant")
+    plant_context = plant.GetMyContextFromRoot(context)
+    cranks = None
+    if plant.HasOutputPort("crank_angles"):
+        cranks = plant.GetOutputPort("crank_angles").Eval(plant_context)
+    pose = plant.GetOutputPort("state").Eval(plant_context)[POSE]
+    failure = diagnose(loop.experiment.truth, context.get_time(), pose, cranks)
+    assert failure is not None, "the simulation ended inside the workspace"
+    return failure
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

@@ -1,0 +1,97 @@
+"""The neural tuner of the weights as a Drake system."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue, Value
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    EventStatus,
+    LeafSystem,
+    State,
+    ValueProducer,
+)
+
+from stewart_drake.loop.lifetime import weak
+from stewart_drake.scenario.signals import WEIGHTS
+from stewart_drake.scenario.timing import event_time
+from stewart_drake.tuner.density import NUM_INPUTS
+from stewart_drake.tuner.law import MAX_FACTOR, tune
+from stewart_drake.tuner.network import Network
+
+Array = NDArray[np.float64]
+
+
+class AnnTuner(LeafSystem):
+    """Sets w_Q and w_R at every sample by a network (III-D), within its bounds and a rate limit.
+
+    With w the weights of the last sample, n the count of fallbacks, rho the densities of samples up
+    to k - 1 and `tune` the law (`tuner.law.tune`):
+
+    Initialise: w unknown, n = 0, then the update of k = 0.
+    Update:     at k dt   (w, n) <- (w_k, n + fallback_k).
+    Output:     weights = w_k, (w_k, fallback_k) = tune(rho, w), to be taken at the samples, before
+                their updates; w_0 = fixed.
+
+    Not finite in, or not finite out of the network: the weights go back towards `fixed`, and n
+    counts it. The weights of sample k rest on data of samples up to k - 1, since the window takes
+    in sample k, of which T_k is a part, in its update: there is no algebraic loop.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | density | input | 18 | - | read every period |
+    | weights | output | 2 | w_Q, w_R | direct feedthrough |
+
+    Args:
+        network: what decides.
+        fixed: (2,) w_Q and w_R at the first sample, and to fall back to.
+        period: dt in s.
+        factor: by which a weight changes at most from one sample to the next.
+    """
+
+    def __init__(
+        self, network: Network, fixed: Array, period: float, factor: float = MAX_FACTOR
+    ) -> None:
+        super().__init__()
+        self._network, self._fixed, self._factor = network, np.array(fixed), factor
+        size = len(WEIGHTS)
+        self._last = self.DeclareDiscreteState(np.full(size, np.nan))
+        self._count = self.DeclareDiscreteState(1)
+        self._density = self.DeclareVectorInputPort("density", NUM_INPUTS)
+        self._step = self.DeclareCacheEntry(
+            "step",
+            ValueProducer(
+                allocate=lambda: Value((np.array(fixed), False)), calc=weak(self._calc_step)
+            ),
+            {self._density.ticket(), self.discrete_state_ticket(self._last)},
+        )
+        self.DeclareVectorOutputPort("weights", size, weak(self._weights), {self._step.ticket()})
+        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._update_first))
+        early = event_time(period)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._update))
+
+    def fallbacks(self, context: Context) -> int:
+        """Samples so far at which the network had to be passed over."""
+        return int(context.get_discrete_state(self._count).value()[0])
+
+    def _calc_step(self, context: Context, result: AbstractValue) -> None:
+        last = context.get_discrete_state(self._last).value()
+        densities = np.asarray(self._density.Eval(context))
+        result.set_value(tune(self._network, densities, last, self._fixed, self._factor))
+
+    def _weights(self, context: Context, output: BasicVector) -> None:
+        step: Any = self._step.Eval(context)
+        output.SetFromVector(step[0])
+
+    def _update_first(self, context: Context, state: State) -> EventStatus:
+        self._update(context, state)
+        return EventStatus.Succeeded()
+
+    def _update(self, context: Context, state: State) -> None:
+        step: Any = self._step.Eval(context)
+        weights, fell_back = step
+        state.get_mutable_discrete_state(self._last).SetFromVector(weights)
+        count = self.fallbacks(context) + fell_back
+        state.get_mutable_discrete_state(self._count).SetFromVector([count])

@@ -1,0 +1,1 @@
+"""The scenario: its sections, files, motions, times and the table of signals."""

@@ -1,0 +1,277 @@
+"""The scenario: one plain dataclass per section and kind, with units, defaults and ranges.
+
+A field is checked alone when it is set; `Scenario.check` checks what several fields share. Nothing
+here needs a mechanism. `scenario_loading` reads scenarios from files.
+"""
+
+import dataclasses
+from dataclasses import field
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.schema import ByKind
+from stewart_drake.files.yamlio import brief, differences, validate
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.fault_config import SensorFault, fault_problem
+from stewart_drake.scenario.field_types import (
+    STRICT,
+    Deviation,
+    Fraction,
+    Name,
+    Six,
+    Steps,
+    TorqueLimit,
+    Weight,
+)
+from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
+from stewart_drake.scenario.timing import METRIC_PERIOD, log_problem, step_problem
+
+
+@dataclass(config=STRICT)
+class PlantConfig:
+    """The simulated platform; the controller is not told the last three fields.
+
+    Attributes:
+        kind: `multibody` (MultibodyPlant with constraints, fixed steps) or `exact` (closed-form
+            dynamics, error-controlled integration).
+        gravity: whether gravity acts, 9.81 m/s^2; false stands for a counterbalanced platform.
+        time_step: of the multibody plant, s.
+        accuracy: of the exact plant's integrator, relative, 1e-12 to 1e-2.
+        payload_mass: a point mass at the plate's centre of mass, kg.
+        torque_bias: added to each motor's torque, N m.
+        joint_damping: viscous damping on each crank shaft, N m s/rad.
+    """
+
+    kind: Literal["multibody", "exact"] = "multibody"
+    gravity: bool = False
+    time_step: Annotated[float, Field(ge=1e-6, le=METRIC_PERIOD)] = 0.001
+    accuracy: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-8
+    payload_mass: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    torque_bias: Six = field(default_factory=lambda: [0.0] * 6)
+    joint_damping: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+
+
+@dataclass(config=STRICT)
+class DelayConfig:
+    """The true delay between computing a torque and feeling it.
+
+    Attributes:
+        steps: whole controller periods.
+        fraction: a further part of one period, 0 to below 1; less than 1e-9 is 0.
+    """
+
+    steps: Steps = 8
+    fraction: Fraction = 0.0
+
+
+@dataclass(config=STRICT)
+class ControllerConfig:
+    """The controller and what it believes.
+
+    Attributes:
+        period: between two torques, s.
+        integral: whether the error is also integrated.
+        delay_steps: whole periods of delay that the controller believes in, 0 for none; null is
+            the true delay.
+        delay_fraction: the further part of a period that it believes in, less than 1e-9 is 0;
+            null is the true one where `delay_steps` is null too, else 0.
+        prediction: across the delay, by the `linear` design model or the `nonlinear` dynamics.
+        feedforward: `none`, `equilibrium` torque, or `inverse_dynamics` of the reference.
+        model: behind gain and prediction, `paper` (massless legs) or `multibody`.
+        torque_map: of the paper's model, from `virtual_work` or as `printed`.
+        estimator: `none`, or `parameters` (torque bias, payload and damping).
+        w_Q: weight of the errors.
+        w_R: weight of the torques.
+        weight_scaling: `bryson` (by what the reference asks for) or `identity`.
+        catch_up: blend onto the reference after a start from rest, s; 0 is none, null the shortest
+            one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
+    """
+
+    period: Annotated[float, Field(ge=1e-4, le=10)] = 0.1
+    integral: bool = True
+    delay_steps: Steps | None = None
+    delay_fraction: Fraction | None = None
+    prediction: Literal["linear", "nonlinear"] = "nonlinear"
+    feedforward: Literal["none", "equilibrium", "inverse_dynamics"] = "inverse_dynamics"
+    model: Literal["paper", "multibody"] = "multibody"
+    torque_map: Literal["virtual_work", "printed"] = "virtual_work"
+    estimator: Literal["none", "parameters"] = "parameters"
+    w_Q: Weight = 1.0
+    w_R: Weight = 1.0
+    weight_scaling: Literal["bryson", "identity"] = "bryson"
+    catch_up: Annotated[float, Field(ge=0, le=10)] | None = None
+
+
+@dataclass(config=STRICT)
+class TorqueActuatorConfig:
+    """Motors that give the torque that arrives, within their limit.
+
+    Attributes:
+        kind: `torque`.
+        torque_limit: of each motor, N m; null is the mechanism's `motor.effort_limit`, the text
+            `none` no limit. Only a number is also planned with, see `ControllerConfig.catch_up`.
+    """
+
+    kind: Literal["torque"] = "torque"
+    torque_limit: TorqueLimit = None
+
+
+ActuatorConfig = Annotated[TorqueActuatorConfig, ByKind()]
+
+
+@dataclass(config=STRICT)
+class WireConfig:
+    """A link between controller and motors that delays every torque by `delay`, and loses none.
+
+    Attributes:
+        kind: `wire`.
+    """
+
+    kind: Literal["wire"] = "wire"
+
+
+LinkConfig = Annotated[WireConfig, ByKind()]
+
+
+@dataclass(config=STRICT)
+class StateSensorConfig:
+    """The measurement of pose and rates.
+
+    Attributes:
+        kind: `state`.
+        noise_std: of [pose; rates], in rad, m, rad/s and m/s.
+        seed: of the noise and of spikes; the same seed gives the same run.
+        faults: when it measures nothing, the same again, or nonsense; see `fault_config`.
+    """
+
+    kind: Literal["state"] = "state"
+    noise_std: Annotated[list[Deviation], Field(min_length=12, max_length=12)] = field(
+        default_factory=lambda: [0.0] * 12
+    )
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    faults: list[SensorFault] = field(default_factory=list)
+
+    def problem(self) -> str | None:
+        """What is wrong with fields that are well formed one by one, or None."""
+        return fault_problem(self.faults)
+
+
+SensorConfig = Annotated[StateSensorConfig, ByKind()]
+
+
+@dataclass(config=STRICT)
+class FixedTunerConfig:
+    """Nobody sets w_Q and w_R while the controller runs.
+
+    Attributes:
+        kind: `fixed`.
+    """
+
+    kind: Literal["fixed"] = "fixed"
+
+
+@dataclass(config=STRICT)
+class AnnTunerConfig:
+    """A neural network sets w_Q and w_R while the controller runs.
+
+    It starts from the controller's w_Q and w_R and goes back to them where it fails.
+
+    Attributes:
+        kind: `ann`.
+        weights: the network, a shipped name or a JSON file; null is the shipped `tuner`.
+    """
+
+    kind: Literal["ann"] = "ann"
+    weights: Name | None = None
+
+
+TunerConfig = Annotated[FixedTunerConfig | AnnTunerConfig, ByKind()]
+
+
+@dataclass(config=STRICT)
+class Scenario:
+    """One closed-loop experiment; the defaults are the paper's.
+
+    Attributes:
+        mechanism: a shipped name or a path.
+        duration: of the simulation, s.
+        start: `rest` (at the reference's first pose, zero rates) or `on_reference`.
+        queue: torques in flight at t = 0: `zero`, `equilibrium`, or `reference` (the inverse
+            dynamics of the reference).
+        reference, plant, delay, link, controller, actuator, sensor, tuner: the sections; all but
+            plant, delay and controller come in kinds, each a class of its own.
+        log_period: of the recorded signals, s; null is every 20 ms and every sample of the
+            controller. The multibody plant is seen on its own steps only, so that it must be a
+            multiple of `plant.time_step`. What is measured of a run does not depend on it.
+    """
+
+    mechanism: Name = "paper"
+    duration: Annotated[float, Field(gt=0, le=1e5)] = 10.0
+    start: Literal["rest", "on_reference"] = "rest"
+    queue: Literal["zero", "equilibrium", "reference"] = "zero"
+    reference: ReferenceConfig = field(default_factory=SineConfig)
+    plant: PlantConfig = field(default_factory=PlantConfig)
+    delay: DelayConfig = field(default_factory=DelayConfig)
+    link: LinkConfig = field(default_factory=WireConfig)
+    controller: ControllerConfig = field(default_factory=ControllerConfig)
+    actuator: ActuatorConfig = field(default_factory=TorqueActuatorConfig)
+    sensor: SensorConfig = field(default_factory=StateSensorConfig)
+    tuner: TunerConfig = field(default_factory=FixedTunerConfig)
+    log_period: Annotated[float, Field(ge=1e-5, le=1e5)] | None = None
+
+    def __repr__(self) -> str:
+        return f"Scenario({differences(self, Scenario())})"
+
+    @property
+    def true_delay(self) -> Delay:
+        """What the torques wait for, which the controller need not know."""
+        return Delay(self.delay.steps, self.delay.fraction)
+
+    @property
+    def eta(self) -> float:
+        """The true delay in s."""
+        return self.true_delay.eta(self.controller.period)
+
+    def check(self, where: str = "scenario") -> None:
+        """Checks every field again, and everything that takes several of them.
+
+        Args:
+            where: what the scenario is, opening the message.
+
+        Raises:
+            ConfigError: the first problem, in one line.
+        """
+        # Assignment is validated, but a list can also be changed in place.
+        validate(Scenario, dataclasses.asdict(self), where)
+        step = self.plant.time_step if self.plant.kind == "multibody" else None
+        for problem in (
+            self.reference.problem(),
+            _controller_problem(self.controller),
+            self.sensor.problem(),
+            step and step_problem(step, self.controller.period, self.delay.fraction),
+            log_problem(self.log_period, self.duration, step),
+        ):
+            if problem:
+                raise ConfigError(f"{where}: {problem}")
+
+
+def _controller_problem(controller: ControllerConfig) -> str | None:
+    if controller.delay_fraction is not None and controller.delay_steps is None:
+        return (
+            f"controller.delay_fraction: got {brief(controller.delay_fraction)} without "
+            "delay_steps; expected both or neither"
+        )
+    if controller.catch_up is not None and 0 < controller.catch_up < 1e-3:
+        return (
+            f"controller.catch_up: got {controller.catch_up!r}; expected 0 for none, null, or at "
+            "least 0.001 s"
+        )
+    if controller.torque_map == "printed" and controller.model != "paper":
+        return (
+            "controller.torque_map: got 'printed' with model 'multibody'; expected "
+            "'virtual_work', or model 'paper'"
+        )
+    return None

@@ -1,0 +1,199 @@
+"""Scenarios and controllers from files, overlays and settings.
+
+Precedence, lowest first: the scenario file, a controller laid over it, single settings. Each layer
+is checked on its own, so that a message names the place to mend.
+"""
+
+import dataclasses
+import io
+import typing
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.representer import RoundTripRepresenter
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import absolute_path, is_path, resolve
+from stewart_drake.files.schema import field_names, sections
+from stewart_drake.files.yamlio import brief, load_yaml, parse_yaml, validate
+from stewart_drake.scenario.config import ControllerConfig, Scenario
+
+_SETTINGS = "settings"
+_KINDS = sections(Scenario)
+
+
+def load_scenario(
+    name_or_path: str | Path,
+    controller: str | Path | None = None,
+    settings: Iterable[str] = (),
+) -> Scenario:
+    """Reads and checks a scenario.
+
+    Args:
+        name_or_path: a shipped name or a YAML file. Paths inside the file start from its folder;
+            what the file leaves out keeps its default.
+        controller: a controller to lay over it, as `load_controller` takes it.
+        settings: `section.field=value` or `field=value`, the value in YAML, e.g.
+            `plant.gravity=true`; paths start from the working directory. A setting of a
+            section's kind also drops what the file says for another kind.
+
+    Raises:
+        ConfigError: the first problem, in one line.
+    """
+    path = resolve("scenario", name_or_path)
+    data = load_yaml(path)
+    _drop_foreign_nulls(data)
+    validate(Scenario, data, str(path))
+    _make_paths_absolute(data, path.parent)
+    if controller is not None:
+        data["controller"] = {**data.get("controller", {}), **load_controller(controller)}
+    overlay = _parse_settings(settings, data)
+    for name, change in overlay.items():
+        data[name] = _laid_over(name, data.get(name), change)
+    scenario = validate(Scenario, data, str(path))
+    scenario.check(f"{path} with settings" if overlay else str(path))
+    return scenario
+
+
+def load_controller(name_or_path: str | Path) -> dict[str, Any]:
+    """Reads a controller: the fields of the scenario's `controller` section that it sets.
+
+    Args:
+        name_or_path: a shipped name or a YAML file of flat keys.
+
+    Returns:
+        The keys listed in the file and their values, checked; `period` is never among them.
+
+    Raises:
+        ConfigError: unreadable file, unknown key, bad value, or a `period`.
+    """
+    path = resolve("controller", name_or_path)
+    data = load_yaml(path)
+    if "period" in data:
+        raise ConfigError(
+            f"{path}: period: got {brief(data['period'])}; a controller keeps the scenario's "
+            "controller.period, set it there"
+        )
+    validate(ControllerConfig, data, str(path))
+    return data
+
+
+def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
+    """The scenario as plain data that JSON and YAML can hold, and `load_scenario` reads back."""
+    return dataclasses.asdict(scenario)
+
+
+def scenario_yaml(scenario: Scenario) -> str:
+    """The scenario as the text of a file that `load_scenario` reads back."""
+    yaml, text = YAML(), io.StringIO()
+    yaml.width, yaml.Representer = 96, _Representer
+    yaml.dump(scenario_to_dict(scenario), text)
+    return text.getvalue()
+
+
+class _Representer(RoundTripRepresenter):
+    """Lists on one line, and null by its name."""
+
+    def flat(self, values: list[Any]) -> Any:
+        return self.represent_sequence("tag:yaml.org,2002:seq", values, flow_style=True)
+
+    def null(self, _: None) -> Any:
+        return self.represent_scalar("tag:yaml.org,2002:null", "null")
+
+
+_Representer.add_representer(list, _Representer.flat)
+_Representer.add_representer(type(None), _Representer.null)
+
+
+def setting_choices() -> list[str]:
+    """The beginning of every setting, `plant.time_step=`; whole where values can be counted."""
+    choices: dict[str, None] = {}  # kinds have fields in common
+    for name, hint in typing.get_type_hints(Scenario).items():
+        members = [m for m in (*typing.get_args(hint), hint) if dataclasses.is_dataclass(m)]
+        hints = [
+            (f"{name}.{field}", inner)
+            for member in members
+            for field, inner in typing.get_type_hints(member).items()
+        ]
+        for field, inner in hints or [(name, hint)]:
+            values: tuple[Any, ...] = ("",)
+            if inner is bool:
+                values = ("true", "false")
+            elif typing.get_origin(inner) is typing.Literal:
+                values = typing.get_args(inner)
+            choices |= dict.fromkeys(f"{field}={value}" for value in values)
+    return list(choices)
+
+
+def _parse_settings(settings: Iterable[str], data: dict[str, Any]) -> dict[str, Any]:
+    """Settings for a scenario's data as a partial one; of two for one field the later one counts.
+
+    The kind of a section that any of them touches is said in what is returned.
+    """
+    changes = [_parse_setting(setting) for setting in settings]
+    for section, kinds in _KINDS.items():
+        touching = [part for c in changes if isinstance(part := c.get(section), dict)]
+        layers = [{"kind": next(iter(kinds))}, data.get(section, {}), *touching]
+        kind = [layer["kind"] for layer in layers if "kind" in layer][-1]
+        for part in touching:
+            part.setdefault("kind", kind)
+    overlay: dict[str, Any] = {}
+    for change in changes:
+        _drop_foreign_nulls(change)
+        validate(Scenario, change, _SETTINGS)
+        _make_paths_absolute(change, Path.cwd())
+        for name, part in change.items():
+            overlay[name] = _laid_over(name, overlay.get(name), part)
+    return overlay
+
+
+def _parse_setting(setting: str) -> dict[str, Any]:
+    """One setting as a partial scenario."""
+    key, equals, text = setting.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts) or len(parts) > 2:
+        raise ConfigError(
+            f"{_SETTINGS}: got {brief(setting)}; expected section.field=value or field=value"
+        )
+    value = parse_yaml(text, f"{_SETTINGS}: {key}")
+    change: dict[str, Any] = {parts[-1]: value}
+    return {parts[0]: change} if len(parts) == 2 else change
+
+
+def _laid_over(name: str, below: Any, above: Any) -> Any:
+    """A scenario's field under a checked change; a new kind drops what it does not know."""
+    if not isinstance(above, dict):
+        return above
+    kept = below or {}
+    if name in _KINDS:
+        known = field_names(_KINDS[name][above["kind"]])
+        kept = {field: value for field, value in kept.items() if field in known}
+    return {**kept, **above}
+
+
+def _drop_foreign_nulls(data: dict[str, Any]) -> None:
+    """Forget a null for a field of another kind: it says that there is none, as in older files."""
+    for section, kinds in _KINDS.items():
+        given = data.get(section)
+        if not isinstance(given, dict):
+            continue
+        own = kinds.get(str(given.get("kind", next(iter(kinds)))))
+        foreign = {name for kind in kinds.values() for name in field_names(kind)}
+        for name in foreign - set(field_names(own)) if own else ():
+            if name in given and given[name] is None:
+                del given[name]
+
+
+def _make_paths_absolute(data: dict[str, Any], folder: Path) -> None:
+    """Ties every relative path in `data` to the folder it was written for; names stay names."""
+
+    def tie(fields: dict[str, Any], name: str) -> None:
+        value = fields.get(name)
+        if value is not None and (name == "file" or is_path(value)):
+            fields[name] = str(absolute_path(value, folder))
+
+    tie(data, "mechanism")
+    tie(data.get("reference", {}), "file")
+    tie(data.get("tuner", {}), "weights")

@@ -1,0 +1,314 @@
+"""References as pydrake trajectories of the pose (6x1), with exact first and second derivatives.
+
+Every trajectory can be evaluated at any t >= 0: the controller looks ahead, beyond the duration.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from functools import singledispatch
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.trajectories import (
+    BezierCurve,
+    CompositeTrajectory,
+    FunctionHandleTrajectory,
+    PiecewisePolynomial,
+    Trajectory,
+)
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.scenario.reference_config import (
+    CsvConfig,
+    HoldConfig,
+    ReferenceConfig,
+    SineConfig,
+    WaypointsConfig,
+)
+from stewart_drake.scenario.reference_files import read_csv, waypoints
+from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
+    COORDINATE_NAMES,
+    NUM_REFERENCE,
+    POSE,
+    POSITION,
+    RATES,
+)
+
+Array = NDArray[np.float64]
+
+_CONSTANT: Final = 1e-9
+"""A coordinate that moves less than this, in rad or beside its largest position in m, is constant:
+rounding is no motion."""
+_GRID: Final = 1e-3
+"""s; the grid on which the peak-to-peak of a sampled reference is read."""
+_INSTANT: Final = 1e-6
+"""s; what is shorter is no piece of its own, its derivatives would be rounding errors."""
+_STOP_SPEED: Final = 1e-3
+"""rad/s or m/s; a motion that ends slower than this, or than the share below, is at rest."""
+_STOP_SHARE: Final = 0.05
+"""Of the coordinate's largest speed at a sample."""
+_GOLDEN: Final = (math.sqrt(5) - 1) / 2
+
+
+@singledispatch
+def make_reference(config: ReferenceConfig, duration: float) -> Trajectory:
+    """The motion that `config` describes; every kind of reference registers its own.
+
+    Waypoints are left and reached at rest, the first, the last, and wherever two neighbours are
+    the same pose; in between the pose is twice continuously differentiable. A CSV motion is the
+    cubic spline through its samples, with third derivatives continuous next to its ends. Before
+    the first and after the last sample of either the pose is constant.
+
+    Args:
+        config: the scenario's section; `file` is a path.
+        duration: of the simulation, s.
+
+    Returns:
+        A 6x1 trajectory, defined for t >= 0, with derivatives of order 1 and 2.
+
+    Raises:
+        ConfigError: the samples or their file break a rule of `reference_files`, or a CSV motion
+            ends before `duration` while it still moves.
+    """
+    raise TypeError(f"config: got a {type(config).__name__}; expected a kind of reference")
+
+
+@make_reference.register
+def _sine(config: SineConfig, duration: float) -> Trajectory:
+    amplitude = np.reshape(config.amplitude, (6, 1))
+    offset = np.reshape(config.offset, (6, 1))
+    omega = config.angular_frequency
+
+    def derivative(t: float, order: int) -> Array:
+        # d/dt sin = cos, then -sin, -cos, sin
+        waves = (math.sin, math.cos)
+        sign = -1.0 if order % 4 in (2, 3) else 1.0
+        return sign * omega**order * waves[order % 2](omega * t) * amplitude
+
+    trajectory = FunctionHandleTrajectory(lambda t: offset + derivative(t, 0), 6, 1, 0.0, math.inf)
+    trajectory.set_derivative(derivative)
+    return trajectory
+
+
+@make_reference.register
+def _constant(config: HoldConfig, duration: float) -> Trajectory:
+    return PiecewisePolynomial(np.reshape(config.offset, (6, 1)))
+
+
+@make_reference.register
+def _sampled(config: CsvConfig, duration: float) -> Trajectory:
+    if config.file is None:
+        raise ConfigError("reference.file: got None; expected a CSV file")
+    times, poses = read_csv(config.file)
+    return _through_samples(times, poses, duration, config.file)
+
+
+def evaluate(trajectory: Trajectory, t: float) -> Array:
+    """`[pose; rates; accelerations]`, (18,), of `trajectory` at time `t` (s)."""
+    result = np.empty(NUM_REFERENCE)
+    result[POSE] = trajectory.value(t)[:, 0]
+    result[RATES] = trajectory.EvalDerivative(t, 1)[:, 0]
+    result[ACCELERATIONS] = trajectory.EvalDerivative(t, 2)[:, 0]
+    return result
+
+
+def spread_instants(duration: float, number: int) -> Array:
+    """Where to look at a motion of unknown period: an instant (number,) in each equal part.
+
+    Evenly spaced ones may all fall on the same phase, such as on the zeros of a sine of 0.5 Hz
+    that is looked at once a second. These sit at the places of the golden sequence in their parts,
+    so that whatever the period, the phases seen are spread evenly.
+
+    Args:
+        duration: s.
+        number: of instants, the first of which is 0.
+    """
+    k = np.arange(number)
+    return duration / number * (k + k * _GOLDEN % 1)
+
+
+def peak_to_peak(config: ReferenceConfig, trajectory: Trajectory, duration: float) -> Array:
+    """How far the motion goes, which tracking errors are measured against.
+
+    Args:
+        config: the scenario's section.
+        trajectory: `make_reference(config, duration)`.
+        duration: s.
+
+    Returns:
+        (6,) rad and m: for a sine twice its amplitude, whether or not `duration` shows all of it;
+        else the range within [0, duration]. It is 0 where the coordinate is constant.
+    """
+    return _told(_span(config, trajectory, duration), trajectory)
+
+
+def moved(trajectory: Trajectory, duration: float) -> Array:
+    """(6,) rad and m, the range of any motion within [0, duration], 0 where it is constant."""
+    return _told(_range(trajectory, duration), trajectory)
+
+
+def _told(span: Array, trajectory: Trajectory) -> Array:
+    """`span` (6,) without what is rounding."""
+    furthest = np.abs(trajectory.value(0.0)[POSITION, 0]).max() + span[POSITION].max()
+    return np.where(span < _CONSTANT * np.repeat([1.0, furthest], 3), 0.0, span)
+
+
+@singledispatch
+def _span(config: ReferenceConfig, trajectory: Trajectory, duration: float) -> Array:
+    return _range(trajectory, duration)
+
+
+def _range(trajectory: Trajectory, duration: float) -> Array:
+    samples = int(np.clip(math.ceil(duration / _GRID), 1000, 1_000_000)) + 1
+    values = trajectory.vector_values(np.linspace(0.0, duration, samples))
+    return np.ptp(values, axis=1)
+
+
+@_span.register
+def _span_of_sine(config: SineConfig, trajectory: Trajectory, duration: float) -> Array:
+    return 2 * np.abs(np.array(config.amplitude))
+
+
+def catch_up(
+    start_pose: ArrayLike,
+    start_rates: ArrayLike,
+    reference: Trajectory,
+    t_start: float,
+    duration: float,
+) -> Trajectory:
+    """A reference that leaves the start state smoothly and ends on `reference`.
+
+    Up to `t_start` it goes on with the constant rates of the start, as a plate does that nothing
+    acts on yet; over the next `duration` it is the quintic that continues pose and rates with zero
+    acceleration and reaches pose, rates and accelerations of the reference; then it is the
+    reference.
+
+    Args:
+        start_pose: (6,) at t = 0, rad and m.
+        start_rates: (6,) rad/s and m/s.
+        reference: the 6x1 trajectory to join.
+        t_start: when torques begin to act, s, >= 0; below 1e-6 it counts as 0.
+        duration: of the blend, s, >= 1e-6.
+
+    Returns:
+        A 6x1 trajectory, defined for t >= 0, with derivatives of order 1 and 2.
+
+    Raises:
+        ValueError: a wrong shape, or times outside their range.
+    """
+    pose, rates = np.asarray(start_pose, dtype=float), np.asarray(start_rates, dtype=float)
+    if pose.shape != (6,) or rates.shape != (6,):
+        raise ValueError(
+            f"start_pose and start_rates have shapes {pose.shape} and {rates.shape}; expected (6,)"
+        )
+    if not (0 <= t_start < math.inf and _INSTANT <= duration < math.inf):
+        raise ValueError(
+            f"got t_start {t_start}, duration {duration}; expected t_start >= 0, "
+            f"duration >= {_INSTANT}"
+        )
+    t_start = t_start if t_start >= _INSTANT else 0.0
+    t_end = t_start + duration
+    leave = np.concatenate([pose + rates * t_start, rates, np.zeros(6)])
+    return through_states([(t_start, leave, t_end, evaluate(reference, t_end))], reference)
+
+
+Piece = tuple[float, Array, float, Array]
+"""Start time in s, [pose; rates; accelerations] (18,) there, end time, the same there."""
+
+
+def through_states(pieces: Sequence[Piece], reference: Trajectory) -> Trajectory:
+    """Quintics through given states, and `reference` from the end of the last one on.
+
+    Before the first piece the pose goes on the straight line that its first rates continue.
+
+    Args:
+        pieces: one after the other; accelerations may jump between two.
+        reference: the 6x1 trajectory to join.
+
+    Returns:
+        A 6x1 trajectory, defined for t >= 0, with derivatives of order 1 and 2.
+    """
+    t_start, leave, t_end = pieces[0][0], pieces[0][1], pieces[-1][2]
+    after = FunctionHandleTrajectory(reference.value, 6, 1, t_end, math.inf)
+    after.set_derivative(reference.EvalDerivative)
+    quintics = [_quintic(t0, t1, start, end) for t0, start, t1, end in pieces]
+    segments: list[Trajectory] = [*quintics, after]
+    if t_start > 0:
+        line = np.column_stack([leave[POSE] - leave[RATES] * t_start, leave[POSE]])
+        segments.insert(0, PiecewisePolynomial.FirstOrderHold([0.0, t_start], line))
+    return CompositeTrajectory(segments)
+
+
+@make_reference.register
+def _through_waypoints(config: WaypointsConfig, duration: float) -> Trajectory:
+    """Quintics with the knot rates and accelerations of a clamped cubic spline."""
+    from scipy.interpolate import CubicSpline  # slow to import; other references go without
+
+    times, poses = waypoints(config)
+    same = np.all(np.diff(poses, axis=0) == 0, axis=1)
+    rest = np.zeros(len(times), dtype=bool)
+    rest[[0, -1]] = True
+    rest[:-1] |= same
+    rest[1:] |= same
+    knots = np.zeros((len(times), NUM_REFERENCE))
+    knots[:, POSE] = poses
+    stops = np.flatnonzero(rest)
+    for first, last in itertools.pairwise(stops):
+        part = slice(first, last + 1)
+        spline = CubicSpline(times[part], poses[part], bc_type="clamped")
+        inner = slice(first + 1, last)
+        knots[inner, RATES] = spline(times[inner], 1)
+        # A cubic would jump in acceleration at a stop; a quintic can start and end with none.
+        knots[inner, ACCELERATIONS] = spline(times[inner], 2)
+    segments: list[Trajectory] = [
+        _quintic(times[k], times[k + 1], knots[k], knots[k + 1]) for k in range(len(times) - 1)
+    ]
+    if times[0] > _INSTANT:
+        segments.insert(0, _hold(poses[0], 0.0, times[0]))
+    return CompositeTrajectory([*segments, _hold(poses[-1], times[-1], math.inf)])
+
+
+def _through_samples(times: Array, poses: Array, duration: float, file: str) -> Trajectory:
+    from scipy.interpolate import CubicSpline  # slow to import; other references go without
+
+    # The free ends follow the samples; prescribed rest would bend the first and last interval of
+    # a motion that was recorded on the move. A PiecewisePolynomial would be the same cubic, but
+    # takes 35 s and 4 GB of a million samples, where this takes 1 s and 0.3 GB.
+    cubic = CubicSpline(times, poses, bc_type="not-a-knot")
+    end = float(times[-1])
+    if end < duration:
+        speeds = np.abs(cubic(times, 1))
+        stops = speeds[-1] <= np.maximum(_STOP_SPEED, _STOP_SHARE * speeds.max(axis=0))
+        if not stops.all():
+            column = int(np.argmin(stops))
+            unit = "rad/s" if column < 3 else "m/s"
+            name = COORDINATE_NAMES[column]
+            raise ConfigError(
+                f"{file}: last row: got {speeds[-1, column]:.3g} {unit} in {name} "
+                f"at {end:.6g} s; expected samples that come to rest, or duration <= {end!r}"
+            )
+    spline = FunctionHandleTrajectory(lambda t: cubic(t)[:, None], 6, 1, 0.0, end)
+    spline.set_derivative(lambda t, order: cubic(t, order)[:, None])
+    return CompositeTrajectory([spline, _hold(poses[-1], end, math.inf)])
+
+
+def _hold(pose: Array, start: float, end: float) -> Trajectory:
+    return PiecewisePolynomial.ZeroOrderHold([start, end], np.column_stack([pose, pose]))
+
+
+def _quintic(t0: float, t1: float, start: Array, end: Array) -> BezierCurve:
+    """The quintic between two [pose; rates; accelerations].
+
+    A Bezier curve of degree 5 over h = t1 - t0 has c' = 5 (c1 - c0) / h and
+    c'' = 20 (c2 - 2 c1 + c0) / h^2 at its start, and the mirror image at its end.
+    """
+    h = t1 - t0
+    c0, c5 = start[POSE], end[POSE]
+    c1 = c0 + h / 5 * start[RATES]
+    c4 = c5 - h / 5 * end[RATES]
+    c2 = 2 * c1 - c0 + h**2 / 20 * start[ACCELERATIONS]
+    c3 = 2 * c4 - c5 + h**2 / 20 * end[ACCELERATIONS]
+    return BezierCurve(t0, t1, np.column_stack([c0, c1, c2, c3, c4, c5]))

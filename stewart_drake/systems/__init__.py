@@ -1,1 +1,0 @@
-"""LeafSystems of the loop: reference, sensor, density, tuner, controller, delay chain."""

@@ -1,0 +1,1 @@
+"""The tuner's network: data, labels, training, evaluation."""
