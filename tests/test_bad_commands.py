@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from stewart_drake.cli import main
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.loading import load_scenario
 from tests.faults import refusal, tree, written
 
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.1", "--set", "delay.steps=1")
@@ -137,7 +139,7 @@ def test_two_commands_do_not_write_into_one_directory(tmp_path, capsys):
             assert tree(tmp_path) == before
     finally:
         os.close(other)
-    assert main(["simulate", *EXACT, "--quiet", "--out", str(tmp_path)]) == 0
+    assert main(["model", "check", "paper", "--quiet", "--out", str(tmp_path)]) == 0
 
 
 @pytest.mark.parametrize("words", [["tune", "dataset"], ["tune", "evaluate", "--scenarios", "2"]])
@@ -161,8 +163,7 @@ def test_signals_and_data_that_are_none(content, tmp_path, capsys, monkeypatch):
 
 
 def test_signals_cut_off_are_refused(tmp_path, capsys):
-    assert main(["simulate", *EXACT, "--quiet", "--out", str(tmp_path)]) == 0
-    capsys.readouterr()
+    simulate(load_scenario("paper", settings=EXACT[1::2]), margin=False).save(tmp_path)
     whole = (tmp_path / "signals.nc").read_bytes()
     for keep in (0.1, 0.5, 0.95):
         written(tmp_path / "cut.nc", whole[: int(keep * len(whole))])

@@ -40,7 +40,7 @@ def scenario(*settings: str, controller: str | None = None, plant: str = "exact"
 
 @functools.cache
 def result(*settings: str, controller: str | None = None, plant: str = "exact") -> SimulationResult:
-    return simulate(scenario(*settings, controller=controller, plant=plant))
+    return simulate(scenario(*settings, controller=controller, plant=plant), margin=False)
 
 
 # What is there.
@@ -118,9 +118,9 @@ def test_applied_torque_is_the_commanded_one_a_delay_ago(
 def test_a_delay_that_is_next_to_whole_is_whole(tiny: float) -> None:
     """A release so near to the next event would come before it, or never."""
     settings = ("duration=2.0", *ON_REFERENCE)
-    run = simulate(scenario(f"delay.fraction={tiny}", *settings))
+    run = simulate(scenario(f"delay.fraction={tiny}", *settings), margin=False)
     believed = ("controller.delay_steps=8", f"controller.delay_fraction={tiny}")
-    same = simulate(scenario(*believed, *settings))
+    same = simulate(scenario(*believed, *settings), margin=False)
     for other in (run, same):
         assert other.accumulated_error == result(*settings).accumulated_error
     sc = scenario(*settings)
@@ -312,7 +312,8 @@ def test_the_same_seed_gives_the_same_bytes(plant: str, tmp_path: Path) -> None:
 
     def saved(seed: int, folder: str) -> tuple[bytes, xr.Dataset]:
         run = simulate(
-            scenario("duration=0.5", *ON_REFERENCE, noise, f"sensor.seed={seed}", plant=plant)
+            scenario("duration=0.5", *ON_REFERENCE, noise, f"sensor.seed={seed}", plant=plant),
+            margin=False,
         )
         run.save(tmp_path / folder)
         return (tmp_path / folder / "signals.nc").read_bytes(), run.signals
@@ -336,7 +337,7 @@ def test_ctrl_c_keeps_what_there_is() -> None:
         if time > 0.31:
             raise KeyboardInterrupt
 
-    run = simulate(scenario("duration=2.0", *ON_REFERENCE), progress=interrupt)
+    run = simulate(scenario("duration=2.0", *ON_REFERENCE), progress=interrupt, margin=False)
     assert run.status == "interrupted"
     assert run.signals.time.values == pytest.approx(GRID * np.arange(17), abs=1e-12)
     assert np.isnan(run.accumulated_error)
@@ -353,7 +354,7 @@ def test_what_progress_raises_reaches_the_caller(error: type[Exception]) -> None
             raise mine
 
     with pytest.raises(error) as caught:
-        simulate(scenario("duration=0.2", *ON_REFERENCE), progress=progress)
+        simulate(scenario("duration=0.2", *ON_REFERENCE), progress=progress, margin=False)
     assert caught.value is mine
 
 

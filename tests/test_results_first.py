@@ -99,9 +99,9 @@ def start(folder: Path, redirection: str = "", **environment: str) -> subprocess
 
 
 def test_figures_do_not_depend_on_the_backend_of_the_surroundings(tmp_path) -> None:
-    usual = start(tmp_path / "usual", MPLBACKEND="Agg")
+    assert main(["simulate", *EXACT, "--quiet", "--out", str(tmp_path / "usual")]) == 0
     other = start(tmp_path / "other", MPLBACKEND="nonsense")
-    assert usual.returncode == other.returncode == 0 and other.stderr == ""
+    assert other.returncode == 0 and other.stderr == ""
     assert names(tmp_path / "usual") == names(tmp_path / "other")
     for name in ("states.png", "torques.svg"):
         one, two = ((tmp_path / folder / name).read_bytes() for folder in ("usual", "other"))
