@@ -24,13 +24,13 @@ from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.experiment import (
     Experiment,
     believed_queue,
+    concrete,
     control_law,
     motion_scale,
-    prepare,
     torques_in_flight,
 )
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
-from stewart_drake.loop.own import OwnReference, OwnSystem, take
+from stewart_drake.loop.own import OwnReference, OwnSystem
 from stewart_drake.loop.own_controller import SampledController
 from stewart_drake.loop.platforms import add_to_torque
 from stewart_drake.loop.reference import Reference
@@ -39,10 +39,8 @@ from stewart_drake.loop.start_check import StartCheck
 from stewart_drake.loop.tuner import AnnTuner
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import (
-    DAMPING,
-    NUM_PARAMETERS,
+    BIAS,
     NUM_TORQUES,
-    PAYLOAD,
     POSE,
     RATES,
     exported_ports,
@@ -94,17 +92,14 @@ def build_closed_loop(
 
     Args:
         scenario: what to build, or what `prepare` made of it.
-        controller, reference, disturbance: of one's own, see `simulate`; not with an Experiment,
-            which has them.
+        controller, reference, disturbance: of one's own, see `simulate`.
         meshcat: where the multibody plant is shown while it is simulated, or None.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
+        TypeError: systems of one's own beside an Experiment, which has its own.
     """
-    if isinstance(scenario, Experiment):
-        experiment = scenario
-    else:
-        experiment = prepare(scenario, own=take(controller, reference, disturbance))
+    experiment = concrete(scenario, controller, reference, disturbance)
     experiment.own.claim()
     builder = DiagramBuilder()
     _add_surroundings(builder, experiment, meshcat)
@@ -241,7 +236,7 @@ def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | Mult
             start=experiment.start[POSE],
             wrench=wrench,
         )
-    parameters = np.zeros(NUM_PARAMETERS)
-    parameters[PAYLOAD], parameters[DAMPING] = plant.payload_mass, plant.joint_damping
+    parameters = np.array(plant.parameters)
+    parameters[BIAS] = 0.0  # added before, where the record of torques ends
     truth = StewartDynamics(experiment.truth, plant.gravity, parameters)
     return ExactPlant(truth, experiment.start, wrench)

@@ -36,7 +36,7 @@ from stewart_drake.law.startup import (
     weight_scales,
 )
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.own import NOTHING, Own, own_motion
+from stewart_drake.loop.own import NOTHING, Own, OwnReference, OwnSystem, own_motion, take
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import AnnTunerConfig, Scenario
@@ -115,6 +115,28 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
             )
         )
     return experiment
+
+
+def concrete(
+    scenario: Scenario | Experiment,
+    controller: OwnSystem | None = None,
+    reference: OwnReference | None = None,
+    disturbance: OwnSystem | None = None,
+    truth: Mechanism | None = None,
+) -> Experiment:
+    """What `prepare` makes of a scenario and of what is the user's own, or an Experiment as it is.
+
+    Raises:
+        ConfigError: bad input, an unreachable reference.
+        TypeError: something of one's own beside an Experiment, which has its own.
+    """
+    if not isinstance(scenario, Experiment):
+        return prepare(scenario, truth, take(controller, reference, disturbance))
+    given = {"controller": controller, "reference": reference, "disturbance": disturbance}
+    for name, thing in (given | {"truth": truth}).items():
+        if thing is not None:
+            raise TypeError(f"{name}: got one with an Experiment, which has its own; expected None")
+    return scenario
 
 
 def first_pose_text(pose: Array, mechanism: Mechanism) -> str:

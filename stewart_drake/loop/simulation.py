@@ -18,9 +18,9 @@ from stewart_drake.loop.cautions import cautions_after, cautions_before
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.loop.exact import set_accuracy
-from stewart_drake.loop.experiment import Experiment, prepare
+from stewart_drake.loop.experiment import Experiment, concrete
 from stewart_drake.loop.lifetime import let_go
-from stewart_drake.loop.own import OwnReference, OwnSystem, take
+from stewart_drake.loop.own import OwnReference, OwnSystem
 from stewart_drake.loop.recording import Recorder, summarize
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.scene import Live
@@ -83,13 +83,6 @@ def simulate(
     """
     if isinstance(scenario, str | Path):
         scenario = load_scenario(scenario)
-    if isinstance(scenario, Experiment):
-        own = {"controller": controller, "reference": reference, "disturbance": disturbance}
-        for name, given in ({"truth": truth} | own).items():
-            if given is not None:
-                raise TypeError(
-                    f"{name}: got one with an Experiment, which has its own; expected None"
-                )
     if not isinstance(scenario, Scenario | Experiment):
         raise TypeError(
             f"scenario: got a {type(scenario).__name__}; expected a Scenario, or the name or path "
@@ -97,10 +90,7 @@ def simulate(
         )
     # Matrices of twenty rows are slower on several threads, fifty times so where cores are busy.
     with one_blas_thread:
-        if isinstance(scenario, Experiment):
-            experiment = scenario
-        else:
-            experiment = prepare(scenario, truth, take(controller, reference, disturbance))
+        experiment = concrete(scenario, controller, reference, disturbance, truth)
         if isinstance(margin, bool):
             judgeable = margin and experiment.own.controller is None
             judged = controller_margin(experiment) if judgeable else None
