@@ -216,6 +216,12 @@ def test_a_mistake_in_a_system_is_an_exception():
         ({"disturbance": lambda: disturbance("force")}, "'torque' (6) or 'wrench' (6)"),
         ({"disturbance": lambda: disturbance("wrench", 3)}, "got 3 values; expected 6"),
         ({"disturbance": controller}, "got an input port 'measurement'; expected none"),
+        ({"sensor": controller}, "sensor: Constant: got an input port 'measurement'; expected st"),
+        ({"link": lambda: Constant((("commanded", 6),))}, "expected an output port 'torque' (6)"),
+        ({"tuner": lambda: Constant((("state", 12),))}, "density (18), measurement (12), refer"),
+        ({"law": 3}, "law: got a int; expected a function of the scenario's law"),
+        ({"law": lambda law: None}, "law: got a NoneType from the function; expected a Predict"),
+        ({"law": lambda law: law, "controller": controller}, "law: got one with a controller"),
         ({"reference": np.zeros(6)}, "reference: got a ndarray; expected a Drake trajectory"),
         (
             {"reference": PiecewisePolynomial(np.zeros((3, 1)))},
@@ -325,7 +331,7 @@ def test_own_reference_that_ends_is_held_there():
     )
     still = np.zeros(6)
     motion = PiecewisePolynomial.CubicHermite([0, 0.5], knots, np.column_stack([still, still]))
-    experiment = prepare(scenario("duration=2"), own=take(None, motion, None))
+    experiment = prepare(scenario("duration=2"), own=take({"reference": motion}))
     reference = experiment.reference
     for t in (0.5, 0.7, 5.0):
         np.testing.assert_allclose(reference.value(t)[:, 0], knots[:, 1])

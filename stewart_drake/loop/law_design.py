@@ -16,7 +16,8 @@ from stewart_drake.files.yamlio import validate
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.experiment import Experiment, believed_queue, control_law
-from stewart_drake.loop.own import Own, own_motion
+from stewart_drake.loop.own import Own
+from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.loop.reference import Reference
 from stewart_drake.scenario.config import ControllerConfig, Scenario
 from stewart_drake.scenario.delay import Delay
