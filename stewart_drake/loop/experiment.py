@@ -1,7 +1,7 @@
 """A scenario made concrete: mechanism, reference, and the control law that it asks for."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,8 @@ from stewart_drake.law.startup import (
     weight_scales,
 )
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.own import NOTHING, Own, own_motion
+from stewart_drake.loop.own import NOTHING, Own, take
+from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import AnnTunerConfig, Scenario
@@ -95,7 +96,7 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
     Args:
         scenario: what to run.
         truth: the machine to simulate where it is not the one that the controller knows.
-        own: controller, reference or disturbance in the place of the scenario's.
+        own: what takes the place of the scenario's.
 
     Raises:
         ConfigError: one line; also where the reference leaves the workspace, with time and leg.
@@ -115,6 +116,28 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
             )
         )
     return experiment
+
+
+def concrete(
+    scenario: Scenario | Experiment, truth: Mechanism | None = None, **own: Any
+) -> Experiment:
+    """What `prepare` makes of a scenario and of what is the user's own, or an Experiment as it is.
+
+    Args:
+        scenario: either.
+        truth: see `prepare`.
+        **own: see `loop.simulation.simulate`.
+
+    Raises:
+        ConfigError: bad input, an unreachable reference.
+        TypeError: something of one's own beside an Experiment, which has its own.
+    """
+    if not isinstance(scenario, Experiment):
+        return prepare(scenario, truth, take(own))
+    for name, thing in ({"truth": truth} | own).items():
+        if thing is not None:
+            raise TypeError(f"{name}: got one with an Experiment, which has its own; expected None")
+    return scenario
 
 
 def first_pose_text(pose: Array, mechanism: Mechanism) -> str:
@@ -262,7 +285,7 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
         "multibody": MultibodyModel(),
     }
     motors = TorqueLimit(experiment.torque_limit)
-    return PredictiveLqi(
+    law = PredictiveLqi(
         timeline=timeline,
         plant=NominalPlant(nominal, substeps, GENTLE * torque_scale, motors),
         sensing=StateSensing(np.array(sc.sensor.noise_std), motion),
@@ -272,6 +295,7 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
         model=models[c.model],
         cost=QuadraticCost(errors, integrals if c.integral else None, torques),
     )
+    return experiment.own.revised(law)
 
 
 def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, float]:

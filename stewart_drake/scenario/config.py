@@ -53,6 +53,11 @@ class PlantConfig:
     torque_bias: Six = field(default_factory=lambda: [0.0] * 6)
     joint_damping: Annotated[float, Field(ge=0, le=1e3)] = 0.0
 
+    @property
+    def parameters(self) -> list[float]:
+        """What the controller is not told, in the order of `scenario.signals.PARAMETERS`."""
+        return [*self.torque_bias, self.payload_mass, self.joint_damping]
+
 
 @dataclass(config=STRICT)
 class DelayConfig:

@@ -23,6 +23,7 @@ from stewart_drake.law.startup import weight_scales
 from stewart_drake.loop.controller_margin import true_dynamics
 from stewart_drake.loop.experiment import believed_delay
 from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.basis import Basis
@@ -119,7 +120,7 @@ def loop_margins(found: Basis, delays: Iterable[int] = DELAYS) -> list[LoopMargi
     for steps in sorted({*delays, sc.delay.steps}):
         believed = believed_delay(replace(sc, delay=replace(sc.delay, steps=steps)))
         K = law_gain(design, predictor, c.period, believed, (Q, R))
-        loop = LinearLoop(plant, K, c.period, steps, sc.delay.fraction, c.integral)
+        loop = LinearLoop(plant, K, c.period, Delay(steps, sc.delay.fraction), c.integral)
         judged.append(_judge(loop))
     return judged
 
@@ -130,7 +131,7 @@ def _judge(loop: LinearLoop) -> LoopMargins:
     S, T = peaks(true, loop.K, loop.period) if radius < 1 else (unknown, unknown)
     margins = worst_margins([loop])
     return LoopMargins(
-        steps=loop.steps,
+        steps=loop.delay.steps,
         radius=radius,
         S=S,
         T=T,
