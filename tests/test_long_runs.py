@@ -58,7 +58,7 @@ PLANTS = ("exact", "multibody")
 
 @needs_proc
 def test_some_runs_leave_nothing_behind():
-    assert growth_per_run(runs=24, warm_up=8) < 0.1 * MB
+    assert growth_per_run(runs=18, warm_up=6) < 0.1 * MB
 
 
 def test_a_prediction_over_many_periods_takes_little_memory():

@@ -7,6 +7,7 @@ import time
 from html.parser import HTMLParser
 from pathlib import Path
 
+import joblib
 import pytest
 
 from stewart_drake.cli import main
@@ -31,7 +32,9 @@ def report(tmp_path_factory) -> Path:
     """The folder of a report on two seconds of the paper's scenario."""
     folder = tmp_path_factory.mktemp("report")
     (folder / "summary.json").write_text("of an earlier run")
-    assert main(["report", "paper", *SETTINGS, "--out", str(folder), "--quiet"]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(joblib, "cpu_count", lambda: 1)  # tests/test_report_stopped.py has processes
+        assert main(["report", "paper", *SETTINGS, "--out", str(folder), "--quiet"]) == 0
     return folder
 
 
