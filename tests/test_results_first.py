@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import joblib
 import pytest
 
 from stewart_drake.cli import main
@@ -51,6 +52,7 @@ def names(folder: Path) -> set[str]:
 def test_a_failure_while_drawing_costs_the_figures_only(
     arguments, module, name, kept, tmp_path, monkeypatch, capsys
 ) -> None:
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)  # so that no process has to start
     monkeypatch.setattr(module, name, broken(tmp_path))
     assert main([*arguments, "--quiet", "--out", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
