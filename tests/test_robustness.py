@@ -83,8 +83,6 @@ def test_wilson_ends_solve_their_equation(n: int, data: st.DataObject, confidenc
     assert 0 <= found.low <= found.value == s / n <= found.high <= 1
     for p in (found.low, found.high):
         assert (s / n - p) ** 2 == pytest.approx(z**2 * p * (1 - p) / n, abs=1e-9)
-    reference = scipy.stats.binomtest(s, n).proportion_ci(confidence, method="wilson")
-    assert found[1:] == pytest.approx((reference.low, reference.high), abs=1e-12)
 
 
 @pytest.mark.parametrize("p", [0.02, 0.3, 0.5, 0.9, 0.99])
@@ -105,15 +103,18 @@ def test_wilson_refuses_what_is_no_share(s: int, n: int) -> None:
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(-5, 5), st.floats(-1e3, 1e3)), min_size=4, max_size=60))
-def test_rank_correlation_is_scipys(pairs: list[tuple[int, float]]) -> None:
+def test_rank_correlation_is_pearsons_of_the_ranks(pairs: list[tuple[int, float]]) -> None:
     x, y = np.array(pairs, dtype=float).T
     found = statistics.rank_correlation(x, y)
     if len(set(x)) == 1 or len(set(y)) == 1:
         assert all(math.isnan(value) for value in found)
         return
-    reference = scipy.stats.spearmanr(x, y)
+    reference = scipy.stats.pearsonr(scipy.stats.rankdata(x), scipy.stats.rankdata(y))
     assert found.rho == pytest.approx(reference.statistic, abs=1e-12)
-    assert found.p_value == pytest.approx(reference.pvalue, rel=1e-6, abs=1e-12)
+    if abs(found.rho) < 1 - 1e-9:  # of the ranks, t has n - 2 degrees
+        t = found.rho * math.sqrt((len(x) - 2) / (1 - found.rho**2))
+        chance = 2 * scipy.stats.t.sf(abs(t), len(x) - 2)
+        assert found.p_value == pytest.approx(chance, rel=1e-6, abs=1e-12)
     assert found.low <= found.rho <= found.high
     assert found.rho == pytest.approx(statistics.rank_correlation(np.exp(x), y).rho)
 
@@ -142,7 +143,7 @@ def test_quantiles_are_covered(n: int, q: float) -> None:
         values = rng.uniform(size=n)
         values[values > 0.95] = np.inf
         found = statistics.quantile_interval(values, q)
-        assert found.value == np.quantile(values, q, method="inverted_cdf")
+        assert found.value == np.sort(values)[math.ceil(n * q - 1e-9) - 1]
         hits += found.low <= q <= found.high
     assert hits / trials > 0.94
 

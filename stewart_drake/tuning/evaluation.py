@@ -158,37 +158,44 @@ def compare(candidates: tuple[str, ...], error: Array, seed: int) -> dict[str, A
     """
     failed = np.isnan(error)
     common = error[:, ~failed.any(axis=0)]
-    number = common.shape[1]
-    nan = float("nan")
-    mean = common.mean(axis=1) if number else np.full(len(candidates), nan)
-    half = np.full(len(candidates), nan)
+    number, failures, nothing = common.shape[1], failed.sum(axis=1), np.full(2, np.nan)
+    some = common if number else np.full((len(candidates), 1), np.nan)
+    mean = some.mean(axis=1)
+    intervals: list[Any] = [nothing] * len(candidates)
     if number > 1:
-        t = stats.t.ppf((1 + CONFIDENCE) / 2, number - 1)
-        half = t * common.std(axis=1, ddof=1) / np.sqrt(number)
-    failures = failed.sum(axis=1)
+        intervals = [stats.ttest_1samp(row, 0).confidence_interval(CONFIDENCE) for row in common]
     best = min(range(len(candidates) - 1), key=lambda i: (failures[i], mean[i]))
-    result: dict[str, Any] = {
+
+    def improvement(tuner: Array, fixed: Array, axis: int = -1) -> Any:
+        return 1 - tuner.mean(axis=axis) / fixed.mean(axis=axis)
+
+    sure: Any = nothing
+    if number > 1:
+        sure = stats.bootstrap(
+            (common[-1], common[best]),
+            improvement,
+            paired=True,
+            n_resamples=RESAMPLES,
+            confidence_level=CONFIDENCE,
+            method="percentile",
+            random_state=np.random.default_rng(seed),
+        ).confidence_interval
+    return {
         "candidates": {
             name: {
                 "failures": int(failures[i]),
                 "mean": mean[i],
-                "interval": [mean[i] - half[i], mean[i] + half[i]],
-                "worst": common[i].max() if number else nan,
+                "interval": list(map(float, intervals[i])),
+                "worst": some[i].max(),
             }
             for i, name in enumerate(candidates)
         },
         "common": number,
         "best_fixed": candidates[best],
-        "improvement": 1 - mean[-1] / mean[best],
-        "hindsight": 1 - common[:-1].min(axis=0).mean() / mean[best] if number else nan,
-        "improvement_interval": [nan, nan],
+        "improvement": improvement(some[-1], some[best]),
+        "hindsight": 1 - some[:-1].min(axis=0).mean() / mean[best],
+        "improvement_interval": list(map(float, sure)),
     }
-    if number > 1:
-        picks = np.random.default_rng(seed).integers(number, size=(RESAMPLES, number))
-        ratio = common[-1][picks].mean(axis=1) / common[best][picks].mean(axis=1)
-        tails = [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]
-        result["improvement_interval"] = np.quantile(1 - ratio, tails).tolist()
-    return result
 
 
 def _with_tuner(scenario: Scenario, path: Path) -> Scenario:
