@@ -87,7 +87,7 @@ def outcome_of(result: SimulationResult) -> Outcome:
     return Outcome(
         status=result.status,  # type: ignore[arg-type]  # never `interrupted`, which is checked
         error=result.accumulated_error,
-        peak_torque=float(result.summary["peak_torque"]),
+        peak_torque=result.summary["peak_torque"],
         tuner_fallbacks=result.summary["counts"]["tuner_fallbacks"],
         **ended,
     )

@@ -117,14 +117,13 @@ def sample_run(scenario: Scenario) -> bytes:
     """One run as the bytes of an .npz file: the samples, and how the run ended."""
     # A log of one's own period need not hold the samples.
     result = run_to_its_end(dataclasses.replace(scenario, log_period=None))
-    buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        samples=samples(result),
-        status=np.array(result.status),
-        stopped=np.nan if result.stopped is None else result.stopped.time,
-        **{name: result.summary[name] for name in _NUMBERS},
-    )
+    buffer, summary = io.BytesIO(), dict[str, Any](result.summary)
+    arrays: dict[str, Any] = {
+        "samples": samples(result),
+        "status": np.array(result.status),
+        "stopped": np.nan if result.stopped is None else result.stopped.time,
+    }
+    np.savez(buffer, **arrays, **{name: summary[name] for name in _NUMBERS})
     return buffer.getvalue()
 
 
