@@ -36,9 +36,13 @@ from stewart_drake.studies.robustness_result import RobustnessStudy, factor_valu
 from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.uncertainty import (
     MACHINE,
+    About,
     Draw,
+    Quantity,
     Scales,
+    Truth,
     draw,
+    draw_from,
     drawn,
     scales_of,
 )
@@ -196,6 +200,28 @@ def test_a_range_of_its_own_leaves_the_other_draws_alone(name: str) -> None:
         one = draw(Ranges(), SCALES, short(), 0, i)
         other = draw(replace(Ranges(), **changed), SCALES, short(), 0, i)
         assert one | {name: other[name]} == other
+
+
+def test_a_new_quantity_is_one_entry_and_leaves_the_other_draws_alone() -> None:
+    """Here for how long nothing is measured, told in ms, in half of the runs."""
+
+    def lose(truth: Truth, time: float) -> None:
+        truth.fields["sensor"]["faults"] = [{"kind": "missing", "from": 0.1, "to": 0.1 + time}]
+
+    loss = Quantity(lambda rng, about: rng.uniform(0, 0.1), lose, "ms", 1e3, sometimes=True)
+    scenario, about = short(), About(Ranges(), SCALES, short())
+    values = []
+    for i in range(40):
+        fixed = draw_from(MACHINE, np.random.default_rng(i), about)
+        more = draw_from({**MACHINE, "loss": loss._replace(sometimes=False)},
+                         np.random.default_rng(i), about)  # fmt: skip
+        assert {name: more[name] for name in MACHINE} == fixed
+        values.append(draw_from({"loss": loss}, np.random.default_rng(i), about)["loss"])
+    assert 8 < values.count(0.0) < 32
+    assert loss.told(max(values)) == pytest.approx(1e3 * max(values))
+    truth = drawn({"loss": loss}, scenario, PAPER, {"loss": 0.05})
+    assert truth.as_scenario().sensor.faults != []
+    assert truth.machine() is PAPER and scenario.sensor.faults == []
 
 
 def test_draws_fill_their_ranges() -> None:

@@ -158,18 +158,17 @@ def compare(candidates: tuple[str, ...], error: Array, seed: int) -> dict[str, A
     """
     failed = np.isnan(error)
     common = error[:, ~failed.any(axis=0)]
-    number, failures, nothing = common.shape[1], failed.sum(axis=1), np.full(2, np.nan)
+    number, failures = common.shape[1], failed.sum(axis=1)
     some = common if number else np.full((len(candidates), 1), np.nan)
-    mean = some.mean(axis=1)
-    intervals: list[Any] = [nothing] * len(candidates)
+    mean, half = some.mean(axis=1), np.full(len(candidates), np.nan)
     if number > 1:
-        intervals = [stats.ttest_1samp(row, 0).confidence_interval(CONFIDENCE) for row in common]
+        half = stats.t.ppf((1 + CONFIDENCE) / 2, number - 1) * stats.sem(some, axis=1)
     best = min(range(len(candidates) - 1), key=lambda i: (failures[i], mean[i]))
 
     def improvement(tuner: Array, fixed: Array, axis: int = -1) -> Any:
         return 1 - tuner.mean(axis=axis) / fixed.mean(axis=axis)
 
-    sure: Any = nothing
+    sure: Any = (np.nan, np.nan)
     if number > 1:
         sure = stats.bootstrap(
             (common[-1], common[best]),
@@ -185,7 +184,7 @@ def compare(candidates: tuple[str, ...], error: Array, seed: int) -> dict[str, A
             name: {
                 "failures": int(failures[i]),
                 "mean": mean[i],
-                "interval": list(map(float, intervals[i])),
+                "interval": [mean[i] - half[i], mean[i] + half[i]],
                 "worst": some[i].max(),
             }
             for i, name in enumerate(candidates)
