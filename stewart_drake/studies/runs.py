@@ -27,12 +27,12 @@ _STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
 def _or_nan(value: Any, check: Any) -> float:
-    missing = value is None or (isinstance(value, float) and math.isnan(value))
+    missing = value is None or (isinstance(value, float) and not math.isfinite(value))
     return math.nan if missing else float(check(value))
 
 
 _Number = Annotated[float, Field(ge=0), WrapValidator(_or_nan)]
-"""Not negative; null is NaN."""
+"""Not negative; null, and what is not finite, is NaN."""
 
 
 @dataclass(config=_STRICT)
