@@ -45,11 +45,12 @@ def test_kill_9_leaves_no_half_page(tmp_path):
     code = """if True:
         import sys
         from pathlib import Path
-        from stewart_drake.report.page import Page, Provenance, Section, write_page
+        from stewart_drake.report.document import Document, Listing, Section
+        from stewart_drake.report.page import Provenance, write_page
         folder = Path(sys.argv[1])
-        page = Page("t", "v", [Section("s", listing="x" * 20_000_000)], Provenance("c"))
+        document = Document("t", "v", [Section("s", Listing("x" * 20_000_000))])
         while True:
-            write_page(page, folder / "report.html")
+            write_page(document, Provenance("c"), folder / "report.html")
     """
     for wait in (0.0, 0.013, 0.037, 0.071):
         process = started(code, tmp_path)
@@ -71,7 +72,7 @@ def test_ctrl_c_while_drake_is_loaded_is_one_as_well(monkeypatch):
     def loading(kind):
         raise ImportError("initialization failed") from stop
 
-    monkeypatch.setattr("stewart_drake.report.tables.shipped_table", loading)
+    monkeypatch.setattr("stewart_drake.report.shipped_table.shipped_table", loading)
     assert main(["list"]) == 130
     stop = None
     with pytest.raises(ImportError):
