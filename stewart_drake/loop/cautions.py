@@ -24,8 +24,8 @@ should, from 5e6 on they are lost or wrong by a hundred times the exact plant's 
 
 def cautions_before(experiment: Experiment, margin: ControllerMargin | None) -> list[str]:
     """What can be said before the run; `margin` is None where the loop was not judged."""
-    if experiment.own.controller is not None:
-        return ["the loop was not judged: its controller is not the scenario's"]
+    if experiment.own.unjudged:
+        return [f"the loop was not judged: its {experiment.own.unjudged} is not the scenario's"]
     if margin is None:
         return []
     if margin.problem:

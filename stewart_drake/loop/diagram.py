@@ -1,6 +1,6 @@
 """The closed loop as a Drake diagram, built from a scenario. Here its systems are connected."""
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +24,12 @@ from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.experiment import (
     Experiment,
     believed_queue,
+    concrete,
     control_law,
     motion_scale,
-    prepare,
     torques_in_flight,
 )
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
-from stewart_drake.loop.own import OwnReference, OwnSystem, take
 from stewart_drake.loop.own_controller import SampledController
 from stewart_drake.loop.platforms import add_to_torque
 from stewart_drake.loop.reference import Reference
@@ -39,16 +38,18 @@ from stewart_drake.loop.start_check import StartCheck
 from stewart_drake.loop.tuner import AnnTuner
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import (
-    DAMPING,
-    NUM_PARAMETERS,
+    BIAS,
     NUM_TORQUES,
-    PAYLOAD,
     POSE,
     RATES,
     exported_ports,
 )
 
 Array = NDArray[np.float64]
+
+
+_TOLD: Final = {"density": "density", "measurement": "sensor", "reference": "reference"}
+"""What a tuner may ask for, and the system whose output of that name it is."""
 
 
 class ClosedLoop(Diagram):
@@ -85,34 +86,30 @@ class ClosedLoop(Diagram):
 def build_closed_loop(
     scenario: Scenario | Experiment,
     *,
-    controller: OwnSystem | None = None,
-    reference: OwnReference | None = None,
-    disturbance: OwnSystem | None = None,
     meshcat: Meshcat | None = None,
+    **own: Any,
 ) -> ClosedLoop:
     """The diagram of a scenario: reference, controller, limit, delay chain, plant, sensor.
 
     Args:
         scenario: what to build, or what `prepare` made of it.
-        controller, reference, disturbance: of one's own, see `simulate`; not with an Experiment,
-            which has them.
         meshcat: where the multibody plant is shown while it is simulated, or None.
+        **own: controller, reference, disturbance, law, sensor, link, tuner of one's own, as of
+            `simulate`.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
+        TypeError: systems of one's own beside an Experiment, which has its own.
     """
-    if isinstance(scenario, Experiment):
-        experiment = scenario
-    else:
-        experiment = prepare(scenario, own=take(controller, reference, disturbance))
+    experiment = concrete(scenario, **own)
     experiment.own.claim()
     builder = DiagramBuilder()
     _add_surroundings(builder, experiment, meshcat)
-    if experiment.own.controller is None:
-        catch_up = _add_law(builder, experiment)
-    else:
+    if "controller" in experiment.own.systems:
         catch_up = 0.0
-        _add_own_controller(builder, experiment, experiment.own.controller)
+        _add_own_controller(builder, experiment)
+    else:
+        catch_up = _add_law(builder, experiment)
     _connect_loop(builder, experiment)
     loop = ClosedLoop()
     builder.BuildInto(loop)
@@ -127,14 +124,14 @@ def _add_surroundings(
     """Everything but reference and controller."""
     sc = experiment.scenario
     period, steps, fraction = sc.controller.period, sc.delay.steps, sc.delay.fraction
-    noise, s = np.array(sc.sensor.noise_std), sc.sensor
-    builder.AddNamedSystem(
-        "sensor", Sensor(noise, s.seed, period, s.faults, motion_scale(experiment))
-    )
+    noise, s, own = np.array(sc.sensor.noise_std), sc.sensor, experiment.own.systems
+    sensor = Sensor(noise, s.seed, period, s.faults, motion_scale(experiment))
+    builder.AddNamedSystem("sensor", own.get("sensor", sensor))
     limit = np.full(NUM_TORQUES, experiment.torque_limit)
     builder.AddNamedSystem("saturation", Saturation(-limit, limit))
     queue = torques_in_flight(experiment, sc.true_delay)
-    builder.AddNamedSystem("delay_chain", DelayChain(period, steps, fraction, queue))
+    chain = DelayChain(period, steps, fraction, queue)
+    builder.AddNamedSystem("delay_chain", own.get("link", chain))
     builder.AddNamedSystem("torque_bias", add_to_torque(np.array(sc.plant.torque_bias)))
     builder.AddNamedSystem("plant", _plant(experiment, meshcat))
     kind = "magnitude" if experiment.network is None else experiment.network.density
@@ -160,8 +157,8 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
     builder.Connect(out("sensor", "measurement"), into("density", "measurement"))
     builder.Connect(out("reference", "reference"), into("density", "reference"))
     builder.Connect(out("controller", "torque"), into("density", "torque"))
-    if experiment.network is not None:
-        builder.Connect(out("density", "density"), into("tuner", "density"))
+    if builder.HasSubsystemNamed("tuner"):
+        _connect_tuner(builder, builder.GetSubsystemByName("tuner"))
     if experiment.start[RATES].any() and experiment.scenario.plant.kind == "multibody":
         builder.AddNamedSystem("start_check", StartCheck(experiment.start))
         builder.Connect(out("plant", "state"), into("start_check", "state"))
@@ -180,13 +177,13 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> float:
         "controller", DelayLqiController(law, believed_queue(experiment, law.timeline))
     )
     builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
-    builder.Connect(weights.get_output_port(), controller.GetInputPort("weights"))
+    builder.Connect(weights, controller.GetInputPort("weights"))
     return catch_up
 
 
-def _add_own_controller(builder: DiagramBuilder, experiment: Experiment, system: System) -> None:
+def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None:
     """The user's controller behind its reference, and what samples it."""
-    sc = experiment.scenario
+    sc, system = experiment.scenario, experiment.own.systems["controller"]
     if experiment.network is not None:
         raise ConfigError(
             f"tuner.kind: got {sc.tuner.kind!r} with a controller of your own; expected 'fixed'"
@@ -206,7 +203,8 @@ def _add_own_controller(builder: DiagramBuilder, experiment: Experiment, system:
 
 def _disturb(builder: DiagramBuilder, experiment: Experiment, torque: OutputPort) -> None:
     """Connect the torque that arrives with the plant, through a disturbance if there is one."""
-    disturbance, plant = experiment.own.disturbance, builder.GetSubsystemByName("plant")
+    disturbance = experiment.own.systems.get("disturbance")
+    plant = builder.GetSubsystemByName("plant")
     if disturbance is not None:
         builder.AddNamedSystem("disturbance", disturbance)
         if disturbance.HasOutputPort("wrench"):
@@ -219,16 +217,26 @@ def _disturb(builder: DiagramBuilder, experiment: Experiment, torque: OutputPort
     builder.Connect(torque, plant.GetInputPort("torque"))
 
 
-def _weights(builder: DiagramBuilder, experiment: Experiment) -> ConstantVectorSource | AnnTuner:
-    c = experiment.scenario.controller
+def _weights(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
+    """What the controller's weights come from: a `tuner`, or constant `weights`."""
+    c, own = experiment.scenario.controller, experiment.own.systems.get("tuner")
     fixed = np.array([c.w_Q, c.w_R])
-    if experiment.network is None:
-        return builder.AddNamedSystem("weights", ConstantVectorSource(fixed))
-    return builder.AddNamedSystem("tuner", AnnTuner(experiment.network, fixed, c.period))
+    if own is None and experiment.network is None:
+        return builder.AddNamedSystem("weights", ConstantVectorSource(fixed)).get_output_port()
+    tuner = AnnTuner(experiment.network, fixed, c.period) if own is None else own
+    return builder.AddNamedSystem("tuner", tuner).GetOutputPort("weights")
+
+
+def _connect_tuner(builder: DiagramBuilder, tuner: System) -> None:
+    """Give it of what the loop can tell those that it has ports for."""
+    for name, source in _TOLD.items():
+        if tuner.HasInputPort(name):
+            told = builder.GetSubsystemByName(source).GetOutputPort(name)
+            builder.Connect(told, tuner.GetInputPort(name))
 
 
 def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | MultibodyStewart:
-    plant, disturbance = experiment.scenario.plant, experiment.own.disturbance
+    plant, disturbance = experiment.scenario.plant, experiment.own.systems.get("disturbance")
     wrench = disturbance is not None and disturbance.HasOutputPort("wrench")
     if plant.kind == "multibody":
         return MultibodyStewart(
@@ -241,7 +249,7 @@ def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | Mult
             start=experiment.start[POSE],
             wrench=wrench,
         )
-    parameters = np.zeros(NUM_PARAMETERS)
-    parameters[PAYLOAD], parameters[DAMPING] = plant.payload_mass, plant.joint_damping
+    parameters = np.array(plant.parameters)
+    parameters[BIAS] = 0.0  # added before, where the record of torques ends
     truth = StewartDynamics(experiment.truth, plant.gravity, parameters)
     return ExactPlant(truth, experiment.start, wrench)
