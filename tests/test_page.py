@@ -1,5 +1,6 @@
 """The analysis page: one file, nothing fetched, whatever the names in it are."""
 
+import pickle
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -10,6 +11,7 @@ from matplotlib.figure import Figure
 from stewart_drake.report.document import (
     Caution,
     Document,
+    Frame,
     Listing,
     Paragraph,
     Picture,
@@ -158,6 +160,33 @@ def test_a_terminal_gets_what_is_brief_in_80_columns():
         assert hidden not in text
     shown = Outline(page(sections=[Section("Shown", table)]))
     assert [cell.get("colspan") for cell in shown.all("td")] == [None] * 5 + ["2", None]
+
+
+def test_every_kind_of_block_is_on_a_page():
+    parts = (Values({"mass": "4 kg"}), Caution("look out"), Listing("a:\n  b: <1>"), Frame("<p>in"))
+    outline = Outline(page(sections=[Section("All", *parts)]))
+    words = outline.words
+    assert words[words.index("mass") + 1] == "4 kg" and len(outline.all("dd")) == 2
+    assert "Warning: Look out." in words and "a:\n  b: <1>" in words
+    assert [frame["srcdoc"] for frame in outline.all("iframe")] == ["<p>in"]
+
+
+def test_a_figure_is_drawn_when_a_page_needs_it_and_is_sent_drawn():
+    drawn = []
+
+    def draw() -> Figure:
+        drawn.append(picture().drawn)
+        return drawn[-1]
+
+    lazy = Picture(draw, "a line")
+    shown = document(sections=[Section("One", lazy)])
+    shown.plain()
+    assert drawn == []
+    sent = pickle.loads(pickle.dumps(shown))
+    assert len(drawn) == 1
+    assert isinstance(sent.sections[0].blocks[0].figure, Figure)
+    assert html(sent, MADE).count("<img") == 1 and html(shown, MADE).count("<img") == 1
+    assert len(drawn) == 1
 
 
 def test_the_same_page_gives_the_same_bytes(tmp_path: Path) -> None:
