@@ -43,9 +43,7 @@ def comparison(run):
 def drawn(monkeypatch):
     """The figures by name, instead of their files."""
     kept = {}
-    monkeypatch.setattr(
-        figures, "write_figure", lambda figure, _, name: kept.update({name: figure}) or []
-    )
+    monkeypatch.setattr(figures, "write_figures", lambda made, _: kept.update(made) or [])
     return kept
 
 

@@ -90,7 +90,12 @@ def test_the_bar_never_counts_to_zero():
         "with t.count_bar('runs', False) as show:\n    show(3, 10)\n    time.sleep(0.3)\n"
         "    show(4, 10)\n    time.sleep(0.3)\n    show(9, 10)\n"
     )
-    process = subprocess.Popen([sys.executable, "-c", script], stderr=follower, cwd=ROOT)
+    process = subprocess.Popen(
+        [sys.executable, "-c", script],
+        stderr=follower,
+        cwd=ROOT,
+        env={**os.environ, "TERM": "xterm"},
+    )
     os.close(follower)
     said, limit = b"", time.monotonic() + 60
     while time.monotonic() < limit:
@@ -102,7 +107,7 @@ def test_the_bar_never_counts_to_zero():
     assert process.wait(10) == 0
     text = said.decode()
     assert not re.search(r"of 0\b|\b0 of", text) and "preparing" in text, text
-    assert "3 of 10" in text and re.search(r"4 of 10, 00:0\d left", text), text
+    assert "3 of 10" in text and re.search(r"4 of 10, about \d s left", text), text
 
 
 def test_durations_are_short():

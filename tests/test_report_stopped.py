@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from stewart_drake.cli import main
-from stewart_drake.report.page import Page, Provenance, Section, write_page
+from stewart_drake.report.document import Document, Listing, Section
+from stewart_drake.report.page import Provenance, write_page
 from tests.faults import forked
 
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
@@ -44,11 +45,11 @@ def test_ctrl_c_ends_it_with_nothing_written(tmp_path):
 
 def test_kill_9_leaves_no_half_page(tmp_path):
     """Killed at some moment while pages of several MB are written over and over."""
-    page = Page("t", "v", [Section("s", listing="x" * 20_000_000)], Provenance("c"))
+    document = Document("t", "v", [Section("s", Listing("x" * 20_000_000))])
 
     def work() -> None:
         while True:
-            write_page(page, tmp_path / "report.html")
+            write_page(document, Provenance("c"), tmp_path / "report.html")
 
     for wait in (0.0, 0.013, 0.037, 0.071):
         before = time.time()
@@ -70,7 +71,7 @@ def test_ctrl_c_while_drake_is_loaded_is_one_as_well(monkeypatch):
     def loading(kind):
         raise ImportError("initialization failed") from stop
 
-    monkeypatch.setattr("stewart_drake.report.tables.shipped_table", loading)
+    monkeypatch.setattr("stewart_drake.report.shipped_table.shipped_table", loading)
     assert main(["list"]) == 130
     stop = None
     with pytest.raises(ImportError):

@@ -14,10 +14,10 @@ from stewart_drake.cli import main
 from stewart_drake.cli import run as run_command
 from stewart_drake.report import (
     figures,
-    hautus_page,
+    hautus_document,
     mechanism_figures,
     replay,
-    report_page,
+    report_document,
 )
 from stewart_drake.studies.compare import CONTROLLERS
 
@@ -45,7 +45,7 @@ def names(folder: Path) -> set[str]:
         (("simulate", *EXACT), figures, "draw_run", {"signals.nc"}),
         (("simulate", *EXACT, "--replay"), replay, "replay_html", {"signals.nc", "states.png"}),
         (("compare", *EXACT), figures, "draw_comparison", {f"{name}.nc" for name in CONTROLLERS}),
-        (("analyze", "hautus"), hautus_page, "hautus_page", set()),
+        (("analyze", "hautus"), hautus_document, "plant_figure", set()),
         (("model", "check", "paper"), mechanism_figures, "mechanism_figure", set()),
     ],
 )
@@ -65,8 +65,8 @@ def test_a_failure_while_drawing_costs_the_figures_only(
 def test_a_report_that_cannot_be_drawn_leaves_its_numbers(tmp_path, monkeypatch, capsys) -> None:
     found = type("Found", (), {"run": None, "analyses": {}, "comparison": {}})()
     monkeypatch.setattr("stewart_drake.report.collect.collect", lambda *_: found)
-    monkeypatch.setattr(report_page, "report_summary", lambda _: {"all": 1})
-    monkeypatch.setattr(report_page, "report_page", broken(tmp_path))
+    monkeypatch.setattr(report_document, "report_summary", lambda _: {"all": 1})
+    monkeypatch.setattr(report_document, "document", broken(tmp_path))
     assert main(["report", "--quiet", "--out", str(tmp_path)]) == 0
     assert capsys.readouterr().err.startswith("warning: report.html could not be drawn")
     assert names(tmp_path) == {"summary.json"}

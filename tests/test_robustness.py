@@ -26,8 +26,8 @@ from stewart_drake.files.jsonio import jsonable
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism import kinematics
-from stewart_drake.report.page import Provenance
-from stewart_drake.report.robustness_page import robustness_page, robustness_table
+from stewart_drake.report.page import Provenance, html
+from stewart_drake.report.robustness_document import document
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies import robustness, runs, statistics
 from stewart_drake.studies.failures import auc_interval, explain
@@ -503,8 +503,8 @@ def test_nothing_drawn_changes_nothing(tmp_path: Path) -> None:
     assert study.outcomes == [study.undisturbed] * 2
     assert study.undisturbed.error == simulate(short()).accumulated_error
     assert all(math.isnan(one.error.rho) for one in study.influences())
-    robustness_table(study)
-    robustness_page(study, Provenance("command")).html()
+    document(study).plain()
+    html(document(study), Provenance("command"))
 
 
 def test_bad_numbers_are_refused(tmp_path: Path) -> None:
@@ -554,7 +554,7 @@ def test_influences_are_found() -> None:
     for name in ("payload", "torque_bias", "damping", "lengths", "anchors", "torque_limit"):
         assert found[name].error_p > 0.05
         assert found[name].failure_p > 0.05
-    told = robustness_table(study).replace("\n  ", " ")
+    told = document(study).plain().replace("\n  ", " ")
     assert "What matters for completing: delay error." in told
     assert "of those that completed: noise of the sensor, delay error." in told
 
@@ -573,7 +573,7 @@ def with_failures(failing: Any, n: int = 300) -> RobustnessStudy:
 
 
 def told_of(study: RobustnessStudy) -> str:
-    return " ".join(robustness_table(study).split())
+    return " ".join(document(study).plain().split())
 
 
 def median_of(study: RobustnessStudy, name: str) -> float:
@@ -604,7 +604,7 @@ def test_one_cause_of_failing_is_found_and_counted() -> None:
     assert "What matters for E_ac, of those that completed: noise of the sensor." in told
     counts = f"of which {cause.failing} of the {found.failing} have the outer third"
     assert counts in told
-    page = robustness_page(study, Provenance("command")).html()
+    page = html(document(study), Provenance("command"))
     assert counts in " ".join(page.split())
     plain = json.loads(json.dumps(jsonable(study.summary)))["explanation"]
     assert plain["singles"][0]["factor"] == "torque_bias" and plain["singles"][0]["found"]
@@ -668,8 +668,8 @@ def test_all_failing_or_none_needs_no_explanation() -> None:
     for fails in (True, False):
         study = with_failures(lambda one, luck, fails=fails: fails, 20)
         assert study.explanation.singles == []
-        assert "who fails" not in robustness_table(study)
-        robustness_page(study, Provenance("command")).html()
+        assert "who fails" not in document(study).plain()
+        html(document(study), Provenance("command"))
 
 
 def test_failures_are_counted_and_never_dropped() -> None:
@@ -700,9 +700,9 @@ def test_tables_and_pages_of_extreme_studies() -> None:
             outcomes=[Outcome("not_assembled", "home", None, 0.0, math.nan, math.nan)] * 400
         ),
     ):
-        text = robustness_table(study)
+        text = document(study).plain()
         assert max(map(len, text.splitlines())) <= 80
-        page = robustness_page(study, Provenance("command")).html()
+        page = html(document(study), Provenance("command"))
         assert page.count("<img") == (4 if study.failed.any() else 3)
         json.dumps(jsonable(study.summary), allow_nan=False)
 
@@ -734,7 +734,7 @@ def test_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) ->
     def interrupted(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(robustness, "study_robustness", interrupted)
+    monkeypatch.setattr(robustness, "run_jobs", interrupted)
     assert main(["analyze", "robustness", "--out", str(tmp_path)]) == 130
     assert "finished runs are kept" in capsys.readouterr().err
     assert main(["analyze", "robustness"]) == 130

@@ -80,3 +80,14 @@ def test_who_does_not_know_of_the_delay_loses_the_plate(
     rows: dict[str, sd.Scenario], row: str
 ) -> None:
     assert sd.simulate(rows[row], margin=False).status == "left_workspace"
+
+
+def test_the_table_has_the_papers_numbers_beside_every_row() -> None:
+    results = sd.compare("table2", ["duration=0.3"])
+    assert list(results) == [*CONTROLLERS, "delay_lqi_sum", "delay_lqi_200"]
+    lines = {line[:17].strip(): line for line in sd.table(results).splitlines()}
+    for row, paper in (("LQR, delay-aware", "225"), ("LQI, delay-aware", "80")):
+        assert lines[row].split()[2] == paper
+    for row in ("delay_lqi_sum", "delay_lqi_200"):
+        assert lines[row].split()[1] == "80"
+    assert lines["LQI, predictor"].split()[2] == "-"

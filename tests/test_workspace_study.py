@@ -359,10 +359,10 @@ def test_a_reference_that_leaves_is_analysed_not_refused(
     assert main(arguments) == 0
     printed = capsys.readouterr().out
     # Legs 2 to 4 do not reach, and no angle has a sine beyond the dead centre.
-    rows = [line for line in printed.splitlines() if re.match("[1-6]  ", line)]
+    rows = [line for line in printed.splitlines() if re.match(" *[1-6] ", line)]
     out = " ".join(printed.split())
     assert out.startswith("no: the reference leaves the workspace at t = 1.061 s, leg 2 reached")
-    assert [row.split()[3] for row in rows] == ["0.91", "-", "-", "-", "0.22", "0.67"]
+    assert [row.split()[3] for row in rows] == ["0.908", "-", "-", "-", "0.216", "0.669"]
     assert "leg 4 is short by 15.2 mm" in out and "0.872 times this one" in out
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["fits"] is False and summary["exit"]["leg"] == 2 and summary["motors"] == []

@@ -4,6 +4,7 @@ import math
 import pickle
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -22,7 +23,8 @@ from stewart_drake.loop.own import OwnReference
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.loading import load_comparison, load_scenario
+from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.studies.jobs import run_jobs
 
 CONTROLLERS: Final = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
@@ -76,14 +78,15 @@ def compare(
         reference, disturbance: for all runs, as of `simulate`.
 
     Returns:
-        Results by controller, in the order of CONTROLLERS, then your own.
+        Results by controller, in the order of CONTROLLERS, then the rows that the scenario's
+        `compare` adds, then your own.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
     """
     settings, controllers = tuple(settings), dict(controllers or {})
     _check_makers(controllers, reference, disturbance)
-    scenarios = {name: load_scenario(scenario_name, name, settings) for name in CONTROLLERS}
+    scenarios = load_comparison(scenario_name, CONTROLLERS, settings)
     scenarios |= {name: load_scenario(scenario_name, settings=settings) for name in controllers}
     given = {
         name: {
@@ -145,12 +148,19 @@ def _check_makers(controllers: Mapping[str, Any], reference: Any, disturbance: A
             ) from None
 
 
-def is_papers(scenario: Scenario) -> bool:
-    """Whether the paper's numbers are about this scenario: its mechanism, motion and delay."""
-    own = Scenario()
+def is_papers(scenario: Scenario, *, any_size: bool = False) -> bool:
+    """Whether the paper's numbers are about this scenario: its mechanism, motion and delay.
+
+    With `any_size` the motion may be a multiple of the paper's: E_ac is relative to it.
+    """
+    own, motion = Scenario(), scenario.reference
+    if any_size and isinstance(motion, SineConfig) and isinstance(own.reference, SineConfig):
+        shares = np.divide(motion.amplitude, own.reference.amplitude)
+        if np.allclose(shares, shares[0], rtol=1e-6) and shares[0] > 0:
+            motion = replace(motion, amplitude=own.reference.amplitude)
     return (
         resolve("mechanism", scenario.mechanism) == resolve("mechanism", own.mechanism)
-        and scenario.reference == own.reference
+        and motion == own.reference
         and math.isclose(scenario.eta, PAPER_DELAY)
     )
 
