@@ -195,6 +195,7 @@ def check_remedy(said: str) -> None:
         "shipped names",
         "--help",
         "accepted",
+        "choose another",
     )
     assert any(words in said.lower() for words in map(str.lower, remedies)), f"no remedy: {said}"
 
