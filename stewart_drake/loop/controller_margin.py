@@ -152,14 +152,16 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
     ]
     poles = [fastest_pole(model.A) for model in models]
     fastest = int(np.argmax(poles)) if poles else 0
-    queue = max(sc.delay.steps + 1, law.timeline.queue_length)
+    queue = max(sc.true_delay.steps + 1, law.timeline.queue_length)
     rows = 12 + 6 * law.cost.integrates + 6 * queue
     radius, time, margins = math.nan, math.nan, Margins(*[math.nan] * 4)
     problem, loops = "", list[LinearLoop]()
     if not all(inside):
         problem = "the true machine does not reach all of the reference"
     elif rows > _LARGEST:
-        problem = f"with {sc.delay.steps} periods of delay it has {rows} states, too many to judge"
+        problem = (
+            f"with {sc.true_delay.steps} periods of delay it has {rows} states, too many to judge"
+        )
     else:
         every = math.ceil((max(rows, _COSTLY) / _COSTLY) ** 3)
         chosen = times[:: min(every, INSTANTS // _FEWEST)]
@@ -217,7 +219,7 @@ def _loops(
         with suppress(RiccatiError, np.linalg.LinAlgError, ArithmeticError):
             gain = _gain(experiment, truth, law, t)
         plant = true_model(experiment, truth, t)
-        delay = (sc.delay.steps, sc.delay.fraction)
+        delay = (sc.true_delay.steps, sc.true_delay.fraction)
         loops.append(LinearLoop(plant, gain, law.timeline.period, *delay, integrates))
     return loops
 

@@ -10,6 +10,7 @@ from pydrake.systems.framework import (
     Diagram,
     DiagramBuilder,
     InputPort,
+    LeafSystem,
     OutputPort,
     System,
 )
@@ -17,7 +18,9 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.controller import DelayLqiController
+from stewart_drake.law.channel import Channel, Packets, Wire
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.loop.controller import DelayLqiController, reported
 from stewart_drake.loop.delay_chain import DelayChain
 from stewart_drake.loop.density import DensityWindow
 from stewart_drake.loop.exact import ExactPlant
@@ -29,17 +32,24 @@ from stewart_drake.loop.experiment import (
     prepare,
     torques_in_flight,
 )
+from stewart_drake.loop.late_measurements import LateMeasurements
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
 from stewart_drake.loop.own import OwnReference, OwnSystem, take
 from stewart_drake.loop.own_controller import SampledController
 from stewart_drake.loop.platforms import add_to_torque
+from stewart_drake.loop.playout import PlayoutBuffer
 from stewart_drake.loop.reference import Reference
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.start_check import StartCheck
 from stewart_drake.loop.tuner import AnnTuner
 from stewart_drake.loop.varying_delay import VaryingDelay, declare_constant
-from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.link import torque_delays
+from stewart_drake.scenario.config import NetworkConfig, Scenario
+from stewart_drake.scenario.link import (
+    measurement_times,
+    number_sent,
+    packet_times,
+    torque_delays,
+)
 from stewart_drake.scenario.signals import (
     DAMPING,
     NUM_PARAMETERS,
@@ -112,11 +122,17 @@ def build_closed_loop(
     experiment.own.claim()
     builder = DiagramBuilder()
     _add_surroundings(builder, experiment, meshcat)
+    channel: Channel = Wire()
+    reports, catch_up = 1, 0.0
     if experiment.own.controller is None:
-        catch_up = _add_law(builder, experiment)
+        law, catch_up = _add_law(builder, experiment)
+        channel, reports = law.channel, reported(law.kept)
     else:
-        catch_up = 0.0
         _add_own_controller(builder, experiment, experiment.own.controller)
+    link = _link(experiment, channel, reports)
+    limit = np.full(link.GetInputPort("commanded").size(), experiment.torque_limit)
+    builder.AddNamedSystem("saturation", Saturation(-limit, limit))
+    builder.AddNamedSystem("delay_chain", link)
     _connect_loop(builder, experiment)
     loop = ClosedLoop()
     builder.BuildInto(loop)
@@ -135,9 +151,6 @@ def _add_surroundings(
     builder.AddNamedSystem(
         "sensor", Sensor(noise, s.seed, period, s.faults, motion_scale(experiment))
     )
-    limit = np.full(NUM_TORQUES, experiment.torque_limit)
-    builder.AddNamedSystem("saturation", Saturation(-limit, limit))
-    builder.AddNamedSystem("delay_chain", _link(experiment))
     builder.AddNamedSystem("torque_bias", add_to_torque(np.array(sc.plant.torque_bias)))
     builder.AddNamedSystem("plant", _plant(experiment, meshcat))
     kind = "magnitude" if experiment.network is None else experiment.network.density
@@ -154,13 +167,18 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
         return builder.GetSubsystemByName(target).GetInputPort(port)
 
     saturation, bias = (builder.GetSubsystemByName(name) for name in ("saturation", "torque_bias"))
-    builder.Connect(out("sensor", "measurement"), into("controller", "measurement"))
-    builder.Connect(out("controller", "torque"), saturation.get_input_port())
+    measured = _measured(builder, experiment)
+    builder.Connect(measured, into("controller", "measurement"))
+    own = experiment.own.controller
+    if own is not None:
+        builder.Connect(measured, own.GetInputPort("measurement"))
+    sends = builder.GetSubsystemByName("controller").HasOutputPort("plan")
+    builder.Connect(out("controller", "plan" if sends else "torque"), saturation.get_input_port())
     builder.Connect(saturation.get_output_port(), into("delay_chain", "commanded"))
     builder.Connect(out("delay_chain", "torque"), bias.get_input_port())
     _disturb(builder, experiment, bias.get_output_port())
     builder.Connect(out("plant", "state"), into("sensor", "state"))
-    builder.Connect(out("sensor", "measurement"), into("density", "measurement"))
+    builder.Connect(measured, into("density", "measurement"))
     builder.Connect(out("reference", "reference"), into("density", "reference"))
     builder.Connect(out("controller", "torque"), into("density", "torque"))
     if experiment.network is not None:
@@ -172,8 +190,37 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
         builder.ExportOutput(out(source, port), name)
 
 
-def _add_law(builder: DiagramBuilder, experiment: Experiment) -> float:
-    """The shipped controller behind its reference and weights; the length of its catch-up, s."""
+def _measured(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
+    """Where the controller has its measurements from: the sensor, or what they are delayed by."""
+    sc, controller = experiment.scenario, builder.GetSubsystemByName("controller")
+    measured = builder.GetSubsystemByName("sensor").GetOutputPort("measurement")
+    link = builder.GetSubsystemByName("delay_chain")
+    report = link.GetOutputPort("report") if link.HasOutputPort("report") else None
+    times = measurement_times(sc)
+    if np.any(times != 0):
+
+        def late(name: str, port: OutputPort) -> System:
+            way = LateMeasurements(sc.controller.period, times, port.size())
+            builder.AddNamedSystem(name, way)
+            builder.Connect(port, way.GetInputPort("measured"))
+            return way
+
+        way = late("late_measurements", measured)
+        measured = way.GetOutputPort("measurement")
+        if controller.HasInputPort("age"):
+            builder.Connect(way.GetOutputPort("age"), controller.GetInputPort("age"))
+        if report is not None:
+            report = late("late_report", report).GetOutputPort("measurement")
+    if report is not None and controller.HasInputPort("report"):
+        link_config = sc.link
+        assert isinstance(link_config, NetworkConfig)
+        if link_config.acknowledged:
+            builder.Connect(report, controller.GetInputPort("report"))
+    return measured
+
+
+def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[PredictiveLqi, float]:
+    """The shipped controller behind its reference and weights; its law, and its catch-up, s."""
     law, planned, catch_up = control_law(experiment)
     reference = builder.AddNamedSystem(
         "reference", Reference(experiment.reference, planned, law.preview_times)
@@ -184,7 +231,7 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> float:
     )
     builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
     builder.Connect(weights.get_output_port(), controller.GetInputPort("weights"))
-    return catch_up
+    return law, catch_up
 
 
 def _add_own_controller(builder: DiagramBuilder, experiment: Experiment, system: System) -> None:
@@ -201,8 +248,6 @@ def _add_own_controller(builder: DiagramBuilder, experiment: Experiment, system:
         "controller", SampledController(sc.controller.period, experiment.torque_limit)
     )
     builder.Connect(system.GetOutputPort("torque"), sampled.GetInputPort("own_torque"))
-    sensor = builder.GetSubsystemByName("sensor")
-    builder.Connect(sensor.GetOutputPort("measurement"), system.GetInputPort("measurement"))
     if system.HasInputPort("reference"):
         builder.Connect(reference.GetOutputPort("reference"), system.GetInputPort("reference"))
 
@@ -230,9 +275,23 @@ def _weights(builder: DiagramBuilder, experiment: Experiment) -> ConstantVectorS
     return builder.AddNamedSystem("tuner", AnnTuner(experiment.network, fixed, c.period))
 
 
-def _link(experiment: Experiment) -> DelayChain | VaryingDelay:
+def _link(experiment: Experiment, channel: Channel, reports: int) -> LeafSystem:
+    """What is between limit and motors, for a law's channel and reports of so many periods."""
     sc, delay = experiment.scenario, experiment.scenario.true_delay
     period, queue = sc.controller.period, torques_in_flight(experiment, delay)
+    if isinstance(sc.link, NetworkConfig):
+        repeats = channel.repeats if isinstance(channel, Packets) else 0
+        times = packet_times(sc.link, number_sent(sc.duration, period), sc.link.seed)
+        return PlayoutBuffer(
+            period,
+            times,
+            delay,
+            queue,
+            rows=repeats + channel.torques,
+            repeats=repeats,
+            dry=sc.link.dry,
+            history=reports,
+        )
     if sc.delay.constant:
         chain = DelayChain(period, delay.steps, delay.fraction, queue)
         declare_constant(chain, "delay", np.array([sc.eta]))  # for the record alone

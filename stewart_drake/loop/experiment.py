@@ -12,6 +12,7 @@ from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
 from stewart_drake.law.catch_up import plan_catch_up
+from stewart_drake.law.channel import Channel, Packets, Wire
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import DesignModel, MultibodyModel, PaperModel
 from stewart_drake.law.feedforward import (
@@ -21,6 +22,7 @@ from stewart_drake.law.feedforward import (
     NoFeedforward,
 )
 from stewart_drake.law.filter_settings import filter_settings
+from stewart_drake.law.late import LateObserver
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import NoObserver, Observer, ParameterObserver
@@ -39,8 +41,9 @@ from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.own import NOTHING, Own, own_motion
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.config import AnnTunerConfig, Scenario
+from stewart_drake.scenario.config import AnnTunerConfig, NetworkConfig, Scenario
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.link import in_time, times_under_way
 from stewart_drake.scenario.signals import POSITION
 from stewart_drake.scenario.trajectories import evaluate, make_reference, moved, peak_to_peak
 from stewart_drake.tuner.network import DEFAULT, Network, load_network
@@ -49,6 +52,12 @@ Array = NDArray[np.float64]
 
 GENTLE = 3.0
 """Torques up to so many times the reference's are predicted with the usual steps."""
+_MOST = 0.999
+"""Share of the measurements that are waited for."""
+_PATIENCE = 10
+"""Periods by which a measurement may be later than that, or lost, before the model goes on."""
+_REPORTS = 10
+"""Reports in a row that may be lost without losing what they said."""
 REACH_CHECK_PERIOD = 0.02
 """s between the instants at which a reference is checked against the workspace."""
 
@@ -262,15 +271,47 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
         "multibody": MultibodyModel(),
     }
     motors = TorqueLimit(experiment.torque_limit)
+    observer, waits = observers[c.estimator], longest_wait(sc)
+    if waits:
+        observer = LateObserver(observer, waits)
+    channel = _channel(sc, timeline, waits)
     return PredictiveLqi(
         timeline=timeline,
         plant=NominalPlant(nominal, substeps, GENTLE * torque_scale, motors),
         sensing=StateSensing(np.array(sc.sensor.noise_std), motion),
-        observer=observers[c.estimator],
+        observer=observer,
         predictor=predictors[c.prediction],
         feedforward=feedforwards[c.feedforward],
         model=models[c.model],
         cost=QuadraticCost(errors, integrals if c.integral else None, torques),
+        channel=channel,
+        kept=waits + (_REPORTS if isinstance(channel, Packets) else 0),
+    )
+
+
+def longest_wait(scenario: Scenario) -> int:
+    """Periods for which the law waits for a late measurement; 0 where none comes late."""
+    sc, period = scenario, scenario.controller.period
+    back = sc.link.back if isinstance(sc.link, NetworkConfig) else None
+    if sc.sensor.delay == 0 and back is None:
+        return 0
+    longest = sc.sensor.delay + (0.0 if back is None else times_under_way(back).ppf(_MOST))
+    return math.ceil(longest / period - 1e-9) + _PATIENCE
+
+
+def _channel(scenario: Scenario, timeline: Timeline, waits: int) -> Channel:
+    link, c = scenario.link, scenario.controller
+    if not isinstance(link, NetworkConfig) or c.delay_steps is not None:
+        return Wire()
+    rows = c.packet_repeats + c.packet_torques
+    due = [timeline.eta + (row - c.packet_repeats) * c.period for row in range(rows)]
+    kept = rows + timeline.steps + waits + _REPORTS + 1
+    return Packets(
+        torques=c.packet_torques,
+        repeats=c.packet_repeats,
+        in_time=tuple(in_time(link, time) for time in due),
+        arrived_by=tuple(in_time(link, i * c.period) for i in range(kept)),
+        holds=link.dry == "hold",
     )
 
 

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from stewart_drake.scenario.timing import LEAST_FRACTION
+
 
 @dataclass(frozen=True)
 class Delay:
@@ -24,6 +26,13 @@ class Delay:
                 f"delay: got {self.steps} steps and a fraction of {self.fraction}; expected "
                 "steps >= 0 and 0 <= fraction < 1"
             )
+
+    @classmethod
+    def lasting(cls, eta: float, period: float) -> "Delay":
+        """The delay of `eta` s; what is within 1e-9 of a whole number of periods is that."""
+        steps = int(eta / period + LEAST_FRACTION)
+        fraction = eta / period - steps
+        return cls(steps, fraction if fraction > LEAST_FRACTION else 0.0)
 
     @property
     def periods(self) -> float:
