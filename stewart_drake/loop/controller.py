@@ -17,6 +17,7 @@ from pydrake.systems.framework import (
 )
 
 from stewart_drake.law.channel import Packets, Report
+from stewart_drake.law.late import LateObserver
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.predictive_lqi import PredictiveLqi, Preview
@@ -73,7 +74,7 @@ class DelayLqiController(LeafSystem):
     | measurement | input | 12 | rad, m, rad/s, m/s | read every period; NaN is lost |
     | preview | input | 18 p | rad, m and time derivatives | read every period |
     | weights | input | 2 | w_Q, w_R | read every period |
-    | age | input | 1 | s, whole periods | of the measurement; 0 where it is not connected |
+    | age | input | 1 | s, whole periods | of the measurement; only with a `LateObserver` |
     | report | input | 7 h | as of `PlayoutBuffer`, NaN is lost | only with a channel of packets |
     | plan | output | 6 (r + N) | N m, the packet to be sent | the same; direct feedthrough |
     | torque | output | 6 | N m | direct feedthrough |
@@ -100,7 +101,8 @@ class DelayLqiController(LeafSystem):
         preview_size = NUM_REFERENCE * len(self._times)
         self._preview = self.DeclareVectorInputPort("preview", preview_size)
         self._weights = self.DeclareVectorInputPort("weights", len(WEIGHTS))
-        self._age = self.DeclareVectorInputPort("age", 1)
+        late = isinstance(law.observer, LateObserver)
+        self._age = self.DeclareVectorInputPort("age", 1) if late else None
         sends = isinstance(law.channel, Packets)
         size = reported(law.kept) * (1 + NUM_TORQUES)
         self._report = self.DeclareVectorInputPort("report", size) if sends else None
@@ -139,7 +141,9 @@ class DelayLqiController(LeafSystem):
 
     def _calc_step(self, context: Context, result: AbstractValue) -> None:
         reference = np.reshape(np.asarray(self._preview.Eval(context)), (-1, NUM_REFERENCE))
-        age = float(np.asarray(self._age.Eval(context))[0]) if self._age.HasValue(context) else 0.0
+        age = 0.0
+        if self._age is not None:
+            age = float(np.asarray(self._age.Eval(context))[0])
         measurement = Measurement.of(np.asarray(self._measurement.Eval(context)), age)
         weights = np.asarray(self._weights.Eval(context))
         memory, preview = self.memory(context), Preview(self._times, reference)
