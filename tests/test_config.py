@@ -101,6 +101,7 @@ def test_the_defaults_are_the_papers_experiment() -> None:
             "estimator": "parameters",
             "w_Q": 1.0,
             "w_R": 1.0,
+            "integral_weight": 1.0,
             "weight_scaling": "bryson",
             "packet_torques": 8,
             "packet_repeats": 1,
@@ -118,6 +119,7 @@ def test_the_defaults_are_the_papers_experiment() -> None:
         },
         "tuner": {"kind": "fixed"},
         "log_period": None,
+        "compare": {},
     }
 
 

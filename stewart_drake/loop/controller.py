@@ -10,7 +10,6 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
     Context,
-    EventStatus,
     LeafSystem,
     State,
     ValueProducer,
@@ -22,13 +21,13 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.predictive_lqi import PredictiveLqi, Preview
 from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.signals import (
     NUM_REFERENCE,
     NUM_TORQUES,
     WEIGHTS,
     ports_of,
 )
-from stewart_drake.scenario.timing import event_time
 
 Array = NDArray[np.float64]
 
@@ -122,10 +121,7 @@ class DelayLqiController(LeafSystem):
             part = HELD[signal.name]  # whose size is the law's: its parameters, what it senses
             size = len(part(first.memory))
             self.DeclareVectorOutputPort(port, size, weak(self._held, part), {memory_ticket})
-        # The first sample before all periodic events, as `DelayChain` does.
-        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._update_first))
-        early = event_time(law.timeline.period)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._update))
+        update_every(self, law.timeline.period, self._update)
 
     def sample(self, context: Context) -> Sample:
         """What the last step left in a context of this system."""
@@ -169,10 +165,6 @@ class DelayLqiController(LeafSystem):
     def _torque(self, context: Context, output: BasicVector) -> None:
         sample: Any = self._step.Eval(context)
         output.SetFromVector(sample.memory.torque)
-
-    def _update_first(self, context: Context, state: State) -> EventStatus:
-        self._update(context, state)
-        return EventStatus.Succeeded()
 
     def _update(self, context: Context, state: State) -> None:
         state.get_mutable_abstract_state(int(self._memory)).set_value(self._step.Eval(context))

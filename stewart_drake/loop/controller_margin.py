@@ -30,11 +30,7 @@ from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.loop.experiment import Experiment, compose_law
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
-    BIAS,
-    DAMPING,
-    NUM_PARAMETERS,
     NUM_TORQUES,
-    PAYLOAD,
     POSE,
     RATES,
 )
@@ -189,10 +185,8 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
 
 def true_dynamics(experiment: Experiment) -> StewartDynamics:
     """The plant as it is simulated, closed exactly whatever engine moves it."""
-    plant, parameters = experiment.scenario.plant, np.empty(NUM_PARAMETERS)
-    parameters[BIAS], parameters[PAYLOAD] = plant.torque_bias, plant.payload_mass
-    parameters[DAMPING] = plant.joint_damping
-    return StewartDynamics(experiment.truth, plant.gravity, parameters)
+    plant = experiment.scenario.plant
+    return StewartDynamics(experiment.truth, plant.gravity, plant.parameters)
 
 
 def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> ContinuousModel:
@@ -219,8 +213,7 @@ def _loops(
         with suppress(RiccatiError, np.linalg.LinAlgError, ArithmeticError):
             gain = _gain(experiment, truth, law, t)
         plant = true_model(experiment, truth, t)
-        delay = (sc.true_delay.steps, sc.true_delay.fraction)
-        loops.append(LinearLoop(plant, gain, law.timeline.period, *delay, integrates))
+        loops.append(LinearLoop(plant, gain, law.timeline.period, sc.true_delay, integrates))
     return loops
 
 

@@ -1,6 +1,6 @@
 """The closed loop as a Drake diagram, built from a scenario. Here its systems are connected."""
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,6 @@ from pydrake.systems.framework import (
     Diagram,
     DiagramBuilder,
     InputPort,
-    LeafSystem,
     OutputPort,
     System,
 )
@@ -27,14 +26,13 @@ from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.experiment import (
     Experiment,
     believed_queue,
+    concrete,
     control_law,
     motion_scale,
-    prepare,
     torques_in_flight,
 )
 from stewart_drake.loop.late_measurements import LateMeasurements
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
-from stewart_drake.loop.own import OwnReference, OwnSystem, take
 from stewart_drake.loop.own_controller import SampledController
 from stewart_drake.loop.platforms import add_to_torque
 from stewart_drake.loop.playout import PlayoutBuffer
@@ -51,17 +49,20 @@ from stewart_drake.scenario.link import (
     torque_delays,
 )
 from stewart_drake.scenario.signals import (
-    DAMPING,
-    NUM_PARAMETERS,
+    BIAS,
     NUM_TORQUES,
     PACKETS,
-    PAYLOAD,
     POSE,
     RATES,
+    SIGNALS,
     exported_ports,
 )
 
 Array = NDArray[np.float64]
+
+
+_TOLD: Final = {"density": "density", "measurement": "sensor", "reference": "reference"}
+"""What a tuner may ask for, and the system whose output of that name it is."""
 
 
 class ClosedLoop(Diagram):
@@ -99,36 +100,32 @@ class ClosedLoop(Diagram):
 def build_closed_loop(
     scenario: Scenario | Experiment,
     *,
-    controller: OwnSystem | None = None,
-    reference: OwnReference | None = None,
-    disturbance: OwnSystem | None = None,
     meshcat: Meshcat | None = None,
+    **own: Any,
 ) -> ClosedLoop:
     """The diagram of a scenario: reference, controller, limit, delay chain, plant, sensor.
 
     Args:
         scenario: what to build, or what `prepare` made of it.
-        controller, reference, disturbance: of one's own, see `simulate`; not with an Experiment,
-            which has them.
         meshcat: where the multibody plant is shown while it is simulated, or None.
+        **own: controller, reference, disturbance, law, sensor, link, tuner of one's own, as of
+            `simulate`.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
+        TypeError: systems of one's own beside an Experiment, which has its own.
     """
-    if isinstance(scenario, Experiment):
-        experiment = scenario
-    else:
-        experiment = prepare(scenario, own=take(controller, reference, disturbance))
+    experiment = concrete(scenario, **own)
     experiment.own.claim()
     builder = DiagramBuilder()
     _add_surroundings(builder, experiment, meshcat)
     channel: Channel = Wire()
     reports, catch_up = 1, 0.0
-    if experiment.own.controller is None:
+    if "controller" in experiment.own.systems:
+        _add_own_controller(builder, experiment)
+    else:
         law, catch_up = _add_law(builder, experiment)
         channel, reports = law.channel, reported(law.kept)
-    else:
-        _add_own_controller(builder, experiment, experiment.own.controller)
     link = _link(experiment, channel, reports)
     limit = np.full(link.GetInputPort("commanded").size(), experiment.torque_limit)
     builder.AddNamedSystem("saturation", Saturation(-limit, limit))
@@ -147,10 +144,9 @@ def _add_surroundings(
     """Everything but reference and controller."""
     sc = experiment.scenario
     period = sc.controller.period
-    noise, s = np.array(sc.sensor.noise_std), sc.sensor
-    builder.AddNamedSystem(
-        "sensor", Sensor(noise, s.seed, period, s.faults, motion_scale(experiment))
-    )
+    noise, s, own = np.array(sc.sensor.noise_std), sc.sensor, experiment.own.systems
+    sensor = Sensor(noise, s.seed, period, s.faults, motion_scale(experiment))
+    builder.AddNamedSystem("sensor", own.get("sensor", sensor))
     builder.AddNamedSystem("torque_bias", add_to_torque(np.array(sc.plant.torque_bias)))
     builder.AddNamedSystem("plant", _plant(experiment, meshcat))
     kind = "magnitude" if experiment.network is None else experiment.network.density
@@ -169,9 +165,8 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
     saturation, bias = (builder.GetSubsystemByName(name) for name in ("saturation", "torque_bias"))
     measured = _measured(builder, experiment)
     builder.Connect(measured, into("controller", "measurement"))
-    own = experiment.own.controller
-    if own is not None:
-        builder.Connect(measured, own.GetInputPort("measurement"))
+    if "controller" in experiment.own.systems:
+        builder.Connect(measured, into("own_controller", "measurement"))
     sends = builder.GetSubsystemByName("controller").HasOutputPort("plan")
     builder.Connect(out("controller", "plan" if sends else "torque"), saturation.get_input_port())
     builder.Connect(saturation.get_output_port(), into("delay_chain", "commanded"))
@@ -181,13 +176,19 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
     builder.Connect(measured, into("density", "measurement"))
     builder.Connect(out("reference", "reference"), into("density", "reference"))
     builder.Connect(out("controller", "torque"), into("density", "torque"))
-    if experiment.network is not None:
-        builder.Connect(out("density", "density"), into("tuner", "density"))
+    if builder.HasSubsystemNamed("tuner"):
+        _connect_tuner(builder, builder.GetSubsystemByName("tuner"))
     if experiment.start[RATES].any() and experiment.scenario.plant.kind == "multibody":
         builder.AddNamedSystem("start_check", StartCheck(experiment.start))
         builder.Connect(out("plant", "state"), into("start_check", "state"))
     for name, (source, port) in exported_ports().items():
-        builder.ExportOutput(out(source, port), name)
+        if builder.GetSubsystemByName(source).HasOutputPort(port):
+            builder.ExportOutput(out(source, port), name)
+        else:  # of a system of one's own
+            size = sum(s.size for s in SIGNALS.values() if s.exported == name)
+            unknown = ConstantVectorSource(np.full(size, np.nan))
+            builder.AddNamedSystem(f"no_{name}", unknown)
+            builder.ExportOutput(unknown.get_output_port(), name)
 
 
 def _measured(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
@@ -230,13 +231,13 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[Predictiv
         "controller", DelayLqiController(law, believed_queue(experiment, law.timeline))
     )
     builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
-    builder.Connect(weights.get_output_port(), controller.GetInputPort("weights"))
+    builder.Connect(weights, controller.GetInputPort("weights"))
     return law, catch_up
 
 
-def _add_own_controller(builder: DiagramBuilder, experiment: Experiment, system: System) -> None:
+def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None:
     """The user's controller behind its reference, and what samples it."""
-    sc = experiment.scenario
+    sc, system = experiment.scenario, experiment.own.systems["controller"]
     if experiment.network is not None:
         raise ConfigError(
             f"tuner.kind: got {sc.tuner.kind!r} with a controller of your own; expected 'fixed'"
@@ -254,7 +255,8 @@ def _add_own_controller(builder: DiagramBuilder, experiment: Experiment, system:
 
 def _disturb(builder: DiagramBuilder, experiment: Experiment, torque: OutputPort) -> None:
     """Connect the torque that arrives with the plant, through a disturbance if there is one."""
-    disturbance, plant = experiment.own.disturbance, builder.GetSubsystemByName("plant")
+    disturbance = experiment.own.systems.get("disturbance")
+    plant = builder.GetSubsystemByName("plant")
     if disturbance is not None:
         builder.AddNamedSystem("disturbance", disturbance)
         if disturbance.HasOutputPort("wrench"):
@@ -267,16 +269,31 @@ def _disturb(builder: DiagramBuilder, experiment: Experiment, torque: OutputPort
     builder.Connect(torque, plant.GetInputPort("torque"))
 
 
-def _weights(builder: DiagramBuilder, experiment: Experiment) -> ConstantVectorSource | AnnTuner:
-    c = experiment.scenario.controller
+def _weights(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
+    """What the controller's weights come from: a `tuner`, or constant `weights`."""
+    c, own = experiment.scenario.controller, experiment.own.systems.get("tuner")
     fixed = np.array([c.w_Q, c.w_R])
-    if experiment.network is None:
-        return builder.AddNamedSystem("weights", ConstantVectorSource(fixed))
-    return builder.AddNamedSystem("tuner", AnnTuner(experiment.network, fixed, c.period))
+    if own is None and experiment.network is None:
+        return builder.AddNamedSystem("weights", ConstantVectorSource(fixed)).get_output_port()
+    tuner = AnnTuner(experiment.network, fixed, c.period) if own is None else own
+    return builder.AddNamedSystem("tuner", tuner).GetOutputPort("weights")
 
 
-def _link(experiment: Experiment, channel: Channel, reports: int) -> LeafSystem:
+def _connect_tuner(builder: DiagramBuilder, tuner: System) -> None:
+    """Give it of what the loop can tell those that it has ports for."""
+    for name, source in _TOLD.items():
+        if tuner.HasInputPort(name):
+            told = builder.GetSubsystemByName(source).GetOutputPort(name)
+            builder.Connect(told, tuner.GetInputPort(name))
+
+
+def _link(experiment: Experiment, channel: Channel, reports: int) -> System:
     """What is between limit and motors, for a law's channel and reports of so many periods."""
+    own = experiment.own.systems.get("link")
+    if own is not None:
+        if isinstance(experiment.scenario.link, NetworkConfig):
+            raise ConfigError("link.kind: got 'network' with a link of your own; expected 'wire'")
+        return own
     sc, delay = experiment.scenario, experiment.scenario.true_delay
     period, queue = sc.controller.period, torques_in_flight(experiment, delay)
     if isinstance(sc.link, NetworkConfig):
@@ -301,7 +318,7 @@ def _link(experiment: Experiment, channel: Channel, reports: int) -> LeafSystem:
 
 
 def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | MultibodyStewart:
-    plant, disturbance = experiment.scenario.plant, experiment.own.disturbance
+    plant, disturbance = experiment.scenario.plant, experiment.own.systems.get("disturbance")
     wrench = disturbance is not None and disturbance.HasOutputPort("wrench")
     if plant.kind == "multibody":
         return MultibodyStewart(
@@ -314,7 +331,7 @@ def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | Mult
             start=experiment.start[POSE],
             wrench=wrench,
         )
-    parameters = np.zeros(NUM_PARAMETERS)
-    parameters[PAYLOAD], parameters[DAMPING] = plant.payload_mass, plant.joint_damping
+    parameters = np.array(plant.parameters)
+    parameters[BIAS] = 0.0  # added before, where the record of torques ends
     truth = StewartDynamics(experiment.truth, plant.gravity, parameters)
     return ExactPlant(truth, experiment.start, wrench)

@@ -1,7 +1,7 @@
 """A scenario made concrete: mechanism, reference, and the control law that it asks for."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,8 @@ from stewart_drake.law.startup import (
     weight_scales,
 )
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.own import NOTHING, Own, own_motion
+from stewart_drake.loop.own import NOTHING, Own, take
+from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import AnnTunerConfig, NetworkConfig, Scenario
@@ -104,7 +105,7 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
     Args:
         scenario: what to run.
         truth: the machine to simulate where it is not the one that the controller knows.
-        own: controller, reference or disturbance in the place of the scenario's.
+        own: what takes the place of the scenario's.
 
     Raises:
         ConfigError: one line; also where the reference leaves the workspace, with time and leg.
@@ -124,6 +125,28 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
             )
         )
     return experiment
+
+
+def concrete(
+    scenario: Scenario | Experiment, truth: Mechanism | None = None, **own: Any
+) -> Experiment:
+    """What `prepare` makes of a scenario and of what is the user's own, or an Experiment as it is.
+
+    Args:
+        scenario: either.
+        truth: see `prepare`.
+        **own: see `loop.simulation.simulate`.
+
+    Raises:
+        ConfigError: bad input, an unreachable reference.
+        TypeError: something of one's own beside an Experiment, which has its own.
+    """
+    if not isinstance(scenario, Experiment):
+        return prepare(scenario, truth, take(own))
+    for name, thing in ({"truth": truth} | own).items():
+        if thing is not None:
+            raise TypeError(f"{name}: got one with an Experiment, which has its own; expected None")
+    return scenario
 
 
 def first_pose_text(pose: Array, mechanism: Mechanism) -> str:
@@ -239,6 +262,15 @@ def planned_limit(scenario: Scenario) -> float | None:
     return None if asked == "none" else asked
 
 
+def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
+    """What the scenario's gain minimises; the torque in N m is what the reference takes."""
+    c = experiment.scenario.controller
+    errors, integrals, torques = weight_scales(
+        c.weight_scaling, experiment.nominal, experiment.peak_to_peak, peak_torque
+    )
+    return QuadraticCost(errors, c.integral_weight * integrals if c.integral else None, torques)
+
+
 def compose_law(experiment: Experiment) -> PredictiveLqi:
     """The parts that a scenario asks for; the only place that knows their names in it."""
     sc, nominal = experiment.scenario, experiment.nominal
@@ -247,9 +279,6 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     substeps = choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration)
     peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
     torque_scale = max(machine_torque(nominal), peak_torque)
-    errors, integrals, torques = weight_scales(
-        c.weight_scaling, nominal, experiment.peak_to_peak, peak_torque
-    )
     plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
     observers: dict[str, Observer] = {
         "none": NoObserver(),
@@ -275,7 +304,7 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     if waits:
         observer = LateObserver(observer, waits)
     channel = _channel(sc, timeline, waits)
-    return PredictiveLqi(
+    law = PredictiveLqi(
         timeline=timeline,
         plant=NominalPlant(nominal, substeps, GENTLE * torque_scale, motors),
         sensing=StateSensing(np.array(sc.sensor.noise_std), motion),
@@ -283,10 +312,11 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
         predictor=predictors[c.prediction],
         feedforward=feedforwards[c.feedforward],
         model=models[c.model],
-        cost=QuadraticCost(errors, integrals if c.integral else None, torques),
+        cost=quadratic_cost(experiment, peak_torque),
         channel=channel,
         kept=waits + (_REPORTS if isinstance(channel, Packets) else 0),
     )
+    return experiment.own.revised(law)
 
 
 def longest_wait(scenario: Scenario) -> int:

@@ -2,11 +2,11 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.link import newest_measurements
-from stewart_drake.scenario.timing import event_time
 
 Array = NDArray[np.float64]
 
@@ -43,13 +43,7 @@ class LateMeasurements(LeafSystem):
         self._measured = self.DeclareVectorInputPort("measured", size)
         self.DeclareVectorOutputPort("measurement", size, weak(self._measurement))
         self.DeclareVectorOutputPort("age", 1, weak(self._age), {self.time_ticket()})
-        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._take_first))
-        early = event_time(period)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._take))
-
-    def _take_first(self, context: Context, state: State) -> EventStatus:
-        self._take(context, state)
-        return EventStatus.Succeeded()
+        update_every(self, period, self._take)
 
     def _take(self, context: Context, state: State) -> None:
         taken = context.get_discrete_state(self._taken).value()

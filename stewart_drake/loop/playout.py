@@ -4,9 +4,10 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_TORQUES, PACKETS
 from stewart_drake.scenario.timing import event_time
@@ -81,11 +82,9 @@ class PlayoutBuffer(LeafSystem):
         size = history * (1 + NUM_TORQUES)
         timed = {*state, self.time_ticket()}
         self.DeclareVectorOutputPort("report", size, weak(self._report), timed)
-        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._take_first))
-        early = event_time(period)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._take))
+        update_every(self, period, self._take)
         if delay.fraction > 0:
-            offset = event_time(delay.fraction * period)
+            early, offset = event_time(period), event_time(delay.fraction * period)
             self.DeclarePeriodicUnrestrictedUpdateEvent(early, offset, weak(self._play_next))
 
     def _declare_state(self, history: int) -> None:
@@ -98,10 +97,6 @@ class PlayoutBuffer(LeafSystem):
         self._taken = self.DeclareDiscreteState(1)
         self._past = self.DeclareDiscreteState(np.tile(applied, history))
         self._counts = self.DeclareDiscreteState(3)  # periods played, dry, begun
-
-    def _take_first(self, context: Context, state: State) -> EventStatus:
-        self._take(context, state)
-        return EventStatus.Succeeded()
 
     def _take(self, context: Context, state: State) -> None:
         taken, packet = self._number(context), self._commanded.Eval(context)

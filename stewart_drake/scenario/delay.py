@@ -28,10 +28,11 @@ class Delay:
             )
 
     @classmethod
-    def lasting(cls, eta: float, period: float) -> "Delay":
-        """The delay of `eta` s; what is within 1e-9 of a whole number of periods is that."""
-        steps = int(eta / period + LEAST_FRACTION)
-        fraction = eta / period - steps
+    def of(cls, eta: float, period: float) -> "Delay":
+        """A delay of eta s; less than LEAST_FRACTION of a period beyond a whole one is none."""
+        periods = max(0.0, eta / period)
+        steps = int(periods + LEAST_FRACTION)
+        fraction = periods - steps
         return cls(steps, fraction if fraction > LEAST_FRACTION else 0.0)
 
     @property

@@ -156,4 +156,4 @@ def network_delay(link: NetworkConfig, controller: ControllerConfig) -> Delay:
     """From computing a torque to its time: the bound, and the periods for repetitions."""
     period, repeats = controller.period, controller.packet_repeats
     bound = usual_bound(link, repeats, period) if link.playout is None else link.playout
-    return Delay.lasting(bound + repeats * period, period)
+    return Delay.of(bound + repeats * period, period)
