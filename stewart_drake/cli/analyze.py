@@ -1,4 +1,4 @@
-"""What an engineer reads before building anything: analyze hautus, delay, workspace, robustness."""
+"""What an engineer reads before building anything: analyze hautus, delay, link, and so on."""
 
 import time
 from collections.abc import Callable
@@ -87,6 +87,40 @@ def delay(
         study.summary,
         delay_table(study),
         lambda: delay_page(study, made),
+        out,
+        quiet,
+        as_json,
+        interrupted=study.interrupted,
+    )
+
+
+@app.command()
+def link(
+    scenario: ScenarioName = "paper",
+    controller: Controller = None,
+    settings: Settings = None,
+    runs: Annotated[int, typer.Option(metavar="N", help="Seeds for each bound and loss.")] = 5,
+    out: Out = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> int:
+    """Which play-out bound suits a network, and what loss it bears.
+
+    Needs --set link.kind=network or a scenario with a network.
+    """
+    from stewart_drake.report.link_page import link_page, link_table
+    from stewart_drake.scenario.loading import load_scenario
+    from stewart_drake.studies.link_bound import study_link
+
+    check_writable(out)
+    started = time.perf_counter()
+    with count_bar("simulations", quiet) as progress:
+        study = study_link(load_scenario(scenario, controller, settings or ()), runs, progress)
+    made = provenance("link", scenario, controller, settings, out, started, runs=runs)
+    return deliver(
+        study.summary,
+        link_table(study),
+        lambda: link_page(study, made),
         out,
         quiet,
         as_json,

@@ -27,7 +27,8 @@ from stewart_drake.law.linear_loop import LinearLoop, Margins, law_gain, worst_m
 from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError
-from stewart_drake.loop.experiment import Experiment, compose_law
+from stewart_drake.loop.experiment import Experiment, compose_law, longest_wait
+from stewart_drake.scenario.config import NetworkConfig
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     NUM_TORQUES,
@@ -154,6 +155,8 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
     problem, loops = "", list[LinearLoop]()
     if not all(inside):
         problem = "the true machine does not reach all of the reference"
+    elif isinstance(sc.link, NetworkConfig) or longest_wait(sc):
+        problem = "its packets or measurements do not all take the same time"
     elif rows > _LARGEST:
         problem = (
             f"with {sc.true_delay.steps} periods of delay it has {rows} states, too many to judge"
