@@ -20,6 +20,8 @@ from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.late_measurements import LateMeasurements
 from stewart_drake.loop.playout import PlayoutBuffer
 from stewart_drake.loop.simulation import make_simulator
+from stewart_drake.report.link_page import link_page, link_table
+from stewart_drake.report.page import Provenance
 from stewart_drake.scenario.config import NetworkConfig, PacketsConfig
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import (
@@ -31,6 +33,7 @@ from stewart_drake.scenario.link import (
     usual_bound,
 )
 from stewart_drake.scenario.timing import look_time
+from stewart_drake.studies import link_bound
 
 Array = NDArray[np.float64]
 PERIOD = 0.1
@@ -374,3 +377,65 @@ def test_a_network_has_the_delay_of_bound_and_repetitions() -> None:
     usual = scenario("link.kind=network")
     assert isinstance(usual.link, NetworkConfig)
     assert usual.eta == pytest.approx(usual_bound(usual.link, 1, 0.1) + 0.1)
+
+
+# The study of the bound.
+
+
+def test_the_study_finds_the_best_bound_and_the_loss_that_is_borne(monkeypatch: Any) -> None:
+    """With runs whose outcome is known: best at 0.4 s, and nothing completes above 20 % lost."""
+
+    def jobs(wanted: Any, *_: Any, **more: Any) -> dict[str, Any]:
+        more["progress"](len(wanted), len(wanted))
+        return {key: arguments[0] for key, arguments in wanted.items()}
+
+    def outcome(run: sd.Scenario) -> tuple[str, float, float]:
+        assert isinstance(run.link, NetworkConfig) and run.link.playout is not None
+        if run.link.loss > 0.2:
+            return "left_workspace", np.nan, 1.0
+        return "completed", 1 + abs(run.link.playout - 0.4) + 0.01 * run.link.seed, np.nan
+
+    monkeypatch.setattr(link_bound, "run_jobs", jobs)
+    monkeypatch.setattr(link_bound, "read_cell", outcome)
+    told = []
+    network = ("link.kind=network", "link.low=0.2", "link.high=0.45")
+    study = link_bound.study_link(
+        scenario(*network), runs=3, progress=lambda *counts: told.append(counts)
+    )
+    assert [cell.bound for cell in study.bounds] == pytest.approx([0.3, 0.4, 0.5, 0.6])
+    assert [cell.late for cell in study.bounds] == pytest.approx([0.6, 0.2, 0, 0], abs=1e-6)
+    assert study.best is not None and study.best.bound == pytest.approx(0.4)
+    assert study.best.expected == pytest.approx(1.01)
+    assert study.survivable == 0.2
+    assert [cell.runs for cell in study.losses] == [3] * len(link_bound.LOSSES)
+    assert told == [(12, 33), (33, 33)]
+    table = link_table(study)
+    assert "0.4 s is the best" in table and "up to a loss of 20 %" in " ".join(table.split())
+    assert max(len(line) for line in table.splitlines()) <= 80
+    page = link_page(study, Provenance("stewart-drake analyze link", {})).html()
+    assert page.count("<svg") + page.count("image/svg") >= 1
+
+
+def test_the_study_asks_for_a_network_and_for_runs() -> None:
+    with pytest.raises(ConfigError, match="got 'wire'; expected 'network'"):
+        link_bound.study_link(scenario())
+    with pytest.raises(ConfigError, match="runs: got 0; expected at least 1"):
+        link_bound.study_link(scenario("link.kind=network"), runs=0)
+
+
+def test_the_overlay_lays_fields_over_a_scenario() -> None:
+    dirty = scenario("overlay=dirty", "sensor.seed=4")
+    assert dirty.plant.payload_mass == pytest.approx(0.1 * 4.0)
+    assert np.abs(dirty.plant.torque_bias).tolist() == [3e-4] * 6
+    clean = scenario("sensor.seed=4")
+    amplitude = np.array(clean.reference.amplitude)  # type: ignore[union-attr]
+    assert dirty.sensor.noise_std == pytest.approx(1e-3 * np.tile(amplitude, 2))
+    for dusty, plain in ((dirty.plant, clean.plant), (dirty.sensor, clean.sensor)):
+        changed = {
+            name
+            for name, value in dataclasses.asdict(plain).items()
+            if dataclasses.asdict(dusty)[name] != value
+        }
+        assert changed <= {"payload_mass", "torque_bias", "noise_std"}
+    with pytest.raises(ConfigError, match="overlay: got 'drity'; expected one of dirty"):
+        scenario("overlay=drity")

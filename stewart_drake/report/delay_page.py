@@ -69,7 +69,7 @@ def delay_table(study: DelayStudy) -> str:
         entries["largest delay"] = ", ".join(
             f"{_seconds(delay)} for a growth of {a:g}" for a, delay, _ in study.limits
         )
-    floor = f"{number(study.floors[sc.delay.steps])} % s of a plate that waits at rest"
+    floor = f"{number(study.floors[sc.true_delay.steps])} % s of a plate that waits at rest"
     entries["floor of E_ac"] = floor + ("" if study.floor_applies else " (does not apply here)")
     loop = study.loop
     if loop is not None and loop.radius < 1:
@@ -137,8 +137,8 @@ def delay_page(study: DelayStudy, made: Provenance) -> Page:
     facts = {
         "mechanism": found.experiment.mechanism.name,
         "gravity": "yes" if sc.plant.gravity else "no",
-        "delay": f"{study.eta:.4g} s: μ = {sc.delay.steps} periods of {c.period:g} s, fraction "
-        f"{sc.delay.fraction:g}",
+        "delay": f"{study.eta:.4g} s: μ = {sc.true_delay.steps} periods of {c.period:g} s, fraction "
+        f"{sc.true_delay.fraction:g}",
         "controller": f"model {c.model}, prediction {c.prediction}, weights {c.weight_scaling}, "
         f"w_Q = {c.w_Q:g}, w_R = {c.w_R:g}",
         "start": f"{sc.start.replace('_', ' ')}, torques in flight: {sc.queue}",
@@ -186,7 +186,11 @@ def _floor_section(study: DelayStudy) -> Section:
     table = Table(
         ("μ", "delay  [s]", "floor of E_ac  [% s]"),
         [
-            (str(s), f"{Delay(s, sc.delay.fraction).eta(sc.controller.period):.4g}", f"{value:.2f}")
+            (
+                str(s),
+                f"{Delay(s, sc.true_delay.fraction).eta(sc.controller.period):.4g}",
+                f"{value:.2f}",
+            )
             for s, value in sorted(study.floors.items())
         ],
     )
