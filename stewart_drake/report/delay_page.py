@@ -137,8 +137,8 @@ def delay_page(study: DelayStudy, made: Provenance) -> Page:
     facts = {
         "mechanism": found.experiment.mechanism.name,
         "gravity": "yes" if sc.plant.gravity else "no",
-        "delay": f"{study.eta:.4g} s: μ = {sc.true_delay.steps} periods of {c.period:g} s, fraction "
-        f"{sc.true_delay.fraction:g}",
+        "delay": f"{study.eta:.4g} s: μ = {sc.true_delay.steps} periods of {c.period:g} s, "
+        f"fraction {sc.true_delay.fraction:g}",
         "controller": f"model {c.model}, prediction {c.prediction}, weights {c.weight_scaling}, "
         f"w_Q = {c.w_Q:g}, w_R = {c.w_R:g}",
         "start": f"{sc.start.replace('_', ' ')}, torques in flight: {sc.queue}",
