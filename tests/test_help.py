@@ -82,24 +82,31 @@ def test_no_summary_is_cut_off_in_the_list_of_commands(capsys):
 # ---------------------------------------------------------------- completion
 
 
-def offered(typed: str) -> list[str]:
-    """What bash would offer after this line."""
-    code = "import sys; from stewart_drake.cli import main; sys.exit(main())"
-    words = typed.split(" ")
-    environment = {
-        **os.environ,
+def asked(typed: str) -> dict[str, str]:
+    """How bash asks what to offer after this line."""
+    return {
         "_STEWART_DRAKE_COMPLETE": "complete_bash",
         "COMP_WORDS": typed,
-        "COMP_CWORD": str(len(words) - 1),
+        "COMP_CWORD": str(len(typed.split(" ")) - 1),
     }
+
+
+def test_the_shell_completes_commands_names_and_settings(monkeypatch, capsys):
+    def offered(typed: str) -> list[str]:
+        for name, value in asked(typed).items():
+            monkeypatch.setenv(name, value)
+        with pytest.raises(SystemExit) as done:
+            main([])
+        out, err = capsys.readouterr()
+        assert err == "" and done.value.code == 0
+        return out.split()
+
+    code = "import sys; from stewart_drake.cli import main; sys.exit(main())"
+    environment = {**os.environ, **asked("stewart-drake si")}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True
     )
-    assert done.stderr == "" and done.returncode == 0
-    return done.stdout.split()
-
-
-def test_the_shell_completes_commands_names_and_settings():
+    assert (done.stderr, done.returncode, done.stdout.split()) == ("", 0, ["simulate"])
     assert offered("stewart-drake si") == ["simulate"]
     assert set(offered("stewart-drake simulate ")) >= set(shipped("scenario"))
     assert offered("stewart-drake model check mot") == ["motion_base"]

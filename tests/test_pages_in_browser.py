@@ -1,6 +1,5 @@
 """Pages in a real browser: short on a narrow screen, figures enlarged and legible, tables whole."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +11,11 @@ from stewart_drake.report.hautus_page import hautus_page
 from stewart_drake.report.page import Page, Picture, Provenance, Section, Table, write_page
 from stewart_drake.report.style import CONTROLLER_LINES, figure_style
 from stewart_drake.studies.hautus import study_hautus
-from tests.browser import Browser, browser, needs_chromium
+from tests.browser import Browser, needs_chromium
 
 pytestmark = needs_chromium
 NARROW = 400
 MADE = Provenance("stewart-drake analyze hautus paper --out out/hautus")
-
-
-@pytest.fixture(scope="module")
-def tab() -> Iterator[Browser]:
-    with browser() as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import joblib
 import pytest
 
 from stewart_drake.cli import main
@@ -51,6 +52,7 @@ def names(folder: Path) -> set[str]:
 def test_a_failure_while_drawing_costs_the_figures_only(
     arguments, module, name, kept, tmp_path, monkeypatch, capsys
 ) -> None:
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)  # so that no process has to start
     monkeypatch.setattr(module, name, broken(tmp_path))
     assert main([*arguments, "--quiet", "--out", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
@@ -99,9 +101,9 @@ def start(folder: Path, redirection: str = "", **environment: str) -> subprocess
 
 
 def test_figures_do_not_depend_on_the_backend_of_the_surroundings(tmp_path) -> None:
-    usual = start(tmp_path / "usual", MPLBACKEND="Agg")
+    assert main(["simulate", *EXACT, "--quiet", "--out", str(tmp_path / "usual")]) == 0
     other = start(tmp_path / "other", MPLBACKEND="nonsense")
-    assert usual.returncode == other.returncode == 0 and other.stderr == ""
+    assert other.returncode == 0 and other.stderr == ""
     assert names(tmp_path / "usual") == names(tmp_path / "other")
     for name in ("states.png", "torques.svg"):
         one, two = ((tmp_path / folder / name).read_bytes() for folder in ("usual", "other"))

@@ -1,6 +1,7 @@
 """Monte Carlo: the statistics against their definitions, the draws, and the study as a whole."""
 
 import csv
+import functools
 import json
 import math
 import os
@@ -336,7 +337,7 @@ def test_the_loop_simulates_the_true_machine(kind: str) -> None:
     legs = replace(PAPER, crank_lengths=1.01 * PAPER.crank_lengths)
     moved = {}
     for name, truth in (("same", None), ("heavy", heavy), ("legs", legs)):
-        result = simulate(scenario, truth=truth)
+        result = simulate(scenario, truth=truth, margin=False)
         moved[name] = result.signals.pose.values
     way = {name: np.abs(pose[-1] - pose[0]).max() for name, pose in moved.items()}
     assert 0.05 < way["heavy"] / way["same"] < 0.2
@@ -416,6 +417,7 @@ def test_a_resumed_study_equals_an_uninterrupted_one(
         study_robustness(short(), tmp_path, runs=4, seed=1)
 
 
+@pytest.mark.soak  # as tests/test_jobs.py kills the jobs and tests/test_faults.py a study
 def test_a_killed_study_goes_on(tmp_path: Path, whole: tuple[Path, RobustnessStudy]) -> None:
     folder, _ = whole
     code = (
@@ -490,6 +492,7 @@ def test_scales_of_the_paper() -> None:
 # ---------------------------------------------------------------- what is told of it
 
 
+@functools.cache
 def made_up(n: int = 400, limit: float | None = None) -> RobustnessStudy:
     """E_ac grows with the noise, the delay and nothing else; late delays fail."""
     scenario = short()

@@ -168,8 +168,7 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
         radii = [spectral_radius(loop.matrix()) for loop in loops]
         worst = int(np.argmax(radii))
         radius, time = radii[worst], float(chosen[worst])
-        order = np.argsort(radii)[::-1]
-        margins = worst_margins([loops[i] for i in order])
+        margins = worst_margins([loops[i] for i in _order(radii)])
     return ControllerMargin(
         period=sc.controller.period,
         eta=sc.eta,
@@ -184,6 +183,16 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
         loops=tuple(loops),
         span=end,
     )
+
+
+def _order(radii: list[float]) -> list[int]:
+    """Of the loops in the search for the least margin: the likely worst first, most then pass it.
+
+    That is an end of their order by radius; the rest are shuffled, since along a smooth motion they
+    may bear less and less, and each would be searched for anew.
+    """
+    first, *between, last = (int(i) for i in np.argsort(radii)[::-1])
+    return [first, last, *(int(i) for i in np.random.default_rng(0).permutation(between))]
 
 
 def true_dynamics(experiment: Experiment) -> StewartDynamics:
