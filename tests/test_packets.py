@@ -370,6 +370,26 @@ def test_out_of_range_is_one_line(changes: tuple[str, ...], message: str) -> Non
     assert message in str(caught.value) and len(str(caught.value).splitlines()) == 1
 
 
+def test_the_bound_is_a_whole_number_of_a_multibody_plants_steps() -> None:
+    multibody = ("link.kind=network", "plant.kind=multibody")
+    assert scenario(*multibody, "link.playout=0.653").true_delay.fraction == pytest.approx(0.53)
+    message = r"link\.playout: got 0\.6535; expected a whole number of plant\.time_step"
+    with pytest.raises(ConfigError, match=message):
+        scenario(*multibody, "link.playout=0.6535")
+    with pytest.raises(ConfigError, match=r"link\.median: got null"):
+        scenario(*multibody, "link.distribution=lognormal")
+
+
+def test_without_reports_the_law_goes_on_what_is_probable() -> None:
+    """The same packets: it still tracks, and takes for acted what was not."""
+    network = ("link.kind=network", "link.loss=0.2", "link.seed=2", "duration=3")
+    deaf = run(*network, "link.playout=0.9", "link.acknowledged=false")
+    told = run(*network, "link.playout=0.9")
+    assert deaf.status == "completed"
+    assert np.array_equal(deaf.signals.packets.values, told.signals.packets.values)
+    assert not np.array_equal(deaf.signals.pose.values, told.signals.pose.values)
+
+
 def test_a_network_has_the_delay_of_bound_and_repetitions() -> None:
     sc = scenario("link.kind=network", "link.playout=0.65", "controller.packet_repeats=2")
     assert sc.true_delay.eta(0.1) == pytest.approx(0.85, abs=1e-12)

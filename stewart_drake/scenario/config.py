@@ -30,7 +30,7 @@ from stewart_drake.scenario.field_types import (
     Weight,
 )
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
-from stewart_drake.scenario.timing import METRIC_PERIOD, log_problem, step_problem
+from stewart_drake.scenario.timing import METRIC_PERIOD, bound_problem, log_problem, step_problem
 
 
 @dataclass(config=STRICT)
@@ -352,10 +352,6 @@ class Scenario:
         """The true delay in s."""
         return self.true_delay.eta(self.controller.period)
 
-    @property
-    def _fraction(self) -> float:
-        return self.true_delay.fraction
-
     def check(self, where: str = "scenario") -> None:
         """Checks every field again, and everything that takes several of them.
 
@@ -373,11 +369,19 @@ class Scenario:
             _controller_problem(self.controller),
             self.sensor.problem(),
             self.link.problem(),
-            step and step_problem(step, self.controller.period, self._fraction),
+            step and self._step_problem(step),
             log_problem(self.log_period, self.duration, step),
         ):
             if problem:
                 raise ConfigError(f"{where}: {problem}")
+
+    def _step_problem(self, step: float) -> str | None:
+        """What does not suit the steps in s of a discrete plant, or None."""
+        period, link = self.controller.period, self.link
+        if isinstance(link, NetworkConfig):
+            bound = None if link.playout is None else bound_problem(link.playout, step)
+            return step_problem(step, period, 0.0) or bound
+        return step_problem(step, period, self.delay.fraction)
 
 
 def _controller_problem(controller: ControllerConfig) -> str | None:
