@@ -51,6 +51,7 @@ SCENARIO_RANGES: dict[str, list[float]] = {
     "controller.delay_fraction": [-0.1, 1.0],
     "controller.w_Q": [0, -1.0],
     "controller.w_R": [0, -1.0],
+    "controller.integral_weight": [0, -1.0],
     "controller.catch_up": [-1.0, 1e-9],
     "actuator.torque_limit": [0, -1.0],
     "sensor.seed": [-1, 2**32],
@@ -150,7 +151,9 @@ def section_of(fault: Fault) -> str:
 
 # Sections that hold six alike have tests of their own.
 # Lists of mappings have them too, see tests/test_sensor_faults.py.
-SCENARIO_FAULTS = faults(Scenario, SCENARIO_RANGES, SCENARIO_LISTS, skip=("sensor.faults",))
+SCENARIO_FAULTS = faults(
+    Scenario, SCENARIO_RANGES, SCENARIO_LISTS, skip=("sensor.faults", "compare")
+)
 # A name may have any form that is not empty; null means a default.
 MECHANISM_FAULTS = faults(MechanismSpec, MECHANISM_RANGES, MECHANISM_LISTS, skip=("legs",))
 NETWORK_LISTS: dict[str, list[Any]] = {

@@ -34,6 +34,7 @@ from stewart_drake.scenario.link import (
 )
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.studies import link_bound
+from stewart_drake.studies.runs import Outcome
 
 Array = NDArray[np.float64]
 PERIOD = 0.1
@@ -405,18 +406,21 @@ def test_a_network_has_the_delay_of_bound_and_repetitions() -> None:
 def test_the_study_finds_the_best_bound_and_the_loss_that_is_borne(monkeypatch: Any) -> None:
     """With runs whose outcome is known: best at 0.4 s, and nothing completes above 20 % lost."""
 
-    def jobs(wanted: Any, *_: Any, **more: Any) -> dict[str, Any]:
+    def jobs(wanted: Any, *_: Any, **more: Any) -> None:
         more["progress"](len(wanted), len(wanted))
-        return {key: arguments[0] for key, arguments in wanted.items()}
 
-    def outcome(run: sd.Scenario) -> tuple[str, float, float]:
+    def outcome(run: sd.Scenario) -> Outcome:
         assert isinstance(run.link, NetworkConfig) and run.link.playout is not None
         if run.link.loss > 0.2:
-            return "left_workspace", np.nan, 1.0
-        return "completed", 1 + abs(run.link.playout - 0.4) + 0.01 * run.link.seed, np.nan
+            return Outcome("left_workspace", "left", time=1.0)
+        return Outcome("completed", error=1 + abs(run.link.playout - 0.4) + 0.01 * run.link.seed)
+
+    def done(wanted: Any, _: Any) -> dict[str, Any]:
+        return {key: arguments[0] for key, arguments in wanted.items()}
 
     monkeypatch.setattr(link_bound, "run_jobs", jobs)
-    monkeypatch.setattr(link_bound, "read_cell", outcome)
+    monkeypatch.setattr(link_bound, "finished", done)
+    monkeypatch.setattr(link_bound, "read_outcome", outcome)
     told = []
     network = ("link.kind=network", "link.low=0.2", "link.high=0.45")
     study = link_bound.study_link(

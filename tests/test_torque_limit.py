@@ -21,7 +21,8 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_yaml
-from stewart_drake.studies.uncertainty import Ranges, draw, scales_of
+from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.uncertainty import draw, scales_of
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]
@@ -232,10 +233,10 @@ def test_drawn_limits_are_never_above_the_motors(tmp_path: Path) -> None:
     """0.66 N m are commanded, so that limits of up to 1.97 would be drawn."""
     sc = scenario(paper_with(tmp_path, 0.8))
     scales = scales_of(assemble(sc), 0.6559)
-    limits = [draw(Ranges(), scales, sc, 0, i).torque_limit or 0.0 for i in range(50)]
+    limits = [draw(Ranges(), scales, sc, 0, i)["torque_limit"] for i in range(50)]
     assert max(limits) == 0.8 > min(limits) > 0.6559
-    assert draw(Ranges(torque_limit=None), scales, sc, 0, 0).torque_limit is None
+    assert draw(Ranges(torque_limit=None), scales, sc, 0, 0)["torque_limit"] is None
     sc.actuator.torque_limit = "none"
     scales = scales_of(assemble(sc), 0.6559)
-    limits = [draw(Ranges(), scales, sc, 0, i).torque_limit or 0.0 for i in range(50)]
+    limits = [draw(Ranges(), scales, sc, 0, i)["torque_limit"] for i in range(50)]
     assert 0.8 < max(limits) < 3 * 0.6559

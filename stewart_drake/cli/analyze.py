@@ -26,7 +26,7 @@ from stewart_drake.cli.common import (
     silence,
 )
 from stewart_drake.report.terminal import count_bar, echo, working
-from stewart_drake.studies.range_units import RANGE_UNITS
+from stewart_drake.studies.ranges import RANGE_UNITS
 
 if TYPE_CHECKING:
     from stewart_drake.report.page import Page, Provenance
@@ -194,8 +194,8 @@ def robustness(
     """
     from stewart_drake.report.robustness_page import robustness_page, robustness_table
     from stewart_drake.scenario.loading import load_scenario
+    from stewart_drake.studies.ranges import read_ranges
     from stewart_drake.studies.robustness import study_robustness
-    from stewart_drake.studies.uncertainty import read_ranges
 
     base = load_scenario(scenario, controller, ("plant.kind=exact", *(settings or ())))
     ranges = read_ranges(vary or ())

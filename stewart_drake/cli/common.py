@@ -5,7 +5,7 @@ import fcntl
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -81,7 +81,7 @@ def silence(text: str) -> None:
     """Print nothing."""
 
 
-def print_json(summary: dict[str, Any]) -> None:
+def print_json(summary: Mapping[str, Any]) -> None:
     """Print a summary as JSON, NaN as null."""
     from stewart_drake.files.jsonio import jsonable
 

@@ -14,7 +14,7 @@ delay it believes in, its model, prediction and the weights it starts with. What
 import math
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.loop.experiment import Experiment, compose_law, longest_wait
+from stewart_drake.loop.results import MarginSummary
 from stewart_drake.scenario.config import NetworkConfig
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
@@ -121,7 +122,7 @@ class ControllerMargin:
         return math.exp(most) if most < 700 else math.inf
 
     @property
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> MarginSummary:
         """What `summary.json` holds; a margin without a limit is infinite, null in the file."""
         m = self.margins
         return {

@@ -226,9 +226,14 @@ def waits_at_rest(scenario: Scenario) -> bool:
 
 
 def believed_delay(scenario: Scenario) -> Delay:
-    """The delay that the controller assumes; null means the true one."""
+    """The delay that the controller assumes; null means the true one.
+
+    When torques act that are sent over a network says the controller itself, unless it knows of no
+    delay.
+    """
     controller = scenario.controller
-    if controller.delay_steps is None:
+    says = isinstance(scenario.link, NetworkConfig) and controller.delay_steps != 0
+    if controller.delay_steps is None or says:
         return scenario.true_delay
     return Delay(controller.delay_steps, controller.delay_fraction or 0.0)
 
@@ -331,7 +336,7 @@ def longest_wait(scenario: Scenario) -> int:
 
 def _channel(scenario: Scenario, timeline: Timeline, waits: int) -> Channel:
     link, c = scenario.link, scenario.controller
-    if not isinstance(link, NetworkConfig) or c.delay_steps is not None:
+    if not isinstance(link, NetworkConfig) or c.delay_steps == 0:
         return Wire()
     rows = c.packet_repeats + c.packet_torques
     due = [timeline.eta + (row - c.packet_repeats) * c.period for row in range(rows)]

@@ -28,8 +28,8 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.delay_limits import study_delay
 from stewart_drake.studies.hautus import study_hautus
+from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.robustness import study_robustness
-from stewart_drake.studies.uncertainty import Ranges
 from stewart_drake.studies.workspace import study_workspace
 
 Results = SimulationResult | Mapping[str, SimulationResult]

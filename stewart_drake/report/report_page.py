@@ -224,7 +224,7 @@ def _row(label: str, name: str, run: SimulationResult, papers: bool) -> tuple[st
     if run.stopped is not None:
         leg = "" if run.stopped.leg is None else f", leg {run.stopped.leg}"
         outcome += f" at {run.stopped.time:.2f} s{leg}"
-    names = ("peak_torque", "peak_torque_applied", "rms_torque", "torque_variation")
+    torques = (s["peak_torque"], s["peak_torque_applied"], s["rms_torque"], s["torque_variation"])
     return (
         label,
         *([paper_error(name)] if papers else []),
@@ -232,7 +232,7 @@ def _row(label: str, name: str, run: SimulationResult, papers: bool) -> tuple[st
         number(s["delay_floor"]),
         outcome,
         number(s["cost"]),
-        *(number(s[name], 2) for name in names),
+        *(number(value, 2) for value in torques),
         number(s["controller_step_ms"]["median"], 2),
     )
 

@@ -118,7 +118,7 @@ class ControllerConfig:
         integral_weight: of the integrals beside the errors, which share w_Q.
         weight_scaling: `bryson` (by what the reference asks for) or `identity`.
         packet_torques: how many torques a packet holds, for the next one and further periods; over
-            a network, with `delay_steps` null.
+            a network, where `delay_steps` is not 0.
         packet_repeats: how many earlier torques it says again, each for a period more of delay.
         catch_up: blend onto the reference after a start from rest, s; 0 is none, null the shortest
             one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
@@ -363,6 +363,9 @@ class Scenario:
         """
         # Assignment is validated, but a list can also be changed in place.
         validate(Scenario, dataclasses.asdict(self), where)
+        for row, change in self.compare.items():
+            fields = {name: value for name, value in change.items() if name != "controller"}
+            validate(ControllerConfig, fields, f"{where}: compare.{row}")
         step = self.plant.time_step if self.plant.kind == "multibody" else None
         for problem in (
             self.reference.problem(),

@@ -17,9 +17,8 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.config import NetworkConfig, Scenario
 from stewart_drake.scenario.link import in_time, times_under_way, torque_missing, usual_bound
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.studies.delay_map import Progress, run_cell
-from stewart_drake.studies.jobs import finished, run_jobs
-from stewart_drake.studies.run_files import read_cell
+from stewart_drake.studies.jobs import Progress, finished, run_jobs
+from stewart_drake.studies.runs import read_outcome, run_scenario
 
 LOSSES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4)
 """Shares of the packets, looked at beside the scenario's own."""
@@ -185,15 +184,15 @@ def _simulated(
     with TemporaryDirectory() as folder:
         try:
             settings = scenario_to_dict(base)
-            paths = run_jobs(jobs, run_cell, folder, settings=settings, progress=tell)
+            run_jobs(jobs, run_scenario, folder, settings=settings, progress=tell)
         except KeyboardInterrupt:
-            paths, stopped = finished(jobs, folder), True
-        results = {key: read_cell(path) for key, path in paths.items()}
+            stopped = True
+        results = {key: read_outcome(path) for key, path in finished(jobs, folder).items()}
     cells = []
     for bound, loss in wanted:
         keys = [f"bound{bound:g}-loss{loss:g}-seed{seed}" for seed in range(runs)]
         there = [results[key] for key in keys if key in results]
-        errors = tuple(error for status, error, _ in there if status == "completed")
+        errors = tuple(one.error for one in there if one.status == "completed")
         lossy = replace(link, loss=loss)
         late = 1 - in_time(replace(link, loss=0.0), bound)
         missing = torque_missing(lossy, bound, c.packet_repeats, c.period)
