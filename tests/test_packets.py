@@ -316,15 +316,21 @@ def test_the_most_probable_content_is_believed() -> None:
         sent = channel.send(sent, plan, flying)
         flying = np.vstack([flying[1:], plan[:1]])
     assert sent.packets[-1, :, 0].tolist() == [13, 14, 24]
-    # Without any report row 1 of each packet is there more likely than not, row 0 is not.
+    # Without any report T_k comes with packet k or its repetition: 0.3 + 0.7 * 0.6 > 1/2.
     _, believed = channel.in_flight(sent, flying, timeline, None)
     assert believed[-5:, 0].tolist() == [10, 11, 12, 13, 14]
     # Nothing has come. T_4: packet 4 is there in time with (0.6 - 0.1) / (1 - 0.1) > 1/2. T_3:
-    # packet 4 with (0.3 - 0.1) / 0.9, packet 3 with (0.6 - 0.3) / 0.7, both < 1/2, packet 2, which
-    # had a plan for it, with (0.9 - 0.6) / 0.4 > 1/2. T_2: none; the buffer holds what acted last.
+    # packet 4 with (0.3 - 0.1) / 0.9 = 0.22, else packet 3 with (0.6 - 0.3) / 0.7 = 0.43, which
+    # make 0.56. T_2: no packet will be there; the buffer holds what acted last.
     nothing = Report(np.zeros(6, dtype=bool), np.full((3, 6), 7.0), 0)
     _, believed = channel.in_flight(sent, flying, timeline, nothing)
-    assert believed[-5:, 0].tolist() == [7, 7, 7, 22, 14]
+    assert believed[-5:, 0].tolist() == [7, 7, 7, 13, 14]
+    # A slower network. T_3: packets 4 and 3 with 0.06 + 0.94 * 0.29 = 0.33, packet 2, which had a
+    # plan for it, with 0.67 (0.9 - 0.4) / 0.6 = 0.56. T_4: 0.33, and the plan of packet 3 0.59.
+    chances = (0.0, 0.1, 0.15, 0.4, 0.9, 0.9)
+    slow = dataclasses.replace(channel, in_time=(0.15, 0.4, 0.9), arrived_by=chances)
+    _, believed = slow.in_flight(sent, flying, timeline, nothing)
+    assert believed[-5:, 0].tolist() == [7, 7, 7, 22, 23]
     # What a packet that has come says is certain.
     came = Report(np.array([False, True, False, False, False]), np.full((3, 6), 7.0), 0)
     _, believed = channel.in_flight(sent, flying, timeline, came)

@@ -140,8 +140,7 @@ class Packets:
         """See `Channel.in_flight`.
 
         T_{k-1-d} begins to act mu - 1 - d periods and eta0 from now. With a report that is m
-        periods old, all that began before it is known, d >= m + mu; the others are what the newest
-        packet has of them that will probably be there.
+        periods old, all that began before it is known, d >= m + mu; the others are `_expected`.
         """
         kept, flying, arrived = len(sent.packets), in_flight.copy(), sent.arrived.copy()
         since = min(sent.since + 1, kept) if report is None else min(report.age, kept)
@@ -164,20 +163,29 @@ class Packets:
     def _expected(
         self, packets: Array, arrived: NDArray[np.bool_], d: int, since: int
     ) -> Array | None:
-        """T_{k-1-d} as the newest packet has it that is there more likely than not, or None."""
-        kept = len(packets)
+        """What will most probably act as T_{k-1-d}; None for a dry buffer.
+
+        The newest packet that is there decides. With p_i the probability that packet i is, what it
+        says acts with p_i prod (1 - p) over the newer ones; repetitions say the same, and add up.
+        """
+        kept, left, chances = len(packets), 1.0, list[tuple[float, Array | None]]()
+        decided = 0.0
         for row in range(max(0, self.repeats - d), len(self.in_time)):
             i = row + 1 + d - self.repeats  # samples since the packet was sent
             if i > kept or np.isnan(packets[-i, row, 0]):
-                return None
-            here = self.in_time[row]
+                break
+            here = 1.0 if arrived[-i] else self.in_time[row]
             if since < kept and i > since and not arrived[-i]:
                 # Bayes: it had not arrived when the report was made.
                 before = self.arrived_by[i - since]
-                here = (here - before) / (1 - before)
-            if arrived[-i] or here > 0.5:
-                return packets[-i, row]
-        return None
+                here = max(0.0, (here - before) / (1 - before))
+            if row <= self.repeats:
+                decided += left * here
+                chances = [(decided, packets[-i, row])]
+            else:
+                chances.append((left * here, packets[-i, row]))
+            left *= 1 - here
+        return max([*chances, (left, None)], key=lambda chance: chance[0])[1]
 
     def send(self, sent: Sent, plan: Array, in_flight: Array) -> Sent:
         """See `Channel.send`."""
