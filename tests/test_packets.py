@@ -325,12 +325,18 @@ def test_the_most_probable_content_is_believed() -> None:
     nothing = Report(np.zeros(6, dtype=bool), np.full((3, 6), 7.0), 0)
     _, believed = channel.in_flight(sent, flying, timeline, nothing)
     assert believed[-5:, 0].tolist() == [7, 7, 7, 13, 14]
-    # A slower network. T_3: packets 4 and 3 with 0.06 + 0.94 * 0.29 = 0.33, packet 2, which had a
-    # plan for it, with 0.67 (0.9 - 0.4) / 0.6 = 0.56. T_4: 0.33, and the plan of packet 3 0.59.
+    # A slower network. T_3: packets 4 and 3 with 0.06 + 0.94 * 0.12 = 0.17, packet 2, which had a
+    # plan for it, with 0.83 (0.9 - 0.25) / 0.75 = 0.72, more than twice as much. T_4: packet 4 with
+    # 0.17, the plan of packet 3 with 0.83 (0.9 - 0.15) / 0.85 = 0.74.
+    chances = (0.0, 0.1, 0.15, 0.25, 0.9, 0.9)
+    slow = dataclasses.replace(channel, in_time=(0.15, 0.25, 0.9), arrived_by=chances)
+    _, believed = slow.in_flight(sent, flying, timeline, nothing)
+    assert believed[-5:, 0].tolist() == [7, 7, 7, 22, 23]
+    # 0.33 and 0.56 are not enough to change one's mind.
     chances = (0.0, 0.1, 0.15, 0.4, 0.9, 0.9)
     slow = dataclasses.replace(channel, in_time=(0.15, 0.4, 0.9), arrived_by=chances)
     _, believed = slow.in_flight(sent, flying, timeline, nothing)
-    assert believed[-5:, 0].tolist() == [7, 7, 7, 22, 23]
+    assert believed[-5:, 0].tolist() == [7, 7, 7, 13, 14]
     # What a packet that has come says is certain.
     came = Report(np.array([False, True, False, False, False]), np.full((3, 6), 7.0), 0)
     _, believed = channel.in_flight(sent, flying, timeline, came)

@@ -7,7 +7,7 @@ probably* play: averaging over what it might play is worse, as it will never pla
 """
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,10 @@ from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.signals import NUM_TORQUES
 
 Array = NDArray[np.float64]
+
+SURE: Final = 2.0
+"""Times as probable as what was decided is what the law changes its mind for. A change makes it
+correct what it thinks has gone wrong, and correct that again if it has not."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +171,7 @@ class Packets:
 
         The newest packet that is there decides. With p_i the probability that packet i is, what it
         says acts with p_i prod (1 - p) over the newer ones; repetitions say the same, and add up.
+        What was decided counts SURE times.
         """
         kept, left, chances = len(packets), 1.0, list[tuple[float, Array | None]]()
         decided = 0.0
@@ -181,7 +186,7 @@ class Packets:
                 here = max(0.0, (here - before) / (1 - before))
             if row <= self.repeats:
                 decided += left * here
-                chances = [(decided, packets[-i, row])]
+                chances = [(SURE * decided, packets[-i, row])]
             else:
                 chances.append((left * here, packets[-i, row]))
             left *= 1 - here
