@@ -1,4 +1,4 @@
-"""What an engineer reads before building anything: analyze hautus, delay, workspace, robustness."""
+"""What an engineer reads before building anything: analyze hautus, delay, link, and so on."""
 
 from collections.abc import Mapping
 from tempfile import TemporaryDirectory
@@ -57,6 +57,35 @@ def delay(
     delivery = Delivery(out, quiet, as_json)
     with count_bar("simulations", quiet) as progress:
         answer = _answer("delay", delivery, scenario, controller, settings, progress=progress)
+    return _deliver(answer, delivery, interrupted=answer.study.interrupted)
+
+
+@app.command()
+def link(
+    scenario: ScenarioName = "paper",
+    controller: Controller = None,
+    settings: Settings = None,
+    runs: Annotated[int, typer.Option(metavar="N", help="Seeds for each bound and loss.")] = 5,
+    out: Out = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> int:
+    """Which play-out bound suits a network, and what loss it bears.
+
+    Needs --set link.kind=network or a scenario with a network.
+    """
+    delivery = Delivery(out, quiet, as_json)
+    with count_bar("simulations", quiet) as progress:
+        answer = _answer(
+            "link",
+            delivery,
+            scenario,
+            controller,
+            settings,
+            typed={"runs": runs},
+            runs=runs,
+            progress=progress,
+        )
     return _deliver(answer, delivery, interrupted=answer.study.interrupted)
 
 

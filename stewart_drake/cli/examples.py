@@ -21,6 +21,7 @@ EXAMPLES: Final = {
     "model view": ("stewart-drake model view desktop",),
     "analyze hautus": ("stewart-drake analyze hautus paper --out out/hautus",),
     "analyze delay": ("stewart-drake analyze delay gravity --out out/delay",),
+    "analyze link": ("stewart-drake analyze link paper --set link.kind=network --out out/link",),
     "analyze workspace": ("stewart-drake analyze workspace paper --out out/workspace",),
     "analyze robustness": ("stewart-drake analyze robustness paper --out out/robustness",),
     "tune dataset": ("stewart-drake tune dataset paper --out out/data",),

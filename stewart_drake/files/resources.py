@@ -10,12 +10,13 @@ from typing import Final, Literal
 
 from stewart_drake.files.errors import ConfigError
 
-Kind = Literal["mechanism", "scenario", "controller", "weights"]
+Kind = Literal["mechanism", "scenario", "controller", "overlay", "weights"]
 
 KINDS: Final[dict[Kind, str]] = {
     "mechanism": "mechanisms",
     "scenario": "scenarios",
     "controller": "controllers",
+    "overlay": "overlays",
     "weights": "tuner weights",
 }
 """What there is of shipped data, and its plural."""
@@ -25,6 +26,7 @@ _PLACES: Final[dict[Kind, tuple[str, str]]] = {
     "mechanism": ("models", ".yaml"),
     "scenario": ("diagrams/scenarios", ".yaml"),
     "controller": ("diagrams/controllers", ".yaml"),
+    "overlay": ("diagrams/overlays", ".yaml"),
     "weights": ("models/weights", ".json"),
 }
 

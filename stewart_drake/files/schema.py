@@ -55,7 +55,25 @@ def _members(hint: Any) -> dict[str, Any]:
 def field_names(hint: Any) -> list[str]:
     """Of a section, or of all its kinds; none where the annotation is of no section."""
     owners = list(kinds(hint).values()) or [_alternative(hint, _is_section)]
-    return [name for owner in owners if owner for name in typing.get_type_hints(owner)]
+    return [
+        spelling(owner, name) for owner in owners if owner for name in typing.get_type_hints(owner)
+    ]
+
+
+def spelling(owner: Any, name: str) -> str:
+    """What a field is called in files: its alias, where Python keeps the word to itself."""
+    field = getattr(owner, "__pydantic_fields__", {}).get(name)
+    return (field and field.alias) or name
+
+
+def plain(value: Any) -> Any:
+    """A dataclass, and what it holds, as mappings in the spelling of files."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = (field.name for field in dataclasses.fields(value))
+        return {spelling(type(value), name): plain(getattr(value, name)) for name in fields}
+    if isinstance(value, dict):
+        return {key: plain(one) for key, one in value.items()}
+    return [plain(one) for one in value] if isinstance(value, list) else value
 
 
 def field_hint(owner: Any, name: str) -> Any:
@@ -63,8 +81,10 @@ def field_hint(owner: Any, name: str) -> Any:
     owner = _alternative(owner, _is_section)  # which may also be null
     if owner is None:
         return None
-    marked = typing.get_type_hints(owner, include_extras=True).get(name)
-    return marked if kinds(marked) else typing.get_type_hints(owner).get(name)
+    names = {spelling(owner, own): own for own in typing.get_type_hints(owner)}
+    own = names.get(name, name)
+    marked = typing.get_type_hints(owner, include_extras=True).get(own)
+    return marked if kinds(marked) else typing.get_type_hints(owner).get(own)
 
 
 def place_of(type_: Any, loc: Sequence[int | str]) -> tuple[tuple[int | str, ...], Any]:

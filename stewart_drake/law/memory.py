@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.law.belief import Belief
+from stewart_drake.law.channel import Sent
 
 Array = NDArray[np.float64]
 
@@ -65,6 +66,8 @@ class Memory:
         torque: (6,) last torque as asked for, which may be beyond the limit.
         weights: (2,) w_Q and w_R that were used.
         counts: see `Counts`.
+        plan: (N, 6) torques that were sent last, the first of them the last in flight.
+        sent: what the channel remembers.
     """
 
     in_flight: Array
@@ -76,3 +79,5 @@ class Memory:
     torque: Array
     weights: Array
     counts: Counts
+    plan: Array
+    sent: Sent

@@ -38,6 +38,8 @@ SMALL = 0.1
 """A correction so many standard deviations long needs no second look."""
 KNOWN = 0.01
 """A parameter is known when its standard deviation is this share of the prior's."""
+LEARNT = 0.3
+"""As KNOWN, for parameters good enough to go on with over a few periods without measurements."""
 PATIENCE = 3
 """After so many outliers in a row that bear each other out the plate must be where they say."""
 
@@ -94,8 +96,9 @@ class ParameterFilter:
         model goes on alone. The plate may have been moved by hand, though: outliers that follow
         from one another as the model has it tell of a plate, not of a broken sensor, and after
         PATIENCE of them, or where the model cannot go on, the measurement is believed. So is the
-        first one that fits after PATIENCE or more periods without any, if the parameters were not
-        known by then: linearised along a way that is only guessed, the covariance is worth nothing.
+        first one that fits after PATIENCE or more periods without any, if little of the parameters
+        was known by then: linearised along a way that is only guessed, the covariance is worth
+        nothing.
         """
         if measurement is None:
             alone = self._attempt(estimate, period, None)
@@ -103,7 +106,7 @@ class ParameterFilter:
         y = measurement.values
         after = self._attempt(estimate, period, y)
         if after is not None:
-            lost = estimate.unseen >= PATIENCE and not self._known(estimate)
+            lost = estimate.unseen >= PATIENCE and not self._known(estimate, LEARNT)
             return self.start(measurement, estimate.parameters) if lost else after
         alone = self._attempt(estimate, period, None)
         outliers = 1
@@ -124,8 +127,8 @@ class ParameterFilter:
     def _no_outlier(self) -> Array:
         return np.full(self.sensing.size, np.nan)
 
-    def _known(self, estimate: Estimate) -> bool:
-        return bool(np.all(estimate.parameter_std <= KNOWN * self.settings.parameters.std))
+    def _known(self, estimate: Estimate, share: float = KNOWN) -> bool:
+        return bool(np.all(estimate.parameter_std <= share * self.settings.parameters.std))
 
     def _attempt(self, estimate: Estimate, period: Period, y: Array | None) -> Estimate | None:
         """`advance` for values (m,) that fit; None for an outlier, or without a finite result."""

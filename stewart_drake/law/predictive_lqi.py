@@ -12,13 +12,15 @@ dynamics through the queue. Torques enter the linear parts as deviations from th
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.law.belief import Belief
+from stewart_drake.law.channel import Channel, Report, Wire
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
@@ -86,6 +88,8 @@ class PredictiveLqi:
         feedforward: what the reference takes.
         model: of the error, for the gain.
         cost: what the gain minimises.
+        channel: how torques get to the motors.
+        kept: how many torques are remembered beyond those of the delay, for late measurements.
     """
 
     timeline: Timeline
@@ -96,6 +100,8 @@ class PredictiveLqi:
     feedforward: Feedforward
     model: DesignModel
     cost: QuadraticCost
+    channel: Channel = field(default_factory=Wire)
+    kept: int = 0
 
     @cached_property
     def preview_times(self) -> Array:
@@ -105,7 +111,11 @@ class PredictiveLqi:
     def times_for(self, timeline: Timeline) -> Array:
         """Times (p,) from now, s, at which the reference must be known; some may be negative."""
         nodes = self.feedforward.nodes(timeline, self.predictor.pending(timeline))
-        return np.concatenate([[0.0], self.predictor.samples(timeline), nodes])
+        at = np.concatenate([[0.0], self.predictor.samples(timeline)])
+        further = (
+            np.append(at[-1], nodes) + timeline.period * i for i in range(1, self.channel.torques)
+        )
+        return np.concatenate([at, nodes, *further])
 
     def warm_up(self) -> None:
         """Take two samples at home, so that no later one waits for functions to be compiled."""
@@ -128,8 +138,9 @@ class PredictiveLqi:
                 of them than that for an observer that may come to believe in a longer one.
         """
         nothing = np.zeros(NUM_TORQUES)
+        in_flight = np.vstack([np.zeros((1 + self.kept, NUM_TORQUES)), queue])
         return Memory(
-            in_flight=np.vstack([nothing, queue]),
+            in_flight=in_flight,
             belief=self.observer.start(self.timeline, self.sensing, self.plant),
             measurement=np.full(self.sensing.size, np.nan),
             error=np.zeros(NUM_COORDINATES),
@@ -138,11 +149,18 @@ class PredictiveLqi:
             torque=queue[-1] if len(queue) else nothing,
             weights=np.full(2, np.nan),
             counts=Counts(),
+            plan=np.tile(nothing, (self.channel.torques, 1)),
+            sent=self.channel.start(),
         )
 
     @np.errstate(over="ignore", invalid="ignore")  # its outcome is checked and counted instead
     def step(
-        self, memory: Memory, measurement: Measurement, motion: Motion, weights: Array
+        self,
+        memory: Memory,
+        measurement: Measurement,
+        motion: Motion,
+        weights: Array,
+        report: Report | None = None,
     ) -> Memory:
         """One sample.
 
@@ -151,6 +169,7 @@ class PredictiveLqi:
             measurement: of `sensing`; the model stands in for one that has a fault.
             motion: to follow. It is asked once, for `times_for` the delay that is believed in.
             weights: (2,) w_Q and w_R.
+            report: that came with the measurement, or None.
 
         Returns:
             The new memory; its torque (6,) is finite. What limits it stands behind the law: in
@@ -159,6 +178,10 @@ class PredictiveLqi:
         Raises:
             ValueError: a shape that does not fit. What numbers can do is survived and counted.
         """
+        sent, in_flight = self.channel.in_flight(
+            memory.sent, memory.in_flight, memory.belief.timeline, report
+        )
+        memory = replace(memory, in_flight=in_flight)
         belief = self.observer.observe(
             memory.belief, measurement, memory.in_flight, self.sensing, self.plant
         )
@@ -166,7 +189,8 @@ class PredictiveLqi:
         as_assumed = belief.timeline == self.timeline
         times = self.preview_times if as_assumed else self.times_for(belief.timeline)
         preview = motion(times)
-        wanted, nodes = preview[:samples, :NUM_STATE], preview[samples:]
+        nodes_end = samples + 2 * (self.predictor.pending(belief.timeline) + 3)
+        wanted, nodes = preview[:samples, :NUM_STATE], preview[samples:nodes_end]
         if not belief.has_state:  # nothing else to go on with
             belief = belief.at(wanted[0])
         error = belief.state[POSE] - wanted[0, POSE]
@@ -185,6 +209,7 @@ class PredictiveLqi:
             torque = memory.torque
         limited = self.plant.motors.let_through(torque)
         saturated = bool(np.any(limited != torque))
+        plan = self._plan(limited, belief, ahead, queue, gain, preview[nodes_end:])
         return Memory(
             in_flight=np.vstack([memory.in_flight[1:], limited]),
             belief=belief,
@@ -200,7 +225,39 @@ class PredictiveLqi:
                 "nonfinite_torque" if nonfinite else None,
                 "saturated_steps" if saturated else None,
             ),
+            plan=plan,
+            sent=self.channel.send(sent, plan, memory.in_flight),
         )
+
+    def _plan(
+        self, first: Array, belief: Belief, ahead: Ahead, queue: Array, gain: Array, preview: Array
+    ) -> Array:
+        """(N, 6) this sample's torque, and what further ones would be if all went as predicted.
+
+        The nominal plant goes on from where the prediction ended, period by period, and is
+        regulated by the same gain. `preview` ((N - 1) (1 + s), 18) is the reference there.
+        """
+        plan, timeline, plant = [first], belief.timeline, self.plant
+        state, error, integral = ahead
+        pending = queue[len(queue) - self.predictor.pending(timeline) :]
+        for rows in np.split(preview, self.channel.torques - 1) if len(preview) else ():
+            flying = np.vstack([pending, plan[-1:]])
+            acting = timeline.next_period(flying)
+            state, pending = plant.predict(state, acting, belief.parameters)[-1], flying[1:]
+            before, error = error, state - rows[0, :NUM_STATE]
+            if not plant.motors.reached(acting.torques):
+                integral = integral + timeline.period / 2 * (before[POSE] + error[POSE])
+            held, changes = self.feedforward.held(rows[1:], plant.dynamics, belief.parameters)
+            torque = held[-1]
+            with suppress(UnreachablePoseError, ArithmeticError, np.linalg.LinAlgError):
+                model = self.model.at(state, torque, belief.parameters, plant)
+                offset = self.feedforward.offset(changes, model.B[RATES], timeline)
+                late = (pending - held[:-1]).ravel()
+                seen = np.concatenate([error - offset, self.cost.sees(integral), late])
+                torque = torque - gain @ seen if _is_there(gain) else torque
+            usable = bool(np.all(np.isfinite(torque)))
+            plan.append(plant.motors.let_through(torque) if usable else plan[-1])
+        return np.array(plan)
 
     def _design(
         self,

@@ -65,7 +65,7 @@ def _finer(scenario: Scenario) -> Iterator[float]:
     for exponent, digit in product(range(-2, -7, -1), (5, 2, 1)):
         step = float(f"{digit}e{exponent}")
         if step < sc.plant.time_step and not step_problem(
-            step, sc.controller.period, sc.delay.fraction
+            step, sc.controller.period, sc.true_delay.fraction
         ):
             yield step
 

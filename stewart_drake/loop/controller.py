@@ -15,6 +15,8 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from stewart_drake.law.channel import Packets, Report
+from stewart_drake.law.late import LateObserver
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.predictive_lqi import PredictiveLqi, Preview
@@ -42,6 +44,11 @@ HELD: Final[dict[str, Callable[[Memory], Array]]] = {
 """Signal of the table `scenario.signals.SIGNALS` -> what the controller's memory has of it."""
 
 
+def reported(kept: int) -> int:
+    """Periods that a report tells of, for a law that keeps so many torques beyond its delay."""
+    return kept + 1
+
+
 class Sample(NamedTuple):
     """What one step of the law left behind."""
 
@@ -66,6 +73,9 @@ class DelayLqiController(LeafSystem):
     | measurement | input | 12 | rad, m, rad/s, m/s | read every period; NaN is lost |
     | preview | input | 18 p | rad, m and time derivatives | read every period |
     | weights | input | 2 | w_Q, w_R | read every period |
+    | age | input | 1 | s, whole periods | of the measurement; only with a `LateObserver` |
+    | report | input | 7 h | as of `PlayoutBuffer`, NaN is lost | only with a channel of packets |
+    | plan | output | 6 (r + N) | N m, the packet to be sent | the same; direct feedthrough |
     | torque | output | 6 | N m | direct feedthrough |
     | torque_commanded | output | 6 | N m | held |
     | integral | output | 6 | rad s, m s | held |
@@ -90,6 +100,11 @@ class DelayLqiController(LeafSystem):
         preview_size = NUM_REFERENCE * len(self._times)
         self._preview = self.DeclareVectorInputPort("preview", preview_size)
         self._weights = self.DeclareVectorInputPort("weights", len(WEIGHTS))
+        late = isinstance(law.observer, LateObserver)
+        self._age = self.DeclareVectorInputPort("age", 1) if late else None
+        sends = isinstance(law.channel, Packets)
+        size = reported(law.kept) * (1 + NUM_TORQUES)
+        self._report = self.DeclareVectorInputPort("report", size) if sends else None
         memory_ticket = self.abstract_state_ticket(self._memory)
         self._step = self.DeclareCacheEntry(
             "step",
@@ -99,6 +114,9 @@ class DelayLqiController(LeafSystem):
         self.DeclareVectorOutputPort(
             "torque", NUM_TORQUES, weak(self._torque), {self._step.ticket()}
         )
+        if sends:
+            size = first.memory.sent.packets[0].size
+            self.DeclareVectorOutputPort("plan", size, weak(self._plan), {self._step.ticket()})
         for port, signal in ports_of("controller").items():
             part = HELD[signal.name]  # whose size is the law's: its parameters, what it senses
             size = len(part(first.memory))
@@ -119,12 +137,30 @@ class DelayLqiController(LeafSystem):
 
     def _calc_step(self, context: Context, result: AbstractValue) -> None:
         reference = np.reshape(np.asarray(self._preview.Eval(context)), (-1, NUM_REFERENCE))
-        measurement = Measurement.of(np.asarray(self._measurement.Eval(context)))
+        age = 0.0
+        if self._age is not None:
+            age = float(np.asarray(self._age.Eval(context))[0])
+        measurement = Measurement.of(np.asarray(self._measurement.Eval(context)), age)
         weights = np.asarray(self._weights.Eval(context))
         memory, preview = self.memory(context), Preview(self._times, reference)
+        report = self._reported(context, age)
         started = time.perf_counter()
-        after = self._law.step(memory, measurement, preview, weights)
+        after = self._law.step(memory, measurement, preview, weights, report)
         result.set_value(Sample(after, time.perf_counter() - started))
+
+    def _reported(self, context: Context, age: float) -> Report | None:
+        if self._report is None or not self._report.HasValue(context):
+            return None
+        values = np.asarray(self._report.Eval(context))
+        number = len(values) // (1 + NUM_TORQUES)
+        if np.any(np.isnan(values)):
+            return None
+        acted = values[number:].reshape(number, NUM_TORQUES)
+        return Report(values[:number] > 0, acted, round(age / self._law.timeline.period))
+
+    def _plan(self, context: Context, output: BasicVector) -> None:
+        sample: Any = self._step.Eval(context)
+        output.SetFromVector(sample.memory.sent.packets[-1].ravel())
 
     def _torque(self, context: Context, output: BasicVector) -> None:
         sample: Any = self._step.Eval(context)

@@ -27,8 +27,9 @@ from stewart_drake.law.linear_loop import LinearLoop, Margins, law_gain, worst_m
 from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError
-from stewart_drake.loop.experiment import Experiment, compose_law
+from stewart_drake.loop.experiment import Experiment, compose_law, longest_wait
 from stewart_drake.loop.results import MarginSummary
+from stewart_drake.scenario.config import NetworkConfig
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     NUM_TORQUES,
@@ -149,14 +150,18 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
     ]
     poles = [fastest_pole(model.A) for model in models]
     fastest = int(np.argmax(poles)) if poles else 0
-    queue = max(sc.delay.steps + 1, law.timeline.queue_length)
+    queue = max(sc.true_delay.steps + 1, law.timeline.queue_length)
     rows = 12 + 6 * law.cost.integrates + 6 * queue
     radius, time, margins = math.nan, math.nan, Margins(*[math.nan] * 4)
     problem, loops = "", list[LinearLoop]()
     if not all(inside):
         problem = "the true machine does not reach all of the reference"
+    elif isinstance(sc.link, NetworkConfig) or longest_wait(sc):
+        problem = "its packets or measurements do not all take the same time"
     elif rows > _LARGEST:
-        problem = f"with {sc.delay.steps} periods of delay it has {rows} states, too many to judge"
+        problem = (
+            f"with {sc.true_delay.steps} periods of delay it has {rows} states, too many to judge"
+        )
     else:
         every = math.ceil((max(rows, _COSTLY) / _COSTLY) ** 3)
         chosen = times[:: min(every, INSTANTS // _FEWEST)]

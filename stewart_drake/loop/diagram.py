@@ -17,7 +17,9 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.controller import DelayLqiController
+from stewart_drake.law.channel import Channel, Packets, Wire
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.loop.controller import DelayLqiController, reported
 from stewart_drake.loop.delay_chain import DelayChain
 from stewart_drake.loop.density import DensityWindow
 from stewart_drake.loop.exact import ExactPlant
@@ -29,19 +31,30 @@ from stewart_drake.loop.experiment import (
     motion_scale,
     torques_in_flight,
 )
+from stewart_drake.loop.late_measurements import LateMeasurements
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
 from stewart_drake.loop.own_controller import SampledController
 from stewart_drake.loop.platforms import add_to_torque
+from stewart_drake.loop.playout import PlayoutBuffer
 from stewart_drake.loop.reference import Reference
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.start_check import StartCheck
 from stewart_drake.loop.tuner import AnnTuner
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.loop.varying_delay import VaryingDelay, declare_constant
+from stewart_drake.scenario.config import NetworkConfig, Scenario
+from stewart_drake.scenario.link import (
+    measurement_times,
+    number_sent,
+    packet_times,
+    torque_delays,
+)
 from stewart_drake.scenario.signals import (
     BIAS,
     NUM_TORQUES,
+    PACKETS,
     POSE,
     RATES,
+    SIGNALS,
     exported_ports,
 )
 
@@ -60,7 +73,8 @@ class ClosedLoop(Diagram):
     `disturbance`, `disturbed_torque`. Output ports: `state`, `reference`,
     `torque_commanded` (what the law asks for), `torque_applied` (what arrives of it: within the
     motors' limit, late, before the bias), `integral`, `weights_used`, `parameters`,
-    `parameter_std`, `density`, `measurement` (held, as the controller read it), `state_estimate`.
+    `parameter_std`, `density`, `measurement` (held, as the controller read it), `state_estimate`,
+    `delay_true` (of the torque sent last), `packets`.
 
     Attributes:
         experiment: what it was built from.
@@ -105,11 +119,17 @@ def build_closed_loop(
     experiment.own.claim()
     builder = DiagramBuilder()
     _add_surroundings(builder, experiment, meshcat)
+    channel: Channel = Wire()
+    reports, catch_up = 1, 0.0
     if "controller" in experiment.own.systems:
-        catch_up = 0.0
         _add_own_controller(builder, experiment)
     else:
-        catch_up = _add_law(builder, experiment)
+        law, catch_up = _add_law(builder, experiment)
+        channel, reports = law.channel, reported(law.kept)
+    link = _link(experiment, channel, reports)
+    limit = np.full(link.GetInputPort("commanded").size(), experiment.torque_limit)
+    builder.AddNamedSystem("saturation", Saturation(-limit, limit))
+    builder.AddNamedSystem("delay_chain", link)
     _connect_loop(builder, experiment)
     loop = ClosedLoop()
     builder.BuildInto(loop)
@@ -123,15 +143,10 @@ def _add_surroundings(
 ) -> None:
     """Everything but reference and controller."""
     sc = experiment.scenario
-    period, steps, fraction = sc.controller.period, sc.delay.steps, sc.delay.fraction
+    period = sc.controller.period
     noise, s, own = np.array(sc.sensor.noise_std), sc.sensor, experiment.own.systems
     sensor = Sensor(noise, s.seed, period, s.faults, motion_scale(experiment))
     builder.AddNamedSystem("sensor", own.get("sensor", sensor))
-    limit = np.full(NUM_TORQUES, experiment.torque_limit)
-    builder.AddNamedSystem("saturation", Saturation(-limit, limit))
-    queue = torques_in_flight(experiment, sc.true_delay)
-    chain = DelayChain(period, steps, fraction, queue)
-    builder.AddNamedSystem("delay_chain", own.get("link", chain))
     builder.AddNamedSystem("torque_bias", add_to_torque(np.array(sc.plant.torque_bias)))
     builder.AddNamedSystem("plant", _plant(experiment, meshcat))
     kind = "magnitude" if experiment.network is None else experiment.network.density
@@ -148,13 +163,17 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
         return builder.GetSubsystemByName(target).GetInputPort(port)
 
     saturation, bias = (builder.GetSubsystemByName(name) for name in ("saturation", "torque_bias"))
-    builder.Connect(out("sensor", "measurement"), into("controller", "measurement"))
-    builder.Connect(out("controller", "torque"), saturation.get_input_port())
+    measured = _measured(builder, experiment)
+    builder.Connect(measured, into("controller", "measurement"))
+    if "controller" in experiment.own.systems:
+        builder.Connect(measured, into("own_controller", "measurement"))
+    sends = builder.GetSubsystemByName("controller").HasOutputPort("plan")
+    builder.Connect(out("controller", "plan" if sends else "torque"), saturation.get_input_port())
     builder.Connect(saturation.get_output_port(), into("delay_chain", "commanded"))
     builder.Connect(out("delay_chain", "torque"), bias.get_input_port())
     _disturb(builder, experiment, bias.get_output_port())
     builder.Connect(out("plant", "state"), into("sensor", "state"))
-    builder.Connect(out("sensor", "measurement"), into("density", "measurement"))
+    builder.Connect(measured, into("density", "measurement"))
     builder.Connect(out("reference", "reference"), into("density", "reference"))
     builder.Connect(out("controller", "torque"), into("density", "torque"))
     if builder.HasSubsystemNamed("tuner"):
@@ -163,11 +182,46 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
         builder.AddNamedSystem("start_check", StartCheck(experiment.start))
         builder.Connect(out("plant", "state"), into("start_check", "state"))
     for name, (source, port) in exported_ports().items():
-        builder.ExportOutput(out(source, port), name)
+        if builder.GetSubsystemByName(source).HasOutputPort(port):
+            builder.ExportOutput(out(source, port), name)
+        else:  # of a system of one's own
+            size = sum(s.size for s in SIGNALS.values() if s.exported == name)
+            unknown = ConstantVectorSource(np.full(size, np.nan))
+            builder.AddNamedSystem(f"no_{name}", unknown)
+            builder.ExportOutput(unknown.get_output_port(), name)
 
 
-def _add_law(builder: DiagramBuilder, experiment: Experiment) -> float:
-    """The shipped controller behind its reference and weights; the length of its catch-up, s."""
+def _measured(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
+    """Where the controller has its measurements from: the sensor, or what they are delayed by."""
+    sc, controller = experiment.scenario, builder.GetSubsystemByName("controller")
+    measured = builder.GetSubsystemByName("sensor").GetOutputPort("measurement")
+    link = builder.GetSubsystemByName("delay_chain")
+    report = link.GetOutputPort("report") if link.HasOutputPort("report") else None
+    times = measurement_times(sc)
+    if np.any(times != 0):
+
+        def late(name: str, port: OutputPort) -> System:
+            way = LateMeasurements(sc.controller.period, times, port.size())
+            builder.AddNamedSystem(name, way)
+            builder.Connect(port, way.GetInputPort("measured"))
+            return way
+
+        way = late("late_measurements", measured)
+        measured = way.GetOutputPort("measurement")
+        if controller.HasInputPort("age"):
+            builder.Connect(way.GetOutputPort("age"), controller.GetInputPort("age"))
+        if report is not None:
+            report = late("late_report", report).GetOutputPort("measurement")
+    if report is not None and controller.HasInputPort("report"):
+        link_config = sc.link
+        assert isinstance(link_config, NetworkConfig)
+        if link_config.acknowledged:
+            builder.Connect(report, controller.GetInputPort("report"))
+    return measured
+
+
+def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[PredictiveLqi, float]:
+    """The shipped controller behind its reference and weights; its law, and its catch-up, s."""
     law, planned, catch_up = control_law(experiment)
     reference = builder.AddNamedSystem(
         "reference", Reference(experiment.reference, planned, law.preview_times)
@@ -178,7 +232,7 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> float:
     )
     builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
     builder.Connect(weights, controller.GetInputPort("weights"))
-    return catch_up
+    return law, catch_up
 
 
 def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None:
@@ -195,8 +249,6 @@ def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None
         "controller", SampledController(sc.controller.period, experiment.torque_limit)
     )
     builder.Connect(system.GetOutputPort("torque"), sampled.GetInputPort("own_torque"))
-    sensor = builder.GetSubsystemByName("sensor")
-    builder.Connect(sensor.GetOutputPort("measurement"), system.GetInputPort("measurement"))
     if system.HasInputPort("reference"):
         builder.Connect(reference.GetOutputPort("reference"), system.GetInputPort("reference"))
 
@@ -233,6 +285,36 @@ def _connect_tuner(builder: DiagramBuilder, tuner: System) -> None:
         if tuner.HasInputPort(name):
             told = builder.GetSubsystemByName(source).GetOutputPort(name)
             builder.Connect(told, tuner.GetInputPort(name))
+
+
+def _link(experiment: Experiment, channel: Channel, reports: int) -> System:
+    """What is between limit and motors, for a law's channel and reports of so many periods."""
+    own = experiment.own.systems.get("link")
+    if own is not None:
+        if isinstance(experiment.scenario.link, NetworkConfig):
+            raise ConfigError("link.kind: got 'network' with a link of your own; expected 'wire'")
+        return own
+    sc, delay = experiment.scenario, experiment.scenario.true_delay
+    period, queue = sc.controller.period, torques_in_flight(experiment, delay)
+    if isinstance(sc.link, NetworkConfig):
+        repeats = channel.repeats if isinstance(channel, Packets) else 0
+        times = packet_times(sc.link, number_sent(sc.duration, period), sc.link.seed)
+        return PlayoutBuffer(
+            period,
+            times,
+            delay,
+            queue,
+            rows=repeats + channel.torques,
+            repeats=repeats,
+            dry=sc.link.dry,
+            history=reports,
+        )
+    if sc.delay.constant:
+        chain = DelayChain(period, delay.steps, delay.fraction, queue)
+        declare_constant(chain, "delay", np.array([sc.eta]))  # for the record alone
+        declare_constant(chain, "packets", np.full(len(PACKETS), np.nan))
+        return chain
+    return VaryingDelay(period, torque_delays(sc), delay, queue)
 
 
 def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | MultibodyStewart:

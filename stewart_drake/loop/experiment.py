@@ -12,6 +12,7 @@ from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
 from stewart_drake.law.catch_up import plan_catch_up
+from stewart_drake.law.channel import Channel, Packets, Wire
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import DesignModel, MultibodyModel, PaperModel
 from stewart_drake.law.feedforward import (
@@ -21,6 +22,7 @@ from stewart_drake.law.feedforward import (
     NoFeedforward,
 )
 from stewart_drake.law.filter_settings import filter_settings
+from stewart_drake.law.late import LateObserver
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import NoObserver, Observer, ParameterObserver
@@ -40,8 +42,9 @@ from stewart_drake.loop.own import NOTHING, Own, take
 from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.config import AnnTunerConfig, Scenario
+from stewart_drake.scenario.config import AnnTunerConfig, NetworkConfig, Scenario
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.link import in_time, times_under_way
 from stewart_drake.scenario.signals import POSITION
 from stewart_drake.scenario.trajectories import evaluate, make_reference, moved, peak_to_peak
 from stewart_drake.tuner.network import DEFAULT, Network, load_network
@@ -50,6 +53,12 @@ Array = NDArray[np.float64]
 
 GENTLE = 3.0
 """Torques up to so many times the reference's are predicted with the usual steps."""
+_MOST = 0.999
+"""Share of the measurements that are waited for."""
+_PATIENCE = 10
+"""Periods by which a measurement may be later than that, or lost, before the model goes on."""
+_REPORTS = 10
+"""Reports in a row that may be lost without losing what they said."""
 REACH_CHECK_PERIOD = 0.02
 """s between the instants at which a reference is checked against the workspace."""
 
@@ -217,9 +226,14 @@ def waits_at_rest(scenario: Scenario) -> bool:
 
 
 def believed_delay(scenario: Scenario) -> Delay:
-    """The delay that the controller assumes; null means the true one."""
+    """The delay that the controller assumes; null means the true one.
+
+    When torques act that are sent over a network says the controller itself, unless it knows of no
+    delay.
+    """
     controller = scenario.controller
-    if controller.delay_steps is None:
+    says = isinstance(scenario.link, NetworkConfig) and controller.delay_steps != 0
+    if controller.delay_steps is None or says:
         return scenario.true_delay
     return Delay(controller.delay_steps, controller.delay_fraction or 0.0)
 
@@ -291,17 +305,49 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
         "multibody": MultibodyModel(),
     }
     motors = TorqueLimit(experiment.torque_limit)
+    observer, waits = observers[c.estimator], longest_wait(sc)
+    if waits:
+        observer = LateObserver(observer, waits)
+    channel = _channel(sc, timeline, waits)
     law = PredictiveLqi(
         timeline=timeline,
         plant=NominalPlant(nominal, substeps, GENTLE * torque_scale, motors),
         sensing=StateSensing(np.array(sc.sensor.noise_std), motion),
-        observer=observers[c.estimator],
+        observer=observer,
         predictor=predictors[c.prediction],
         feedforward=feedforwards[c.feedforward],
         model=models[c.model],
         cost=quadratic_cost(experiment, peak_torque),
+        channel=channel,
+        kept=waits + (_REPORTS if isinstance(channel, Packets) else 0),
     )
     return experiment.own.revised(law)
+
+
+def longest_wait(scenario: Scenario) -> int:
+    """Periods for which the law waits for a late measurement; 0 where none comes late."""
+    sc, period = scenario, scenario.controller.period
+    back = sc.link.back if isinstance(sc.link, NetworkConfig) else None
+    if sc.sensor.delay == 0 and back is None:
+        return 0
+    longest = sc.sensor.delay + (0.0 if back is None else times_under_way(back).ppf(_MOST))
+    return math.ceil(longest / period - 1e-9) + _PATIENCE
+
+
+def _channel(scenario: Scenario, timeline: Timeline, waits: int) -> Channel:
+    link, c = scenario.link, scenario.controller
+    if not isinstance(link, NetworkConfig) or c.delay_steps == 0:
+        return Wire()
+    rows = c.packet_repeats + c.packet_torques
+    due = [timeline.eta + (row - c.packet_repeats) * c.period for row in range(rows)]
+    kept = rows + timeline.steps + waits + _REPORTS + 1
+    return Packets(
+        torques=c.packet_torques,
+        repeats=c.packet_repeats,
+        in_time=tuple(in_time(link, time) for time in due),
+        arrived_by=tuple(in_time(link, i * c.period) for i in range(kept)),
+        holds=link.dry == "hold",
+    )
 
 
 def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, float]:

@@ -7,6 +7,7 @@ from typing import Any, Final, NamedTuple
 from stewart_drake.report import (
     delay_document,
     hautus_document,
+    link_document,
     robustness_document,
     workspace_document,
 )
@@ -15,6 +16,7 @@ from stewart_drake.report.document import Document
 from stewart_drake.report.page import Provenance
 from stewart_drake.studies.delay_limits import study_delay
 from stewart_drake.studies.hautus import study_hautus
+from stewart_drake.studies.link_bound import study_link
 from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.studies.workspace import study_workspace
 
@@ -32,6 +34,7 @@ class Analysis(NamedTuple):
 ANALYSES: Final = {
     "delay": Analysis(study_delay, delay_document.document),
     "hautus": Analysis(study_hautus, hautus_document.document),
+    "link": Analysis(study_link, link_document.document),
     "workspace": Analysis(study_workspace, workspace_document.document),
     "robustness": Analysis(study_robustness, robustness_document.document),
 }

@@ -127,7 +127,7 @@ def loop_figure(study: DelayStudy) -> Figure:
         "tolerable error of the delay  [ms]": {"longer": [1e3 * m.later for m in loops],
                                                "shorter": [1e3 * m.earlier for m in loops]},
     }  # fmt: skip
-    own = study.basis.experiment.scenario.delay.steps
+    own = study.basis.experiment.scenario.true_delay.steps
     looks = ((BLUE, "o"), (ORANGE, "s"))
     for ax, (label, pair) in zip(axes, curves.items(), strict=True):
         for (name, values), (line, marker) in zip(pair.items(), looks, strict=True):
@@ -150,7 +150,7 @@ def map_figure(study: DelayStudy) -> Figure:
         floor = study.floors[cell.steps] if study.floor_applies else 0.0
         _draw_cell(ax, cell, x, y, floor)
     period = study.basis.experiment.scenario.controller.period
-    fraction = study.basis.experiment.scenario.delay.fraction
+    fraction = study.basis.experiment.scenario.true_delay.fraction
     ax.set_xticks(
         range(len(steps)), [f"{Delay(s, fraction).eta(period):.3g} s\nμ = {s}" for s in steps]
     )

@@ -73,8 +73,8 @@ def document(study: DelayStudy) -> Document:
     facts = {
         "mechanism": found.experiment.mechanism.name,
         "gravity": "yes" if sc.plant.gravity else "no",
-        "delay": f"{study.eta:.4g} s: μ = {sc.delay.steps} periods of {c.period:g} s, fraction "
-        f"{sc.delay.fraction:g}",
+        "delay": f"{study.eta:.4g} s: μ = {sc.true_delay.steps} periods of {c.period:g} s, "
+        f"fraction {sc.true_delay.fraction:g}",
         "controller": f"model {c.model}, prediction {c.prediction}, weights {c.weight_scaling}, "
         f"w_Q = {c.w_Q:g}, w_R = {c.w_R:g}",
         "start": f"{sc.start.replace('_', ' ')}, torques in flight: {sc.queue}",
@@ -129,11 +129,15 @@ def _growth_section(study: DelayStudy) -> Section:
 def _floor_section(study: DelayStudy) -> Section:
     sc = study.basis.experiment.scenario
     rows = [
-        (str(s), f"{Delay(s, sc.delay.fraction).eta(sc.controller.period):.4g}", f"{value:.2f}")
+        (
+            str(s),
+            f"{Delay(s, sc.true_delay.fraction).eta(sc.controller.period):.4g}",
+            f"{value:.2f}",
+        )
         for s, value in sorted(study.floors.items())
     ]
     table = Table(("μ", "delay  [s]", "floor of E_ac  [% s]"), rows)
-    own = f"{number(study.floors[sc.delay.steps])} % s with this delay. "
+    own = f"{number(study.floors[sc.true_delay.steps])} % s with this delay. "
     applies = (
         "It applies to this scenario."
         if study.floor_applies

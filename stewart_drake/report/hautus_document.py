@@ -41,7 +41,9 @@ def document(study: HautusStudy) -> Document:
     sections = []
     chains = [system for name in _CHAINS for system in study.family(name)]
     if chains:
-        shown = [one for name in _CHAINS for one in _landmarks(study.family(name), sc.delay.steps)]
+        shown = [
+            one for name in _CHAINS for one in _landmarks(study.family(name), sc.true_delay.steps)
+        ]
         table = _models_table(shown, "Some delays, of mu periods.")
         picture = Picture(partial(chain_figure, study), _MARGINS)
         failing = _deficiencies(chains)
@@ -72,8 +74,8 @@ def document(study: HautusStudy) -> Document:
     motion = ", ".join(f"{value:.3g}" for value in found.motion)
     facts = {
         "mechanism": found.experiment.mechanism.name,
-        "period, delay": f"{sc.controller.period:g} s, μ = {sc.delay.steps}, "
-        f"fraction {sc.delay.fraction:g}",
+        "period, delay": f"{sc.controller.period:g} s, μ = {sc.true_delay.steps}, "
+        f"fraction {sc.true_delay.fraction:g}",
         "units of the states": f"[{motion}] rad and m, these per s, these times s",
         "unit of the torques": f"{found.torque:.3g} N m",
     }

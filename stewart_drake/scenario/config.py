@@ -8,7 +8,7 @@ import dataclasses
 from dataclasses import field
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
@@ -21,13 +21,16 @@ from stewart_drake.scenario.field_types import (
     Deviation,
     Fraction,
     Name,
+    Positive,
+    Seconds,
+    Seed,
     Six,
     Steps,
     TorqueLimit,
     Weight,
 )
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
-from stewart_drake.scenario.timing import METRIC_PERIOD, log_problem, step_problem
+from stewart_drake.scenario.timing import METRIC_PERIOD, bound_problem, log_problem, step_problem
 
 
 @dataclass(config=STRICT)
@@ -61,15 +64,37 @@ class PlantConfig:
 
 @dataclass(config=STRICT)
 class DelayConfig:
-    """The true delay between computing a torque and feeling it.
+    """The true delay between computing a torque and feeling it, by when it was computed.
+
+    A torque computed at t waits for (steps + fraction) dt + drift t + swing sin(swing_frequency t),
+    from `jump_time` on plus jump, plus jitter, in all at least 0: `scenario.link.torque_delays`.
 
     Attributes:
         steps: whole controller periods.
         fraction: a further part of one period, 0 to below 1; less than 1e-9 is 0.
+        drift: growth of the delay, s/s.
+        swing: amplitude of a slow change, s.
+        swing_frequency: of that, rad/s.
+        jump: a change all at once, s.
+        jump_time: when that is, s.
+        jitter_std: standard deviation of what differs from torque to torque, s.
+        seed: of the jitter.
     """
 
     steps: Steps = 8
     fraction: Fraction = 0.0
+    drift: Annotated[float, Field(ge=-0.9, le=10)] = 0.0
+    swing: Annotated[float, Field(ge=0, le=100)] = 0.0
+    swing_frequency: Annotated[float, Field(gt=0, le=1e3)] = 1.0
+    jump: Annotated[float, Field(ge=-100, le=100)] = 0.0
+    jump_time: Seconds = 0.0
+    jitter_std: Annotated[float, Field(ge=0, le=10)] = 0.0
+    seed: Seed = 0
+
+    @property
+    def constant(self) -> bool:
+        """Whether every torque waits as long."""
+        return self.drift == self.swing == self.jump == self.jitter_std == 0
 
 
 @dataclass(config=STRICT)
@@ -92,6 +117,9 @@ class ControllerConfig:
         w_R: weight of the torques.
         integral_weight: of the integrals beside the errors, which share w_Q.
         weight_scaling: `bryson` (by what the reference asks for) or `identity`.
+        packet_torques: how many torques a packet holds, for the next one and further periods; over
+            a network, where `delay_steps` is not 0.
+        packet_repeats: how many earlier torques it says again, each for a period more of delay.
         catch_up: blend onto the reference after a start from rest, s; 0 is none, null the shortest
             one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
     """
@@ -109,6 +137,8 @@ class ControllerConfig:
     w_R: Weight = 1.0
     integral_weight: Weight = 1.0
     weight_scaling: Literal["bryson", "identity"] = "bryson"
+    packet_torques: Annotated[int, Field(ge=1, le=100)] = 8
+    packet_repeats: Annotated[int, Field(ge=0, le=100)] = 1
     catch_up: Annotated[float, Field(ge=0, le=10)] | None = None
 
 
@@ -139,8 +169,75 @@ class WireConfig:
 
     kind: Literal["wire"] = "wire"
 
+    def problem(self) -> str | None:
+        """Nothing can be."""
+        return None
 
-LinkConfig = Annotated[WireConfig, ByKind()]
+
+@dataclass(config=STRICT)
+class PacketsConfig:
+    """How long packets are under way, and how many are lost.
+
+    Attributes:
+        distribution: of the time under way, `uniform` from `low` to `high`, or `lognormal`.
+        low, high: of the uniform one, s.
+        median: of the lognormal one, s.
+        sigma: of the lognormal one, standard deviation of its logarithm.
+        loss: share of the packets that never arrive.
+        burst: how many in a row are lost together.
+    """
+
+    distribution: Literal["uniform", "lognormal"] = "uniform"
+    low: Seconds = 0.5
+    high: Seconds = 0.9
+    median: Positive | None = None
+    sigma: Annotated[float, Field(gt=0, le=10)] | None = None
+    loss: Annotated[float, Field(ge=0, le=0.99)] = 0.05
+    burst: Annotated[int, Field(ge=1, le=1000)] = 1
+
+    def times_problem(self, where: str) -> str | None:
+        """What is wrong with the times, or None."""
+        if self.distribution == "uniform" and self.low > self.high:
+            return f"{where}.low: got {self.low:g} s; expected at most high, {self.high:g} s"
+        if self.distribution == "lognormal":
+            for name in ("median", "sigma"):
+                if getattr(self, name) is None:
+                    return f"{where}.{name}: got null with a lognormal one; expected a number"
+        return None
+
+
+@dataclass(config=STRICT | ConfigDict(populate_by_name=True))
+class NetworkConfig(PacketsConfig):
+    """Packets of torques with the times at which they shall act, and a buffer at the machine.
+
+    Each packet takes a time of its own, see `PacketsConfig`; `delay` is not used. A torque acts at
+    its time, a bound later than it was sent. Where no packet has brought one for a period, the
+    buffer is dry. Clocks agree.
+
+    Attributes:
+        kind: `network`.
+        playout: the bound, s; null is the one that makes late packets as rare as lost ones
+            (`scenario.link.usual_bound`). The controller adds its `packet_repeats` periods.
+        dry: what a dry buffer does, `hold` the last torque or put out `zero`.
+        back: `return` in files, how measurements come back; null is at once and all of them.
+        acknowledged: whether each measurement tells which packets have arrived and what has acted.
+        seed: of times and losses.
+    """
+
+    kind: Literal["network"] = "network"
+    playout: Seconds | None = None
+    dry: Literal["hold", "zero"] = "hold"
+    back: PacketsConfig | None = Field(default=None, alias="return")
+    acknowledged: bool = True
+    seed: Seed = 0
+
+    def problem(self) -> str | None:
+        """What is wrong with fields that are well formed one by one, or None."""
+        back = self.back.times_problem("link.return") if self.back else None
+        return self.times_problem("link") or back
+
+
+LinkConfig = Annotated[WireConfig | NetworkConfig, ByKind()]
 
 
 @dataclass(config=STRICT)
@@ -150,7 +247,9 @@ class StateSensorConfig:
     Attributes:
         kind: `state`.
         noise_std: of [pose; rates], in rad, m, rad/s and m/s.
-        seed: of the noise and of spikes; the same seed gives the same run.
+        delay: between measuring and having the measurement, s; by the next sample after that.
+        loss: share of the measurements that are lost.
+        seed: of the noise, of spikes and losses; the same seed gives the same run.
         faults: when it measures nothing, the same again, or nonsense; see `fault_config`.
     """
 
@@ -158,7 +257,9 @@ class StateSensorConfig:
     noise_std: Annotated[list[Deviation], Field(min_length=12, max_length=12)] = field(
         default_factory=lambda: [0.0] * 12
     )
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    delay: Annotated[float, Field(ge=0, le=100)] = 0.0
+    loss: Annotated[float, Field(ge=0, le=0.99)] = 0.0
+    seed: Seed = 0
     faults: list[SensorFault] = field(default_factory=list)
 
     def problem(self) -> str | None:
@@ -237,7 +338,13 @@ class Scenario:
 
     @property
     def true_delay(self) -> Delay:
-        """What the torques wait for, which the controller need not know."""
+        """What the torques wait for at t = 0, which the controller need not know."""
+        if isinstance(self.link, NetworkConfig):
+            from stewart_drake.scenario.link import (
+                network_delay,
+            )  # numpy, which --help goes without
+
+            return network_delay(self.link, self.controller)
         return Delay(self.delay.steps, self.delay.fraction)
 
     @property
@@ -264,11 +371,20 @@ class Scenario:
             self.reference.problem(),
             _controller_problem(self.controller),
             self.sensor.problem(),
-            step and step_problem(step, self.controller.period, self.delay.fraction),
+            self.link.problem(),
+            step and self._step_problem(step),
             log_problem(self.log_period, self.duration, step),
         ):
             if problem:
                 raise ConfigError(f"{where}: {problem}")
+
+    def _step_problem(self, step: float) -> str | None:
+        """What does not suit the steps in s of a discrete plant, or None."""
+        period, link = self.controller.period, self.link
+        if isinstance(link, NetworkConfig):
+            bound = None if link.playout is None else bound_problem(link.playout, step)
+            return step_problem(step, period, 0.0) or bound
+        return step_problem(step, period, self.delay.fraction)
 
 
 def _controller_problem(controller: ControllerConfig) -> str | None:

@@ -15,12 +15,13 @@ from ruamel.yaml import YAML
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.resources import absolute_path, is_path, resolve
-from stewart_drake.files.schema import field_names, sections
+from stewart_drake.files.resources import absolute_path, is_path, resolve, shipped
+from stewart_drake.files.schema import field_names, plain, sections, spelling
 from stewart_drake.files.yamlio import brief, load_yaml, parse_yaml, validate
 from stewart_drake.scenario.config import ControllerConfig, Scenario
 
 _SETTINGS = "settings"
+_OVERLAY = "overlay"
 _KINDS = sections(Scenario)
 
 
@@ -37,7 +38,8 @@ def load_scenario(
         controller: a controller to lay over it, as `load_controller` takes it.
         settings: `section.field=value` or `field=value`, the value in YAML, e.g.
             `plant.gravity=true`; paths start from the working directory. A setting of a
-            section's kind also drops what the file says for another kind.
+            section's kind also drops what the file says for another kind. `overlay=dirty` lays the
+            fields of a shipped overlay or a YAML file over the scenario.
 
     Raises:
         ConfigError: the first problem, in one line.
@@ -110,7 +112,7 @@ def load_comparison(
 
 def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
     """The scenario as plain data that JSON and YAML can hold, and `load_scenario` reads back."""
-    return dataclasses.asdict(scenario)
+    return plain(scenario)
 
 
 def scenario_yaml(scenario: Scenario) -> str:
@@ -141,7 +143,7 @@ def setting_choices() -> list[str]:
     for name, hint in typing.get_type_hints(Scenario).items():
         members = [m for m in (*typing.get_args(hint), hint) if dataclasses.is_dataclass(m)]
         hints = [
-            (f"{name}.{field}", inner)
+            (f"{name}.{spelling(member, field)}", inner)
             for member in members
             for field, inner in typing.get_type_hints(member).items()
         ]
@@ -152,7 +154,7 @@ def setting_choices() -> list[str]:
             elif typing.get_origin(inner) is typing.Literal:
                 values = typing.get_args(inner)
             choices |= dict.fromkeys(f"{field}={value}" for value in values)
-    return list(choices)
+    return [*choices, *(f"{_OVERLAY}={name}" for name in shipped("overlay"))]
 
 
 def _parse_settings(settings: Iterable[str], data: dict[str, Any]) -> dict[str, Any]:
@@ -180,6 +182,12 @@ def _parse_settings(settings: Iterable[str], data: dict[str, Any]) -> dict[str, 
 def _parse_setting(setting: str) -> dict[str, Any]:
     """One setting as a partial scenario."""
     key, equals, text = setting.partition("=")
+    if key.strip() == _OVERLAY and text:
+        path = resolve("overlay", text.strip())
+        overlay = load_yaml(path)
+        validate(Scenario, overlay, str(path))
+        _make_paths_absolute(overlay, path.parent)
+        return overlay
     parts = key.strip().split(".")
     if not equals or not all(parts) or len(parts) > 2:
         raise ConfigError(

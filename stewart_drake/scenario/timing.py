@@ -94,6 +94,17 @@ def step_problem(time_step: float, period: float, fraction: float) -> str | None
     return None
 
 
+def bound_problem(bound: float, time_step: float) -> str | None:
+    """What is wrong with a network's bound in s for a discrete plant, or None."""
+    if _is_whole(bound / time_step):
+        return None
+    nearest = _tidy(max(1, round(bound / time_step)) * time_step)
+    return (
+        f"link.playout: got {bound!r}; expected a whole number of plant.time_step "
+        f"({time_step!r} s), nearest {nearest!r}"
+    )
+
+
 def log_problem(log_period: float | None, duration: float, time_step: float | None) -> str | None:
     """What is wrong with the period of a log.
 

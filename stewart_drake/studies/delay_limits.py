@@ -15,7 +15,7 @@ from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.experiment import waits_at_rest
 from stewart_drake.loop.metrics import delay_floor
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.config import NetworkConfig, Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.studies.basis import Basis, basis
@@ -104,7 +104,7 @@ class DelayStudy:
     @property
     def loop(self) -> LoopMargins | None:
         """The closed loop at the scenario's own delay."""
-        own = self.basis.experiment.scenario.delay.steps
+        own = self.basis.experiment.scenario.true_delay.steps
         return next((loop for loop in self.loops if loop.steps == own), None)
 
     @property
@@ -123,7 +123,7 @@ class DelayStudy:
     @property
     def summary(self) -> dict[str, Any]:
         """What summary.json holds."""
-        own = self.basis.experiment.scenario.delay.steps
+        own = self.basis.experiment.scenario.true_delay.steps
         return {
             "eta": self.eta,
             "obstacles": self.basis.obstacles,
@@ -171,13 +171,13 @@ def study_delay(
     """
     with threadpool_limits(limits=1):
         found = basis(scenario)
-        period, fraction = scenario.controller.period, scenario.delay.fraction
+        period, fraction = scenario.controller.period, scenario.true_delay.fraction
         poles = _poles(found)
         loops, problem = _loops(found)
         cells, interrupted = (
             delay_map(scenario, progress) if simulations and not problem else ([], False)
         )
-        wanted = {scenario.delay.steps, *map_delays(scenario.delay.steps)}
+        wanted = {scenario.true_delay.steps, *map_delays(scenario.true_delay.steps)}
         return DelayStudy(
             basis=found,
             controller=controller_margin(found.experiment, found.followed_until) if poles else None,
@@ -246,6 +246,8 @@ def _growths(found: Basis, poles: list[PolePoint], eta: float) -> list[Growth]:
 
 
 def _loops(found: Basis) -> tuple[list[LoopMargins], str]:
+    if isinstance(found.experiment.scenario.link, NetworkConfig):
+        return [], "its torques come in packets, which analyze link is about"
     pose = found.experiment.reference.value(0.0)[:, 0]
     failure = diagnose(found.experiment.mechanism, 0.0, pose)
     if failure is not None:

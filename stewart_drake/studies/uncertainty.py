@@ -169,7 +169,7 @@ def _delay(truth: Truth, late: float) -> None:
     sc, believed = truth.scenario, believed_delay(truth.scenario)
     fraction = sc.delay.fraction + late / sc.controller.period
     whole = math.floor(fraction + 1e-9)
-    truth.fields["delay"] = {
+    truth.fields["delay"] |= {
         "steps": sc.delay.steps + whole,
         "fraction": round(max(0.0, fraction - whole), 12),
     }

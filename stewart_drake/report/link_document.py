@@ -1,0 +1,107 @@
+"""What is told of the analysis of a network."""
+
+import math
+from functools import partial
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from stewart_drake.report.document import Document, Paragraph, Picture, Section, Table, Tone
+from stewart_drake.report.style import figure_style
+from stewart_drake.report.words import number
+from stewart_drake.studies.link_bound import Cell, LinkStudy
+
+_TEXT: Final = (
+    "A torque acts a bound after it was computed, and one period more for each repetition. With a "
+    "short bound many packets come too late, with a long one the prediction has to reach further.",
+    "Late is the share of the packets that are not there by the bound, of those that are not lost; "
+    "missing the share of the torques that are in no packet that is there in time, so that an "
+    "older plan stands in. E_ac is the mean of the runs that completed.",
+)
+_LOSS_TEXT: Final = "The same at the best bound, with other shares of the packets lost."
+_COLUMNS: Final = (
+    "bound [s]",
+    "lost",
+    "late",
+    "missing",
+    "completed",
+    "E_ac [% s]",
+    "worst [% s]",
+)
+
+
+def document(study: LinkStudy) -> Document:
+    """Bounds, then losses at the best of them."""
+    text, tone = _verdict(study)
+    caption = f"Simulations on the exact plant, {study.runs} seeds each."
+    table = Table(_COLUMNS, [_row(cell) for cell in study.bounds], caption, brief=True)
+    figure = partial(bound_figure, study)
+    picture = Picture(figure, "E_ac over the bound; dots are runs, dashed: best.")
+    more = [Paragraph("Interrupted: not all simulations were run.", brief=True)] * study.interrupted
+    sections = [Section("The bound", *_TEXT, *more, table, picture)]
+    if study.losses:
+        rows = [_row(cell) for cell in study.losses]
+        losses = Table(_COLUMNS, rows, caption, brief=True)
+        sections.append(Section("Losses", _LOSS_TEXT, losses))
+    facts = {"play-out without a bound given": f"{study.usual:.3g} s"}
+    return Document("What a network asks for", text, sections, tone, facts)
+
+
+def _verdict(study: LinkStudy) -> tuple[str, Tone]:
+    """The answer in a few sentences, and how good it is."""
+    best = study.best
+    if best is None:
+        return "No run completed, whatever the bound.", "bad"
+    late = f"{100 * best.late:.3g} % of the packets are late"
+    text = (
+        f"A bound of {best.bound:.3g} s is the best of those looked at: E_ac is "
+        f"{number(float(np.mean(best.errors)))} % s, {late}. Without a bound given the scenario "
+        f"takes {study.usual:.3g} s."
+    )
+    if study.losses:
+        survived = study.survivable
+        text += (
+            " At that bound no loss is survived in every run."
+            if math.isnan(survived)
+            else f" At that bound every run completed up to a loss of {100 * survived:.3g} %."
+        )
+    own = best.completed == 1
+    return text, "good" if own else "bad"
+
+
+def bound_figure(study: LinkStudy) -> Figure:
+    """E_ac of every completed run over the bound, their mean, and how many packets are late."""
+    with figure_style():
+        figure = Figure(figsize=(8.0, 3.6), layout="constrained")
+        ax = figure.subplots()
+        done = [cell for cell in study.bounds if cell.errors]
+        for cell in done:
+            ax.plot([cell.bound] * len(cell.errors), cell.errors, "o", ms=3, color="#9AA3AD")
+        bounds = [cell.bound for cell in done]
+        ax.plot(bounds, [np.mean(c.errors) for c in done], "o-", color="#1B6CA8", label="mean E_ac")
+        if study.best is not None:
+            ax.axvline(study.best.bound, color="#666666", lw=1, ls="--")
+        if done:
+            ax.set_yscale("log")
+        ax.set(xlabel="bound  [s]", ylabel="E_ac  [% s]")
+        right = ax.twinx()
+        shares = [100 * cell.late for cell in study.bounds]
+        every = [cell.bound for cell in study.bounds]
+        right.plot(every, shares, ":", color="#B5651D", label="late packets")
+        right.set(ylabel="late  [%]", ylim=(0, 100))
+        right.grid(False)
+        figure.legend(loc="outside upper center", ncols=2, frameon=False)
+        return figure
+
+
+def _row(cell: Cell) -> tuple[str, ...]:
+    return (
+        f"{cell.bound:.3g}",
+        f"{100 * cell.loss:.3g} %",
+        f"{100 * cell.late:.3g} %",
+        f"{100 * cell.missing:.3g} %",
+        f"{len(cell.errors)} of {cell.runs}",
+        number(float(np.mean(cell.errors))) if cell.errors else "-",
+        number(max(cell.errors)) if cell.errors else "-",
+    )
