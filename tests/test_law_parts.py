@@ -27,7 +27,7 @@ from stewart_drake.law.memory import Memory
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import VIGOROUS, NominalPlant
 from stewart_drake.law.observers import NoObserver, ParameterObserver
-from stewart_drake.law.predictive_lqi import Preview
+from stewart_drake.law.motion import Preview
 from stewart_drake.law.sensing import FirstState, Sensing, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import DelayLqiController

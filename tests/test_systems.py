@@ -20,7 +20,8 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.predictive_lqi import PredictiveLqi, Preview
+from stewart_drake.law.motion import Preview
+from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.delay_chain import DelayChain
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop

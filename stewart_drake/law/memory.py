@@ -1,10 +1,11 @@
 """What the control law carries from one sample to the next."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.trajectories import Trajectory
 
 from stewart_drake.law.belief import Belief
 
@@ -65,6 +66,8 @@ class Memory:
         torque: (6,) last torque as asked for, which may be beyond the limit.
         weights: (2,) w_Q and w_R that were used.
         counts: see `Counts`.
+        path: that was planned in flight, or None.
+        silence: samples that are still to go on without feedback.
     """
 
     in_flight: Array
@@ -76,3 +79,10 @@ class Memory:
     torque: Array
     weights: Array
     counts: Counts
+    path: Trajectory | None = None
+    silence: int = 0
+
+    def without_error(self) -> "Memory":
+        """The same with nothing integrated."""
+        nothing = np.zeros_like(self.error)
+        return replace(self, error=nothing, integral=nothing)

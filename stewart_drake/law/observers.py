@@ -65,7 +65,7 @@ class NoObserver:
         plant: NominalPlant,
     ) -> Belief:
         """See `Observer.observe`."""
-        after = _told(belief, measurement, sensing, plant)
+        after = told(belief, measurement, sensing, plant)
         if after.fault is None:
             return after.at(sensing.start(measurement).state)
         return after.at(_moved(belief, in_flight, plant)) if belief.has_state else after
@@ -94,7 +94,7 @@ class ParameterObserver:
         plant: NominalPlant,
     ) -> Belief:
         """See `Observer.observe`."""
-        after = _told(belief, measurement, sensing, plant)
+        after = told(belief, measurement, sensing, plant)
         ekf = ParameterFilter(plant.dynamics, sensing, self.settings)
         usable = measurement if after.fault is None else None
         if not belief.estimate.uncertain:
@@ -112,7 +112,7 @@ class ParameterObserver:
         return replace(after, estimate=estimate, fault=fault)
 
 
-def _told(
+def told(
     belief: Belief, measurement: Measurement, sensing: Sensing, plant: NominalPlant
 ) -> Belief:
     """The belief with what was measured, and what is wrong with that, and nothing made of it."""

@@ -11,9 +11,9 @@ with K from `law.riccati.reduced_gain` and T_ff the feedforward of the hold inte
 dynamics through the queue. Torques enter the linear parts as deviations from their feedforward.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,10 @@ from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
+from stewart_drake.law.motion import Motion
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import Observer
+from stewart_drake.law.planner import NoPlanner, Planner
 from stewart_drake.law.predictors import Ahead, Predictor
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Timeline
@@ -40,36 +42,21 @@ from stewart_drake.scenario.signals import (
 )
 
 Array = NDArray[np.float64]
-Motion = Callable[[Array], Array]
-"""The reference (p, 18), pose, rates and accelerations, at instants (p,) in s from now; some of
-them may be negative."""
 
 
-@dataclass(frozen=True)
-class Preview:
-    """A motion that is known at some instants only, those that a law asks for.
+class Response(NamedTuple):
+    """What one sample comes to."""
 
-    Attributes:
-        times: (p,) s from now.
-        reference: (p, 18) there.
-    """
-
-    times: Array
-    reference: Array
-
-    def __call__(self, times: Array) -> Array:
-        """The reference at all of `times`.
-
-        Raises:
-            ValueError: at other instants than those.
-        """
-        asked = times is self.times or np.array_equal(times, self.times)
-        if not asked or len(self.reference) != len(times):
-            raise ValueError(
-                f"preview: got {len(self.reference)} rows for {len(self.times)} instants; "
-                f"expected the {len(times)} that the law asks for"
-            )
-        return self.reference
+    torque: Array
+    """(6,) N m."""
+    error: Array
+    """(6,) of the pose, that counts for the integral."""
+    integral: Array
+    """(6,)."""
+    gain: Array
+    """(6, g), NaN for none."""
+    trouble: str | None
+    """What went wrong, as the name of a count."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +73,9 @@ class PredictiveLqi:
         feedforward: what the reference takes.
         model: of the error, for the gain.
         cost: what the gain minimises.
+        planner: of the way back, where the prediction is off.
+        silence: samples at the start at which nothing is fed back: what they tell is of a plate on
+            which nothing of the controller's acts, and noise.
     """
 
     timeline: Timeline
@@ -96,6 +86,8 @@ class PredictiveLqi:
     feedforward: Feedforward
     model: DesignModel
     cost: QuadraticCost
+    planner: Planner = NoPlanner()
+    silence: int = 0
 
     @cached_property
     def preview_times(self) -> Array:
@@ -138,6 +130,7 @@ class PredictiveLqi:
             torque=queue[-1] if len(queue) else nothing,
             weights=np.full(2, np.nan),
             counts=Counts(),
+            silence=self.silence,
         )
 
     @np.errstate(over="ignore", invalid="ignore")  # its outcome is checked and counted instead
@@ -162,24 +155,21 @@ class PredictiveLqi:
         belief = self.observer.observe(
             memory.belief, measurement, memory.in_flight, self.sensing, self.plant
         )
+        followed = self.planner.follow(memory.path, belief, memory.in_flight, motion, self.plant)
+        if followed.anew:
+            memory = memory.without_error()
         samples = 1 + len(self.predictor.samples(belief.timeline))
         as_assumed = belief.timeline == self.timeline
         times = self.preview_times if as_assumed else self.times_for(belief.timeline)
-        preview = motion(times)
+        preview = followed.motion(times)
         wanted, nodes = preview[:samples, :NUM_STATE], preview[samples:]
         if not belief.has_state:  # nothing else to go on with
             belief = belief.at(wanted[0])
-        error = belief.state[POSE] - wanted[0, POSE]
-        integral = self._integrate(memory, error, belief.timeline)
-        queue = belief.timeline.queue(memory.in_flight)
-        ahead = self.predictor.ahead(belief, integral, queue, wanted, self.plant)
-        held, changes = self.feedforward.held(nodes, self.plant.dynamics, belief.parameters)
-        error_ahead, gain, trouble = self._design(memory, belief, ahead, held[-1], changes, weights)
-        torque = held[-1]
-        if _is_there(gain):
-            pending = (queue[len(queue) - len(held) + 1 :] - held[:-1]).ravel()
-            seen = self.cost.sees(ahead.integral)
-            torque = torque - gain @ np.concatenate([error_ahead, seen, pending])
+        if belief.feeds_back and memory.silence == 0:
+            response = self._feed_back(memory, belief, wanted, nodes, weights)
+        else:
+            response = self._go_on_alone(memory, nodes)
+        torque, error, integral, gain, trouble = response
         nonfinite = not np.all(np.isfinite(torque))
         if nonfinite:
             torque = memory.torque
@@ -200,7 +190,33 @@ class PredictiveLqi:
                 "nonfinite_torque" if nonfinite else None,
                 "saturated_steps" if saturated else None,
             ),
+            path=followed.path,
+            silence=max(memory.silence - 1, 0),
         )
+
+    def _feed_back(
+        self, memory: Memory, belief: Belief, wanted: Array, nodes: Array, weights: Array
+    ) -> Response:
+        """(42) where the torque acts: torque, error, integral, gain, and what went wrong."""
+        error = belief.state[POSE] - wanted[0, POSE]
+        integral = self._integrate(memory, error, belief.timeline)
+        queue = belief.timeline.queue(memory.in_flight)
+        ahead = self.predictor.ahead(belief, integral, queue, wanted, self.plant)
+        held, changes = self.feedforward.held(nodes, self.plant.dynamics, belief.parameters)
+        error_ahead, gain, trouble = self._design(memory, belief, ahead, held[-1], changes, weights)
+        torque = held[-1]
+        if _is_there(gain):
+            pending = (queue[len(queue) - len(held) + 1 :] - held[:-1]).ravel()
+            seen = self.cost.sees(ahead.integral)
+            torque = torque - gain @ np.concatenate([error_ahead, seen, pending])
+        return Response(torque, error, integral, gain, trouble)
+
+    def _go_on_alone(self, memory: Memory, nodes: Array) -> Response:
+        """The feedforward of what is known beforehand; errors do not count."""
+        dynamics = self.plant.dynamics
+        held, _ = self.feedforward.held(nodes, dynamics, dynamics.parameters)
+        nothing = np.zeros(NUM_COORDINATES)
+        return Response(held[-1], nothing, memory.integral, memory.gain, None)
 
     def _design(
         self,

@@ -23,8 +23,9 @@ from stewart_drake.loop.density import DensityWindow
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.experiment import (
     Experiment,
-    believed_queue,
     control_law,
+    first_queue,
+    followed_motion,
     motion_scale,
     prepare,
     torques_in_flight,
@@ -177,7 +178,10 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> float:
     )
     weights = _weights(builder, experiment)
     controller = builder.AddNamedSystem(
-        "controller", DelayLqiController(law, believed_queue(experiment, law.timeline))
+        "controller",
+        DelayLqiController(
+            law, first_queue(experiment, law), followed_motion(experiment, law, planned)
+        ),
     )
     builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
     builder.Connect(weights.get_output_port(), controller.GetInputPort("weights"))

@@ -88,6 +88,14 @@ class ControllerConfig:
         weight_scaling: `bryson` (by what the reference asks for) or `identity`.
         catch_up: blend onto the reference after a start from rest, s; 0 is none, null the shortest
             one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
+        delay_estimator: `none`; or the delay is estimated, beginning with the one that is believed
+            in, as `constant`, or as `drifting` with a rate of its own.
+        delay_std: of that belief, s.
+        delay_max: longest delay that is thought possible, s.
+        quiet_start: whether, from rest, nothing is fed back before a torque of the controller can
+            have acted.
+        rejoin: with a delay estimator: a plan back onto the reference takes so long, in s, where
+            the prediction is off it, as when the delay was found or has jumped; 0 is none.
     """
 
     period: Annotated[float, Field(ge=1e-4, le=10)] = 0.1
@@ -103,6 +111,11 @@ class ControllerConfig:
     w_R: Weight = 1.0
     weight_scaling: Literal["bryson", "identity"] = "bryson"
     catch_up: Annotated[float, Field(ge=0, le=10)] | None = None
+    delay_estimator: Literal["none", "constant", "drifting"] = "none"
+    delay_std: Annotated[float, Field(ge=1e-3, le=10)] = 0.3
+    delay_max: Annotated[float, Field(gt=0, le=10)] = 1.5
+    quiet_start: bool = True
+    rejoin: Annotated[float, Field(ge=0, le=10)] = 0.6
 
 
 @dataclass(config=STRICT)
@@ -268,6 +281,14 @@ def _controller_problem(controller: ControllerConfig) -> str | None:
         return (
             f"controller.catch_up: got {controller.catch_up!r}; expected 0 for none, null, or at "
             "least 0.001 s"
+        )
+    if controller.delay_estimator != "none" and (
+        controller.estimator != "parameters" or controller.prediction != "nonlinear"
+    ):
+        return (
+            f"controller.delay_estimator: got {controller.delay_estimator!r} with estimator "
+            f"{controller.estimator!r} and prediction {controller.prediction!r}; expected 'none', "
+            "or estimator 'parameters' and prediction 'nonlinear'"
         )
     if controller.torque_map == "printed" and controller.model != "paper":
         return (

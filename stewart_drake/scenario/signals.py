@@ -137,6 +137,7 @@ _TORQUE: Final = Quantity("leg", ("N m",) * NUM_TORQUES)
 _WEIGHTS: Final = Quantity("weight", ("1",) * len(WEIGHTS))
 _PARAMETERS: Final = Quantity("parameter", PARAMETER_UNITS)
 _DENSITY: Final = Quantity("tuner_input", ("1",) * len(TUNER_INPUTS))
+_SECONDS: Final = Quantity(None, ("s",))
 _STATE: Final = Quantity("state", COORDINATE_UNITS + RATE_UNITS)
 
 _TABLE: Final = (
@@ -168,6 +169,8 @@ _TABLE: Final = (
         "controller.measurement_used",
     ),
     Signal("state_estimate", _STATE, "pose and rates that the controller goes on", "controller"),
+    Signal("delay_estimate", _SECONDS, "delay that the controller believes in", "controller"),
+    Signal("delay_std", _SECONDS, "standard deviation of that estimate", "controller"),
 )
 SIGNALS: Final[dict[str, Signal]] = {signal.name: signal for signal in _TABLE}
 """By name, in the order of the record. Held signals show the value from an instant on.
