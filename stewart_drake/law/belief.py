@@ -62,6 +62,7 @@ class Belief:
         measured: (m,) last value of each measured quantity that was there; NaN before any.
         fault: why the model stood in for the last measurement, as the name of a count, or None.
         feeds_back: whether it is good enough to act on; else the feedforward goes on alone.
+        caution: how many times as much torques weigh as they should.
         settled: whether the delay is known.
         found: whether it has just been found, or is another than before.
         delay_mean, delay_std: s, of the delay; NaN where it is not estimated.
@@ -72,6 +73,7 @@ class Belief:
     measured: Array
     fault: str | None = None
     feeds_back: bool = True
+    caution: float = 1.0
     settled: bool = True
     found: bool = False
     delay_mean: float = math.nan

@@ -45,7 +45,7 @@ DIFFERENCE = 1e-3
 """s."""
 FEW = 4
 """Iterations once the delay is known."""
-ITERATIONS = 15
+ITERATIONS = 6
 """At the most, while the delay is hardly known; later a few do."""
 TRIED = 15
 """Values of the delay that are tried where a filter is to begin with its iterations."""

@@ -59,6 +59,10 @@ BEST = 3
 """Of them, from which filters are begun."""
 SETTLED = 5.0
 """Log of the odds at which one of those takes over."""
+AT_ONCE = 2
+"""Cells that leave time for a plan at the same sample."""
+CAUTION = 10.0
+"""Times the weight of torques while the delay is sought: a slow loop bears a delay that is wrong."""
 LOOSENED = 0.05
 """Standard deviations of the prior by which parameters may have changed with the delay."""
 
@@ -79,12 +83,17 @@ class DelayBelief(Belief):
         guess: that the law goes on; None before the first measurement.
         master: nothing has arrived; None once the search is over.
         cells: what else may be; none once the search is over.
+        fresh: whether the delay was found at this sample with so much work that what follows from
+            it, planning above all, waits for the next, which has time for it.
+        silent: whether nothing is fed back until then.
         past: (2, m) the last two measurements, NaN for none.
     """
 
     guess: Guess | None = None
     master: Cell | None = None
     cells: tuple[Cell, ...] = ()
+    fresh: bool = False
+    silent: bool = False
     past: Array | None = None
 
     @property
@@ -118,7 +127,7 @@ class DelayObserver:
         none = np.zeros((0, 6))
         first = Arrivals(timeline.period, Delay(0), self.believed, before=none)
         nothing = Belief.nothing(first, sensing.size, self.settings.parameters.prior)
-        return DelayBelief(nothing.estimate, first, nothing.measured)
+        return DelayBelief(nothing.estimate, first, nothing.measured, silent=self.quiet)
 
     def observe(
         self,
@@ -130,7 +139,9 @@ class DelayObserver:
     ) -> Belief:
         """See `law.observers.Observer.observe`."""
         assert isinstance(belief, DelayBelief) and isinstance(belief.timeline, Arrivals)
-        after = replace(told(belief, measurement, sensing, plant), found=False)
+        after = replace(
+            told(belief, measurement, sensing, plant), found=belief.fresh, fresh=False
+        )
         y = measurement.values if after.fault is None else None
         filtering = DelayFilter(plant, sensing, self.settings, self.delay)
         if len(belief.timeline.before) == 0:  # the first sample: all in flight is others'
@@ -216,6 +227,7 @@ class _Search:
         if k < len(self.in_flight) and (k - 1) * self.period < self._longest:
             new, master = self._spawn(master, master, k)
             cells = (*cells, new)
+        busy = len(cells) > AT_ONCE
         cells = tuple(self._updated(cell, y) for cell in cells)
         master = self._updated(master, y)
         top = max(cell.weight for cell in (master, *cells))
@@ -232,7 +244,7 @@ class _Search:
         found = best is not master and best.guess.fits and y is not None
         if found and max([master.weight, *rivals]) < -LEAD and best.guess.std < near:
             guess = replace(best.guess, low=0.0, high=self._longest)
-            return replace(after, guess=guess, master=None, cells=(), found=True)
+            return replace(after, guess=guess, master=None, cells=(), found=True, fresh=busy)
         return after
 
     def _updated(self, cell: Cell, y: Array | None) -> Cell:
@@ -246,7 +258,7 @@ class _Search:
         if y is not None and guess.outliers >= SUSPICIOUS and belief.past is not None:
             jumped = self._jumped(guess, np.vstack([belief.past, y]))
             if jumped is not None:
-                return replace(belief, guess=jumped, found=True)
+                return replace(belief, guess=jumped, fresh=True)
         return replace(belief, guess=guess)
 
     def _jumped(self, guess: Guess, seen: Array) -> Guess | None:
@@ -344,21 +356,24 @@ class _Search:
         nothing = np.full(self.filter.sensing.size, np.nan)
         estimate = guess.estimate(nothing)
         arrival, rate, feeds_back = guess.eta, guess.rate, True
-        mean, std = guess.eta, guess.std
-        if not belief.locked:
-            mean, std = self._mixture(belief)
+        settled = belief.locked and not belief.fresh
+        silent = belief.silent and not settled
+        if not settled:
             waiting = guess.eta >= NEVER
             late = self.now.sent * self.period >= believed
-            feeds_back = not (self.observer.quiet or (waiting and late))
-            if waiting or self.observer.quiet:
+            feeds_back = not (silent or (waiting and late))
+            if waiting or silent:
                 arrival, rate = believed, 0.0
+        mean, std = (guess.eta, guess.std) if belief.locked else self._mixture(belief)
         return replace(
             belief,
             estimate=estimate,
             timeline=replace(self.now, arrival=max(arrival, 0.0), rate=rate),
             fault=fault,
             feeds_back=feeds_back,
-            settled=belief.locked,
+            caution=1.0 if settled else CAUTION,
+            settled=settled,
+            silent=silent,
             delay_mean=mean,
             delay_std=std,
         )

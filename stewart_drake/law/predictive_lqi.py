@@ -233,7 +233,7 @@ class PredictiveLqi:
             model = self.model.at(ahead.point, torque, belief.parameters, self.plant)
             error = error - self.feedforward.offset(changes, model.B[RATES], belief.timeline)
             delayed = self.cost.sampled(model, belief.timeline)
-            K = self.cost.gain(delayed, weights)
+            K = self.cost.gain(delayed, weights * [1.0, belief.caution])
             return error, self.predictor.gain(K, delayed), None
         except UnreachablePoseError:  # nothing to regulate: the feedforward goes on alone
             return error, self._no_gain(belief.timeline), "unreachable"
