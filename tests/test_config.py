@@ -78,7 +78,17 @@ def test_the_defaults_are_the_papers_experiment() -> None:
             "torque_bias": [0] * 6,
             "joint_damping": 0.0,
         },
-        "delay": {"steps": 8, "fraction": 0.0},
+        "delay": {
+            "steps": 8,
+            "fraction": 0.0,
+            "drift": 0.0,
+            "swing": 0.0,
+            "swing_frequency": 1.0,
+            "jump": 0.0,
+            "jump_time": 0.0,
+            "jitter_std": 0.0,
+            "seed": 0,
+        },
         "controller": {
             "period": 0.1,
             "integral": True,

@@ -60,6 +60,8 @@ def test_closed_loop_has_named_ports_and_systems(plant: str) -> None:
         "density": 18,
         "measurement": 12,
         "state_estimate": 12,
+        "delay_true": 1,
+        "packets": 5,
     }
     found = [loop.get_output_port(i) for i in range(loop.num_output_ports())]
     assert {port.get_name(): port.size() for port in found} == sizes

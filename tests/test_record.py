@@ -174,7 +174,7 @@ def test_the_file_says_what_is_in_it(tmp_path) -> None:
         for name in (*read.data_vars, *read.coords):
             assert read[name].attrs["long_name"]
         for name, signal in SIGNALS.items():
-            labels = read.sizes[signal.quantity.dimension]
+            labels = read.sizes[signal.quantity.dimension] if signal.quantity.dimension else 1
             units = read[name].attrs["units"].split(", ")
             assert len(units) in (1, labels) and signal.size == labels
             assert list(signal.quantity.units) in (units, units * labels)

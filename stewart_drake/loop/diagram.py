@@ -38,11 +38,14 @@ from stewart_drake.loop.reference import Reference
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.start_check import StartCheck
 from stewart_drake.loop.tuner import AnnTuner
+from stewart_drake.loop.varying_delay import VaryingDelay, declare_constant
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.link import torque_delays
 from stewart_drake.scenario.signals import (
     DAMPING,
     NUM_PARAMETERS,
     NUM_TORQUES,
+    PACKETS,
     PAYLOAD,
     POSE,
     RATES,
@@ -60,7 +63,8 @@ class ClosedLoop(Diagram):
     `disturbance`, `disturbed_torque`. Output ports: `state`, `reference`,
     `torque_commanded` (what the law asks for), `torque_applied` (what arrives of it: within the
     motors' limit, late, before the bias), `integral`, `weights_used`, `parameters`,
-    `parameter_std`, `density`, `measurement` (held, as the controller read it), `state_estimate`.
+    `parameter_std`, `density`, `measurement` (held, as the controller read it), `state_estimate`,
+    `delay_true` (of the torque sent last), `packets`.
 
     Attributes:
         experiment: what it was built from.
@@ -127,15 +131,14 @@ def _add_surroundings(
 ) -> None:
     """Everything but reference and controller."""
     sc = experiment.scenario
-    period, steps, fraction = sc.controller.period, sc.delay.steps, sc.delay.fraction
+    period = sc.controller.period
     noise, s = np.array(sc.sensor.noise_std), sc.sensor
     builder.AddNamedSystem(
         "sensor", Sensor(noise, s.seed, period, s.faults, motion_scale(experiment))
     )
     limit = np.full(NUM_TORQUES, experiment.torque_limit)
     builder.AddNamedSystem("saturation", Saturation(-limit, limit))
-    queue = torques_in_flight(experiment, sc.true_delay)
-    builder.AddNamedSystem("delay_chain", DelayChain(period, steps, fraction, queue))
+    builder.AddNamedSystem("delay_chain", _link(experiment))
     builder.AddNamedSystem("torque_bias", add_to_torque(np.array(sc.plant.torque_bias)))
     builder.AddNamedSystem("plant", _plant(experiment, meshcat))
     kind = "magnitude" if experiment.network is None else experiment.network.density
@@ -229,6 +232,17 @@ def _weights(builder: DiagramBuilder, experiment: Experiment) -> ConstantVectorS
     if experiment.network is None:
         return builder.AddNamedSystem("weights", ConstantVectorSource(fixed))
     return builder.AddNamedSystem("tuner", AnnTuner(experiment.network, fixed, c.period))
+
+
+def _link(experiment: Experiment) -> DelayChain | VaryingDelay:
+    sc, delay = experiment.scenario, experiment.scenario.true_delay
+    period, queue = sc.controller.period, torques_in_flight(experiment, delay)
+    if sc.delay.constant:
+        chain = DelayChain(period, delay.steps, delay.fraction, queue)
+        declare_constant(chain, "delay", np.array([sc.eta]))  # for the record alone
+        declare_constant(chain, "packets", np.full(len(PACKETS), np.nan))
+        return chain
+    return VaryingDelay(period, torque_delays(sc), delay, queue)
 
 
 def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | MultibodyStewart:

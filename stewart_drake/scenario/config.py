@@ -21,6 +21,8 @@ from stewart_drake.scenario.field_types import (
     Deviation,
     Fraction,
     Name,
+    Seconds,
+    Seed,
     Six,
     Steps,
     TorqueLimit,
@@ -56,15 +58,37 @@ class PlantConfig:
 
 @dataclass(config=STRICT)
 class DelayConfig:
-    """The true delay between computing a torque and feeling it.
+    """The true delay between computing a torque and feeling it, by when it was computed.
+
+    A torque computed at t waits for (steps + fraction) dt + drift t + swing sin(swing_frequency t),
+    from `jump_time` on plus jump, plus jitter, in all at least 0: `scenario.link.torque_delays`.
 
     Attributes:
         steps: whole controller periods.
         fraction: a further part of one period, 0 to below 1; less than 1e-9 is 0.
+        drift: growth of the delay, s/s.
+        swing: amplitude of a slow change, s.
+        swing_frequency: of that, rad/s.
+        jump: a change all at once, s.
+        jump_time: when that is, s.
+        jitter_std: standard deviation of what differs from torque to torque, s.
+        seed: of the jitter.
     """
 
     steps: Steps = 8
     fraction: Fraction = 0.0
+    drift: Annotated[float, Field(ge=-0.9, le=10)] = 0.0
+    swing: Annotated[float, Field(ge=0, le=100)] = 0.0
+    swing_frequency: Annotated[float, Field(gt=0, le=1e3)] = 1.0
+    jump: Annotated[float, Field(ge=-100, le=100)] = 0.0
+    jump_time: Seconds = 0.0
+    jitter_std: Annotated[float, Field(ge=0, le=10)] = 0.0
+    seed: Seed = 0
+
+    @property
+    def constant(self) -> bool:
+        """Whether every torque waits as long."""
+        return self.drift == self.swing == self.jump == self.jitter_std == 0
 
 
 @dataclass(config=STRICT)
@@ -164,7 +188,7 @@ class StateSensorConfig:
     noise_std: Annotated[list[Deviation], Field(min_length=12, max_length=12)] = field(
         default_factory=lambda: [0.0] * 12
     )
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    seed: Seed = 0
     faults: list[SensorFault] = field(default_factory=list)
 
     def problem(self) -> str | None:

@@ -24,6 +24,7 @@ TorqueLimit = Annotated[
     Positive | Literal["none"] | None,
     one_message("a number above 0 and of at most 1e6, none for no limit"),
 ]
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Steps = Annotated[int, Field(ge=0, le=1000)]
 Row = Annotated[list[float], Field(min_length=6, max_length=6)]
 Six = Annotated[list[Annotated[float, Field(ge=-1e3, le=1e3)]], Field(min_length=6, max_length=6)]

@@ -40,6 +40,11 @@ DAMPING: Final = 7
 
 WEIGHTS: Final = ("w_Q", "w_R")
 
+PACKETS: Final = ("sent", "lost", "late", "played", "dry")
+"""Counts of a link with packets: late are those that came after their first torque's time, played
+and dry the periods in which a torque of a packet acted, and in which there was none.
+"""
+
 TUNER_INPUTS: Final = (
     *(f"error_{name}" for name in COORDINATES),
     *(f"rate_error_{name}" for name in COORDINATES),
@@ -68,6 +73,7 @@ DIMENSIONS: Final[dict[str, Dimension]] = {
     "parameter": Dimension(PARAMETERS, "parameters that nobody tells the controller"),
     "tuner_input": Dimension(TUNER_INPUTS, "what a density is taken of"),
     "state": Dimension(STATE, "coordinates, then their time derivatives"),
+    "packet": Dimension(PACKETS, "what became of packets, and of the periods they are for"),
 }
 
 
@@ -139,6 +145,7 @@ _PARAMETERS: Final = Quantity("parameter", PARAMETER_UNITS)
 _DENSITY: Final = Quantity("tuner_input", ("1",) * len(TUNER_INPUTS))
 _SECONDS: Final = Quantity(None, ("s",))
 _STATE: Final = Quantity("state", COORDINATE_UNITS + RATE_UNITS)
+_PACKETS: Final = Quantity("packet", ("1",) * len(PACKETS))
 
 _TABLE: Final = (
     Signal("pose", _POSE, "pose of the plate", "plant", "state", POSE),
@@ -171,6 +178,8 @@ _TABLE: Final = (
     Signal("state_estimate", _STATE, "pose and rates that the controller goes on", "controller"),
     Signal("delay_estimate", _SECONDS, "delay that the controller believes in", "controller"),
     Signal("delay_std", _SECONDS, "standard deviation of that estimate", "controller"),
+    Signal("delay_true", _SECONDS, "true delay of the torque sent last", "delay_chain.delay"),
+    Signal("packets", _PACKETS, "counts of packets, NaN without any", "delay_chain"),
 )
 SIGNALS: Final[dict[str, Signal]] = {signal.name: signal for signal in _TABLE}
 """By name, in the order of the record. Held signals show the value from an instant on.

@@ -221,7 +221,7 @@ def disturbed(scenario: Scenario, motion: tuple[float, ...], one: Draw) -> Scena
         "torque_bias": [a + b for a, b in zip(sc.plant.torque_bias, one.torque_bias, strict=True)],
         "joint_damping": sc.plant.joint_damping + one.damping,
     }
-    data["delay"] = {
+    data["delay"] |= {
         "steps": sc.delay.steps + whole,
         "fraction": round(max(0.0, fraction - whole), 12),
     }

@@ -1,0 +1,248 @@
+"""The link as it is: a delay that drifts, swings, jumps and jitters, against brute force."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
+from scipy.integrate import solve_ivp
+
+import stewart_drake as sd
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.loop.delay_chain import DelayChain
+from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.experiment import torques_in_flight
+from stewart_drake.loop.simulation import make_simulator
+from stewart_drake.loop.varying_delay import VaryingDelay
+from stewart_drake.scenario.config import DelayConfig
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.link import acting, delay_at, torque_delays
+
+Array = NDArray[np.float64]
+PERIOD = 0.1
+LONG = ("plant.kind=exact", "start=on_reference", "queue=reference")
+
+
+class Numbers(LeafSystem):
+    """Puts out the number of the sample, and 1000 before t = 0."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.DeclareVectorOutputPort("number", 6, self._output, {self.time_ticket()})
+
+    def _output(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(np.full(6, round(context.get_time() / PERIOD)))
+
+
+def scenario(*more: str) -> sd.Scenario:
+    return sd.load_scenario("paper", settings=(*LONG, *more))
+
+
+def bare(delays: Array, before: Delay) -> tuple[Simulator, LeafSystem]:
+    """A link alone; the torque of sample k is k, also where it was sent before t = 0."""
+    builder = DiagramBuilder()
+    source = builder.AddSystem(Numbers())
+    queue = np.repeat(np.arange(-before.queue_length, 0.0)[:, None], 6, axis=1)
+    link = builder.AddSystem(VaryingDelay(PERIOD, delays, before, queue))
+    builder.Connect(source.get_output_port(), link.GetInputPort("commanded"))
+    return Simulator(builder.Build()), link
+
+
+def newest(arrivals: dict[int, float], t: float) -> float:
+    """What has arrived by t and was sent last; 0 for nothing."""
+    return max((k for k, arrival in arrivals.items() if arrival <= t), default=0)
+
+
+# What acts when.
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**31), kind=st.sampled_from(["walk", "white", "short", "grid"]))
+def test_what_acts_is_the_newest_torque_that_has_arrived(seed: int, kind: str) -> None:
+    """Overtaking, arrivals at samples and no delay at all among them."""
+    rng = np.random.default_rng(seed)
+    n = 25
+    before = Delay(int(rng.integers(0, 5)), float(rng.choice([0.0, 0.3])))
+    eta = before.eta(PERIOD)
+    delays = {
+        "walk": eta + np.cumsum(0.05 * rng.standard_normal(n)),
+        "white": eta + 0.2 * rng.standard_normal(n),
+        "short": 0.05 * rng.standard_normal(n),
+        "grid": PERIOD * rng.integers(0, 6, n),
+    }[kind]
+    delays = np.maximum(delays, 0.0)
+    arrivals = {k: k * PERIOD + float(delays[k]) for k in range(n)}
+    arrivals |= {k: k * PERIOD + eta for k in range(-before.queue_length, 0)}
+    simulator, link = bare(delays, before)
+    context = link.GetMyContextFromRoot(simulator.get_context())
+    simulator.Initialize()
+    near = 1e-9
+    for t in sorted({a for a in arrivals.values() if 0 < a < n * PERIOD}):
+        for at in (t - near, t + near):
+            if at >= simulator.get_context().get_time():
+                simulator.AdvanceTo(at)
+                torque = link.GetOutputPort("torque").Eval(context)
+                expected = newest(arrivals, simulator.get_context().get_time())
+                if before.queue_length or expected:
+                    assert torque == pytest.approx(np.full(6, expected), abs=0)
+        sent = min(int((t + near) / PERIOD + 1e-9), n - 1)
+        assert link.GetOutputPort("delay").Eval(context) == pytest.approx(delays[sent], abs=1e-10)
+
+
+@pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (0, 0.4), (3, 0.0), (8, 0.5)])
+def test_a_constant_delay_is_the_delay_chain(steps: int, fraction: float) -> None:
+    before = Delay(steps, fraction)
+    simulator, link = bare(np.full(40, before.eta(PERIOD)), before)
+    builder = DiagramBuilder()
+    source = builder.AddSystem(Numbers())
+    queue = np.repeat(np.arange(-before.queue_length, 0.0)[:, None], 6, axis=1)
+    chain = builder.AddSystem(DelayChain(PERIOD, steps, fraction, queue))
+    builder.Connect(source.get_output_port(), chain.get_input_port())
+    plain = Simulator(builder.Build())
+    of_chain = chain.GetMyContextFromRoot(plain.get_context())
+    of_link = link.GetMyContextFromRoot(simulator.get_context())
+    for t in np.arange(1, 300) * 0.01 + 1e-6:
+        simulator.AdvanceTo(t)
+        plain.AdvanceTo(t)
+        expected = chain.get_output_port().Eval(of_chain)
+        assert np.array_equal(link.GetOutputPort("torque").Eval(of_link), expected)
+
+
+def test_a_torque_that_was_overtaken_never_acts() -> None:
+    # Sent at 0, 1, 2, 3 s: the second comes after the third, the fourth together with the third.
+    assert acting(np.array([0.5, 4.0, 3.5, 3.5])).tolist() == [True, False, False, True]
+    assert acting(np.array([0.5, np.inf, 3.5])).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("wrong", [np.array([0.1, -0.1]), np.array([np.nan]), np.empty(0)])
+def test_what_is_no_delay_is_refused(wrong: Array) -> None:
+    with pytest.raises(ValueError, match="delays: got"):
+        VaryingDelay(PERIOD, wrong, Delay(0), np.empty((0, 6)))
+    with pytest.raises(ValueError, match="queue: got shape"):
+        VaryingDelay(PERIOD, np.ones(3), Delay(2), np.empty((1, 6)))
+
+
+# The delay as a function of the sending time.
+
+
+def test_drift_swing_and_jump_add_up() -> None:
+    delay = DelayConfig(
+        steps=3, drift=0.02, swing=0.05, swing_frequency=2.0, jump=-0.1, jump_time=4.0
+    )
+    t = np.array([-1.0, 0.0, 1.0, 3.999, 4.0, 7.0])
+    expected = [
+        0.3,
+        0.3,
+        0.3 + 0.02 + 0.05 * np.sin(2.0),
+        0.3 + 0.02 * 3.999 + 0.05 * np.sin(2 * 3.999),
+        0.3 + 0.08 + 0.05 * np.sin(8.0) - 0.1,
+        0.3 + 0.14 + 0.05 * np.sin(14.0) - 0.1,
+    ]
+    assert delay_at(delay, 0.1, t) == pytest.approx(np.array(expected), abs=1e-15)
+    assert delay_at(DelayConfig(steps=1, jump=-5.0), 0.1, np.array([1.0])) == 0.0
+
+
+def test_jitter_is_white_seeded_and_never_before_its_time() -> None:
+    many = ("duration=1000", "delay.jitter_std=0.01")
+    jitter = torque_delays(scenario(*many)) - 0.8
+    n = len(jitter)
+    assert n == 10001
+    assert abs(jitter.mean()) < 4 * 0.01 / np.sqrt(n)
+    assert abs(jitter.std() / 0.01 - 1) < 4 / np.sqrt(2 * n)
+    assert abs(np.corrcoef(jitter[:-1], jitter[1:])[0, 1]) < 4 / np.sqrt(n)
+    assert np.array_equal(torque_delays(scenario(*many)) - 0.8, jitter)
+    assert np.array_equal(torque_delays(scenario("duration=10", *many[1:])) - 0.8, jitter[:101])
+    assert not np.any(jitter == torque_delays(scenario(*many, "delay.seed=1")) - 0.8)
+    clipped = torque_delays(scenario("delay.steps=0", *many))
+    assert clipped.min() == 0
+    assert abs(np.mean(clipped == 0) - 0.5) < 4 * 0.5 / np.sqrt(n)
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ("delay.drift=-1", "at least -0.9"),
+        ("delay.swing=-0.1", "at least 0"),
+        ("delay.swing_frequency=0", "above 0"),
+        ("delay.jitter_std=-1e-3", "at least 0"),
+        ("delay.jump=.nan", "finite"),
+    ],
+)
+def test_out_of_range_is_one_line(setting: str, expected: str) -> None:
+    with pytest.raises(ConfigError, match=f"settings: {setting.partition('=')[0]}: .*{expected}"):
+        scenario(setting)
+
+
+# On the plants.
+
+
+def test_a_delay_that_does_not_change_takes_the_plain_chain() -> None:
+    assert type(build_closed_loop(scenario()).GetSubsystemByName("delay_chain")) is DelayChain
+    loop = build_closed_loop(scenario("delay.seed=3", "delay.jump_time=2"))
+    assert type(loop.GetSubsystemByName("delay_chain")) is DelayChain
+
+
+@pytest.mark.parametrize(
+    "course",
+    [
+        ("delay.drift=0.05",),
+        ("delay.jitter_std=0.03", "delay.swing=0.05"),
+        ("delay.jump=-0.23", "delay.jump_time=0.5", "delay.steps=4"),
+    ],
+)
+def test_the_exact_plant_stops_at_every_arrival(course: tuple[str, ...]) -> None:
+    """Against scipy from arrival to arrival, with the torques that the loop sent, to 1e-9."""
+    sc = scenario("duration=1.65", "plant.accuracy=1e-11", *course)
+    loop = build_closed_loop(sc)
+    simulator = make_simulator(loop)
+    context = simulator.get_context()
+    period, n = sc.controller.period, 17
+    simulator.Initialize()
+    sent, start = {}, loop.experiment.start
+    delays = torque_delays(sc)
+    eta, before = sc.eta, sc.true_delay.queue_length
+    first = torques_in_flight(loop.experiment, sc.true_delay)
+    sent |= {k - before: first[k] for k in range(before)}
+    for k in range(n):
+        simulator.AdvanceTo(k * period + 1e-12)
+        sent[k] = loop.GetOutputPort("torque_commanded").Eval(context)
+    simulator.AdvanceTo(1.65)
+    arrivals = {k: k * period + float(delays[k]) for k in range(n)}
+    arrivals |= {k: k * period + eta for k in range(-before, 0)}
+    dynamics, x, t = loop.experiment.nominal, start, 0.0
+    for end in sorted({a for a in arrivals.values() if 0 < a < 1.65} | {1.65}):
+        torque = sent[int(newest(arrivals, (t + end) / 2))]
+
+        def change(_: float, x: Array, torque: Array = torque) -> Array:
+            return np.concatenate([x[6:], dynamics.accelerations(x[:6], x[6:], torque)])
+
+        x = solve_ivp(change, (t, end), x, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+        t = end
+    assert loop.GetOutputPort("state").Eval(context) == pytest.approx(x, abs=1e-9)
+
+
+def test_the_multibody_plant_feels_torques_at_its_nearest_step() -> None:
+    settings = ("plant.kind=multibody", "plant.time_step=0.005", "duration=1.3")
+    sc = scenario(*settings, "delay.jitter_std=0.02", "log_period=0.005", "delay.steps=2")
+    signals = sd.simulate(sc, margin=False).signals
+    exact = torque_delays(scenario("duration=1.3", "delay.jitter_std=0.02", "delay.steps=2"))
+    arrivals = 0.005 * np.round((0.1 * np.arange(14) + exact) / 0.005)
+    applied = signals.torque_applied.values
+    commanded = signals.torque_commanded.values[::20]
+    for at, torque in zip(signals.time.values, applied, strict=True):
+        here = [k for k in range(14) if arrivals[k] <= at + 1e-9]
+        if here:
+            assert np.array_equal(torque, commanded[max(here)])
+    assert np.allclose(signals.delay_true.values[::20], arrivals - 0.1 * np.arange(14), atol=1e-12)
+
+
+def test_the_record_shows_the_delay() -> None:
+    signals = sd.simulate(scenario("duration=1", "delay.drift=0.01"), margin=False).signals
+    sent = np.floor(signals.time.values / 0.1 + 1e-9) * 0.1
+    assert signals.delay_true.values == pytest.approx(0.8 + 0.01 * sent, abs=1e-12)
+    assert signals.delay_true.attrs["units"] == "s"
+    plain = sd.simulate(scenario("duration=0.3"), margin=False).signals
+    assert np.all(plain.delay_true.values == 0.8)
+    assert np.isnan(plain.packets.values).all()
