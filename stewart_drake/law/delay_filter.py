@@ -15,7 +15,7 @@ is kept: the delay is found by comparing filters (`law.delay_search`).
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,14 @@ ITERATIONS = 6
 """At the most, while the delay is hardly known; later a few do."""
 TRIED = 15
 """Values of the delay that are tried where a filter is to begin with its iterations."""
+MEMORY = 5.0
+"""s over which the timing of single torques is judged."""
+TIMING_WEIGHT = 1e10
+"""1/s^4; as if it had been measured to (3 ms)^2 before."""
+UNTIMELY = 0.1
+"""Periods by which a single torque may come early or late at the most."""
+JERKED = 0.03
+"""Periods by which the delay itself may have changed where it did."""
 LARGEST_RATE = 0.5
 """s/s."""
 NEVER = 1e6
@@ -64,7 +72,7 @@ class DelaySettings:
     Attributes:
         std: s, of the prior about the delay that is believed in.
         longest: s.
-        timing_std: s by which a single torque may come early or late.
+        timing_std: s by which a single torque may come early or late, at the least.
         walk: s per root s, of the delay itself.
         rate_std: s/s, of its rate; 0 for none.
         rate_walk: s/s per root s.
@@ -96,7 +104,8 @@ class Guess:
         log_likelihood: of the last measurement.
         fits: whether that was no outlier.
         outliers: in a row.
-        updates: measurements that were used.
+        timing: s^2, variance by which single torques come early or late, as it is estimated.
+        weight: 1/s^4, information behind that.
     """
 
     mean: Array
@@ -106,7 +115,8 @@ class Guess:
     log_likelihood: float = 0.0
     fits: bool = True
     outliers: int = 0
-    updates: int = 0
+    timing: float = 0.0
+    weight: float = TIMING_WEIGHT
 
     @property
     def eta(self) -> float:
@@ -156,9 +166,11 @@ class DelayFilter:
             y: what was measured now.
             newest: as of `Arrivals.within`.
         """
-        model = DelayModel(self.plant, timeline, in_flight, newest)
+        model, period = DelayModel(self.plant, timeline, in_flight, newest), timeline.period
         if y is not None:
             after = self._attempt(model, guess, y)
+            if after is None and self._precise(guess, period):
+                after = self._attempt(model, self._untimely(guess, period), y)
             if after is not None:
                 return after
         alone = self._attempt(model, guess, None)
@@ -185,20 +197,23 @@ class DelayFilter:
         known = bool(np.all(std <= KNOWN * self.settings.parameters.std))
         nodes, period = MIDPOINT if known else GAUSS_NODES, model.timeline.period
         at = model.at(xi, nodes)
-        likelihood, drift = 0.0, self._drift(at, xi)
+        sooner = self._sooner(at, xi)
+        likelihood, timing, weight = 0.0, guess.timing, guess.weight
         if y is not None:
             if guess.std > period / 10:
                 xi = self._best_of_many(model, guess, y, at.F[:NUM_STATE, :-2])
                 at = model.at(xi, nodes)
-                drift = self._drift(at, xi)
-            found = self._correct(model, guess, y, (xi, at, drift), nodes)
+                sooner = self._sooner(at, xi)
+            found = self._correct(model, guess, y, (xi, at, sooner), nodes)
             if found is None:
                 return None
-            xi, at, P, likelihood = found
+            xi, at, P, likelihood = found.xi, found.at, found.covariance, found.log_likelihood
+            if self._precise(guess, period):
+                timing, weight = self._timed(guess, found, period)
         mean = np.concatenate([at.state, xi[NUM_STATE:]])
         mean[-2] += period * xi[-1]
         P = at.F @ P @ at.F.T
-        P[:NUM_STATE, :NUM_STATE] += drift
+        P[:NUM_STATE, :NUM_STATE] += np.diag(self._drift(guess, sooner))
         if guess.eta < NEVER:
             P[-2, -2] += self.delay.walk**2 * period
             P[-1, -1] += self.delay.rate_walk**2 * period
@@ -209,14 +224,48 @@ class DelayFilter:
             log_likelihood=likelihood,
             fits=True,
             outliers=guess.outliers if y is None else 0,
-            updates=guess.updates + (y is not None),
+            timing=timing,
+            weight=weight,
         )
 
-    def _drift(self, at: "Linearized", xi: Array) -> Array:
-        """(12, 12) by which the model itself may be off after the period."""
-        moved = kicks(self.plant.dynamics, at.state, xi[NUM_STATE:-2], at.period)
-        early = self.delay.timing_std**2 * np.sum(moved**2, axis=0)
-        return np.diag(self.settings.model_std**2 + early)
+    def _sooner(self, at: "Linearized", xi: Array) -> Array:
+        """(12,) squared change of the state per s by which torques come early."""
+        early = kicks(self.plant.dynamics, at.state, xi[NUM_STATE:-2], at.period)
+        return np.asarray(np.sum(early**2, axis=0))
+
+    def _drift(self, guess: Guess, sooner: Array) -> Array:
+        """(12,) variance by which the model itself may be off after the period."""
+        timing = max(guess.timing, self.delay.timing_std**2)
+        return np.asarray(self.settings.model_std**2 + timing * sooner)
+
+    def _precise(self, guess: Guess, period: float) -> bool:
+        """Whether what a single torque does can be told from what the delay does."""
+        return guess.std < period / 50 and guess.eta < NEVER
+
+    def _untimely(self, guess: Guess, period: float) -> Guess:
+        """The same where the last torque may have come very early or late, or all from now on."""
+        P = guess.covariance.copy()
+        P[-2, -2] += (JERKED * period) ** 2
+        return replace(guess, covariance=P, timing=max(guess.timing, (UNTIMELY * period) ** 2))
+
+    def _timed(self, guess: Guess, found: "Corrected", period: float) -> tuple[float, float]:
+        """Variance of the timing and the information behind it, after one more measurement.
+
+        With S = S_0 + s M, s the variance, the log-likelihood has the slope and the information
+
+            dL/ds = 1/2 (nu' S^-1 M S^-1 nu - tr S^-1 M),   I = 1/2 tr S^-1 M S^-1 M,
+
+        so that s + (dL/ds) / I is what this measurement alone tells of it (Fisher scoring).
+        """
+        used = max(guess.timing, self.delay.timing_std**2)
+        share = np.linalg.solve(found.S, found.M)
+        pull = np.linalg.solve(found.S, found.innovation)
+        information = 0.5 * float(np.sum(share * share.T))
+        slope = 0.5 * float(pull @ found.M @ pull - np.trace(share))
+        kept = guess.weight * float(np.exp(-period / MEMORY))
+        weight = kept + information
+        timing = (kept * min(guess.timing, used) + information * used + slope) / weight
+        return min(max(timing, 0.0), (UNTIMELY * period) ** 2), weight
 
     def _correct(
         self,
@@ -225,13 +274,16 @@ class DelayFilter:
         y: Array,
         start: "tuple[Array, Linearized, Array]",
         nodes: Array,
-    ) -> "tuple[Array, Linearized, Array, float] | None":
-        """The iterations of `ParameterFilter.advance`: mean before, model there, P, likelihood."""
+    ) -> "Corrected | None":
+        """The iterations of `ParameterFilter.advance`; None for an outlier."""
         sensing, prior, P = self.sensing, guess.mean, guess.covariance
-        xi, at, drift = start
-        R = np.diag(sensing.noise_std**2)
-        R = R + sensing.through(at.state, sensing.through(at.state, drift).T)
-        small = SMALL * np.sqrt(np.diag(R))
+        xi, at, sooner = start
+
+        def seen(variance: Array) -> Array:
+            return sensing.through(at.state, sensing.through(at.state, np.diag(variance)).T)
+
+        R = np.diag(sensing.noise_std**2) + seen(self._drift(guess, sooner))
+        M, small = seen(sooner), SMALL * np.sqrt(np.diag(R))
         for _ in range(ITERATIONS if guess.std > model.timeline.period / 100 else FEW):
             H = sensing.through(at.state, at.F[:NUM_STATE])
             innovation = y - sensing.seen(at.state) - H @ (prior - xi)
@@ -253,7 +305,8 @@ class DelayFilter:
         distance = float(innovation @ np.linalg.solve(S, innovation))
         if not distance <= gate(len(y)):  # or NaN
             return None
-        return xi, at, posterior, -0.5 * (distance + float(np.linalg.slogdet(S)[1]))
+        likelihood = -0.5 * (distance + float(np.linalg.slogdet(S)[1]))
+        return Corrected(xi, at, posterior, likelihood, innovation, S, M)
 
     def _best_of_many(self, model: "DelayModel", guess: Guess, y: Array, H: Array) -> Array:
         """The mean with that eta of TRIED ones that the measurement fits best.
@@ -294,6 +347,24 @@ class DelayFilter:
             np.append(known.upper, [guess.high, LARGEST_RATE])[: n - NUM_STATE],
         )
         return np.concatenate([within_bounds(mean[:n], covariance[:n, :n], limits), mean[n:]])
+
+
+class Corrected(NamedTuple):
+    """What a measurement made of a guess."""
+
+    xi: Array
+    """Mean at the sample before."""
+    at: "Linearized"
+    """The period from there."""
+    covariance: Array
+    """Of xi."""
+    log_likelihood: float
+    innovation: Array
+    """(m,)."""
+    S: Array
+    """(m, m) its covariance."""
+    M: Array
+    """(m, m) by which that grows with the variance of the timing."""
 
 
 @dataclass(frozen=True)

@@ -53,9 +53,9 @@ LEAST_SHARE = 1e-4
 """Of the master's weight that goes to a cell, and that stays."""
 SUSPICIOUS = 2
 """Outliers in a row that may be a jump."""
-GRID = 0.2
+GRID = 0.5
 """Periods between the delays that are tried after a jump."""
-BEST = 3
+BEST = 2
 """Of them, from which filters are begun."""
 SETTLED = 5.0
 """Log of the odds at which one of those takes over."""
@@ -303,7 +303,8 @@ class _Search:
         best, near = ended[0], NEAR * self.period
         rivals = [c.weight for c in ended[1:] if abs(c.guess.eta - best.guess.eta) > near]
         sure = best.weight - max(rivals, default=-math.inf) >= SETTLED
-        if best.guess.fits and best.guess.std < near and sure:
+        moved = abs(best.guess.eta - guess.eta) > near  # less than that is not a jump
+        if best.guess.fits and best.guess.std < near and sure and moved:
             return replace(best.guess, low=0.0, high=self._longest, outliers=0)
         return None
 
