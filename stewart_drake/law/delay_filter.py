@@ -53,9 +53,9 @@ MEMORY = 5.0
 """s over which the timing of single torques is judged."""
 TIMING_WEIGHT = 1e10
 """1/s^4; as if it had been measured to (3 ms)^2 before."""
-UNTIMELY = 0.1
+UNTIMELY = 0.05
 """Periods by which a single torque may come early or late at the most."""
-JERKED = 0.03
+JERKED = 0.02
 """Periods by which the delay itself may have changed where it did."""
 LARGEST_RATE = 0.5
 """s/s."""
@@ -103,7 +103,7 @@ class Guess:
         low, high: s, between which eta is.
         log_likelihood: of the last measurement.
         fits: whether that was no outlier.
-        outliers: in a row.
+        outliers: in a row; with those that a torque at another time explains.
         timing: s^2, variance by which single torques come early or late, as it is estimated.
         weight: 1/s^4, information behind that.
     """
@@ -171,6 +171,8 @@ class DelayFilter:
             after = self._attempt(model, guess, y)
             if after is None and self._precise(guess, period):
                 after = self._attempt(model, self._untimely(guess, period), y)
+                if after is not None:  # explained, but one more of these may be a jump
+                    after = replace(after, outliers=guess.outliers + 1)
             if after is not None:
                 return after
         alone = self._attempt(model, guess, None)
@@ -198,7 +200,7 @@ class DelayFilter:
         nodes, period = MIDPOINT if known else GAUSS_NODES, model.timeline.period
         at = model.at(xi, nodes)
         sooner = self._sooner(at, xi)
-        likelihood, timing, weight = 0.0, guess.timing, guess.weight
+        likelihood, timing, weight, odd = 0.0, guess.timing, guess.weight, 0
         if y is not None:
             if guess.std > period / 10:
                 xi = self._best_of_many(model, guess, y, at.F[:NUM_STATE, :-2])
@@ -209,11 +211,11 @@ class DelayFilter:
                 return None
             xi, at, P, likelihood = found.xi, found.at, found.covariance, found.log_likelihood
             if self._precise(guess, period):
-                timing, weight = self._timed(guess, found, period)
+                timing, weight, odd = self._timed(guess, found, period)
         mean = np.concatenate([at.state, xi[NUM_STATE:]])
         mean[-2] += period * xi[-1]
         P = at.F @ P @ at.F.T
-        P[:NUM_STATE, :NUM_STATE] += np.diag(self._drift(guess, sooner))
+        P[:NUM_STATE, :NUM_STATE] += self._drift(guess, sooner)
         if guess.eta < NEVER:
             P[-2, -2] += self.delay.walk**2 * period
             P[-1, -1] += self.delay.rate_walk**2 * period
@@ -223,20 +225,20 @@ class DelayFilter:
             covariance=(P + P.T) / 2,
             log_likelihood=likelihood,
             fits=True,
-            outliers=guess.outliers if y is None else 0,
+            outliers=guess.outliers if y is None else odd,
             timing=timing,
             weight=weight,
         )
 
     def _sooner(self, at: "Linearized", xi: Array) -> Array:
-        """(12,) squared change of the state per s by which torques come early."""
+        """(12, 12) covariance of the state per s^2 by which torques come early or late."""
         early = kicks(self.plant.dynamics, at.state, xi[NUM_STATE:-2], at.period)
-        return np.asarray(np.sum(early**2, axis=0))
+        return np.asarray(early.T @ early + np.diag(np.sum(early**2, axis=0)))
 
     def _drift(self, guess: Guess, sooner: Array) -> Array:
-        """(12,) variance by which the model itself may be off after the period."""
+        """(12, 12) covariance of what the model itself may be off after the period."""
         timing = max(guess.timing, self.delay.timing_std**2)
-        return np.asarray(self.settings.model_std**2 + timing * sooner)
+        return np.diag(self.settings.model_std**2) + timing * sooner
 
     def _precise(self, guess: Guess, period: float) -> bool:
         """Whether what a single torque does can be told from what the delay does."""
@@ -248,8 +250,8 @@ class DelayFilter:
         P[-2, -2] += (JERKED * period) ** 2
         return replace(guess, covariance=P, timing=max(guess.timing, (UNTIMELY * period) ** 2))
 
-    def _timed(self, guess: Guess, found: "Corrected", period: float) -> tuple[float, float]:
-        """Variance of the timing and the information behind it, after one more measurement.
+    def _timed(self, guess: Guess, found: "Corrected", period: float) -> tuple[float, float, int]:
+        """Variance of the timing, the information behind it, and `outliers`, after a measurement.
 
         With S = S_0 + s M, s the variance, the log-likelihood has the slope and the information
 
@@ -264,8 +266,10 @@ class DelayFilter:
         slope = 0.5 * float(pull @ found.M @ pull - np.trace(share))
         kept = guess.weight * float(np.exp(-period / MEMORY))
         weight = kept + information
-        timing = (kept * min(guess.timing, used) + information * used + slope) / weight
-        return min(max(timing, 0.0), (UNTIMELY * period) ** 2), weight
+        timing = (kept * guess.timing + information * used + slope) / weight
+        most = (UNTIMELY * period) ** 2
+        odd = guess.outliers + 1 if used + slope / information > 2 * most else 0
+        return min(max(timing, 0.0), most), weight, odd
 
     def _correct(
         self,
@@ -279,8 +283,8 @@ class DelayFilter:
         sensing, prior, P = self.sensing, guess.mean, guess.covariance
         xi, at, sooner = start
 
-        def seen(variance: Array) -> Array:
-            return sensing.through(at.state, sensing.through(at.state, np.diag(variance)).T)
+        def seen(covariance: Array) -> Array:
+            return sensing.through(at.state, sensing.through(at.state, covariance).T)
 
         R = np.diag(sensing.noise_std**2) + seen(self._drift(guess, sooner))
         M, small = seen(sooner), SMALL * np.sqrt(np.diag(R))

@@ -57,6 +57,8 @@ GRID = 0.5
 """Periods between the delays that are tried after a jump."""
 BEST = 2
 """Of them, from which filters are begun."""
+HOPELESS = 100.0
+"""Squared distance by which it is not worth to begin one."""
 SETTLED = 5.0
 """Log of the odds at which one of those takes over."""
 AT_ONCE = 2
@@ -289,7 +291,8 @@ class _Search:
                 misses.append(y - sensing.seen(model.end(xi)))
             distance = np.sum(np.transpose(misses) * np.linalg.solve(S, np.transpose(misses)), 0)
             cost = distance if not len(cost) else cost + distance
-        chosen = _valleys(cost)[:BEST]
+        valleys = _valleys(cost)[:BEST]
+        chosen = [i for i in valleys if cost[i] <= HOPELESS + 10 * cost[valleys[0]]]
         begun = [self._begin_at(guess, float(tried[i]), states[0].covariance, states[0].state)
                  for i in chosen]
         ended = []
