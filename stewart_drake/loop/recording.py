@@ -68,6 +68,7 @@ class Recorder:
         peak_applied: largest torque that acted, N m.
         counts: what went wrong and was survived, as of the last sample.
         tuner_fallbacks: samples at which the tuner passed its network over.
+        delay: at the last sample, s: true, as it is believed in or estimated, standard deviation.
     """
 
     def __init__(self, loop: ClosedLoop) -> None:
@@ -85,6 +86,7 @@ class Recorder:
         self.on_grid, self.samples = Table(13), Table(19)
         self.peak_applied = 0.0
         self.counts, self.tuner_fallbacks = Counts(), 0
+        self.delay: dict[str, float] = {}
 
     def _port(self, context: Context, name: str) -> Array:
         if name not in self._ports:
@@ -109,6 +111,14 @@ class Recorder:
             if self._tuner is not None:
                 tuner_context = self._tuner.GetMyContextFromRoot(context)
                 self.tuner_fallbacks = self._tuner.fallbacks(tuner_context)
+            self.delay = {
+                key: float(self._port(context, name)[0])
+                for key, name in (
+                    ("true_s", "delay_true"),
+                    ("estimated_s", "delay_estimate"),
+                    ("std_s", "delay_std"),
+                )
+            }
             self.samples.append(self._error, memory.torque, memory.in_flight[-1], seconds)
         if instant.on_grid:
             self.on_grid.append(self._instant, self._error, self._wanted[POSE])
@@ -190,6 +200,7 @@ def summarize(
             "median": 1e3 * np.median(seconds) if some else nan,
             "worst": 1e3 * seconds.max() if some else nan,
         },
+        "delay": recorder.delay,
         "wall_s": wall,
         "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
         "own": experiment.own.names,

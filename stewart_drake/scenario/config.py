@@ -272,6 +272,18 @@ class Scenario:
         """The true delay in s."""
         return self.true_delay.eta(self.controller.period)
 
+    def _delay_problem(self) -> str | None:
+        c = self.controller
+        believed = self.eta
+        if c.delay_steps is not None:
+            believed = Delay(c.delay_steps, c.delay_fraction or 0.0).eta(c.period)
+        if c.delay_estimator == "none" or believed <= c.delay_max:
+            return None
+        return (
+            f"controller.delay_max: got {c.delay_max:g} s, less than the {believed:g} s that are "
+            "believed in; expected as much or more"
+        )
+
     def check(self, where: str = "scenario") -> None:
         """Checks every field again, and everything that takes several of them.
 
@@ -288,6 +300,7 @@ class Scenario:
             self.reference.problem(),
             _controller_problem(self.controller),
             self.sensor.problem(),
+            self._delay_problem(),
             step and step_problem(step, self.controller.period, self.delay.fraction),
             log_problem(self.log_period, self.duration, step),
         ):
