@@ -134,9 +134,12 @@ def dirty_runs() -> str:
 
 def changing() -> str:
     """Drift, swing, jumps, jitter, on the reference."""
-    ramp = ("drifting", (*ON_REFERENCE, "delay.drift=0.01"))
-    swing = ("drifting", (*ON_REFERENCE, "delay.swing=0.02"))
-    cases = {"0.8 to 0.9 s in 10 s": [ramp], "20 ms at 1 rad/s": [swing]}
+    ramp: tuple[str, Sequence[str]] = ("drifting", (*ON_REFERENCE, "delay.drift=0.01"))
+    swing: tuple[str, Sequence[str]] = ("drifting", (*ON_REFERENCE, "delay.swing=0.02"))
+    cases: dict[str, list[tuple[str, Sequence[str]]]] = {
+        "0.8 to 0.9 s in 10 s": [ramp],
+        "20 ms at 1 rad/s": [swing],
+    }
     seeds = range(SEEDS)
     cases["0.8 to 0.9 s, dirty"] = [(ramp[0], (*ramp[1], *dirty(seed))) for seed in seeds]
     for jump in (0.1, -0.1, 0.05, 0.3):
@@ -176,7 +179,7 @@ def coverage() -> str:
 
 def limits() -> str:
     """Gravity, where an error of the prediction grows by e^(p eta)."""
-    cases = {}
+    cases: dict[str, list[tuple[str, Sequence[str]]]] = {}
     for more in (0.0, 0.1, 0.2, 0.3, 0.5):
         for kind in ("none", "constant"):
             settings = ("plant.gravity=true", *ON_REFERENCE, "delay.steps=3", *believed(0.3 + more))

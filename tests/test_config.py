@@ -101,14 +101,25 @@ def test_the_defaults_are_the_papers_experiment() -> None:
             "estimator": "parameters",
             "w_Q": 1.0,
             "w_R": 1.0,
+            "integral_weight": 1.0,
             "weight_scaling": "bryson",
+            "packet_torques": 8,
+            "packet_repeats": 1,
             "catch_up": None,
         },
         "link": {"kind": "wire"},
         "actuator": {"kind": "torque", "torque_limit": None},
-        "sensor": {"kind": "state", "noise_std": [0] * 12, "seed": 0, "faults": []},
+        "sensor": {
+            "kind": "state",
+            "noise_std": [0] * 12,
+            "delay": 0.0,
+            "loss": 0.0,
+            "seed": 0,
+            "faults": [],
+        },
         "tuner": {"kind": "fixed"},
         "log_period": None,
+        "compare": {},
     }
 
 

@@ -33,7 +33,7 @@ def table(text: str) -> dict[str, np.ndarray]:
 
 def test_every_number_of_every_signal_is_there(run):
     columns = table(signals_csv(run.signals))
-    assert len(columns) == 1 + sum(signal.shape[1] for signal in run.signals.values())
+    assert len(columns) == 1 + sum(signal[0].size for signal in run.signals.values())
     assert np.array_equal(columns["time[s]"], run.signals.time.values)
     for name, column, unit in (
         ("pose", "roll", "rad"),

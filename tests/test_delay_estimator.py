@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -125,7 +126,7 @@ def record(eta: float, samples: int, seed: int, rate: float = 0.0) -> tuple[Arra
     arrive = DT * np.arange(samples) + eta + rate * DT * np.arange(samples)
     for k in range(samples - 1):
         edges = [k * DT, *arrive[(arrive > k * DT) & (arrive < (k + 1) * DT)], (k + 1) * DT]
-        for begin, end in zip(edges, edges[1:], strict=False):
+        for begin, end in pairwise(edges):
             place = np.searchsorted(arrive, (begin + end) / 2) - 1
             torque = torques[place] if place >= 0 else np.zeros(6)
             if end - begin > 1e-12:
@@ -137,9 +138,7 @@ def record(eta: float, samples: int, seed: int, rate: float = 0.0) -> tuple[Arra
     return torques, truth, truth + noise
 
 
-def observed(
-    torques: Array, measured: Array, believed: float, **changes: Any
-) -> list[DelayBelief]:
+def observed(torques: Array, measured: Array, believed: float, **changes: Any) -> list[DelayBelief]:
     """The beliefs at all samples."""
     delay = replace(DELAY, **changes)
     observer = DelayObserver(SETTINGS, delay, believed, quiet=False)
@@ -177,7 +176,8 @@ def test_the_filter_finds_what_batch_least_squares_finds() -> None:
 
     guess = np.concatenate([np.zeros(20), [0.33]])
     batch = least_squares(residuals, guess, x_scale=np.append(np.ones(20), 1e-2))
-    std = float(np.sqrt(np.linalg.inv(batch.jac.T @ batch.jac)[20, 20]))
+    jacobian = np.asarray(batch.jac)
+    std = float(np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[20, 20]))
     last = observed(torques, measured, believed=0.5)[-1]
     assert last.settled and last.guess is not None
     assert abs(batch.x[20] - eta) < 4 * std  # the oracle is one
@@ -307,15 +307,18 @@ def test_nothing_is_fed_back_before_the_first_torque_can_act() -> None:
 
     quiet, same = first(noisy), first(noisy, "sensor.seed=1")
     assert np.array_equal(quiet[:8], same[:8]) and np.all(quiet[8] != same[8])
-    loud = [first(noisy, seed, "controller.quiet_start=false") for seed in ("sensor.seed=0", "sensor.seed=1")]
+    loud = [
+        first(noisy, seed, "controller.quiet_start=false")
+        for seed in ("sensor.seed=0", "sensor.seed=1")
+    ]
     assert np.all(loud[0][0] != loud[1][0])
 
 
 def test_what_does_not_fit_is_refused() -> None:
     for wrong in ("controller.estimator=none", "controller.prediction=linear"):
-        with pytest.raises(ConfigError, match="controller.delay_estimator: got 'constant'"):
+        with pytest.raises(ConfigError, match=r"controller\.delay_estimator: got 'constant'"):
             looped(wrong)
-    with pytest.raises(ConfigError, match=r"controller.delay_max: got 0\.5 .* believed"):
+    with pytest.raises(ConfigError, match=r"controller\.delay_max: got 0\.5 .* believed"):
         looped("controller.delay_max=0.5")
 
 

@@ -247,8 +247,9 @@ def test_the_check_of_names_finds_what_is_wrong(code: str, wrong: bool) -> None:
 # ------------------------------------------------------------------ code blocks
 
 
-@each(blocks("python", "py"))
+@each([block for block in blocks("python", "py") if block.path.name != "extending.md"])
 def test_python_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All but those of docs/extending.md, which `tests/test_extending.py` runs and looks into."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
     source = "\n" * block.line + block.text  # so that a traceback shows the document's line

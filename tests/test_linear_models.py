@@ -12,6 +12,7 @@ from stewart_drake.law.linear_loop import LinearLoop
 from stewart_drake.loop.controller_margin import controller_margin, loop_at
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.state_space import state_spaces
+from stewart_drake.scenario.delay import Delay
 
 OMEGA = np.geomspace(0.05, 30, 40)
 
@@ -24,7 +25,7 @@ def test_double_integrator_in_closed_form():
     """L = (k1 h^2/2 (z + 1) + k2 h (z - 1)) / (z - 1)^2 z^-mu / (1 + k3 z^-1) by hand."""
     h, k1, k2, k3 = 0.1, 2.0, 3.0, 0.4
     plant = ContinuousModel(np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]]), np.eye(1, 2))
-    loop = LinearLoop(plant, np.array([[k1, k2, k3]]), h, steps=1, fraction=0.0, integral=False)
+    loop = LinearLoop(plant, np.array([[k1, k2, k3]]), h, Delay(1), integral=False)
     models = state_spaces(loop)
     for omega in OMEGA:
         z = np.exp(1j * omega * h)

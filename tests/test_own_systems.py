@@ -13,7 +13,9 @@ from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.trajectories import FunctionHandleTrajectory, PiecewisePolynomial
 
 import stewart_drake as sd
+from stewart_drake.loop import simulation
 from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.own import take
 from stewart_drake.scenario.trajectories import make_reference
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -214,6 +216,12 @@ def test_a_mistake_in_a_system_is_an_exception():
         ({"disturbance": lambda: disturbance("force")}, "'torque' (6) or 'wrench' (6)"),
         ({"disturbance": lambda: disturbance("wrench", 3)}, "got 3 values; expected 6"),
         ({"disturbance": controller}, "got an input port 'measurement'; expected none"),
+        ({"sensor": controller}, "sensor: Constant: got an input port 'measurement'; expected st"),
+        ({"link": lambda: Constant((("commanded", 6),))}, "expected an output port 'torque' (6)"),
+        ({"tuner": lambda: Constant((("state", 12),))}, "density (18), measurement (12), refer"),
+        ({"law": 3}, "law: got a int; expected a function of the scenario's law"),
+        ({"law": lambda law: None}, "law: got a NoneType from the function; expected a Predict"),
+        ({"law": lambda law: law, "controller": controller}, "law: got one with a controller"),
         ({"reference": np.zeros(6)}, "reference: got a ndarray; expected a Drake trajectory"),
         (
             {"reference": PiecewisePolynomial(np.zeros((3, 1)))},
@@ -283,14 +291,14 @@ def test_what_a_system_noted_is_still_there_and_a_loop_that_made_its_own_is_not(
             output.SetFromVector(np.zeros(6))
 
     system, seen = Noting(), []
-    original = sd.simulation.make_simulator
+    original = simulation.make_simulator
 
     def watched(loop):
         seen.append(weakref.ref(loop.GetSubsystemByName("controller")))
         return original(loop)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sd.simulation, "make_simulator", watched)
+        patch.setattr(simulation, "make_simulator", watched)
         sd.simulate(scenario("duration=0.05"), controller=system)
         sd.simulate(scenario("duration=0.05"), controller=Noting)
     np.testing.assert_allclose(np.unique(np.round(system.noted, 9)), np.arange(6) * 0.01)
@@ -323,9 +331,16 @@ def test_own_reference_that_ends_is_held_there():
     )
     still = np.zeros(6)
     motion = PiecewisePolynomial.CubicHermite([0, 0.5], knots, np.column_stack([still, still]))
-    experiment = prepare(scenario("duration=2"), own=sd.own.take(None, motion, None))
+    experiment = prepare(scenario("duration=2"), own=take({"reference": motion}))
     reference = experiment.reference
     for t in (0.5, 0.7, 5.0):
         np.testing.assert_allclose(reference.value(t)[:, 0], knots[:, 1])
     np.testing.assert_array_equal(reference.EvalDerivative(0.7, 1), np.zeros((6, 1)))
     np.testing.assert_allclose(experiment.peak_to_peak, [0, 0, 0, 0, 0, 0.01], atol=1e-12)
+
+
+def test_systems_beside_an_experiment_are_refused_by_everybody():
+    prepared = prepare(scenario("duration=0.05"))
+    for build in (sd.build_closed_loop, sd.simulate):
+        with pytest.raises(TypeError, match="controller: got one with an Experiment"):
+            build(prepared, controller=Constant)

@@ -54,7 +54,7 @@ def deck_height(mechanism):
     """Of the plate's upper side above its COM, read from the model's own disc."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
-    sd.AddStewartPlatform(builder, mechanism, plant=plant, collision=True)
+    sd.AddStewartPlatform(builder, mechanism, plant=plant)
     plant.Finalize()
     inspector = scene_graph.model_inspector()
     (disc,) = plant.GetCollisionGeometriesForBody(plant.GetBodyByName("plate"))

@@ -190,14 +190,14 @@ def compare(
     experiment = prepare(load_scenario(scenario, settings=settings or ()))
     check_writable(out)
     say(wrap(str(delay_verdict(experiment))))
-    names = study.CONTROLLERS
+    names = tuple(study.shown(scenario, settings or ()))
     with progress_bars(names, experiment.scenario.duration, quiet) as progress:
         results = study.compare(
             scenario, settings or (), lambda name, time, error: progress[name](time, error)
         )
     say(comparison_table(results))
     if out is not None:
-        stale = ["summary.json", *(f"{name}.nc" for name in names)]
+        stale = ["summary.json", *(f"{name}.nc" for name in (*names, study.ADAPTIVE))]
         remove(out, [*stale, *_pictures(COMPARISON_FIGURES)])
         study.save_comparison(results, out)
         written = f"summary.json, {len(results)} signal files"

@@ -106,6 +106,11 @@ class Belief:
         """Whether there is a state to go on with."""
         return bool(np.all(np.isfinite(self.state)))
 
+    def assuming(self, parameters: Array) -> "Belief":
+        """The same with other parameters (p,)."""
+        mean = np.concatenate([self.state, parameters])
+        return replace(self, estimate=replace(self.estimate, mean=mean))
+
     def at(self, state: Array) -> "Belief":
         """The same in another state (12,)."""
         mean = np.concatenate([state, self.parameters])

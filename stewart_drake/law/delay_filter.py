@@ -24,6 +24,7 @@ from stewart_drake.law.arrivals import Arrivals
 from stewart_drake.law.belief import Estimate
 from stewart_drake.law.filter_settings import FilterSettings, ParameterSet
 from stewart_drake.law.holds import GAUSS_NODES
+from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.parameter_filter import (
     KNOWN,
     MIDPOINT,
@@ -34,7 +35,6 @@ from stewart_drake.law.parameter_filter import (
     transition,
     within_bounds,
 )
-from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Acting
 from stewart_drake.scenario.signals import NUM_STATE
@@ -86,7 +86,9 @@ class DelaySettings:
     rate_walk: float
 
 
-def delay_settings(kind: Literal["constant", "drifting"], std: float, longest: float) -> DelaySettings:
+def delay_settings(
+    kind: Literal["constant", "drifting"], std: float, longest: float
+) -> DelaySettings:
     """For a delay that stays, or one whose rate is to be followed."""
     if kind == "constant":
         return DelaySettings(std, longest, 2e-4, 0.0, 0.0, 0.0)
@@ -180,9 +182,7 @@ class DelayFilter:
             alone = guess
         if y is None:
             return alone
-        return replace(
-            alone, fits=False, outliers=guess.outliers + 1, log_likelihood=UNLIKELY
-        )
+        return replace(alone, fits=False, outliers=guess.outliers + 1, log_likelihood=UNLIKELY)
 
     def _attempt(self, model: "DelayModel", guess: Guess, y: Array | None) -> Guess | None:
         try:
@@ -338,7 +338,7 @@ class DelayFilter:
         return np.sum(seen**2, axis=1)
 
     def _bounded(self, mean: Array, covariance: Array, guess: Guess) -> Array:
-        """`within_bounds` of what is uncertain: the parameters, and eta and its rate if they are."""
+        """`within_bounds` of what is uncertain: the parameters, and eta and rate if they are."""
         known = self.settings.parameters
         free = int(np.sum(np.diag(guess.covariance)[-2:] > 0))
         n = len(mean) - 2 + free

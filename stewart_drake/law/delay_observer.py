@@ -64,7 +64,7 @@ SETTLED = 5.0
 AT_ONCE = 2
 """Cells that leave time for a plan at the same sample."""
 CAUTION = 10.0
-"""Times the weight of torques while the delay is sought: a slow loop bears a delay that is wrong."""
+"""Times the weight of torques while the delay is sought: a slow loop bears a wrong one."""
 LOOSENED = 0.05
 """Standard deviations of the prior by which parameters may have changed with the delay."""
 
@@ -141,9 +141,7 @@ class DelayObserver:
     ) -> Belief:
         """See `law.observers.Observer.observe`."""
         assert isinstance(belief, DelayBelief) and isinstance(belief.timeline, Arrivals)
-        after = replace(
-            told(belief, measurement, sensing, plant), found=belief.fresh, fresh=False
-        )
+        after = replace(told(belief, measurement, sensing, plant), found=belief.fresh, fresh=False)
         y = measurement.values if after.fault is None else None
         filtering = DelayFilter(plant, sensing, self.settings, self.delay)
         if len(belief.timeline.before) == 0:  # the first sample: all in flight is others'
@@ -293,8 +291,10 @@ class _Search:
             cost = distance if not len(cost) else cost + distance
         valleys = _valleys(cost)[:BEST]
         chosen = [i for i in valleys if cost[i] <= HOPELESS + 10 * cost[valleys[0]]]
-        begun = [self._begin_at(guess, float(tried[i]), states[0].covariance, states[0].state)
-                 for i in chosen]
+        begun = [
+            self._begin_at(guess, float(tried[i]), states[0].covariance, states[0].state)
+            for i in chosen
+        ]
         ended = []
         for candidate in begun:
             total = 0.0
@@ -328,8 +328,12 @@ class _Search:
         P[-2, -2], P[-1, -1] = self.period**2 / 12, delay.rate_std**2
         half = self.period
         return replace(
-            guess, mean=mean, covariance=P, low=max(eta - half, 0.0),
-            high=min(eta + half, self._longest), outliers=0,
+            guess,
+            mean=mean,
+            covariance=P,
+            low=max(eta - half, 0.0),
+            high=min(eta + half, self._longest),
+            outliers=0,
         )
 
     def restarted(self, belief: DelayBelief, measurement: Measurement) -> DelayBelief:

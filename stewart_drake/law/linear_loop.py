@@ -58,15 +58,14 @@ class LinearLoop:
         plant: the true one, without integral states.
         K: (m, n + m L) of (law), which knows the last L torques.
         period: s.
-        steps, fraction: the true delay in periods.
+        delay: the true one.
         integral: whether the law integrates the error.
     """
 
     plant: ContinuousModel
     K: Array
     period: float
-    steps: int
-    fraction: float
+    delay: Delay
     integral: bool
 
     def sampled(self, longer: float = 0.0, step: float | None = None) -> DelayedModel:
@@ -74,13 +73,11 @@ class LinearLoop:
 
         `step` as of `delayed_model`.
         """
-        steps, fraction = self.steps, self.fraction
+        delay = self.delay
         if longer:
-            periods = max(0.0, steps + fraction + longer / self.period)
-            steps = int(periods + 1e-9)
-            fraction = max(0.0, periods - steps)
+            delay = Delay.of(delay.eta(self.period) + longer, self.period)
         return delayed_model(
-            self.plant, self.period, steps, fraction, integral=self.integral, step=step
+            self.plant, self.period, delay.steps, delay.fraction, integral=self.integral, step=step
         )
 
     def matrix(self, longer: float = 0.0, gain: float = 1.0, step: float | None = None) -> Array:
@@ -121,7 +118,7 @@ def worst_margins(loops: Sequence[LinearLoop]) -> Margins:
     if not all(is_stable(loop.matrix()) for loop in loops):
         return Margins(0.0, 0.0, 1.0, 1.0)
     period = loops[0].period
-    eta = Delay(loops[0].steps, loops[0].fraction).eta(period)
+    eta = loops[0].delay.eta(period)
     finest = _FINEST_DELAY * period
 
     def least(disturbed: Callable[[LinearLoop, float], Array], start: float, limit: float) -> float:

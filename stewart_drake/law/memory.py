@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.law.belief import Belief
+from stewart_drake.law.channel import Sent
 
 Array = NDArray[np.float64]
 
@@ -66,6 +67,8 @@ class Memory:
         torque: (6,) last torque as asked for, which may be beyond the limit.
         weights: (2,) w_Q and w_R that were used.
         counts: see `Counts`.
+        plan: (N, 6) torques that were sent last, the first of them the last in flight.
+        sent: what the channel remembers.
         path: that was planned in flight, or None.
         silence: samples that are still to go on without feedback.
     """
@@ -79,6 +82,8 @@ class Memory:
     torque: Array
     weights: Array
     counts: Counts
+    plan: Array
+    sent: Sent
     path: Trajectory | None = None
     silence: int = 0
 

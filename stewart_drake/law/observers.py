@@ -112,9 +112,7 @@ class ParameterObserver:
         return replace(after, estimate=estimate, fault=fault)
 
 
-def told(
-    belief: Belief, measurement: Measurement, sensing: Sensing, plant: NominalPlant
-) -> Belief:
+def told(belief: Belief, measurement: Measurement, sensing: Sensing, plant: NominalPlant) -> Belief:
     """The belief with what was measured, and what is wrong with that, and nothing made of it."""
     measurement.require_fresh()
     period = belief.timeline.period

@@ -11,7 +11,8 @@ with K from `law.riccati.reduced_gain` and T_ff the feedforward of the hold inte
 dynamics through the queue. Torques enter the linear parts as deviations from their feedforward.
 """
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.law.belief import Belief
+from stewart_drake.law.channel import Channel, Report, Wire
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
@@ -53,6 +55,8 @@ class Response(NamedTuple):
     """(6,) of the pose, that counts for the integral."""
     integral: Array
     """(6,)."""
+    ahead: Ahead
+    """Where the torque acts."""
     gain: Array
     """(6, g), NaN for none."""
     trouble: str | None
@@ -76,6 +80,8 @@ class PredictiveLqi:
         planner: of the way back, where the prediction is off.
         silence: samples at the start at which nothing is fed back: what they tell is of a plate on
             which nothing of the controller's acts, and noise.
+        channel: how torques get to the motors.
+        kept: how many torques are remembered beyond those of the delay, for late measurements.
     """
 
     timeline: Timeline
@@ -86,7 +92,9 @@ class PredictiveLqi:
     feedforward: Feedforward
     model: DesignModel
     cost: QuadraticCost
-    planner: Planner = NoPlanner()
+    channel: Channel = field(default_factory=Wire)
+    kept: int = 0
+    planner: Planner = field(default_factory=NoPlanner)
     silence: int = 0
 
     @cached_property
@@ -97,7 +105,11 @@ class PredictiveLqi:
     def times_for(self, timeline: Timeline) -> Array:
         """Times (p,) from now, s, at which the reference must be known; some may be negative."""
         nodes = self.feedforward.nodes(timeline, self.predictor.pending(timeline))
-        return np.concatenate([[0.0], self.predictor.samples(timeline), nodes])
+        at = np.concatenate([[0.0], self.predictor.samples(timeline)])
+        further = (
+            np.append(at[-1], nodes) + timeline.period * i for i in range(1, self.channel.torques)
+        )
+        return np.concatenate([at, nodes, *further])
 
     def warm_up(self) -> None:
         """Take two samples at home, so that no later one waits for functions to be compiled."""
@@ -120,8 +132,9 @@ class PredictiveLqi:
                 of them than that for an observer that may come to believe in a longer one.
         """
         nothing = np.zeros(NUM_TORQUES)
+        in_flight = np.vstack([np.zeros((1 + self.kept, NUM_TORQUES)), queue])
         return Memory(
-            in_flight=np.vstack([nothing, queue]),
+            in_flight=in_flight,
             belief=self.observer.start(self.timeline, self.sensing, self.plant),
             measurement=np.full(self.sensing.size, np.nan),
             error=np.zeros(NUM_COORDINATES),
@@ -130,12 +143,19 @@ class PredictiveLqi:
             torque=queue[-1] if len(queue) else nothing,
             weights=np.full(2, np.nan),
             counts=Counts(),
+            plan=np.tile(nothing, (self.channel.torques, 1)),
+            sent=self.channel.start(),
             silence=self.silence,
         )
 
     @np.errstate(over="ignore", invalid="ignore")  # its outcome is checked and counted instead
     def step(
-        self, memory: Memory, measurement: Measurement, motion: Motion, weights: Array
+        self,
+        memory: Memory,
+        measurement: Measurement,
+        motion: Motion,
+        weights: Array,
+        report: Report | None = None,
     ) -> Memory:
         """One sample.
 
@@ -144,6 +164,7 @@ class PredictiveLqi:
             measurement: of `sensing`; the model stands in for one that has a fault.
             motion: to follow. It is asked once, for `times_for` the delay that is believed in.
             weights: (2,) w_Q and w_R.
+            report: that came with the measurement, or None.
 
         Returns:
             The new memory; its torque (6,) is finite. What limits it stands behind the law: in
@@ -152,6 +173,10 @@ class PredictiveLqi:
         Raises:
             ValueError: a shape that does not fit. What numbers can do is survived and counted.
         """
+        sent, in_flight = self.channel.in_flight(
+            memory.sent, memory.in_flight, memory.belief.timeline, report
+        )
+        memory = replace(memory, in_flight=in_flight)
         belief = self.observer.observe(
             memory.belief, measurement, memory.in_flight, self.sensing, self.plant
         )
@@ -162,19 +187,24 @@ class PredictiveLqi:
         as_assumed = belief.timeline == self.timeline
         times = self.preview_times if as_assumed else self.times_for(belief.timeline)
         preview = followed.motion(times)
-        wanted, nodes = preview[:samples, :NUM_STATE], preview[samples:]
+        nodes_end = samples + 2 * (self.predictor.pending(belief.timeline) + 3)
+        wanted, nodes = preview[:samples, :NUM_STATE], preview[samples:nodes_end]
         if not belief.has_state:  # nothing else to go on with
             belief = belief.at(wanted[0])
+        queue = belief.timeline.queue(memory.in_flight)
+        guide = belief
         if belief.feeds_back and memory.silence == 0:
-            response = self._feed_back(memory, belief, wanted, nodes, weights)
+            response = self._feed_back(memory, belief, queue, wanted, nodes, weights)
         else:
-            response = self._go_on_alone(memory, nodes)
-        torque, error, integral, gain, trouble = response
+            guide = belief.assuming(self.plant.dynamics.parameters)
+            response = self._go_on_alone(memory, guide, wanted, nodes)
+        torque, error, integral, ahead, gain, trouble = response
         nonfinite = not np.all(np.isfinite(torque))
         if nonfinite:
             torque = memory.torque
         limited = self.plant.motors.let_through(torque)
         saturated = bool(np.any(limited != torque))
+        plan = self._plan(limited, guide, ahead, queue, gain, preview[nodes_end:])
         return Memory(
             in_flight=np.vstack([memory.in_flight[1:], limited]),
             belief=belief,
@@ -192,15 +222,22 @@ class PredictiveLqi:
             ),
             path=followed.path,
             silence=max(memory.silence - 1, 0),
+            plan=plan,
+            sent=self.channel.send(sent, plan, memory.in_flight),
         )
 
     def _feed_back(
-        self, memory: Memory, belief: Belief, wanted: Array, nodes: Array, weights: Array
+        self,
+        memory: Memory,
+        belief: Belief,
+        queue: Array,
+        wanted: Array,
+        nodes: Array,
+        weights: Array,
     ) -> Response:
         """(42) where the torque acts: torque, error, integral, gain, and what went wrong."""
         error = belief.state[POSE] - wanted[0, POSE]
         integral = self._integrate(memory, error, belief.timeline)
-        queue = belief.timeline.queue(memory.in_flight)
         ahead = self.predictor.ahead(belief, integral, queue, wanted, self.plant)
         held, changes = self.feedforward.held(nodes, self.plant.dynamics, belief.parameters)
         error_ahead, gain, trouble = self._design(memory, belief, ahead, held[-1], changes, weights)
@@ -209,14 +246,47 @@ class PredictiveLqi:
             pending = (queue[len(queue) - len(held) + 1 :] - held[:-1]).ravel()
             seen = self.cost.sees(ahead.integral)
             torque = torque - gain @ np.concatenate([error_ahead, seen, pending])
-        return Response(torque, error, integral, gain, trouble)
+        return Response(torque, error, integral, ahead, gain, trouble)
 
-    def _go_on_alone(self, memory: Memory, nodes: Array) -> Response:
+    def _go_on_alone(self, memory: Memory, belief: Belief, wanted: Array, nodes: Array) -> Response:
         """The feedforward of what is known beforehand; errors do not count."""
-        dynamics = self.plant.dynamics
-        held, _ = self.feedforward.held(nodes, dynamics, dynamics.parameters)
+        held, _ = self.feedforward.held(nodes, self.plant.dynamics, belief.parameters)
         nothing = np.zeros(NUM_COORDINATES)
-        return Response(held[-1], nothing, memory.integral, memory.gain, None)
+        none, ahead = (
+            self._no_gain(belief.timeline),
+            Ahead(wanted[-1], np.zeros(NUM_STATE), nothing),
+        )
+        return Response(held[-1], nothing, memory.integral, ahead, none, None)
+
+    def _plan(
+        self, first: Array, belief: Belief, ahead: Ahead, queue: Array, gain: Array, preview: Array
+    ) -> Array:
+        """(N, 6) this sample's torque, and what further ones would be if all went as predicted.
+
+        The nominal plant goes on from where the prediction ended, period by period, and is
+        regulated by the same gain. `preview` ((N - 1) (1 + s), 18) is the reference there.
+        """
+        plan, timeline, plant = [first], belief.timeline, self.plant
+        state, error, integral = ahead
+        pending = queue[len(queue) - self.predictor.pending(timeline) :]
+        for rows in np.split(preview, self.channel.torques - 1) if len(preview) else ():
+            flying = np.vstack([pending, plan[-1:]])
+            acting = timeline.next_period(flying)
+            state, pending = plant.predict(state, acting, belief.parameters)[-1], flying[1:]
+            before, error = error, state - rows[0, :NUM_STATE]
+            if not plant.motors.reached(acting.torques):
+                integral = integral + timeline.period / 2 * (before[POSE] + error[POSE])
+            held, changes = self.feedforward.held(rows[1:], plant.dynamics, belief.parameters)
+            torque = held[-1]
+            with suppress(UnreachablePoseError, ArithmeticError, np.linalg.LinAlgError):
+                model = self.model.at(state, torque, belief.parameters, plant)
+                offset = self.feedforward.offset(changes, model.B[RATES], timeline)
+                late = (pending - held[:-1]).ravel()
+                seen = np.concatenate([error - offset, self.cost.sees(integral), late])
+                torque = torque - gain @ seen if _is_there(gain) else torque
+            usable = bool(np.all(np.isfinite(torque)))
+            plan.append(plant.motors.let_through(torque) if usable else plan[-1])
+        return np.array(plan)
 
     def _design(
         self,

@@ -103,6 +103,28 @@ class Timeline:
             holds[0] = self.fraction * self.period  # the oldest has acted for the rest of its hold
         return Acting(queue, holds)
 
+    def last_periods(self, in_flight: Array, number: int) -> Acting:
+        """What acted in the last `number` >= 1 periods, of torques (n, 6), the oldest first.
+
+        Raises:
+            ValueError: fewer torques than that takes.
+        """
+        longest = len(in_flight) - number
+        if longest < self.queue_length:
+            raise ValueError(
+                f"delay: {len(in_flight)} torques are kept; expected at least "
+                f"{self.queue_length + number}"
+            )
+        torques, durations = self.acting(in_flight[longest - self.queue_length :])
+        n = number * self.per_period
+        return Acting(torques[:n], durations[:n])
+
+    def next_period(self, queue: Array) -> Acting:
+        """What acts in the period in which the oldest of torques (n, 6) begins it."""
+        torques, durations = self.acting(queue)
+        n = self.per_period
+        return Acting(torques[:n], durations[:n])
+
     def last_period(self, in_flight: Array) -> tuple[Acting, Array]:
         """What acted since the last sample, and the torque (6,) that acts next.
 

@@ -24,8 +24,8 @@ should, from 5e6 on they are lost or wrong by a hundred times the exact plant's 
 
 def cautions_before(experiment: Experiment, margin: ControllerMargin | None) -> list[str]:
     """What can be said before the run; `margin` is None where the loop was not judged."""
-    if experiment.own.controller is not None:
-        return ["the loop was not judged: its controller is not the scenario's"]
+    if experiment.own.unjudged:
+        return [f"the loop was not judged: its {experiment.own.unjudged} is not the scenario's"]
     if margin is None:
         return []
     if margin.problem:
@@ -64,7 +64,7 @@ def _finer(scenario: Scenario) -> Iterator[float]:
     for exponent, digit in product(range(-2, -7, -1), (5, 2, 1)):
         step = float(f"{digit}e{exponent}")
         if step < sc.plant.time_step and not step_problem(
-            step, sc.controller.period, sc.delay.fraction
+            step, sc.controller.period, sc.true_delay.fraction
         ):
             yield step
 

@@ -10,25 +10,26 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
     Context,
-    EventStatus,
     LeafSystem,
     State,
     ValueProducer,
 )
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.law.channel import Packets, Report
+from stewart_drake.law.late import LateObserver
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.signals import (
     NUM_REFERENCE,
     NUM_TORQUES,
     WEIGHTS,
     ports_of,
 )
-from stewart_drake.scenario.timing import event_time
 
 Array = NDArray[np.float64]
 
@@ -45,6 +46,11 @@ HELD: Final[dict[str, Callable[[Memory], Array]]] = {
     "delay_std": lambda memory: np.array([memory.belief.delay_std]),
 }
 """Signal of the table `scenario.signals.SIGNALS` -> what the controller's memory has of it."""
+
+
+def reported(kept: int) -> int:
+    """Periods that a report tells of, for a law that keeps so many torques beyond its delay."""
+    return kept + 1
 
 
 class Sample(NamedTuple):
@@ -71,6 +77,9 @@ class DelayLqiController(LeafSystem):
     | measurement | input | 12 | rad, m, rad/s, m/s | read every period; NaN is lost |
     | preview | input | 18 p | rad, m and time derivatives | read every period |
     | weights | input | 2 | w_Q, w_R | read every period |
+    | age | input | 1 | s, whole periods | of the measurement; only with a `LateObserver` |
+    | report | input | 7 h | as of `PlayoutBuffer`, NaN is lost | only with a channel of packets |
+    | plan | output | 6 (r + N) | N m, the packet to be sent | the same; direct feedthrough |
     | torque | output | 6 | N m | direct feedthrough |
     | torque_commanded | output | 6 | N m | held |
     | integral | output | 6 | rad s, m s | held |
@@ -104,6 +113,11 @@ class DelayLqiController(LeafSystem):
         preview_size = NUM_REFERENCE * len(self._times)
         self._preview = self.DeclareVectorInputPort("preview", preview_size)
         self._weights = self.DeclareVectorInputPort("weights", len(WEIGHTS))
+        late = isinstance(law.observer, LateObserver)
+        self._age = self.DeclareVectorInputPort("age", 1) if late else None
+        sends = isinstance(law.channel, Packets)
+        size = reported(law.kept) * (1 + NUM_TORQUES)
+        self._report = self.DeclareVectorInputPort("report", size) if sends else None
         memory_ticket = self.abstract_state_ticket(self._memory)
         self._step = self.DeclareCacheEntry(
             "step",
@@ -113,14 +127,14 @@ class DelayLqiController(LeafSystem):
         self.DeclareVectorOutputPort(
             "torque", NUM_TORQUES, weak(self._torque), {self._step.ticket()}
         )
+        if sends:
+            size = first.memory.sent.packets[0].size
+            self.DeclareVectorOutputPort("plan", size, weak(self._plan), {self._step.ticket()})
         for port, signal in ports_of("controller").items():
             part = HELD[signal.name]  # whose size is the law's: its parameters, what it senses
             size = len(part(first.memory))
             self.DeclareVectorOutputPort(port, size, weak(self._held, part), {memory_ticket})
-        # The first sample before all periodic events, as `DelayChain` does.
-        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._update_first))
-        early = event_time(law.timeline.period)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._update))
+        update_every(self, law.timeline.period, self._update)
 
     def sample(self, context: Context) -> Sample:
         """What the last step left in a context of this system."""
@@ -135,12 +149,30 @@ class DelayLqiController(LeafSystem):
         output.SetFromVector(part(self.memory(context)))
 
     def _calc_step(self, context: Context, result: AbstractValue) -> None:
-        measurement = Measurement.of(np.asarray(self._measurement.Eval(context)))
+        age = 0.0
+        if self._age is not None:
+            age = float(np.asarray(self._age.Eval(context))[0])
+        measurement = Measurement.of(np.asarray(self._measurement.Eval(context)), age)
         weights = np.asarray(self._weights.Eval(context))
         memory, motion = self.memory(context), self._followed(context)
+        report = self._reported(context, age)
         started = time.perf_counter()
-        after = self._law.step(memory, measurement, motion, weights)
+        after = self._law.step(memory, measurement, motion, weights, report)
         result.set_value(Sample(after, time.perf_counter() - started))
+
+    def _reported(self, context: Context, age: float) -> Report | None:
+        if self._report is None or not self._report.HasValue(context):
+            return None
+        values = np.asarray(self._report.Eval(context))
+        number = len(values) // (1 + NUM_TORQUES)
+        if np.any(np.isnan(values)):
+            return None
+        acted = values[number:].reshape(number, NUM_TORQUES)
+        return Report(values[:number] > 0, acted, round(age / self._law.timeline.period))
+
+    def _plan(self, context: Context, output: BasicVector) -> None:
+        sample: Any = self._step.Eval(context)
+        output.SetFromVector(sample.memory.sent.packets[-1].ravel())
 
     def _followed(self, context: Context) -> Motion:
         if self._motion is not None:
@@ -151,10 +183,6 @@ class DelayLqiController(LeafSystem):
     def _torque(self, context: Context, output: BasicVector) -> None:
         sample: Any = self._step.Eval(context)
         output.SetFromVector(sample.memory.torque)
-
-    def _update_first(self, context: Context, state: State) -> EventStatus:
-        self._update(context, state)
-        return EventStatus.Succeeded()
 
     def _update(self, context: Context, state: State) -> None:
         state.get_mutable_abstract_state(int(self._memory)).set_value(self._step.Eval(context))

@@ -30,11 +30,7 @@ from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.loop.experiment import Experiment, compose_law
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
-    BIAS,
-    DAMPING,
-    NUM_PARAMETERS,
     NUM_TORQUES,
-    PAYLOAD,
     POSE,
     RATES,
 )
@@ -152,14 +148,16 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
     ]
     poles = [fastest_pole(model.A) for model in models]
     fastest = int(np.argmax(poles)) if poles else 0
-    queue = max(sc.delay.steps + 1, law.timeline.queue_length)
+    queue = max(sc.true_delay.steps + 1, law.timeline.queue_length)
     rows = 12 + 6 * law.cost.integrates + 6 * queue
     radius, time, margins = math.nan, math.nan, Margins(*[math.nan] * 4)
     problem, loops = "", list[LinearLoop]()
     if not all(inside):
         problem = "the true machine does not reach all of the reference"
     elif rows > _LARGEST:
-        problem = f"with {sc.delay.steps} periods of delay it has {rows} states, too many to judge"
+        problem = (
+            f"with {sc.true_delay.steps} periods of delay it has {rows} states, too many to judge"
+        )
     else:
         every = math.ceil((max(rows, _COSTLY) / _COSTLY) ** 3)
         chosen = times[:: min(every, INSTANTS // _FEWEST)]
@@ -187,10 +185,8 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
 
 def true_dynamics(experiment: Experiment) -> StewartDynamics:
     """The plant as it is simulated, closed exactly whatever engine moves it."""
-    plant, parameters = experiment.scenario.plant, np.empty(NUM_PARAMETERS)
-    parameters[BIAS], parameters[PAYLOAD] = plant.torque_bias, plant.payload_mass
-    parameters[DAMPING] = plant.joint_damping
-    return StewartDynamics(experiment.truth, plant.gravity, parameters)
+    plant = experiment.scenario.plant
+    return StewartDynamics(experiment.truth, plant.gravity, plant.parameters)
 
 
 def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> ContinuousModel:
@@ -217,8 +213,7 @@ def _loops(
         with suppress(RiccatiError, np.linalg.LinAlgError, ArithmeticError):
             gain = _gain(experiment, truth, law, t)
         plant = true_model(experiment, truth, t)
-        delay = (sc.delay.steps, sc.delay.fraction)
-        loops.append(LinearLoop(plant, gain, law.timeline.period, *delay, integrates))
+        loops.append(LinearLoop(plant, gain, law.timeline.period, sc.true_delay, integrates))
     return loops
 
 

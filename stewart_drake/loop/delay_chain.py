@@ -2,9 +2,10 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.scenario.timing import event_time
@@ -62,18 +63,11 @@ class DelayChain(LeafSystem):
         self.DeclareVectorOutputPort(
             "torque", NUM_TORQUES, weak(self._output), {self.discrete_state_ticket(self._applied)}
         )
-        # At t = 0 ahead of all periodic events: nothing is earlier than a plant's first step.
-        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._take_first))
-        early = event_time(period)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._take))
+        update_every(self, period, self._take)
         if fraction > 0:
             self.DeclarePeriodicUnrestrictedUpdateEvent(
-                early, event_time(fraction * period), weak(self._release)
+                event_time(period), event_time(fraction * period), weak(self._release)
             )
-
-    def _take_first(self, context: Context, state: State) -> EventStatus:
-        self._take(context, state)
-        return EventStatus.Succeeded()
 
     def _take(self, context: Context, state: State) -> None:
         waiting = context.get_discrete_state(self._waiting).value()

@@ -2,11 +2,11 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES
-from stewart_drake.scenario.timing import event_time
 from stewart_drake.tuner.density import NUM_INPUTS, WINDOW, Kind, density
 
 Array = NDArray[np.float64]
@@ -49,17 +49,11 @@ class DensityWindow(LeafSystem):
         self.DeclareVectorOutputPort(
             "density", NUM_INPUTS, weak(self._density), {self.discrete_state_ticket(self._window)}
         )
-        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._update_first))
-        early = event_time(period)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._update))
+        update_every(self, period, self._update)
 
     def window(self, context: Context) -> Array:
         """(31, 18) samples in a context of this system, the newest last, NaN where unknown."""
         return np.reshape(context.get_discrete_state(self._window).value(), (WINDOW, NUM_INPUTS))
-
-    def _update_first(self, context: Context, state: State) -> EventStatus:
-        self._update(context, state)
-        return EventStatus.Succeeded()
 
     def _update(self, context: Context, state: State) -> None:
         target = np.asarray(self._reference.Eval(context))[:NUM_STATE]

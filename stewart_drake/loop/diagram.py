@@ -1,6 +1,6 @@
 """The closed loop as a Drake diagram, built from a scenario. Here its systems are connected."""
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,42 +17,53 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.controller import DelayLqiController
+from stewart_drake.law.channel import Channel, Packets, Wire
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.loop.controller import DelayLqiController, reported
 from stewart_drake.loop.delay_chain import DelayChain
 from stewart_drake.loop.density import DensityWindow
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.experiment import (
     Experiment,
+    concrete,
     control_law,
     first_queue,
     followed_motion,
     motion_scale,
-    prepare,
     torques_in_flight,
 )
+from stewart_drake.loop.late_measurements import LateMeasurements
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
-from stewart_drake.loop.own import OwnReference, OwnSystem, take
 from stewart_drake.loop.own_controller import SampledController
 from stewart_drake.loop.platforms import add_to_torque
+from stewart_drake.loop.playout import PlayoutBuffer
 from stewart_drake.loop.reference import Reference
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.start_check import StartCheck
 from stewart_drake.loop.tuner import AnnTuner
 from stewart_drake.loop.varying_delay import VaryingDelay, declare_constant
-from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.link import torque_delays
+from stewart_drake.scenario.config import NetworkConfig, Scenario
+from stewart_drake.scenario.link import (
+    measurement_times,
+    number_sent,
+    packet_times,
+    torque_delays,
+)
 from stewart_drake.scenario.signals import (
-    DAMPING,
-    NUM_PARAMETERS,
+    BIAS,
     NUM_TORQUES,
     PACKETS,
-    PAYLOAD,
     POSE,
     RATES,
+    SIGNALS,
     exported_ports,
 )
 
 Array = NDArray[np.float64]
+
+
+_TOLD: Final = {"density": "density", "measurement": "sensor", "reference": "reference"}
+"""What a tuner may ask for, and the system whose output of that name it is."""
 
 
 class ClosedLoop(Diagram):
@@ -90,34 +101,36 @@ class ClosedLoop(Diagram):
 def build_closed_loop(
     scenario: Scenario | Experiment,
     *,
-    controller: OwnSystem | None = None,
-    reference: OwnReference | None = None,
-    disturbance: OwnSystem | None = None,
     meshcat: Meshcat | None = None,
+    **own: Any,
 ) -> ClosedLoop:
     """The diagram of a scenario: reference, controller, limit, delay chain, plant, sensor.
 
     Args:
         scenario: what to build, or what `prepare` made of it.
-        controller, reference, disturbance: of one's own, see `simulate`; not with an Experiment,
-            which has them.
         meshcat: where the multibody plant is shown while it is simulated, or None.
+        **own: controller, reference, disturbance, law, sensor, link, tuner of one's own, as of
+            `simulate`.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
+        TypeError: systems of one's own beside an Experiment, which has its own.
     """
-    if isinstance(scenario, Experiment):
-        experiment = scenario
-    else:
-        experiment = prepare(scenario, own=take(controller, reference, disturbance))
+    experiment = concrete(scenario, **own)
     experiment.own.claim()
     builder = DiagramBuilder()
     _add_surroundings(builder, experiment, meshcat)
-    if experiment.own.controller is None:
-        catch_up = _add_law(builder, experiment)
+    channel: Channel = Wire()
+    reports, catch_up = 1, 0.0
+    if "controller" in experiment.own.systems:
+        _add_own_controller(builder, experiment)
     else:
-        catch_up = 0.0
-        _add_own_controller(builder, experiment, experiment.own.controller)
+        law, catch_up = _add_law(builder, experiment)
+        channel, reports = law.channel, reported(law.kept)
+    link = _link(experiment, channel, reports)
+    limit = np.full(link.GetInputPort("commanded").size(), experiment.torque_limit)
+    builder.AddNamedSystem("saturation", Saturation(-limit, limit))
+    builder.AddNamedSystem("delay_chain", link)
     _connect_loop(builder, experiment)
     loop = ClosedLoop()
     builder.BuildInto(loop)
@@ -132,13 +145,9 @@ def _add_surroundings(
     """Everything but reference and controller."""
     sc = experiment.scenario
     period = sc.controller.period
-    noise, s = np.array(sc.sensor.noise_std), sc.sensor
-    builder.AddNamedSystem(
-        "sensor", Sensor(noise, s.seed, period, s.faults, motion_scale(experiment))
-    )
-    limit = np.full(NUM_TORQUES, experiment.torque_limit)
-    builder.AddNamedSystem("saturation", Saturation(-limit, limit))
-    builder.AddNamedSystem("delay_chain", _link(experiment))
+    noise, s, own = np.array(sc.sensor.noise_std), sc.sensor, experiment.own.systems
+    sensor = Sensor(noise, s.seed, period, s.faults, motion_scale(experiment))
+    builder.AddNamedSystem("sensor", own.get("sensor", sensor))
     builder.AddNamedSystem("torque_bias", add_to_torque(np.array(sc.plant.torque_bias)))
     builder.AddNamedSystem("plant", _plant(experiment, meshcat))
     kind = "magnitude" if experiment.network is None else experiment.network.density
@@ -155,26 +164,65 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
         return builder.GetSubsystemByName(target).GetInputPort(port)
 
     saturation, bias = (builder.GetSubsystemByName(name) for name in ("saturation", "torque_bias"))
-    builder.Connect(out("sensor", "measurement"), into("controller", "measurement"))
-    builder.Connect(out("controller", "torque"), saturation.get_input_port())
+    measured = _measured(builder, experiment)
+    builder.Connect(measured, into("controller", "measurement"))
+    if "controller" in experiment.own.systems:
+        builder.Connect(measured, into("own_controller", "measurement"))
+    sends = builder.GetSubsystemByName("controller").HasOutputPort("plan")
+    builder.Connect(out("controller", "plan" if sends else "torque"), saturation.get_input_port())
     builder.Connect(saturation.get_output_port(), into("delay_chain", "commanded"))
     builder.Connect(out("delay_chain", "torque"), bias.get_input_port())
     _disturb(builder, experiment, bias.get_output_port())
     builder.Connect(out("plant", "state"), into("sensor", "state"))
-    builder.Connect(out("sensor", "measurement"), into("density", "measurement"))
+    builder.Connect(measured, into("density", "measurement"))
     builder.Connect(out("reference", "reference"), into("density", "reference"))
     builder.Connect(out("controller", "torque"), into("density", "torque"))
-    if experiment.network is not None:
-        builder.Connect(out("density", "density"), into("tuner", "density"))
+    if builder.HasSubsystemNamed("tuner"):
+        _connect_tuner(builder, builder.GetSubsystemByName("tuner"))
     if experiment.start[RATES].any() and experiment.scenario.plant.kind == "multibody":
         builder.AddNamedSystem("start_check", StartCheck(experiment.start))
         builder.Connect(out("plant", "state"), into("start_check", "state"))
     for name, (source, port) in exported_ports().items():
-        builder.ExportOutput(out(source, port), name)
+        if builder.GetSubsystemByName(source).HasOutputPort(port):
+            builder.ExportOutput(out(source, port), name)
+        else:  # of a system of one's own
+            size = sum(s.size for s in SIGNALS.values() if s.exported == name)
+            unknown = ConstantVectorSource(np.full(size, np.nan))
+            builder.AddNamedSystem(f"no_{name}", unknown)
+            builder.ExportOutput(unknown.get_output_port(), name)
 
 
-def _add_law(builder: DiagramBuilder, experiment: Experiment) -> float:
-    """The shipped controller behind its reference and weights; the length of its catch-up, s."""
+def _measured(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
+    """Where the controller has its measurements from: the sensor, or what they are delayed by."""
+    sc, controller = experiment.scenario, builder.GetSubsystemByName("controller")
+    measured = builder.GetSubsystemByName("sensor").GetOutputPort("measurement")
+    link = builder.GetSubsystemByName("delay_chain")
+    report = link.GetOutputPort("report") if link.HasOutputPort("report") else None
+    times = measurement_times(sc)
+    if np.any(times != 0):
+
+        def late(name: str, port: OutputPort) -> System:
+            way = LateMeasurements(sc.controller.period, times, port.size())
+            builder.AddNamedSystem(name, way)
+            builder.Connect(port, way.GetInputPort("measured"))
+            return way
+
+        way = late("late_measurements", measured)
+        measured = way.GetOutputPort("measurement")
+        if controller.HasInputPort("age"):
+            builder.Connect(way.GetOutputPort("age"), controller.GetInputPort("age"))
+        if report is not None:
+            report = late("late_report", report).GetOutputPort("measurement")
+    if report is not None and controller.HasInputPort("report"):
+        link_config = sc.link
+        assert isinstance(link_config, NetworkConfig)
+        if link_config.acknowledged:
+            builder.Connect(report, controller.GetInputPort("report"))
+    return measured
+
+
+def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[PredictiveLqi, float]:
+    """The shipped controller behind its reference and weights; its law, and its catch-up, s."""
     law, planned, catch_up = control_law(experiment)
     reference = builder.AddNamedSystem(
         "reference", Reference(experiment.reference, planned, law.preview_times)
@@ -187,13 +235,13 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> float:
         ),
     )
     builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
-    builder.Connect(weights.get_output_port(), controller.GetInputPort("weights"))
-    return catch_up
+    builder.Connect(weights, controller.GetInputPort("weights"))
+    return law, catch_up
 
 
-def _add_own_controller(builder: DiagramBuilder, experiment: Experiment, system: System) -> None:
+def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None:
     """The user's controller behind its reference, and what samples it."""
-    sc = experiment.scenario
+    sc, system = experiment.scenario, experiment.own.systems["controller"]
     if experiment.network is not None:
         raise ConfigError(
             f"tuner.kind: got {sc.tuner.kind!r} with a controller of your own; expected 'fixed'"
@@ -205,15 +253,14 @@ def _add_own_controller(builder: DiagramBuilder, experiment: Experiment, system:
         "controller", SampledController(sc.controller.period, experiment.torque_limit)
     )
     builder.Connect(system.GetOutputPort("torque"), sampled.GetInputPort("own_torque"))
-    sensor = builder.GetSubsystemByName("sensor")
-    builder.Connect(sensor.GetOutputPort("measurement"), system.GetInputPort("measurement"))
     if system.HasInputPort("reference"):
         builder.Connect(reference.GetOutputPort("reference"), system.GetInputPort("reference"))
 
 
 def _disturb(builder: DiagramBuilder, experiment: Experiment, torque: OutputPort) -> None:
     """Connect the torque that arrives with the plant, through a disturbance if there is one."""
-    disturbance, plant = experiment.own.disturbance, builder.GetSubsystemByName("plant")
+    disturbance = experiment.own.systems.get("disturbance")
+    plant = builder.GetSubsystemByName("plant")
     if disturbance is not None:
         builder.AddNamedSystem("disturbance", disturbance)
         if disturbance.HasOutputPort("wrench"):
@@ -226,17 +273,46 @@ def _disturb(builder: DiagramBuilder, experiment: Experiment, torque: OutputPort
     builder.Connect(torque, plant.GetInputPort("torque"))
 
 
-def _weights(builder: DiagramBuilder, experiment: Experiment) -> ConstantVectorSource | AnnTuner:
-    c = experiment.scenario.controller
+def _weights(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
+    """What the controller's weights come from: a `tuner`, or constant `weights`."""
+    c, own = experiment.scenario.controller, experiment.own.systems.get("tuner")
     fixed = np.array([c.w_Q, c.w_R])
-    if experiment.network is None:
-        return builder.AddNamedSystem("weights", ConstantVectorSource(fixed))
-    return builder.AddNamedSystem("tuner", AnnTuner(experiment.network, fixed, c.period))
+    if own is None and experiment.network is None:
+        return builder.AddNamedSystem("weights", ConstantVectorSource(fixed)).get_output_port()
+    tuner = AnnTuner(experiment.network, fixed, c.period) if own is None else own
+    return builder.AddNamedSystem("tuner", tuner).GetOutputPort("weights")
 
 
-def _link(experiment: Experiment) -> DelayChain | VaryingDelay:
+def _connect_tuner(builder: DiagramBuilder, tuner: System) -> None:
+    """Give it of what the loop can tell those that it has ports for."""
+    for name, source in _TOLD.items():
+        if tuner.HasInputPort(name):
+            told = builder.GetSubsystemByName(source).GetOutputPort(name)
+            builder.Connect(told, tuner.GetInputPort(name))
+
+
+def _link(experiment: Experiment, channel: Channel, reports: int) -> System:
+    """What is between limit and motors, for a law's channel and reports of so many periods."""
+    own = experiment.own.systems.get("link")
+    if own is not None:
+        if isinstance(experiment.scenario.link, NetworkConfig):
+            raise ConfigError("link.kind: got 'network' with a link of your own; expected 'wire'")
+        return own
     sc, delay = experiment.scenario, experiment.scenario.true_delay
     period, queue = sc.controller.period, torques_in_flight(experiment, delay)
+    if isinstance(sc.link, NetworkConfig):
+        repeats = channel.repeats if isinstance(channel, Packets) else 0
+        times = packet_times(sc.link, number_sent(sc.duration, period), sc.link.seed)
+        return PlayoutBuffer(
+            period,
+            times,
+            delay,
+            queue,
+            rows=repeats + channel.torques,
+            repeats=repeats,
+            dry=sc.link.dry,
+            history=reports,
+        )
     if sc.delay.constant:
         chain = DelayChain(period, delay.steps, delay.fraction, queue)
         declare_constant(chain, "delay", np.array([sc.eta]))  # for the record alone
@@ -246,7 +322,7 @@ def _link(experiment: Experiment) -> DelayChain | VaryingDelay:
 
 
 def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | MultibodyStewart:
-    plant, disturbance = experiment.scenario.plant, experiment.own.disturbance
+    plant, disturbance = experiment.scenario.plant, experiment.own.systems.get("disturbance")
     wrench = disturbance is not None and disturbance.HasOutputPort("wrench")
     if plant.kind == "multibody":
         return MultibodyStewart(
@@ -259,7 +335,7 @@ def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | Mult
             start=experiment.start[POSE],
             wrench=wrench,
         )
-    parameters = np.zeros(NUM_PARAMETERS)
-    parameters[PAYLOAD], parameters[DAMPING] = plant.payload_mass, plant.joint_damping
+    parameters = np.array(plant.parameters)
+    parameters[BIAS] = 0.0  # added before, where the record of torques ends
     truth = StewartDynamics(experiment.truth, plant.gravity, parameters)
     return ExactPlant(truth, experiment.start, wrench)

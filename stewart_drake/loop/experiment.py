@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
 from stewart_drake.law.catch_up import plan_catch_up
+from stewart_drake.law.channel import Channel, Packets, Wire
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.delay_filter import delay_settings
 from stewart_drake.law.delay_observer import DelayObserver
@@ -24,6 +25,7 @@ from stewart_drake.law.feedforward import (
     NoFeedforward,
 )
 from stewart_drake.law.filter_settings import filter_settings
+from stewart_drake.law.late import LateObserver
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import NoObserver, Observer, ParameterObserver
@@ -45,11 +47,13 @@ from stewart_drake.law.startup import (
     weight_scales,
 )
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.own import NOTHING, Own, own_motion
+from stewart_drake.loop.own import NOTHING, Own, take
+from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.config import AnnTunerConfig, Scenario
+from stewart_drake.scenario.config import AnnTunerConfig, NetworkConfig, Scenario
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.link import in_time, times_under_way
 from stewart_drake.scenario.signals import POSITION
 from stewart_drake.scenario.trajectories import evaluate, make_reference, moved, peak_to_peak
 from stewart_drake.tuner.network import DEFAULT, Network, load_network
@@ -58,6 +62,12 @@ Array = NDArray[np.float64]
 
 GENTLE = 3.0
 """Torques up to so many times the reference's are predicted with the usual steps."""
+_MOST = 0.999
+"""Share of the measurements that are waited for."""
+_PATIENCE = 10
+"""Periods by which a measurement may be later than that, or lost, before the model goes on."""
+_REPORTS = 10
+"""Reports in a row that may be lost without losing what they said."""
 REACH_CHECK_PERIOD = 0.02
 """s between the instants at which a reference is checked against the workspace."""
 
@@ -104,7 +114,7 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
     Args:
         scenario: what to run.
         truth: the machine to simulate where it is not the one that the controller knows.
-        own: controller, reference or disturbance in the place of the scenario's.
+        own: what takes the place of the scenario's.
 
     Raises:
         ConfigError: one line; also where the reference leaves the workspace, with time and leg.
@@ -124,6 +134,28 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
             )
         )
     return experiment
+
+
+def concrete(
+    scenario: Scenario | Experiment, truth: Mechanism | None = None, **own: Any
+) -> Experiment:
+    """What `prepare` makes of a scenario and of what is the user's own, or an Experiment as it is.
+
+    Args:
+        scenario: either.
+        truth: see `prepare`.
+        **own: see `loop.simulation.simulate`.
+
+    Raises:
+        ConfigError: bad input, an unreachable reference.
+        TypeError: something of one's own beside an Experiment, which has its own.
+    """
+    if not isinstance(scenario, Experiment):
+        return prepare(scenario, truth, take(own))
+    for name, thing in ({"truth": truth} | own).items():
+        if thing is not None:
+            raise TypeError(f"{name}: got one with an Experiment, which has its own; expected None")
+    return scenario
 
 
 def first_pose_text(pose: Array, mechanism: Mechanism) -> str:
@@ -259,6 +291,15 @@ def planned_limit(scenario: Scenario) -> float | None:
     return None if asked == "none" else asked
 
 
+def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
+    """What the scenario's gain minimises; the torque in N m is what the reference takes."""
+    c = experiment.scenario.controller
+    errors, integrals, torques = weight_scales(
+        c.weight_scaling, experiment.nominal, experiment.peak_to_peak, peak_torque
+    )
+    return QuadraticCost(errors, c.integral_weight * integrals if c.integral else None, torques)
+
+
 def compose_law(experiment: Experiment) -> PredictiveLqi:
     """The parts that a scenario asks for; the only place that knows their names in it."""
     sc, nominal = experiment.scenario, experiment.nominal
@@ -267,9 +308,6 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     substeps = choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration)
     peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
     torque_scale = max(machine_torque(nominal), peak_torque)
-    errors, integrals, torques = weight_scales(
-        c.weight_scaling, nominal, experiment.peak_to_peak, peak_torque
-    )
     plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
     settings = filter_settings(motion, plate, torque_scale, asked, c.period)
     observers: dict[str, Observer] = {
@@ -291,26 +329,58 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     }
     motors = TorqueLimit(experiment.torque_limit)
     quiet = c.quiet_start and sc.start == "rest"
+    observer, waits = observers[c.estimator], longest_wait(sc)
+    if waits:
+        observer = LateObserver(observer, waits)
+    channel = _channel(sc, timeline, waits)
     law = PredictiveLqi(
         timeline=timeline,
         plant=NominalPlant(nominal, substeps, GENTLE * torque_scale, motors),
         sensing=StateSensing(np.array(sc.sensor.noise_std), motion),
-        observer=observers[c.estimator],
+        observer=observer,
         predictor=predictors[c.prediction],
         feedforward=feedforwards[c.feedforward],
         model=models[c.model],
-        cost=QuadraticCost(errors, integrals if c.integral else None, torques),
+        cost=quadratic_cost(experiment, peak_torque),
+        channel=channel,
+        kept=waits + (_REPORTS if isinstance(channel, Packets) else 0),
         silence=math.ceil(timeline.delay.periods) if quiet else 0,
     )
-    if c.delay_estimator == "none":
-        return law
-    delay = delay_settings(c.delay_estimator, c.delay_std, c.delay_max)
-    return replace(
-        law,
-        observer=DelayObserver(settings, delay, timeline.eta, quiet),
-        predictor=ArrivalPredictor(),
-        planner=Rejoin(c.rejoin, experiment.scale) if c.rejoin > 0 else NoPlanner(),
-        silence=0,  # until the delay is found
+    if c.delay_estimator != "none":
+        delay = delay_settings(c.delay_estimator, c.delay_std, c.delay_max)
+        law = replace(
+            law,
+            observer=DelayObserver(settings, delay, timeline.eta, quiet),
+            predictor=ArrivalPredictor(),
+            planner=Rejoin(c.rejoin, experiment.scale) if c.rejoin > 0 else NoPlanner(),
+            silence=0,  # until the delay is found
+        )
+    return experiment.own.revised(law)
+
+
+def longest_wait(scenario: Scenario) -> int:
+    """Periods for which the law waits for a late measurement; 0 where none comes late."""
+    sc, period = scenario, scenario.controller.period
+    back = sc.link.back if isinstance(sc.link, NetworkConfig) else None
+    if sc.sensor.delay == 0 and back is None:
+        return 0
+    longest = sc.sensor.delay + (0.0 if back is None else times_under_way(back).ppf(_MOST))
+    return math.ceil(longest / period - 1e-9) + _PATIENCE
+
+
+def _channel(scenario: Scenario, timeline: Timeline, waits: int) -> Channel:
+    link, c = scenario.link, scenario.controller
+    if not isinstance(link, NetworkConfig) or c.delay_steps is not None:
+        return Wire()
+    rows = c.packet_repeats + c.packet_torques
+    due = [timeline.eta + (row - c.packet_repeats) * c.period for row in range(rows)]
+    kept = rows + timeline.steps + waits + _REPORTS + 1
+    return Packets(
+        torques=c.packet_torques,
+        repeats=c.packet_repeats,
+        in_time=tuple(in_time(link, time) for time in due),
+        arrived_by=tuple(in_time(link, i * c.period) for i in range(kept)),
+        holds=link.dry == "hold",
     )
 
 

@@ -17,11 +17,12 @@ from stewart_drake.law.delay_observer import DelayObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.experiment import Experiment, control_law, first_queue
-from stewart_drake.loop.own import Own, own_motion
+from stewart_drake.loop.own import Own
+from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.loop.reference import Reference
 from stewart_drake.scenario.config import ControllerConfig, Scenario
+from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_STATE, POSE
-from stewart_drake.scenario.timing import LEAST_FRACTION
 from stewart_drake.scenario.trajectories import evaluate, moved
 
 Array = NDArray[np.float64]
@@ -120,9 +121,6 @@ def design_law(
         raise ConfigError(f"delay: got {delay!r}; expected a number of seconds, 0 or more")
     if not (math.isfinite(period) and period > 0):
         raise ConfigError(f"period: got {period!r}; expected a number of seconds above 0")
-    periods = delay / period
-    steps = int(periods + LEAST_FRACTION)
-    fraction = periods - steps
     chosen = dataclasses.asdict(ControllerConfig() if options is None else options)
     if horizon is None:
         horizon = reference.end_time() if math.isfinite(reference.end_time()) else _HORIZON
@@ -131,7 +129,7 @@ def design_law(
         "start": "on_reference" if start is None else "rest",
         "queue": queue,
         "plant": {"kind": "exact", "gravity": dynamics.gravity != 0},
-        "delay": {"steps": steps, "fraction": fraction if fraction > LEAST_FRACTION else 0.0},
+        "delay": dataclasses.asdict(Delay.of(delay, period)),
         "controller": chosen | {"period": period, "delay_steps": None, "delay_fraction": None},
         "actuator": {"torque_limit": torque_limit},
         "sensor": {"noise_std": np.asarray(noise_std, dtype=float).tolist()},

@@ -1,78 +1,96 @@
-"""Systems and trajectories of the user's own in the loop, checked at the border."""
+"""What of a loop is the user's own: systems, a trajectory, a law, checked at the border."""
 
-import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 from weakref import WeakSet
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import InputPort, OutputPort, PortDataType, System
-from pydrake.trajectories import FunctionHandleTrajectory, Trajectory
+from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.scenario.signals import (
-    ACCELERATIONS,
-    NUM_COORDINATES,
     NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
-    POSE,
-    RATES,
+    TUNER_INPUTS,
+    WEIGHTS,
 )
-from stewart_drake.scenario.trajectories import evaluate
-
-Array = NDArray[np.float64]
 
 OwnSystem = System | Callable[[], System]
 """A system, which serves one run, or what makes one, such as its class."""
 OwnReference = Trajectory | Callable[[], Trajectory]
+OwnLaw = Callable[[PredictiveLqi], PredictiveLqi]
+"""Takes the law that the scenario asks for; returns the one to be used."""
 
-_CONTROLLER: Final = {"measurement": NUM_STATE, "reference": NUM_REFERENCE}
-"""Inputs of a controller; the first it must have."""
-_DISTURBANCE: Final = {"torque": NUM_TORQUES, "wrench": 6}
-"""Outputs of a disturbance, of which it has one or both."""
-_REST: Final = 1e-6
-"""rad/s or m/s; a trajectory that ends slower than this goes on at rest."""
-_APART: Final = 1e-9
-"""s before and after a joint of two pieces."""
-_CHECKS: Final = 200
-"""Instants at which a trajectory is looked at."""
+
+class Role(NamedTuple):
+    """What a system needs to take a place in the loop: its ports and their sizes."""
+
+    inputs: Mapping[str, int]
+    """That it must have."""
+    may: Mapping[str, int]
+    """Inputs that it may have."""
+    outputs: Mapping[str, int]
+    """Of which it has one at least."""
+
+
+ROLES: Final[Mapping[str, Role]] = MappingProxyType(
+    {
+        "controller": Role(
+            {"measurement": NUM_STATE}, {"reference": NUM_REFERENCE}, {"torque": NUM_TORQUES}
+        ),
+        "disturbance": Role({}, {}, {"torque": NUM_TORQUES, "wrench": 6}),
+        "sensor": Role({"state": NUM_STATE}, {}, {"measurement": NUM_STATE}),
+        "link": Role({"commanded": NUM_TORQUES}, {}, {"torque": NUM_TORQUES}),
+        "tuner": Role(
+            {},
+            {
+                "density": len(TUNER_INPUTS),
+                "measurement": NUM_STATE,
+                "reference": NUM_REFERENCE,
+            },
+            {"weights": len(WEIGHTS)},
+        ),
+    }
+)
+"""Places in the loop that a system of the user's own may take."""
 
 _used: "WeakSet[Any]" = WeakSet()
 
 
 class Own(NamedTuple):
-    """What of a loop is the user's own; None where the scenario's is used.
+    """What of a loop is the user's own; the scenario's is used for all else.
 
     Attributes:
-        controller: inputs `measurement` (12) and, if it wants, `reference` (18), what the plate
-            shall do now; output `torque` (6), read every period of the controller.
-        disturbance: output `torque` (6), at the shafts, or `wrench` (6), moment then force in the
-            world at the plate's COM, or both.
+        systems: by their ROLES.
         reference: a 6 x 1 trajectory of the pose with two derivatives.
+        law: makes another law of the scenario's.
+        instances: those of the systems that were given as such, and stay the user's.
     """
 
-    controller: System | None = None
-    disturbance: System | None = None
+    systems: Mapping[str, System] = MappingProxyType({})
     reference: Trajectory | None = None
+    law: OwnLaw | None = None
     instances: tuple[System, ...] = ()
-    """Those of the systems that were given as such, and stay the user's."""
 
     @property
     def names(self) -> dict[str, str]:
         """What each is, as `summary.json` tells it."""
-        given = {
-            "controller": self.controller,
-            "disturbance": self.disturbance,
-            "reference": self.reference,
-        }
-        return {name: type(thing).__name__ for name, thing in given.items() if thing is not None}
+        found = {role: type(system).__name__ for role, system in self.systems.items()}
+        if self.reference is not None:
+            found["reference"] = type(self.reference).__name__
+        if self.law is not None:
+            found["law"] = getattr(self.law, "__name__", type(self.law).__name__)
+        return found
 
     @property
-    def systems(self) -> list[Any]:
-        """Those that are systems."""
-        return [system for system in (self.controller, self.disturbance) if system is not None]
+    def unjudged(self) -> str | None:
+        """Whose dynamics nobody knows, so that no stability of the loop can be told, or None."""
+        return next(
+            (role for role in ("controller", "sensor", "link") if role in self.systems), None
+        )
 
     def claim(self) -> None:
         """Note that the systems now belong to a loop.
@@ -80,7 +98,7 @@ class Own(NamedTuple):
         Raises:
             ConfigError: one of them belongs to another one.
         """
-        for system in self.systems:
+        for system in self.systems.values():
             if system in _used:
                 raise ConfigError(
                     f"{type(system).__name__}: got an instance that has been in a loop already; "
@@ -88,30 +106,56 @@ class Own(NamedTuple):
                 )
             _used.add(system)
 
+    def revised(self, law: PredictiveLqi) -> PredictiveLqi:
+        """The law to be used in the place of the scenario's.
+
+        Raises:
+            ConfigError: the user's function returned something else.
+        """
+        if self.law is None:
+            return law
+        made = self.law(law)
+        if not isinstance(made, PredictiveLqi):
+            raise ConfigError(
+                f"law: got a {type(made).__name__} from the function; expected a PredictiveLqi, "
+                "such as dataclasses.replace(law, ...)"
+            )
+        return made
+
 
 NOTHING: Final = Own()
 """All is the scenario's."""
 
 
-def take(
-    controller: OwnSystem | None, reference: OwnReference | None, disturbance: OwnSystem | None
-) -> Own:
+def take(given: Mapping[str, Any]) -> Own:
     """What a user gave for one run, made and checked, the reference's motion excepted.
+
+    Args:
+        given: by the name of its argument in `simulate`; None is nothing.
 
     Raises:
         ConfigError: one line.
     """
-    own = Own(
-        None if controller is None else _make("controller", controller, System),
-        None if disturbance is None else _make("disturbance", disturbance, System),
+    given = {name: thing for name, thing in given.items() if thing is not None}
+    systems = {role: _make(role, given[role], System) for role in ROLES if role in given}
+    for role, system in systems.items():
+        _check(role, system)
+    reference, law = given.get("reference"), given.get("law")
+    if law is not None and not callable(law):
+        raise ConfigError(
+            f"law: got a {type(law).__name__}; expected a function of the scenario's law"
+        )
+    for other in ("law", "tuner"):
+        if "controller" in systems and other in given:
+            raise ConfigError(
+                f"{other}: got one with a controller of your own; expected one of the two"
+            )
+    return Own(
+        systems,
         None if reference is None else _make("reference", reference, Trajectory),
-        tuple(given for given in (controller, disturbance) if isinstance(given, System)),
+        law,
+        tuple(given[role] for role in systems if isinstance(given[role], System)),
     )
-    if own.controller is not None:
-        _check_controller(own.controller)
-    if own.disturbance is not None:
-        _check_disturbance(own.disturbance)
-    return own
 
 
 def _make(what: str, given: Any, kind: type) -> Any:
@@ -124,38 +168,30 @@ def _make(what: str, given: Any, kind: type) -> Any:
     return made
 
 
-def _check_controller(system: System) -> None:
-    known = " and, if wanted, ".join(f"{name} ({size})" for name, size in _CONTROLLER.items())
+def _check(role: str, system: System) -> None:
+    """Whether the ports fit; the user's system is no longer needed where they do not."""
+    needed, name = ROLES[role], f"{role}: {type(system).__name__}"
     inputs = _ports(system.get_input_port, system.num_input_ports())
-    name = f"controller: {type(system).__name__}"
+    outputs = _ports(system.get_output_port, system.num_output_ports())
+    must, may = (
+        ", ".join(f"{port} ({size})" for port, size in ports.items())
+        for ports in (needed.inputs, needed.may)
+    )
+    known = " and, if wanted, ".join(filter(None, (must, may))) or "none"
+    sizes = {**needed.inputs, **needed.may}
     for port in inputs:
-        if port not in _CONTROLLER:
+        if port not in sizes:
             raise ConfigError(f"{name}: got an input port {port!r}; expected {known}")
-        _check_size(name, "input", inputs[port], _CONTROLLER[port])
-    if "measurement" not in inputs:
-        raise ConfigError(f"{name}: got no input port 'measurement'; expected {known}")
-    outputs = _ports(system.get_output_port, system.num_output_ports())
-    if "torque" not in outputs:
-        raise ConfigError(
-            f"{name}: got {_list(outputs)}; expected an output port 'torque' ({NUM_TORQUES})"
-        )
-    _check_size(name, "output", outputs["torque"], NUM_TORQUES)
-
-
-def _check_disturbance(system: System) -> None:
-    name = f"disturbance: {type(system).__name__}"
-    inputs = _ports(system.get_input_port, system.num_input_ports())
-    if inputs:
-        raise ConfigError(f"{name}: got an input port {min(inputs)!r}; expected none")
-    outputs = _ports(system.get_output_port, system.num_output_ports())
-    found = [port for port in _DISTURBANCE if port in outputs]
+        _check_size(name, "input", inputs[port], sizes[port])
+    for port in needed.inputs:
+        if port not in inputs:
+            raise ConfigError(f"{name}: got no input port {port!r}; expected {known}")
+    found = [port for port in needed.outputs if port in outputs]
     if not found:
-        raise ConfigError(
-            f"{name}: got {_list(outputs)}; expected an output port "
-            + " or ".join(f"{port!r} ({size})" for port, size in _DISTURBANCE.items())
-        )
+        wanted = " or ".join(f"{port!r} ({size})" for port, size in needed.outputs.items())
+        raise ConfigError(f"{name}: got {_list(outputs)}; expected an output port {wanted}")
     for port in found:
-        _check_size(name, "output", outputs[port], _DISTURBANCE[port])
+        _check_size(name, "output", outputs[port], needed.outputs[port])
 
 
 def _ports(get: Callable[[int], Any], number: int) -> dict[str, Any]:
@@ -177,77 +213,3 @@ def _check_size(name: str, way: str, port: InputPort | OutputPort, size: int) ->
         raise ConfigError(
             f"{name}: {way} port {port.get_name()!r}: got {port.size()} values; expected {size}"
         )
-
-
-def own_motion(reference: Trajectory, duration: float) -> Trajectory:
-    """A trajectory of the user's own, checked, and at rest after its end.
-
-    Args:
-        reference: 6 x 1, rad and m, with derivatives of order 1 and 2.
-        duration: of the simulation, s.
-
-    Returns:
-        The same, defined for t >= 0: the controller looks ahead of the end.
-
-    Raises:
-        ConfigError: one line.
-    """
-    name = f"reference: {type(reference).__name__}"
-    shape = (reference.rows(), reference.cols())
-    if shape != (NUM_COORDINATES, 1):
-        raise ConfigError(f"{name}: got shape {shape}; expected (6, 1), the pose")
-    begin, end = reference.start_time(), reference.end_time()
-    if begin > 0:
-        raise ConfigError(f"{name}: got a start at {begin:g} s; expected one at 0 s or before")
-    if end < 0:
-        raise ConfigError(f"{name}: got an end at {end:g} s; expected one after 0 s")
-    for t in np.linspace(0.0, min(duration, end), _CHECKS):
-        try:
-            values = evaluate(reference, float(t))
-        except (Exception, SystemExit) as error:  # Drake ends the process where it has none
-            raise ConfigError(
-                f"{name}: got no pose, rates and accelerations at {t:.4g} s "
-                f"({' '.join(str(error).split())}); expected derivatives of order 1 and 2"
-            ) from error
-        if not np.all(np.isfinite(values)):
-            raise ConfigError(f"{name}: got {values} at {t:.4g} s; expected finite numbers")
-    _check_joints(name, reference, min(duration, end))
-    if math.isinf(end):
-        return reference
-    rates = evaluate(reference, end)[RATES]
-    if end < duration and np.abs(rates).max() > _REST:
-        raise ConfigError(
-            f"{name}: got an end at {end:g} s with rates {rates}; expected it to come to rest, or "
-            f"duration <= {end:g}"
-        )
-    return _held_after(reference, end)
-
-
-def _check_joints(name: str, reference: Trajectory, until: float) -> None:
-    """Refuse pieces that do not fit, such as straight lines: nothing with a mass follows a jump."""
-    if not hasattr(reference, "get_segment_times"):
-        return
-    joints = [t for t in reference.get_segment_times() if 0 < t < until]
-    for t in joints:
-        before, after = (evaluate(reference, t + side * _APART) for side in (-1, 1))
-        for what, part, change in (("pose", POSE, RATES), ("rates", RATES, ACCELERATIONS)):
-            moving = np.abs(np.concatenate([before[change], after[change]])).max()
-            jump = np.abs(after[part] - before[part]).max()
-            if jump > _REST + 4 * _APART * moving:
-                raise ConfigError(
-                    f"{name}: got a jump of {jump:.3g} in the {what} at {t:.4g} s; expected pose "
-                    "and rates without jumps"
-                )
-
-
-def _held_after(reference: Trajectory, end: float) -> Trajectory:
-    still = np.zeros((NUM_COORDINATES, 1))
-
-    def derivative(t: float, order: int) -> Array:
-        return reference.EvalDerivative(t, order) if t <= end else still
-
-    held = FunctionHandleTrajectory(
-        lambda t: reference.value(min(t, end)), NUM_COORDINATES, 1, 0.0, math.inf
-    )
-    held.set_derivative(derivative)
-    return held

@@ -9,7 +9,6 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
     Context,
-    EventStatus,
     LeafSystem,
     State,
     ValueProducer,
@@ -17,8 +16,8 @@ from pydrake.systems.framework import (
 
 from stewart_drake.law.memory import Counts
 from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, ports_of
-from stewart_drake.scenario.timing import event_time
 
 Array = NDArray[np.float64]
 
@@ -80,9 +79,7 @@ class SampledController(LeafSystem):
         for port, signal in ports_of("controller").items():
             calc, of = known.get(port, _nothing), ticket if port in known else self.nothing_ticket()
             self.DeclareVectorOutputPort(port, signal.size, calc, {of})
-        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._update_first))
-        early = event_time(period)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._update))
+        update_every(self, period, self._update)
 
     def sample(self, context: Context) -> tuple[Sample, float]:
         """The last sample in a context of this system, and the time that it took, s."""
@@ -121,10 +118,6 @@ class SampledController(LeafSystem):
 
     def _used(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._sample(context).measurement)
-
-    def _update_first(self, context: Context, state: State) -> EventStatus:
-        self._update(context, state)
-        return EventStatus.Succeeded()
 
     def _update(self, context: Context, state: State) -> None:
         state.get_mutable_abstract_state(int(self._last)).set_value(self._step.Eval(context))

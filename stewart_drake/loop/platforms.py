@@ -32,12 +32,8 @@ from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.signals import (
-    BIAS,
-    DAMPING,
-    NUM_PARAMETERS,
     NUM_STATE,
     NUM_TORQUES,
-    PAYLOAD,
     POSE,
     RATES,
 )
@@ -183,7 +179,7 @@ def AddStewartPlatform(
     plant: MultibodyPlant | None = None,
     parent: Frame | None = None,
     X_PB: RigidTransform | None = None,
-    collision: bool = False,
+    collision: bool = True,
     start: ArrayLike | None = None,
 ) -> StewartPlatform:
     """Add a platform to a diagram of one's own.
@@ -202,8 +198,8 @@ def AddStewartPlatform(
         plant: a MultibodyPlant that is not finalized, registered with a SceneGraph.
         parent: frame of `plant` that the base is welded to, the world's if None.
         X_PB: pose of the base in that frame, none if None.
-        collision: whether plate, base, cranks and rods touch other bodies of `plant`; never each
-            other.
+        collision: whether plate, base, cranks and rods touch other bodies of a `plant` of one's
+            own; never each other.
         start: (6,) pose by default, home if None.
 
     Raises:
@@ -223,10 +219,7 @@ def AddStewartPlatform(
                     f"{name}: got it for plant.kind exact; expected kind multibody, which alone "
                     "can be among other bodies"
                 )
-        parameters = np.zeros(NUM_PARAMETERS)
-        parameters[BIAS], parameters[PAYLOAD] = config.torque_bias, config.payload_mass
-        parameters[DAMPING] = config.joint_damping
-        dynamics = StewartDynamics(machine, config.gravity, parameters)
+        dynamics = StewartDynamics(machine, config.gravity, config.parameters)
         exact = ExactPlant(dynamics, np.concatenate([pose, np.zeros(6)]), wrench=True)
         exact.set_name(machine.name)
         return StewartPlatform(builder, machine, builder.AddSystem(exact))
@@ -246,7 +239,7 @@ def AddStewartPlatform(
         dataclasses.replace(machine, effort_limit=None),
         payload_mass=config.payload_mass,
         joint_damping=config.joint_damping,
-        collision=collision,
+        collision=collision and not own,
         parent=parent,
         X_PB=X_PB,
         start=pose,

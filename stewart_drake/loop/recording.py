@@ -15,6 +15,7 @@ from stewart_drake.law.memory import Counts
 from stewart_drake.loop import metrics
 from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.experiment import Experiment, waits_at_rest
+from stewart_drake.loop.tuner import AnnTuner
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.signals import (
     DIMENSIONS,
@@ -75,9 +76,8 @@ class Recorder:
         self._loop = loop
         self._ports: dict[str, Any] = {}
         self._controller: Any = loop.GetSubsystemByName("controller")
-        self._tuner: Any = (
-            loop.GetSubsystemByName("tuner") if loop.HasSubsystemNamed("tuner") else None
-        )
+        tuner = loop.GetSubsystemByName("tuner") if loop.HasSubsystemNamed("tuner") else None
+        self._tuner = tuner if isinstance(tuner, AnnTuner) else None
         self._scale = loop.experiment.scale
         self._instant = 0.0
         self._state, self._wanted, self._error = np.empty(0), np.empty(0), np.empty(0)

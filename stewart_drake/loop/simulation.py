@@ -18,9 +18,9 @@ from stewart_drake.loop.cautions import cautions_after, cautions_before
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.loop.exact import set_accuracy
-from stewart_drake.loop.experiment import Experiment, prepare
+from stewart_drake.loop.experiment import Experiment, concrete
 from stewart_drake.loop.lifetime import let_go
-from stewart_drake.loop.own import OwnReference, OwnSystem, take
+from stewart_drake.loop.own import OwnLaw, OwnReference, OwnSystem
 from stewart_drake.loop.recording import Recorder, summarize
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.scene import Live
@@ -43,6 +43,10 @@ def simulate(
     controller: OwnSystem | None = None,
     reference: OwnReference | None = None,
     disturbance: OwnSystem | None = None,
+    law: OwnLaw | None = None,
+    sensor: OwnSystem | None = None,
+    link: OwnSystem | None = None,
+    tuner: OwnSystem | None = None,
     progress: Progress | None = None,
     meshcat: Meshcat | None = None,
     truth: Mechanism | None = None,
@@ -69,6 +73,15 @@ def simulate(
         disturbance: a Drake system with the output `torque` (6, N m), added at the shafts, or
             `wrench` (6: moment in N m, force in N, in the world, at the plate's COM), or both.
             Nobody is told of it.
+        law: a function that takes the `law.predictive_lqi.PredictiveLqi` that the scenario asks for
+            and returns the one to be used, such as `dataclasses.replace(law, observer=Mine())`.
+        sensor: a Drake system with the input `state` (12) and the output `measurement` (12; NaN is
+            lost), read every `controller.period`; the scenario's noise and faults are its affair.
+        link: a Drake system with the input `commanded` (6, N m, as it was limited) and the output
+            `torque` (6, what arrives now); the law goes on believing what the scenario says.
+        tuner: a Drake system with the output `weights` (2: w_Q, w_R), read every
+            `controller.period`, and of the inputs `density` (18), `measurement` (12) and
+            `reference` (18) those that it wants.
         progress: called every 20 ms of simulated time; what it raises reaches the caller.
         meshcat: where the machine, its reference and the torques are shown live, or None; the run
             then takes at least as long as its duration.
@@ -83,13 +96,6 @@ def simulate(
     """
     if isinstance(scenario, str | Path):
         scenario = load_scenario(scenario)
-    if isinstance(scenario, Experiment):
-        own = {"controller": controller, "reference": reference, "disturbance": disturbance}
-        for name, given in ({"truth": truth} | own).items():
-            if given is not None:
-                raise TypeError(
-                    f"{name}: got one with an Experiment, which has its own; expected None"
-                )
     if not isinstance(scenario, Scenario | Experiment):
         raise TypeError(
             f"scenario: got a {type(scenario).__name__}; expected a Scenario, or the name or path "
@@ -97,12 +103,19 @@ def simulate(
         )
     # Matrices of twenty rows are slower on several threads, fifty times so where cores are busy.
     with one_blas_thread:
-        if isinstance(scenario, Experiment):
-            experiment = scenario
-        else:
-            experiment = prepare(scenario, truth, take(controller, reference, disturbance))
+        experiment = concrete(
+            scenario,
+            truth,
+            controller=controller,
+            reference=reference,
+            disturbance=disturbance,
+            law=law,
+            sensor=sensor,
+            link=link,
+            tuner=tuner,
+        )
         if isinstance(margin, bool):
-            judgeable = margin and experiment.own.controller is None
+            judgeable = margin and experiment.own.unjudged is None
             judged = controller_margin(experiment) if judgeable else None
         else:
             judged = margin
@@ -129,7 +142,7 @@ def _run(
     finally:
         if live is not None:
             live.close()
-        let_go(loop, experiment.own.instances, experiment.own.systems)
+        let_go(loop, experiment.own.instances, tuple(experiment.own.systems.values()))
     summary = summarize(experiment, recorder, status, stopped, wall)
     summary["controller_margin"] = None if margin is None else margin.summary
     summary["warnings"] = cautions_before(experiment, margin) + cautions_after(experiment, summary)

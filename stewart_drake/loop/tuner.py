@@ -8,15 +8,14 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
     Context,
-    EventStatus,
     LeafSystem,
     State,
     ValueProducer,
 )
 
 from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.signals import WEIGHTS
-from stewart_drake.scenario.timing import event_time
 from stewart_drake.tuner.density import NUM_INPUTS
 from stewart_drake.tuner.law import MAX_FACTOR, tune
 from stewart_drake.tuner.network import Network
@@ -68,9 +67,7 @@ class AnnTuner(LeafSystem):
             {self._density.ticket(), self.discrete_state_ticket(self._last)},
         )
         self.DeclareVectorOutputPort("weights", size, weak(self._weights), {self._step.ticket()})
-        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._update_first))
-        early = event_time(period)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._update))
+        update_every(self, period, self._update)
 
     def fallbacks(self, context: Context) -> int:
         """Samples so far at which the network had to be passed over."""
@@ -84,10 +81,6 @@ class AnnTuner(LeafSystem):
     def _weights(self, context: Context, output: BasicVector) -> None:
         step: Any = self._step.Eval(context)
         output.SetFromVector(step[0])
-
-    def _update_first(self, context: Context, state: State) -> EventStatus:
-        self._update(context, state)
-        return EventStatus.Succeeded()
 
     def _update(self, context: Context, state: State) -> None:
         step: Any = self._step.Eval(context)

@@ -4,9 +4,10 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import acting
 from stewart_drake.scenario.signals import NUM_TORQUES, PACKETS
@@ -82,17 +83,11 @@ class VaryingDelay(LeafSystem):
         taken_ticket = self.discrete_state_ticket(self._taken)
         self.DeclareVectorOutputPort("delay", 1, weak(self._delay), {taken_ticket})
         declare_constant(self, "packets", np.full(len(PACKETS), np.nan))
-        self.DeclareInitializationUnrestrictedUpdateEvent(weak(self._take_first))
-        early = event_time(period)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(early, early, weak(self._take))
+        update_every(self, period, self._take)
         for number, time in zip(self._numbers.tolist(), times.tolist(), strict=True):
             if time > 0 and number not in self._at_once:
                 arrive = weak(self._arrive, number)
                 self.DeclarePeriodicUnrestrictedUpdateEvent(_ONCE, event_time(time), arrive)
-
-    def _take_first(self, context: Context, state: State) -> EventStatus:
-        self._take(context, state)
-        return EventStatus.Succeeded()
 
     def _take(self, context: Context, state: State) -> None:
         number = int(context.get_discrete_state(self._taken).value()[0])

@@ -6,7 +6,7 @@ here needs a mechanism. `scenario_loading` reads scenarios from files.
 
 import dataclasses
 from dataclasses import field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -21,6 +21,7 @@ from stewart_drake.scenario.field_types import (
     Deviation,
     Fraction,
     Name,
+    Positive,
     Seconds,
     Seed,
     Six,
@@ -54,6 +55,11 @@ class PlantConfig:
     payload_mass: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     torque_bias: Six = field(default_factory=lambda: [0.0] * 6)
     joint_damping: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+
+    @property
+    def parameters(self) -> list[float]:
+        """What the controller is not told, in the order of `scenario.signals.PARAMETERS`."""
+        return [*self.torque_bias, self.payload_mass, self.joint_damping]
 
 
 @dataclass(config=STRICT)
@@ -109,7 +115,11 @@ class ControllerConfig:
         estimator: `none`, or `parameters` (torque bias, payload and damping).
         w_Q: weight of the errors.
         w_R: weight of the torques.
+        integral_weight: of the integrals beside the errors, which share w_Q.
         weight_scaling: `bryson` (by what the reference asks for) or `identity`.
+        packet_torques: how many torques a packet holds, for the next one and further periods; over
+            a network, with `delay_steps` null.
+        packet_repeats: how many earlier torques it says again, each for a period more of delay.
         catch_up: blend onto the reference after a start from rest, s; 0 is none, null the shortest
             one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
         delay_estimator: `none`; or the delay is estimated, beginning with the one that is believed
@@ -133,7 +143,10 @@ class ControllerConfig:
     estimator: Literal["none", "parameters"] = "parameters"
     w_Q: Weight = 1.0
     w_R: Weight = 1.0
+    integral_weight: Weight = 1.0
     weight_scaling: Literal["bryson", "identity"] = "bryson"
+    packet_torques: Annotated[int, Field(ge=1, le=100)] = 8
+    packet_repeats: Annotated[int, Field(ge=0, le=100)] = 1
     catch_up: Annotated[float, Field(ge=0, le=10)] | None = None
     delay_estimator: Literal["none", "constant", "drifting"] = "none"
     delay_std: Annotated[float, Field(ge=1e-3, le=10)] = 0.3
@@ -169,8 +182,75 @@ class WireConfig:
 
     kind: Literal["wire"] = "wire"
 
+    def problem(self) -> str | None:
+        """Nothing can be."""
+        return None
 
-LinkConfig = Annotated[WireConfig, ByKind()]
+
+@dataclass(config=STRICT)
+class PacketsConfig:
+    """How long packets are under way, and how many are lost.
+
+    Attributes:
+        distribution: of the time under way, `uniform` from `low` to `high`, or `lognormal`.
+        low, high: of the uniform one, s.
+        median: of the lognormal one, s.
+        sigma: of the lognormal one, standard deviation of its logarithm.
+        loss: share of the packets that never arrive.
+        burst: how many in a row are lost together.
+    """
+
+    distribution: Literal["uniform", "lognormal"] = "uniform"
+    low: Seconds = 0.5
+    high: Seconds = 0.9
+    median: Positive | None = None
+    sigma: Annotated[float, Field(gt=0, le=10)] | None = None
+    loss: Annotated[float, Field(ge=0, le=0.99)] = 0.05
+    burst: Annotated[int, Field(ge=1, le=1000)] = 1
+
+    def times_problem(self, where: str) -> str | None:
+        """What is wrong with the times, or None."""
+        if self.distribution == "uniform" and self.low > self.high:
+            return f"{where}.low: got {self.low:g} s; expected at most high, {self.high:g} s"
+        if self.distribution == "lognormal":
+            for name in ("median", "sigma"):
+                if getattr(self, name) is None:
+                    return f"{where}.{name}: got null with a lognormal one; expected a number"
+        return None
+
+
+@dataclass(config=STRICT)
+class NetworkConfig(PacketsConfig):
+    """Packets of torques with the times at which they shall act, and a buffer at the machine.
+
+    Each packet takes a time of its own, see `PacketsConfig`; `delay` is not used. A torque acts at
+    its time, a bound later than it was sent. Where no packet has brought one for a period, the
+    buffer is dry. Clocks agree.
+
+    Attributes:
+        kind: `network`.
+        playout: the bound, s; null is the one that makes late packets as rare as lost ones
+            (`scenario.link.usual_bound`). The controller adds its `packet_repeats` periods.
+        dry: what a dry buffer does, `hold` the last torque or put out `zero`.
+        back: how measurements come back; null is at once and all of them.
+        acknowledged: whether each measurement tells which packets have arrived and what has acted.
+        seed: of times and losses.
+    """
+
+    kind: Literal["network"] = "network"
+    playout: Seconds | None = None
+    dry: Literal["hold", "zero"] = "hold"
+    back: PacketsConfig | None = None
+    acknowledged: bool = True
+    seed: Seed = 0
+
+    def problem(self) -> str | None:
+        """What is wrong with fields that are well formed one by one, or None."""
+        back = self.back.times_problem("link.back") if self.back else None
+        return self.times_problem("link") or back
+
+
+LinkConfig = Annotated[WireConfig | NetworkConfig, ByKind()]
 
 
 @dataclass(config=STRICT)
@@ -180,7 +260,9 @@ class StateSensorConfig:
     Attributes:
         kind: `state`.
         noise_std: of [pose; rates], in rad, m, rad/s and m/s.
-        seed: of the noise and of spikes; the same seed gives the same run.
+        delay: between measuring and having the measurement, s; by the next sample after that.
+        loss: share of the measurements that are lost.
+        seed: of the noise, of spikes and losses; the same seed gives the same run.
         faults: when it measures nothing, the same again, or nonsense; see `fault_config`.
     """
 
@@ -188,6 +270,8 @@ class StateSensorConfig:
     noise_std: Annotated[list[Deviation], Field(min_length=12, max_length=12)] = field(
         default_factory=lambda: [0.0] * 12
     )
+    delay: Annotated[float, Field(ge=0, le=100)] = 0.0
+    loss: Annotated[float, Field(ge=0, le=0.99)] = 0.0
     seed: Seed = 0
     faults: list[SensorFault] = field(default_factory=list)
 
@@ -243,6 +327,8 @@ class Scenario:
         log_period: of the recorded signals, s; null is every 20 ms and every sample of the
             controller. The multibody plant is seen on its own steps only, so that it must be a
             multiple of `plant.time_step`. What is measured of a run does not depend on it.
+        compare: what `compare` lays over each controller last, by its name. Another name is one
+            row more, of the shipped or own file that its `controller` says.
     """
 
     mechanism: Name = "paper"
@@ -258,13 +344,20 @@ class Scenario:
     sensor: SensorConfig = field(default_factory=StateSensorConfig)
     tuner: TunerConfig = field(default_factory=FixedTunerConfig)
     log_period: Annotated[float, Field(ge=1e-5, le=1e5)] | None = None
+    compare: dict[Name, dict[str, Any]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Scenario({differences(self, Scenario())})"
 
     @property
     def true_delay(self) -> Delay:
-        """What the torques wait for, which the controller need not know."""
+        """What the torques wait for at t = 0, which the controller need not know."""
+        if isinstance(self.link, NetworkConfig):
+            from stewart_drake.scenario.link import (
+                network_delay,
+            )  # numpy, which --help goes without
+
+            return network_delay(self.link, self.controller)
         return Delay(self.delay.steps, self.delay.fraction)
 
     @property
@@ -277,12 +370,24 @@ class Scenario:
         believed = self.eta
         if c.delay_steps is not None:
             believed = Delay(c.delay_steps, c.delay_fraction or 0.0).eta(c.period)
-        if c.delay_estimator == "none" or believed <= c.delay_max:
+        if c.delay_estimator == "none":
+            return None
+        if not isinstance(self.link, WireConfig) or self.sensor.delay > 0:
+            return (
+                f"controller.delay_estimator: got {c.delay_estimator!r} with link.kind "
+                f"{self.link.kind!r} and a sensor.delay of {self.sensor.delay:g} s; expected "
+                "'none', or a wire and measurements of now"
+            )
+        if believed <= c.delay_max:
             return None
         return (
             f"controller.delay_max: got {c.delay_max:g} s, less than the {believed:g} s that are "
             "believed in; expected as much or more"
         )
+
+    @property
+    def _fraction(self) -> float:
+        return self.true_delay.fraction
 
     def check(self, where: str = "scenario") -> None:
         """Checks every field again, and everything that takes several of them.
@@ -300,8 +405,9 @@ class Scenario:
             self.reference.problem(),
             _controller_problem(self.controller),
             self.sensor.problem(),
+            self.link.problem(),
             self._delay_problem(),
-            step and step_problem(step, self.controller.period, self.delay.fraction),
+            step and step_problem(step, self.controller.period, self._fraction),
             log_problem(self.log_period, self.duration, step),
         ):
             if problem:

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from stewart_drake.scenario.timing import LEAST_FRACTION
+
 
 @dataclass(frozen=True)
 class Delay:
@@ -24,6 +26,14 @@ class Delay:
                 f"delay: got {self.steps} steps and a fraction of {self.fraction}; expected "
                 "steps >= 0 and 0 <= fraction < 1"
             )
+
+    @classmethod
+    def of(cls, eta: float, period: float) -> "Delay":
+        """A delay of eta s; less than LEAST_FRACTION of a period beyond a whole one is none."""
+        periods = max(0.0, eta / period)
+        steps = int(periods + LEAST_FRACTION)
+        fraction = periods - steps
+        return cls(steps, fraction if fraction > LEAST_FRACTION else 0.0)
 
     @property
     def periods(self) -> float:

@@ -3,13 +3,28 @@
 Everything is drawn beforehand from a seed, so that the same scenario gives the same run.
 """
 
+from typing import Any, Final
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import lognorm, uniform
 
-from stewart_drake.scenario.config import DelayConfig, Scenario
+from stewart_drake.scenario.config import (
+    ControllerConfig,
+    DelayConfig,
+    NetworkConfig,
+    PacketsConfig,
+    Scenario,
+)
 from stewart_drake.scenario.delay import Delay
 
 Array = NDArray[np.float64]
+_FORWARD, _BACK, _SENSOR = range(3)
+"""Streams of random numbers of one seed."""
+RARE: Final = 1.5
+"""Torques that are missing, by those that would be with no packet late."""
+ALMOST_NONE: Final = 1e-3
+"""Share of torques that may be late where no packet is lost."""
 
 
 def number_sent(duration: float, period: float) -> int:
@@ -37,10 +52,10 @@ def torque_delays(scenario: Scenario) -> Array:
     The multibody plant feels torques at its own steps, so that they arrive at the nearest one.
     """
     delay, period = scenario.delay, scenario.controller.period
-    sent = period * np.arange(number_sent(scenario.duration, period))
+    sent: Array = np.arange(number_sent(scenario.duration, period), dtype=np.float64) * period
     rng = np.random.Generator(np.random.Philox(key=delay.seed))
     jitter = delay.jitter_std * rng.standard_normal(len(sent))
-    eta = np.maximum(delay_at(delay, period, sent) + jitter, 0.0)
+    eta: Array = np.maximum(delay_at(delay, period, sent) + jitter, 0.0)
     if scenario.plant.kind == "multibody":
         step = scenario.plant.time_step
         eta = np.maximum(step * np.round((sent + eta) / step) - sent, 0.0)
@@ -56,3 +71,89 @@ def acting(arrivals: Array, together: float = 0.0) -> NDArray[np.bool_]:
     """
     earliest_newer = np.minimum.accumulate(np.append(arrivals, np.inf)[::-1])[::-1][1:]
     return np.isfinite(arrivals) & (arrivals + together < earliest_newer)
+
+
+def times_under_way(config: PacketsConfig) -> Any:
+    """The distribution of the time in s that a packet takes, as scipy has it."""
+    if config.distribution == "uniform":
+        return uniform(config.low, max(config.high - config.low, 1e-12))
+    assert config.sigma is not None and config.median is not None  # or it is refused
+    return lognorm(s=config.sigma, scale=config.median)
+
+
+def losses(number: int, loss: float, burst: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Which of `number` packets are lost.
+
+    A burst loses that many in a row. Where one begins with probability p, independently of others,
+    a packet is kept if none of the last `burst` began one: 1 - loss = (1 - p)^burst.
+    """
+    begins = rng.random(number) < 1 - (1 - loss) ** (1 / burst)
+    return np.convolve(begins, np.ones(burst))[:number] > 0
+
+
+def packet_times(config: PacketsConfig, number: int, seed: int, stream: int = _FORWARD) -> Array:
+    """(number,) s that each packet is under way; infinite for one that is lost."""
+    rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, stream, 0]))
+    # Two streams, so that the time of a packet does not depend on how many are lost.
+    times = times_under_way(config).ppf(rng.random(number))
+    rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 1, stream, 0]))
+    return np.where(losses(number, config.loss, config.burst, rng), np.inf, times)
+
+
+def measurement_times(scenario: Scenario) -> Array:
+    """(n,) s from each sample until the controller has what was measured; infinite for never."""
+    sc, link = scenario.sensor, scenario.link
+    n = number_sent(scenario.duration, scenario.controller.period)
+    lost = packet_times(PacketsConfig(low=0.0, high=0.0, loss=sc.loss), n, sc.seed, _SENSOR)
+    times = sc.delay + np.where(np.isfinite(lost), 0.0, np.inf)
+    if isinstance(link, NetworkConfig) and link.back is not None:
+        times = times + packet_times(link.back, n, link.seed, _BACK)
+    return times
+
+
+def newest_measurements(times: Array, period: float) -> NDArray[np.int64]:
+    """(n,) which measurement the controller gets at each of n samples, -1 for none.
+
+    It is the newest that has arrived by then, and none where that was given before: measurements
+    that were overtaken are dropped.
+    """
+    n = len(times)
+    # In samples; the tolerance is that of times which are whole numbers of periods.
+    ready = np.arange(n) + np.ceil(times / period - 1e-9)
+    newest = np.full(n, -1)
+    there = np.flatnonzero(ready < n)
+    np.maximum.at(newest, ready[there].astype(int), there)
+    so_far = np.maximum.accumulate(newest)
+    return np.where(newest > np.append(-1, so_far[:-1]), newest, -1)
+
+
+def in_time(config: PacketsConfig, time: float) -> float:
+    """Probability that a packet has arrived so many s after it was sent."""
+    return float((1 - config.loss) * times_under_way(config).cdf(time + 1e-9))
+
+
+def torque_missing(config: PacketsConfig, bound: float, repeats: int, period: float) -> float:
+    """Probability that a torque is not there in time, in its own packet or a repetition."""
+    chances = [1 - in_time(config, bound + i * period) for i in range(repeats + 1)]
+    return float(np.prod(chances))
+
+
+def usual_bound(config: PacketsConfig, repeats: int, period: float) -> float:
+    """The least bound in s, in whole periods, at which being late is rarer than being lost.
+
+    A longer one cannot bring back what is lost, and costs delay. With the bound B and r repetitions
+    a torque is missing with q(B) = prod_i [1 - (1 - loss) F(B + i dt)], i = 0 to r, which falls to
+    loss^(r+1); wanted is the least B with q(B) <= RARE loss^(r+1), or ALMOST_NONE.
+    """
+    enough = max(RARE * config.loss ** (repeats + 1), ALMOST_NONE)
+    steps = 0
+    while torque_missing(config, steps * period, repeats, period) > enough:
+        steps += 1
+    return steps * period
+
+
+def network_delay(link: NetworkConfig, controller: ControllerConfig) -> Delay:
+    """From computing a torque to its time: the bound, and the periods for repetitions."""
+    period, repeats = controller.period, controller.packet_repeats
+    bound = usual_bound(link, repeats, period) if link.playout is None else link.playout
+    return Delay.of(bound + repeats * period, period)

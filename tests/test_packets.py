@@ -1,0 +1,376 @@
+"""Packets, the buffer that plays them, late measurements, and the law that sends plans."""
+
+import dataclasses
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
+
+import stewart_drake as sd
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.channel import Packets, Report, Wire
+from stewart_drake.law.timeline import Timeline
+from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.late_measurements import LateMeasurements
+from stewart_drake.loop.playout import PlayoutBuffer
+from stewart_drake.loop.simulation import make_simulator
+from stewart_drake.scenario.config import NetworkConfig, PacketsConfig
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.link import (
+    in_time,
+    losses,
+    newest_measurements,
+    packet_times,
+    torque_missing,
+    usual_bound,
+)
+from stewart_drake.scenario.timing import look_time
+
+Array = NDArray[np.float64]
+PERIOD = 0.1
+LONG = ("plant.kind=exact", "start=on_reference", "queue=reference")
+IDEAL = ("link.kind=network", "link.loss=0", "controller.packet_repeats=0")
+
+
+class Plans(LeafSystem):
+    """Packet k, whose row c is 100 k + c in all six."""
+
+    def __init__(self, rows: int) -> None:
+        super().__init__()
+        self._rows = rows
+        self.DeclareVectorOutputPort("plan", 6 * rows, self._output, {self.time_ticket()})
+
+    def _output(self, context: Context, output: BasicVector) -> None:
+        k = round(context.get_time() / PERIOD)
+        output.SetFromVector(np.repeat(100.0 * k + np.arange(self._rows), 6))
+
+
+class Ramp(LeafSystem):
+    """Its time, twice."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.DeclareVectorOutputPort("y", 2, self._output, {self.time_ticket()})
+
+    def _output(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector([context.get_time()] * 2)
+
+
+def scenario(*more: str, controller: str | None = None) -> sd.Scenario:
+    return sd.load_scenario("paper", controller, settings=(*LONG, *more))
+
+
+def run(*more: str) -> sd.SimulationResult:
+    return sd.simulate(scenario(*more), margin=False)
+
+
+# The buffer, against every packet looked at for every period.
+
+
+@settings(max_examples=80, deadline=None)
+@given(seed=st.integers(0, 2**31), dry=st.sampled_from(["hold", "zero"]))
+def test_the_buffer_plays_the_newest_packet_that_is_there(seed: int, dry: Any) -> None:
+    rng = np.random.default_rng(seed)
+    n, rows = 30, int(rng.integers(1, 6))
+    repeats = int(rng.integers(0, rows))
+    delay = Delay(int(rng.integers(0, 6)), float(rng.choice([0.0, 0.4])))
+    eta = delay.eta(PERIOD)
+    times = rng.choice([rng.uniform(0, 2 * eta + 0.1, n), PERIOD * rng.integers(0, 8, n)])
+    times = np.where(rng.random(n) < 0.3, np.inf, times)
+    queue = -1.0 - np.repeat(np.arange(delay.queue_length)[:, None], 6, axis=1)
+    builder = DiagramBuilder()
+    plans = builder.AddSystem(Plans(rows))
+    buffer = builder.AddSystem(
+        PlayoutBuffer(PERIOD, times, delay, queue, rows=rows, repeats=repeats, dry=dry, history=3)
+    )
+    builder.Connect(plans.get_output_port(), buffer.GetInputPort("commanded"))
+    simulator = Simulator(builder.Build())
+    context = buffer.GetMyContextFromRoot(simulator.get_context())
+    simulator.Initialize()
+    last = queue[0, 0] if len(queue) else 0.0
+    played = missed = 0
+    history = [last] * 3
+    for s in range(n - 1):  # the period from s dt + eta0 on
+        begins = (s + delay.fraction) * PERIOD
+        due = {
+            k: 100.0 * k + c
+            for k in range(min(s + 1, n))
+            for c in range(rows)
+            if abs(k * PERIOD + eta + (c - repeats) * PERIOD - begins) < 1e-6
+            and k * PERIOD + times[k] <= begins + 1e-8
+        }
+        if due:
+            last, played = due[max(due)], played + 1
+        elif s < delay.steps:
+            last = queue[s - delay.steps + len(queue), 0]
+        else:
+            last, missed = (last if dry == "hold" else 0.0), missed + 1
+        history = [last, *history[:2]]
+        simulator.AdvanceTo(begins + 0.3 * PERIOD)
+        now = begins + 0.3 * PERIOD
+        assert np.array_equal(buffer.GetOutputPort("torque").Eval(context), np.full(6, last))
+        sent = int(now / PERIOD + 1e-9) + 1
+        late = [
+            k
+            for k in range(min(sent, n))
+            if np.isfinite(times[k])
+            and k * PERIOD + eta - repeats * PERIOD <= begins + 1e-8
+            and times[k] > eta - repeats * PERIOD + 1e-8
+        ]
+        counts = [sent, np.isinf(times[:sent]).sum(), len(late), played, missed]
+        assert buffer.GetOutputPort("packets").Eval(context).tolist() == counts
+        report = buffer.GetOutputPort("report").Eval(context)
+        there = [0 <= k < n and k * PERIOD + times[k] <= now for k in range(sent - 1, sent - 4, -1)]
+        assert report[:3].tolist() == there
+        assert report[3::6].tolist() == history
+
+
+@pytest.mark.parametrize("burst", [1, 3])
+def test_so_many_are_lost_and_in_bursts(burst: int) -> None:
+    n, loss = 200_000, 0.2
+    lost = losses(n, loss, burst, np.random.default_rng(1))
+    # A burst makes neighbours alike: as if there were so many fewer packets.
+    assert abs(lost.mean() - loss) < 4 * np.sqrt(loss * burst / n)
+    changes = np.flatnonzero(np.diff(lost.astype(int)))
+    lengths = np.diff(changes)[0 if lost[changes[0] + 1] else 1 :: 2]
+    assert lengths.min() == burst
+    begins = 1 - (1 - loss) ** (1 / burst)
+    # A run goes on as long as another burst begins in each of its last packets.
+    assert lengths.mean() == pytest.approx(loss / ((1 - loss) * begins), rel=0.03)
+
+
+def test_times_are_those_of_the_distribution() -> None:
+    uniform = packet_times(PacketsConfig(low=0.5, high=0.9, loss=0.0), 20_000, 3)
+    assert 0.5 <= uniform.min() < 0.501 and 0.899 < uniform.max() <= 0.9
+    assert abs(uniform.mean() - 0.7) < 4 * 0.4 / np.sqrt(12 * 20_000)
+    log = PacketsConfig(distribution="lognormal", median=0.65, sigma=0.15, loss=0.0)
+    assert np.median(packet_times(log, 20_000, 3)) == pytest.approx(0.65, rel=0.01)
+    assert np.log(packet_times(log, 20_000, 3)).std() == pytest.approx(0.15, rel=0.03)
+    lossy = packet_times(dataclasses.replace(log, loss=0.3), 20_000, 3)
+    there = np.isfinite(lossy)
+    assert np.array_equal(lossy[there], packet_times(log, 20_000, 3)[there])
+    assert in_time(dataclasses.replace(log, loss=0.3), 0.65) == pytest.approx(0.35, abs=1e-6)
+
+
+def test_the_usual_bound_is_the_least_that_makes_late_rarer_than_lost() -> None:
+    config = PacketsConfig(low=0.5, high=0.9, loss=0.05)
+    rng = np.random.default_rng(0)
+    for repeats in (0, 1, 2):
+        bound = usual_bound(config, repeats, PERIOD)
+        enough = max(1.5 * 0.05 ** (repeats + 1), 1e-3)
+        assert torque_missing(config, bound, repeats, PERIOD) <= enough
+        assert torque_missing(config, bound - PERIOD, repeats, PERIOD) > enough
+        times = np.where(rng.random((100_000, repeats + 1)) < 0.05, np.inf, 0)
+        times = times + rng.uniform(0.5, 0.9, times.shape)
+        missing = np.all(times > 0.7 + PERIOD * np.arange(repeats + 1), axis=1).mean()
+        exact = torque_missing(config, 0.7, repeats, PERIOD)
+        assert missing == pytest.approx(exact, abs=4 * np.sqrt(exact / 100_000))
+
+
+# Measurements that come late.
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**31))
+def test_the_newest_measurement_is_handed_on_once(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 25
+    times = rng.choice([PERIOD * rng.integers(0, 5, n), rng.uniform(0, 0.5, n), np.zeros(n)])
+    times = np.where(rng.random(n) < 0.3, np.inf, times)
+    builder = DiagramBuilder()
+    ramp, way = builder.AddSystem(Ramp()), builder.AddSystem(LateMeasurements(PERIOD, times, 2))
+    builder.Connect(ramp.get_output_port(), way.get_input_port())
+    simulator = Simulator(builder.Build())
+    context = way.GetMyContextFromRoot(simulator.get_context())
+    given, simulated = -1, newest_measurements(times, PERIOD)
+    for k in range(n):
+        if k:
+            simulator.AdvanceTo(k * PERIOD * (1 - 2e-14))  # before the events of the sample
+        there = [j for j in range(k + 1) if j * PERIOD + times[j] <= k * PERIOD + 1e-9]
+        newest = max(there, default=-1)
+        y = way.GetOutputPort("measurement").Eval(context)
+        age = way.GetOutputPort("age").Eval(context)[0]
+        if newest > given:
+            assert y == pytest.approx(newest * PERIOD, abs=1e-12)
+            assert age == pytest.approx((k - newest) * PERIOD, abs=1e-12)
+            assert simulated[k] == newest
+            given = newest
+        else:
+            assert np.isnan(y).all() and age == 0 and simulated[k] == -1
+
+
+def test_a_sensor_that_is_late_is_borne_like_a_longer_delay() -> None:
+    """On a plant without faults 0.6 and 0.2 s leave what 0.8 and 0 do, or less: 0.03 % s."""
+    late = run("delay.steps=6", "sensor.delay=0.2")
+    assert late.status == "completed" and late.accumulated_error < 0.03
+    assert late.summary["counts"]["measurements_missing"] == 2
+    signals = late.signals
+    samples = [int(np.argmin(np.abs(signals.time.values - 0.1 * k))) for k in range(100)]
+    state = np.hstack([signals.pose.values, signals.rates.values])[samples]
+    measured, estimate = signals.measurement.values[samples], signals.state_estimate.values[samples]
+    assert np.abs(measured[2:] - state[:-2]).max() < 1e-12
+    late_by = np.abs(measured - state)[5:].max()
+    assert np.abs(estimate - state)[5:].max() < 1e-3 * late_by
+
+
+def test_a_delay_of_the_sensor_that_is_no_whole_period_waits_for_the_sample() -> None:
+    first = run("delay.steps=6", "sensor.delay=0.2", "duration=1").signals
+    second = run("delay.steps=6", "sensor.delay=0.11", "duration=1").signals
+    assert np.array_equal(first.pose.values, second.pose.values)
+
+
+def test_lost_measurements_are_counted_and_borne() -> None:
+    result = run("sensor.loss=0.5", "sensor.seed=1", "duration=5")
+    missing = result.summary["counts"]["measurements_missing"]
+    assert result.status == "completed" and 10 < missing < 41
+    assert np.isnan(result.signals.measurement.values).any()
+
+
+# The law.
+
+
+@pytest.mark.parametrize(
+    ("time", "delay"), [(0.8, ()), (0.25, ("delay.steps=2", "delay.fraction=0.5"))]
+)
+@pytest.mark.parametrize("torques", [1, 4])
+@pytest.mark.parametrize("controller", ["predictor_lqi", "delay_lqi"])
+def test_a_network_without_losses_is_a_wire(
+    time: float, delay: tuple[str, ...], torques: int, controller: str
+) -> None:
+    """Every packet takes as long as the bound: nothing differs from a wire of that delay."""
+    network = (
+        *IDEAL,
+        f"link.low={time}",
+        f"link.high={time}",
+        f"link.playout={time}",
+        f"controller.packet_torques={torques}",
+    )
+    found, expected = (
+        sd.simulate(scenario("duration=1", *more, controller=controller), margin=False).signals
+        for more in (network, delay)
+    )
+    for name in ("pose", "torque_applied", "torque_commanded", "state_estimate"):
+        assert np.abs(found[name].values - expected[name].values).max() <= 1e-9
+    assert found.packets.values[-1].tolist()[:3] == [11, 0, 0]
+
+
+def test_plans_say_what_the_law_will_say() -> None:
+    """Where everything arrives, the next sample's plan is this one's, but for what was learnt."""
+    loop = build_closed_loop(scenario(*IDEAL, "link.playout=0.9", "duration=4"))
+    simulator, controller = make_simulator(loop), loop.GetSubsystemByName("controller")
+    plans = []
+    for k in range(40):
+        simulator.AdvanceTo(look_time(0.1 * k)) if k else simulator.Initialize()
+        context = controller.GetMyContextFromRoot(simulator.get_context())
+        plans.append(controller.memory(context).plan)
+    for before, after in pairwise(plans[25:]):
+        assert np.abs(before[1:] - after[:-1]).max() < 1e-3 * np.abs(after).max()
+
+
+def test_the_law_knows_what_has_acted() -> None:
+    """Over a bad network, with reports: what the filter takes to have acted has acted."""
+    bad = ("link.kind=network", "link.loss=0.1", "link.playout=0.8", "duration=4")
+    loop = build_closed_loop(scenario(*bad, "controller.packet_torques=3"))
+    simulator, controller = make_simulator(loop), loop.GetSubsystemByName("controller")
+    law, applied, decided = controller._law, [], []
+    steps = law.timeline.steps
+    for k in range(40):
+        if k:
+            simulator.AdvanceTo(look_time(0.1 * k) - 0.05)
+            applied.append(loop.GetOutputPort("torque_applied").Eval(simulator.get_context()))
+            simulator.AdvanceTo(look_time(0.1 * k))
+        else:
+            simulator.Initialize()
+        memory = controller.memory(controller.GetMyContextFromRoot(simulator.get_context()))
+        acted = memory.in_flight[: -1 - steps]  # before T_k and the mu that are under way
+        known = min(k, len(acted))
+        assert np.array_equal(
+            acted[len(acted) - known :], np.reshape(applied[k - known :], (-1, 6))
+        )
+        decided.append(memory.in_flight[-1])
+    _, lost, late, _, _ = loop.GetOutputPort("packets").Eval(simulator.get_context())
+    assert lost >= 2 and late >= 2
+    # And not all of it had been decided so: plans stood in.
+    assert not np.array_equal(applied[steps:], decided[: len(applied) - steps])
+
+
+def test_the_most_probable_content_is_believed() -> None:
+    """One packet a period, r = 1, by hand: packet k has T_{k-1}, T_k and a plan for k + 1."""
+    # mu = 3: the rows are due 0.2, 0.3 and 0.4 s after they are sent.
+    channel = Packets(2, 1, in_time=(0.3, 0.6, 0.9), arrived_by=(0.0, 0.1, 0.3, 0.6, 0.9, 0.9))
+    timeline = Timeline(PERIOD, Delay(3))
+    sent, flying = channel.start(), np.zeros((6, 6))
+    for k in range(5):
+        sent, flying = channel.in_flight(sent, flying, timeline, None)
+        plan = np.array([np.full(6, 10.0 + k), np.full(6, 20.0 + k)])  # T_k, and for T_{k+1}
+        sent = channel.send(sent, plan, flying)
+        flying = np.vstack([flying[1:], plan[:1]])
+    assert sent.packets[-1, :, 0].tolist() == [13, 14, 24]
+    # Without any report row 1 of each packet is there more likely than not, row 0 is not.
+    _, believed = channel.in_flight(sent, flying, timeline, None)
+    assert believed[-5:, 0].tolist() == [10, 11, 12, 13, 14]
+    # Nothing has come. T_4: packet 4 is there in time with (0.6 - 0.1) / (1 - 0.1) > 1/2. T_3:
+    # packet 4 with (0.3 - 0.1) / 0.9, packet 3 with (0.6 - 0.3) / 0.7, both < 1/2, packet 2, which
+    # had a plan for it, with (0.9 - 0.6) / 0.4 > 1/2. T_2: none; the buffer holds what acted last.
+    nothing = Report(np.zeros(6, dtype=bool), np.full((3, 6), 7.0), 0)
+    _, believed = channel.in_flight(sent, flying, timeline, nothing)
+    assert believed[-5:, 0].tolist() == [7, 7, 7, 22, 14]
+    # What a packet that has come says is certain.
+    came = Report(np.array([False, True, False, False, False]), np.full((3, 6), 7.0), 0)
+    _, believed = channel.in_flight(sent, flying, timeline, came)
+    assert believed[-5:, 0].tolist() == [7, 7, 12, 13, 14]
+
+
+def test_a_channel_refuses_chances_of_other_rows() -> None:
+    with pytest.raises(ValueError, match="in_time: got 1 values; expected 3"):
+        Packets(2, 1, in_time=(1.0,), arrived_by=(0.0,))
+    assert isinstance(
+        build_closed_loop(scenario()).GetSubsystemByName("controller")._law.channel, Wire
+    )
+
+
+def test_measurements_that_come_back_over_a_network_are_borne() -> None:
+    back = "link.back={low: 0.0, high: 0.3, loss: 0.1}"
+    result = run("link.kind=network", "link.loss=0.05", back, "link.low=0.3", "link.high=0.5")
+    assert result.status == "completed"
+    assert result.summary["counts"]["measurements_missing"] > 10
+    assert result.accumulated_error < 5
+
+
+def test_the_multibody_plant_is_held_over_a_network() -> None:
+    settings = ("plant.kind=multibody", "link.kind=network", "link.loss=0.05", "duration=3")
+    result = sd.simulate(scenario(*settings), margin=False)
+    assert result.status == "completed" and result.accumulated_error < 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (("link.low=0.9", "link.high=0.5"), "link.low: got 0.9 s; expected at most high, 0.5 s"),
+        (("link.distribution=lognormal",), "link.median: got null"),
+        (("link.loss=1",), "link.loss: got 1; expected"),
+        (("link.burst=0",), "link.burst: got 0; expected"),
+        (("link.back={low: 2}",), "link.back.low: got 2 s; expected at most high"),
+        (("sensor.loss=1.5",), "sensor.loss: got 1.5; expected"),
+        (("controller.packet_torques=0",), "controller.packet_torques: got 0; expected"),
+    ],
+)
+def test_out_of_range_is_one_line(changes: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        scenario("link.kind=network", *changes)
+    assert message in str(caught.value) and len(str(caught.value).splitlines()) == 1
+
+
+def test_a_network_has_the_delay_of_bound_and_repetitions() -> None:
+    sc = scenario("link.kind=network", "link.playout=0.65", "controller.packet_repeats=2")
+    assert sc.true_delay.eta(0.1) == pytest.approx(0.85, abs=1e-12)
+    assert sc.true_delay.steps == 8 and sc.true_delay.fraction == pytest.approx(0.5)
+    usual = scenario("link.kind=network")
+    assert isinstance(usual.link, NetworkConfig)
+    assert usual.eta == pytest.approx(usual_bound(usual.link, 1, 0.1) + 0.1)
