@@ -190,8 +190,9 @@ class DelayFilter:
                 after = self._filter(model, guess, y)
         except (np.linalg.LinAlgError, ArithmeticError):
             return None
-        finite = after is not None and np.all(np.isfinite(after.covariance))
-        return after if finite and np.all(np.isfinite(after.mean[:-2])) else None
+        if after is None or not np.all(np.isfinite(after.covariance)):
+            return None
+        return after if np.all(np.isfinite(after.mean)) else None
 
     def _filter(self, model: "DelayModel", guess: Guess, y: Array | None) -> Guess | None:
         P, xi = guess.covariance, guess.mean

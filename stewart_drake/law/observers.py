@@ -1,7 +1,7 @@
 """Where the plate is, and what it is: from measurements and from the torques that acted."""
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Timeline
 
 Array = NDArray[np.float64]
+AnyBelief = TypeVar("AnyBelief", bound=Belief)
 
 
 class Observer(Protocol):
@@ -112,7 +113,9 @@ class ParameterObserver:
         return replace(after, estimate=estimate, fault=fault)
 
 
-def told(belief: Belief, measurement: Measurement, sensing: Sensing, plant: NominalPlant) -> Belief:
+def told(
+    belief: AnyBelief, measurement: Measurement, sensing: Sensing, plant: NominalPlant
+) -> AnyBelief:
     """The belief with what was measured, and what is wrong with that, and nothing made of it."""
     measurement.require_fresh()
     period = belief.timeline.period

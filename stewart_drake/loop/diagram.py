@@ -75,7 +75,7 @@ class ClosedLoop(Diagram):
     `torque_commanded` (what the law asks for), `torque_applied` (what arrives of it: within the
     motors' limit, late, before the bias), `integral`, `weights_used`, `parameters`,
     `parameter_std`, `density`, `measurement` (held, as the controller read it), `state_estimate`,
-    `delay_true` (of the torque sent last), `packets`.
+    `delay_estimate`, `delay_std`, `delay_true` (of the torque sent last), `packets`.
 
     Attributes:
         experiment: what it was built from.
