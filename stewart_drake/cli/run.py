@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 CSV: Final = "signals.csv"
 REPLAY: Final = "replay.html"
-RUN_FIGURES: Final = ("states", "errors", "torques", "parameters", "weights")
+RUN_FIGURES: Final = ("states", "errors", "torques", "parameters", "delay", "weights")
 """All that `run_figures` may write, and below `comparison_figures`; what is older is removed."""
 COMPARISON_FIGURES: Final = (
     "states",

@@ -116,6 +116,8 @@ def draw_run(result: SimulationResult) -> dict[str, Figure]:
         }
         if np.isfinite(result.signals.parameter_std.values).any():
             figures["parameters"] = _parameters(result)
+        if np.isfinite(result.signals.delay_std.values).any():
+            figures["delay"] = _delay(result)
         if _is_tuned(result):
             figures["weights"] = weights_figure({"weights that the tuner set": result})
         return figures
@@ -205,6 +207,36 @@ def _parameters(run: SimulationResult) -> Figure:
     return _with_legend(figure, axes)
 
 
+def _delay(run: SimulationResult) -> Figure:
+    """The delay with its band, and how far that is from the truth."""
+    figure, (whole, fine) = _grid([run], rows=1)
+    signals, steps = run.signals, {"drawstyle": "steps-post"}
+    time, true = signals.time.values, signals.delay_true.values
+    value, width = signals.delay_estimate.values, 2 * signals.delay_std.values
+    for ax, origin, factor in ((whole, 0.0, 1.0), (fine, true, 1e3)):
+        ax.plot(
+            time, factor * (true - origin), label="true value", **steps, **style.TRUTH._asdict()
+        )
+        middle = factor * (value - origin)
+        ax.plot(time, middle, label="estimate", **steps, **style.RUN._asdict())
+        ax.fill_between(
+            time,
+            middle - factor * width,
+            middle + factor * width,
+            step="post",
+            color=style.RUN.color,
+            alpha=style.BAND_ALPHA,
+            linewidth=0,
+            label="± 2 σ",
+        )
+    # The band at the end, and an error that is some times as large, can be told apart.
+    last = 1e3 * float(np.nanmin(width))
+    fine.set_ylim(-10 * last, 10 * last)
+    whole.set_ylabel("delay  [s]")
+    fine.set_ylabel("delay minus true one  [ms]")
+    return _with_legend(figure, [whole, fine])
+
+
 def _grid(
     runs: Iterable[SimulationResult], rows: int = 3, sharey: bool = False
 ) -> tuple[Figure, list[Axes]]:
@@ -214,7 +246,7 @@ def _grid(
     room = {"left": 0.09, "right": 0.985, "wspace": 0.24, "hspace": 0.12}
     figure = Figure(figsize=(10, height))
     figure.subplots_adjust(bottom=0.5 / height, top=1 - 0.45 / height, **room)
-    axes = figure.subplots(rows, 2, sharex=True, sharey=sharey)
+    axes = figure.subplots(rows, 2, sharex=True, sharey=sharey, squeeze=False)
     for ax in axes.ravel():
         ax.yaxis.set_label_coords(-0.14, 0.5)
         # More digits than these would run into the label.
