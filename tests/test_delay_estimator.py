@@ -28,6 +28,7 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.report.figures import draw_run
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, shown
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]
@@ -324,6 +325,16 @@ def test_nothing_is_fed_back_before_the_first_torque_can_act() -> None:
         for seed in ("sensor.seed=0", "sensor.seed=1")
     ]
     assert np.all(loud[0][0] != loud[1][0])
+
+
+def test_the_comparison_shows_it_where_the_delay_is_believed_wrongly() -> None:
+    assert tuple(shown("paper")) == CONTROLLERS
+    rows = shown("paper", ("controller.delay_steps=6",))
+    assert tuple(rows) == (*CONTROLLERS, ADAPTIVE)
+    believed = [scenario.controller.delay_steps for scenario in rows.values()]
+    assert believed == [0, 0, 6, 6, 6, 6]  # a controller that knows of no delay stays blind
+    assert ADAPTIVE in shown("paper", ("delay.drift=0.01",))
+    assert ADAPTIVE not in shown("paper", ("delay.drift=0.01", "sensor.delay=0.1"))
 
 
 def test_what_does_not_fit_is_refused() -> None:

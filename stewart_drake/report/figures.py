@@ -210,7 +210,8 @@ def _parameters(run: SimulationResult) -> Figure:
 def _delay(run: SimulationResult) -> Figure:
     """The delay with its band, and how far that is from the truth."""
     figure, (whole, fine) = _grid([run], rows=1)
-    signals, steps = run.signals, {"drawstyle": "steps-post"}
+    steps: dict[str, Any] = {"drawstyle": "steps-post"}
+    signals = run.signals
     time, true = signals.time.values, signals.delay_true.values
     value, width = signals.delay_estimate.values, 2 * signals.delay_std.values
     for ax, origin, factor in ((whole, 0.0, 1.0), (fine, true, 1e3)):
