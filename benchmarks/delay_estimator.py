@@ -1,8 +1,8 @@
 """An unknown, drifting, jumping delay: `python benchmarks/delay_estimator.py [section ...]`.
 
 Writes benchmarks/results/delay_estimator.md; SEEDS and COVERED of the environment are the
-numbers of runs. Sections: constant, dirty, changing, coverage, limits. The error of the delay is against that of the
-torque sent last, which where it changes is not the delay of what arrives.
+numbers of runs. Sections: constant, dirty, changing, coverage, limits. The error of the delay is
+against that of the torque sent last, which where it changes is not the delay of what arrives.
 "Dirty" is noise of 0.1 % of the amplitudes (per second, for the rates), a torque bias of 3e-4 N m
 of alternating sign and a payload of a tenth of the plate. All runs are on the exact plant with the
 paper's motion and a true delay of 0.8 s where the row says nothing else. Times are the CPU's.
