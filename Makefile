@@ -22,10 +22,11 @@ COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null || true
 .DEFAULT_GOAL := help
 .PHONY: demo test lint format-check types wheel newest bench soak clean help
 
-demo: $(INSTALLED)  ## the paper's comparison, from rest and started on the reference
+demo: $(INSTALLED)  ## the paper's comparison, from rest, on the reference, and with a delay of 0.8 s believed to be 0.6 s
 	$(BIN)/stewart-drake compare paper --out out/demo/rest
 	$(BIN)/stewart-drake compare paper --set start=on_reference --set queue=reference \
 		--out out/demo/on_reference
+	$(BIN)/stewart-drake compare paper --set controller.delay_steps=6 --out out/demo/wrong_delay
 	@echo "figures:"; find out/demo -name '*.png' -o -name '*.svg' -o -name '*.pdf' | sort | sed 's/^/  /'
 
 # Workers of one thread each, so that they do not fight over the processor.

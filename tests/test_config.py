@@ -106,6 +106,11 @@ def test_the_defaults_are_the_papers_experiment() -> None:
             "packet_torques": 8,
             "packet_repeats": 1,
             "catch_up": None,
+            "delay_estimator": "none",
+            "delay_std": 0.3,
+            "delay_max": 1.5,
+            "quiet_start": True,
+            "rejoin": 0.6,
         },
         "link": {"kind": "wire"},
         "actuator": {"kind": "torque", "torque_limit": None},
@@ -169,6 +174,7 @@ def test_the_papers_controllers(name: str, integral: bool, delay_steps: int | No
         estimator="none",
         weight_scaling="identity",
         catch_up=0,
+        quiet_start=False,
     )
 
 

@@ -27,8 +27,9 @@ from stewart_drake.law.holds import (
 )
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
+from stewart_drake.law.motion import Preview
 from stewart_drake.law.motors import TorqueLimit
-from stewart_drake.law.predictive_lqi import PredictiveLqi, Preview
+from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import Ahead, LinearPredictor, NonlinearPredictor
 from stewart_drake.law.riccati import RiccatiError, full_gain
 from stewart_drake.law.startup import weight_scales

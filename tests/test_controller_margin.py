@@ -16,7 +16,7 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.law.delay_model import sample, sample_in_steps
 from stewart_drake.law.limits import is_stable, spectral_radius
 from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.predictive_lqi import Preview
+from stewart_drake.law.motion import Preview
 from stewart_drake.loop.cautions import cautions_after, cautions_before, coarse_step
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin, true_dynamics
 from stewart_drake.loop.experiment import believed_queue, control_law, prepare

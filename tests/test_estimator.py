@@ -161,7 +161,7 @@ def test_transition_equals_central_differences(t: float, gravity: bool) -> None:
 
     def error(period: float) -> float:
         durations = period * np.array([0.3, 0.7])
-        after, F = parameter_filter._transition(dynamics, point, acted(torques, durations, 4))
+        after, F = parameter_filter.transition(dynamics, point, acted(torques, durations, 4))
         expected = central_difference(
             lambda p: dynamics.predict(p[:12], torques, durations, 16, p[12:])[-1], point
         )
@@ -209,7 +209,7 @@ def test_kicks_are_what_early_and_late_torques_do(
     durations = PERIOD * np.array([split, 1 - split])[: 1 if split == 1 else 2]
     period = Period(three[: len(durations)], durations, three[len(durations)], 8)
     after = PLANT.predict(x, period.torques, durations, 8, theta)[-1]
-    kick = parameter_filter._kicks(PLANT, after, theta, period)[0]
+    kick = parameter_filter.kicks(PLANT, after, theta, period)[0]
 
     # The same second in three pieces, the first change `late` after its time.
     parts = [split * PERIOD + late, PERIOD * (1 - split) - late]
@@ -368,7 +368,7 @@ def test_bounds_are_kept_by_the_nearest_mean_there_is(seed: int, width: float) -
     mean = rng.normal(0, 1, 20)
     lower, upper = -width * rng.uniform(0, 1, 8), width * rng.uniform(0, 1, 8)
     box = dataclasses.replace(KNOWN, lower=lower, upper=upper)
-    found = parameter_filter._within_bounds(mean, covariance, box)
+    found = parameter_filter.within_bounds(mean, covariance, box)
     metric = np.linalg.inv(np.linalg.cholesky(covariance))
     free = np.full(12, np.inf)
     limits = (np.concatenate([-free, lower]), np.concatenate([free, upper]))
@@ -383,7 +383,7 @@ def test_what_was_learnt_about_combinations_survives_a_bound() -> None:
     covariance[12, 18] = covariance[18, 12] = -0.9e-6
     mean = np.zeros(20)
     mean[12], mean[18] = 1e-3, -2e-3
-    found = parameter_filter._within_bounds(mean, covariance, KNOWN)
+    found = parameter_filter.within_bounds(mean, covariance, KNOWN)
     assert found[18] == 0
     assert found[12] == pytest.approx(1e-3 - 0.9 * 2e-3, rel=1e-12)
 

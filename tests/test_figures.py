@@ -118,7 +118,7 @@ def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(compar
     assert [line.get_xdata()[0] for line in crosses] == [0.43]
     assert limits(shown)[0] <= crosses[0].get_ydata()[0] <= limits(shown)[1]
     legend = [text.get_text() for text in drawn["states"].legends[0].get_texts()]
-    assert legend == ["reference", *LABELS.values(), "run ended"]
+    assert legend == ["reference", *(LABELS[name] for name in CONTROLLERS), "run ended"]
 
 
 def test_labels_of_small_values_stay_off_the_names_of_the_axes(run, drawn):

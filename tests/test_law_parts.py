@@ -24,10 +24,10 @@ from stewart_drake.law.feedforward import (
 from stewart_drake.law.holds import held_torques, means_and_changes
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
+from stewart_drake.law.motion import Preview
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import VIGOROUS, NominalPlant
 from stewart_drake.law.observers import NoObserver, ParameterObserver
-from stewart_drake.law.predictive_lqi import Preview
 from stewart_drake.law.sensing import FirstState, Sensing, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import DelayLqiController

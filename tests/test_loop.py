@@ -61,6 +61,8 @@ def test_closed_loop_has_named_ports_and_systems(plant: str) -> None:
         "density": 18,
         "measurement": 12,
         "state_estimate": 12,
+        "delay_estimate": 1,
+        "delay_std": 1,
         "delay_true": 1,
         "packets": 5,
     }

@@ -20,7 +20,8 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.predictive_lqi import PredictiveLqi, Preview
+from stewart_drake.law.motion import Preview
+from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.delay_chain import DelayChain
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
@@ -308,6 +309,8 @@ def test_controller_topology_and_initial_state() -> None:
         "weights_used": 2,
         "parameters": 8,
         "parameter_std": 8,
+        "delay_estimate": 1,
+        "delay_std": 1,
     }
     for name in outputs:
         port = controller.GetOutputPort(name).get_index()
@@ -325,7 +328,8 @@ def test_controller_topology_and_initial_state() -> None:
     assert not shown("integral").any()
     assert np.isnan(shown("weights_used")).all()
     assert not shown("parameters").any()
-    assert np.isnan(shown("parameter_std")).all()
+    assert np.isnan(shown("parameter_std")).all() and np.isnan(shown("delay_std")).all()
+    assert shown("delay_estimate")[0] == pytest.approx(law().timeline.eta)
     assert np.array_equal(shown("torque_commanded"), in_flight[-1])
 
 

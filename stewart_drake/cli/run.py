@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 CSV: Final = "signals.csv"
 REPLAY: Final = "replay.html"
-RUN_FIGURES: Final = ("states", "errors", "torques", "parameters", "weights")
+RUN_FIGURES: Final = ("states", "errors", "torques", "parameters", "delay", "weights")
 """All that `run_figures` may write, and below `comparison_figures`; what is older is removed."""
 COMPARISON_FIGURES: Final = (
     "states",
@@ -180,7 +180,7 @@ def compare(
     from stewart_drake.loop.experiment import prepare
     from stewart_drake.report.run_document import comparison_document
     from stewart_drake.report.words import wrap
-    from stewart_drake.scenario.loading import load_comparison, load_scenario
+    from stewart_drake.scenario.loading import load_scenario
     from stewart_drake.studies import compare as study
     from stewart_drake.studies.verdict import delay_verdict
 
@@ -191,14 +191,16 @@ def compare(
 
     experiment = prepare(load_scenario(scenario, settings=settings or ()))
     delivery = Delivery(out, quiet, as_json)
-    names = tuple(load_comparison(scenario, study.CONTROLLERS, settings or ()))
+    names = tuple(study.shown(scenario, settings or ()))
     delivery.say(wrap(str(delay_verdict(experiment))))
     with progress_bars(names, experiment.scenario.duration, quiet) as progress:
         results = study.compare(
             scenario, settings or (), lambda name, time, error: progress[name](time, error)
         )
     delivery.say(comparison_document(results).plain())
-    delivery.discard(*(f"{name}.nc" for name in names), *_pictures(COMPARISON_FIGURES))
+    delivery.discard(
+        *(f"{name}.nc" for name in (*names, study.ADAPTIVE)), *_pictures(COMPARISON_FIGURES)
+    )
     if out is not None:
         study.save_comparison(results, out)
         delivery.wrote("summary.json", f"{len(results)} signal files")

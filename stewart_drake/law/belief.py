@@ -1,5 +1,6 @@
 """What an observer believes: state, parameters, their covariance, delay, what it rejected."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,12 +61,23 @@ class Belief:
         timeline: the delay that it believes in.
         measured: (m,) last value of each measured quantity that was there; NaN before any.
         fault: why the model stood in for the last measurement, as the name of a count, or None.
+        feeds_back: whether it is good enough to act on; else the feedforward goes on alone.
+        caution: how many times as much torques weigh as they should.
+        settled: whether the delay is known.
+        found: whether it has just been found, or is another than before.
+        delay_mean, delay_std: s, of the delay; NaN where it is not estimated.
     """
 
     estimate: Estimate
     timeline: Timeline
     measured: Array
     fault: str | None = None
+    feeds_back: bool = True
+    caution: float = 1.0
+    settled: bool = True
+    found: bool = False
+    delay_mean: float = math.nan
+    delay_std: float = math.nan
 
     @classmethod
     def nothing(cls, timeline: Timeline, size: int, parameters: Array) -> "Belief":
@@ -85,9 +97,19 @@ class Belief:
         return self.estimate.parameters
 
     @property
+    def delay(self) -> Array:
+        """(1,) s, as it is estimated, else as it is believed."""
+        return np.array([self.timeline.eta if math.isnan(self.delay_mean) else self.delay_mean])
+
+    @property
     def has_state(self) -> bool:
         """Whether there is a state to go on with."""
         return bool(np.all(np.isfinite(self.state)))
+
+    def assuming(self, parameters: Array) -> "Belief":
+        """The same with other parameters (p,)."""
+        mean = np.concatenate([self.state, parameters])
+        return replace(self, estimate=replace(self.estimate, mean=mean))
 
     def at(self, state: Array) -> "Belief":
         """The same in another state (12,)."""

@@ -1,10 +1,11 @@
 """What the control law carries from one sample to the next."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.trajectories import Trajectory
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Sent
@@ -68,6 +69,8 @@ class Memory:
         counts: see `Counts`.
         plan: (N, 6) torques that were sent last, the first of them the last in flight.
         sent: what the channel remembers.
+        path: that was planned in flight, or None.
+        silence: samples that are still to go on without feedback.
     """
 
     in_flight: Array
@@ -81,3 +84,10 @@ class Memory:
     counts: Counts
     plan: Array
     sent: Sent
+    path: Trajectory | None = None
+    silence: int = 0
+
+    def without_error(self) -> "Memory":
+        """The same with nothing integrated."""
+        nothing = np.zeros_like(self.error)
+        return replace(self, error=nothing, integral=nothing)

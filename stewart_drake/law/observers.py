@@ -1,7 +1,7 @@
 """Where the plate is, and what it is: from measurements and from the torques that acted."""
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Timeline
 
 Array = NDArray[np.float64]
+AnyBelief = TypeVar("AnyBelief", bound=Belief)
 
 
 class Observer(Protocol):
@@ -65,7 +66,7 @@ class NoObserver:
         plant: NominalPlant,
     ) -> Belief:
         """See `Observer.observe`."""
-        after = _told(belief, measurement, sensing, plant)
+        after = told(belief, measurement, sensing, plant)
         if after.fault is None:
             return after.at(sensing.start(measurement).state)
         return after.at(_moved(belief, in_flight, plant)) if belief.has_state else after
@@ -94,7 +95,7 @@ class ParameterObserver:
         plant: NominalPlant,
     ) -> Belief:
         """See `Observer.observe`."""
-        after = _told(belief, measurement, sensing, plant)
+        after = told(belief, measurement, sensing, plant)
         ekf = ParameterFilter(plant.dynamics, sensing, self.settings)
         usable = measurement if after.fault is None else None
         if not belief.estimate.uncertain:
@@ -112,9 +113,9 @@ class ParameterObserver:
         return replace(after, estimate=estimate, fault=fault)
 
 
-def _told(
-    belief: Belief, measurement: Measurement, sensing: Sensing, plant: NominalPlant
-) -> Belief:
+def told(
+    belief: AnyBelief, measurement: Measurement, sensing: Sensing, plant: NominalPlant
+) -> AnyBelief:
     """The belief with what was measured, and what is wrong with that, and nothing made of it."""
     measurement.require_fresh()
     period = belief.timeline.period

@@ -147,9 +147,9 @@ class ParameterFilter:
         xi = prior
         # Corrections of parameters that are known already are too small to need F to fourth order.
         nodes = MIDPOINT if self._known(estimate) else GAUSS_NODES
-        after, F = _transition(dynamics, xi, period, nodes)
-        kicks = _kicks(dynamics, after, xi[THETA], period)
-        drift = np.diag(settings.model_std**2 + settings.timing_std**2 * np.sum(kicks**2, axis=0))
+        after, F = transition(dynamics, xi, period, nodes)
+        early = kicks(dynamics, after, xi[THETA], period)
+        drift = np.diag(settings.model_std**2 + settings.timing_std**2 * np.sum(early**2, axis=0))
         if y is not None:
             R = np.diag(sensing.noise_std**2)
             R = R + sensing.through(after, sensing.through(after, drift).T)
@@ -161,7 +161,7 @@ class ParameterFilter:
                 gain = np.linalg.solve(S, H @ P).T
                 keep = np.eye(len(xi)) - gain @ H
                 posterior = keep @ P @ keep.T + gain @ R @ gain.T  # Joseph's form stays positive
-                moved = _within_bounds(prior + gain @ innovation, posterior, settings.parameters)
+                moved = within_bounds(prior + gain @ innovation, posterior, settings.parameters)
                 shift, xi = F[:NUM_STATE] @ (moved - xi), moved
                 linear = after + shift
                 # What linearising leaves out is of second order: nothing beside a small correction.
@@ -171,7 +171,7 @@ class ParameterFilter:
                 after = _integrate(dynamics, xi, period)[-1]
                 if np.all(np.abs(sensing.through(after, after - linear)) <= small):
                     break
-                after, F = _transition(dynamics, xi, period, nodes)
+                after, F = transition(dynamics, xi, period, nodes)
             if not innovation @ np.linalg.solve(S, innovation) <= gate(len(y)):  # or NaN
                 return None
             P = posterior
@@ -180,7 +180,7 @@ class ParameterFilter:
         return Estimate(np.concatenate([after, xi[THETA]]), (P + P.T) / 2, self._no_outlier())
 
 
-def _kicks(dynamics: StewartDynamics, state: Array, theta: Array, period: Period) -> Array:
+def kicks(dynamics: StewartDynamics, state: Array, theta: Array, period: Period) -> Array:
     """(n, 12) change of the last state per s by which one of the n changes of torque comes early.
 
     To first order: for that time the acceleration differs by B dT, which stays in the rates, and
@@ -199,7 +199,7 @@ def _integrate(dynamics: StewartDynamics, xi: Array, period: Period) -> Array:
     return dynamics.predict(xi[:NUM_STATE], torques, durations, substeps, xi[THETA])
 
 
-def _transition(
+def transition(
     dynamics: StewartDynamics, xi: Array, period: Period, nodes: Array = GAUSS_NODES
 ) -> tuple[Array, Array]:
     """State (12,) after the torques, and F (12 + p, 12 + p) of [state; parameters].
@@ -233,7 +233,7 @@ def _within_hold(start: Array, end: Array, h: float, s: float) -> tuple[Array, A
     return pose, rise + left * (1 - 3 * s) * a + s * (3 * s - 2) * b
 
 
-def _within_bounds(mean: Array, covariance: Array, parameters: ParameterSet) -> Array:
+def within_bounds(mean: Array, covariance: Array, parameters: ParameterSet) -> Array:
     """The mean nearest to `mean`, as the covariance measures it, with each parameter in bounds.
 
     Fixing components at bounds moves all that is correlated with them along their columns of P, so

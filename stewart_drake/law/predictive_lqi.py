@@ -11,10 +11,10 @@ with K from `law.riccati.reduced_gain` and T_ff the feedforward of the hold inte
 dynamics through the queue. Torques enter the linear parts as deviations from their feedforward.
 """
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,10 @@ from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
+from stewart_drake.law.motion import Motion
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import Observer
+from stewart_drake.law.planner import NoPlanner, Planner
 from stewart_drake.law.predictors import Ahead, Predictor
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Timeline
@@ -42,36 +44,23 @@ from stewart_drake.scenario.signals import (
 )
 
 Array = NDArray[np.float64]
-Motion = Callable[[Array], Array]
-"""The reference (p, 18), pose, rates and accelerations, at instants (p,) in s from now; some of
-them may be negative."""
 
 
-@dataclass(frozen=True)
-class Preview:
-    """A motion that is known at some instants only, those that a law asks for.
+class Response(NamedTuple):
+    """What one sample comes to."""
 
-    Attributes:
-        times: (p,) s from now.
-        reference: (p, 18) there.
-    """
-
-    times: Array
-    reference: Array
-
-    def __call__(self, times: Array) -> Array:
-        """The reference at all of `times`.
-
-        Raises:
-            ValueError: at other instants than those.
-        """
-        asked = times is self.times or np.array_equal(times, self.times)
-        if not asked or len(self.reference) != len(times):
-            raise ValueError(
-                f"preview: got {len(self.reference)} rows for {len(self.times)} instants; "
-                f"expected the {len(times)} that the law asks for"
-            )
-        return self.reference
+    torque: Array
+    """(6,) N m."""
+    error: Array
+    """(6,) of the pose, that counts for the integral."""
+    integral: Array
+    """(6,)."""
+    ahead: Ahead
+    """Where the torque acts."""
+    gain: Array
+    """(6, g), NaN for none."""
+    trouble: str | None
+    """What went wrong, as the name of a count."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +77,9 @@ class PredictiveLqi:
         feedforward: what the reference takes.
         model: of the error, for the gain.
         cost: what the gain minimises.
+        planner: of the way back, where the prediction is off.
+        silence: samples at the start at which nothing is fed back: what they tell is of a plate on
+            which nothing of the controller's acts, and noise.
         channel: how torques get to the motors.
         kept: how many torques are remembered beyond those of the delay, for late measurements.
     """
@@ -102,6 +94,8 @@ class PredictiveLqi:
     cost: QuadraticCost
     channel: Channel = field(default_factory=Wire)
     kept: int = 0
+    planner: Planner = field(default_factory=NoPlanner)
+    silence: int = 0
 
     @cached_property
     def preview_times(self) -> Array:
@@ -151,6 +145,7 @@ class PredictiveLqi:
             counts=Counts(),
             plan=np.tile(nothing, (self.channel.torques, 1)),
             sent=self.channel.start(),
+            silence=self.silence,
         )
 
     @np.errstate(over="ignore", invalid="ignore")  # its outcome is checked and counted instead
@@ -185,31 +180,31 @@ class PredictiveLqi:
         belief = self.observer.observe(
             memory.belief, measurement, memory.in_flight, self.sensing, self.plant
         )
+        followed = self.planner.follow(memory.path, belief, memory.in_flight, motion, self.plant)
+        if followed.anew:
+            memory = memory.without_error()
         samples = 1 + len(self.predictor.samples(belief.timeline))
         as_assumed = belief.timeline == self.timeline
         times = self.preview_times if as_assumed else self.times_for(belief.timeline)
-        preview = motion(times)
+        preview = followed.motion(times)
         nodes_end = samples + 2 * (self.predictor.pending(belief.timeline) + 3)
         wanted, nodes = preview[:samples, :NUM_STATE], preview[samples:nodes_end]
         if not belief.has_state:  # nothing else to go on with
             belief = belief.at(wanted[0])
-        error = belief.state[POSE] - wanted[0, POSE]
-        integral = self._integrate(memory, error, belief.timeline)
         queue = belief.timeline.queue(memory.in_flight)
-        ahead = self.predictor.ahead(belief, integral, queue, wanted, self.plant)
-        held, changes = self.feedforward.held(nodes, self.plant.dynamics, belief.parameters)
-        error_ahead, gain, trouble = self._design(memory, belief, ahead, held[-1], changes, weights)
-        torque = held[-1]
-        if _is_there(gain):
-            pending = (queue[len(queue) - len(held) + 1 :] - held[:-1]).ravel()
-            seen = self.cost.sees(ahead.integral)
-            torque = torque - gain @ np.concatenate([error_ahead, seen, pending])
+        guide = belief
+        if belief.feeds_back and memory.silence == 0:
+            response = self._feed_back(memory, belief, queue, wanted, nodes, weights)
+        else:
+            guide = belief.assuming(self.plant.dynamics.parameters)
+            response = self._go_on_alone(memory, guide, wanted, nodes)
+        torque, error, integral, ahead, gain, trouble = response
         nonfinite = not np.all(np.isfinite(torque))
         if nonfinite:
             torque = memory.torque
         limited = self.plant.motors.let_through(torque)
         saturated = bool(np.any(limited != torque))
-        plan = self._plan(limited, belief, ahead, queue, gain, preview[nodes_end:])
+        plan = self._plan(limited, guide, ahead, queue, gain, preview[nodes_end:])
         return Memory(
             in_flight=np.vstack([memory.in_flight[1:], limited]),
             belief=belief,
@@ -225,9 +220,43 @@ class PredictiveLqi:
                 "nonfinite_torque" if nonfinite else None,
                 "saturated_steps" if saturated else None,
             ),
+            path=followed.path,
+            silence=max(memory.silence - 1, 0),
             plan=plan,
             sent=self.channel.send(sent, plan, memory.in_flight),
         )
+
+    def _feed_back(
+        self,
+        memory: Memory,
+        belief: Belief,
+        queue: Array,
+        wanted: Array,
+        nodes: Array,
+        weights: Array,
+    ) -> Response:
+        """(42) where the torque acts: torque, error, integral, gain, and what went wrong."""
+        error = belief.state[POSE] - wanted[0, POSE]
+        integral = self._integrate(memory, error, belief.timeline)
+        ahead = self.predictor.ahead(belief, integral, queue, wanted, self.plant)
+        held, changes = self.feedforward.held(nodes, self.plant.dynamics, belief.parameters)
+        error_ahead, gain, trouble = self._design(memory, belief, ahead, held[-1], changes, weights)
+        torque = held[-1]
+        if _is_there(gain):
+            pending = (queue[len(queue) - len(held) + 1 :] - held[:-1]).ravel()
+            seen = self.cost.sees(ahead.integral)
+            torque = torque - gain @ np.concatenate([error_ahead, seen, pending])
+        return Response(torque, error, integral, ahead, gain, trouble)
+
+    def _go_on_alone(self, memory: Memory, belief: Belief, wanted: Array, nodes: Array) -> Response:
+        """The feedforward of what is known beforehand; errors do not count."""
+        held, _ = self.feedforward.held(nodes, self.plant.dynamics, belief.parameters)
+        nothing = np.zeros(NUM_COORDINATES)
+        none, ahead = (
+            self._no_gain(belief.timeline),
+            Ahead(wanted[-1], np.zeros(NUM_STATE), nothing),
+        )
+        return Response(held[-1], nothing, memory.integral, ahead, none, None)
 
     def _plan(
         self, first: Array, belief: Belief, ahead: Ahead, queue: Array, gain: Array, preview: Array
@@ -274,7 +303,7 @@ class PredictiveLqi:
             model = self.model.at(ahead.point, torque, belief.parameters, self.plant)
             error = error - self.feedforward.offset(changes, model.B[RATES], belief.timeline)
             delayed = self.cost.sampled(model, belief.timeline)
-            K = self.cost.gain(delayed, weights)
+            K = self.cost.gain(delayed, weights * [1.0, belief.caution])
             return error, self.predictor.gain(K, delayed), None
         except UnreachablePoseError:  # nothing to regulate: the feedforward goes on alone
             return error, self._no_gain(belief.timeline), "unreachable"

@@ -151,3 +151,23 @@ class NonlinearPredictor:
         """The equations that it integrates."""
         derivatives = plant.dynamics.derivatives(state[POSE], state[RATES], torque, parameters)
         return linear_model(derivatives.A, derivatives.B)
+
+
+@dataclass(frozen=True)
+class ArrivalPredictor(NonlinearPredictor):
+    """Integrates to the very instant from which the next torque acts, whatever part of a period."""
+
+    def pending(self, timeline: Timeline) -> int:
+        """None: by then all have acted."""
+        return 0
+
+    def ahead(
+        self, belief: Belief, integral: Array, queue: Array, wanted: Array, plant: NominalPlant
+    ) -> Ahead:
+        """The integral goes on from one change of torque to the next."""
+        acting = belief.timeline.until_next(queue)
+        states = np.vstack([belief.state, plant.predict(belief.state, acting, belief.parameters)])
+        errors = states - wanted
+        added = acting.durations[:, None] / 2 * (errors[:-1, POSE] + errors[1:, POSE])
+        held = [plant.motors.reached(torque) for torque in acting.torques]
+        return Ahead(states[-1], errors[-1], integral + added[~np.array(held)].sum(axis=0))

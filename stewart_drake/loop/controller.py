@@ -14,12 +14,14 @@ from pydrake.systems.framework import (
     State,
     ValueProducer,
 )
+from pydrake.trajectories import Trajectory
 
 from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.late import LateObserver
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
-from stewart_drake.law.predictive_lqi import PredictiveLqi, Preview
+from stewart_drake.law.motion import KnownMotion, Motion, Preview
+from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.signals import (
@@ -40,6 +42,8 @@ HELD: Final[dict[str, Callable[[Memory], Array]]] = {
     "state_estimate": lambda memory: memory.belief.state,
     "parameters": lambda memory: memory.belief.parameters,
     "parameter_std": lambda memory: memory.belief.estimate.parameter_std,
+    "delay_estimate": lambda memory: memory.belief.delay,
+    "delay_std": lambda memory: np.array([memory.belief.delay_std]),
 }
 """Signal of the table `scenario.signals.SIGNALS` -> what the controller's memory has of it."""
 
@@ -84,15 +88,24 @@ class DelayLqiController(LeafSystem):
     | state_estimate | output | 12 | rad, m, rad/s, m/s | held, NaN before the first sample |
     | parameters | output | 8 | N m, kg, N m s/rad | held; as the law believes |
     | parameter_std | output | 8 | the same | held; NaN without estimator |
+    | delay_estimate | output | 1 | s | held; as the law believes |
+    | delay_std | output | 1 | s | held; NaN without delay estimator |
 
     Args:
         law: the control law.
         queue: (L, 6) torques in flight at t = 0 in N m, oldest first, as the controller believes.
+        motion: what it follows, and the reference, for a law that asks for other instants of it
+            than it did at the start; without it what it follows is `preview`.
     """
 
-    def __init__(self, law: PredictiveLqi, queue: Array) -> None:
+    def __init__(
+        self,
+        law: PredictiveLqi,
+        queue: Array,
+        motion: tuple[Trajectory, Trajectory] | None = None,
+    ) -> None:
         super().__init__()
-        self._law = law
+        self._law, self._motion = law, motion
         first = Sample(law.initial_memory(queue), 0.0)
         self._memory = self.DeclareAbstractState(Value(first))
         self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
@@ -136,16 +149,15 @@ class DelayLqiController(LeafSystem):
         output.SetFromVector(part(self.memory(context)))
 
     def _calc_step(self, context: Context, result: AbstractValue) -> None:
-        reference = np.reshape(np.asarray(self._preview.Eval(context)), (-1, NUM_REFERENCE))
         age = 0.0
         if self._age is not None:
             age = float(np.asarray(self._age.Eval(context))[0])
         measurement = Measurement.of(np.asarray(self._measurement.Eval(context)), age)
         weights = np.asarray(self._weights.Eval(context))
-        memory, preview = self.memory(context), Preview(self._times, reference)
+        memory, motion = self.memory(context), self._followed(context)
         report = self._reported(context, age)
         started = time.perf_counter()
-        after = self._law.step(memory, measurement, preview, weights, report)
+        after = self._law.step(memory, measurement, motion, weights, report)
         result.set_value(Sample(after, time.perf_counter() - started))
 
     def _reported(self, context: Context, age: float) -> Report | None:
@@ -161,6 +173,12 @@ class DelayLqiController(LeafSystem):
     def _plan(self, context: Context, output: BasicVector) -> None:
         sample: Any = self._step.Eval(context)
         output.SetFromVector(sample.memory.sent.packets[-1].ravel())
+
+    def _followed(self, context: Context) -> Motion:
+        if self._motion is not None:
+            return KnownMotion(*self._motion, context.get_time())
+        reference = np.reshape(np.asarray(self._preview.Eval(context)), (-1, NUM_REFERENCE))
+        return Preview(self._times, reference)
 
     def _torque(self, context: Context, output: BasicVector) -> None:
         sample: Any = self._step.Eval(context)

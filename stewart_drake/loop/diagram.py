@@ -25,9 +25,10 @@ from stewart_drake.loop.density import DensityWindow
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.experiment import (
     Experiment,
-    believed_queue,
     concrete,
     control_law,
+    first_queue,
+    followed_motion,
     motion_scale,
     torques_in_flight,
 )
@@ -74,7 +75,7 @@ class ClosedLoop(Diagram):
     `torque_commanded` (what the law asks for), `torque_applied` (what arrives of it: within the
     motors' limit, late, before the bias), `integral`, `weights_used`, `parameters`,
     `parameter_std`, `density`, `measurement` (held, as the controller read it), `state_estimate`,
-    `delay_true` (of the torque sent last), `packets`.
+    `delay_estimate`, `delay_std`, `delay_true` (of the torque sent last), `packets`.
 
     Attributes:
         experiment: what it was built from.
@@ -228,7 +229,10 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[Predictiv
     )
     weights = _weights(builder, experiment)
     controller = builder.AddNamedSystem(
-        "controller", DelayLqiController(law, believed_queue(experiment, law.timeline))
+        "controller",
+        DelayLqiController(
+            law, first_queue(experiment, law), followed_motion(experiment, law, planned)
+        ),
     )
     builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
     builder.Connect(weights, controller.GetInputPort("weights"))

@@ -1,6 +1,7 @@
 """A scenario made concrete: mechanism, reference, and the control law that it asks for."""
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,8 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.law.catch_up import plan_catch_up
 from stewart_drake.law.channel import Channel, Packets, Wire
 from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.delay_filter import delay_settings
+from stewart_drake.law.delay_observer import DelayObserver
 from stewart_drake.law.design_models import DesignModel, MultibodyModel, PaperModel
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
@@ -26,8 +29,14 @@ from stewart_drake.law.late import LateObserver
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import NoObserver, Observer, ParameterObserver
+from stewart_drake.law.planner import NoPlanner, Rejoin
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.predictors import LinearPredictor, NonlinearPredictor, Predictor
+from stewart_drake.law.predictors import (
+    ArrivalPredictor,
+    LinearPredictor,
+    NonlinearPredictor,
+    Predictor,
+)
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.startup import (
     STILL,
@@ -252,6 +261,26 @@ def believed_queue(experiment: Experiment, timeline: Timeline) -> Array:
     return torques_in_flight(experiment, timeline.delay)
 
 
+def first_queue(experiment: Experiment, law: PredictiveLqi) -> Array:
+    """The torques in flight at t = 0 that a law begins with.
+
+    One that does not know the delay has more: what acts in each period until its own do, up to the
+    longest delay.
+    """
+    if not isinstance(law.observer, DelayObserver):
+        return believed_queue(experiment, law.timeline)
+    return torques_in_flight(experiment, Delay(law.observer.kept(law.timeline.period)))
+
+
+def followed_motion(
+    experiment: Experiment, law: PredictiveLqi, planned: Trajectory
+) -> tuple[Trajectory, Trajectory] | None:
+    """What a law that changes its mind has to know: what it follows, and the reference."""
+    if not isinstance(law.observer, DelayObserver):
+        return None
+    return planned, experiment.reference
+
+
 def motion_scale(experiment: Experiment) -> Array:
     """(6,) rad and m: half the reference's peak to peak, STILL where constant."""
     still = STILL * np.repeat([1.0, experiment.mechanism.crank_lengths.min()], 3)
@@ -285,11 +314,10 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
     torque_scale = max(machine_torque(nominal), peak_torque)
     plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
+    settings = filter_settings(motion, plate, torque_scale, asked, c.period)
     observers: dict[str, Observer] = {
         "none": NoObserver(),
-        "parameters": ParameterObserver(
-            filter_settings(motion, plate, torque_scale, asked, c.period)
-        ),
+        "parameters": ParameterObserver(settings),
     }
     predictors: dict[str, Predictor] = {
         "linear": LinearPredictor(),
@@ -305,6 +333,7 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
         "multibody": MultibodyModel(),
     }
     motors = TorqueLimit(experiment.torque_limit)
+    quiet = c.quiet_start and sc.start == "rest"
     observer, waits = observers[c.estimator], longest_wait(sc)
     if waits:
         observer = LateObserver(observer, waits)
@@ -320,7 +349,17 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
         cost=quadratic_cost(experiment, peak_torque),
         channel=channel,
         kept=waits + (_REPORTS if isinstance(channel, Packets) else 0),
+        silence=math.ceil(timeline.delay.periods) if quiet else 0,
     )
+    if c.delay_estimator != "none":
+        delay = delay_settings(c.delay_estimator, c.delay_std, c.delay_max)
+        law = replace(
+            law,
+            observer=DelayObserver(settings, delay, timeline.eta, quiet),
+            predictor=ArrivalPredictor(),
+            planner=Rejoin(c.rejoin, experiment.scale) if c.rejoin > 0 else NoPlanner(),
+            silence=0,  # until the delay is found
+        )
     return experiment.own.revised(law)
 
 

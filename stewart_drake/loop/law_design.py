@@ -13,9 +13,10 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import validate
+from stewart_drake.law.delay_observer import DelayObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController
-from stewart_drake.loop.experiment import Experiment, believed_queue, control_law
+from stewart_drake.loop.experiment import Experiment, control_law, first_queue
 from stewart_drake.loop.own import Own
 from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.loop.reference import Reference
@@ -58,7 +59,9 @@ class DesignedLaw:
 
     def controller(self) -> DelayLqiController:
         """The law alone as a LeafSystem, whose `preview` and `weights` are the caller's."""
-        return DelayLqiController(self.law, self.queue)
+        known = isinstance(self.law.observer, DelayObserver)
+        motion = (self.planned, self.reference) if known else None
+        return DelayLqiController(self.law, self.queue, motion)
 
     def AddToBuilder(self, builder: DiagramBuilder, name: str = "delay_lqi") -> DelayLqiController:
         """Add the law with its reference and weights, which are connected.
@@ -152,5 +155,5 @@ def design_law(
     )
     law, planned, _ = control_law(experiment)
     c = scenario.controller
-    flying = believed_queue(experiment, law.timeline)
+    flying = first_queue(experiment, law)
     return DesignedLaw(law, motion, planned, flying, np.array([c.w_Q, c.w_R]))

@@ -1,6 +1,5 @@
 """Collecting the signals of a running loop, and summing them up."""
 
-import dataclasses
 import json
 from typing import Any
 
@@ -16,9 +15,9 @@ from stewart_drake.loop import metrics
 from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.experiment import Experiment, waits_at_rest
-from stewart_drake.loop.results import RunSummary
+from stewart_drake.loop.results import DelaySummary, RunSummary
 from stewart_drake.loop.tuner import AnnTuner
-from stewart_drake.scenario.loading import scenario_yaml
+from stewart_drake.scenario.loading import scenario_to_dict, scenario_yaml
 from stewart_drake.scenario.signals import (
     DIMENSIONS,
     NUM_STATE,
@@ -71,6 +70,7 @@ class Recorder:
         peak_applied: largest torque that acted, N m.
         counts: what went wrong and was survived, as of the last sample.
         tuner_fallbacks: samples at which the tuner passed its network over.
+        delay: at the last sample, s: true, as it is believed in or estimated, standard deviation.
     """
 
     def __init__(self, loop: ClosedLoop) -> None:
@@ -87,6 +87,8 @@ class Recorder:
         self.on_grid, self.samples = Table(13), Table(19)
         self.peak_applied = 0.0
         self.counts, self.tuner_fallbacks = Counts(), 0
+        nan = float("nan")
+        self.delay: DelaySummary = {"true_s": nan, "estimated_s": nan, "std_s": nan}
 
     def _port(self, context: Context, name: str) -> Array:
         if name not in self._ports:
@@ -111,6 +113,11 @@ class Recorder:
             if self._tuner is not None:
                 tuner_context = self._tuner.GetMyContextFromRoot(context)
                 self.tuner_fallbacks = self._tuner.fallbacks(tuner_context)
+            self.delay = {
+                "true_s": float(self._port(context, "delay_true")[0]),
+                "estimated_s": float(self._port(context, "delay_estimate")[0]),
+                "std_s": float(self._port(context, "delay_std")[0]),
+            }
             self.samples.append(self._error, memory.torque, memory.in_flight[-1], seconds)
         if instant.on_grid:
             self.on_grid.append(self._instant, self._error, self._wanted[POSE])
@@ -192,10 +199,11 @@ def summarize(
             "median": float(1e3 * np.median(seconds)) if some else nan,
             "worst": float(1e3 * seconds.max()) if some else nan,
         },
+        "delay": recorder.delay,
         "wall_s": wall,
         "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
         "own": experiment.own.names,
-        "scenario": dataclasses.asdict(sc),
+        "scenario": scenario_to_dict(sc),
         "versions": versions(),
         "controller_margin": None if margin is None else margin.summary,
         "warnings": [],

@@ -35,6 +35,16 @@ class MarginSummary(TypedDict):
     """Of an error of the prediction within the delay, e^(p eta), a factor."""
 
 
+class DelaySummary(TypedDict):
+    """The delay at the last sample, s."""
+
+    true_s: float
+    estimated_s: float
+    """What the law goes by."""
+    std_s: float
+    """NaN without an estimator."""
+
+
 class RunSummary(TypedDict):
     """How a run went: what its `summary.json` holds, with null for NaN.
 
@@ -62,6 +72,7 @@ class RunSummary(TypedDict):
     delay_floor: float
     """E_ac in % s that a plate at rest collects before any torque acts; 0 where it is not."""
     controller_step_ms: StepTimes
+    delay: DelaySummary
     wall_s: float
     """Time that the run took, s."""
     counts: dict[str, int]

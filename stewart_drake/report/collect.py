@@ -17,8 +17,8 @@ from stewart_drake.report.analyses import analyze
 from stewart_drake.report.answer import Answer
 from stewart_drake.report.figures import TORQUE_CONTROLLERS
 from stewart_drake.scenario.config import AnnTunerConfig, Scenario
-from stewart_drake.scenario.loading import load_comparison, load_scenario
-from stewart_drake.studies.compare import CONTROLLERS
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.studies.compare import shown
 from stewart_drake.studies.jobs import Job, run_jobs
 from stewart_drake.tuner.network import DEFAULT
 
@@ -73,7 +73,7 @@ def collect(
     scenarios: dict[str, Scenario] = {}
     rows: set[str] = set()
     if failure is None:
-        scenarios = load_comparison(scenario_name, CONTROLLERS, settings)
+        scenarios = shown(scenario_name, settings)
         rows = set(scenarios)
         if scenario not in scenarios.values():
             scenarios[_OWN] = scenario

@@ -19,7 +19,7 @@ from stewart_drake.report.style import FACTORS, UNITS, figure_style, write_figur
 from stewart_drake.report.tuner_figures import shown_until, weights_figure
 from stewart_drake.scenario.config import FixedTunerConfig
 from stewart_drake.scenario.signals import ANGLES, COORDINATES, LEGS, PARAMETERS, POSITION
-from stewart_drake.studies.compare import LABELS
+from stewart_drake.studies.compare import ADAPTIVE, LABELS
 from stewart_drake.studies.compare import label as spoken
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
         return {}
     lines = {spoken(name): style.controller_line(name) for name in results}
     runs = {spoken(name): result for name, result in results.items()}
-    shown = (*TORQUE_CONTROLLERS, *(name for name in results if name not in LABELS))
+    shown = (*TORQUE_CONTROLLERS, ADAPTIVE, *(name for name in results if name not in LABELS))
     aware = {name: results[name] for name in shown if name in results}
     with figure_style():
         figures = {"states": _states(runs, lines), "errors": _errors(runs, lines)}
@@ -112,6 +112,8 @@ def draw_run(result: SimulationResult) -> dict[str, Figure]:
         }
         if np.isfinite(result.signals.parameter_std.values).any():
             figures["parameters"] = _parameters(result)
+        if np.isfinite(result.signals.delay_std.values).any():
+            figures["delay"] = _delay(result)
         if _is_tuned(result):
             figures["weights"] = weights_figure({"weights that the tuner set": result})
         return figures
@@ -193,6 +195,37 @@ def _parameters(run: SimulationResult) -> Figure:
     return _with_legend(figure, axes)
 
 
+def _delay(run: SimulationResult) -> Figure:
+    """The delay with its band, and how far that is from the truth."""
+    figure, (whole, fine) = _grid([run], rows=1)
+    steps: dict[str, Any] = {"drawstyle": "steps-post"}
+    signals = run.signals
+    time, true = signals.time.values, signals.delay_true.values
+    value, width = signals.delay_estimate.values, 2 * signals.delay_std.values
+    for ax, origin, factor in ((whole, 0.0, 1.0), (fine, true, 1e3)):
+        ax.plot(
+            time, factor * (true - origin), label="true value", **steps, **style.TRUTH._asdict()
+        )
+        middle = factor * (value - origin)
+        ax.plot(time, middle, label="estimate", **steps, **style.RUN._asdict())
+        ax.fill_between(
+            time,
+            middle - factor * width,
+            middle + factor * width,
+            step="post",
+            color=style.RUN.color,
+            alpha=style.BAND_ALPHA,
+            linewidth=0,
+            label="± 2 σ",
+        )
+    # The band at the end, and an error that is some times as large, can be told apart.
+    last = 1e3 * float(np.nanmin(width))
+    fine.set_ylim(-10 * last, 10 * last)
+    whole.set_ylabel("delay  [s]")
+    fine.set_ylabel("delay minus true one  [ms]")
+    return _with_legend(figure, [whole, fine])
+
+
 def _grid(
     runs: Iterable[SimulationResult], rows: int = 3, sharey: bool = False
 ) -> tuple[Figure, list[Axes]]:
@@ -202,7 +235,7 @@ def _grid(
     room = {"left": 0.09, "right": 0.985, "wspace": 0.24, "hspace": 0.12}
     figure = Figure(figsize=(10, height))
     figure.subplots_adjust(bottom=0.5 / height, top=1 - 0.45 / height, **room)
-    axes = figure.subplots(rows, 2, sharex=True, sharey=sharey)
+    axes = figure.subplots(rows, 2, sharex=True, sharey=sharey, squeeze=False)
     for ax in axes.ravel():
         ax.yaxis.set_label_coords(-0.14, 0.5)
         # More digits than these would run into the label.

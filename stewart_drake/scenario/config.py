@@ -122,6 +122,14 @@ class ControllerConfig:
         packet_repeats: how many earlier torques it says again, each for a period more of delay.
         catch_up: blend onto the reference after a start from rest, s; 0 is none, null the shortest
             one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
+        delay_estimator: `none`; or the delay is estimated, beginning with the one that is believed
+            in, as `constant`, or as `drifting` with a rate of its own.
+        delay_std: of that belief, s.
+        delay_max: longest delay that is thought possible, s.
+        quiet_start: whether, from rest, nothing is fed back before a torque of the controller can
+            have acted.
+        rejoin: with a delay estimator: a plan back onto the reference takes so long, in s, where
+            the prediction is off it, as when the delay was found or has jumped; 0 is none.
     """
 
     period: Annotated[float, Field(ge=1e-4, le=10)] = 0.1
@@ -140,6 +148,11 @@ class ControllerConfig:
     packet_torques: Annotated[int, Field(ge=1, le=100)] = 8
     packet_repeats: Annotated[int, Field(ge=0, le=100)] = 1
     catch_up: Annotated[float, Field(ge=0, le=10)] | None = None
+    delay_estimator: Literal["none", "constant", "drifting"] = "none"
+    delay_std: Annotated[float, Field(ge=1e-3, le=10)] = 0.3
+    delay_max: Annotated[float, Field(gt=0, le=10)] = 1.5
+    quiet_start: bool = True
+    rejoin: Annotated[float, Field(ge=0, le=10)] = 0.6
 
 
 @dataclass(config=STRICT)
@@ -352,6 +365,26 @@ class Scenario:
         """The true delay in s."""
         return self.true_delay.eta(self.controller.period)
 
+    def _delay_problem(self) -> str | None:
+        c = self.controller
+        believed = self.eta
+        if c.delay_steps is not None:
+            believed = Delay(c.delay_steps, c.delay_fraction or 0.0).eta(c.period)
+        if c.delay_estimator == "none":
+            return None
+        if not isinstance(self.link, WireConfig) or self.sensor.delay > 0:
+            return (
+                f"controller.delay_estimator: got {c.delay_estimator!r} with link.kind "
+                f"{self.link.kind!r} and a sensor.delay of {self.sensor.delay:g} s; expected "
+                "'none', or a wire and measurements of now"
+            )
+        if believed <= c.delay_max:
+            return None
+        return (
+            f"controller.delay_max: got {c.delay_max:g} s, less than the {believed:g} s that are "
+            "believed in; expected as much or more"
+        )
+
     def check(self, where: str = "scenario") -> None:
         """Checks every field again, and everything that takes several of them.
 
@@ -372,6 +405,7 @@ class Scenario:
             _controller_problem(self.controller),
             self.sensor.problem(),
             self.link.problem(),
+            self._delay_problem(),
             step and self._step_problem(step),
             log_problem(self.log_period, self.duration, step),
         ):
@@ -397,6 +431,14 @@ def _controller_problem(controller: ControllerConfig) -> str | None:
         return (
             f"controller.catch_up: got {controller.catch_up!r}; expected 0 for none, null, or at "
             "least 0.001 s"
+        )
+    if controller.delay_estimator != "none" and (
+        controller.estimator != "parameters" or controller.prediction != "nonlinear"
+    ):
+        return (
+            f"controller.delay_estimator: got {controller.delay_estimator!r} with estimator "
+            f"{controller.estimator!r} and prediction {controller.prediction!r}; expected 'none', "
+            "or estimator 'parameters' and prediction 'nonlinear'"
         )
     if controller.torque_map == "printed" and controller.model != "paper":
         return (

@@ -87,6 +87,9 @@ def load_comparison(
 ) -> dict[str, Scenario]:
     """Reads a scenario once for every controller, and for every further row of its `compare`.
 
+    What `settings` say of the delay that is believed in does not change a controller that knows of
+    none.
+
     Args:
         name_or_path, settings: as of `load_scenario`.
         controllers: names or paths.
@@ -98,11 +101,14 @@ def load_comparison(
         ConfigError: the first problem, in one line.
     """
     settings = tuple(settings)
+    others = tuple(s for s in settings if not s.strip().startswith("controller.delay_"))
     changes = load_scenario(name_or_path, settings=settings).compare
     rows = {}
     for row in dict.fromkeys([*controllers, *changes]):
         where, change = f"{name_or_path}: compare.{row}", dict(changes.get(row, {}))
-        scenario = load_scenario(name_or_path, change.pop("controller", row), settings)
+        controller = change.pop("controller", row)
+        blind = load_controller(controller).get("delay_steps") == 0
+        scenario = load_scenario(name_or_path, controller, others if blind else settings)
         changed = dataclasses.asdict(scenario.controller) | change
         scenario.controller = validate(ControllerConfig, changed, where)
         scenario.check(where)

@@ -143,8 +143,8 @@ _TORQUE: Final = Quantity("leg", ("N m",) * NUM_TORQUES)
 _WEIGHTS: Final = Quantity("weight", ("1",) * len(WEIGHTS))
 _PARAMETERS: Final = Quantity("parameter", PARAMETER_UNITS)
 _DENSITY: Final = Quantity("tuner_input", ("1",) * len(TUNER_INPUTS))
-_STATE: Final = Quantity("state", COORDINATE_UNITS + RATE_UNITS)
 _SECONDS: Final = Quantity(None, ("s",))
+_STATE: Final = Quantity("state", COORDINATE_UNITS + RATE_UNITS)
 _PACKETS: Final = Quantity("packet", ("1",) * len(PACKETS))
 
 _TABLE: Final = (
@@ -176,6 +176,8 @@ _TABLE: Final = (
         "controller.measurement_used",
     ),
     Signal("state_estimate", _STATE, "pose and rates that the controller goes on", "controller"),
+    Signal("delay_estimate", _SECONDS, "delay that the controller believes in", "controller"),
+    Signal("delay_std", _SECONDS, "standard deviation of that estimate", "controller"),
     Signal("delay_true", _SECONDS, "true delay of the torque sent last", "delay_chain.delay"),
     Signal("packets", _PACKETS, "counts of packets, NaN without any", "delay_chain"),
 )

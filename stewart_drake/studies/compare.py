@@ -19,14 +19,17 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.files.resources import resolve
+from stewart_drake.loop.experiment import believed_delay
 from stewart_drake.loop.own import OwnReference
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.config import Scenario, WireConfig
 from stewart_drake.scenario.loading import load_comparison, load_scenario
 from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.studies.jobs import run_jobs
 
+ADAPTIVE: Final = "adaptive_lqi"
+"""Shown beside the others where the delay that they go by is not the true one."""
 CONTROLLERS: Final = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
 """Shipped names, in the order of tables and legends: the paper's four, and ours."""
 LABELS: Final = {
@@ -35,6 +38,7 @@ LABELS: Final = {
     "delay_lqr": "LQR, delay-aware",
     "delay_lqi": "LQI, delay-aware",
     "predictor_lqi": "LQI, predictor",
+    "adaptive_lqi": "LQI, delay found",
 }
 PAPER_ERRORS: Final = {"lqr": None, "lqi": None, "delay_lqr": 225.0, "delay_lqi": 80.0}
 """E_ac in % s that the paper reports in its Table II, None where it reports a failure."""
@@ -78,15 +82,14 @@ def compare(
         reference, disturbance: for all runs, as of `simulate`.
 
     Returns:
-        Results by controller, in the order of CONTROLLERS, then the rows that the scenario's
-        `compare` adds, then your own.
+        Results by controller, in the order of `shown`, then your own.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
     """
     settings, controllers = tuple(settings), dict(controllers or {})
     _check_makers(controllers, reference, disturbance)
-    scenarios = load_comparison(scenario_name, CONTROLLERS, settings)
+    scenarios = shown(scenario_name, settings)
     scenarios |= {name: load_scenario(scenario_name, settings=settings) for name in controllers}
     given = {
         name: {
@@ -121,6 +124,24 @@ def compare(
             board.stop()
         results = zip(scenarios, runs.result().values(), strict=True)
     return Comparison({name: result for name, result in results if result is not None})
+
+
+def shown(scenario_name: str | Path, settings: Iterable[str] = ()) -> dict[str, Scenario]:
+    """Scenarios of the shipped controllers, then of the rows that the scenario's `compare` adds.
+
+    ADAPTIVE is among them where the others' delay is not the true one, or changes, unless the
+    scenario is one that it is not for.
+
+    Raises:
+        ConfigError: bad input.
+    """
+    settings = tuple(settings)
+    rows = load_comparison(scenario_name, CONTROLLERS, settings)
+    aware = rows["predictor_lqi"]
+    known = aware.delay.constant and believed_delay(aware) == aware.true_delay
+    if known or not isinstance(aware.link, WireConfig) or aware.sensor.delay > 0:
+        return rows
+    return load_comparison(scenario_name, (*CONTROLLERS, ADAPTIVE), settings)
 
 
 def label(name: str) -> str:

@@ -1,0 +1,360 @@
+"""A delay that nobody tells the controller: what acts when, the filter, the search, the loop."""
+
+import dataclasses
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.stats import norm
+
+import stewart_drake as sd
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.arrivals import Arrivals
+from stewart_drake.law.delay_filter import DelayFilter, DelayModel, Guess, delay_settings
+from stewart_drake.law.delay_observer import DelayBelief, DelayObserver
+from stewart_drake.law.filter_settings import filter_settings
+from stewart_drake.law.holds import GAUSS_NODES
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.sensing import StateSensing
+from stewart_drake.law.timeline import Timeline
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.report.figures import draw_run
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, shown
+from tests.mechanisms import PAPER
+
+Array = NDArray[np.float64]
+
+DT = 0.1
+AMPLITUDES = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
+DYNAMICS = StewartDynamics(PAPER, gravity=False)
+PLANT = NominalPlant(DYNAMICS, 2, 1.0, TorqueLimit())
+SETTINGS = filter_settings(AMPLITUDES, 4.0, 0.06, None, DT)
+NOISE = 1e-4 * np.tile(AMPLITUDES, 2)
+SENSING = StateSensing(NOISE, AMPLITUDES)
+DELAY = delay_settings("constant", 0.3, 1.5)
+HOME = np.concatenate([PAPER.home, np.zeros(6)])
+THETA = np.concatenate([1e-3 * np.array([1, -1, 2, 0, -2, 1.0]), [0.5, 0.002]])
+
+
+# What acts when.
+
+
+def acting_at(arrivals: Arrivals, torques: Array, t: float, newest: int) -> float:
+    """By definition: the own torque that arrived last, else what acts in that period."""
+    arrived = [
+        i
+        for i in range(newest - arrivals.sent + 1, newest + 1)
+        if (i * DT + arrivals.arrival) * (1 + arrivals.rate) <= t
+    ]
+    if arrived:
+        return float(torques[len(torques) - 1 + max(arrived) - newest, 0])
+    return float(arrivals.before[min(int(t / DT), len(arrivals.before) - 1), 0])
+
+
+@pytest.mark.parametrize("newest", [-1, 0])
+@pytest.mark.parametrize("sent", [0, 1, 4, 9])
+@pytest.mark.parametrize("rate", [0.0, 0.05, -0.05])
+@pytest.mark.parametrize("eta", [0.0, 0.03, 0.1, 0.37, 0.8, 1e6])
+def test_what_acts_is_what_arrived_last(eta: float, rate: float, sent: int, newest: int) -> None:
+    torques = np.arange(1.0, 10)[:, None] * np.ones(6)
+    before = -np.arange(1.0, 8)[:, None] * np.ones(6)
+    arrivals = Arrivals(DT, Delay(0), eta, rate, sent, before)
+    end = min(arrivals.eta, 0.7)
+    acting = arrivals.within(torques, 0.0, end, newest)
+    assert acting.durations.sum() == pytest.approx(end) and np.all(acting.durations >= 0)
+    t = 0.0
+    for torque, duration in zip(acting.torques, acting.durations, strict=True):
+        for share in (0.01, 0.5, 0.99) if duration > 1e-6 else ():
+            assert torque[0] == acting_at(arrivals, torques, t + share * duration, newest)
+        t += duration
+
+
+@pytest.mark.parametrize(("steps", "fraction"), [(3, 0.0), (3, 0.4), (0, 0.5)])
+def test_whole_and_real_delays_agree(steps: int, fraction: float) -> None:
+    rng = np.random.default_rng(0)
+    torques, whole = rng.normal(0, 0.02, (9, 6)), Timeline(DT, Delay(steps, fraction))
+    real = Arrivals(DT, Delay(0), whole.eta, 0.0, 9, np.zeros((1, 6)))
+    for t in (whole, real):
+        acting = t.until_next(t.queue(torques))
+        # The exact dynamics tell whether both let the same act for as long.
+        end = PLANT.predict(HOME, acting)[-1]
+        assert end == pytest.approx(PLANT.predict(HOME, real.until_next(torques))[-1], abs=1e-12)
+    assert real.holds(-1, 1) == pytest.approx(whole.holds(-1, 1))
+
+
+# The filter.
+
+
+def swing(k: int) -> Array:
+    """Torques that move the plate in all coordinates."""
+    return 0.02 * np.sin(0.9 * k + np.arange(6)) + 0.01 * np.cos(0.5 * k * np.arange(1, 7))
+
+
+@pytest.mark.parametrize("eta", [0.137, 0.25, 0.449])
+def test_sensitivity_to_the_delay_equals_a_finer_difference(eta: float) -> None:
+    """Richardson's extrapolation of the response, with 64 steps per torque."""
+    fine = NominalPlant(DYNAMICS, 64, 1.0, TorqueLimit())
+    torques = np.array([swing(k) for k in range(12)])
+    view = Arrivals(DT, Delay(0), 0.0, 0.0, 12, np.zeros((1, 6)))
+    xi = np.concatenate([HOME, THETA, [eta, 0.0]])
+    xi[6:12] = 0.3 * AMPLITUDES
+
+    def end(at: float) -> Array:
+        moved = xi.copy()
+        moved[-2] = at
+        return DelayModel(fine, view, torques).end(moved)
+
+    def slope(h: float) -> Array:
+        return (end(eta + h) - end(eta - h)) / (2 * h)
+
+    expected = (4 * slope(5e-4) - slope(1e-3)) / 3
+    found = DelayModel(PLANT, view, torques).at(xi, GAUSS_NODES).F[:12, -2]
+    assert np.abs(found - expected).max() < 1e-3 * np.abs(expected).max()
+
+
+def record(eta: float, samples: int, seed: int, rate: float = 0.0) -> tuple[Array, Array, Array]:
+    """Torques, states and measurements at the samples, by fine integration of its own."""
+    torques = np.array([swing(k) for k in range(samples)])
+    step, states, x = 5e-3, [HOME], HOME
+    arrive = DT * np.arange(samples) + eta + rate * DT * np.arange(samples)
+    for k in range(samples - 1):
+        edges = [k * DT, *arrive[(arrive > k * DT) & (arrive < (k + 1) * DT)], (k + 1) * DT]
+        for begin, end in pairwise(edges):
+            place = np.searchsorted(arrive, (begin + end) / 2) - 1
+            torque = torques[place] if place >= 0 else np.zeros(6)
+            if end - begin > 1e-12:
+                n = int(np.ceil((end - begin) / step))
+                x = DYNAMICS.predict(x, torque, end - begin, n, THETA)[-1]
+        states.append(x)
+    truth = np.array(states)
+    noise = np.random.default_rng(seed).normal(0, 1, truth.shape) * NOISE
+    return torques, truth, truth + noise
+
+
+def observed(torques: Array, measured: Array, believed: float, **changes: Any) -> list[DelayBelief]:
+    """The beliefs at all samples."""
+    delay = replace(DELAY, **changes)
+    observer = DelayObserver(SETTINGS, delay, believed, quiet=False)
+    belief = observer.start(Timeline(DT, Delay(0)), SENSING, PLANT)
+    in_flight = np.zeros((observer.kept(DT) + 1, 6))
+    found = []
+    for torque, values in zip(torques, measured, strict=True):
+        belief = observer.observe(belief, Measurement.of(values), in_flight, SENSING, PLANT)
+        in_flight = np.vstack([in_flight[1:], torque])
+        assert isinstance(belief, DelayBelief)
+        found.append(belief)
+    return found
+
+
+def test_the_filter_finds_what_batch_least_squares_finds() -> None:
+    """One nonlinear least-squares problem over all measurements, its own simulation and weights."""
+    eta, samples = 0.337, 14
+    torques, _, measured = record(eta, samples, seed=1)
+    prior = SETTINGS.parameters
+
+    def simulated(first: Array, theta: Array, delay: float) -> Array:
+        x, states = first, [first]
+        for k in range(samples - 1):
+            split = np.clip(delay % DT, 0, DT)
+            j = k - int(delay // DT)
+            pair = [torques[i] if i >= 0 else np.zeros(6) for i in (j - 1, j)]
+            x = DYNAMICS.predict(x, np.array(pair), np.array([split, DT - split]), 2, theta)[-1]
+            states.append(x)
+        return np.array(states)
+
+    def residuals(unknown: Array) -> Array:
+        first, theta = unknown[:12] * NOISE + measured[0], unknown[12:20] * prior.std
+        misses = (simulated(first, theta, unknown[20]) - measured) / NOISE
+        return np.concatenate([misses.ravel(), unknown[12:20]])
+
+    guess = np.concatenate([np.zeros(20), [0.33]])
+    batch = least_squares(residuals, guess, x_scale=np.append(np.ones(20), 1e-2))
+    jacobian = np.asarray(batch.jac)
+    std = float(np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[20, 20]))
+    last = observed(torques, measured, believed=0.5)[-1]
+    assert last.settled and last.guess is not None
+    assert abs(batch.x[20] - eta) < 4 * std  # the oracle is one
+    # The filter also allows for errors of the model, and is wider for them.
+    assert std < last.guess.std < 0.01
+    assert abs(last.guess.eta - batch.x[20]) < 2 * last.guess.std
+
+
+@pytest.mark.parametrize("size", [3e-4, 5e-4])
+def test_the_search_weighs_as_a_grid_of_filters_does(size: float) -> None:
+    """Cells against the posterior of filters that each know the delay, on a grid of 10 ms.
+
+    The torques are so small that what they do is hardly seen yet.
+    """
+    samples, believed, std = 7, 0.45, 0.1
+    torques = size * np.array([swing(k) for k in range(samples)])
+    measured = small_record(torques, 0.43, samples)
+    belief = observed(torques, measured, believed, std=std)[-1]
+    assert not belief.settled and belief.master is not None
+    weights = np.exp([belief.master.weight, *(c.weight for c in belief.cells)])
+    weights = weights / weights.sum()
+    grid = np.arange(0.005, 1.5, 0.01)
+    log = np.array([known_delay_likelihood(torques, measured, eta) for eta in grid])
+    posterior = norm(believed, std).pdf(grid) * np.exp(log - log.max())
+    posterior /= posterior.sum()
+    assert weights[0] == pytest.approx(posterior[grid > (samples - 1) * DT].sum(), abs=0.06)
+    for weight, cell in zip(weights[1:], belief.cells, strict=True):
+        inside = (grid > cell.guess.low) & (grid < cell.guess.high)
+        assert weight == pytest.approx(posterior[inside].sum(), abs=0.06)
+
+
+def small_record(torques: Array, eta: float, samples: int) -> Array:
+    """Measurements of a plate without payload under such torques."""
+    x, states = HOME, [HOME]
+    view = Arrivals(DT, Delay(0), eta, 0.0, 0, np.zeros((1, 6)))
+    for k in range(samples - 1):
+        sent = replace(view, sent=k + 1)
+        x = DYNAMICS.predict(x, *sent.within(torques[: k + 1], 0.0, DT, newest=0), 8)[-1]
+        states.append(x)
+    noise = np.random.default_rng(5).normal(0, 1, (samples, 12)) * NOISE
+    return np.array(states) + noise
+
+
+def known_delay_likelihood(torques: Array, measured: Array, eta: float) -> float:
+    """Log-likelihood of the measurements by a filter that is told the delay."""
+    ekf = DelayFilter(PLANT, SENSING, SETTINGS, DELAY)
+    prior = SETTINGS.parameters
+    mean = np.concatenate([measured[0], prior.prior, [eta, 0.0]])
+    covariance = np.diag(np.concatenate([NOISE**2, prior.std**2, [0.0, 0.0]]))
+    guess, total = Guess(mean, covariance, 0.0, 1.5), 0.0
+    for k in range(1, len(measured)):
+        view = Arrivals(DT, Delay(0), eta, 0.0, k, np.zeros((1, 6)))
+        guess = ekf.advance(guess, view, torques[:k], measured[k])
+        total += guess.log_likelihood
+    return total
+
+
+@pytest.mark.parametrize("eta", [0.05, 0.337, 0.8, 1.21])
+def test_the_delay_is_found_soon_after_the_first_arrival(eta: float) -> None:
+    torques, truth, measured = record(eta, int(eta / DT) + 12, seed=3)
+    beliefs = observed(torques, measured, believed=0.6)
+    first = int(np.ceil(eta / DT))
+    found = next(k for k, belief in enumerate(beliefs) if belief.settled)
+    assert first <= found <= first + 3
+    last = beliefs[-1]
+    assert abs(last.delay_mean - eta) < 3 * last.delay_std + 1e-4 and last.delay_std < 5e-3
+    assert np.all(np.abs(last.state - truth[-1]) < 6 * NOISE + 1e-4)
+    assert beliefs[0].delay_std > 0.2  # the prior, cut off at 0 and at the longest
+
+
+def test_a_lost_or_impossible_measurement_is_survived() -> None:
+    torques, _, measured = record(0.337, 16, seed=4)
+    measured[0] = np.nan  # there is nothing to begin with
+    measured[9] = np.nan
+    measured[12, :6] += 0.05
+    beliefs = observed(torques, measured, believed=0.5)
+    assert beliefs[0].fault == beliefs[9].fault == "measurements_missing"
+    assert beliefs[12].fault == "measurements_rejected"
+    assert beliefs[-1].settled and abs(beliefs[-1].delay_mean - 0.337) < 3e-3
+
+
+# The loop.
+
+
+def looped(*settings: str, kind: str = "constant") -> SimulationResult:
+    chosen = ("plant.kind=exact", f"controller.delay_estimator={kind}", *settings)
+    return simulate(sd.load_scenario("paper", settings=chosen), margin=False)
+
+
+ON_REFERENCE = ("start=on_reference", "queue=reference")
+
+
+@pytest.mark.parametrize(
+    ("settings", "bound"),
+    [
+        (("controller.delay_steps=6",), 25.0),
+        ((*ON_REFERENCE, "controller.delay_steps=5"), 3.5),
+        (ON_REFERENCE, 0.03),
+    ],
+)
+def test_a_delay_believed_wrongly_is_found_in_the_loop(
+    settings: tuple[str, ...], bound: float
+) -> None:
+    result = looped(*settings)
+    assert result.status == "completed" and result.accumulated_error < bound
+    assert abs(result.summary["delay"]["estimated_s"] - 0.8) < 5e-5
+    assert result.summary["delay"]["true_s"] == pytest.approx(0.8)
+    assert 0 < result.summary["delay"]["std_s"] < 3e-4
+
+
+def test_a_jump_is_followed() -> None:
+    result = looped(*ON_REFERENCE, "delay.jump=0.1", "delay.jump_time=2", "duration=5")
+    assert result.status == "completed"
+    assert result.summary["delay"]["estimated_s"] == pytest.approx(0.9, abs=1e-4)
+    estimates, time = result.signals.delay_estimate.values, result.signals.time.values
+    assert np.all(np.abs(estimates[(time > 1) & (time < 2.8)] - 0.8) < 1e-3)
+
+
+def test_the_figure_has_the_estimate_its_band_and_the_truth() -> None:
+    result = looped("duration=1.5", "controller.delay_steps=6")
+    figure = draw_run(result)["delay"]
+    whole, fine = figure.axes
+    lines = {str(line.get_label()): line for line in whole.lines}
+    assert np.array_equal(lines["estimate"].get_ydata(), result.signals.delay_estimate.values)
+    assert np.all(np.asarray(lines["true value"].get_ydata()) == pytest.approx(0.8))
+    assert len(whole.collections) == len(fine.collections) == 1  # the bands
+    assert "delay" not in draw_run(looped("duration=0.3", kind="none"))
+
+
+def test_nothing_is_fed_back_before_the_first_torque_can_act() -> None:
+    """From rest the first torques do not depend on what was measured; then they do."""
+    noisy = "sensor.noise_std=[" + ",".join(f"{n:g}" for n in 1e-3 * np.tile(AMPLITUDES, 2)) + "]"
+
+    def first(*settings: str) -> Array:
+        run = looped("duration=1.5", *settings, kind="none")
+        samples = run.signals.sel(time=np.arange(12) * DT, method="nearest")
+        return np.asarray(samples.torque_commanded.values)
+
+    quiet, same = first(noisy), first(noisy, "sensor.seed=1")
+    assert np.array_equal(quiet[:8], same[:8]) and np.all(quiet[8] != same[8])
+    loud = [
+        first(noisy, seed, "controller.quiet_start=false")
+        for seed in ("sensor.seed=0", "sensor.seed=1")
+    ]
+    assert np.all(loud[0][0] != loud[1][0])
+
+
+def test_the_comparison_shows_it_where_the_delay_is_believed_wrongly() -> None:
+    assert tuple(shown("paper")) == CONTROLLERS
+    rows = shown("paper", ("controller.delay_steps=6",))
+    assert tuple(rows) == (*CONTROLLERS, ADAPTIVE)
+    believed = [scenario.controller.delay_steps for scenario in rows.values()]
+    assert believed == [0, 0, 6, 6, 6, 6]  # a controller that knows of no delay stays blind
+    assert ADAPTIVE in shown("paper", ("delay.drift=0.01",))
+    assert ADAPTIVE not in shown("paper", ("delay.drift=0.01", "sensor.delay=0.1"))
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    for wrong in ("controller.estimator=none", "controller.prediction=linear"):
+        with pytest.raises(ConfigError, match=r"controller\.delay_estimator: got 'constant'"):
+            looped(wrong)
+    with pytest.raises(ConfigError, match=r"controller\.delay_max: got 0\.5 .* believed"):
+        looped("controller.delay_max=0.5")
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("kind", ["constant", "drifting"])
+def test_the_stated_band_covers(kind: str) -> None:
+    """95 % +- 5 % of 200 noisy records of random delays."""
+    rng, ratios = np.random.default_rng(0), []
+    settings = dataclasses.asdict(delay_settings(kind, 0.3, 1.5))  # type: ignore[arg-type]
+    for seed in range(200):
+        eta = rng.uniform(0.1, 0.7)
+        torques, _, measured = record(eta, 30, seed)
+        last = observed(torques, measured, rng.uniform(0.1, 0.7), **settings)[-1]
+        assert last.settled
+        ratios.append((last.delay_mean - eta) / last.delay_std)
+    assert 0.9 <= np.mean(np.abs(ratios) < 1.96) <= 1.0
