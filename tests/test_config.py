@@ -91,6 +91,7 @@ def test_the_defaults_are_the_papers_experiment() -> None:
             "estimator": "parameters",
             "w_Q": 1.0,
             "w_R": 1.0,
+            "integral_weight": 1.0,
             "weight_scaling": "bryson",
             "catch_up": None,
         },
@@ -99,6 +100,7 @@ def test_the_defaults_are_the_papers_experiment() -> None:
         "sensor": {"kind": "state", "noise_std": [0] * 12, "seed": 0, "faults": []},
         "tuner": {"kind": "fixed"},
         "log_period": None,
+        "compare": {},
     }
 
 

@@ -253,6 +253,15 @@ def planned_limit(scenario: Scenario) -> float | None:
     return None if asked == "none" else asked
 
 
+def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
+    """What the scenario's gain minimises; the torque in N m is what the reference takes."""
+    c = experiment.scenario.controller
+    errors, integrals, torques = weight_scales(
+        c.weight_scaling, experiment.nominal, experiment.peak_to_peak, peak_torque
+    )
+    return QuadraticCost(errors, c.integral_weight * integrals if c.integral else None, torques)
+
+
 def compose_law(experiment: Experiment) -> PredictiveLqi:
     """The parts that a scenario asks for; the only place that knows their names in it."""
     sc, nominal = experiment.scenario, experiment.nominal
@@ -261,9 +270,6 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     substeps = choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration)
     peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
     torque_scale = max(machine_torque(nominal), peak_torque)
-    errors, integrals, torques = weight_scales(
-        c.weight_scaling, nominal, experiment.peak_to_peak, peak_torque
-    )
     plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
     observers: dict[str, Observer] = {
         "none": NoObserver(),
@@ -293,7 +299,7 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
         predictor=predictors[c.prediction],
         feedforward=feedforwards[c.feedforward],
         model=models[c.model],
-        cost=QuadraticCost(errors, integrals if c.integral else None, torques),
+        cost=quadratic_cost(experiment, peak_torque),
     )
     return experiment.own.revised(law)
 

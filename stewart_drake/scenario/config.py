@@ -6,7 +6,7 @@ here needs a mechanism. `scenario_loading` reads scenarios from files.
 
 import dataclasses
 from dataclasses import field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -90,6 +90,7 @@ class ControllerConfig:
         estimator: `none`, or `parameters` (torque bias, payload and damping).
         w_Q: weight of the errors.
         w_R: weight of the torques.
+        integral_weight: of the integrals beside the errors, which share w_Q.
         weight_scaling: `bryson` (by what the reference asks for) or `identity`.
         catch_up: blend onto the reference after a start from rest, s; 0 is none, null the shortest
             one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
@@ -106,6 +107,7 @@ class ControllerConfig:
     estimator: Literal["none", "parameters"] = "parameters"
     w_Q: Weight = 1.0
     w_R: Weight = 1.0
+    integral_weight: Weight = 1.0
     weight_scaling: Literal["bryson", "identity"] = "bryson"
     catch_up: Annotated[float, Field(ge=0, le=10)] | None = None
 
@@ -211,6 +213,8 @@ class Scenario:
         log_period: of the recorded signals, s; null is every 20 ms and every sample of the
             controller. The multibody plant is seen on its own steps only, so that it must be a
             multiple of `plant.time_step`. What is measured of a run does not depend on it.
+        compare: what `compare` lays over each controller last, by its name. Another name is one
+            row more, of the shipped or own file that its `controller` says.
     """
 
     mechanism: Name = "paper"
@@ -226,6 +230,7 @@ class Scenario:
     sensor: SensorConfig = field(default_factory=StateSensorConfig)
     tuner: TunerConfig = field(default_factory=FixedTunerConfig)
     log_period: Annotated[float, Field(ge=1e-5, le=1e5)] | None = None
+    compare: dict[Name, dict[str, Any]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Scenario({differences(self, Scenario())})"

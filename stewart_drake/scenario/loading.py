@@ -80,6 +80,34 @@ def load_controller(name_or_path: str | Path) -> dict[str, Any]:
     return data
 
 
+def load_comparison(
+    name_or_path: str | Path, controllers: Iterable[str], settings: Iterable[str] = ()
+) -> dict[str, Scenario]:
+    """Reads a scenario once for every controller, and for every further row of its `compare`.
+
+    Args:
+        name_or_path, settings: as of `load_scenario`.
+        controllers: names or paths.
+
+    Returns:
+        Scenarios by row: the controllers, then the further rows in the file's order.
+
+    Raises:
+        ConfigError: the first problem, in one line.
+    """
+    settings = tuple(settings)
+    changes = load_scenario(name_or_path, settings=settings).compare
+    rows = {}
+    for row in dict.fromkeys([*controllers, *changes]):
+        where, change = f"{name_or_path}: compare.{row}", dict(changes.get(row, {}))
+        scenario = load_scenario(name_or_path, change.pop("controller", row), settings)
+        changed = dataclasses.asdict(scenario.controller) | change
+        scenario.controller = validate(ControllerConfig, changed, where)
+        scenario.check(where)
+        rows[row] = scenario
+    return rows
+
+
 def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
     """The scenario as plain data that JSON and YAML can hold, and `load_scenario` reads back."""
     return dataclasses.asdict(scenario)

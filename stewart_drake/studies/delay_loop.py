@@ -19,9 +19,8 @@ from stewart_drake.law.limits import (
     spectral_radius,
 )
 from stewart_drake.law.linear_loop import LinearLoop, law_gain, worst_margins
-from stewart_drake.law.startup import weight_scales
 from stewart_drake.loop.controller_margin import true_dynamics
-from stewart_drake.loop.experiment import believed_delay
+from stewart_drake.loop.experiment import believed_delay, quadratic_cost
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import POSE
@@ -111,15 +110,11 @@ def loop_margins(found: Basis, delays: Iterable[int] = DELAYS) -> list[LoopMargi
         design = double_integrators(torque_map(experiment.mechanism, pose, c.torque_map))
     if c.prediction == "linear":
         predictor = design
-    errors, integrals, torques = weight_scales(
-        c.weight_scaling, experiment.nominal, experiment.peak_to_peak, found.torque
-    )
-    Q = c.w_Q * np.diag(np.concatenate([errors, integrals] if c.integral else [errors]))
-    R = c.w_R * np.diag(torques)
+    weights = quadratic_cost(experiment, found.torque).matrices(np.array([c.w_Q, c.w_R]))
     judged = []
     for steps in sorted({*delays, sc.delay.steps}):
         believed = believed_delay(replace(sc, delay=replace(sc.delay, steps=steps)))
-        K = law_gain(design, predictor, c.period, believed, (Q, R))
+        K = law_gain(design, predictor, c.period, believed, weights)
         loop = LinearLoop(plant, K, c.period, Delay(steps, sc.delay.fraction), c.integral)
         judged.append(_judge(loop))
     return judged
