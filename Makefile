@@ -20,7 +20,7 @@ PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
 COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null || true
 
 .DEFAULT_GOAL := help
-.PHONY: demo test lint format-check types wheel newest bench soak clean help
+.PHONY: generate demo test lint format-check types wheel newest bench soak clean help
 
 demo: $(INSTALLED)  ## the paper's comparison, from rest and started on the reference
 	$(BIN)/stewart-drake compare paper --out out/demo/rest
@@ -59,6 +59,10 @@ bench: $(INSTALLED_BENCH)  ## every script in benchmarks/, one after the other
 		echo "== $$script"; $(BIN)/python $$script; \
 	done
 
+generate: $(INSTALLED)  ## writes the equations in C anew, after a change of theirs, and compiles them
+	$(BIN)/python -m stewart_drake.dynamics.generate
+	$(BIN)/python -m stewart_drake.native.build
+
 clean:  ## removes builds, caches and the demo's output, keeps .venv
 	rm -rf build dist out/demo .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find . -path ./$(VENV) -prune -o -type d -name __pycache__ -exec rm -rf {} +
@@ -66,7 +70,8 @@ clean:  ## removes builds, caches and the demo's output, keeps .venv
 help:  ## this list
 	@awk 'BEGIN {FS = ":.*  ## "} /^[a-z-]+:.*  ## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
 
-$(INSTALLED): pyproject.toml constraints.txt
+# The C is compiled by the installation; a library that is older than its source is not used.
+$(INSTALLED): pyproject.toml constraints.txt hatch_build.py $(wildcard stewart_drake/native/*.[ch])
 	@test -n "$(PYTHON)" || { echo "no Python found: set PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "$(PYTHON) is too old: set PYTHON to a Python 3.11 or newer"; exit 1; }

@@ -16,7 +16,7 @@ import casadi as ca
 from stewart_drake.dynamics import equations
 from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers, numbers_of
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.signals import BIAS, DAMPING, NUM_LEGS, PAYLOAD
+from stewart_drake.scenario.signals import BIAS, DAMPING, PAYLOAD
 
 
 class Plate(NamedTuple):

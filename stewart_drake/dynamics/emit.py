@@ -1,4 +1,4 @@
-"""CasADi expressions as plain C: no virtual machine, no memory, no branches, loops over the legs."""
+"""CasADi expressions as plain C: straight lines of operations, and one loop over the legs."""
 
 from collections.abc import Sequence
 from typing import Final, NamedTuple

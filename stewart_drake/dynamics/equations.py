@@ -153,7 +153,9 @@ def leg_at_joint(leg: LegNumbers, common: CommonNumbers) -> ca.Function:
         + coupling * (tg + tg.T)
         + mu_2 * ca.SX.eye(3)
     )
-    lever = common.crank_mass * common.crank_center + mu_0 - mu_1  # mass that the crank tip carries, kg
+    lever = (
+        common.crank_mass * common.crank_center + mu_0 - mu_1
+    )  # mass that the crank tip carries, kg
     bias = (
         g
         * (shaft_inertia * alpha_acc + u**2 * tip_mass * alpha_acc - u * lever * ca.dot(t, gravity))
@@ -287,9 +289,7 @@ def plate_alone(common: CommonNumbers, plate: PlateMotion, parameters: ca.SX) ->
     )
 
 
-def leg_on_plate(
-    leg: LegNumbers, common: CommonNumbers, plate: PlateMotion
-) -> tuple[Sums, ca.SX]:
+def leg_on_plate(leg: LegNumbers, common: CommonNumbers, plate: PlateMotion) -> tuple[Sums, ca.SX]:
     """What a leg adds to (EOM), and its row (1, 6) of B'."""
     R_WP, position, w, v, g_W = plate
     R_WS = leg.R_WS

@@ -54,7 +54,9 @@ def _numbers() -> tuple[Input, Input]:
 def _lower(sums: Sums) -> ca.SX:
     """Each number once (28,)."""
     M_ww, M_wv, M_vv, *rest = sums
-    triangles = [ca.vertcat(*(M[i, j] for i in range(3) for j in range(i + 1))) for M in (M_ww, M_vv)]
+    triangles = [
+        ca.vertcat(*(M[i, j] for i in range(3) for j in range(i + 1))) for M in (M_ww, M_vv)
+    ]
     return _joined(triangles[0], M_wv, triangles[1], *rest)
 
 
@@ -93,7 +95,9 @@ def _motion() -> list[str]:
             [Output("plate", _joined(*plate)), Output("sums", _lower(alone))],
         ),
         c_function(
-            "leg_motion", [moving, common, legs], [Output("added", _lower(added)), Output("arms", arm)]
+            "leg_motion",
+            [moving, common, legs],
+            [Output("added", _lower(added)), Output("arms", arm)],
         ),
         c_function(
             "solve_accelerations",
@@ -137,7 +141,12 @@ def _derivatives() -> list[str]:
         c_function(
             "leg_derivatives",
             [*plain, *_inputs(s, "parameters gravity"), common, legs, torque, bias],
-            [Output("dF_dx", change), Output("M", mass), Output("arms", arm), Output("arm_rates", rate)],
+            [
+                Output("dF_dx", change),
+                Output("M", mass),
+                Output("arms", arm),
+                Output("arm_rates", rate),
+            ],
         ),
         c_function(
             "pose_derivatives",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.dynamics.compiled import Buffered, Buffers
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.native.layout import SIGNATURES, SHAPES, geometry_of
+from stewart_drake.native.layout import SHAPES, SIGNATURES, geometry_of
 from stewart_drake.scenario.signals import NUM_PARAMETERS, NUM_STATE, NUM_TORQUES
 
 Array = NDArray[np.float64]

@@ -16,6 +16,7 @@ from stewart_drake.loop import metrics
 from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.experiment import Experiment, waits_at_rest
 from stewart_drake.loop.tuner import AnnTuner
+from stewart_drake.native.library import backend
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.signals import (
     DIMENSIONS,
@@ -191,6 +192,7 @@ def summarize(
             "worst": 1e3 * seconds.max() if some else nan,
         },
         "wall_s": wall,
+        "backend": backend().name,
         "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
         "own": experiment.own.names,
         "scenario": dataclasses.asdict(sc),

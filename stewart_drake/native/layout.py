@@ -91,4 +91,6 @@ def geometry_of(mechanism: Mechanism) -> Array:
     )
     crank = [m.crank.mass, m.crank.center, m.crank.inertia[2]]
     rod = [m.rod.mass, m.rod.center, *m.rod.inertia]
-    return np.array([*legs.T.ravel(), m.plate.mass, *m.plate.inertia, *crank, *rod, plate_radius(m)])
+    return np.array(
+        [*legs.T.ravel(), m.plate.mass, *m.plate.inertia, *crank, *rod, plate_radius(m)]
+    )
