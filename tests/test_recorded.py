@@ -1,7 +1,8 @@
 """Torques stay what they are: step by step, and around the loop.
 
 The record is of CasADi's virtual machine, and so are the comparisons: the dynamics in C round
-otherwise, and the law alone makes more of that with every sample. Around the loop they are compared too.
+otherwise, and the law alone makes more of that with every sample. Around the loop they are compared
+too.
 """
 
 from collections.abc import Iterator

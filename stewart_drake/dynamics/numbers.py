@@ -25,7 +25,7 @@ class LegNumbers(NamedTuple):
     p_PQ: Numbers
     p_WS: Numbers
     symbols: tuple[ca.SX, ...] = ()
-    """What a function of these numbers takes beside its arguments: nothing where they are floats."""
+    """What a function of them takes beside its arguments: nothing where they are floats."""
 
 
 class CommonNumbers(NamedTuple):
@@ -76,6 +76,7 @@ def leg_numbers(symbols: ca.SX) -> LegNumbers:
 
 def common_numbers(symbols: ca.SX) -> CommonNumbers:
     """What stands where in the part (13,) of the geometry that is not of a leg."""
-    mass, inertia, *rest = ca.vertsplit(symbols, [0, 1, *range(4, COMMON_NUMBERS + 1)])
-    I_a, I_y, I_t, radius = rest[-4:]
-    return CommonNumbers(mass, inertia, *rest[:-4], (I_a, I_y, I_t), radius, (symbols,))
+    ends = [0, 1, *range(4, COMMON_NUMBERS + 1)]
+    plate, inertia, m, center, I_crank, rod, f, I_a, I_y, I_t, radius = ca.vertsplit(symbols, ends)
+    moments = I_a, I_y, I_t
+    return CommonNumbers(plate, inertia, m, center, I_crank, rod, f, moments, radius, (symbols,))

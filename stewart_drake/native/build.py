@@ -14,9 +14,9 @@ from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent
 LIBRARY = FOLDER / "_dynamics.so"
-# Neither contracted to fused operations nor reordered: every processor gives the same numbers, and
-# they are those of CasADi's virtual machine but for the order of sums. Without errno and traps, which
-# nobody reads, square roots of two legs are one instruction.
+# Neither contracted to fused operations nor reordered: the numbers are those of CasADi's virtual
+# machine to the last digits. Without errno and traps, which nobody reads, the compiler can do two
+# legs at a time; that changes no number.
 FLAGS = (
     *("-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
     *("-fPIC", "-shared", "-fvisibility=hidden"),
