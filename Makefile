@@ -20,7 +20,7 @@ PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
 COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null || true
 
 .DEFAULT_GOAL := help
-.PHONY: generate demo test lint format-check types wheel newest bench soak clean help
+.PHONY: generate demo test casadi lint format-check types wheel newest bench soak clean help
 
 demo: $(INSTALLED)  ## the paper's comparison, from rest and started on the reference
 	$(BIN)/stewart-drake compare paper --out out/demo/rest
@@ -30,11 +30,15 @@ demo: $(INSTALLED)  ## the paper's comparison, from rest and started on the refe
 
 # Workers of one thread each, so that they do not fight over the processor.
 WORKERS := -n logical --maxprocesses 4
-test soak bench: export OMP_NUM_THREADS := 1
-test soak bench: export OPENBLAS_NUM_THREADS := 1
+test casadi soak bench: export OMP_NUM_THREADS := 1
+test casadi soak bench: export OPENBLAS_NUM_THREADS := 1
 
 test: $(INSTALLED)  ## the tests; ARGS="..." is handed to pytest
 	$(BIN)/pytest $(WORKERS) $(ARGS)
+
+WITHOUT_C := test_dynamics test_exact_plant test_wrench test_control_law test_estimator test_closed_loop
+casadi: $(INSTALLED)  ## the tests of dynamics, plant and law on CasADi's virtual machine
+	STEWART_NATIVE=0 $(BIN)/pytest $(WORKERS) $(WITHOUT_C:%=tests/%.py) $(ARGS)
 
 soak: $(INSTALLED)  ## the endurance runs, which `make test` leaves out
 	$(BIN)/pytest $(WORKERS) -m soak $(ARGS)

@@ -36,15 +36,19 @@ class Buffered(ABC):
 
     def __call__(self, *arguments: ArrayLike) -> Sequence[Array]:
         """Evaluate; every argument is broadcast to its place."""
-        try:
-            own = self._own.buffers
-        except AttributeError:
-            own = self._own.buffers = self.buffers()
-        places, results, evaluate, _ = own
+        places, results, evaluate, _ = self.own_buffers()
         for place, argument in zip(places, arguments, strict=True):
             place[...] = argument
         evaluate()
         return [result.copy() for result in results]
+
+    def own_buffers(self) -> Buffers:
+        """Those of this thread."""
+        try:
+            return self._own.buffers
+        except AttributeError:
+            self._own.buffers = self.buffers()
+            return self._own.buffers
 
     @abstractmethod
     def buffers(self) -> Buffers:

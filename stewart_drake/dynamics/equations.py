@@ -153,9 +153,8 @@ def leg_at_joint(leg: LegNumbers, common: CommonNumbers) -> ca.Function:
         + coupling * (tg + tg.T)
         + mu_2 * ca.SX.eye(3)
     )
-    lever = (
-        common.crank_mass * common.crank_center + mu_0 - mu_1
-    )  # mass that the crank tip carries, kg
+    # Mass that the crank tip carries, kg.
+    lever = common.crank_mass * common.crank_center + mu_0 - mu_1
     bias = (
         g
         * (shaft_inertia * alpha_acc + u**2 * tip_mass * alpha_acc - u * lever * ca.dot(t, gravity))

@@ -19,7 +19,7 @@ from stewart_drake.scenario.signals import NUM_PARAMETERS
 
 FILE: Final = Path(__file__).resolve().parents[1] / "native" / "equations.h"
 
-_HEAD: Final = f"""/* Written by python -m stewart_drake.dynamics.generate; not to be changed by hand. */
+_HEAD: Final = f"""/* Written by python -m stewart_drake.dynamics.generate; not by hand. */
 
 #define PARAMETERS {NUM_PARAMETERS}
 #define GEOMETRY {GEOMETRY}

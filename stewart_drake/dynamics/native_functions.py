@@ -38,6 +38,7 @@ class NativeFunction(Buffered):
     ) -> None:
         super().__init__()
         self._call = getattr(library, name)
+        self._call.restype = None
         self._fixed = np.array(first, dtype=np.float64), geometry
         self._shapes = arguments, results
 
@@ -77,12 +78,19 @@ class NativeFunctions:
         return NativeFunction(self._library, name, self._geometry, arguments, signature.results)
 
     def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
-        """d[pose; rates]/dt (12,)."""
-        return self._change(state, torque, parameters, gravity)[0]
+        """d[pose; rates]/dt (12,); the array is this thread's, until its next call."""
+        places, results, evaluate, _ = self._change.own_buffers()
+        places[0][...], places[1][...] = state, torque
+        places[2][...], places[3][...] = parameters, gravity
+        evaluate()
+        return results[0]
 
     def margin(self, pose: Array, sign: float, least: Array) -> float:
         """`margin_of` the measures of a pose."""
-        return float(self._margin(pose, sign, least)[0])
+        places, results, evaluate, _ = self._margin.own_buffers()
+        places[0][...], places[1][...], places[2][...] = pose, sign, least
+        evaluate()
+        return float(results[0])
 
     def many_steps(self, steps: int) -> NativeFunction:
         """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12), one call."""

@@ -96,7 +96,7 @@ def ExactPlant_(T):
                     change[RATES] += self.dynamics.wrench_accelerations(x[POSE], wrench)
             else:
                 change = self._with_gradient(x, torque, wrench)
-            derivatives.get_mutable_vector().SetFromVector(change)
+            derivatives.SetFromVector(change)
 
         def _with_gradient(self, x, torque, wrench):
             """d(x_dot) = A dx + B dT + (M N)^-1 dF, F the wrench."""

@@ -1,4 +1,4 @@
-/* Written by python -m stewart_drake.dynamics.generate; not to be changed by hand. */
+/* Written by python -m stewart_drake.dynamics.generate; not by hand. */
 
 #define PARAMETERS 8
 #define GEOMETRY 121
