@@ -1,7 +1,7 @@
 """The dynamics in C against CasADi's virtual machine, ratios of times in one interleaved run.
 
-Two processes, one with each backend, take turns; a time is the least CPU time of its repeats. Writes
-benchmarks/results/native.md.
+Two processes, one with each backend, take turns; a time is the least CPU time of its repeats.
+Writes benchmarks/results/native.md.
 """
 
 import os
@@ -27,7 +27,7 @@ from stewart_drake.native.library import SWITCH, backend
 from stewart_drake.scenario.signals import NUM_PARAMETERS
 
 RESULTS = Path(__file__).parent / "results"
-ROUNDS = 3
+ROUNDS = 12
 BACKENDS = {"casadi": "0", "native": "require"}
 MECHANISM = sd.load_mechanism("paper")
 RNG = np.random.default_rng(0)
