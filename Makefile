@@ -29,9 +29,13 @@ demo: $(INSTALLED)  ## the paper's comparison, from rest and started on the refe
 	@echo "figures:"; find out/demo -name '*.png' -o -name '*.svg' -o -name '*.pdf' | sort | sed 's/^/  /'
 
 # Workers of one thread each, so that they do not fight over the processor.
-WORKERS := -n logical --maxprocesses 4
+# Each takes a stretch of the files, so that what their tests share is made once, and who is done
+# takes from the other.
+WORKERS := -n logical --maxprocesses 4 --dist worksteal
 test casadi soak bench: export OMP_NUM_THREADS := 1
 test casadi soak bench: export OPENBLAS_NUM_THREADS := 1
+# Tests start commands, and each would compile all of the package anew.
+test casadi soak: export PYTHONDONTWRITEBYTECODE :=
 
 test: $(INSTALLED)  ## the tests; ARGS="..." is handed to pytest
 	$(BIN)/pytest $(WORKERS) $(ARGS)

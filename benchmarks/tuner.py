@@ -5,7 +5,6 @@ gains under three conditions. Writes benchmarks/results/tuner.md; what it runs i
 (out/tuner-bench by default), and a second start goes on from there.
 """
 
-import json
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -19,14 +18,15 @@ import numpy as np
 
 import stewart_drake as sd
 from stewart_drake.files.versions import versions
-from stewart_drake.report.tables import number
 from stewart_drake.report.terminal import count_bar
+from stewart_drake.report.words import number
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.disturbances import disturbed, draw, with_gain
 from stewart_drake.studies.jobs import run_jobs
+from stewart_drake.studies.runs import read_outcome, run_scenario
 from stewart_drake.tuner.network import save_network
 from stewart_drake.tuning.dataset import make_dataset
-from stewart_drake.tuning.evaluation import TUNER, Evaluation, evaluate, evaluation_run
+from stewart_drake.tuning.evaluation import TUNER, Evaluation, evaluate
 from stewart_drake.tuning.training import Training, train
 
 RESULTS = Path(__file__).parent / "results"
@@ -114,15 +114,15 @@ def beyond(folder: Path, condition: str, grid: Evaluation) -> list[str]:
         for ratio in BEYOND
         for number, cell in enumerate(cells)
     }
-    files = run_jobs(
+    outcomes = run_jobs(
         jobs,
-        evaluation_run,
+        run_scenario,
         folder / f"beyond-{slug(condition)}",
         settings={"scenario": scenario_to_dict(base(condition))},
+        read=read_outcome,
         workers=WORKERS,
     )
-    found = [json.loads(path.read_text())["accumulated_error"] for path in files.values()]
-    error = np.array(found, dtype=np.float64).reshape(len(BEYOND), -1)
+    error = np.array([one.error for one in outcomes.values()]).reshape(len(BEYOND), -1)
     fixed = grid.error[:-1]
     common = ~np.isnan(fixed).any(axis=0)
     best = grid.summary["candidates"][grid.summary["best_fixed"]]["mean"]

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from stewart_drake.mechanism.files import load_mechanism
     from stewart_drake.mechanism.geometry import Mechanism
     from stewart_drake.mechanism.kinematics import ForwardKinematicsError, UnreachablePoseError
+    from stewart_drake.report.answer import Answer
     from stewart_drake.report.api import (
-        Answer,
         analyze_delay,
         analyze_hautus,
         analyze_robustness,
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 # Names are imported when first asked for, so that the command answers --help without Drake.
 _MODULES = {
     "AddStewartPlatform": "loop.platforms",
-    "Answer": "report.api",
+    "Answer": "report.answer",
     "ConfigError": "files.errors",
     "ControllerConfig": "scenario.config",
     "DesignedLaw": "loop.law_design",

@@ -1,8 +1,12 @@
 """What all tests need of the process they run in."""
 
 import signal
+from collections.abc import Iterator
+
+import pytest
 
 from stewart_drake.report import terminal
+from tests.browser import Browser, browser
 
 # A shell that runs the tests in the background lets them ignore Ctrl-C, and the commands that they
 # start would inherit that; those are tested for what they do on Ctrl-C.
@@ -11,3 +15,17 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 
 # What takes long on a busy machine tells on stderr how far it is, where tests expect nothing.
 terminal.EVERY = 3600.0
+
+
+@pytest.fixture(scope="session")
+def one_browser() -> Iterator[Browser]:
+    """The browser of a session, which takes seconds to start."""
+    with browser() as opened:
+        yield opened
+
+
+@pytest.fixture
+def tab(one_browser: Browser) -> Iterator[Browser]:
+    """Its tab; `Browser.open` sets all that a test before may have changed."""
+    yield one_browser
+    one_browser.call("Page.navigate", url="about:blank")  # an animation would go on for ever

@@ -18,7 +18,8 @@ from stewart_drake.loop.experiment import prepare
 from stewart_drake.scenario.reference_config import HoldConfig, SineConfig, WaypointsConfig
 from stewart_drake.studies import delay_limits, delay_map, hautus
 from stewart_drake.studies.delay_loop import loop_margins
-from stewart_drake.studies.delay_map import Cell, map_delays, run_cell, scaled_motion
+from stewart_drake.studies.delay_map import Cell, map_delays, scaled_motion
+from stewart_drake.studies.runs import run_scenario
 from stewart_drake.studies.verdict import delay_verdict
 from tests.mechanisms import PAPER
 
@@ -238,7 +239,9 @@ def test_cells_are_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
             "reference.amplitude=[0.1308996939, 0.1308996939, 0.1308996939, 0.01, 0.01, 0.04]",
         ),
     )
-    assert cells[2].error == pytest.approx(sd.simulate(alone).accumulated_error, rel=1e-9)
+    assert cells[2].error == pytest.approx(
+        sd.simulate(alone, margin=False).accumulated_error, rel=1e-9
+    )
     assert cells[1].time == pytest.approx(1.04)
     assert math.isnan(cells[1].error)
 
@@ -261,7 +264,7 @@ def test_a_run_that_leaves_the_workspace_says_when() -> None:
     scenario = sd.load_scenario(
         "paper", "delay_lqi", ("plant.kind=exact", "duration=3.0", "controller.catch_up=0")
     )
-    outcome = json.loads(run_cell(scenario))
+    outcome = json.loads(run_scenario(scenario))["outcome"]
     assert outcome["status"] == "left_workspace"
     assert outcome["error"] is None
     assert 1 < outcome["time"] < 2

@@ -14,7 +14,8 @@ from pydrake.trajectories import FunctionHandleTrajectory
 
 import stewart_drake as sd
 from stewart_drake.files.jsonio import jsonable
-from stewart_drake.report.api import Answer, Figures, Replay
+from stewart_drake.report.answer import Answer
+from stewart_drake.report.api import Figures, Replay
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = ("plant.kind=exact", "duration=0.3")

@@ -162,8 +162,9 @@ def test_the_same_scenario_gives_the_same_bytes(tmp_path):
     noise = f"sensor.noise_std={[1e-5] * 12}"
     scenario = load_scenario("paper", "lqi", ("plant.kind=exact", "duration=0.5", noise))
     for name in ("first", "again"):
-        simulate(scenario).save(tmp_path / name)
-        time.sleep(1.1)  # what is stamped with the time shows
+        if name == "again":
+            time.sleep(1.1)  # what is stamped with the time shows
+        simulate(scenario, margin=False).save(tmp_path / name)
     first, again = (tmp_path / name / "signals.nc" for name in ("first", "again"))
     assert first.read_bytes() == again.read_bytes()
 
@@ -222,15 +223,15 @@ def interrupted(arguments: list[str], wait: float, group: bool) -> tuple[int, st
 
 
 def test_ctrl_c_in_simulate_keeps_what_was_computed(tmp_path):
-    arguments = ["simulate", *EXACT, "--set", "duration=40", "--set", "controller.period=0.02"]
-    arguments += ["--set", "delay.steps=40", "--out", str(tmp_path)]
-    assert interrupted(arguments, wait=2.0, group=False) == (130, "")
+    arguments = ["simulate", *EXACT, "--set", "duration=200", "--set", "controller.period=0.02"]
+    arguments += ["--set", "delay.steps=4", "--out", str(tmp_path)]
+    assert interrupted(arguments, wait=1.0, group=False) == (130, "")
     assert files(tmp_path) >= RUN_FILES
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["status"] == "interrupted"
     assert summary["failure"]["reason"] == "interrupted"
     with xr.open_dataset(tmp_path / "signals.nc") as signals:
-        assert 0 < signals.sizes["time"] < 2001
+        assert 0 < signals.sizes["time"] < 10_001
         assert np.isfinite(signals.pose.values).all()
 
 

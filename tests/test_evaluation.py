@@ -8,7 +8,7 @@ from scipy import stats
 
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.report.tuner_tables import evaluation_table
+from stewart_drake.report.tuner_document import evaluation_document
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.tuner.network import Network, save_network
 from stewart_drake.tuning.evaluation import GAINS, TUNER, Evaluation, compare, evaluate
@@ -93,7 +93,7 @@ def test_hindsight_bounds_what_any_choice_of_gain_can_do():
 def test_without_common_scenarios_there_is_no_mean():
     found = compare(NAMES, np.array([[np.nan, 1], [1, np.nan], [1, 1]]), 0)
     assert found["common"] == 0 and np.isnan(found["improvement"])
-    table = evaluation_table(Evaluation(NAMES, np.full((3, 2), np.nan), found))
+    table = evaluation_document(Evaluation(NAMES, np.full((3, 2), np.nan), found)).plain()
     assert "0 of 2 scenarios" in table
 
 

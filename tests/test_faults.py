@@ -1,7 +1,7 @@
 """kill -9, dead workers, two processes: nothing finished is lost, nothing is half.
 
 Instants are drawn from a seed. Work runs in copies of this process, so that a kill costs no
-imports; `make soak` kills ten times as often.
+imports; `make soak` kills dozens of times.
 """
 
 import json
@@ -21,12 +21,12 @@ from stewart_drake.cli import main
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.tuning.dataset import data_hash, load_dataset, make_dataset
-from tests.faults import killed
+from tests.faults import killed, refusal
 from tests.test_cli import command
 from tests.test_dataset import shrink
 from tests.test_robustness import short
 
-KILLS = 8
+KILLS = 1
 SOAK_KILLS = 80
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.1", "--set", "delay.steps=1")
 LITTLE = ("plant.kind=exact", "reference.amplitude=[0.01, 0.01, 0.01, 0.001, 0.001, 0.004]")
@@ -35,6 +35,13 @@ LITTLE = ("plant.kind=exact", "reference.amplitude=[0.01, 0.01, 0.01, 0.001, 0.0
 def kill_times(number: int, longest: float, seed: int) -> Iterator[float]:
     """So many waiting times in s."""
     yield from np.random.default_rng(seed).uniform(0.0, longest, number)
+
+
+def duration(work: Callable[[], object]) -> float:
+    """s; a kill at any time of it meets the work somewhere, however fast the machine is."""
+    began = time.monotonic()
+    work()
+    return time.monotonic() - began
 
 
 def finished_runs(folder: Path, pattern: str) -> dict[str, tuple[bytes, int]]:
@@ -83,8 +90,7 @@ def little_dataset(folder: Path) -> None:
 
 
 def kill_dataset(number: int, tmp_path: Path) -> None:
-    little_dataset(tmp_path / "whole")
-    longest = 2.5
+    longest = duration(lambda: little_dataset(tmp_path / "whole"))
     kill_and_resume(
         little_dataset, tmp_path / "killed", tmp_path / "whole", "runs/*.npz", number, longest
     )
@@ -102,9 +108,9 @@ def little_study(folder: Path) -> None:
 
 
 def kill_study(number: int, tmp_path: Path) -> None:
-    little_study(tmp_path / "whole")
+    longest = duration(lambda: little_study(tmp_path / "whole"))
     kill_and_resume(
-        little_study, tmp_path / "killed", tmp_path / "whole", "runs/run0*.json", number, 2.0
+        little_study, tmp_path / "killed", tmp_path / "whole", "runs/run0*.json", number, longest
     )
     one, other = ((tmp_path / n / "runs.csv").read_bytes() for n in ("killed", "whole"))
     assert one == other
@@ -146,11 +152,14 @@ def kill_writers(number: int, tmp_path: Path) -> None:
             while main([*one, "--quiet", "--out", str(folder)]) == 0:
                 pass
 
-        assert main([*one, "--quiet", "--out", str(folder)]) == 0
-        for after in kill_times(number // 2, 2.5, seed=number):
+        def once(one: list[str] = one, folder: Path = folder) -> None:
+            assert main([*one, "--quiet", "--out", str(folder)]) == 0
+
+        longest = duration(once)
+        for after in kill_times(-(-number // 2), longest, seed=number):
             assert killed(work, after)
             check_whole(folder)
-        assert main([*one, "--quiet", "--out", str(folder)]) == 0
+        once()
         check_whole(folder)
         assert not list(folder.glob(".*.part"))
 
@@ -177,7 +186,7 @@ def children(pid: int) -> list[int]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
-def test_a_worker_that_dies_and_a_second_process(tmp_path):
+def test_a_worker_that_dies_and_a_second_process(tmp_path, capsys):
     """The whole command, on the whole grid, which is stopped long before its end."""
     words = ["tune", "dataset", "--workers", "2", "--controller", "delay_lqi", "--quiet"]
     words += [word for setting in LITTLE for word in ("--set", setting)]
@@ -191,9 +200,7 @@ def test_a_worker_that_dies_and_a_second_process(tmp_path):
 
     process = subprocess.Popen(line, stderr=subprocess.PIPE, text=True, start_new_session=True)
     wait_for(2)
-    second = subprocess.run(line, capture_output=True, text=True, timeout=60)
-    assert second.returncode == 2 and second.stderr.count("\n") == 1
-    assert "another command is writing" in second.stderr
+    assert "another command is writing" in refusal([*words, "--out", str(tmp_path)], capsys)
     os.kill(children(process.pid)[0], signal.SIGKILL)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 2

@@ -21,7 +21,7 @@ from stewart_drake.studies.compare import CONTROLLERS, LABELS
 @pytest.fixture(scope="module")
 def run():
     settings = ("plant.kind=exact", "duration=1.0", "plant.payload_mass=0.2")
-    return simulate(load_scenario("paper", settings=settings))
+    return simulate(load_scenario("paper", settings=settings), margin=False)
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +43,7 @@ def comparison(run):
 def drawn(monkeypatch):
     """The figures by name, instead of their files."""
     kept = {}
-    monkeypatch.setattr(
-        figures, "write_figure", lambda figure, _, name: kept.update({name: figure}) or []
-    )
+    monkeypatch.setattr(figures, "write_figures", lambda made, _: kept.update(made) or [])
     return kept
 
 
@@ -92,7 +90,7 @@ def test_figures_of_a_comparison(comparison, drawn):
 
 def test_a_controller_without_estimator_has_no_parameters_to_show(drawn):
     settings = ("plant.kind=exact", "duration=0.1")
-    run_figures(simulate(load_scenario("paper", "lqr", settings)), "unused")
+    run_figures(simulate(load_scenario("paper", "lqr", settings), margin=False), "unused")
     assert list(drawn) == ["states", "errors", "torques"]
 
 

@@ -38,7 +38,7 @@ from stewart_drake.scenario.reference_config import CsvConfig, WaypointsConfig
 from stewart_drake.scenario.reference_files import read_csv, read_waypoints
 from stewart_drake.scenario.trajectories import evaluate, make_reference
 from stewart_drake.studies.jobs import _check_manifest, settings_hash
-from stewart_drake.studies.run_files import read_evaluation, read_outcome
+from stewart_drake.studies.runs import read_outcome
 from stewart_drake.tuner.network import load_network, save_network
 from stewart_drake.tuning.dataset import assemble, load_dataset, read_run, summarize
 from stewart_drake.tuning.grid import paper_runs
@@ -247,10 +247,9 @@ def mechanism_loads(path: Path) -> None:
 MANIFEST_SETTINGS = {"scenario": {"duration": 1.0, "poses": [[0.0] * 6]}, "seed": 0}
 MANIFEST_FILE = {"hash": settings_hash(MANIFEST_SETTINGS), "settings": MANIFEST_SETTINGS}
 OUTCOME = {"status": "completed", "reason": "", "leg": None, "time": None, "error": 9.1}
-RUN_FILE = {"draw": {"payload": 0.1}, "outcome": {**OUTCOME, "peak_torque": 0.6}}
-EVALUATION_FILE = {
-    **{"accumulated_error": 9.1, "rms_torque": 0.1, "peak_torque": 0.6, "torque_variation": 3.0},
-    **{"status": "completed", "stopped": None, "tuner_fallbacks": 0},
+RUN_FILE = {
+    "draw": {"payload": 0.1},
+    "outcome": {**OUTCOME, "peak_torque": 0.6, "tuner_fallbacks": 2},
 }
 RUN_ARRAYS = {
     **{"samples": np.zeros((100, 18)), "status": np.array("completed"), "stopped": np.nan},
@@ -269,7 +268,7 @@ def npz_of_a_run() -> bytes:
 def some_signals() -> xr.Dataset:
     """Of a short run."""
     settings = ("plant.kind=exact", "duration=0.1", "start=on_reference", "queue=reference")
-    return sd.simulate(sd.load_scenario("paper", settings=settings)).signals
+    return sd.simulate(sd.load_scenario("paper", settings=settings), margin=False).signals
 
 
 @lru_cache(maxsize=1)
@@ -280,7 +279,7 @@ def some_data() -> xr.Dataset:
         path.write_bytes(npz_of_a_run())
         runs = dict(list(paper_runs(load_scenario("paper", "delay_lqi")).items())[:2])
         settings = {"data": "paper", "scenario": {}}
-        return assemble(runs, dict.fromkeys(runs, path), settings)
+        return assemble(runs, dict.fromkeys(runs, read_run(path)), settings)
 
 
 def netcdf(data: xr.Dataset) -> bytes:
@@ -313,10 +312,7 @@ KINDS: dict[str, Kind] = {
         lambda _: json.dumps(network()).encode(),
         lambda dice: json_bytes(spoiled_document(network(), dice), dice),
     ),
-    "robustness run": Kind(read_outcome, "f.json", plain(RUN_FILE), document=RUN_FILE),
-    "evaluation run": Kind(
-        read_evaluation, "f.json", plain(EVALUATION_FILE), document=EVALUATION_FILE
-    ),
+    "run": Kind(read_outcome, "f.json", plain(RUN_FILE), document=RUN_FILE),
     "manifest": Kind(resumed, "manifest.json", plain(MANIFEST_FILE), document=MANIFEST_FILE),
     "npz": Kind(
         read_run, "f.npz", lambda _: npz_of_a_run(), lambda dice: other_npz(RUN_ARRAYS, dice)

@@ -16,8 +16,7 @@ from stewart_drake.files.schema import field_names, sections
 from stewart_drake.files.yamlio import parse_yaml, validate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_yaml, setting_choices
-from stewart_drake.studies.range_units import RANGE_UNITS
-from stewart_drake.studies.uncertainty import Ranges
+from stewart_drake.studies.ranges import RANGE_UNITS, Ranges
 from tests import test_docs
 
 main(["--version"])  # which also puts the examples where they belong
@@ -82,24 +81,31 @@ def test_no_summary_is_cut_off_in_the_list_of_commands(capsys):
 # ---------------------------------------------------------------- completion
 
 
-def offered(typed: str) -> list[str]:
-    """What bash would offer after this line."""
-    code = "import sys; from stewart_drake.cli import main; sys.exit(main())"
-    words = typed.split(" ")
-    environment = {
-        **os.environ,
+def asked(typed: str) -> dict[str, str]:
+    """How bash asks what to offer after this line."""
+    return {
         "_STEWART_DRAKE_COMPLETE": "complete_bash",
         "COMP_WORDS": typed,
-        "COMP_CWORD": str(len(words) - 1),
+        "COMP_CWORD": str(len(typed.split(" ")) - 1),
     }
+
+
+def test_the_shell_completes_commands_names_and_settings(monkeypatch, capsys):
+    def offered(typed: str) -> list[str]:
+        for name, value in asked(typed).items():
+            monkeypatch.setenv(name, value)
+        with pytest.raises(SystemExit) as done:
+            main([])
+        out, err = capsys.readouterr()
+        assert err == "" and done.value.code == 0
+        return out.split()
+
+    code = "import sys; from stewart_drake.cli import main; sys.exit(main())"
+    environment = {**os.environ, **asked("stewart-drake si")}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True
     )
-    assert done.stderr == "" and done.returncode == 0
-    return done.stdout.split()
-
-
-def test_the_shell_completes_commands_names_and_settings():
+    assert (done.stderr, done.returncode, done.stdout.split()) == ("", 0, ["simulate"])
     assert offered("stewart-drake si") == ["simulate"]
     assert set(offered("stewart-drake simulate ")) >= set(shipped("scenario"))
     assert offered("stewart-drake model check mot") == ["motion_base"]

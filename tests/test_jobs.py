@@ -308,8 +308,11 @@ def test_errors_of_a_cluster_are_one_line(tmp_path, cluster):
         run_jobs(numbered(1), lacks_a_module, tmp_path, settings=SETTINGS, scheduler=cluster)
 
 
-def test_a_cluster_with_threads_or_without_workers_is_refused(tmp_path):
+def test_a_cluster_with_threads_or_without_workers_is_refused(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
+    from stewart_drake.studies import cluster as backend
+
+    monkeypatch.setattr(backend, "_CONNECT_TIMEOUT", 1.0)
     for number, threads, said in ((1, 2, "has 2 threads"), (0, 1, "has no workers")):
         with (
             distributed.LocalCluster(

@@ -58,7 +58,7 @@ PLANTS = ("exact", "multibody")
 
 @needs_proc
 def test_some_runs_leave_nothing_behind():
-    assert growth_per_run(runs=40, warm_up=20) < 0.1 * MB
+    assert growth_per_run(runs=18, warm_up=6) < 0.1 * MB
 
 
 def test_a_prediction_over_many_periods_takes_little_memory():
@@ -159,9 +159,15 @@ def check_steady(rows: list[tuple[float, float, float, float]], gap: float, erro
 
 @needs_proc
 @pytest.mark.parametrize(
-    ("kind", "duration", "gap"), [("exact", 60.0, 1e-12), ("multibody", 20.0, 1e-6)]
+    ("kind", "duration", "gap"),
+    [
+        ("exact", 20.0, 1e-12),
+        ("multibody", 5.0, 1e-6),
+        pytest.param("exact", 60.0, 1e-12, marks=pytest.mark.soak),
+        pytest.param("multibody", 20.0, 1e-6, marks=pytest.mark.soak),
+    ],
 )
-def test_a_minute_is_as_good_as_a_second(kind, duration, gap):
+def test_the_second_half_is_as_good_as_the_first(kind, duration, gap):
     check_steady(follow(kind, duration), gap, 1e-3)
 
 

@@ -23,6 +23,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.scenario.trajectories import evaluate, make_reference
+from stewart_drake.studies import delay_limits
 from stewart_drake.studies.delay_limits import study_delay
 from tests.mechanisms import PAPER
 
@@ -39,7 +40,7 @@ def scenario(*settings: str, controller: str | None = None, plant: str = "exact"
 
 @functools.cache
 def result(*settings: str, controller: str | None = None, plant: str = "exact") -> SimulationResult:
-    return simulate(scenario(*settings, controller=controller, plant=plant))
+    return simulate(scenario(*settings, controller=controller, plant=plant), margin=False)
 
 
 # What is there.
@@ -117,9 +118,9 @@ def test_applied_torque_is_the_commanded_one_a_delay_ago(
 def test_a_delay_that_is_next_to_whole_is_whole(tiny: float) -> None:
     """A release so near to the next event would come before it, or never."""
     settings = ("duration=2.0", *ON_REFERENCE)
-    run = simulate(scenario(f"delay.fraction={tiny}", *settings))
+    run = simulate(scenario(f"delay.fraction={tiny}", *settings), margin=False)
     believed = ("controller.delay_steps=8", f"controller.delay_fraction={tiny}")
-    same = simulate(scenario(*believed, *settings))
+    same = simulate(scenario(*believed, *settings), margin=False)
     for other in (run, same):
         assert other.accumulated_error == result(*settings).accumulated_error
     sc = scenario(*settings)
@@ -260,10 +261,13 @@ def test_delay_floor_is_what_a_plate_that_cannot_move_collects(plant: str) -> No
         (ON_REFERENCE, False),
     ],
 )
-def test_the_floor_is_that_of_a_plate_which_waits(settings: tuple[str, ...], waits: bool) -> None:
+def test_the_floor_is_that_of_a_plate_which_waits(
+    settings: tuple[str, ...], waits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In the summary of a run and in the analysis of the delay alike; where it falls, none."""
+    monkeypatch.setattr(delay_limits, "loop_margins", lambda _: [])  # which take seconds
     sc = scenario("duration=0.3", *settings)
-    floor = simulate(sc).summary["delay_floor"]
+    floor = simulate(sc, margin=False).summary["delay_floor"]
     assert (floor > 1) is waits and (floor == 0) is not waits
     assert study_delay(sc, simulations=False).floor_applies is waits
 
@@ -308,7 +312,8 @@ def test_the_same_seed_gives_the_same_bytes(plant: str, tmp_path: Path) -> None:
 
     def saved(seed: int, folder: str) -> tuple[bytes, xr.Dataset]:
         run = simulate(
-            scenario("duration=0.5", *ON_REFERENCE, noise, f"sensor.seed={seed}", plant=plant)
+            scenario("duration=0.5", *ON_REFERENCE, noise, f"sensor.seed={seed}", plant=plant),
+            margin=False,
         )
         run.save(tmp_path / folder)
         return (tmp_path / folder / "signals.nc").read_bytes(), run.signals
@@ -332,7 +337,7 @@ def test_ctrl_c_keeps_what_there_is() -> None:
         if time > 0.31:
             raise KeyboardInterrupt
 
-    run = simulate(scenario("duration=2.0", *ON_REFERENCE), progress=interrupt)
+    run = simulate(scenario("duration=2.0", *ON_REFERENCE), progress=interrupt, margin=False)
     assert run.status == "interrupted"
     assert run.signals.time.values == pytest.approx(GRID * np.arange(17), abs=1e-12)
     assert np.isnan(run.accumulated_error)
@@ -349,7 +354,7 @@ def test_what_progress_raises_reaches_the_caller(error: type[Exception]) -> None
             raise mine
 
     with pytest.raises(error) as caught:
-        simulate(scenario("duration=0.2", *ON_REFERENCE), progress=progress)
+        simulate(scenario("duration=0.2", *ON_REFERENCE), progress=progress, margin=False)
     assert caught.value is mine
 
 

@@ -107,7 +107,7 @@ def test_a_wrench_gives_the_momentum_of_its_impulse():
 def test_disturbing_torque_is_the_same_as_a_bias(plant):
     settings = ("duration=0.3", f"plant.kind={plant}")
     bias = np.array([0.02, -0.01, 0.03, 0.0, 0.01, -0.02])
-    biased = sd.simulate(scenario(*settings, f"plant.torque_bias={bias.tolist()}"))
+    biased = sd.simulate(scenario(*settings, f"plant.torque_bias={bias.tolist()}"), margin=False)
     system = ConstantVectorSource(bias)
     with pytest.raises(sd.ConfigError, match="output port 'torque'"):
         sd.simulate(scenario(*settings), disturbance=system)  # its port has another name
@@ -117,15 +117,15 @@ def test_disturbing_torque_is_the_same_as_a_bias(plant):
             super().__init__()
             self.DeclareVectorOutputPort("torque", 6, lambda _, output: output.SetFromVector(bias))
 
-    pushed = sd.simulate(scenario(*settings), disturbance=Pushed)
+    pushed = sd.simulate(scenario(*settings), disturbance=Pushed, margin=False)
     np.testing.assert_allclose(pushed.signals.pose, biased.signals.pose, atol=1e-12)
 
 
 @pytest.mark.parametrize("port", ["torque", "wrench"])
 def test_a_disturbance_of_nothing_changes_nothing(port):
     sc = sd.load_scenario("paper", settings=("plant.kind=multibody", "duration=1"))
-    plain = sd.simulate(sc)
-    pushed = sd.simulate(sc, disturbance=disturbance(port))
+    plain = sd.simulate(sc, margin=False)
+    pushed = sd.simulate(sc, disturbance=disturbance(port), margin=False)
     np.testing.assert_array_equal(pushed.signals.pose, plain.signals.pose)
 
 
@@ -312,13 +312,13 @@ def test_what_a_system_noted_is_still_there_and_a_loop_that_made_its_own_is_not(
 def test_own_reference_is_followed_like_the_same_one_of_a_scenario():
     sc = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=2"))
     same = make_reference(sc.reference, sc.duration)
-    own = sd.simulate(sc, reference=same)
+    own = sd.simulate(sc, reference=same, margin=False)
     other = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=2"))
     other.reference.amplitude = [0.0] * 6
-    replaced = sd.simulate(other, reference=same)
+    replaced = sd.simulate(other, reference=same, margin=False)
     np.testing.assert_array_equal(own.signals.pose, replaced.signals.pose)
     assert own.summary["own"] == {"reference": "FunctionHandleTrajectory"}
-    shipped = sd.simulate(sc)
+    shipped = sd.simulate(sc, margin=False)
     assert shipped.summary["own"] == {}
     # What it is measured by, the range within 2 s, is all that differs.
     scale = np.abs(own.signals.error.values - shipped.signals.error.values).max()

@@ -1,5 +1,6 @@
 """The analysis page: one file, nothing fetched, whatever the names in it are."""
 
+import pickle
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -7,15 +8,18 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from stewart_drake.report.page import (
-    Page,
+from stewart_drake.report.document import (
+    Caution,
+    Document,
+    Frame,
+    Listing,
+    Paragraph,
     Picture,
-    Provenance,
     Section,
     Table,
-    command_line,
-    write_page,
+    Values,
 )
+from stewart_drake.report.page import Provenance, command_line, html, write_page
 from stewart_drake.report.style import figure_style
 
 
@@ -54,24 +58,30 @@ def picture() -> Picture:
     return Picture(figure, "a line that goes down")
 
 
-def page(**changes: object) -> Page:
+MADE = Provenance("stewart-drake analyze hautus 'a b'", {"drake": "1.51"}, 12.3)
+
+
+def document(**changes: object) -> Document:
     table = Table(
         ("model", "margin", "note"),
         [("<b>a</b> & b", "1.2e-3", "x" * 50), ("c", "-", "fine"), ("d", "> 5", "")],
         "Some models.",
     )
     sections = [
-        Section("One", ("First.", "Second <i>paragraph</i>."), [table], [picture()]),
-        Section("Two", pictures=[picture()]),
-        Section("Three", ("Hidden.",), folded=True),
+        Section("One", "First.", "Second <i>paragraph</i>.", table, picture()),
+        Section("Two", picture()),
+        Section("Three", "Hidden.", folded=True),
     ]
-    made = Provenance("stewart-drake analyze hautus 'a b'", {"drake": "1.51"}, 12.3)
     parts = {"title": "A <title>", "verdict": "All is well.", "tone": "good", "facts": {"mu": "8"}}
-    return Page(**{**parts, "sections": sections, "provenance": made, **changes})  # type: ignore[arg-type]
+    return Document(**{**parts, "sections": sections, **changes})  # type: ignore[arg-type]
+
+
+def page(**changes: object) -> str:
+    return html(document(**changes), MADE)
 
 
 def test_a_page_holds_everything_and_fetches_nothing() -> None:
-    text = page().html()
+    text = page()
     outline = Outline(text)
     sources = [image["src"] or "" for image in outline.all("img")]
     assert [source.partition(";")[0] for source in sources] == ["data:image/svg+xml"] * 2
@@ -89,7 +99,7 @@ def test_a_page_holds_everything_and_fetches_nothing() -> None:
 
 
 def test_names_from_files_are_text_and_not_markup() -> None:
-    text = page(verdict="<script>alert(1)</script>").html()
+    text = page(verdict="<script>alert(1)</script>")
     assert "<script" not in text
     assert "<b>a</b>" not in text
     outline = Outline(text)
@@ -99,7 +109,7 @@ def test_names_from_files_are_text_and_not_markup() -> None:
 
 
 def test_numbers_are_aligned_and_long_words_are_broken() -> None:
-    cells = [cell["class"] or "" for cell in Outline(page().html()).all("td")][:3]
+    cells = [cell["class"] or "" for cell in Outline(page()).all("td")][:3]
     assert [("n" in c.split(), "s" in c.split()) for c in cells] == [
         (False, True),
         (True, True),
@@ -120,21 +130,79 @@ def test_a_row_of_another_length_is_refused() -> None:
         Table(("a", "b"), [("1", "2"), ("3",)])
 
 
+def test_a_terminal_gets_what_is_brief_in_80_columns():
+    """The verdict, and of open sections the brief blocks; what covers several cells is whole."""
+    long = "a reason that is told at some length, " * 4
+    rows = [("one", "1.50", "-0.25", long), ("two", "ended at 3.25 s, leg 2", None, "x")]
+    table = Table(("run", "E_ac, % s", "worst", "why"), rows, "Some runs.", brief=True)
+    chosen = Table(("a", "b"), [("1", "never shown")], brief=("first\nhead", None))
+    text = document(
+        sections=[
+            Section("Shown", "For pages.", table, chosen, Paragraph("Told.", brief=True)),
+            Section("Not shown", "For pages.", picture(), Listing("nothing")),
+            Section("Folded", Values({"hidden": "yes"}), folded=True),
+            Section("", Values({"mass": "4 kg"}), Caution("look out")),
+        ]
+    ).plain()
+    lines = text.splitlines()
+    assert lines[:4] == ["All is well.", "", "Shown", "Some runs."]
+    assert max(map(len, lines)) <= 80 and not any(line != line.rstrip() for line in lines)
+    first = next(k for k, line in enumerate(lines) if line.startswith("one"))
+    assert lines[first].split()[:3] == ["one", "1.50", "-0.25"]
+    told = " ".join(line[lines[first].index("a reason") :] for line in lines[first : first + 4])
+    assert long.split() == told.split()[: len(long.split())]
+    second = next(line for line in lines if line.startswith("two"))
+    assert "ended at 3.25 s, leg 2" in second
+    assert lines[first].index("-0.25") + 5 == second.index("leg 2") + 5, "over two columns"
+    assert lines[lines.index("first") : lines.index("first") + 3] == ["first", " head", "    1"]
+    assert lines[-3:] == ["Told.", "mass  4 kg", "warning: look out"]
+    for hidden in ("For pages.", "Not shown", "Folded", "hidden", "never shown"):
+        assert hidden not in text
+    shown = Outline(page(sections=[Section("Shown", table)]))
+    assert [cell.get("colspan") for cell in shown.all("td")] == [None] * 5 + ["2", None]
+
+
+def test_every_kind_of_block_is_on_a_page():
+    parts = (Values({"mass": "4 kg"}), Caution("look out"), Listing("a:\n  b: <1>"), Frame("<p>in"))
+    outline = Outline(page(sections=[Section("All", *parts)]))
+    words = outline.words
+    assert words[words.index("mass") + 1] == "4 kg" and len(outline.all("dd")) == 2
+    assert "Warning: Look out." in words and "a:\n  b: <1>" in words
+    assert [frame["srcdoc"] for frame in outline.all("iframe")] == ["<p>in"]
+
+
+def test_a_figure_is_drawn_when_a_page_needs_it_and_is_sent_drawn():
+    drawn = []
+
+    def draw() -> Figure:
+        drawn.append(picture().drawn)
+        return drawn[-1]
+
+    lazy = Picture(draw, "a line")
+    shown = document(sections=[Section("One", lazy)])
+    shown.plain()
+    assert drawn == []
+    sent = pickle.loads(pickle.dumps(shown))
+    assert len(drawn) == 1
+    assert isinstance(sent.sections[0].blocks[0].figure, Figure)
+    assert html(sent, MADE).count("<img") == 1 and html(shown, MADE).count("<img") == 1
+    assert len(drawn) == 1
+
+
 def test_the_same_page_gives_the_same_bytes(tmp_path: Path) -> None:
-    first, second = (write_page(page(), tmp_path / f"{k}.html") for k in range(2))
+    first, second = (write_page(document(), MADE, tmp_path / f"{k}.html") for k in range(2))
     assert first.read_bytes() == second.read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0.html", "1.html"]
 
 
 def test_a_page_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(OSError):
-        write_page(page(), tmp_path / "nowhere" / "report.html")
+        write_page(document(), MADE, tmp_path / "nowhere" / "report.html")
     assert not list(tmp_path.iterdir())
 
 
 def test_few_sections_need_no_contents_and_no_time_is_no_line() -> None:
-    plain = page(sections=[Section("One")], provenance=Provenance("x", {"drake": "1.51"}))
-    text = plain.html()
+    text = html(document(sections=[Section("One")]), Provenance("x", {"drake": "1.51"}))
     assert "<nav" not in text
     assert "Computed in" not in text
 

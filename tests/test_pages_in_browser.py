@@ -1,6 +1,5 @@
 """Pages in a real browser: short on a narrow screen, figures enlarged and legible, tables whole."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +7,12 @@ import pytest
 from matplotlib.figure import Figure
 
 import stewart_drake as sd
-from stewart_drake.report.hautus_page import hautus_page
-from stewart_drake.report.page import Page, Picture, Provenance, Section, Table, write_page
+from stewart_drake.report import hautus_document
+from stewart_drake.report.document import Document, Picture, Section, Table
+from stewart_drake.report.page import Provenance, write_page
 from stewart_drake.report.style import CONTROLLER_LINES, figure_style
 from stewart_drake.studies.hautus import study_hautus
-from tests.browser import Browser, browser, needs_chromium
+from tests.browser import Browser, needs_chromium
 
 pytestmark = needs_chromium
 NARROW = 400
@@ -20,16 +20,11 @@ MADE = Provenance("stewart-drake analyze hautus paper --out out/hautus")
 
 
 @pytest.fixture(scope="module")
-def tab() -> Iterator[Browser]:
-    with browser() as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
 def hautus(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of the paper's scenario, with all its delays and poses."""
     path = tmp_path_factory.mktemp("hautus") / "report.html"
-    return write_page(hautus_page(study_hautus(sd.load_scenario("paper")), MADE), path)
+    study = study_hautus(sd.load_scenario("paper"))
+    return write_page(hautus_document.document(study), MADE, path)
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +41,9 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = Table(
         ("model", "why"), [(f"chain {k}", "one reason or another " * 6) for k in range(9)]
     )
-    sections = [Section("Figure", pictures=[Picture(figure, "Lines.")]),
-                Section("Tables", tables=[wide, words])]  # fmt: skip
+    sections = [Section("Figure", Picture(figure, "Lines.")), Section("Tables", wide, words)]
     path = tmp_path_factory.mktemp("small") / "report.html"
-    return write_page(Page("A page", "Fine.", sections, MADE), path)
+    return write_page(Document("A page", "Fine.", sections), MADE, path)
 
 
 def box(tab: Browser, selector: str) -> dict[str, float]:

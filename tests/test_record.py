@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import tracemalloc
+import typing
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from stewart_drake.files.jsonio import jsonable
 from stewart_drake.loop.controller import HELD
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.recording import Table
+from stewart_drake.loop.results import MarginSummary, RunSummary, StepTimes
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.report.csv_file import read_signals, signals_csv
 from stewart_drake.scenario.loading import scenario_yaml
@@ -40,7 +42,7 @@ def scenario(*settings: str, plant: str = "exact", start: tuple[str, ...] = ON_R
 
 
 def run(*settings: str, plant: str = "exact") -> sd.SimulationResult:
-    return sd.simulate(scenario(*settings, plant=plant))
+    return sd.simulate(scenario(*settings, plant=plant), margin=False)
 
 
 # Instants.
@@ -51,7 +53,7 @@ def run(*settings: str, plant: str = "exact") -> sd.SimulationResult:
 def test_no_torque_is_lost(period: float, plant: str) -> None:
     """The law's own torques, taken at its samples, are those of the log."""
     sc = scenario(f"controller.period={period}", "duration=0.3", "delay.steps=3", plant=plant)
-    result = sd.simulate(sc)
+    result = sd.simulate(sc, margin=False)
     number = round(0.3 / period) + 1
     at = period * np.arange(number)
     logged = result.signals.sel(time=at, method="nearest")
@@ -247,6 +249,31 @@ def test_the_ports_are_those_of_the_table() -> None:
 
 
 # What it costs.
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [("duration=0.3",), ("duration=2", "start=rest", "queue=zero", "plant.gravity=true")],
+)
+def test_the_summary_has_the_keys_and_kinds_that_its_type_tells(settings: tuple[str, ...]) -> None:
+    """Of a run that completes, and of one that leaves the workspace."""
+    summary = run(*settings).summary
+    assert (summary["status"] == "completed") == (len(settings) == 1)
+    margin = summary["controller_margin"]
+    assert margin is not None
+    for part, kind in (
+        (summary, RunSummary),
+        (margin, MarginSummary),
+        (summary["controller_step_ms"], StepTimes),
+    ):
+        hints = typing.get_type_hints(kind)
+        assert list(part) == list(hints)
+        for name, hint in hints.items():
+            if hint in (float, str):
+                assert type(part[name]) is hint, name
+            elif typing.get_origin(hint) is list:
+                (inner,) = typing.get_args(hint)
+                assert all(type(value) is inner for value in part[name]), name
 
 
 def test_a_table_grows_without_being_copied() -> None:

@@ -50,7 +50,7 @@ def test_a_live_run_shows_the_plate_the_ring_and_the_torques(kind, meshcat):
         )
 
     scenario = sd.load_scenario("paper", settings=(f"plant.kind={kind}", *MOVING))
-    run = sd.simulate(scenario, meshcat=meshcat, progress=look)
+    run = sd.simulate(scenario, meshcat=meshcat, progress=look, margin=False)
     for path in ("/reference/ring", "/reference/pointer"):
         assert meshcat.HasPath(path)
     assert len(looks) == 13
@@ -73,12 +73,15 @@ def test_a_live_run_keeps_to_real_time(meshcat):
     scenario = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=0.6"))
     seen = []
     run = sd.simulate(
-        scenario, meshcat=meshcat, progress=lambda now, _: seen.append((now, time.monotonic()))
+        scenario,
+        meshcat=meshcat,
+        progress=lambda now, _: seen.append((now, time.monotonic())),
+        margin=False,
     )
     assert run.status == "completed"
     (start, began), (end, ended) = seen[0], seen[-1]
     assert ended - began > 0.9 * (end - start)
-    unpaced = sd.simulate(scenario)
+    unpaced = sd.simulate(scenario, margin=False)
     np.testing.assert_array_equal(unpaced.signals.pose, run.signals.pose)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from stewart_drake.report.page import Picture, environment
+from stewart_drake.report.page import environment, size
 from stewart_drake.report.style import DARK, figure_style, for_dark_too, plain_log_ticks
 
 
@@ -57,7 +57,7 @@ def figure_bytes(figure: Figure) -> bytes:
 
 
 def test_a_picture_knows_its_size():
-    assert Picture(Figure(figsize=(10, 6.9)), "one").size == (960, 662)
+    assert size(Figure(figsize=(10, 6.9))) == (960, 662)
 
 
 @pytest.mark.parametrize(("low", "high"), [(19.5, 37), (0.4, 300), (8, 12), (20, 55), (1e-3, 2e-3)])

@@ -43,6 +43,11 @@ def test_a_row_that_does_not_fit_is_refused_in_one_line(compare: str, message: s
     assert message in str(refused.value) and "\n" not in str(refused.value)
 
 
+def test_a_bad_row_is_found_when_the_scenario_is_read() -> None:
+    with pytest.raises(sd.ConfigError, match=r"compare\.lqr: w_Q: got -1"):
+        sd.load_scenario("paper", settings=["compare={lqr: {w_Q: -1}}"])
+
+
 def test_the_integral_weight_scales_its_block_alone() -> None:
     def blocks(weight: float) -> np.ndarray:
         settings = [f"controller.integral_weight={weight}"]
@@ -75,3 +80,14 @@ def test_who_does_not_know_of_the_delay_loses_the_plate(
     rows: dict[str, sd.Scenario], row: str
 ) -> None:
     assert sd.simulate(rows[row], margin=False).status == "left_workspace"
+
+
+def test_the_table_has_the_papers_numbers_beside_every_row() -> None:
+    results = sd.compare("table2", ["duration=0.3"])
+    assert list(results) == [*CONTROLLERS, "delay_lqi_sum", "delay_lqi_200"]
+    lines = {line[:17].strip(): line for line in sd.table(results).splitlines()}
+    for row, paper in (("LQR, delay-aware", "225"), ("LQI, delay-aware", "80")):
+        assert lines[row].split()[2] == paper
+    for row in ("delay_lqi_sum", "delay_lqi_200"):
+        assert lines[row].split()[1] == "80"
+    assert lines["LQI, predictor"].split()[2] == "-"

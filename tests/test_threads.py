@@ -32,7 +32,7 @@ def variants(duration: float) -> Iterable[tuple[str, ...]]:
 
 
 def run(settings: tuple[str, ...]) -> xr.Dataset:
-    return sd.simulate(sd.load_scenario("paper", settings=settings)).signals
+    return sd.simulate(sd.load_scenario("paper", settings=settings), margin=False).signals
 
 
 def differing(settings: list[tuple[str, ...]], threads: int) -> list[tuple[str, ...]]:

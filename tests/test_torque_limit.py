@@ -21,7 +21,8 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_yaml
-from stewart_drake.studies.uncertainty import Ranges, draw, scales_of
+from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.uncertainty import draw, scales_of
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]
@@ -52,7 +53,7 @@ def paper_with(folder: Path, effort: float | None, masses: float = 1.0) -> str:
 def weak(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SimulationResult]:
     """The paper's experiment with motors of 0.3 N m on both plants."""
     motors = paper_with(tmp_path_factory.mktemp("weak"), WEAK)
-    return {plant: simulate(scenario(motors, plant=plant)) for plant in PLANTS}
+    return {plant: simulate(scenario(motors, plant=plant), margin=False) for plant in PLANTS}
 
 
 def saturated(run: SimulationResult) -> int:
@@ -93,11 +94,13 @@ def test_applied_is_what_the_limit_lets_through_a_delay_later(
 def test_a_heavy_machine_is_not_held_back_without_a_word(tmp_path: Path, plant: str) -> None:
     """A thousand times the masses take a thousand times the torque, which the motors lack."""
     motors = paper_with(tmp_path, 10.0, masses=1000.0)
-    run = simulate(scenario(motors, "duration=2.5", plant=plant))
+    run = simulate(scenario(motors, "duration=2.5", plant=plant), margin=False)
     assert saturated(run) > 10
     assert run.summary["peak_torque_applied"] == 10.0
-    free = simulate(scenario(motors, "duration=2.5", "actuator.torque_limit=none", plant=plant))
-    light = simulate(scenario("duration=2.5", plant=plant))
+    free = simulate(
+        scenario(motors, "duration=2.5", "actuator.torque_limit=none", plant=plant), margin=False
+    )
+    light = simulate(scenario("duration=2.5", plant=plant), margin=False)
     assert saturated(free) == saturated(light) == 0
     assert free.summary["peak_torque_applied"] == pytest.approx(655.86, abs=0.01)
     assert free.accumulated_error == pytest.approx(light.accumulated_error, rel=1e-3)
@@ -198,7 +201,9 @@ def test_a_limit_of_the_machine_alone_plans_nothing() -> None:
 
 
 def test_the_papers_experiment_does_not_feel_its_motors_limit() -> None:
-    usual, free = (simulate(scenario(*s)) for s in ((), ("actuator.torque_limit=none",)))
+    usual, free = (
+        simulate(scenario(*s), margin=False) for s in ((), ("actuator.torque_limit=none",))
+    )
     assert usual.accumulated_error == free.accumulated_error == pytest.approx(21.077, abs=0.001)
     assert usual.summary["peak_torque"] == usual.summary["peak_torque_applied"]
     assert usual.summary["peak_torque"] == pytest.approx(0.656, abs=5e-4)
@@ -212,7 +217,10 @@ def test_torques_in_flight_at_the_start_keep_it_too(tmp_path: Path, queue: str) 
     held = StewartDynamics(PAPER).equilibrium_torque(PAPER.home)
     assert np.abs(held).max() > 0.9
     run = simulate(
-        scenario(motors, "plant.gravity=true", f"queue={queue}", "start=on_reference", "duration=1")
+        scenario(
+            motors, "plant.gravity=true", f"queue={queue}", "start=on_reference", "duration=1"
+        ),
+        margin=False,
     )
     assert np.abs(run.signals.torque_applied.values).max() == 0.9
     loop = build_closed_loop(run.scenario)
@@ -225,10 +233,10 @@ def test_drawn_limits_are_never_above_the_motors(tmp_path: Path) -> None:
     """0.66 N m are commanded, so that limits of up to 1.97 would be drawn."""
     sc = scenario(paper_with(tmp_path, 0.8))
     scales = scales_of(assemble(sc), 0.6559)
-    limits = [draw(Ranges(), scales, sc, 0, i).torque_limit or 0.0 for i in range(50)]
+    limits = [draw(Ranges(), scales, sc, 0, i)["torque_limit"] for i in range(50)]
     assert max(limits) == 0.8 > min(limits) > 0.6559
-    assert draw(Ranges(torque_limit=None), scales, sc, 0, 0).torque_limit is None
+    assert draw(Ranges(torque_limit=None), scales, sc, 0, 0)["torque_limit"] is None
     sc.actuator.torque_limit = "none"
     scales = scales_of(assemble(sc), 0.6559)
-    limits = [draw(Ranges(), scales, sc, 0, i).torque_limit or 0.0 for i in range(50)]
+    limits = [draw(Ranges(), scales, sc, 0, i)["torque_limit"] for i in range(50)]
     assert 0.8 < max(limits) < 3 * 0.6559

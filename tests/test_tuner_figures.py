@@ -14,12 +14,13 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 import stewart_drake as sd
+from docs.images.loop_figure import loop_figure
+from docs.images.network_figure import network_figure
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files import resources
 from stewart_drake.report.figures import comparison_figures, run_figures
-from stewart_drake.report.loop_figure import loop_figure
-from stewart_drake.report.tables import shipped_table
-from stewart_drake.report.tuner_figures import network_figure, weights_figure
+from stewart_drake.report.shipped_table import shipped_table
+from stewart_drake.report.tuner_figures import weights_figure
 from stewart_drake.tuner.network import save_network
 from tests.test_network import small_network
 
@@ -33,7 +34,7 @@ def tuned_scenario(folder: Path, *settings: str) -> sd.Scenario:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> sd.SimulationResult:
-    return sd.simulate(tuned_scenario(tmp_path_factory.mktemp("run"), "duration=2.0"))
+    return sd.simulate(tuned_scenario(tmp_path_factory.mktemp("run"), "duration=2.0"), margin=False)
 
 
 def visible_texts(ax: Axes) -> list[Text]:

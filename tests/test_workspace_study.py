@@ -236,12 +236,12 @@ def test_every_shipped_reference_fits_and_so_does_its_largest_scaling(name: str)
     time = check_instants(experiment.scenario.duration)
     assert first_exit(experiment.mechanism, experiment.reference, time) is None
     factor = largest_factor(experiment.mechanism, experiment.reference, time)
-    assert factor.limited and 1 < factor.value < LARGEST_FACTOR
+    assert 1 < factor.value <= LARGEST_FACTOR and factor.limited == (factor.value < LARGEST_FACTOR)
     poses = np.array([experiment.reference.value(t)[:, 0] for t in time])
     for share, inside in ((1.0, True), (1.002, False)):
         scaled = poses[0] + share * factor.value * (poses - poses[0])
         margins = [margin(experiment.mechanism, pose) for pose in scaled]
-        assert (min(margins) > 0) is inside
+        assert (min(margins) > 0) is (inside or not factor.limited)
 
 
 @pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
@@ -359,10 +359,10 @@ def test_a_reference_that_leaves_is_analysed_not_refused(
     assert main(arguments) == 0
     printed = capsys.readouterr().out
     # Legs 2 to 4 do not reach, and no angle has a sine beyond the dead centre.
-    rows = [line for line in printed.splitlines() if re.match("[1-6]  ", line)]
+    rows = [line for line in printed.splitlines() if re.match(" *[1-6] ", line)]
     out = " ".join(printed.split())
     assert out.startswith("no: the reference leaves the workspace at t = 1.061 s, leg 2 reached")
-    assert [row.split()[3] for row in rows] == ["0.91", "-", "-", "-", "0.22", "0.67"]
+    assert [row.split()[3] for row in rows] == ["0.908", "-", "-", "-", "0.216", "0.669"]
     assert "leg 4 is short by 15.2 mm" in out and "0.872 times this one" in out
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["fits"] is False and summary["exit"]["leg"] == 2 and summary["motors"] == []

@@ -3,9 +3,10 @@
 import sys
 from pathlib import Path
 
+from loop_figure import loop_figure
+from network_figure import network_figure
+
 from stewart_drake.loop.diagram import build_closed_loop
-from stewart_drake.report.loop_figure import loop_figure
-from stewart_drake.report.tuner_figures import network_figure
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.tuner.network import DEFAULT, load_network
 

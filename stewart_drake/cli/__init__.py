@@ -96,7 +96,7 @@ def _root(
 def list_shipped() -> None:
     """List the shipped models, scenarios and so on."""
     from stewart_drake.files.resources import KINDS, shipped
-    from stewart_drake.report.tables import shipped_table
+    from stewart_drake.report.shipped_table import shipped_table
 
     for kind, heading in KINDS.items():
         if shipped(kind):

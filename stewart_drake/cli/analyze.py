@@ -1,17 +1,16 @@
 """What an engineer reads before building anything: analyze hautus, delay, workspace, robustness."""
 
-import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Mapping
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stewart_drake.cli.common import (
-    INTERRUPTED,
+    GO_ON,
     AsJson,
     Controller,
+    Delivery,
     Out,
     Quiet,
     ScenarioName,
@@ -19,21 +18,15 @@ from stewart_drake.cli.common import (
     Seed,
     Settings,
     Workers,
-    check_writable,
-    drawing,
-    print_json,
-    remove,
-    silence,
+    stopping,
 )
-from stewart_drake.report.terminal import count_bar, echo, working
-from stewart_drake.studies.range_units import RANGE_UNITS
+from stewart_drake.report.terminal import count_bar, working
+from stewart_drake.studies.ranges import RANGE_UNITS
 
 if TYPE_CHECKING:
-    from stewart_drake.report.page import Page, Provenance
+    from stewart_drake.report.answer import Answer
 
 app = typer.Typer(rich_markup_mode=None, help="Tell beforehand what can be controlled, and how.")
-
-PAGE = "report.html"
 
 
 @app.command()
@@ -45,23 +38,10 @@ def hautus(
     as_json: AsJson = False,
 ) -> int:
     """Whether every model can be controlled and observed, by mode."""
-    from stewart_drake.report.hautus_page import hautus_page, hautus_table
-    from stewart_drake.scenario.loading import load_scenario
-    from stewart_drake.studies.hautus import study_hautus
-
-    check_writable(out)
-    started = time.perf_counter()
+    delivery = Delivery(out, quiet, as_json)
     with working("hautus", quiet):
-        study = study_hautus(load_scenario(scenario, settings=settings or ()))
-    made = provenance("hautus", scenario, None, settings, out, started)
-    return deliver(
-        study.summary,
-        hautus_table(study),
-        lambda: hautus_page(study, made),
-        out,
-        quiet,
-        as_json,
-    )
+        answer = _answer("hautus", delivery, scenario, None, settings)
+    return _deliver(answer, delivery)
 
 
 @app.command()
@@ -74,24 +54,10 @@ def delay(
     as_json: AsJson = False,
 ) -> int:
     """How much delay the open loop, and the closed one, can bear."""
-    from stewart_drake.report.delay_page import delay_page, delay_table
-    from stewart_drake.scenario.loading import load_scenario
-    from stewart_drake.studies.delay_limits import study_delay
-
-    check_writable(out)
-    started = time.perf_counter()
+    delivery = Delivery(out, quiet, as_json)
     with count_bar("simulations", quiet) as progress:
-        study = study_delay(load_scenario(scenario, controller, settings or ()), progress)
-    made = provenance("delay", scenario, controller, settings, out, started)
-    return deliver(
-        study.summary,
-        delay_table(study),
-        lambda: delay_page(study, made),
-        out,
-        quiet,
-        as_json,
-        interrupted=study.interrupted,
-    )
+        answer = _answer("delay", delivery, scenario, controller, settings, progress=progress)
+    return _deliver(answer, delivery, interrupted=answer.study.interrupted)
 
 
 @app.command()
@@ -107,23 +73,10 @@ def workspace(
     A motion that does not fit is analysed too. Shown are the reach that each leg has left, how
     large the motion may be, and torque, speed and power of each motor.
     """
-    from stewart_drake.report.workspace_page import workspace_page, workspace_table
-    from stewart_drake.scenario.loading import load_scenario
-    from stewart_drake.studies.workspace import study_workspace
-
-    check_writable(out)
-    started = time.perf_counter()
+    delivery = Delivery(out, quiet, as_json)
     with working("workspace", quiet):
-        study = study_workspace(load_scenario(scenario, settings=settings or ()))
-    made = provenance("workspace", scenario, None, settings, out, started)
-    return deliver(
-        study.summary,
-        workspace_table(study),
-        lambda: workspace_page(study, made),
-        out,
-        quiet,
-        as_json,
-    )
+        answer = _answer("workspace", delivery, scenario, None, settings)
+    return _deliver(answer, delivery)
 
 
 Vary = Annotated[
@@ -158,109 +111,65 @@ def robustness(
 
     With --out the same command goes on where it was stopped.
     """
-    from stewart_drake.report.robustness_page import robustness_page, robustness_table
-    from stewart_drake.scenario.loading import load_scenario
-    from stewart_drake.studies.robustness import study_robustness
-    from stewart_drake.studies.uncertainty import read_ranges
+    from stewart_drake.studies.ranges import read_ranges
 
-    base = load_scenario(scenario, controller, ("plant.kind=exact", *(settings or ())))
-    ranges = read_ranges(vary or ())
-    check_writable(out)
-    started = time.perf_counter()
+    ranges, delivery = read_ranges(vary or ()), Delivery(out, quiet, as_json)
     with TemporaryDirectory() as scratch:
-        try:
-            with count_bar("runs", quiet) as progress:
-                study = study_robustness(
-                    base,
-                    scratch if out is None else out,
-                    ranges=ranges,
-                    runs=runs,
-                    seed=seed,
-                    limit=limit,
-                    workers=workers,
-                    scheduler=scheduler,
-                    progress=progress,
-                )
-        except KeyboardInterrupt:
-            kept = "finished runs are kept, the same command goes on from there"
-            echo(f"stopped; {'nothing is kept without --out' if out is None else kept}", error=True)
-            return INTERRUPTED
-    options: dict[str, object] = {"runs": runs, "seed": seed, "limit": limit}
-    made = provenance(
-        "robustness", scenario, controller, settings, out, started, vary=vary or (), **options
-    )
-    summary = study.summary
-    return deliver(
-        summary,
-        robustness_table(study),
-        lambda: robustness_page(study, made),
-        out,
-        quiet,
-        as_json,
-        beside=("runs.csv", "runs/"),
-    )
+        kept = GO_ON if out else "nothing is kept without --out"
+        given = {"runs": runs, "seed": seed, "limit": limit}
+        with stopping(kept), count_bar("runs", quiet) as progress:
+            answer = _answer(
+                "robustness",
+                delivery,
+                scenario,
+                controller,
+                settings,
+                fixed=("plant.kind=exact",),
+                typed={"vary": vary or (), **given},
+                directory=out or scratch,
+                ranges=ranges,
+                workers=workers,
+                scheduler=scheduler,
+                progress=progress,
+                **given,
+            )
+    return _deliver(answer, delivery, "runs.csv", "runs/")
 
 
-def provenance(
-    analysis: str,
+def _answer(
+    name: str,
+    delivery: Delivery,
     scenario: str,
     controller: str | None,
     settings: list[str] | None,
-    out: Path | None,
-    started: float,
-    **more: object,
-) -> "Provenance":
-    """The command as typed, versions, and the time since `started` (time.perf_counter, s).
-
-    `more` are further options; a list or tuple is an option given so many times, None is one that
-    is not.
-    """
-    from stewart_drake.report.page import Provenance, command_line
-
-    options = {"controller": controller, **more, "out": out}
-    command = command_line("analyze", analysis, scenario, settings=settings or (), options=options)
-    return Provenance(command, seconds=time.perf_counter() - started)
-
-
-def deliver(
-    summary: dict[str, Any],
-    table: str,
-    page: "Callable[[], Page]",
-    out: Path | None,
-    quiet: bool,
-    as_json: bool,
     *,
-    interrupted: bool = False,
-    beside: tuple[str, ...] = (),
-) -> int:
-    """Print a table or the summary as JSON; with `--out` write summary.json and the page.
+    fixed: tuple[str, ...] = (),
+    typed: Mapping[str, object] | None = None,
+    **options: Any,
+) -> "Answer":
+    """Analyse a scenario; `fixed` are settings below the user's, `typed` further words of theirs.
 
-    Args:
-        summary: plain data.
-        table: for a person, at most 80 columns.
-        page: makes the page; called only with `--out`.
-        out, quiet, as_json: the command's options.
-        interrupted: whether Ctrl-C ended the analysis early.
-        beside: what the analysis itself has written into `out`.
-
-    Returns:
-        The exit status.
+    Of these a list or tuple is an option given so many times, None is one that is not.
     """
-    say = silence if quiet or as_json else echo
-    say(table)
-    if out is not None:
-        from stewart_drake.files.jsonio import write_json
+    from stewart_drake.report.analyses import analyze
+    from stewart_drake.report.page import command_line
+    from stewart_drake.scenario.loading import load_scenario
 
-        # No page of an earlier run beside this one's numbers, which come first.
-        remove(out, ["summary.json", PAGE])
-        write_json(out / "summary.json", summary)
-        written = ["summary.json"]
-        with drawing(PAGE):
-            from stewart_drake.report.page import write_page
+    given = settings or []
+    words = {"controller": controller, **(typed or {}), "out": delivery.out}
+    command = command_line("analyze", name, scenario, settings=given, options=words)
+    loaded = load_scenario(scenario, controller, (*fixed, *given))
+    return analyze(name, loaded, command=command, **options)
 
-            write_page(page(), out / PAGE)
-            written.append(PAGE)
-        say(f"written to {out}: {', '.join((*written, *beside))}")
-    if as_json:
-        print_json(summary)
-    return INTERRUPTED if interrupted else 0
+
+def _deliver(answer: "Answer", delivery: Delivery, *beside: str, interrupted: bool = False) -> int:
+    """Print an answer; write summary.json and the page `beside` what the study has written."""
+    from stewart_drake.report.answer import PAGE
+
+    delivery.say(str(answer))
+    # No page of an earlier run beside this one's numbers, which come first.
+    delivery.discard(PAGE)
+    delivery.write(answer.summary)
+    delivery.draw(PAGE, answer.save_page)
+    delivery.wrote(*beside)
+    return delivery.end(answer.summary, interrupted)

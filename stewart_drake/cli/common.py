@@ -5,7 +5,7 @@ import fcntl
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 INTERRUPTED: Final = 130
 """Exit status after Ctrl-C."""
 
+GO_ON: Final = "finished runs are kept, the same command goes on from there"
 _held: Final = contextlib.ExitStack()
 """What is to be undone when the running command ends."""
 
@@ -75,17 +76,6 @@ Scheduler = Annotated[
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="For summary, signals, figures.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
-
-
-def silence(text: str) -> None:
-    """Print nothing."""
-
-
-def print_json(summary: dict[str, Any]) -> None:
-    """Print a summary as JSON, NaN as null."""
-    from stewart_drake.files.jsonio import jsonable
-
-    typer.echo(json.dumps(jsonable(summary), indent=2, allow_nan=False))
 
 
 def check_writable(directory: Path | None, *, alone: bool = True) -> None:
@@ -147,25 +137,79 @@ def _remove_empty(directories: list[Path]) -> None:
             path.rmdir()
 
 
-def remove(directory: Path, names: Iterable[str]) -> None:
-    """Delete files of an earlier run, as far as they exist."""
-    for name in names:
-        (directory / name).unlink(missing_ok=True)
-
-
 @contextlib.contextmanager
-def drawing(what: str) -> Iterator[None]:
-    """What is drawn in here comes after the results; a failure costs it alone, and is told.
-
-    A file that cannot be written, as on a full disk, is an error as everywhere.
-    """
+def stopping(text: str) -> Iterator[None]:
+    """On Ctrl-C in here the command ends at once, with these words."""
     try:
         yield
-    except OSError:
-        raise
-    except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        echo(f"warning: {what} could not be drawn ({reason}); everything else is kept", error=True)
+    except KeyboardInterrupt:
+        echo(f"stopped; {text}", error=True)
+        raise typer.Exit(INTERRUPTED) from None
+
+
+class Delivery:
+    """What a command says and leaves behind; made before anything is computed.
+
+    Args:
+        out: the directory of `--out`, or None; see `check_writable`.
+        quiet, as_json: the command's options.
+    """
+
+    def __init__(self, out: Path | None, quiet: bool, as_json: bool = False) -> None:
+        check_writable(out)
+        self.out, self.as_json, self.silent = out, as_json, quiet or as_json
+        self._written: list[str] = []
+
+    def say(self, text: str) -> None:
+        """Print it, unless nothing or only JSON is wanted."""
+        if not self.silent:
+            echo(text)
+
+    def discard(self, *names: str) -> None:
+        """Delete files of an earlier run, as far as they exist, and its summary."""
+        if self.out is not None:
+            for name in ("summary.json", *names):
+                (self.out / name).unlink(missing_ok=True)
+
+    def write(self, summary: Mapping[str, Any]) -> None:
+        """Write summary.json."""
+        from stewart_drake.files.jsonio import write_json
+
+        if self.out is not None:
+            write_json(self.out / "summary.json", summary)
+            self.wrote("summary.json")
+
+    def draw(self, what: str, draw: Callable[[Path], Any]) -> None:
+        """What comes after the results, into `out`; a failure costs it alone, and is told.
+
+        A file that cannot be written, as on a full disk, is an error as everywhere.
+        """
+        if self.out is None:
+            return
+        try:
+            found = draw(self.out)
+        except OSError:
+            raise
+        except Exception as error:
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            text = f"warning: {what} could not be drawn ({reason}); everything else is kept"
+            echo(text, error=True)
+        else:
+            self.wrote(f"{len(found)} figures" if what == "figures" else what)
+
+    def wrote(self, *names: str) -> None:
+        """To be told at the end."""
+        self._written += names
+
+    def end(self, summary: Mapping[str, Any], interrupted: bool = False) -> int:
+        """Tell what was written, print the summary if it is wanted; the exit status."""
+        from stewart_drake.files.jsonio import jsonable
+
+        if self.out is not None:
+            self.say(f"written to {self.out}: {', '.join(self._written)}")
+        if self.as_json:  # NaN as null
+            typer.echo(json.dumps(jsonable(summary), indent=2, allow_nan=False))
+        return INTERRUPTED if interrupted else 0
 
 
 def open_meshcat() -> Any:

@@ -7,15 +7,11 @@ import typer
 
 from stewart_drake.cli.common import (
     AsJson,
+    Delivery,
     MechanismName,
     Quiet,
     check_file,
-    check_writable,
-    drawing,
     open_meshcat,
-    print_json,
-    remove,
-    silence,
 )
 from stewart_drake.files.fileio import replacing
 from stewart_drake.report.terminal import echo
@@ -55,28 +51,21 @@ def check(
 ) -> None:
     """Check a mechanism and describe it at its home pose, under gravity."""
     from stewart_drake.mechanism.files import load_mechanism
-    from stewart_drake.report.mechanism_table import mechanism_table
+    from stewart_drake.report.mechanism_document import document
     from stewart_drake.studies.mechanism_check import check_mechanism
 
-    check_writable(out)
-    say = silence if quiet or as_json else echo
+    def draw(folder: Path) -> None:
+        from stewart_drake.report.mechanism_figures import write_mechanism_figure
+
+        write_mechanism_figure(found.mechanism, folder)
+
+    delivery = Delivery(out, quiet, as_json)
     found = check_mechanism(load_mechanism(mechanism))
-    say(mechanism_table(found))
-    if out is not None:
-        from stewart_drake.files.jsonio import write_json
-
-        pictures = ("mechanism.png", "mechanism.svg")
-        remove(out, ["summary.json", *pictures])
-        write_json(out / "summary.json", found.summary)
-        written = ["summary.json"]
-        with drawing("mechanism"):
-            from stewart_drake.report.mechanism_figures import write_mechanism_figure
-
-            write_mechanism_figure(found.mechanism, out)
-            written += pictures
-        say(f"written to {out}: {', '.join(written)}")
-    if as_json:
-        print_json(found.summary)
+    delivery.say(document(found).plain())
+    delivery.discard("mechanism.png", "mechanism.svg")
+    delivery.write(found.summary)
+    delivery.draw("mechanism.png, mechanism.svg", draw)
+    delivery.end(found.summary)
 
 
 @app.command()
@@ -91,15 +80,15 @@ def view(
     from stewart_drake.mechanism.files import load_mechanism
     from stewart_drake.report.viewer import STOP, PoseViewer
 
-    check_writable(out)
-    say = silence if quiet else echo
+    delivery = Delivery(out, quiet)
     viewer = PoseViewer(load_mechanism(mechanism), open_meshcat())
     if out is not None:
         text = viewer.meshcat.StaticHtml()
         with replacing(out / "view.html") as partial:
             partial.write_text(text)
-        say(f"written to {out}: view.html")
+        delivery.wrote("view.html")
+        delivery.end({})
         return
     # A reader needs the address even when everything else is quiet.
     echo(f"showing it at {viewer.meshcat.web_url()}, ends with {STOP!r} there or Ctrl-C")
-    viewer.run(say)
+    viewer.run(delivery.say)

@@ -9,20 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from stewart_drake.cli.common import (
-    INTERRUPTED,
     AsJson,
     Controller,
+    Delivery,
     Out,
     Quiet,
     ScenarioName,
     Settings,
     check_file,
-    check_writable,
-    drawing,
     open_meshcat,
-    print_json,
-    remove,
-    silence,
 )
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.report.terminal import echo, progress_bars
@@ -67,40 +62,38 @@ def simulate(
     from stewart_drake.loop.controller_margin import controller_margin
     from stewart_drake.loop.experiment import prepare
     from stewart_drake.loop.simulation import simulate as run
-    from stewart_drake.report.tables import run_table, warning_lines, wrap
+    from stewart_drake.report.document import Caution
+    from stewart_drake.report.run_document import run_document
+    from stewart_drake.report.words import wrap
     from stewart_drake.scenario.loading import load_scenario
     from stewart_drake.studies.verdict import Verdict, loop_verdict
 
     for option, given in (("--csv", csv), ("--replay", replay)):
         if given and out is None:
             raise ConfigError(f"{option}: got it without --out; expected --out DIR to write into")
-    say = silence if quiet or as_json else echo
     experiment = prepare(load_scenario(scenario, controller, settings or ()))
-    check_writable(out)
+    delivery = Delivery(out, quiet, as_json)
     viewer = open_meshcat() if meshcat else None
     margin = controller_margin(experiment)
-    say(wrap(loop_verdict(margin)))
-    say(wrap(str(Verdict(margin.eta, margin.pole, margin.pole_time))))
-    for line in warning_lines(cautions_before(experiment, margin)):
-        say(line)
+    delivery.say(wrap(loop_verdict(margin)))
+    delivery.say(wrap(str(Verdict(margin.eta, margin.pole, margin.pole_time))))
+    for text in cautions_before(experiment, margin):
+        delivery.say(Caution(text).plain())
     if viewer is not None:
         _await_viewer(viewer)
     name = Path(scenario).stem
     with progress_bars([name], experiment.scenario.duration, quiet) as progress:
         result = run(experiment, progress=progress[name], meshcat=viewer, margin=margin)
-    say(run_table(result))
-    if out is not None:
-        written = _write_run(result, experiment.mechanism, out, name, csv, replay or meshcat)
-        say(f"written to {out}: {', '.join(written)}")
-    if as_json:
-        print_json(result.summary)
+    delivery.say(run_document(result).plain())
+    _write_run(delivery, result, experiment.mechanism, name, csv, replay or meshcat)
+    status = delivery.end(result.summary, interrupted=result.status == "interrupted")
     if viewer is not None:
         from stewart_drake.report.replay import replay as play
 
         play(result.signals, experiment.mechanism, viewer)
         if sys.stdin.isatty():
             input(f"replay at {viewer.web_url()}, Enter ends")
-    return INTERRUPTED if result.status == "interrupted" else 0
+    return status
 
 
 def _await_viewer(viewer: "Meshcat") -> None:
@@ -116,35 +109,39 @@ def _await_viewer(viewer: "Meshcat") -> None:
 
 
 def _write_run(
+    delivery: Delivery,
     result: "SimulationResult",
     mechanism: "Mechanism",
-    out: Path,
     name: str,
     csv: bool,
     replay: bool,
-) -> list[str]:
-    """Write what a run leaves behind; what was written, in words."""
+) -> None:
+    """Write what a run leaves behind."""
+    if delivery.out is None:
+        return
     # The summary comes last of the results: where there is one, the signals beside it are of the
     # same run. What is drawn of them comes after that.
-    remove(out, ["summary.json", CSV, REPLAY, *_pictures(RUN_FIGURES)])
-    written = ["summary.json", "signals.nc"]
+    delivery.discard(CSV, REPLAY, *_pictures(RUN_FIGURES))
     if csv:
         from stewart_drake.report.csv_file import write_csv
 
-        write_csv(result.signals, out / CSV)
-        written.append(".csv")
-    result.save(out)
-    with drawing("figures"):
+        write_csv(result.signals, delivery.out / CSV)
+    result.save(delivery.out)
+    delivery.wrote("summary.json", "signals.nc", *[".csv"] * csv)
+
+    def draw(folder: Path) -> list[Path]:
         from stewart_drake.report.figures import run_figures
 
-        written.append(f"{len(run_figures(result, out))} figures")
-    if replay:
-        with drawing(REPLAY):
-            from stewart_drake.report.replay import write_replay
+        return run_figures(result, folder)
 
-            write_replay(result, mechanism, out / REPLAY, name)
-            written.append(REPLAY)
-    return written
+    def film(folder: Path) -> None:
+        from stewart_drake.report.replay import write_replay
+
+        write_replay(result, mechanism, folder / REPLAY, name)
+
+    delivery.draw("figures", draw)
+    if replay:
+        delivery.draw(REPLAY, film)
 
 
 def _pictures(names: Iterable[str]) -> list[str]:
@@ -179,34 +176,33 @@ def compare(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Run the five shipped controllers on a scenario, as a table."""
+    """Run the shipped controllers on a scenario, and the rows it adds, as a table."""
     from stewart_drake.loop.experiment import prepare
-    from stewart_drake.report.tables import comparison_table, wrap
-    from stewart_drake.scenario.loading import load_scenario
+    from stewart_drake.report.run_document import comparison_document
+    from stewart_drake.report.words import wrap
+    from stewart_drake.scenario.loading import load_comparison, load_scenario
     from stewart_drake.studies import compare as study
     from stewart_drake.studies.verdict import delay_verdict
 
-    say = silence if quiet or as_json else echo
+    def draw(folder: Path) -> list[Path]:
+        from stewart_drake.report.figures import comparison_figures
+
+        return comparison_figures(results, folder)
+
     experiment = prepare(load_scenario(scenario, settings=settings or ()))
-    check_writable(out)
-    say(wrap(str(delay_verdict(experiment))))
-    names = study.CONTROLLERS
+    delivery = Delivery(out, quiet, as_json)
+    names = tuple(load_comparison(scenario, study.CONTROLLERS, settings or ()))
+    delivery.say(wrap(str(delay_verdict(experiment))))
     with progress_bars(names, experiment.scenario.duration, quiet) as progress:
         results = study.compare(
             scenario, settings or (), lambda name, time, error: progress[name](time, error)
         )
-    say(comparison_table(results))
+    delivery.say(comparison_document(results).plain())
+    delivery.discard(*(f"{name}.nc" for name in names), *_pictures(COMPARISON_FIGURES))
     if out is not None:
-        stale = ["summary.json", *(f"{name}.nc" for name in names)]
-        remove(out, [*stale, *_pictures(COMPARISON_FIGURES)])
         study.save_comparison(results, out)
-        written = f"summary.json, {len(results)} signal files"
-        with drawing("figures"):
-            from stewart_drake.report.figures import comparison_figures
-
-            written += f", {len(comparison_figures(results, out))} figures"
-        say(f"written to {out}: {written}")
-    if as_json:
-        print_json(study.comparison_summary(results))
+        delivery.wrote("summary.json", f"{len(results)} signal files")
+    delivery.draw("figures", draw)
     ended = [result.status for result in results.values()]
-    return INTERRUPTED if "interrupted" in ended or len(ended) < len(names) else 0
+    interrupted = "interrupted" in ended or len(ended) < len(names)
+    return delivery.end(study.comparison_summary(results), interrupted)

@@ -8,29 +8,25 @@ from typing import Annotated
 import typer
 
 from stewart_drake.cli.common import (
-    INTERRUPTED,
+    GO_ON,
     AsJson,
     Controller,
+    Delivery,
     Quiet,
     ScenarioName,
     Scheduler,
     Seed,
     Settings,
     Workers,
-    check_writable,
-    drawing,
-    print_json,
-    remove,
-    silence,
+    stopping,
 )
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.report.terminal import count_bar, echo, working
+from stewart_drake.report.terminal import count_bar, working
 from stewart_drake.scenario.config import Scenario
 
 app = typer.Typer(rich_markup_mode=None, help="Data for the neural tuner, its training, its worth.")
 
 Out = Annotated[Path, typer.Option(metavar="DIR", help="Where runs, results and summary go.")]
-_GO_ON = "stopped; finished runs are kept, the same command goes on from there"
 
 
 class LabelKind(StrEnum):
@@ -72,35 +68,26 @@ def dataset(
     as_json: AsJson = False,
 ) -> int:
     """Run the grid of delays, frequencies and weights, 180 runs."""
-    from stewart_drake.files.jsonio import write_json
-    from stewart_drake.report.tuner_tables import dataset_table
+    from stewart_drake.report.tuner_document import dataset_document
     from stewart_drake.tuning.dataset import make_dataset, summarize
 
-    say = silence if quiet or as_json else echo
-    base = _base(scenario, controller, settings)
-    check_writable(out)
+    base, delivery = _base(scenario, controller, settings), Delivery(out, quiet, as_json)
     started = time.perf_counter()
-    try:
-        with count_bar("runs", quiet) as progress:
-            data = make_dataset(
-                base,
-                out,
-                disturbances=disturbed,
-                seed=seed,
-                workers=workers,
-                scheduler=scheduler,
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        echo(_GO_ON, error=True)
-        return INTERRUPTED
+    with stopping(GO_ON), count_bar("runs", quiet) as progress:
+        data = make_dataset(
+            base,
+            out,
+            disturbances=disturbed,
+            seed=seed,
+            workers=workers,
+            scheduler=scheduler,
+            progress=progress,
+        )
     summary = summarize(data) | {"wall_s": time.perf_counter() - started}
-    write_json(out / "summary.json", summary)
-    say(dataset_table(data))
-    say(f"written to {out}: dataset.nc, summary.json, runs/")
-    if as_json:
-        print_json(summary)
-    return 0
+    delivery.write(summary)
+    delivery.say(dataset_document(data).plain())
+    delivery.wrote("dataset.nc", "runs/")
+    return delivery.end(summary)
 
 
 @app.command()
@@ -119,41 +106,32 @@ def train(
     as_json: AsJson = False,
 ) -> int:
     """Train the network on a data set by Levenberg-Marquardt."""
-    from stewart_drake.files.jsonio import write_json
-    from stewart_drake.report.tuner_tables import training_table
+    from stewart_drake.report.tuner_document import training_document
     from stewart_drake.tuner.network import save_network
     from stewart_drake.tuning.dataset import load_dataset
     from stewart_drake.tuning.training import summarize
     from stewart_drake.tuning.training import train as run
 
-    say = silence if quiet or as_json else echo
     if out.suffix != ".json":
         raise ConfigError(f"--out: got {str(out)!r}; expected a file ending in .json")
-    folder = out.parent
-    check_writable(folder)
+    delivery = Delivery(out.parent, quiet, as_json)
     read = load_dataset(data)
-    try:
-        with working("training", quiet):
-            result = run(
-                read, kind=labels.value, split=split.value, density=density.value, seed=seed
-            )
-    except KeyboardInterrupt:
-        echo("stopped; nothing written", error=True)
-        return INTERRUPTED
+    with stopping("nothing written"), working("training", quiet):
+        result = run(read, kind=labels.value, split=split.value, density=density.value, seed=seed)
     summary = summarize(result)
-    remove(folder, ["summary.json"])
+    delivery.discard()
     save_network(result.network, out)
-    write_json(folder / "summary.json", summary)
-    say(training_table(summary))
-    written = f"{out.name}, summary.json"
-    with drawing("figures"):
+    delivery.wrote(out.name)
+    delivery.write(summary)
+    delivery.say(training_document(summary).plain())
+
+    def draw(folder: Path) -> list[Path]:
         from stewart_drake.report.training_figures import training_figures
 
-        written += f", {len(training_figures(result, folder))} figures"
-    say(f"written to {folder}: {written}")
-    if as_json:
-        print_json(summary)
-    return 0
+        return training_figures(result, folder)
+
+    delivery.draw("figures", draw)
+    return delivery.end(summary)
 
 
 @app.command()
@@ -175,36 +153,27 @@ def evaluate(
     as_json: AsJson = False,
 ) -> int:
     """Compare the tuner with every fixed gain on unseen scenarios."""
-    from stewart_drake.files.jsonio import write_json
-    from stewart_drake.report.tuner_tables import evaluation_table
+    from stewart_drake.report.tuner_document import evaluation_document
     from stewart_drake.tuning.evaluation import evaluate as run
 
-    say = silence if quiet or as_json else echo
-    base = _base(scenario, controller, settings)
-    check_writable(out)
+    base, delivery = _base(scenario, controller, settings), Delivery(out, quiet, as_json)
     started = time.perf_counter()
-    try:
-        with count_bar("runs", quiet) as progress:
-            result = run(
-                base,
-                weights,
-                out,
-                scenarios=scenarios,
-                seed=seed,
-                workers=workers,
-                scheduler=scheduler,
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        echo(_GO_ON, error=True)
-        return INTERRUPTED
+    with stopping(GO_ON), count_bar("runs", quiet) as progress:
+        result = run(
+            base,
+            weights,
+            out,
+            scenarios=scenarios,
+            seed=seed,
+            workers=workers,
+            scheduler=scheduler,
+            progress=progress,
+        )
     summary = result.summary | {"wall_s": time.perf_counter() - started}
-    write_json(out / "summary.json", summary)
-    say(evaluation_table(result))
-    say(f"written to {out}: summary.json, runs in fixed/ and tuner-*/")
-    if as_json:
-        print_json(summary)
-    return 0
+    delivery.write(summary)
+    delivery.say(evaluation_document(result).plain())
+    delivery.wrote("runs in fixed/ and tuner-*/")
+    return delivery.end(summary)
 
 
 def _base(scenario: str, controller: str | None, settings: list[str] | None) -> Scenario:

@@ -1,10 +1,13 @@
 """What a result depends on beside its scenario."""
 
 import platform
+from functools import cache
 from importlib.metadata import version
+
+_version = cache(version)  # read from files, which takes ms
 
 
 def versions() -> dict[str, str]:
     """Versions of what a result depends on."""
     packages = ("stewart-drake", "drake", "casadi", "numpy", "scipy")
-    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+    return {"python": platform.python_version()} | {name: _version(name) for name in packages}

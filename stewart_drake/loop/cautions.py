@@ -6,10 +6,11 @@ They are printed before a run as far as they are known then, and stand in `summa
 
 from collections.abc import Iterator
 from itertools import product
-from typing import Any, Final
+from typing import Final
 
 from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.loop.experiment import Experiment
+from stewart_drake.loop.results import RunSummary
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.timing import step_problem
 
@@ -69,8 +70,8 @@ def _finer(scenario: Scenario) -> Iterator[float]:
             yield step
 
 
-def cautions_after(experiment: Experiment, summary: dict[str, Any]) -> list[str]:
-    """What the run has shown; `summary` as of `loop.recording.summarize`, with its margin."""
+def cautions_after(experiment: Experiment, summary: RunSummary) -> list[str]:
+    """What the run has shown."""
     found, period = [], 1e3 * experiment.scenario.controller.period
     median = summary["controller_step_ms"]["median"]
     if median > period:  # one slow step is the machine's doing, the median is not

@@ -14,7 +14,7 @@ delay it believes in, its model, prediction and the weights it starts with. What
 import math
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.loop.experiment import Experiment, compose_law
+from stewart_drake.loop.results import MarginSummary
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     NUM_TORQUES,
@@ -120,7 +121,7 @@ class ControllerMargin:
         return math.exp(most) if most < 700 else math.inf
 
     @property
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> MarginSummary:
         """What `summary.json` holds; a margin without a limit is infinite, null in the file."""
         m = self.margins
         return {
@@ -163,8 +164,7 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
         radii = [spectral_radius(loop.matrix()) for loop in loops]
         worst = int(np.argmax(radii))
         radius, time = radii[worst], float(chosen[worst])
-        order = np.argsort(radii)[::-1]
-        margins = worst_margins([loops[i] for i in order])
+        margins = worst_margins([loops[i] for i in _order(radii)])
     return ControllerMargin(
         period=sc.controller.period,
         eta=sc.eta,
@@ -179,6 +179,16 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
         loops=tuple(loops),
         span=end,
     )
+
+
+def _order(radii: list[float]) -> list[int]:
+    """Of the loops in the search for the least margin: the likely worst first, most then pass it.
+
+    That is an end of their order by radius; the rest are shuffled, since along a smooth motion they
+    may bear less and less, and each would be searched for anew.
+    """
+    first, *between, last = (int(i) for i in np.argsort(radii)[::-1])
+    return [first, last, *(int(i) for i in np.random.default_rng(0).permutation(between))]
 
 
 def true_dynamics(experiment: Experiment) -> StewartDynamics:

@@ -13,8 +13,10 @@ from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.versions import versions
 from stewart_drake.law.memory import Counts
 from stewart_drake.loop import metrics
+from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.experiment import Experiment, waits_at_rest
+from stewart_drake.loop.results import RunSummary
 from stewart_drake.loop.tuner import AnnTuner
 from stewart_drake.native.library import backend
 from stewart_drake.scenario.loading import scenario_yaml
@@ -161,17 +163,17 @@ def summarize(
     status: str,
     stopped: Failure | None,
     wall: float,
-) -> dict[str, Any]:
-    """What `summary.json` holds; NaN where a run that did not complete has no value."""
-    sc, nan = experiment.scenario, float("nan")
-    done = status == "completed"
+    margin: ControllerMargin | None,
+) -> RunSummary:
+    """How a run went, without warnings yet."""
+    sc, c, nan = experiment.scenario, experiment.scenario.controller, float("nan")
     # Not from the log, whose instants are the scenario's choice.
     time, error = recorder.on_grid.column(0), recorder.on_grid.columns(slice(1, 7))
     reference = recorder.on_grid.columns(slice(7, 13))
     errors, torques, sent = (recorder.samples.columns(slice(n, n + 6)) for n in (0, 6, 12))
     seconds = recorder.samples.column(18)
-    some = len(torques) > 0
-    c = sc.controller
+    some, done = len(torques) > 0, status == "completed"
+    peaks = metrics.peak_error(error, experiment.scale).tolist() if len(error) else [nan] * 6
     return {
         "status": status,
         "accumulated_error": metrics.accumulated_error(time, error, experiment.scale)
@@ -181,15 +183,15 @@ def summarize(
         "cost": metrics.quadratic_cost(errors, sent, c.period, c.w_Q, c.w_R, c.integral)
         if done
         else nan,
-        "peak_torque": np.abs(torques).max() if some else nan,
+        "peak_torque": float(np.abs(torques).max()) if some else nan,
         "peak_torque_applied": recorder.peak_applied if some else nan,
-        "rms_torque": np.sqrt(np.mean(torques**2)) if some else nan,
+        "rms_torque": float(np.sqrt(np.mean(torques**2))) if some else nan,
         "torque_variation": metrics.total_variation(torques) if some else nan,
-        "peak_error": metrics.peak_error(error, experiment.scale) if len(error) else [nan] * 6,
+        "peak_error": peaks,
         "delay_floor": _floor(experiment, time, reference),
         "controller_step_ms": {
-            "median": 1e3 * np.median(seconds) if some else nan,
-            "worst": 1e3 * seconds.max() if some else nan,
+            "median": float(1e3 * np.median(seconds)) if some else nan,
+            "worst": float(1e3 * seconds.max()) if some else nan,
         },
         "wall_s": wall,
         "backend": backend().name,
@@ -197,6 +199,8 @@ def summarize(
         "own": experiment.own.names,
         "scenario": dataclasses.asdict(sc),
         "versions": versions(),
+        "controller_margin": None if margin is None else margin.summary,
+        "warnings": [],
     }
 
 

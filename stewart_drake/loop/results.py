@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import xarray as xr
 
@@ -11,6 +11,73 @@ from stewart_drake.files.arrayio import write_netcdf
 from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.scenario.config import Scenario
+
+
+class StepTimes(TypedDict):
+    """Computing time of the controller's step, ms; NaN where there was none."""
+
+    median: float
+    worst: float
+
+
+class MarginSummary(TypedDict):
+    """Whether the loop is stable, linearised along the reference, and what it bears."""
+
+    stable: bool | None
+    """None where it could not be judged."""
+    spectral_radius: float
+    """The largest along the reference; errors grow with it per period where it is above 1."""
+    delay_margin_s: list[float]
+    """By which the true delay may be shorter, and longer, s."""
+    gain_margin: list[float]
+    """Factors by which the motors may be weaker, and stronger."""
+    growth: float
+    """Of an error of the prediction within the delay, e^(p eta), a factor."""
+
+
+class RunSummary(TypedDict):
+    """How a run went: what its `summary.json` holds, with null for NaN.
+
+    NaN where a run that did not complete has no value.
+    """
+
+    status: str
+    """`completed`, `left_workspace`, `solver_failed` or `interrupted`."""
+    accumulated_error: float
+    """E_ac in % s, equation (47)."""
+    failure: dict[str, Any] | None
+    """What stopped it: `time` in s, `leg`, `margin`, `reason`."""
+    cost: float
+    """Equation (40) on the samples, of the torques that the limit let through."""
+    peak_torque: float
+    """Largest that the law asked for, N m."""
+    peak_torque_applied: float
+    """Largest that acted, N m."""
+    rms_torque: float
+    """Of what the law asked for, over all motors, N m."""
+    torque_variation: float
+    """Mean over the motors of sum |T_{k+1} - T_k| of the same, N m."""
+    peak_error: list[float]
+    """(6,) of the pose, % of peak to peak."""
+    delay_floor: float
+    """E_ac in % s that a plate at rest collects before any torque acts; 0 where it is not."""
+    controller_step_ms: StepTimes
+    wall_s: float
+    """Time that the run took, s."""
+    backend: str
+    """What ran the dynamics: `native`, or `casadi`, its virtual machine."""
+    counts: dict[str, int]
+    """What went wrong and was survived, by name (`law.memory.Counts`, `tuner_fallbacks`)."""
+    own: dict[str, str]
+    """The user's own systems in the loop, by their part in it."""
+    scenario: dict[str, Any]
+    """As run."""
+    versions: dict[str, str]
+    """What the numbers depend on beside the scenario."""
+    controller_margin: MarginSummary | None
+    """None where it was not asked for."""
+    warnings: list[str]
+    """What the user should know of this run, a sentence each."""
 
 
 @dataclass(frozen=True)
@@ -27,16 +94,14 @@ class SimulationResult:
             limit, late), weights, parameters and parameter_std (estimated), density (45),
             measurement and state_estimate (12, as the controller has them). Held signals show the
             value from that instant on. Units, long names, the scenario and versions are attributes.
-        summary: what `summary.json` holds: of commanded torques `peak_torque`, `rms_torque` and
-            `torque_variation`, of applied ones `peak_torque_applied`; `cost` counts what the limit
-            let through.
+        summary: what `summary.json` holds.
     """
 
     scenario: Scenario
     status: str
     stopped: Failure | None
     signals: xr.Dataset
-    summary: dict[str, Any]
+    summary: RunSummary
 
     def __repr__(self) -> str:
         status = self.status if self.stopped is None else f"{self.status}: {self.stopped}"
@@ -45,7 +110,7 @@ class SimulationResult:
     @property
     def accumulated_error(self) -> float:
         """E_ac in % s, equation (47); NaN for a run that did not complete."""
-        return float(self.summary["accumulated_error"])
+        return self.summary["accumulated_error"]
 
     @property
     def failure(self) -> str | None:

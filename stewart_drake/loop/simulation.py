@@ -143,8 +143,7 @@ def _run(
         if live is not None:
             live.close()
         let_go(loop, experiment.own.instances, tuple(experiment.own.systems.values()))
-    summary = summarize(experiment, recorder, status, stopped, wall)
-    summary["controller_margin"] = None if margin is None else margin.summary
+    summary = summarize(experiment, recorder, status, stopped, wall, margin)
     summary["warnings"] = cautions_before(experiment, margin) + cautions_after(experiment, summary)
     return SimulationResult(
         scenario=scenario,

@@ -1,6 +1,6 @@
 """Figures of the Hautus and delay analyses; limits are drawn, and grey print tells lines apart."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -9,7 +9,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from stewart_drake.report.style import DATA_INK, DATA_PAPER, Line, figure_style
+from stewart_drake.report.style import (
+    DATA_INK,
+    DATA_PAPER,
+    WIDTH,
+    Line,
+    figure_style,
+    legend_above,
+    limit,
+    panels,
+)
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.studies.delay_limits import DelayStudy
 from stewart_drake.studies.delay_map import Cell
@@ -21,8 +30,6 @@ Array = NDArray[np.float64]
 BLUE: Final = Line("#0072B2", "-", 1.5)
 ORANGE: Final = Line("#D55E00", (0, (5, 1.6)), 1.5)
 BLACK: Final = Line("#000000", (0, (1.2, 1.2)), 1.6)
-LIMIT: Final = Line("#8A2B0B", "-", 0.9)
-"""A limit that something must stay on one side of."""
 _FAMILIES: Final = {
     "minimal chain": (BLUE, "o"),
     "paper's chain": (ORANGE, "s"),
@@ -30,146 +37,130 @@ _FAMILIES: Final = {
 }
 _SMALLEST: Final = 1e-18
 """Margins below are drawn here: they are rounding."""
-_WIDTH: Final = 9.0
-"""Inches."""
 
 
+@figure_style()
 def chain_figure(study: HautusStudy) -> Figure:
     """Margins of the delay chains over the delay, against the tolerance."""
-    with figure_style():
-        figure, axes = _panels(2, 3.4)
-        for ax, word, title in zip(
-            axes,
-            ("controllable", "observable"),
-            ("controllability", "observability"),
-            strict=True,
-        ):
-            for name, (line, marker) in _FAMILIES.items():
-                _margins(ax, study.family(name), word, name, line, marker)
-            _limit(ax, study.systems[0].reach.tolerance, "tolerance")
-            ax.set(xlabel="delay μ  [periods]", ylabel=f"margin of {title}", yscale="log")
-        _envelope(axes[0], study)
-        _legend_above(figure, axes[0])
-        return figure
+    lines = {
+        name: ([s.steps or 0 for s in study.family(name)], study.family(name), *look)
+        for name, look in _FAMILIES.items()
+    }
+    figure, axes = _margins(study, lines, "delay μ  [periods]", 3.4)
+    _envelope(axes[0], study)
+    return legend_above(figure, axes[0])
 
 
+@figure_style()
 def plant_figure(study: HautusStudy) -> Figure:
     """Margins of the plant held still along the reference."""
-    with figure_style():
-        figure, axes = _panels(2, 3.2)
-        plants = [system for system in study.family("plant") if system.time is not None]
-        for ax, word, title in zip(
-            axes,
-            ("controllable", "observable"),
-            ("controllability", "observability"),
-            strict=True,
-        ):
-            for where, line, marker in (("without", BLUE, "o"), ("under", BLACK, "^")):
-                some = [system for system in plants if f"plant {where} gravity" in system.name]
-                values = [system.margins[word] for system in some]
-                times = [system.time or 0.0 for system in some]
-                label = f"{where} gravity"
-                ax.plot(times, values, marker=marker, ms=4, label=label, **line._asdict())
-            _limit(ax, study.systems[0].reach.tolerance, "tolerance")
-            ax.set(xlabel="time on the reference  [s]", ylabel=f"margin of {title}", yscale="log")
-        _legend_above(figure, axes[0])
-        return figure
+    lines = {}
+    for where, line, marker in (("without", BLUE, "o"), ("under", BLACK, "^")):
+        some = [
+            s
+            for s in study.family("plant")
+            if f"plant {where} gravity" in s.name and s.time is not None
+        ]
+        lines[f"{where} gravity"] = ([s.time or 0.0 for s in some], some, line, marker)
+    figure, axes = _margins(study, lines, "time on the reference  [s]", 3.2)
+    return legend_above(figure, axes[0])
 
 
+def _margins(
+    study: HautusStudy,
+    lines: Mapping[str, tuple[Sequence[float], Sequence[System], Line, str]],
+    over: str,
+    height: float,
+) -> tuple[Figure, list[Axes]]:
+    """Margins of controllability and observability, against the tolerance."""
+    figure, axes = panels(2, height)
+    titles = {"controllable": "controllability", "observable": "observability"}
+    for ax, (word, title) in zip(axes, titles.items(), strict=True):
+        for label, (x, systems, line, marker) in lines.items():
+            values = np.maximum([system.margins[word] for system in systems], _SMALLEST)
+            ax.plot(x, values, marker=marker, ms=3.5, label=label, **line._asdict())
+        tolerance = study.systems[0].reach.tolerance
+        limit(ax, tolerance, f"tolerance {tolerance:g}")
+        ax.set(xlabel=over, ylabel=f"margin of {title}", yscale="log")
+    return figure, axes
+
+
+@figure_style()
 def growth_figure(study: DelayStudy) -> Figure:
     """The fastest pole along the reference, and what it makes of an error over a delay."""
-    with figure_style():
-        figure, (left, right) = _panels(2, 3.2)
-        time = [point.time for point in study.poles]
-        left.plot(time, [p.moving for p in study.poles], label="in motion", **BLUE._asdict())
-        left.plot(time, [p.held for p in study.poles], label="held still", **ORANGE._asdict())
-        left.set(xlabel="time on the reference  [s]", ylabel="fastest unstable pole p  [1/s]")
-        left.set_ylim(bottom=0)
-        left.legend(loc="best")
-        pole = max(point.moving for point in study.poles)
-        longest = max(2.5 * study.eta, 0.1)
-        delay = np.linspace(0, longest, 200)
-        decades = np.minimum(pole * delay / np.log(10), 30)
-        right.plot(delay, 10**decades, **BLUE._asdict())
-        for level, word in ((HARDLY, "hardly beatable above"), (NO, "not beatable above")):
-            _limit(right, level, word)
-        right.axvline(study.eta, color="#666666", lw=1, ls=":")
-        right.set(
-            xlabel="delay η  [s]", ylabel="growth $e^{pη}$ at the worst instant", yscale="log"
-        )
-        right.set(xlim=(0, longest), ylim=(0.7, max(1e4, 3 * 10 ** decades.max())))
-        x = study.eta + 0.02 * longest
-        right.text(x, 1.0, f"this delay, {study.eta:.3g} s", color="#444444", fontsize=8)
-        return figure
+    figure, (left, right) = panels(2, 3.2)
+    time = [point.time for point in study.poles]
+    left.plot(time, [p.moving for p in study.poles], label="in motion", **BLUE._asdict())
+    left.plot(time, [p.held for p in study.poles], label="held still", **ORANGE._asdict())
+    left.set(xlabel="time on the reference  [s]", ylabel="fastest unstable pole p  [1/s]")
+    left.set_ylim(bottom=0)
+    left.legend(loc="best")
+    pole = max(point.moving for point in study.poles)
+    longest = max(2.5 * study.eta, 0.1)
+    delay = np.linspace(0, longest, 200)
+    decades = np.minimum(pole * delay / np.log(10), 30)
+    right.plot(delay, 10**decades, **BLUE._asdict())
+    for level, word in ((HARDLY, "hardly beatable above"), (NO, "not beatable above")):
+        limit(right, level, f"{word} {level:g}")
+    right.axvline(study.eta, color="#666666", lw=1, ls=":")
+    right.set(xlabel="delay η  [s]", ylabel="growth $e^{pη}$ at the worst instant", yscale="log")
+    right.set(xlim=(0, longest), ylim=(0.7, max(1e4, 3 * 10 ** decades.max())))
+    x = study.eta + 0.02 * longest
+    right.text(x, 1.0, f"this delay, {study.eta:.3g} s", color="#444444", fontsize=8)
+    return figure
 
 
+@figure_style()
 def loop_figure(study: DelayStudy) -> Figure:
     """Peaks of S and T, and what the loop bears of wrong gains and delays, over the delay."""
-    with figure_style():
-        figure, axes = _panels(3, 3.2)
-        loops = [loop for loop in study.loops if loop.radius < 1]
-        steps = [loop.steps for loop in loops]
-        bare = [100 * min(m.gain_up - 1, 1 - m.gain_down) for m in loops]
-        single = [
-            100 * min(m.motor.gain_up - 1, 1 - m.motor.gain_down) if m.motor else np.nan
-            for m in loops
-        ]
-        curves: tuple[tuple[Axes, str, list[tuple[str, list[float], Line, str]]], ...] = (
-            (
-                axes[0],
-                "peak over all frequencies",
-                [
-                    ("S", [m.S.value for m in loops], BLUE, "o"),
-                    ("T", [m.T.value for m in loops], ORANGE, "s"),
-                ],
-            ),
-            (
-                axes[1],
-                "tolerable error of the gain  [%]",
-                [("one motor", single, BLUE, "o"), ("all motors", bare, ORANGE, "s")],
-            ),
-            (
-                axes[2],
-                "tolerable error of the delay  [ms]",
-                [
-                    ("longer", [1e3 * m.later for m in loops], BLUE, "o"),
-                    ("shorter", [1e3 * m.earlier for m in loops], ORANGE, "s"),
-                ],
-            ),
-        )
-        own = study.basis.experiment.scenario.delay.steps
-        for ax, label, lines in curves:
-            for name, values, line, marker in lines:
-                ax.plot(steps, values, marker=marker, ms=3.5, label=name, **line._asdict())
-            ax.axvline(own, color="#666666", lw=1, ls=":")
-            ax.set(xlabel="delay μ  [periods]", ylabel=label, yscale="log")
-            ax.legend(loc="best")
-        return figure
+    figure, axes = panels(3, 3.2)
+    loops = [loop for loop in study.loops if loop.radius < 1]
+    steps = [loop.steps for loop in loops]
+    bare = [100 * min(m.gain_up - 1, 1 - m.gain_down) for m in loops]
+    single = [
+        100 * min(m.motor.gain_up - 1, 1 - m.motor.gain_down) if m.motor else np.nan for m in loops
+    ]
+    curves: dict[str, dict[str, list[float]]] = {
+        "peak over all frequencies": {"S": [m.S.value for m in loops],
+                                      "T": [m.T.value for m in loops]},
+        "tolerable error of the gain  [%]": {"one motor": single, "all motors": bare},
+        "tolerable error of the delay  [ms]": {"longer": [1e3 * m.later for m in loops],
+                                               "shorter": [1e3 * m.earlier for m in loops]},
+    }  # fmt: skip
+    own = study.basis.experiment.scenario.delay.steps
+    looks = ((BLUE, "o"), (ORANGE, "s"))
+    for ax, (label, pair) in zip(axes, curves.items(), strict=True):
+        for (name, values), (line, marker) in zip(pair.items(), looks, strict=True):
+            ax.plot(steps, values, marker=marker, ms=3.5, label=name, **line._asdict())
+        ax.axvline(own, color="#666666", lw=1, ls=":")
+        ax.set(xlabel="delay μ  [periods]", ylabel=label, yscale="log")
+        ax.legend(loc="best")
+    return figure
 
 
+@figure_style()
 def map_figure(study: DelayStudy) -> Figure:
     """E_ac over delay and amplitude, with the floor that the delay alone sets under it."""
-    with figure_style():
-        steps = sorted({cell.steps for cell in study.cells})
-        factors = sorted({cell.factor for cell in study.cells})
-        figure = Figure(figsize=(_WIDTH, 1.2 + 0.75 * len(factors)), layout="constrained")
-        ax = figure.subplots()
-        for cell in study.cells:
-            x, y = steps.index(cell.steps), factors.index(cell.factor)
-            floor = study.floors[cell.steps] if study.floor_applies else 0.0
-            _draw_cell(ax, cell, x, y, floor)
-        period = study.basis.experiment.scenario.controller.period
-        fraction = study.basis.experiment.scenario.delay.fraction
-        ax.set_xticks(
-            range(len(steps)), [f"{Delay(s, fraction).eta(period):.3g} s\nμ = {s}" for s in steps]
-        )
-        ax.set_yticks(range(len(factors)), [f"{100 * factor:.0f} %" for factor in factors])
-        ax.set(xlim=(-0.5, len(steps) - 0.5), ylim=(-0.5, len(factors) - 0.5))
-        ax.set(xlabel="delay", ylabel="amplitude")
-        ax.grid(False)
-        ax.spines[:].set_visible(False)
-        ax.tick_params(length=0)
-        return figure
+    steps = sorted({cell.steps for cell in study.cells})
+    factors = sorted({cell.factor for cell in study.cells})
+    figure = Figure(figsize=(WIDTH, 1.2 + 0.75 * len(factors)), layout="constrained")
+    ax = figure.subplots()
+    for cell in study.cells:
+        x, y = steps.index(cell.steps), factors.index(cell.factor)
+        floor = study.floors[cell.steps] if study.floor_applies else 0.0
+        _draw_cell(ax, cell, x, y, floor)
+    period = study.basis.experiment.scenario.controller.period
+    fraction = study.basis.experiment.scenario.delay.fraction
+    ax.set_xticks(
+        range(len(steps)), [f"{Delay(s, fraction).eta(period):.3g} s\nμ = {s}" for s in steps]
+    )
+    ax.set_yticks(range(len(factors)), [f"{100 * factor:.0f} %" for factor in factors])
+    ax.set(xlim=(-0.5, len(steps) - 0.5), ylim=(-0.5, len(factors) - 0.5))
+    ax.set(xlabel="delay", ylabel="amplitude")
+    ax.grid(False)
+    ax.spines[:].set_visible(False)
+    ax.tick_params(length=0)
+    return figure
 
 
 def _draw_cell(ax: Axes, cell: Cell, x: int, y: int, floor: float) -> None:
@@ -198,19 +189,6 @@ def _draw_cell(ax: Axes, cell: Cell, x: int, y: int, floor: float) -> None:
     )
 
 
-def _panels(number: int, height: float) -> tuple[Figure, Sequence[Axes]]:
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
-    return figure, list(np.atleast_1d(figure.subplots(1, number)))
-
-
-def _margins(
-    ax: Axes, systems: Sequence[System], word: str, label: str, line: Line, marker: str
-) -> None:
-    steps = [system.steps or 0 for system in systems]
-    values = np.maximum([system.margins[word] for system in systems], _SMALLEST)
-    ax.plot(steps, values, marker=marker, ms=3, label=label, **line._asdict())
-
-
 def _envelope(ax: Axes, study: HautusStudy) -> None:
     """e^(-p eta) through the margin without delay: what the fastest mode leaves of it."""
     chains = study.family("chain under gravity")
@@ -222,24 +200,3 @@ def _envelope(ax: Axes, study: HautusStudy) -> None:
     steps = np.array([system.steps for system in chains], dtype=float)
     values = chains[0].margins["controllable"] * np.exp(-pole * period * steps)
     ax.plot(steps, values, color="#888888", lw=0.9, label="$e^{-pη}$, home under gravity")
-
-
-def _limit(ax: Axes, level: float, word: str) -> None:
-    ax.axhline(level, color=LIMIT.color, lw=LIMIT.linewidth)
-    ax.annotate(
-        f"{word} {level:g}",
-        (0.01, level),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, 2.5),
-        textcoords="offset points",
-        ha="left",
-        va="bottom",
-        fontsize=8,
-        color=LIMIT.color,
-        bbox={"fc": "white", "ec": "none", "pad": 0.6},  # a curve may pass behind it
-    )
-
-
-def _legend_above(figure: Figure, ax: Axes) -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))

@@ -2,35 +2,28 @@
 
 import dataclasses
 import html
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from matplotlib.figure import Figure
 from pydrake.geometry import Meshcat
 
-from stewart_drake.files.jsonio import write_json
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.report import delay_page, hautus_page, robustness_page, workspace_page
+from stewart_drake.report import report_document
+from stewart_drake.report.analyses import analyze
+from stewart_drake.report.answer import Answer, framed
 from stewart_drake.report.collect import collect
 from stewart_drake.report.figures import comparison_figures, draw_comparison, draw_run, run_figures
-from stewart_drake.report.page import Page, Picture, Provenance, write_page
+from stewart_drake.report.page import Provenance, source
 from stewart_drake.report.replay import replay as animate
 from stewart_drake.report.replay import replay_html, write_replay
-from stewart_drake.report.report_page import report_page, report_summary
-from stewart_drake.report.tables import comparison_table, run_table
+from stewart_drake.report.run_document import comparison_document, run_document
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.delay_limits import study_delay
-from stewart_drake.studies.hautus import study_hautus
-from stewart_drake.studies.robustness import study_robustness
-from stewart_drake.studies.uncertainty import Ranges
-from stewart_drake.studies.workspace import study_workspace
+from stewart_drake.studies.ranges import Ranges
 
 Results = SimulationResult | Mapping[str, SimulationResult]
 """Of `simulate`, or of `compare`."""
@@ -41,48 +34,13 @@ class Figures(dict[str, Figure]):
 
     def _repr_html_(self) -> str:
         pictures = (
-            f'<img src="{Picture(figure, name).source}" alt="{html.escape(name)}">'
+            f'<img src="{source(figure)}" alt="{html.escape(name)}">'
             for name, figure in self.items()
         )
         return "\n".join(pictures)
 
     def __repr__(self) -> str:
         return f"Figures({', '.join(self)})"
-
-
-@dataclass(frozen=True)
-class Answer:
-    """An analysis or a report; printed it is a table, in a notebook the page.
-
-    Attributes:
-        verdict: in a sentence.
-        summary: what `summary.json` holds.
-        page: that can be saved.
-        study: everything that was found.
-    """
-
-    verdict: str
-    summary: dict[str, Any] = field(repr=False)
-    page: Page = field(repr=False)
-    study: Any = field(repr=False)
-    _table: str = field(repr=False)
-
-    def __str__(self) -> str:
-        return self._table
-
-    def _repr_html_(self) -> str:
-        return _frame(self.page.html())
-
-    def save(self, directory: str | Path) -> Path:
-        """Write report.html and summary.json into a directory, which is made; the page's path.
-
-        Raises:
-            OSError: the directory cannot be written to.
-        """
-        folder = Path(directory)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "summary.json", self.summary)
-        return write_page(self.page, folder / "report.html")
 
 
 class Replay:
@@ -95,14 +53,14 @@ class Replay:
         return f"Replay({len(self.html) / 1e6:.1f} MB of HTML)"
 
     def _repr_html_(self) -> str:
-        return _frame(self.html)
+        return framed(self.html)
 
 
 def table(results: Results) -> str:
     """How a run or a comparison went, as at a terminal."""
     if isinstance(results, SimulationResult):
-        return run_table(results)
-    return comparison_table(results)
+        return run_document(results).plain()
+    return comparison_document(results).plain()
 
 
 def plot(results: Results, directory: str | Path | None = None) -> Figures:
@@ -174,9 +132,8 @@ def report(scenario: str | Path, settings: Iterable[str] = ()) -> Answer:
     if found.run is not None:
         film = replay_html(found.run, load_mechanism(found.scenario.mechanism), Path(scenario).stem)
     made = Provenance(f"sd.report({str(scenario)!r}, {list(settings)})")
-    page = report_page(found, Path(scenario).stem, made, film)
-    text = comparison_table(found.comparison) if found.comparison else page.verdict
-    return Answer(page.verdict, report_summary(found), page, found, text)
+    document = report_document.document(found, Path(scenario).stem, film)
+    return Answer(found, report_document.report_summary(found), document, made)
 
 
 def analyze_delay(scenario: Scenario | str | Path, simulations: bool = True) -> Answer:
@@ -189,9 +146,7 @@ def analyze_delay(scenario: Scenario | str | Path, simulations: bool = True) -> 
     Raises:
         ConfigError: bad input.
     """
-    study, made = _study(partial(study_delay, simulations=simulations), scenario, "delay")
-    page, text = delay_page.delay_page(study, made), delay_page.delay_table(study)
-    return Answer(page.verdict, study.summary, page, study, text)
+    return _analyze("delay", scenario, simulations=simulations)
 
 
 def analyze_robustness(
@@ -220,19 +175,18 @@ def analyze_robustness(
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     base = dataclasses.replace(loaded, plant=dataclasses.replace(loaded.plant, kind="exact"))
 
-    def study(into: str | Path) -> Any:
-        return study_robustness(base, into, ranges=ranges, runs=runs, seed=seed, limit=limit)
-
-    if directory is None:
-        with TemporaryDirectory() as scratch:
-            found = study(scratch)
-    else:
-        found = study(directory)
-    page = robustness_page.robustness_page(
-        found, Provenance(f"sd.analyze_robustness({loaded!r}, {runs})")
-    )
-    text = robustness_page.robustness_table(found)
-    return Answer(page.verdict, found.summary, page, found, text)
+    command = f"sd.analyze_robustness({loaded!r}, {runs})"
+    with TemporaryDirectory() as scratch:
+        return analyze(
+            "robustness",
+            base,
+            directory or scratch,
+            command=command,
+            ranges=ranges,
+            runs=runs,
+            seed=seed,
+            limit=limit,
+        )
 
 
 def analyze_hautus(scenario: Scenario | str | Path) -> Answer:
@@ -241,9 +195,7 @@ def analyze_hautus(scenario: Scenario | str | Path) -> Answer:
     Raises:
         ConfigError: bad input.
     """
-    study, made = _study(study_hautus, scenario, "hautus")
-    page, text = hautus_page.hautus_page(study, made), hautus_page.hautus_table(study)
-    return Answer(page.verdict, study.summary, page, study, text)
+    return _analyze("hautus", scenario)
 
 
 def analyze_workspace(scenario: Scenario | str | Path) -> Answer:
@@ -252,22 +204,9 @@ def analyze_workspace(scenario: Scenario | str | Path) -> Answer:
     Raises:
         ConfigError: bad input.
     """
-    study, made = _study(study_workspace, scenario, "workspace")
-    page = workspace_page.workspace_page(study, made)
-    text = workspace_page.workspace_table(study)
-    return Answer(page.verdict, study.summary, page, study, text)
+    return _analyze("workspace", scenario)
 
 
-def _study(
-    study: Callable[[Scenario], Any], scenario: Scenario | str | Path, name: str
-) -> tuple[Any, Provenance]:
+def _analyze(name: str, scenario: Scenario | str | Path, **options: bool) -> Answer:
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-    return study(loaded), Provenance(f"sd.analyze_{name}({scenario!r})")
-
-
-def _frame(page: str) -> str:
-    """A page inside another one, where its scripts reach nothing outside."""
-    return (
-        f'<iframe srcdoc="{html.escape(page)}" sandbox="allow-scripts" '
-        'style="width: 100%; height: 600px; border: 0"></iframe>'
-    )
+    return analyze(name, loaded, command=f"sd.analyze_{name}({scenario!r})", **options)

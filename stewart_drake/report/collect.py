@@ -2,10 +2,10 @@
 
 import pickle
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
@@ -13,16 +13,13 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.loop.experiment import assemble, reference_failure
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.report import delay_page, hautus_page, workspace_page
+from stewart_drake.report.analyses import analyze
+from stewart_drake.report.answer import Answer
 from stewart_drake.report.figures import TORQUE_CONTROLLERS
-from stewart_drake.report.page import Page, Provenance, Tone
 from stewart_drake.scenario.config import AnnTunerConfig, Scenario
-from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.loading import load_comparison, load_scenario
 from stewart_drake.studies.compare import CONTROLLERS
-from stewart_drake.studies.delay_limits import study_delay
-from stewart_drake.studies.hautus import study_hautus
 from stewart_drake.studies.jobs import Job, run_jobs
-from stewart_drake.studies.workspace import study_workspace
 from stewart_drake.tuner.network import DEFAULT
 
 ANALYSES: Final = ("delay", "hautus", "workspace")
@@ -32,15 +29,6 @@ _TUNED: Final = "tuned-"
 
 Progress = Callable[[int, int], None]
 """Called with the number of finished pieces and of all pieces."""
-
-
-class Analysis(NamedTuple):
-    """An analysis: its answer, how good that is, its page, and what its summary.json holds."""
-
-    verdict: str
-    tone: Tone
-    page: Page
-    summary: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -53,7 +41,7 @@ class Collected:
         run: of the scenario as it stands; None with a `failure`.
         comparison: the shipped controllers on it, by name.
         tuned: those that know of the delay, with the tuner's weights; empty without a network.
-        analyses: by name, in the order of ANALYSES.
+        analyses: by name, in the order of ANALYSES; without their studies.
     """
 
     scenario: Scenario
@@ -61,7 +49,7 @@ class Collected:
     run: SimulationResult | None = None
     comparison: dict[str, SimulationResult] = field(default_factory=dict)
     tuned: dict[str, SimulationResult] = field(default_factory=dict)
-    analyses: dict[str, Analysis] = field(default_factory=dict)
+    analyses: dict[str, Answer] = field(default_factory=dict)
 
 
 def collect(
@@ -83,8 +71,10 @@ def collect(
     scenario = load_scenario(scenario_name, settings=settings)
     failure = reference_failure(assemble(scenario))
     scenarios: dict[str, Scenario] = {}
+    rows: set[str] = set()
     if failure is None:
-        scenarios = {name: load_scenario(scenario_name, name, settings) for name in CONTROLLERS}
+        scenarios = load_comparison(scenario_name, CONTROLLERS, settings)
+        rows = set(scenarios)
         if scenario not in scenarios.values():
             scenarios[_OWN] = scenario
         if has_network(scenario):
@@ -96,7 +86,7 @@ def collect(
         scenario=scenario,
         failure=failure,
         run=next((done[key] for key, sc in scenarios.items() if sc == scenario), None),
-        comparison={name: done[name] for name in CONTROLLERS if name in done},
+        comparison={name: done[name] for name in scenarios if name in rows},
         tuned={name: done[_TUNED + name] for name in TORQUE_CONTROLLERS if _TUNED + name in done},
         analyses={name: done[name] for name in ANALYSES},
     )
@@ -129,16 +119,7 @@ def _piece(what: str, scenario: Scenario) -> bytes:
     return pickle.dumps(simulate(scenario) if what == "simulate" else _analyse(what, scenario))
 
 
-def _analyse(name: str, scenario: Scenario) -> Analysis:
-    made = Provenance(f"stewart-drake analyze {name}")
-    if name == "delay":
-        delay = study_delay(scenario, simulations=False)
-        text, tone = delay_page.verdict(delay)
-        return Analysis(text, tone, delay_page.delay_page(delay, made), delay.summary)
-    if name == "hautus":
-        hautus = study_hautus(scenario)
-        text, tone = hautus_page.verdict(hautus)
-        return Analysis(text, tone, hautus_page.hautus_page(hautus, made), hautus.summary)
-    work = study_workspace(scenario)
-    page = workspace_page.workspace_page(work, made)
-    return Analysis(page.verdict, page.tone, page, work.summary)
+def _analyse(name: str, scenario: Scenario) -> Answer:
+    options = {"simulations": False} if name == "delay" else {}
+    found = analyze(name, scenario, command=f"stewart-drake analyze {name}", **options)
+    return replace(found, study=None)  # what no process can send

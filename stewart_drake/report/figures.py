@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.report import style
-from stewart_drake.report.style import figure_style, write_figure
+from stewart_drake.report.style import FACTORS, UNITS, figure_style, write_figures
 from stewart_drake.report.tuner_figures import shown_until, weights_figure
 from stewart_drake.scenario.config import FixedTunerConfig
 from stewart_drake.scenario.signals import ANGLES, COORDINATES, LEGS, PARAMETERS, POSITION
@@ -27,8 +27,6 @@ Array = NDArray[np.float64]
 TORQUE_CONTROLLERS: Final = ("delay_lqr", "delay_lqi", "predictor_lqi")
 """Those whose torques a comparison shows: they know of the delay."""
 
-_UNITS: Final = ("deg",) * 3 + ("mm",) * 3
-_FACTORS: Final = np.array([180 / np.pi] * 3 + [1e3] * 3)
 _SYMBOLS: Final = dict(zip(COORDINATES, ("roll φ", "pitch θ", "yaw ψ", "x", "y", "z"), strict=True))
 _PARAMETER_UNITS: Final = ("mN m",) * 6 + ("kg", "mN m s/rad")
 _PARAMETER_FACTORS: Final = np.array([1e3] * 6 + [1.0, 1e3])
@@ -63,8 +61,7 @@ def comparison_figures(
     Raises:
         OSError: the directory cannot be written to.
     """
-    with figure_style():
-        return _write(draw_comparison(results), directory)
+    return write_figures(draw_comparison(results), directory)
 
 
 def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure]:
@@ -101,8 +98,7 @@ def run_figures(result: SimulationResult, directory: str | Path) -> list[Path]:
     Raises:
         OSError: the directory cannot be written to.
     """
-    with figure_style():
-        return _write(draw_run(result), directory)
+    return write_figures(draw_run(result), directory)
 
 
 def draw_run(result: SimulationResult) -> dict[str, Figure]:
@@ -125,39 +121,31 @@ def _is_tuned(run: SimulationResult) -> bool:
     return not isinstance(run.scenario.tuner, FixedTunerConfig)
 
 
-def _write(figures: Mapping[str, Figure], directory: str | Path) -> list[Path]:
-    return [
-        path
-        for name, figure in figures.items()
-        for path in write_figure(figure, Path(directory), name)
-    ]
-
-
 def _states(runs: Mapping[str, SimulationResult], lines: Mapping[str, style.Line]) -> Figure:
     figure, axes = _grid(runs.values())
     wanted = max((run.signals for run in runs.values()), key=lambda s: s.sizes["time"])
-    spans = _FACTORS * np.array([_span(values) for values in wanted.reference.values.T])
+    spans = FACTORS * np.array([_span(values) for values in wanted.reference.values.T])
     least = _LEAST_SPAN * np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
     for k, ax in enumerate(axes):
-        reference = _FACTORS[k] * wanted.reference.values[:, k]
+        reference = FACTORS[k] * wanted.reference.values[:, k]
         ax.plot(wanted.time.values, reference, label="reference", **style.REFERENCE._asdict())
-        data = {label: _FACTORS[k] * run.signals.pose.values[:, k] for label, run in runs.items()}
+        data = {label: FACTORS[k] * run.signals.pose.values[:, k] for label, run in runs.items()}
         _limit(ax, [reference, *_trusted(runs, data)], data, _STATE_REACH * spans[k], least[k])
         _plot(ax, runs, lines, data)
-        ax.set_ylabel(f"{_SYMBOLS[COORDINATES[k]]}  [{_UNITS[k]}]")
+        ax.set_ylabel(f"{_SYMBOLS[COORDINATES[k]]}  [{UNITS[k]}]")
     return _with_legend(figure, axes)
 
 
 def _errors(runs: Mapping[str, SimulationResult], lines: Mapping[str, style.Line]) -> Figure:
     figure, axes = _grid(runs.values())
     for k, ax in enumerate(axes):
-        data = {label: _FACTORS[k] * run.signals.error.values[:, k] for label, run in runs.items()}
-        motion = _FACTORS[k] * max(
+        data = {label: FACTORS[k] * run.signals.error.values[:, k] for label, run in runs.items()}
+        motion = FACTORS[k] * max(
             (_span(run.signals.reference.values[:, k]) for run in runs.values()), default=0.0
         )
         _limit(ax, _trusted(runs, data), data, _ERROR_REACH * motion)
         _plot(ax, runs, lines, data)
-        ax.set_ylabel(f"{_SYMBOLS[COORDINATES[k]]} error  [{_UNITS[k]}]")
+        ax.set_ylabel(f"{_SYMBOLS[COORDINATES[k]]} error  [{UNITS[k]}]")
     return _with_legend(figure, axes)
 
 

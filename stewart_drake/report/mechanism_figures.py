@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.report.style import Line, figure_style, write_figure
+from stewart_drake.report.style import Line, figure_style, write_figures
 from stewart_drake.scenario.signals import LEGS
 
 Array = NDArray[np.float64]
@@ -59,9 +59,7 @@ def write_mechanism_figure(mechanism: Mechanism, directory: Path) -> list[Path]:
     Raises:
         OSError: the directory cannot be written to.
     """
-    figure = mechanism_figure(mechanism)
-    with figure_style():
-        return write_figure(figure, directory, "mechanism")
+    return write_figures({"mechanism": mechanism_figure(mechanism)}, directory)
 
 
 def _view(ax: Axes, points: dict[str, Array], axes: tuple[int, int], centre: Array) -> None:

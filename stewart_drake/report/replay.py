@@ -18,7 +18,7 @@ from stewart_drake.loop.scene import TORQUE_COLORS, Scene, crank_paths, full_col
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.report.page import environment
-from stewart_drake.report.tables import number
+from stewart_drake.report.words import number
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
 
 if TYPE_CHECKING:

@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 
 from stewart_drake.report.style import (
     BAND_ALPHA,
+    LIMIT,
     RUN,
     TRUTH,
-    Line,
+    WIDTH,
     figure_style,
+    legend_above,
+    limit,
+    panels,
     plain_log_ticks,
 )
 from stewart_drake.studies.robustness_result import (
@@ -39,12 +43,9 @@ TITLES: Final = {
 }
 SIGNIFICANT: Final = 0.05
 """Adjusted p-value below which an influence counts as found."""
-LIMIT: Final = Line("#8A2B0B", "-", 0.9)
 _SOFT: Final = "#666666"
 # Of many points, which are a bitmap that a dark page cannot change: readable on both.
 _SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
-_WIDTH: Final = 9.0
-"""Inches."""
 
 
 def title(factor: str) -> str:
@@ -53,101 +54,88 @@ def title(factor: str) -> str:
     return f"|{name}|" if factor.startswith("|") else name
 
 
+@figure_style()
 def distribution_figure(study: RobustnessStudy) -> Figure:
     """Share of all runs with E_ac at most so large, with its interval point by point."""
-    with figure_style():
-        figure, (ax,) = _panels(1, 3.4)
-        errors, number = np.sort(study.errors[np.isfinite(study.errors)]), len(study.outcomes)
-        counts = np.arange(1, len(errors) + 1)
-        bounds = [wilson_interval(int(n), number) for n in counts]
-        low, high = ([100 * getattr(b, end) for b in bounds] for end in ("low", "high"))
-        label = "95 % interval"
-        ax.fill_between(errors, low, high, step="post", color=RUN.color, alpha=BAND_ALPHA, lw=0,
-                        label=label)  # fmt: skip
-        ax.step(errors, 100 * counts / number, where="post", label="all runs", **RUN._asdict())
-        if len(errors) < number:
-            share = 100 * len(errors) / number
-            ax.axhline(share, color=LIMIT.color, lw=LIMIT.linewidth)
-            text = f"{number - len(errors)} of {number} runs did not complete"
-            below = share > 50  # where there is room for the words
-            ax.annotate(text, (0.01, share), xycoords=("axes fraction", "data"), fontsize=8,
-                        xytext=(0, -4 if below else 4), textcoords="offset points",
-                        va="top" if below else "bottom", color=LIMIT.color, zorder=5,
-                        bbox={"fc": "white", "ec": "none", "pad": 0.6})  # fmt: skip
-        if np.isfinite(study.undisturbed.error):
-            ax.axvline(study.undisturbed.error, label="undisturbed run", **TRUTH._asdict())
-        if study.limit is not None:
-            ax.axvline(study.limit, color=LIMIT.color, ls=":", label="limit")
-        ax.set(xscale="log", ylim=(0, 103))
-        plain_log_ticks(ax.xaxis)
-        ax.set(xlabel="accumulated error E_ac  [% s]", ylabel="share of all runs  [%]")
-        figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
-        return figure
+    figure, (ax,) = panels(1, 3.4)
+    errors, number = np.sort(study.errors[np.isfinite(study.errors)]), len(study.outcomes)
+    counts = np.arange(1, len(errors) + 1)
+    bounds = [wilson_interval(int(n), number) for n in counts]
+    low, high = ([100 * getattr(b, end) for b in bounds] for end in ("low", "high"))
+    label = "95 % interval"
+    ax.fill_between(errors, low, high, step="post", color=RUN.color, alpha=BAND_ALPHA, lw=0,
+                    label=label)  # fmt: skip
+    ax.step(errors, 100 * counts / number, where="post", label="all runs", **RUN._asdict())
+    if len(errors) < number:
+        share = 100 * len(errors) / number
+        text = f"{number - len(errors)} of {number} runs did not complete"
+        limit(ax, share, text, below=share > 50)  # where there is room for the words
+    if np.isfinite(study.undisturbed.error):
+        ax.axvline(study.undisturbed.error, label="undisturbed run", **TRUTH._asdict())
+    if study.limit is not None:
+        ax.axvline(study.limit, color=LIMIT.color, ls=":", label="limit")
+    ax.set(xscale="log", ylim=(0, 103))
+    plain_log_ticks(ax.xaxis)
+    ax.set(xlabel="accumulated error E_ac  [% s]", ylabel="share of all runs  [%]")
+    return legend_above(figure, ax)
 
 
+@figure_style()
 def influence_figure(influences: Sequence[Influence]) -> Figure:
     """Rank correlations with their intervals; hollow where chance explains them."""
-    with figure_style():
-        figure, axes = _panels(2, 1.2 + 0.27 * len(influences), sharey=True)
-        names = [title(one.factor) for one in influences]
-        errors = [(one.error, one.error_p) for one in influences]
-        failures = [(one.failure, one.failure_p) for one in influences]
-        _dots(axes[0], errors, "rank correlation with E_ac, completed runs")
-        _dots(axes[1], failures, "rank correlation with failing, all runs")
-        axes[0].set_yticks(range(len(names)), names)
-        axes[0].set_ylim(len(names) - 0.5, -0.5)
-        return figure
+    figure, axes = panels(2, 1.2 + 0.27 * len(influences), sharey=True)
+    names = [title(one.factor) for one in influences]
+    errors = [(one.error, one.error_p) for one in influences]
+    failures = [(one.failure, one.failure_p) for one in influences]
+    _dots(axes[0], errors, "rank correlation with E_ac, completed runs")
+    _dots(axes[1], failures, "rank correlation with failing, all runs")
+    axes[0].set_yticks(range(len(names)), names)
+    axes[0].set_ylim(len(names) - 0.5, -0.5)
+    return figure
 
 
+@figure_style()
 def runs_figure(study: RobustnessStudy) -> Figure:
     """E_ac of every run over every drawn quantity, failures in a strip of their own on top."""
-    with figure_style():
-        figure = Figure(figsize=(_WIDTH, 5.2), layout="constrained")
-        axes = figure.subplots(2, 4, sharey=True)
-        values, done = factor_values(study.draws), np.isfinite(study.errors)
-        for ax, (name, unit) in zip(axes.ravel(), FACTORS.items(), strict=True):
-            x = values[name]
-            kept = done & ~study.failed
-            _scatter(ax, x[kept], study.errors[kept], "o", _SUCCESS, "success")
-            above = done & study.failed
-            if above.any():
-                _scatter(ax, x[above], study.errors[above], "s", _ABOVE, "above the limit")
-            ax.set(yscale="log", xlabel=f"{TITLES[name]}  [{unit}]")
-            if not np.isfinite(x).all():
-                ax.text(0.5, 0.5, "none", transform=ax.transAxes, ha="center", color=_SOFT)
-        low, high = _log_range(study.errors[done])
-        strip = high * (high / low) ** 0.06
-        top = high * (high / low) ** 0.18
-        for ax, name in zip(axes.ravel(), FACTORS, strict=True):
-            ax.set_ylim(low, top)
-            ax.axhspan(strip, top, color="#F1EAE6", zorder=0)
-            # Spread over the strip by the number of the run, so that marks do not hide each other.
-            spread = (np.arange(len(done)) * 0.618034) % 1 * 0.8 + 0.1
-            y = strip * (top / strip) ** spread[~done]
-            _scatter(ax, values[name][~done], y, "x", _FAILED, "did not complete")
-        plain_log_ticks(axes[0, 0].yaxis)  # which all share
-        for ax in axes[:, 0]:
-            ax.set_ylabel("E_ac  [% s]")
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
-        return figure
+    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
+    axes = figure.subplots(2, 4, sharey=True)
+    values, done = factor_values(study.draws), np.isfinite(study.errors)
+    for ax, (name, unit) in zip(axes.ravel(), FACTORS.items(), strict=True):
+        x = values[name]
+        kept = done & ~study.failed
+        _scatter(ax, x[kept], study.errors[kept], "o", _SUCCESS, "success")
+        above = done & study.failed
+        if above.any():
+            _scatter(ax, x[above], study.errors[above], "s", _ABOVE, "above the limit")
+        ax.set(yscale="log", xlabel=f"{TITLES[name]}  [{unit}]")
+        if not np.isfinite(x).all():
+            ax.text(0.5, 0.5, "none", transform=ax.transAxes, ha="center", color=_SOFT)
+    low, high = _log_range(study.errors[done])
+    strip = high * (high / low) ** 0.06
+    top = high * (high / low) ** 0.18
+    for ax, name in zip(axes.ravel(), FACTORS, strict=True):
+        ax.set_ylim(low, top)
+        ax.axhspan(strip, top, color="#F1EAE6", zorder=0)
+        # Spread over the strip by the number of the run, so that marks do not hide each other.
+        spread = (np.arange(len(done)) * 0.618034) % 1 * 0.8 + 0.1
+        y = strip * (top / strip) ** spread[~done]
+        _scatter(ax, values[name][~done], y, "x", _FAILED, "did not complete")
+    plain_log_ticks(axes[0, 0].yaxis)  # which all share
+    for ax in axes[:, 0]:
+        ax.set_ylabel("E_ac  [% s]")
+    return legend_above(figure, axes[0, 0])
 
 
+@figure_style()
 def times_figure(study: RobustnessStudy) -> Figure:
     """When runs ended early."""
-    with figure_style():
-        figure, (ax,) = _panels(1, 2.2)
-        times = [one.time for one in study.outcomes if one.status != "completed"]
-        end = study.experiment.scenario.duration
-        ax.hist(times, bins=np.linspace(0, end, 41).tolist(), color=RUN.color, ec="white", lw=0.5)
-        ax.set(xlim=(0, end), xlabel="time at which a run ended early  [s]", ylabel="runs")
-        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-        return figure
-
-
-def _panels(number: int, height: float, sharey: bool = False) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
-    return figure, list(np.atleast_1d(figure.subplots(1, number, sharey=sharey)))
+    figure, (ax,) = panels(1, 2.2)
+    times = [one.time for one in study.outcomes if one.status != "completed"]
+    end = study.experiment.scenario.duration
+    ax.hist(times, bins=np.linspace(0, end, 41).tolist(), color=RUN.color, ec="white", lw=0.5)
+    ax.set(xlim=(0, end), xlabel="time at which a run ended early  [s]", ylabel="runs")
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    return figure
 
 
 def _dots(ax: Axes, found: Sequence[tuple[Correlation, float]], label: str) -> None:

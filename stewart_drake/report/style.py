@@ -1,11 +1,13 @@
 """How every figure looks: one line per controller, also told apart in grey print, light or dark."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
@@ -35,6 +37,13 @@ RUN: Final = Line("#0072B2", "-", 1.5)
 """A single run."""
 COMMANDED: Final = Line("#D55E00", "--", 1.0)
 TRUTH: Final = Line("#D55E00", "--", 1.2)
+LIMIT: Final = Line("#8A2B0B", "-", 0.9)
+"""A limit that something must stay on one side of."""
+WIDTH: Final = 9.0
+"""Inches of the figures of a page."""
+UNITS: Final = ("deg",) * 3 + ("mm",) * 3
+FACTORS: Final = np.array([180 / np.pi] * 3 + [1e3] * 3)
+"""In which coordinates are shown, and what takes them there from rad and m."""
 BAND_ALPHA: Final = 0.2
 """Opacity of an uncertainty band, in the colour of its line."""
 
@@ -115,6 +124,51 @@ def plain_log_ticks(axis: Axis) -> None:
     axis.set_major_locator(_RoundTicks(subs=(1, 2, 5)))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def panels(number: int, height: float, sharey: bool = False) -> tuple[Figure, list[Axes]]:
+    """A row of axes, as wide as a page; height in inches."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    return figure, list(np.atleast_1d(figure.subplots(1, number, sharey=sharey)))
+
+
+def limit(ax: Axes, level: float, text: str, *, below: bool = False) -> None:
+    """A level that something must stay on one side of, with words on it."""
+    ax.axhline(level, color=LIMIT.color, lw=LIMIT.linewidth)
+    ax.annotate(
+        text,
+        (0.01, level),
+        xycoords=("axes fraction", "data"),
+        xytext=(0, -4 if below else 2.5),
+        textcoords="offset points",
+        ha="left",
+        va="top" if below else "bottom",
+        fontsize=8,
+        color=LIMIT.color,
+        bbox={"fc": "white", "ec": "none", "pad": 0.6},  # a curve may pass behind it
+        zorder=5,
+    )
+
+
+def legend_above(figure: Figure, ax: Axes) -> Figure:
+    """The figure with the lines of one of its axes named above all of them."""
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=max(1, len(labels)))
+    return figure
+
+
+def write_figures(figures: Mapping[str, Figure], directory: str | Path) -> list[Path]:
+    """Write every figure by its name as `write_figure` does; the paths written.
+
+    Raises:
+        OSError: the directory cannot be written to.
+    """
+    with figure_style():
+        return [
+            path
+            for name, figure in figures.items()
+            for path in write_figure(figure, Path(directory), name)
+        ]
 
 
 def write_figure(figure: Figure, directory: Path, name: str) -> list[Path]:

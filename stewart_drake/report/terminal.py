@@ -10,9 +10,12 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import typer
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
 
 _COLORS: Final = {
     "green": r"\bcompleted\b|(?<=beatable: )yes|(?<=loop is )stable",
@@ -53,36 +56,20 @@ def progress_bars(
     Yields:
         By name, a function of simulated time in s and current error in % of peak to peak.
     """
-    from tqdm import tqdm
-
     names, times = tuple(names), dict[str, float]()
-    bars = {
-        name: tqdm(
-            total=duration,
-            desc=name,
-            position=position,
-            leave=False,
-            disable=quiet or not _is_terminal(),
-            bar_format="{desc:<14}{bar} {n:6.2f} of {total:g} s{postfix}, {remaining} left",
-        )
-        for position, name in enumerate(names)
-    }
 
     def advance(name: str, time: float, error: float) -> None:
         times[name] = time
-        bars[name].set_postfix_str(f"error {error:7.3f} %", refresh=False)
-        bars[name].update(time - bars[name].n)
+        text = f"{time:6.2f} of {duration:g} s, error {error:7.3f} %"
+        bars.update(tasks[name], completed=time, state=_with_rest(text, bars, tasks[name]))
 
     def state() -> str:
         runs = ", ".join(f"{name} {times[name]:.1f}" for name in names if name in times)
         return f"{runs} of {duration:g} s" if runs else f"{', '.join(names)}: preparing"
 
-    try:
-        with _said_now_and_then(state, quiet):
-            yield {name: partial(advance, name) for name in names}
-    finally:
-        for bar in bars.values():
-            bar.close()
+    with _bars(quiet) as bars, _said_now_and_then(state, quiet):
+        tasks = {name: bars.add_task(name, total=duration, state="preparing") for name in names}
+        yield {name: partial(advance, name) for name in names}
 
 
 @contextmanager
@@ -99,30 +86,18 @@ def count_bar(
     Yields:
         A function of the number done and the number of all.
     """
-    from tqdm import tqdm
-
-    hidden = quiet or not _is_terminal()
-    count = _Count(first)
-    with tqdm(
-        total=1,
-        desc=name,
-        leave=False,
-        disable=hidden,
-        smoothing=0,  # workers end in bursts: the mean pace of all is the better guess
-        bar_format=f"{{desc:<14}}{first}",
-    ) as bar:
+    with _bars(quiet) as bars:
+        task = bars.add_task(name, total=None, state=first)
 
         def show(done: int, total: int) -> None:
-            if count.total != total:
-                bar.bar_format = "{desc:<14}{bar} {n_fmt} of {total_fmt}, {remaining} left"
+            if bars.tasks[0].total != total:
                 # What an earlier start has done says nothing of the pace, nor does the time before.
-                bar.total, bar.initial, bar.n, bar.last_print_n = total, done, done, done
-                bar.start_t = time.time()
-                bar.refresh()
-            count.set(done, total)
-            bar.update(done - bar.n)
+                bars.reset(task, total=total, completed=done)
+                bars.advance(task, 0)  # from here on
+            bars.update(task, completed=done)
+            bars.update(task, state=_with_rest(f"{done} of {total}", bars, task))
 
-        with _said_now_and_then(lambda: f"{name}: {count}", quiet):
+        with _said_now_and_then(lambda: f"{name}: {bars.tasks[0].fields['state']}", quiet):
             yield show
 
 
@@ -138,27 +113,29 @@ def working(name: str, quiet: bool) -> Iterator[None]:
         yield
 
 
-class _Count:
-    """How many of how many, and how long the rest will take at the pace so far."""
+def _bars(quiet: bool) -> "Progress":
+    """Bars with what the field `state` says; none where there is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
 
-    def __init__(self, first: str) -> None:
-        self._word = first
-        self.done = self.total = self._first = 0
-        self._start = time.monotonic()
+    return Progress(
+        TextColumn("{task.description:<13}"),
+        BarColumn(None),
+        TextColumn("{task.fields[state]}"),
+        console=Console(stderr=True, highlight=False),
+        expand=True,
+        transient=True,
+        redirect_stdout=False,
+        redirect_stderr=False,
+        speed_estimate_period=1e9,  # workers end in bursts: the mean pace of all is better
+        disable=quiet or not _is_terminal(),
+    )
 
-    def set(self, done: int, total: int) -> None:
-        if total != self.total:
-            self._first, self._start = done, time.monotonic()
-        self.done, self.total = done, total
 
-    def __str__(self) -> str:
-        if not self.total:
-            return self._word
-        text = f"{self.done} of {self.total}"
-        if self.done > self._first:
-            pace = (time.monotonic() - self._start) / (self.done - self._first)
-            text += f", about {_duration(pace * (self.total - self.done))} left"
-        return text
+def _with_rest(text: str, bars: "Progress", task: "TaskID") -> str:
+    """The text, and as far as that is known how long the rest of the task will take."""
+    left = next(one.time_remaining for one in bars.tasks if one.id == task)
+    return text if left is None else f"{text}, about {_duration(left)} left"
 
 
 @contextmanager
@@ -185,9 +162,10 @@ def _said_now_and_then(state: Callable[[], str], quiet: bool) -> Iterator[None]:
 
 
 def _is_terminal() -> bool:
-    """Whether stderr is one; it may also be closed."""
+    """Whether stderr is one that can draw; it may also be closed."""
     try:
-        return sys.stderr is not None and sys.stderr.isatty()
+        drawing = os.environ.get("TERM") not in ("dumb", "unknown")
+        return drawing and sys.stderr is not None and sys.stderr.isatty()
     except ValueError:
         return False
 

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from stewart_drake.report import style
-from stewart_drake.report.style import figure_style, write_figure
+from stewart_drake.report.style import figure_style, write_figures
 from stewart_drake.tuning.training import Training
 
 _TEST: Final = style.Line("#D55E00", "--", 1.5)
@@ -30,11 +30,7 @@ def training_figures(training: Training, directory: str | Path) -> list[Path]:
     """
     with figure_style():
         figures = {"training_curve": _curve(training), "regression": _regression(training)}
-        return [
-            path
-            for name, figure in figures.items()
-            for path in write_figure(figure, Path(directory), name)
-        ]
+    return write_figures(figures, directory)
 
 
 def _unit(training: Training) -> str:

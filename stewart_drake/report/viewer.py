@@ -15,6 +15,7 @@ from stewart_drake.loop.multibody import set_pose
 from stewart_drake.loop.multibody_stewart import build_viewer
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import rotation
+from stewart_drake.report.style import FACTORS
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.studies.workspace_map import travel
 
@@ -22,7 +23,6 @@ Array = NDArray[np.float64]
 
 SLIDERS: Final = ("roll [deg]", "pitch [deg]", "yaw [deg]", "x [mm]", "y [mm]", "z [mm]")
 STOP: Final = "Stop viewing"
-_FACTORS: Final = np.array([180 / np.pi] * 3 + [1e3] * 3)
 _BEYOND: Final = 1.25
 """Sliders go beyond the travel by this factor, so that one sees where it ends."""
 _NARROW: Final = 0.15
@@ -65,7 +65,7 @@ class Placement(NamedTuple):
 
 def place(mechanism: Mechanism, values: ArrayLike) -> Placement:
     """Slider values (6,) in degrees and mm as a pose, with its reach margins."""
-    pose = np.asarray(values, dtype=np.float64) / _FACTORS
+    pose = np.asarray(values, dtype=np.float64) / FACTORS
     return Placement(pose, mechanism.reach_margins(pose), diagnose(mechanism, 0.0, pose))
 
 
@@ -94,7 +94,7 @@ class PoseViewer:
         meshcat.AddButton(STOP, "Escape")
         self._deck = np.array([0.0, 0.0, mechanism.p_PQ[:, 2].mean() + 0.03 * rod])
         aim_camera(meshcat, mechanism)
-        home = _FACTORS * mechanism.home
+        home = FACTORS * mechanism.home
         for name, low, high, value in zip(SLIDERS, *slider_range(mechanism), home, strict=True):
             meshcat.AddSlider(name, low, high, 0.1, value)
         self.step(home)
@@ -177,5 +177,5 @@ def slider_range(mechanism: Mechanism) -> tuple[Array, Array]:
     if not spans:  # of a singular home pose
         rod = float(mechanism.rod_lengths.min())
         spans = [(-0.5, 0.5)] * 3 + [(-0.2 * rod, 0.2 * rod)] * 3
-    low, high = _FACTORS * (mechanism.home[:, None] + _BEYOND * np.array(spans)).T
+    low, high = FACTORS * (mechanism.home[:, None] + _BEYOND * np.array(spans)).T
     return np.floor(low), np.ceil(high)

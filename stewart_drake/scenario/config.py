@@ -256,6 +256,9 @@ class Scenario:
         """
         # Assignment is validated, but a list can also be changed in place.
         validate(Scenario, dataclasses.asdict(self), where)
+        for row, change in self.compare.items():
+            fields = {name: value for name, value in change.items() if name != "controller"}
+            validate(ControllerConfig, fields, f"{where}: compare.{row}")
         step = self.plant.time_step if self.plant.kind == "multibody" else None
         for problem in (
             self.reference.problem(),

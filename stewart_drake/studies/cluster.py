@@ -1,37 +1,36 @@
-"""A Dask cluster as the place where joblib runs its jobs."""
+"""A Dask cluster as the place where jobs run."""
 
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import CancelledError, Future
-from contextlib import contextmanager
-from typing import Any, Final
-
-import joblib
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, Final, TypeVar
 
 from stewart_drake.files.errors import ConfigError
 
 _CONNECT_TIMEOUT: Final = 10.0
-"""s to wait for a scheduler."""
+"""s to wait for a scheduler, and for a first worker of it."""
 _KEPT: Final = "what had finished is kept and the same command goes on from there"
+_T = TypeVar("_T")
 
 
-@contextmanager
-def dask_backend(scheduler: str) -> Iterator[None]:
-    """Make a Dask cluster the backend of joblib.
+def on_cluster(scheduler: str, calls: Sequence[Callable[[], _T]]) -> Generator[_T]:
+    """What calls return, as they finish; closing the iterator ends those in flight.
 
     Args:
         scheduler: its address, such as tcp://127.0.0.1:8786.
+        calls: of functions that its workers can import.
 
     Raises:
         ConfigError: no scheduler there; no workers, or workers that cannot be used.
-        ChildProcessError: in the context, workers died over one job, or the scheduler went away.
+        ChildProcessError: workers died over one call, or the scheduler went away.
     """
     try:
-        from distributed import Client, KilledWorker
+        from distributed import CancelledError, Client, KilledWorker, as_completed
     except ImportError:
         raise ConfigError(
             "--scheduler: needs the package distributed; install it with pip install distributed"
         ) from None
-    connect: Any = Client  # which has no annotations
+    untyped: Any = (Client, as_completed)
+    connect, in_turn = untyped
     try:
         client = connect(scheduler, timeout=_CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:
@@ -41,11 +40,13 @@ def dask_backend(scheduler: str) -> Iterator[None]:
             f"such as tcp://127.0.0.1:8786 ({reason})"
         ) from None
     with client:
+        with suppress(TimeoutError):
+            client.wait_for_workers(1, timeout=_CONNECT_TIMEOUT)
         _check_workers(scheduler, client.nthreads())
-        joblib.register_parallel_backend("stewart-drake-dask", _backend_class())
+        futures = [client.submit(call, pure=False) for call in calls]
         try:
-            with joblib.parallel_config(backend="stewart-drake-dask", client=client):
-                yield
+            for future in in_turn(futures, loop=client.loop):
+                yield future.result()
         except KilledWorker:
             raise ChildProcessError(
                 f"Dask gave up a job whose workers died one after the other; {_KEPT}"
@@ -68,38 +69,3 @@ def _check_workers(scheduler: str, threads: Mapping[str, int]) -> None:
             f"--scheduler: a worker of {scheduler} has {max(threads.values())} threads; expected "
             "workers with one thread each (dask worker --nthreads 1)"
         )
-
-
-def _backend_class() -> type:
-    from joblib._dask import DaskDistributedBackend
-
-    class Backend(DaskDistributedBackend):  # type: ignore[misc]
-        """joblib's own, but for two things.
-
-        It calls back for results only and would wait for ever for a job that Dask has given up; and
-        what has one worker joblib does not use at all, it runs the jobs in this process.
-        """
-
-        def effective_n_jobs(self, n_jobs: int) -> int:
-            return max(2, int(super().effective_n_jobs(n_jobs)))
-
-        def submit(
-            self, func: Callable[[], Any], callback: Callable[[Any], None] | None = None
-        ) -> Any:
-            future = super().submit(func, callback)
-
-            def tell(done: Future[Any]) -> None:
-                error = done.exception()
-                if error is not None and callback is not None:
-                    callback(error)
-
-            future.add_done_callback(tell)
-            return future
-
-        def retrieve_result_callback(self, out: Any) -> Any:
-            # A lost scheduler leaves its CancelledError as the result of every job.
-            if isinstance(out, BaseException):
-                raise out
-            return super().retrieve_result_callback(out)
-
-    return Backend

@@ -2,15 +2,13 @@
 
 import math
 import pickle
-import signal
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
-from multiprocessing import resource_tracker
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-import joblib
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import System
@@ -25,7 +23,9 @@ from stewart_drake.loop.own import OwnReference
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.loading import load_comparison, load_scenario
+from stewart_drake.scenario.reference_config import SineConfig
+from stewart_drake.studies.jobs import run_jobs
 
 CONTROLLERS: Final = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
 """Shipped names, in the order of tables and legends: the paper's four, and ours."""
@@ -78,14 +78,15 @@ def compare(
         reference, disturbance: for all runs, as of `simulate`.
 
     Returns:
-        Results by controller, in the order of CONTROLLERS, then your own.
+        Results by controller, in the order of CONTROLLERS, then the rows that the scenario's
+        `compare` adds, then your own.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
     """
     settings, controllers = tuple(settings), dict(controllers or {})
     _check_makers(controllers, reference, disturbance)
-    scenarios = {name: load_scenario(scenario_name, name, settings) for name in CONTROLLERS}
+    scenarios = load_comparison(scenario_name, CONTROLLERS, settings)
     scenarios |= {name: load_scenario(scenario_name, settings=settings) for name in controllers}
     given = {
         name: {
@@ -97,7 +98,15 @@ def compare(
     }
     with TemporaryDirectory() as folder, ThreadPoolExecutor(1) as thread:
         board = _Board(Path(folder) / "board", len(scenarios), new=True)
-        runs = thread.submit(_run_all, scenarios, given, board.path)
+        jobs = {
+            f"run{i}": (name, scenarios[name], given[name], board.path, i, len(scenarios))
+            for i, name in enumerate(scenarios)
+        }
+        # Ctrl-C reaches this thread alone, which tells the processes by the board.
+        run: Callable[..., dict[str, SimulationResult | None]] = run_jobs
+        runs = thread.submit(
+            run, jobs, _run, folder, settings={}, suffix=".pickle", read=_unpickled
+        )
         try:
             while not runs.done():
                 try:
@@ -110,7 +119,7 @@ def compare(
                     board.stop()
         finally:
             board.stop()
-        results = zip(scenarios, runs.result(), strict=True)
+        results = zip(scenarios, runs.result().values(), strict=True)
     return Comparison({name: result for name, result in results if result is not None})
 
 
@@ -139,12 +148,19 @@ def _check_makers(controllers: Mapping[str, Any], reference: Any, disturbance: A
             ) from None
 
 
-def is_papers(scenario: Scenario) -> bool:
-    """Whether the paper's numbers are about this scenario: its mechanism, motion and delay."""
-    own = Scenario()
+def is_papers(scenario: Scenario, *, any_size: bool = False) -> bool:
+    """Whether the paper's numbers are about this scenario: its mechanism, motion and delay.
+
+    With `any_size` the motion may be a multiple of the paper's: E_ac is relative to it.
+    """
+    own, motion = Scenario(), scenario.reference
+    if any_size and isinstance(motion, SineConfig) and isinstance(own.reference, SineConfig):
+        shares = np.divide(motion.amplitude, own.reference.amplitude)
+        if np.allclose(shares, shares[0], rtol=1e-6) and shares[0] > 0:
+            motion = replace(motion, amplitude=own.reference.amplitude)
     return (
         resolve("mechanism", scenario.mechanism) == resolve("mechanism", own.mechanism)
-        and scenario.reference == own.reference
+        and motion == own.reference
         and math.isclose(scenario.eta, PAPER_DELAY)
     )
 
@@ -190,25 +206,10 @@ class _Board:
         return self._rows[:-1, 0], self._rows[:-1, 1]
 
 
-def _run_all(
-    scenarios: dict[str, Scenario], given: dict[str, dict[str, Any]], board: Path
-) -> list[SimulationResult | None]:
-    # Ctrl-C is for the main thread, which tells the processes by the board: in the middle of an
-    # import it would break them. They inherit the mask of this thread; the resource tracker comes
-    # first, because some Pythons unblock the signal when they start it.
-    resource_tracker.ensure_running()
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    number = min(joblib.cpu_count(), len(scenarios))
-    jobs = (
-        joblib.delayed(_run)(name, scenario, given[name], board, run, len(scenarios))
-        for run, (name, scenario) in enumerate(scenarios.items())
-    )
-    return list(joblib.Parallel(n_jobs=number, backend="loky", batch_size=1)(jobs))
-
-
 def _run(
     name: str, scenario: Scenario, own: dict[str, Any], path: Path, run: int, runs: int
-) -> SimulationResult | None:
+) -> bytes:
+    """The run's result, pickled: None if it was stopped before, or why it is refused."""
     board = _Board(path, runs)
 
     def progress(time: float, error: float) -> None:
@@ -216,9 +217,15 @@ def _run(
         if board.stopped:
             raise KeyboardInterrupt
 
-    if board.stopped:
-        return None
     try:
-        return simulate(scenario, progress=progress, **own)
+        return pickle.dumps(None if board.stopped else simulate(scenario, progress=progress, **own))
     except ConfigError as error:
-        raise ConfigError(f"{name}: {error}") from None
+        return pickle.dumps(ConfigError(f"{name}: {error}"))
+
+
+def _unpickled(path: Path) -> SimulationResult | None:
+    # Written by our own workers a moment ago, into a folder that nobody else can write to.
+    result: SimulationResult | ConfigError | None = pickle.loads(path.read_bytes())
+    if isinstance(result, ConfigError):
+        raise result
+    return result

@@ -20,7 +20,8 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
-from stewart_drake.studies.delay_map import Cell, Progress, delay_map, map_delays
+from stewart_drake.studies.delay_map import Cell, delay_map, map_delays
+from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.verdict import Verdict, pole_in_motion
 
 Array = NDArray[np.float64]

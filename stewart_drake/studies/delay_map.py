@@ -1,28 +1,21 @@
 """What is achieved at other delays and amplitudes: a scenario simulated over a grid of both."""
 
-import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import singledispatch
 from tempfile import TemporaryDirectory
 from typing import Final, NamedTuple
 
-from stewart_drake.files.jsonio import jsonable
 from stewart_drake.loop.experiment import assemble, reference_failure
-from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig, WaypointsConfig
 from stewart_drake.scenario.reference_files import waypoints
-from stewart_drake.studies.jobs import finished, run_jobs
-from stewart_drake.studies.run_files import read_cell
+from stewart_drake.studies.jobs import Progress, finished, run_jobs
+from stewart_drake.studies.runs import read_outcome, run_scenario
 
 FACTORS: Final = (0.5, 0.75, 1.0, 1.25)
 """Of the reference's amplitude."""
-
-Progress = Callable[[int, int], None]
-"""Called with the number of finished simulations and of all."""
 
 
 class Cell(NamedTuple):
@@ -103,20 +96,10 @@ def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[lis
     with TemporaryDirectory() as folder:
         try:
             settings = scenario_to_dict(scenario)
-            paths = run_jobs(jobs, run_cell, folder, settings=settings, progress=progress)
+            run_jobs(jobs, run_scenario, folder, settings=settings, progress=progress)
         except KeyboardInterrupt:
-            paths, interrupted = finished(jobs, folder), True
-        for key, path in paths.items():
-            status, error, time = read_cell(path)
-            cells[key] = cells[key]._replace(status=status, error=error, time=time)
+            interrupted = True
+        for key, path in finished(jobs, folder).items():
+            one = read_outcome(path)
+            cells[key] = cells[key]._replace(status=one.status, error=one.error, time=one.time)
     return list(cells.values()), interrupted
-
-
-def run_cell(scenario: Scenario) -> bytes:
-    """Status, E_ac in % s and time of the end in s of one simulation, as JSON."""
-    result = simulate(scenario, margin=False)
-    if result.status == "interrupted":
-        raise KeyboardInterrupt
-    time = math.nan if result.stopped is None else result.stopped.time
-    found = {"status": result.status, "error": result.accumulated_error, "time": time}
-    return json.dumps(jsonable(found)).encode()

@@ -1,57 +1,83 @@
-"""Unlike conditions of one scenario, drawn from a seed: delay, motion, plant and sensor.
+"""Unlike conditions for a tuner, drawn from a seed: delay, motion, plant and sensor."""
 
-Every draw is relative to the machine and its motion, so that the same shares suit any mechanism.
-"""
-
-import copy
-from typing import Final, Literal, NamedTuple
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.startup import reference_torque
-from stewart_drake.loop.experiment import motion_scale, prepare
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.reference_config import SineConfig
-
-DELAYS: Final = (0, 15)
-"""Whole periods, uniform, both included."""
-FREQUENCIES: Final = (0.5, 3.0)
-"""rad/s, uniform in the logarithm."""
-AMPLITUDES: Final = (0.3, 1.0)
-"""Share of the scenario's own amplitudes, uniform."""
-BIAS: Final = 4e-3
-"""Standard deviation of each motor's torque bias, as a share of the largest torque that the
-scenario's motion takes at 1 rad/s and full amplitude."""
-PAYLOAD: Final = 0.1
-"""Largest payload as a share of the plate's mass, uniform from 0."""
-NOISE: Final = (1e-4, 3e-3)
-"""Standard deviation of pose (rates: per second), as a share of the amplitudes, uniform in the
-logarithm."""
+from stewart_drake.studies.uncertainty import (
+    Draw,
+    Model,
+    Quantity,
+    Truth,
+    add_bias,
+    add_noise,
+    add_payload,
+    draw_from,
+    draw_seed,
+    drawn,
+    seed_noise,
+)
 
 _STREAMS: Final = {"training": 0, "evaluation": 1}
 
 
-class Disturbance(NamedTuple):
-    """What is unlike in one scenario; bias, payload and noise are each absent in half of the draws.
+class Standard(NamedTuple):
+    """Of the scenario's motion at 1 rad/s and full amplitude."""
 
-    Attributes:
-        delay_steps: whole periods.
-        frequency: of the sine, rad/s.
-        amplitude: share of the scenario's own.
-        torque_bias: (6,) N m.
-        payload_mass: kg.
-        noise: share of the amplitudes.
-        seed: of the noise.
-    """
+    torque: float
+    """Largest that it takes, N m."""
+    plate_mass: float
 
-    delay_steps: int
-    frequency: float
-    amplitude: float
-    torque_bias: tuple[float, ...]
-    payload_mass: float
-    noise: float
-    seed: int
+
+def _logarithmic(low: float, high: float) -> Callable[[Generator, Any], float]:
+    return lambda rng, _: float(np.exp(rng.uniform(*np.log((low, high)))))
+
+
+def _biases(rng: Generator, standard: Standard) -> tuple[float, ...]:
+    return tuple((4e-3 * standard.torque * rng.standard_normal(6)).tolist())
+
+
+def _delay(truth: Truth, steps: int) -> None:
+    truth.fields["delay"]["steps"] = steps
+
+
+def _frequency(truth: Truth, frequency: float) -> None:
+    truth.fields["reference"] |= {"frequency": frequency, "frequency_unit": "rad/s"}
+
+
+def _amplitude(truth: Truth, share: float) -> None:
+    reference = truth.fields["reference"]
+    reference["amplitude"] = [share * a for a in reference["amplitude"]]
+
+
+CONDITIONS: Final[Model] = {
+    # Whole periods, 0 and 15 included, which the controller knows.
+    "delay_steps": Quantity(lambda rng, _: int(rng.integers(0, 16)), _delay),
+    # rad/s of the sine.
+    "frequency": Quantity(_logarithmic(0.5, 3.0), _frequency),
+    # Share of the scenario's own amplitudes.
+    "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.3, 1.0)), _amplitude),
+    # Of each motor; its standard deviation is a share of the standard torque.
+    "torque_bias": Quantity(_biases, add_bias, sometimes=True),
+    # kg, up to a tenth of the plate's.
+    "payload_mass": Quantity(
+        lambda rng, standard: float(rng.uniform(0.0, 0.1 * standard.plate_mass)),
+        add_payload, sometimes=True,
+    ),
+    # Standard deviation of pose (rates: per second), share of the amplitudes.
+    "noise": Quantity(_logarithmic(1e-4, 3e-3), add_noise, sometimes=True),
+    "seed": Quantity(draw_seed, seed_noise),
+}  # fmt: skip
+"""What is unlike; uniform, what covers decades in the logarithm."""
 
 
 def sine_of(scenario: Scenario) -> SineConfig:
@@ -70,8 +96,8 @@ def sine_of(scenario: Scenario) -> SineConfig:
 
 def draw(
     scenario: Scenario, number: int, seed: int, purpose: Literal["training", "evaluation"]
-) -> list[Disturbance]:
-    """So many draws; the first ones stay the same when more are asked for.
+) -> list[Draw]:
+    """So many draws of CONDITIONS; the first ones stay the same when more are asked for.
 
     Args:
         scenario: whose machine and motion give the scales.
@@ -82,51 +108,25 @@ def draw(
     Raises:
         ConfigError: the scenario cannot be prepared, or its reference is not a sine.
     """
-    standard = _with_motion(scenario, 1.0, 1.0)
-    experiment = prepare(standard)
-    torque = reference_torque(experiment.nominal, experiment.reference, standard.duration)
-    mass = experiment.mechanism.plate.mass
-    draws = []
-    for index in range(number):
-        rng = np.random.default_rng([seed, _STREAMS[purpose], index])
-        biased, loaded, noisy = rng.integers(2, size=3)
-        draws.append(
-            Disturbance(
-                delay_steps=int(rng.integers(DELAYS[0], DELAYS[1] + 1)),
-                frequency=float(np.exp(rng.uniform(*np.log(FREQUENCIES)))),
-                amplitude=float(rng.uniform(*AMPLITUDES)),
-                torque_bias=tuple(map(float, biased * BIAS * torque * rng.standard_normal(6))),
-                payload_mass=float(loaded * rng.uniform(0.0, PAYLOAD * mass)),
-                noise=float(noisy * np.exp(rng.uniform(*np.log(NOISE)))),
-                seed=int(rng.integers(2**31)),
-            )
-        )
-    return draws
+    slow = replace(sine_of(scenario), frequency=1.0, frequency_unit="rad/s")
+    experiment = prepare(replace(scenario, reference=slow))
+    torque = reference_torque(experiment.nominal, experiment.reference, scenario.duration)
+    standard = Standard(torque, experiment.mechanism.plate.mass)
+    streams = (np.random.default_rng([seed, _STREAMS[purpose], i]) for i in range(number))
+    return [draw_from(CONDITIONS, rng, standard) for rng in streams]
 
 
-def disturbed(scenario: Scenario, disturbance: Disturbance) -> Scenario:
-    """A copy of the scenario under a disturbance."""
-    d = disturbance
-    result = _with_motion(scenario, d.frequency, d.amplitude)
-    result.delay.steps = d.delay_steps
-    result.plant.torque_bias = list(d.torque_bias)
-    result.plant.payload_mass = d.payload_mass
-    scale = np.tile(motion_scale(prepare(result)), 2)
-    result.sensor.noise_std = [float(std) for std in d.noise * scale]
-    result.sensor.seed = d.seed
+def disturbed(scenario: Scenario, one: Draw) -> Scenario:
+    """A copy of the scenario under conditions that were drawn.
+
+    Raises:
+        ConfigError: the motion leaves the workspace.
+    """
+    result = drawn(CONDITIONS, scenario, load_mechanism(scenario.mechanism), one).as_scenario()
+    prepare(result)
     return result
 
 
 def with_gain(scenario: Scenario, w_Q: float, w_R: float) -> Scenario:
     """A copy of the scenario with these fixed weights."""
-    result = copy.deepcopy(scenario)
-    result.controller.w_Q, result.controller.w_R = w_Q, w_R
-    return result
-
-
-def _with_motion(scenario: Scenario, frequency: float, share: float) -> Scenario:
-    result = copy.deepcopy(scenario)
-    sine = sine_of(result)
-    sine.frequency, sine.frequency_unit = frequency, "rad/s"
-    sine.amplitude = [share * a for a in sine.amplitude]
-    return result
+    return replace(scenario, controller=replace(scenario.controller, w_Q=w_Q, w_R=w_R))

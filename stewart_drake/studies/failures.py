@@ -141,12 +141,9 @@ def auc_interval(auc: float, failing: int, others: int, confidence: float = CONF
         spread = 1 + half * (1 - a) / (2 - a) + half * a / (1 + a)
         return (auc - a) ** 2 - z**2 * a * (1 - a) * spread / (failing * others)
 
-    low = brentq(beyond, 0.0, auc) if auc > 0 and beyond(auc) < 0 else 0.0
-    high = brentq(beyond, auc, 1.0) if auc < 1 and beyond(auc) < 0 else 1.0
-    if auc == 1:
-        low = brentq(beyond, 0.0, 1.0 - 1e-12)
-    if auc == 0:
-        high = brentq(beyond, 1e-12, 1.0)
+    # The estimate itself is a root where it is an end of [0, 1]: just beside it begins the search.
+    low = brentq(beyond, 0.0, min(auc, 1 - 1e-12)) if auc > 0 else 0.0
+    high = brentq(beyond, max(auc, 1e-12), 1.0) if auc < 1 else 1.0
     return Interval(auc, float(low), float(high))
 
 

@@ -15,9 +15,10 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import closing, contextmanager
+from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, Final
@@ -25,12 +26,13 @@ from typing import Any, Final
 import joblib
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
+from typing_extensions import TypeVar
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials, replacing
 from stewart_drake.files.jsonio import jsonable, load_json
 from stewart_drake.files.yamlio import brief, validate
-from stewart_drake.studies.cluster import dask_backend
+from stewart_drake.studies.cluster import on_cluster
 
 MANIFEST: Final = "manifest.json"
 """The settings that all jobs of a folder share, and their hash."""
@@ -39,6 +41,8 @@ Job = tuple[Any, ...]
 """Arguments of one call; they are pickled."""
 Progress = Callable[[int, int], None]
 """Called with the number of finished jobs and of all jobs."""
+
+T = TypeVar("T", default=Path)
 
 _LOCK: Final = ".lock"
 _MAX_MANIFEST: Final = 10_000_000
@@ -61,11 +65,11 @@ def run_jobs(
     *,
     settings: Mapping[str, Any],
     suffix: str = ".json",
+    read: Callable[[Path], T] = lambda path: path,  # type: ignore[assignment, return-value]
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
-    check: Callable[[Path], object] | None = None,
-) -> dict[str, Path]:
+) -> dict[str, T]:
     """Call `function(*jobs[key])` for every key whose file is not there yet, or is damaged.
 
     Ctrl-C stops the jobs in flight and raises KeyboardInterrupt; `function` must let it through.
@@ -78,14 +82,14 @@ def run_jobs(
         settings: what all jobs depend on, plain data. A folder that was begun with others is
             refused.
         suffix: of the files.
+        read: what becomes of a file. Where it raises ConfigError of one that an earlier start has
+            left, that job is done again, which a warning of the package's logger tells in one line.
         workers: processes on this machine, with one numerical thread each; all cores by default.
         scheduler: address of a Dask scheduler, whose workers are used instead.
         progress: called at the start and for each finished job.
-        check: reads a file that an earlier start has left; where it raises ConfigError, that job is
-            done again, which a warning of the package's logger tells in one line.
 
     Returns:
-        The file of every job, in the order of `jobs`.
+        What `read` makes of the file of every job, by default its path, in the order of `jobs`.
 
     Raises:
         ConfigError: the folder belongs to other settings or another process is working in it; the
@@ -105,18 +109,17 @@ def run_jobs(
     with _locked(folder):
         remove_partials(folder)
         _check_manifest(folder, settings, suffix)
-        missing = _missing(jobs, paths, check)
-        done = len(jobs) - len(missing)
-        if progress is not None:
-            progress(done, len(jobs))
-        calls = [joblib.delayed(_named)(key, function, job) for key, job in missing.items()]
-        with _backend(scheduler), _outcomes(calls, workers, scheduler) as outcomes:
-            for key, data in outcomes:
+        found = _kept(paths, read)
+        calls = [partial(_named, k, function, job) for k, job in jobs.items() if k not in found]
+        made = on_cluster(scheduler, calls) if scheduler else _on_this_machine(workers, calls)
+        tell = progress or (lambda *_: None)
+        tell(len(found), len(jobs))
+        with closing(made):
+            for key, data in made:
                 write_atomically(paths[key], data)
-                done += 1
-                if progress is not None:
-                    progress(done, len(jobs))
-    return paths
+                found[key] = read(paths[key])
+                tell(len(found), len(jobs))
+    return {key: found[key] for key in jobs}
 
 
 def finished(jobs: Mapping[str, Job], folder: str | Path, suffix: str = ".json") -> dict[str, Path]:
@@ -125,21 +128,19 @@ def finished(jobs: Mapping[str, Job], folder: str | Path, suffix: str = ".json")
     return {key: path for key, path in paths.items() if path.exists()}
 
 
-def _missing(
-    jobs: Mapping[str, Job], paths: Mapping[str, Path], check: Callable[[Path], object] | None
-) -> dict[str, Job]:
-    """What is to be done: a file that is damaged is as good as none."""
-    damaged: dict[str, ConfigError] = {}
+def _kept(paths: Mapping[str, Path], read: Callable[[Path], T]) -> dict[str, T]:
+    """What there is from an earlier start; a file that is damaged is as good as none."""
+    found, damaged = {}, []
     for key, path in paths.items():
         try:
-            if check is not None and path.exists():
-                check(path)
+            if path.exists():
+                found[key] = read(path)
         except ConfigError as error:
-            damaged[key] = error
+            damaged.append(error)
     if damaged:
         more = f" (and {len(damaged) - 1} more)" if len(damaged) > 1 else ""
-        _log.warning("%s; this run is done again%s", next(iter(damaged.values())), more)
-    return {k: job for k, job in jobs.items() if k in damaged or not paths[k].exists()}
+        _log.warning("%s; this run is done again%s", damaged[0], more)
+    return found
 
 
 def settings_hash(settings: Mapping[str, Any]) -> str:
@@ -216,32 +217,33 @@ def _difference(theirs: Any, mine: Any, name: str = "") -> str:
 # the threads of the executor that of the thread that starts the executor; in a worker the signal
 # would break imports in the middle. The resource tracker comes first, because some Pythons
 # unblock the signal when they start it.
-@contextmanager
-def _outcomes(
-    calls: list[Any], workers: int | None, scheduler: str | None
-) -> Iterator[Iterator[tuple[str, bytes]]]:
-    """Key and bytes of each call, as they finish; leaving early ends the workers."""
+def _on_this_machine(
+    workers: int | None, calls: Sequence[Callable[[], tuple[str, bytes]]]
+) -> Generator[tuple[str, bytes]]:
+    """What calls return, as they finish; closing the iterator ends the workers."""
     number = min(workers or joblib.cpu_count(), max(1, len(calls)))
-    parallel = joblib.Parallel(
-        n_jobs=-1 if scheduler else number, batch_size=1, return_as="generator_unordered"
+    backend = joblib.parallel_config(
+        backend="loky", inner_max_num_threads=1, initializer=_end_with, initargs=(os.getpid(),)
     )
-    with _silent_trackers():
-        resource_tracker.ensure_running()
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    # On leaving early joblib warns that not all results were fetched: that is meant.
+    with backend, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", category=UserWarning, module="joblib")
+        parallel = joblib.Parallel(n_jobs=number, batch_size=1, return_as="generator_unordered")
+        with _silent_trackers():
+            resource_tracker.ensure_running()
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                outcomes = parallel(joblib.delayed(call)() for call in calls)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         try:
-            outcomes = parallel(calls)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-    try:
-        with warnings.catch_warnings(), closing(outcomes):
-            # On leaving early joblib warns that not all results were fetched: that is meant.
-            warnings.filterwarnings("ignore", category=UserWarning, module="joblib")
-            yield outcomes
-    except BrokenProcessPool:
-        raise ChildProcessError(
-            "a worker process was killed, perhaps for want of memory; what had finished is kept "
-            "and the same command goes on from there"
-        ) from None
+            with closing(outcomes):
+                yield from outcomes
+        except BrokenProcessPool:
+            raise ChildProcessError(
+                "a worker process was killed, perhaps for want of memory; what had finished is "
+                "kept and the same command goes on from there"
+            ) from None
 
 
 @contextmanager
@@ -259,14 +261,6 @@ def _silent_trackers() -> Iterator[None]:
             del os.environ["PYTHONWARNINGS"]
         else:
             os.environ["PYTHONWARNINGS"] = before
-
-
-def _backend(scheduler: str | None) -> AbstractContextManager[Any]:
-    if scheduler is not None:
-        return dask_backend(scheduler)
-    return joblib.parallel_config(
-        backend="loky", inner_max_num_threads=1, initializer=_end_with, initargs=(os.getpid(),)
-    )
 
 
 def _end_with(parent: int) -> None:

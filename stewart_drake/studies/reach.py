@@ -9,6 +9,7 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.dynamics.workspace import Failure, diagnose, margin
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.studies.singularity import measure
+from stewart_drake.studies.workspace_map import border, last_inside
 
 Array = NDArray[np.float64]
 
@@ -74,18 +75,12 @@ def first_exit(mechanism: Mechanism, reference: Trajectory, time: Array) -> Fail
     """
 
     def failure(t: float) -> Failure | None:
-        return diagnose(mechanism, t, reference.value(t)[:, 0])
+        return diagnose(mechanism, float(t), reference.value(t)[:, 0])
 
     for k, t in enumerate(time):
-        found = failure(float(t))
-        if found is None:
-            continue
-        low, high = (float(time[k - 1]), float(t)) if k else (float(t), float(t))
-        while high - low > _TIME_TOLERANCE:
-            middle = (low + high) / 2
-            closer = failure(middle)
-            low, high, found = (middle, high, found) if closer is None else (low, middle, closer)
-        return found
+        if failure(t) is not None:
+            before = time[max(k - 1, 0)]
+            return failure(border(lambda s: failure(s) is None, before, t, _TIME_TOLERANCE)[1])
     return None
 
 
@@ -106,12 +101,6 @@ def largest_factor(mechanism: Mechanism, reference: Trajectory, time: Array) -> 
         return Factor(0.0, True)
     if not change.any():
         return Factor(np.nan, False)
-    number = round(LARGEST_FACTOR / FACTOR_STEP)
-    last = next((k for k in range(number) if not fits((k + 1) * FACTOR_STEP)), None)
-    if last is None:
-        return Factor(LARGEST_FACTOR, False)
-    low, high = last * FACTOR_STEP, (last + 1) * FACTOR_STEP
-    while high - low > _FACTOR_TOLERANCE:
-        middle = (low + high) / 2
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return Factor(low, True)
+    steps = round(LARGEST_FACTOR / FACTOR_STEP)
+    factor = last_inside(fits, LARGEST_FACTOR, steps, _FACTOR_TOLERANCE)
+    return Factor(factor, factor < LARGEST_FACTOR)

@@ -15,7 +15,8 @@ from stewart_drake.files.versions import versions
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.failures import Explanation, explain
-from stewart_drake.studies.sizing import rms
+from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.statistics import (
     Correlation,
     Interval,
@@ -24,42 +25,15 @@ from stewart_drake.studies.statistics import (
     rank_correlation,
     wilson_interval,
 )
-from stewart_drake.studies.uncertainty import Draw, Ranges, Scales
+from stewart_drake.studies.uncertainty import MACHINE, Draw, Scales
 
 Array = NDArray[np.float64]
 
 QUANTILES: Final = (0.5, 0.75, 0.9, 0.95, 0.99)
-FACTORS: Final = {
-    "payload": "kg",
-    "torque_bias": "mN m",
-    "noise": "%",
-    "torque_limit": "N m",
-    "damping": "mN m s/rad",
-    "delay": "ms",
-    "lengths": "mm",
-    "anchors": "mm",
-}
-"""What is ranked, with its unit; payload and delay have a sign, what has six parts or more its rms.
-"""
-SIGNED: Final = ("payload", "delay")
-"""Either direction may hurt: these are ranked by their size too, as |payload| and |delay|."""
-
-
-class Outcome(NamedTuple):
-    """How a run ended."""
-
-    status: str
-    """As of a simulation; `not_assembled` where the drawn parts do not fit together, `refused`
-    where the scenario cannot be prepared with what was drawn."""
-    reason: str
-    """Why it failed, or nothing."""
-    leg: int | None
-    time: float
-    """s, when it failed, else NaN."""
-    error: float
-    """E_ac in % s, NaN for a run that did not complete."""
-    peak_torque: float
-    """N m, as commanded, NaN where nothing ran."""
+FACTORS: Final = {name: one.unit for name, one in MACHINE.items() if one.unit}
+"""What is ranked, with its unit; what has six parts or more by its rms."""
+SIGNED: Final = tuple(name for name in FACTORS if MACHINE[name].signed)
+"""These are ranked by their size too, as |payload| and |delay|."""
 
 
 class Influence(NamedTuple):
@@ -162,7 +136,7 @@ class RobustnessStudy(NamedTuple):
             else None,
             "influences": [_influence_summary(one) for one in self.influences()],
             "explanation": self.explanation.summary,
-            "undisturbed": self.undisturbed._asdict(),
+            "undisturbed": dataclasses.asdict(self.undisturbed),
             "ranges": dataclasses.asdict(self.ranges),
             "scales": self.scales._asdict(),
             "scenario": scenario_to_dict(self.experiment.scenario),
@@ -177,17 +151,10 @@ def unit_of(factor: str) -> str:
 
 def factor_values(draws: list[Draw]) -> dict[str, Array]:
     """(n,) of each factor in the units of FACTORS, and of the sizes of those with a sign."""
-    values = {
-        "payload": [one.payload for one in draws],
-        "torque_bias": [1e3 * rms(np.array(one.torque_bias)) for one in draws],
-        "noise": [100 * one.noise for one in draws],
-        "torque_limit": [one.torque_limit or math.inf for one in draws],
-        "damping": [1e3 * one.damping for one in draws],
-        "delay": [1e3 * one.delay for one in draws],
-        "lengths": [1e3 * rms(np.array(one.lengths)) for one in draws],
-        "anchors": [1e3 * rms(np.array(one.anchors)) for one in draws],
+    arrays = {
+        name: np.array([MACHINE[name].told(one[name]) for one in draws], dtype=np.float64)
+        for name in FACTORS
     }
-    arrays = {name: np.array(column) for name, column in values.items()}
     return arrays | {f"|{name}|": np.abs(arrays[name]) for name in SIGNED}
 
 

@@ -1,72 +1,198 @@
-"""What is not known of a machine before it runs: ranges, draws from them, and what they change.
+"""What is not known of a machine before it runs: quantities, draws of them, and what they change.
 
-A draw adds to what the scenario says already. All ranges are relative to the machine and its
-motion, so that the same shares suit any mechanism.
+A quantity says how it is drawn, what it changes, and how it is told; a model is a table of them by
+name. The table's order is that of the random numbers, so that a new quantity goes to its end and
+leaves all other draws as they were. A draw adds to what the scenario says already. All scales are
+those of the machine and its motion, so that the same shares suit any mechanism.
 """
 
 import dataclasses
 import math
-import re
-from collections.abc import Iterable
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass
 
-from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.yamlio import brief, parse_yaml, validate
+from stewart_drake.files.yamlio import validate
 from stewart_drake.law.startup import INSTANTS
-from stewart_drake.loop.experiment import Experiment, believed_delay, motion_scale
+from stewart_drake.loop.experiment import Experiment, assemble, believed_delay, motion_scale
 from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
 from stewart_drake.scenario.trajectories import spread_instants
-from stewart_drake.studies.range_units import RANGE_UNITS
-from stewart_drake.studies.sizing import size_motors
+from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.sizing import rms, size_motors
 
 Array = NDArray[np.float64]
-Share = Annotated[float, Field(ge=0, lt=1)]
-NonNegative = Annotated[float, Field(ge=0)]
+
+Draw = dict[str, Any]
+"""What was drawn by name of the quantity, SI units: a number, a tuple of them, or None for nothing.
+Empty it changes nothing."""
 
 
-@dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
-class Ranges:
-    """How far each quantity may be off; 0 (null for `torque_limit`) leaves it alone.
-
-    The controller is told the torque limit and the sensor's noise, and nothing else.
+@dataclass
+class Truth:
+    """A scenario and its machine while a draw changes them; the controller's belief stays.
 
     Attributes:
-        payload: a mass at the plate's centre of mass, share of the plate's, uniform in +-.
-        torque_bias: rms over the motors, share of the largest torque that the reference takes,
-            uniform from 0; its direction in the space of the six motors is random.
-        noise: standard deviation of the measured pose (rates: per second), share of half the
-            reference's peak to peak, uniform from 0.
-        torque_limit: of the motors, least and most, in units of the largest torque that the
-            undisturbed run commands, uniform; what limits that run, the scenario's number or the
-            mechanism's motors, is never exceeded.
-        damping: friction torque of a crank at its highest speed on the reference, share of the
-            largest torque that the reference takes, uniform from 0.
-        delay: true delay less the believed one, periods, uniform in +-.
-        delay_steps: the same in whole periods, each number in +- alike; adds to `delay`.
-        lengths: error of crank and rod lengths, rms over the twelve, share of the mean crank
-            length, uniform from 0.
-        anchors: error of the coordinates of motor shafts and plate joints, rms over the 36, share
-            of the mean crank length, uniform from 0.
+        scenario, mechanism: as they were.
+        fields: of the scenario, as they are.
+        parts: fields of the mechanism that are others.
     """
 
-    payload: Share = 0.1
-    torque_bias: NonNegative = 0.02
-    noise: NonNegative = 1e-3
-    torque_limit: (
-        Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=2, max_length=2)] | None
-    ) = dataclasses.field(default_factory=lambda: [1.0, 3.0])
-    damping: NonNegative = 0.02
-    delay: Annotated[float, Field(ge=0, le=100)] = 0.01
-    delay_steps: Annotated[int, Field(ge=0, le=100)] = 0
-    lengths: Share = 2e-4
-    anchors: Share = 2e-4
+    scenario: Scenario
+    mechanism: Mechanism
+    fields: dict[str, Any]
+    parts: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def as_scenario(self) -> Scenario:
+        """The scenario as it is.
+
+        Raises:
+            ConfigError: what was drawn is beyond what a scenario may hold.
+        """
+        return validate(Scenario, self.fields, "drawn")
+
+    def machine(self) -> Mechanism:
+        """The machine as it is.
+
+        Raises:
+            ConfigError, UnreachablePoseError: such parts cannot be assembled at home.
+        """
+        return dataclasses.replace(self.mechanism, **self.parts) if self.parts else self.mechanism
+
+
+class Quantity(NamedTuple):
+    """One thing that is not known."""
+
+    draw: Callable[[Generator, Any], Any]
+    """From random numbers and whatever its model draws with; takes the same share of the random
+    numbers whatever its range, so that narrowing one range leaves the others' draws alone."""
+    apply: Callable[[Truth, Any], None]
+    """Changes `fields` or `parts`."""
+    unit: str = ""
+    """In which it is told, empty where it is not."""
+    per_unit: float = 1.0
+    """Units in one of SI."""
+    signed: bool = False
+    """Either direction may hurt."""
+    sometimes: bool = False
+    """Absent, 0, in half of the draws."""
+
+    def told(self, value: Any) -> float:
+        """What was drawn in its unit, of several numbers their rms, of None infinite."""
+        if value is None:
+            return math.inf
+        return self.per_unit * (rms(np.array(value)) if isinstance(value, tuple) else value)
+
+
+Model = Mapping[str, Quantity]
+
+
+def draw_from(model: Model, rng: Generator, about: Any) -> Draw:
+    """One draw of all quantities; `about` is what the model's quantities are drawn with."""
+    some = [name for name, quantity in model.items() if quantity.sometimes]
+    there = dict(zip(some, rng.integers(2, size=len(some)), strict=True)) if some else {}
+    one: Draw = {}
+    for name, quantity in model.items():
+        value = quantity.draw(rng, about)
+        one[name] = _times(there[name], value) if name in there else value
+    return one
+
+
+def drawn(model: Model, scenario: Scenario, mechanism: Mechanism, one: Draw) -> Truth:
+    """A scenario and its mechanism with what was drawn; they themselves stay as they are."""
+    truth = Truth(scenario, mechanism, dataclasses.asdict(scenario))
+    for name, value in one.items():
+        model[name].apply(truth, value)
+    return truth
+
+
+def _times(there: int, value: Any) -> Any:
+    return (
+        tuple(_times(there, x) for x in value) if isinstance(value, tuple) else float(there * value)
+    )
+
+
+# ---------------------------------------------------------------- what quantities change
+
+
+def add_payload(truth: Truth, mass: float) -> None:
+    """Of kg at the plate's centre of mass; beyond the payload it is taken off the plate."""
+    plant, plate = truth.fields["plant"], truth.mechanism.plate
+    total = plant["payload_mass"] + mass
+    plant["payload_mass"] = max(0.0, total)
+    if total < 0:
+        truth.parts["plate"] = Body(plate.mass + total, plate.inertia)
+
+
+def add_bias(truth: Truth, bias: tuple[float, ...]) -> None:
+    """Of (6,) N m at the shafts."""
+    plant = truth.fields["plant"]
+    plant["torque_bias"] = [a + b for a, b in zip(plant["torque_bias"], bias, strict=True)]
+
+
+def add_noise(truth: Truth, share: float) -> None:
+    """Of a standard deviation that is a share of half the reference's peak to peak."""
+    if share != 0:
+        moving = dataclasses.asdict(truth.scenario) | {"reference": truth.fields["reference"]}
+        motion = motion_scale(assemble(validate(Scenario, moving, "drawn")))
+        sensor = truth.fields["sensor"]
+        std = np.array(sensor["noise_std"]) + share * np.tile(motion, 2)
+        sensor["noise_std"] = std.tolist()
+
+
+def seed_noise(truth: Truth, seed: int) -> None:
+    """Of noise that was drawn; a sensor that is as it was has its own seed."""
+    if truth.fields["sensor"]["noise_std"] != truth.scenario.sensor.noise_std:
+        truth.fields["sensor"]["seed"] = seed
+
+
+def draw_seed(rng: Generator, _: Any) -> int:
+    """A seed for the sensor."""
+    return int(rng.integers(2**31))
+
+
+def _limit_torque(truth: Truth, limit: float | None) -> None:
+    if limit is not None:
+        truth.fields["actuator"]["torque_limit"] = limit
+
+
+def _damp(truth: Truth, damping: float) -> None:
+    truth.fields["plant"]["joint_damping"] += damping
+
+
+def _delay(truth: Truth, late: float) -> None:
+    sc, believed = truth.scenario, believed_delay(truth.scenario)
+    fraction = sc.delay.fraction + late / sc.controller.period
+    whole = math.floor(fraction + 1e-9)
+    truth.fields["delay"] = {
+        "steps": sc.delay.steps + whole,
+        "fraction": round(max(0.0, fraction - whole), 12),
+    }
+    told = {"delay_steps": believed.steps, "delay_fraction": believed.fraction}
+    truth.fields["controller"] |= told
+
+
+def _lengthen(truth: Truth, errors: tuple[float, ...]) -> None:
+    if any(errors):
+        cranks, rods = np.reshape(errors, (2, NUM_LEGS))
+        m = truth.mechanism
+        lengths = {"crank_lengths": m.crank_lengths + cranks, "rod_lengths": m.rod_lengths + rods}
+        truth.parts |= lengths
+
+
+def _move_anchors(truth: Truth, errors: tuple[float, ...]) -> None:
+    if any(errors):
+        shafts, joints = np.reshape(errors, (2, NUM_LEGS, 3))
+        m = truth.mechanism
+        truth.parts |= {"p_WS": m.p_WS + shafts, "p_PQ": m.p_PQ + joints}
+
+
+# ---------------------------------------------------------------- a machine out of all possible
 
 
 class Scales(NamedTuple):
@@ -89,62 +215,12 @@ class Scales(NamedTuple):
     """That of the undisturbed run, N m, infinite for none."""
 
 
-class Draw(NamedTuple):
-    """One machine out of all that are possible; errors are true less believed."""
+class About(NamedTuple):
+    """What machines are drawn with."""
 
-    payload: float
-    """kg."""
-    torque_bias: tuple[float, ...]
-    """(6,) N m."""
-    noise: float
-    """Share of half the reference's peak to peak."""
-    torque_limit: float | None
-    """N m."""
-    damping: float
-    """N m s/rad."""
-    delay: float
-    """s."""
-    lengths: tuple[float, ...]
-    """(12,) six cranks, six rods, m."""
-    anchors: tuple[float, ...]
-    """(36,) six motor shafts in W, six plate joints in P, m."""
-    seed: int
-    """Of the sensor's noise."""
-
-
-UNDISTURBED = Draw(0.0, (0.0,) * 6, 0.0, None, 0.0, 0.0, (0.0,) * 12, (0.0,) * 36, 0)
-
-
-def read_ranges(settings: Iterable[str]) -> Ranges:
-    """Ranges from `name=value` settings, the value in YAML; the rest keeps its default.
-
-    Raises:
-        ConfigError: in one line.
-    """
-    given: dict[str, Any] = {}
-    for setting in settings:
-        name, equals, text = setting.partition("=")
-        if not equals or not name.strip():
-            raise ConfigError(f"--vary: got {brief(setting)}; expected name=value{_units(setting)}")
-        given[name.strip()] = parse_yaml(text, f"--vary: {name.strip()}")
-    try:
-        ranges = validate(Ranges, given, "--vary")
-    except ConfigError as error:
-        raise ConfigError(f"{error}{_units(str(error), given)}") from None
-    limit = ranges.torque_limit
-    if limit is not None and limit[0] > limit[1]:
-        raise ConfigError(
-            f"--vary: torque_limit: got {limit!r}; expected the lesser one first"
-            f"{_units('torque_limit')}"
-        )
-    return ranges
-
-
-def _units(message: str, names: Iterable[str] = RANGE_UNITS) -> str:
-    """What the numbers mean of those `names` that a message speaks of."""
-    spoken = set(re.findall(r"\w+", message))
-    told = [f"{name}: {RANGE_UNITS[name]}" for name in names if name in spoken & set(RANGE_UNITS)]
-    return f" ({'; '.join(told)})" if told else ""
+    ranges: Ranges
+    scales: Scales
+    scenario: Scenario
 
 
 def scales_of(experiment: Experiment, commanded: float) -> Scales:
@@ -170,108 +246,63 @@ def scales_of(experiment: Experiment, commanded: float) -> Scales:
 
 
 def draw(ranges: Ranges, scales: Scales, scenario: Scenario, seed: int, index: int) -> Draw:
-    """The machine with this index; it does not depend on any other, nor on their number.
-
-    Every quantity takes the same share of the random numbers whatever its range, so that narrowing
-    one range leaves the others' draws as they were.
-    """
-    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, index])))
-    r, s = ranges, scales
-    payload = r.payload * s.plate_mass * rng.uniform(-1, 1)
-    bias = _of_random_size(rng, NUM_TORQUES, r.torque_bias * s.torque)
-    noise = r.noise * rng.uniform()
-    strength = rng.uniform()
-    damping = r.damping * rng.uniform()
-    steps = math.floor((2 * r.delay_steps + 1) * rng.uniform()) - r.delay_steps
-    late = steps + r.delay * rng.uniform(-1, 1)
-    if scenario.plant.kind == "multibody":  # which sees torques change at its own steps only
-        late = round(late * s.period / scenario.plant.time_step) * scenario.plant.time_step
-        late /= s.period
-    own = scenario.true_delay.periods
-    return Draw(
-        payload=float(payload),
-        torque_bias=bias,
-        noise=float(noise),
-        torque_limit=_limit(r, s, strength, scenario.actuator.torque_limit),
-        # A reference that rests moves no crank, and friction has no scale.
-        damping=float(damping * s.torque / s.speed if s.speed > 0 else 0.0),
-        delay=s.period * float(max(late, -own)),  # nothing acts before it is computed
-        lengths=_of_random_size(rng, 2 * NUM_LEGS, r.lengths * s.crank),
-        anchors=_of_random_size(rng, 6 * NUM_LEGS, r.anchors * s.crank),
-        seed=int(rng.integers(2**31)),
-    )
+    """The machine with this index; it does not depend on any other, nor on their number."""
+    rng = Generator(np.random.Philox(np.random.SeedSequence([seed, index])))
+    return draw_from(MACHINE, rng, About(ranges, scales, scenario))
 
 
-def disturbed(scenario: Scenario, motion: tuple[float, ...], one: Draw) -> Scenario:
-    """The scenario with what a draw changes, but for the machine's own dimensions.
-
-    Args:
-        scenario: the undisturbed one; it stays as it is.
-        motion: (6,) as in `Scales`.
-        one: the draw.
-
-    Raises:
-        ConfigError: what was drawn is beyond what a scenario may hold.
-    """
-    sc, data = scenario, dataclasses.asdict(scenario)
-    fraction = sc.delay.fraction + one.delay / sc.controller.period
-    whole = math.floor(fraction + 1e-9)
-    data["plant"] |= {
-        "payload_mass": max(0.0, sc.plant.payload_mass + one.payload),
-        "torque_bias": [a + b for a, b in zip(sc.plant.torque_bias, one.torque_bias, strict=True)],
-        "joint_damping": sc.plant.joint_damping + one.damping,
-    }
-    data["delay"] = {
-        "steps": sc.delay.steps + whole,
-        "fraction": round(max(0.0, fraction - whole), 12),
-    }
-    believed = believed_delay(sc)
-    data["controller"] |= {"delay_steps": believed.steps, "delay_fraction": believed.fraction}
-    if one.torque_limit is not None:
-        data["actuator"]["torque_limit"] = one.torque_limit
-    if one.noise != 0:
-        std = np.array(sc.sensor.noise_std) + one.noise * np.tile(motion, 2)
-        data["sensor"] |= {"noise_std": std.tolist(), "seed": one.seed}
-    return validate(Scenario, data, "drawn")
-
-
-def true_mechanism(mechanism: Mechanism, payload: float, one: Draw) -> Mechanism:
-    """The machine as it is, whose drawing is `mechanism`.
-
-    Args:
-        mechanism: as the controller knows it.
-        payload: of the undisturbed scenario, kg; what a draw takes off beyond it, the plate lacks.
-        one: the draw.
-
-    Raises:
-        ConfigError, UnreachablePoseError: such parts cannot be assembled at home.
-    """
-    if not (any(one.lengths) or any(one.anchors)) and payload + one.payload >= 0:
-        return mechanism
-    cranks, rods = np.reshape(one.lengths, (2, NUM_LEGS))
-    shafts, joints = np.reshape(one.anchors, (2, NUM_LEGS, 3))
-    lacking = max(0.0, -(payload + one.payload))
-    return dataclasses.replace(
-        mechanism,
-        crank_lengths=mechanism.crank_lengths + cranks,
-        rod_lengths=mechanism.rod_lengths + rods,
-        p_WS=mechanism.p_WS + shafts,
-        p_PQ=mechanism.p_PQ + joints,
-        plate=Body(mechanism.plate.mass - lacking, mechanism.plate.inertia),
-    )
-
-
-def _of_random_size(rng: np.random.Generator, number: int, largest: float) -> tuple[float, ...]:
+def _of_random_size(rng: Generator, number: int, largest: float) -> tuple[float, ...]:
     """So many values whose rms is uniform in [0, largest], in a direction that is uniform too."""
     size, direction = largest * rng.uniform(), rng.standard_normal(number)
     return tuple((size * np.sqrt(number) / np.linalg.norm(direction) * direction).tolist())
 
 
-def _limit(
-    ranges: Ranges, scales: Scales, strength: float, own: float | str | None
-) -> float | None:
+def _draw_limit(rng: Generator, about: About) -> float | None:
+    strength, scales, own = rng.uniform(), about.scales, about.scenario.actuator.torque_limit
     # Where the undisturbed run takes no torque, as at rest without gravity, a limit has no scale.
-    if ranges.torque_limit is None or scales.commanded == 0:
+    if about.ranges.torque_limit is None or scales.commanded == 0:
         return own if isinstance(own, float) else None
-    low, high = ranges.torque_limit
+    low, high = about.ranges.torque_limit
     return min(scales.commanded * (low + (high - low) * strength), scales.torque_limit)
+
+
+def _draw_damping(rng: Generator, about: About) -> float:
+    damping, s = about.ranges.damping * rng.uniform(), about.scales
+    # A reference that rests moves no crank, and friction has no scale.
+    return float(damping * s.torque / s.speed if s.speed > 0 else 0.0)
+
+
+def _draw_delay(rng: Generator, about: About) -> float:
+    r, period, plant = about.ranges, about.scales.period, about.scenario.plant
+    steps = math.floor((2 * r.delay_steps + 1) * rng.uniform()) - r.delay_steps
+    late = steps + r.delay * rng.uniform(-1, 1)
+    if plant.kind == "multibody":  # which sees torques change at its own steps only
+        late = round(late * period / plant.time_step) * plant.time_step / period
+    # Nothing acts before it is computed.
+    return period * float(max(late, -about.scenario.true_delay.periods))
+
+
+MACHINE: Final[Model] = {
+    "payload": Quantity(
+        lambda rng, a: float(a.ranges.payload * a.scales.plate_mass * rng.uniform(-1, 1)),
+        add_payload, "kg", signed=True,
+    ),
+    "torque_bias": Quantity(
+        lambda rng, a: _of_random_size(rng, NUM_TORQUES, a.ranges.torque_bias * a.scales.torque),
+        add_bias, "mN m", 1e3,
+    ),
+    "noise": Quantity(lambda rng, a: float(a.ranges.noise * rng.uniform()), add_noise, "%", 100),
+    "torque_limit": Quantity(_draw_limit, _limit_torque, "N m"),
+    "damping": Quantity(_draw_damping, _damp, "mN m s/rad", 1e3),
+    "delay": Quantity(_draw_delay, _delay, "ms", 1e3, signed=True),
+    "lengths": Quantity(
+        lambda rng, a: _of_random_size(rng, 2 * NUM_LEGS, a.ranges.lengths * a.scales.crank),
+        _lengthen, "mm", 1e3,
+    ),
+    "anchors": Quantity(
+        lambda rng, a: _of_random_size(rng, 6 * NUM_LEGS, a.ranges.anchors * a.scales.crank),
+        _move_anchors, "mm", 1e3,
+    ),
+    "seed": Quantity(draw_seed, seed_noise),
+}  # fmt: skip
+"""True less believed, of what `Ranges` says how far it may be off."""

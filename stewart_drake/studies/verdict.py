@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
 from stewart_drake.law.limits import amplification, fastest_pole
 from stewart_drake.loop.controller_margin import ControllerMargin, true_dynamics, true_model
 from stewart_drake.loop.experiment import Experiment
+from stewart_drake.loop.results import MarginSummary
 
 INSTANTS: Final = 30
 """Poles are looked at this often along the reference; 29 steps, a prime, since a round number of
@@ -75,7 +76,7 @@ def loop_verdict(loop: ControllerMargin) -> str:
     )
 
 
-def loop_word(margin: dict[str, Any] | None) -> str:
+def loop_word(margin: MarginSummary | None) -> str:
     """The same in a few words, of `controller_margin` in a run's summary."""
     if margin is None or margin["stable"] is None:
         return "not judged"

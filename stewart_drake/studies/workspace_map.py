@@ -57,21 +57,29 @@ class Section(NamedTuple):
     margin: Array
 
 
-def last_inside(inside: Callable[[float], bool], limit: float) -> float:
-    """Largest s in [0, limit] with everything before it inside, to limit / 2^30 beyond a scan.
-
-    The scan of 200 steps finds the first exit unless one is narrower than a step; `inside(0)`
-    holds.
-    """
-    step = limit / _STEPS
-    last = next((k for k in range(_STEPS) if not inside((k + 1) * step)), None)
-    if last is None:
-        return limit
-    low, high = last * step, (last + 1) * step
-    for _ in range(_BISECTIONS):
+def border(
+    inside: Callable[[float], bool], low: float, high: float, tolerance: float
+) -> tuple[float, float]:
+    """Two numbers so close to each other, the first inside and the second not, by bisection."""
+    while high - low > tolerance:
         middle = (low + high) / 2
         low, high = (middle, high) if inside(middle) else (low, middle)
-    return low
+    return low, high
+
+
+def last_inside(
+    inside: Callable[[float], bool], limit: float, steps: int = _STEPS, tolerance: float = 0.0
+) -> float:
+    """Largest s in [0, limit] with everything before it inside.
+
+    The scan finds the first exit unless one is narrower than a step; `inside(0)` holds. The
+    tolerance, if none is given, is that of 30 bisections of a step.
+    """
+    step = limit / steps
+    last = next((k for k in range(steps) if not inside((k + 1) * step)), None)
+    if last is None:
+        return limit
+    return border(inside, last * step, (last + 1) * step, tolerance or step / 2**_BISECTIONS)[0]
 
 
 def travel(mechanism: Mechanism) -> list[Travel]:

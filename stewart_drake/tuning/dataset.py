@@ -24,12 +24,12 @@ from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.versions import versions
 from stewart_drake.files.yamlio import brief
 from stewart_drake.loop.results import SimulationResult
-from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS
 from stewart_drake.studies.disturbances import draw
 from stewart_drake.studies.jobs import Progress, run_jobs
+from stewart_drake.studies.runs import run_to_its_end
 from stewart_drake.tuner.density import densities
 from stewart_drake.tuning.grid import PAPER_ROWS, SAMPLES, Run, disturbed_runs, paper_runs
 
@@ -92,18 +92,18 @@ def make_dataset(
         "data": f"disturbed, seed {seed}" if disturbances else "paper",
     }
     directory = Path(directory)
-    files = run_jobs(
+    kept = run_jobs(
         {key: (run.scenario,) for key, run in runs.items()},
         sample_run,
         directory / "runs",
         settings=settings,
         suffix=".npz",
+        read=read_run,
         workers=workers,
         scheduler=scheduler,
         progress=progress,
-        check=read_run,
     )
-    dataset = assemble(runs, files, settings | {"draws": [one._asdict() for one in draws]})
+    dataset = assemble(runs, kept, settings | {"draws": draws})
     if not disturbances and dataset.sizes["run"] * dataset.sizes["sample"] != PAPER_ROWS:
         raise AssertionError(f"the paper's data set has {PAPER_ROWS} rows")
     # A summary that is there speaks of the data set beside it.
@@ -116,17 +116,14 @@ def make_dataset(
 def sample_run(scenario: Scenario) -> bytes:
     """One run as the bytes of an .npz file: the samples, and how the run ended."""
     # A log of one's own period need not hold the samples.
-    result = simulate(dataclasses.replace(scenario, log_period=None), margin=False)
-    if result.status == "interrupted":
-        raise KeyboardInterrupt
-    buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        samples=samples(result),
-        status=np.array(result.status),
-        stopped=np.nan if result.stopped is None else result.stopped.time,
-        **{name: result.summary[name] for name in _NUMBERS},
-    )
+    result = run_to_its_end(dataclasses.replace(scenario, log_period=None))
+    buffer, summary = io.BytesIO(), dict[str, Any](result.summary)
+    arrays: dict[str, Any] = {
+        "samples": samples(result),
+        "status": np.array(result.status),
+        "stopped": np.nan if result.stopped is None else result.stopped.time,
+    }
+    np.savez(buffer, **arrays, **{name: summary[name] for name in _NUMBERS})
     return buffer.getvalue()
 
 
@@ -147,14 +144,10 @@ def samples(result: SimulationResult) -> Array:
 
 
 def assemble(
-    runs: Mapping[str, Run], files: Mapping[str, Path], settings: Mapping[str, Any]
+    runs: Mapping[str, Run], kept: Mapping[str, dict[str, Any]], settings: Mapping[str, Any]
 ) -> xr.Dataset:
-    """All runs as one data set over (run, sample, input).
-
-    Raises:
-        ConfigError: a file is damaged.
-    """
-    read = [read_run(files[key]) for key in runs]
+    """All runs, and what `read_run` tells of each, as one data set over (run, sample, input)."""
+    read = [kept[key] for key in runs]
     rows = np.array([one["samples"] for one in read]).reshape(-1, SAMPLES, len(TUNER_INPUTS))
     valid = np.isfinite(rows).all(axis=2)
     rho = np.array([densities(one) for one in rows]).reshape(rows.shape)

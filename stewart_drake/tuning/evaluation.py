@@ -6,8 +6,6 @@ tuner is compared with is the one that did best on these very scenarios.
 """
 
 import hashlib
-import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -18,14 +16,13 @@ from scipy import stats
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import read_bytes
-from stewart_drake.files.jsonio import jsonable
 from stewart_drake.files.resources import resolve
-from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import AnnTunerConfig, Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.studies.disturbances import Disturbance, disturbed, draw, with_gain
+from stewart_drake.studies.disturbances import disturbed, draw, with_gain
 from stewart_drake.studies.jobs import Job, Progress, run_jobs
-from stewart_drake.studies.run_files import EvaluationOutcome, read_evaluation
+from stewart_drake.studies.runs import Outcome, read_outcome, run_scenario
+from stewart_drake.studies.uncertainty import Draw
 from stewart_drake.tuner.network import DEFAULT, EXPECTED, MAX_BYTES, load_network
 from stewart_drake.tuning.grid import PAIRS
 
@@ -39,8 +36,6 @@ GAINS: Final = {
 TUNER: Final = "tuner"
 CONFIDENCE: Final = 0.95
 RESAMPLES: Final = 10_000
-
-_KEPT: Final = ("accumulated_error", "rms_torque", "peak_torque", "torque_variation")
 
 
 class Evaluation(NamedTuple):
@@ -98,30 +93,27 @@ def evaluate(
         f"{number:04d}_tuner": (_with_tuner(cell, path),) for number, cell in enumerate(cells)
     }
     settings = {"scenario": scenario_to_dict(scenario), "seed": seed}
-    directory = Path(directory)
-    done = 0
+    directory, runs = Path(directory), dict[str, Outcome]()
 
     def counted(number: int, _: int) -> None:
         if progress is not None:
             progress(done + number, len(fixed) + len(tuned))
 
-    files: dict[str, Path] = {}
     for jobs, name, extra in (
         (fixed, "fixed", {}),
         (tuned, f"tuner-{content[:8]}", {"network": content}),
     ):
-        files |= run_jobs(
+        done = len(runs)
+        runs |= run_jobs(
             jobs,
-            evaluation_run,
+            run_scenario,
             directory / name,
             settings=settings | extra,
+            read=read_outcome,
             workers=workers,
             scheduler=scheduler,
             progress=counted,
-            check=read_evaluation,
         )
-        done += len(jobs)
-    runs = {key: read_evaluation(file) for key, file in files.items()}
     # The fixed runs go through all gains, one scenario after the other.
     table = [[runs[key] for key in fixed][i :: len(GAINS)] for i in range(len(GAINS))]
     table.append([runs[key] for key in tuned])
@@ -130,7 +122,7 @@ def evaluate(
 
 
 def _evaluation(
-    table: list[list[EvaluationOutcome]], draws: Sequence[Disturbance], settings: dict[str, Any]
+    table: list[list[Outcome]], draws: list[Draw], settings: dict[str, Any]
 ) -> Evaluation:
     """What runs (candidates x scenarios) say together, the tuner's last."""
     candidates = (*GAINS, TUNER)
@@ -139,10 +131,7 @@ def _evaluation(
         **compare(candidates, error, settings["seed"]),
         "fallbacks": sum(run.tuner_fallbacks for run in table[-1]),
         "scenarios": [
-            {
-                **one._asdict(),
-                "E_ac": dict(zip(candidates, error[:, number], strict=True)),
-            }
+            one | {"E_ac": dict(zip(candidates, error[:, number], strict=True))}
             for number, one in enumerate(draws)
         ],
         "base": settings["scenario"],
@@ -150,19 +139,6 @@ def _evaluation(
         "network": settings["network"],
     }
     return Evaluation(candidates, error, summary)
-
-
-def evaluation_run(scenario: Scenario) -> bytes:
-    """One run as JSON: how it ended, its error and torques, the tuner's fallbacks."""
-    result = simulate(scenario, margin=False)
-    if result.status == "interrupted":
-        raise KeyboardInterrupt
-    data = {name: result.summary[name] for name in _KEPT} | {
-        "status": result.status,
-        "stopped": None if result.stopped is None else result.stopped.time,
-        "tuner_fallbacks": result.summary["counts"]["tuner_fallbacks"],
-    }
-    return (json.dumps(jsonable(data)) + "\n").encode()
 
 
 def compare(candidates: tuple[str, ...], error: Array, seed: int) -> dict[str, Any]:
@@ -182,37 +158,43 @@ def compare(candidates: tuple[str, ...], error: Array, seed: int) -> dict[str, A
     """
     failed = np.isnan(error)
     common = error[:, ~failed.any(axis=0)]
-    number = common.shape[1]
-    nan = float("nan")
-    mean = common.mean(axis=1) if number else np.full(len(candidates), nan)
-    half = np.full(len(candidates), nan)
+    number, failures = common.shape[1], failed.sum(axis=1)
+    some = common if number else np.full((len(candidates), 1), np.nan)
+    mean, half = some.mean(axis=1), np.full(len(candidates), np.nan)
     if number > 1:
-        t = stats.t.ppf((1 + CONFIDENCE) / 2, number - 1)
-        half = t * common.std(axis=1, ddof=1) / np.sqrt(number)
-    failures = failed.sum(axis=1)
+        half = stats.t.ppf((1 + CONFIDENCE) / 2, number - 1) * stats.sem(some, axis=1)
     best = min(range(len(candidates) - 1), key=lambda i: (failures[i], mean[i]))
-    result: dict[str, Any] = {
+
+    def improvement(tuner: Array, fixed: Array, axis: int = -1) -> Any:
+        return 1 - tuner.mean(axis=axis) / fixed.mean(axis=axis)
+
+    sure: Any = (np.nan, np.nan)
+    if number > 1:
+        sure = stats.bootstrap(
+            (common[-1], common[best]),
+            improvement,
+            paired=True,
+            n_resamples=RESAMPLES,
+            confidence_level=CONFIDENCE,
+            method="percentile",
+            random_state=np.random.default_rng(seed),
+        ).confidence_interval
+    return {
         "candidates": {
             name: {
                 "failures": int(failures[i]),
                 "mean": mean[i],
                 "interval": [mean[i] - half[i], mean[i] + half[i]],
-                "worst": common[i].max() if number else nan,
+                "worst": some[i].max(),
             }
             for i, name in enumerate(candidates)
         },
         "common": number,
         "best_fixed": candidates[best],
-        "improvement": 1 - mean[-1] / mean[best],
-        "hindsight": 1 - common[:-1].min(axis=0).mean() / mean[best] if number else nan,
-        "improvement_interval": [nan, nan],
+        "improvement": improvement(some[-1], some[best]),
+        "hindsight": 1 - some[:-1].min(axis=0).mean() / mean[best],
+        "improvement_interval": list(map(float, sure)),
     }
-    if number > 1:
-        picks = np.random.default_rng(seed).integers(number, size=(RESAMPLES, number))
-        ratio = common[-1][picks].mean(axis=1) / common[best][picks].mean(axis=1)
-        tails = [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]
-        result["improvement_interval"] = np.quantile(1 - ratio, tails).tolist()
-    return result
 
 
 def _with_tuner(scenario: Scenario, path: Path) -> Scenario:

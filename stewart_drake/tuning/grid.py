@@ -1,13 +1,14 @@
 """The runs that a tuner's data set is made of: the paper's grid, and disturbed ones."""
 
-import copy
 import itertools
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.timing import METRIC_PERIOD
-from stewart_drake.studies.disturbances import Disturbance, disturbed, sine_of, with_gain
+from stewart_drake.studies.disturbances import disturbed, sine_of, with_gain
+from stewart_drake.studies.uncertainty import Draw
 
 LEVELS: Final = (0.1, 1.0, 4.0)
 PAIRS: Final = tuple(itertools.product(LEVELS, LEVELS))
@@ -40,15 +41,16 @@ def paper_runs(scenario: Scenario) -> dict[str, Run]:
     check(scenario)
     runs: dict[str, Run] = {}
     for steps, frequency in itertools.product(DELAYS, FREQUENCIES):
-        cell = copy.deepcopy(scenario)
-        cell.delay.steps = steps
-        sine = sine_of(cell)
-        sine.frequency, sine.frequency_unit = frequency, "rad/s"
+        cell = replace(
+            scenario,
+            delay=replace(scenario.delay, steps=steps),
+            reference=replace(sine_of(scenario), frequency=frequency, frequency_unit="rad/s"),
+        )
         runs |= _pairs(cell, f"delay{steps:02d}_frequency{frequency:g}", steps, frequency, -1)
     return runs
 
 
-def disturbed_runs(scenario: Scenario, draws: list[Disturbance]) -> dict[str, Run]:
+def disturbed_runs(scenario: Scenario, draws: list[Draw]) -> dict[str, Run]:
     """Nine runs for each disturbance, which brings its own delay and frequency.
 
     Raises:
@@ -58,7 +60,7 @@ def disturbed_runs(scenario: Scenario, draws: list[Disturbance]) -> dict[str, Ru
     runs: dict[str, Run] = {}
     for number, one in enumerate(draws):
         cell = disturbed(scenario, one)
-        runs |= _pairs(cell, f"disturbed{number:04d}", one.delay_steps, one.frequency, number)
+        runs |= _pairs(cell, f"disturbed{number:04d}", one["delay_steps"], one["frequency"], number)
     return runs
 
 

@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from stewart_drake.report.page import Table
-from stewart_drake.report.tables import number
+from stewart_drake.report.document import Table
+from stewart_drake.report.words import number
 from stewart_drake.studies.failures import Explanation, Pair, Separation
 
 Names = Callable[[str], str]
@@ -19,12 +19,21 @@ def failures_sentence(found: Explanation, names: Names, units: Names) -> str:
         return ""
     total = f"the {found.failing} failing runs from the other {found.others}"
     if found.found:
-        told = "; ".join(_single(one, found, names, units) for one in found.found[:_TOLD])
+        told = "; ".join(
+            f"{names(one.factor)}, of which {one.failing} of the {found.failing} have the outer "
+            f"third ({_third(one, units)}) against {one.others} of the {found.others} "
+            f"(AUC {one.auc.value:.2f}, {one.auc.low:.2f} to {one.auc.high:.2f})"
+            for one in found.found[:_TOLD]
+        )
         text = f"What tells {total}: {told}."
     else:
         text = f"No single quantity separates {total}."
     if found.pairs:
-        told = "; ".join(_pair(one, found, names) for one in found.pairs[:_TOLD])
+        told = "; ".join(
+            f"{_where(one, names)}, {one.failing} of the {found.failing} against {one.others} of "
+            f"the {found.others}"
+            for one in found.pairs[:_TOLD]
+        )
         text += f" Two together: {told}."
     elif not found.found:
         text += " Nor does a pair of them."
@@ -33,34 +42,24 @@ def failures_sentence(found: Explanation, names: Names, units: Names) -> str:
 
 def failures_tables(found: Explanation, names: Names, units: Names) -> list[Table]:
     """Every quantity asked about, and the pairs that were found."""
-    lines = [
-        (
-            names(one.factor),
-            f"{'from' if one.larger else 'up to'} {number(one.bound)} {units(one.factor)}",
-            f"{one.failing} of {found.failing}",
-            f"{one.others} of {found.others}",
-            f"{one.auc.value:.2f}",
-            f"{one.auc.low:.2f} to {one.auc.high:.2f}",
-            f"{one.p:.2g}",
-        )
+
+    def counts(one: Separation | Pair) -> tuple[str, str]:
+        return f"{one.failing} of {found.failing}", f"{one.others} of {found.others}"
+
+    singles = [
+        (names(one.factor), _third(one, units), *counts(one), f"{one.auc.value:.2f}",
+         f"{one.auc.low:.2f} to {one.auc.high:.2f}", f"{one.p:.2g}")
         for one in found.singles
-    ]
+    ]  # fmt: skip
     head = ("quantity", "its outer third", "of failing runs", "of the others",
             "P(failing larger)", "interval", "adjusted p")  # fmt: skip
-    tables = [
-        Table(
-            head,
-            lines,
-            "Failing runs against the others, by Mann and Whitney's rank test; a third of all runs "
-            "would lie in the outer third by chance.",
-        )
-    ]
+    caption = (
+        "Failing runs against the others, by Mann and Whitney's rank test; a third of all runs "
+        "would lie in the outer third by chance."
+    )
+    tables = [Table(head, singles, caption)]
     if found.pairs:
-        pairs = [
-            (_where(one, names), f"{one.failing} of {found.failing}",
-             f"{one.others} of {found.others}", f"{one.p:.2g}")
-            for one in found.pairs
-        ]  # fmt: skip
+        pairs = [(_where(one, names), *counts(one), f"{one.p:.2g}") for one in found.pairs]
         caption = (
             "Pairs, cut at their medians, that tell more together than each alone (Fisher's exact "
             "tests)."
@@ -71,20 +70,8 @@ def failures_tables(found: Explanation, names: Names, units: Names) -> list[Tabl
     return tables
 
 
-def _single(one: Separation, found: Explanation, names: Names, units: Names) -> str:
-    side = "from" if one.larger else "up to"
-    return (
-        f"{names(one.factor)}, of which {one.failing} of the {found.failing} have the outer third "
-        f"({side} {number(one.bound)} {units(one.factor)}) against {one.others} of the "
-        f"{found.others} (AUC {one.auc.value:.2f}, {one.auc.low:.2f} to {one.auc.high:.2f})"
-    )
-
-
-def _pair(one: Pair, found: Explanation, names: Names) -> str:
-    return (
-        f"{_where(one, names)}, {one.failing} of the {found.failing} against {one.others} of the "
-        f"{found.others}"
-    )
+def _third(one: Separation, units: Names) -> str:
+    return f"{'from' if one.larger else 'up to'} {number(one.bound)} {units(one.factor)}"
 
 
 def _where(one: Pair, names: Names) -> str:

@@ -1,19 +1,20 @@
-"""What `model check` prints."""
+"""What is told of a mechanism at its home pose, held there under gravity."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.report.tables import number, rows, wrap
-from stewart_drake.report.workspace_page import travel_text
+from stewart_drake.report.document import Document, Section, Values
+from stewart_drake.report.words import number
+from stewart_drake.report.workspace_document import travel_text
 from stewart_drake.studies.mechanism_check import MechanismCheck
 
 Array = NDArray[np.float64]
 
 
-def mechanism_table(check: MechanismCheck) -> str:
-    """A mechanism at its home pose, held there under gravity; 80 columns."""
+def document(check: MechanismCheck) -> Document:
+    """What `model check` prints."""
     mechanism, measures = check.mechanism, check.measures
     cranks, rods = _lengths(mechanism.crank_lengths), _lengths(mechanism.rod_lengths)
     entries = {
@@ -36,17 +37,14 @@ def mechanism_table(check: MechanismCheck) -> str:
             "open-loop poles": _poles(check.poles),
             "from home alone": travel_text(check.travel),
         }
-    return "\n".join([wrap(check.verdict), rows(entries)])
+    return Document(mechanism.name, check.verdict, [Section("", Values(entries))])
 
 
 def _inertias(mechanism: Mechanism) -> str:
     """Principal moments of what moves, and which of them nobody measured."""
     parts = []
-    for name, body, shape in (
-        ("plate", mechanism.plate, "disc"),
-        ("crank", mechanism.crank, "bar"),
-        ("rod", mechanism.rod, "bar"),
-    ):
+    for name, shape in (("plate", "disc"), ("crank", "bar"), ("rod", "bar")):
+        body = getattr(mechanism, name)
         moments = ", ".join(f"{value:.3g}" for value in body.inertia)
         note = f" (estimated: uniform {shape})" if body.estimated else ""
         parts.append(f"{name} {moments}{note}")
@@ -70,7 +68,7 @@ def _poles(poles: NDArray[np.complex128]) -> str:
     swing = [pole.imag for pole in poles if abs(pole.real) <= 1e-6 * fastest < pole.imag]
     parts = []
     if grow:
-        parts.append("unstable " + ", ".join(number(pole) for pole in grow) + " /s")
+        parts.append("unstable " + ", ".join(map(number, grow)) + " /s")
     if swing:
-        parts.append("oscillating " + ", ".join(number(pole) for pole in swing) + " rad/s")
+        parts.append("oscillating " + ", ".join(map(number, swing)) + " rad/s")
     return "; ".join(parts) or "all zero"

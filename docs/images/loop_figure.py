@@ -71,23 +71,23 @@ _ROUTES: Final[dict[tuple[str, str], _Route]] = {
 }
 
 
+@figure_style()
 def loop_figure(loop: Diagram) -> Figure:
     """The block diagram of a closed loop, see `loop.diagram.build_closed_loop`.
 
     Raises:
         ValueError: a block or a connection that has no place in the drawing.
     """
-    with figure_style():
-        figure = Figure(figsize=_SIZE)
-        ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        ax.set(xlim=(0, _SIZE[0]), ylim=(0, _SIZE[1]))
-        ax.axis("off")
-        for (target, j), (source, i) in loop.connection_map().items():
-            output, into = source.get_output_port(i), target.get_input_port(j)
-            _line(ax, source.get_name(), target.get_name(), _text(output, into))
-        for system in loop.GetSystems():
-            _block(ax, system)
-        return figure
+    figure = Figure(figsize=_SIZE)
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    ax.set(xlim=(0, _SIZE[0]), ylim=(0, _SIZE[1]))
+    ax.axis("off")
+    for (target, j), (source, i) in loop.connection_map().items():
+        output, into = source.get_output_port(i), target.get_input_port(j)
+        _line(ax, source.get_name(), target.get_name(), _text(output, into))
+    for system in loop.GetSystems():
+        _block(ax, system)
+    return figure
 
 
 def _text(output: Any, into: Any) -> str:

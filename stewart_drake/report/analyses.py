@@ -1,0 +1,53 @@
+"""The analyses of a scenario: what studies it, and what is told of that."""
+
+import time
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+from stewart_drake.report import (
+    delay_document,
+    hautus_document,
+    robustness_document,
+    workspace_document,
+)
+from stewart_drake.report.answer import Answer
+from stewart_drake.report.document import Document
+from stewart_drake.report.page import Provenance
+from stewart_drake.studies.delay_limits import study_delay
+from stewart_drake.studies.hautus import study_hautus
+from stewart_drake.studies.robustness import study_robustness
+from stewart_drake.studies.workspace import study_workspace
+
+
+class Analysis(NamedTuple):
+    """One of them.
+
+    `study` is called with the scenario and options; what it returns has a `summary`, plain data.
+    """
+
+    study: Callable[..., Any]
+    document: Callable[[Any], Document]
+
+
+ANALYSES: Final = {
+    "delay": Analysis(study_delay, delay_document.document),
+    "hautus": Analysis(study_hautus, hautus_document.document),
+    "workspace": Analysis(study_workspace, workspace_document.document),
+    "robustness": Analysis(study_robustness, robustness_document.document),
+}
+"""By the word after `analyze`."""
+
+
+def analyze(name: str, *subject: Any, command: str, **options: Any) -> Answer:
+    """Study a scenario.
+
+    Args:
+        name: of the analysis.
+        subject: the scenario, and what else the study takes by position.
+        command: what does the same again, as typed.
+        options: of the study.
+    """
+    analysis, started = ANALYSES[name], time.perf_counter()
+    study = analysis.study(*subject, **options)
+    made = Provenance(command, seconds=time.perf_counter() - started)
+    return Answer(study, study.summary, analysis.document(study), made)

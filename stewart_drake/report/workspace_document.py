@@ -1,0 +1,164 @@
+"""What is told of a workspace study."""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
+from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
+from stewart_drake.report.document import (
+    Block,
+    Document,
+    Paragraph,
+    Picture,
+    Section,
+    Table,
+    Values,
+)
+from stewart_drake.report.style import FACTORS, UNITS
+from stewart_drake.report.words import number
+from stewart_drake.report.workspace_figures import (
+    margins_figure,
+    motors_figure,
+    sections_figure,
+)
+from stewart_drake.scenario.signals import COORDINATE_NAMES
+from stewart_drake.studies.sizing import Sizing
+from stewart_drake.studies.workspace import WorkspaceStudy
+from stewart_drake.studies.workspace_map import Travel
+
+_COORDINATES: Final = tuple(zip(COORDINATE_NAMES, FACTORS, UNITS, strict=True))
+_MOTORS: Final = {
+    "peak_torque": "torque peak [N\u00a0m]",
+    "rms_torque": "torque rms [N\u00a0m]",
+    "peak_speed": "speed peak [rad/s]",
+    "rms_speed": "speed rms [rad/s]",
+    "peak_power": "power peak [W]",
+    "least_power": "power least [W]",
+    "rms_power": "power rms [W]",
+}
+
+
+def document(study: WorkspaceStudy) -> Document:
+    """Reach and singularity along the reference, motors, and what is around home."""
+    mechanism, summary = study.experiment.mechanism, study.summary
+    time, leg, margin = study.worst
+    factor = study.factor
+    largest = f"{'' if factor.limited else 'more than '}{factor.told} of this one"
+    facts = {
+        "mechanism": mechanism.name,
+        "least reach margin": f"{number(1e3 * margin)} mm, leg {leg}, t = {time:.2f} s",
+        "largest amplitude": "-" if np.isnan(factor.value) else largest,
+    }
+    sections = [_along(study, summary)]
+    if study.sizing is not None:
+        sections.append(_motors(study.sizing, study.torque_limit, summary["motors"]))
+    if study.travel:
+        sections.append(_around(study))
+    return Document(
+        f"Workspace of {mechanism.name}, {study.experiment.scenario.reference.kind} reference",
+        study.verdict,
+        sections,
+        "bad" if study.exit is not None else "fair" if study.home is not None else "good",
+        facts,
+    )
+
+
+def travel_text(travel: list[Travel]) -> str:
+    """How far each coordinate goes from home alone, degrees and mm."""
+    return ", ".join(
+        f"{name} {factor * t.low:.3g} to +{factor * t.high:.3g} {unit}"
+        for (name, factor, unit), t in zip(_COORDINATES, travel, strict=True)
+    )
+
+
+def _along(study: WorkspaceStudy, summary: Mapping[str, Any]) -> Section:
+    columns = (
+        "leg",
+        "least reach margin [mm]",
+        "at [s]",
+        "least sine off dead centre",
+        "least transmission",
+    )
+    rows = [
+        (
+            str(leg["leg"]),
+            number(1e3 * leg["least_reach_margin"]),
+            f"{leg['time']:.2f}",
+            # A dash where the leg does not reach: there is no angle.
+            number(leg["least_sine"] if leg["least_sine"] >= 0 else np.nan),
+            number(leg["least_transmission"]),
+        )
+        for leg in summary["legs"]
+    ]
+    caption = "Negative margins are missing millimetres."
+    length = 1e3 * summary["characteristic_length"]
+    home = summary["home"]
+    values = {
+        "condition": f"home {number(home['condition'])}, "
+        f"worst {number(summary['worst_condition'])} on the reference",
+        "parallel": f"home {number(home['parallel'])}, least "
+        f"{number(summary['least_parallel'])} (a simulation stops at {SINGULARITY_LIMIT:g})",
+    }
+    text = [
+        "The reach margin is how far the rod's end could still be moved before the leg cannot be "
+        f"closed. A run ends where a crank comes within {DEAD_CENTRE_SINE:g} (sine of the angle) "
+        "of its dead centre: there it cannot follow (serial singularity). It also ends where "
+        f"det W falls below {SINGULARITY_LIMIT:g}: there locked cranks no longer hold the plate "
+        "(parallel singularity). The transmission is the cosine of the angle between the rod and "
+        "the way of the crank's tip.",
+        "The condition number is that of A, which takes the plate's twist to crank rates, with "
+        f"angular velocities times {length:.4g} mm, the mean distance of the plate joints from "
+        "the centre of mass. 1 is a machine alike in all directions.",
+        "The largest amplitude scales the motion about its first pose. It is the end of the first "
+        "range that fits: beyond, larger motions might fit again.",
+    ]
+    picture = Picture(
+        partial(margins_figure, study.margins, study.exit),
+        "Margins along the reference. Dotted: where a simulation stops.",
+    )
+    table = Table(columns, rows, caption, brief=True)
+    return Section("Along the reference", *text, table, Values(values), picture)
+
+
+def _motors(sizing: Sizing, limit: float | None, motors: list[dict[str, Any]]) -> Section:
+    rows = [(str(m["leg"]), *(number(m[name]) for name in _MOTORS)) for m in motors]
+    caption = "Per crank, by inverse dynamics of the nominal plant on the reference."
+    text = (
+        "What the motors must do to follow the reference exactly, without catch-up, feedback and "
+        "unknown loads. Negative power is fed back or braked away."
+    )
+    parts: list[Block | str] = [text, Table(("leg", *_MOTORS.values()), rows, caption, brief=True)]
+    if limit is not None:
+        used = f"{100 * max(m['use_of_limit'] for m in motors):.3g} %"
+        text = f"The largest torque is {used} of the limit, {limit:g} N m."
+        parts.append(Paragraph(text, brief=True))
+    figure = partial(motors_figure, sizing, limit)
+    return Section("Motors", *parts, Picture(figure, "Torque, speed and power per crank."))
+
+
+def _around(study: WorkspaceStudy) -> Section:
+    rows = [
+        (name, unit, f"{factor * t.low:.4g}", t.low_reason, f"+{factor * t.high:.4g}",
+         t.high_reason)
+        for (name, factor, unit), t in zip(_COORDINATES, study.travel, strict=True)
+    ]  # fmt: skip
+    columns = ("coordinate", "unit", "from home down", "ends because", "up", "ends because")
+    caption = "One coordinate alone; the other five stay as at home."
+    figure = partial(
+        sections_figure, study.sections, study.experiment.mechanism.home, study.margins.pose
+    )
+    picture = Picture(
+        figure,
+        "Condition number over sections through home, the other four coordinates as there. Only "
+        "the part that is connected with home within the section is shown. The reference is "
+        "projected: off the section it may be elsewhere in the workspace.",
+    )
+    text = (
+        "No contact between parts is modelled: cables, covers and crossing rods may end a motion "
+        "earlier."
+    )
+    travel = Values({"from home alone": travel_text(study.travel)})
+    return Section("Around home", text, travel, Table(columns, rows, caption), picture)

@@ -1,0 +1,103 @@
+"""How far each quantity of `analyze robustness` may be off; nothing heavy is imported here."""
+
+import dataclasses
+import re
+import typing
+from collections.abc import Iterable
+from typing import Annotated, Any, Final
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.yamlio import brief, parse_yaml, validate
+
+_Positive = Annotated[float, Field(gt=0)]
+
+
+@dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+class Ranges:
+    """How far each quantity may be off; 0 (null for `torque_limit`) leaves it alone.
+
+    The controller is told the torque limit and the sensor's noise, and nothing else. What the
+    numbers are shares of stands beside them, and in `RANGE_UNITS`.
+
+    Attributes:
+        payload: a mass at the plate's centre of mass, uniform in +-.
+        torque_bias: rms over the motors, uniform from 0; its direction in the space of the six
+            motors is random.
+        noise: standard deviation of the measured pose (rates: per second), uniform from 0.
+        torque_limit: of the motors, least and most, uniform; what limits the undisturbed run, the
+            scenario's number or the mechanism's motors, is never exceeded.
+        damping: friction torque of a crank, uniform from 0.
+        delay: true delay less the believed one, uniform in +-.
+        delay_steps: the same, each number in +- alike; adds to `delay`.
+        lengths: error of crank and rod lengths, rms over the twelve, uniform from 0.
+        anchors: error of the coordinates of motor shafts and plate joints, rms over the 36,
+            uniform from 0.
+    """
+
+    payload: Annotated[float, Field(ge=0, lt=1, description="+-share of the plate's mass")] = 0.1
+    torque_bias: Annotated[
+        float, Field(ge=0, description="share of the reference's largest torque")
+    ] = 0.02
+    noise: Annotated[
+        float, Field(ge=0, description="share of half the reference's peak to peak")
+    ] = 1e-3
+    torque_limit: Annotated[
+        Annotated[list[_Positive], Field(min_length=2, max_length=2)] | None,
+        Field(description="[least, most] in peak torques of the undisturbed run"),
+    ] = dataclasses.field(default_factory=lambda: [1.0, 3.0])
+    damping: Annotated[
+        float,
+        Field(
+            ge=0, description="share of the reference's largest torque, at its largest crank speed"
+        ),
+    ] = 0.02
+    delay: Annotated[float, Field(ge=0, le=100, description="+-periods of the controller")] = 0.01
+    delay_steps: Annotated[int, Field(ge=0, le=100, description="+-whole periods")] = 0
+    lengths: Annotated[float, Field(ge=0, lt=1, description="share of the mean crank length")] = (
+        2e-4
+    )
+    anchors: Annotated[float, Field(ge=0, lt=1, description="share of the mean crank length")] = (
+        2e-4
+    )
+
+
+RANGE_UNITS: Final[dict[str, str]] = {
+    name: next(one.description for one in hint.__metadata__ if one.description)
+    for name, hint in typing.get_type_hints(Ranges, include_extras=True).items()
+}
+"""By name of a field of `Ranges`, what its numbers are shares of."""
+
+
+def read_ranges(settings: Iterable[str]) -> Ranges:
+    """Ranges from `name=value` settings, the value in YAML; the rest keeps its default.
+
+    Raises:
+        ConfigError: in one line.
+    """
+    given: dict[str, Any] = {}
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if not equals or not name.strip():
+            raise ConfigError(f"--vary: got {brief(setting)}; expected name=value{_units(setting)}")
+        given[name.strip()] = parse_yaml(text, f"--vary: {name.strip()}")
+    try:
+        ranges = validate(Ranges, given, "--vary")
+    except ConfigError as error:
+        raise ConfigError(f"{error}{_units(str(error), given)}") from None
+    limit = ranges.torque_limit
+    if limit is not None and limit[0] > limit[1]:
+        raise ConfigError(
+            f"--vary: torque_limit: got {limit!r}; expected the lesser one first"
+            f"{_units('torque_limit')}"
+        )
+    return ranges
+
+
+def _units(message: str, names: Iterable[str] = RANGE_UNITS) -> str:
+    """What the numbers mean of those `names` that a message speaks of."""
+    spoken = set(re.findall(r"\w+", message))
+    told = [f"{name}: {RANGE_UNITS[name]}" for name in names if name in spoken & set(RANGE_UNITS)]
+    return f" ({'; '.join(told)})" if told else ""
