@@ -69,7 +69,7 @@ def alone(name: str) -> float:
     """A function without its arguments being copied, but with the call from Python."""
     found, arguments = function(name)
     found(*arguments)
-    return repeated(found._own.buffers.evaluate, 500)
+    return repeated(found.own_buffers().evaluate, 500)
 
 
 def called(name: str) -> float:

@@ -27,6 +27,8 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native import build, library
 from stewart_drake.native.layout import SIGNATURES
+from stewart_drake.report.document import Document
+from stewart_drake.report.page import Provenance, html
 from tests.backends import switched
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
@@ -280,6 +282,8 @@ def test_the_backend_is_named(native, capsys, value: str, name: str) -> None:
         assert f"dynamics: {name}" in capsys.readouterr().out
         scenario = sd.load_scenario("paper", settings=["duration=0.2"])
         assert sd.simulate(scenario, margin=False).summary["backend"] == name
+        page = html(Document("Title", "Verdict.", ()), Provenance("command"))
+        assert f"Dynamics: {name}." in page
 
 
 def test_without_a_library_nothing_but_speed_is_missing(native, monkeypatch) -> None:
