@@ -58,7 +58,7 @@ class DynamicsFunctions(Protocol):
         """(pose, angles) -> the same with crank angles (6,) that are known."""
 
     def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
-        """d[pose; rates]/dt (12,), in an array that this thread's next call may use again."""
+        """d[pose; rates]/dt (12,)."""
 
     def margin(self, pose: Array, sign: float, least: Array) -> float:
         """`margin_of` the measures of a pose."""

@@ -128,10 +128,7 @@ class StewartDynamics:
         )[0]
 
     def change(self, state: Array, torque: Array) -> Array:
-        """d[pose; rates]/dt (12,), for an integrator, whose arrays have the right shape.
-
-        The array may be used again by this thread's next call.
-        """
+        """d[pose; rates]/dt (12,), for an integrator, whose arrays have the right shape."""
         return self._functions.change(state, torque, self.parameters, self.gravity)
 
     def inverse_dynamics(
