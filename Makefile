@@ -20,7 +20,7 @@ PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
 COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null || true
 
 .DEFAULT_GOAL := help
-.PHONY: demo test lint format-check types wheel newest bench soak clean help
+.PHONY: generate demo test casadi lint format-check types wheel newest bench soak clean help
 
 demo: $(INSTALLED)  ## the paper's comparison, from rest, on the reference, and with a delay of 0.8 s believed to be 0.6 s
 	$(BIN)/stewart-drake compare paper --out out/demo/rest
@@ -33,13 +33,17 @@ demo: $(INSTALLED)  ## the paper's comparison, from rest, on the reference, and 
 # Each takes a stretch of the files, so that what their tests share is made once, and who is done
 # takes from the other.
 WORKERS := -n logical --maxprocesses 4 --dist worksteal
-test soak bench: export OMP_NUM_THREADS := 1
-test soak bench: export OPENBLAS_NUM_THREADS := 1
+test casadi soak bench: export OMP_NUM_THREADS := 1
+test casadi soak bench: export OPENBLAS_NUM_THREADS := 1
 # Tests start commands, and each would compile all of the package anew.
-test soak: export PYTHONDONTWRITEBYTECODE :=
+test casadi soak: export PYTHONDONTWRITEBYTECODE :=
 
 test: $(INSTALLED)  ## the tests; ARGS="..." is handed to pytest
 	$(BIN)/pytest $(WORKERS) $(ARGS)
+
+WITHOUT_C := test_dynamics test_exact_plant test_wrench test_control_law test_estimator test_closed_loop
+casadi: $(INSTALLED)  ## the tests of dynamics, plant and law on CasADi's virtual machine
+	STEWART_NATIVE=0 $(BIN)/pytest $(WORKERS) $(WITHOUT_C:%=tests/%.py) $(ARGS)
 
 soak: $(INSTALLED)  ## the endurance runs, which `make test` leaves out
 	$(BIN)/pytest $(WORKERS) -m soak $(ARGS)
@@ -64,6 +68,10 @@ bench: $(INSTALLED_BENCH)  ## every script in benchmarks/, one after the other
 		echo "== $$script"; $(BIN)/python $$script; \
 	done
 
+generate: $(INSTALLED)  ## writes the equations in C anew, after a change of theirs, and compiles them
+	$(BIN)/python -m stewart_drake.dynamics.generate
+	$(BIN)/python -m stewart_drake.native.build
+
 clean:  ## removes builds, caches and the demo's output, keeps .venv
 	rm -rf build dist out/demo .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find . -path ./$(VENV) -prune -o -type d -name __pycache__ -exec rm -rf {} +
@@ -71,7 +79,8 @@ clean:  ## removes builds, caches and the demo's output, keeps .venv
 help:  ## this list
 	@awk 'BEGIN {FS = ":.*  ## "} /^[a-z-]+:.*  ## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
 
-$(INSTALLED): pyproject.toml constraints.txt
+# The C is compiled by the installation; a library that is older than its source is not used.
+$(INSTALLED): pyproject.toml constraints.txt hatch_build.py $(wildcard stewart_drake/native/*.[ch])
 	@test -n "$(PYTHON)" || { echo "no Python found: set PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "$(PYTHON) is too old: set PYTHON to a Python 3.11 or newer"; exit 1; }

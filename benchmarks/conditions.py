@@ -60,7 +60,9 @@ def run(number: int, controller: str, factor: float) -> str:
     if result.stopped is not None:
         return f"left at {result.stopped.time:.2f} s"
     worst = result.summary["controller_step_ms"]["worst"]
-    return f"{result.accumulated_error:.3g}" + (f" ({worst:.0f} ms)" if controller[0] == "a" else "")
+    return f"{result.accumulated_error:.3g}" + (
+        f" ({worst:.0f} ms)" if controller[0] == "a" else ""
+    )
 
 
 def main() -> None:

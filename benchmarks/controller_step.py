@@ -26,6 +26,7 @@ from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
 from stewart_drake.law.observers import NoObserver, ParameterObserver
 from stewart_drake.law.predictors import NonlinearPredictor
+from stewart_drake.native.library import backend
 
 RESULTS = Path(__file__).parent / "results"
 RUNS = 6
@@ -134,8 +135,8 @@ def evaluations() -> list[list[str]]:
     dynamics.accelerations(pose, rates, torque)
     compiled, theta = dynamics._functions.accelerations, dynamics.parameters
     calls: dict[str, Callable[[], object]] = {
-        "CasADi's virtual machine alone": compiled._evaluate,
-        "behind `Compiled`": lambda: compiled(pose, rates, torque, theta, dynamics.gravity),
+        f"the function alone, {backend().name}": compiled.own_buffers().evaluate,
+        "with its arguments": lambda: compiled(pose, rates, torque, theta, dynamics.gravity),
         "`StewartDynamics.accelerations`": lambda: dynamics.accelerations(pose, rates, torque),
     }
     least = dict.fromkeys(calls, np.inf)

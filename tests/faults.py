@@ -18,6 +18,7 @@ from typing_extensions import is_typeddict
 
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.schema import spelling
 
 Loader = Callable[[Path], Any]
 
@@ -55,7 +56,7 @@ def fields(type_: type, above: str = "") -> Iterator[tuple[str, Any, bool]]:
     """
     hints = typing.get_type_hints(type_)
     for field in dataclasses.fields(type_):
-        hint, name = hints[field.name], f"{above}{field.name}"
+        hint, name = hints[field.name], f"{above}{spelling(type_, field.name)}"
         required = (
             field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         )

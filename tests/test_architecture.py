@@ -24,6 +24,7 @@ ROOMS = (
     "files",
     "scenario",
     "mechanism",
+    "native",
     "dynamics",
     "law",
     "tuner",
@@ -35,7 +36,7 @@ ROOMS = (
 )
 RANK = {name: number for number, name in enumerate(ROOMS)}
 
-PURE = ("mechanism", "dynamics", "law", "tuner")
+PURE = ("mechanism", "native", "dynamics", "law", "tuner")
 FRAMEWORK = ("pydrake.systems.framework", "pydrake.all")
 CONNECTS = ("loop.diagram", "loop.law_design", "loop.platforms")
 SEES_PUBLIC_NAMES = ("cli",)  # may import the package itself

@@ -46,6 +46,27 @@ SCENARIO_RANGES: dict[str, list[float]] = {
     "plant.joint_damping": [-1.0],
     "delay.steps": [-1, 1001],
     "delay.fraction": [-0.1, 1.0],
+    "delay.drift": [-1.0, 11.0],
+    "delay.swing": [-0.1, 101.0],
+    "delay.swing_frequency": [0, -1.0],
+    "delay.jump": [-101.0, 101.0],
+    "delay.jump_time": [-1.0],
+    "delay.jitter_std": [-0.1, 11.0],
+    "delay.seed": [-1, 2**32],
+    **{
+        f"link.{part}{name}": values
+        for part in ("", "return.")
+        for name, values in {
+            "low": [-0.1, 0.95],
+            "high": [-0.1],
+            "median": [0, -1.0],
+            "sigma": [0, 11.0],
+            "loss": [-0.1, 1.0],
+            "burst": [0, 1001],
+        }.items()
+    },
+    "link.playout": [-0.1],
+    "link.seed": [-1, 2**32],
     "controller.period": [0, -0.1, 1e-9],
     "controller.delay_steps": [-1, 1001],
     "controller.delay_fraction": [-0.1, 1.0],
@@ -53,8 +74,15 @@ SCENARIO_RANGES: dict[str, list[float]] = {
     "controller.w_R": [0, -1.0],
     "controller.integral_weight": [0, -1.0],
     "controller.catch_up": [-1.0, 1e-9],
+    "controller.packet_torques": [0, 101],
+    "controller.packet_repeats": [-1, 101],
+    "controller.delay_std": [0, 11.0],
+    "controller.delay_max": [0, 11.0],
+    "controller.rejoin": [-0.1, 11.0],
     "actuator.torque_limit": [0, -1.0],
     "sensor.seed": [-1, 2**32],
+    "sensor.delay": [-0.1, 101.0],
+    "sensor.loss": [-0.1, 1.0],
 }
 SCENARIO_LISTS: dict[str, list[Any]] = {
     "reference.amplitude": [0.1] * 6,
@@ -69,6 +97,11 @@ FOR_KIND = {
     "reference.poses": {"kind": "waypoints", "times": [0.0, 1.0]},
     "reference.file": {"kind": "csv"},
     "tuner.weights": {"kind": "ann"},
+    **{
+        f"link.{name}": {"kind": "network"}
+        for name in ("distribution", "return.distribution", "dry", "acknowledged")
+    },
+    **{name: {"kind": "network"} for name in SCENARIO_RANGES if name.startswith("link.")},
 }
 """What a field needs beside it, so that it means something."""
 FITS_NOT = ("reference.times", "too long")

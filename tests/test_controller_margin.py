@@ -90,7 +90,12 @@ def growth(sc: Scenario, periods: int, last: int) -> float:
 
 SHORT_PERIOD = ("controller.period=0.02", "delay.steps=5")
 """Over which the law's own integration of an unstable plant is exact enough."""
-ALONE = (*HOLD, "controller.estimator=none", "controller.catch_up=0")
+ALONE = (
+    *HOLD,
+    "controller.estimator=none",
+    "controller.catch_up=0",
+    "controller.quiet_start=false",
+)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from stewart_drake.files.jsonio import jsonable
 from stewart_drake.loop.controller import HELD
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.recording import Table
-from stewart_drake.loop.results import MarginSummary, RunSummary, StepTimes
+from stewart_drake.loop.results import DelaySummary, MarginSummary, RunSummary, StepTimes
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.report.csv_file import read_signals, signals_csv
 from stewart_drake.scenario.loading import scenario_yaml
@@ -257,7 +257,7 @@ def test_the_ports_are_those_of_the_table() -> None:
 )
 def test_the_summary_has_the_keys_and_kinds_that_its_type_tells(settings: tuple[str, ...]) -> None:
     """Of a run that completes, and of one that leaves the workspace."""
-    summary = run(*settings).summary
+    summary = sd.simulate(scenario(*settings)).summary
     assert (summary["status"] == "completed") == (len(settings) == 1)
     margin = summary["controller_margin"]
     assert margin is not None
@@ -265,6 +265,7 @@ def test_the_summary_has_the_keys_and_kinds_that_its_type_tells(settings: tuple[
         (summary, RunSummary),
         (margin, MarginSummary),
         (summary["controller_step_ms"], StepTimes),
+        (summary["delay"], DelaySummary),
     ):
         hints = typing.get_type_hints(kind)
         assert list(part) == list(hints)

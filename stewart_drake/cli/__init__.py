@@ -84,7 +84,9 @@ def _root(
     if show_version:
         from importlib.metadata import version
 
-        typer.echo(f"stewart-drake {version('stewart-drake')}")
+        from stewart_drake.native.library import backend
+
+        typer.echo(f"stewart-drake {version('stewart-drake')}, dynamics: {backend()}")
         raise typer.Exit
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())

@@ -176,7 +176,7 @@ def compare(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Run the shipped controllers on a scenario, and the rows it adds, as a table."""
+    """Run the shipped controllers on a scenario, as a table."""
     from stewart_drake.loop.experiment import prepare
     from stewart_drake.report.run_document import comparison_document
     from stewart_drake.report.words import wrap

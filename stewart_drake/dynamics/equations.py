@@ -19,8 +19,10 @@ from typing import NamedTuple
 
 import casadi as ca
 
+from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers, Number, numbers_of
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.signals import BIAS, DAMPING, NUM_LEGS, NUM_PARAMETERS, PAYLOAD
+from stewart_drake.native.layout import SHAPES
+from stewart_drake.scenario.signals import BIAS, DAMPING, NUM_LEGS, PAYLOAD
 
 STANDARD_GRAVITY = 9.81
 """m/s^2, along -z of W; Drake's default."""
@@ -64,6 +66,36 @@ class Motion(NamedTuple):
     """J, kinetic plus potential."""
 
 
+class Sums(NamedTuple):
+    """What plate and legs add up to."""
+
+    M_ww: ca.SX
+    """(3, 3), as the next two: blocks of M."""
+    M_wv: ca.SX
+    M_vv: ca.SX
+    h_w: ca.SX
+    """(3,), as the next one: parts of h."""
+    h_v: ca.SX
+    energy: ca.SX
+    """J."""
+
+    def plus(self, other: "Sums") -> "Sums":
+        """Both."""
+        return Sums(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+class PlateMotion(NamedTuple):
+    """How the plate moves: all that a leg needs to know, in W."""
+
+    R_WP: ca.SX
+    position: ca.SX
+    """(3,) m."""
+    w: ca.SX
+    v: ca.SX
+    gravity: ca.SX
+    """(3,) m/s^2."""
+
+
 def cross_matrix(a: ca.SX) -> ca.SX:
     """(3, 3) with cross_matrix(a) b = a x b."""
     return ca.skew(a)
@@ -82,8 +114,8 @@ def _held_above(x: ca.SX, threshold: float) -> ca.SX:
     return threshold * (held + ca.fmax(y - 1.0, 0.0))
 
 
-def leg_at_joint(mechanism: Mechanism, leg: int) -> ca.Function:
-    """Crank and rod of leg `leg` (0 to 5) reduced to Q: (q, w, gravity) in S -> `Leg`.
+def leg_at_joint(leg: LegNumbers, common: CommonNumbers) -> ca.Function:
+    """Crank and rod of a leg reduced to Q: (q, w, gravity) in S and the numbers -> `Leg`.
 
     Crank tip T at u c, its direction of motion t = n x c, rod direction r, all unit vectors, n the
     motor axis (z of S). The rod's length gives r.(w - v_T) = 0 with v_T = u alpha_dot t, so
@@ -99,8 +131,8 @@ def leg_at_joint(mechanism: Mechanism, leg: int) -> ca.Function:
     * I_y, about the universal joint's second axis y, may differ from I_t = I_z: a rank-one rest.
     """
     q, w, gravity = ca.SX.sym("q", 3), ca.SX.sym("w", 3), ca.SX.sym("gravity", 3)
-    u, length = float(mechanism.crank_lengths[leg]), float(mechanism.rod_lengths[leg])
-    c, t = crank_directions(q, u, length, float(mechanism.branches[leg]))
+    u, length = leg.crank_length, leg.rod_length
+    c, t = crank_directions(q, u, length, leg.branch)
     r = q - u * c
     r /= ca.norm_2(r)  # which is the rod's length, but out of reach
     g = r / (u * ca.dot(r, t))
@@ -110,19 +142,19 @@ def leg_at_joint(mechanism: Mechanism, leg: int) -> ca.Function:
     alpha_acc = (ca.sumsqr(d) / length + u * alpha_dot**2 * ca.dot(r, c)) / (u * ca.dot(r, t))
     a_T = u * (alpha_acc * t - alpha_dot**2 * c)
 
-    crank, rod = mechanism.crank, mechanism.rod
-    I_a, I_y, I_t = (float(moment) for moment in rod.inertia)
-    mu_0, mu_1 = rod.mass, rod.mass * rod.center
-    mu_2 = mu_1 * rod.center + I_t / length**2
+    I_a, I_y, I_t = common.rod_inertia
+    mu_0, mu_1 = common.rod_mass, common.rod_mass * common.rod_center
+    mu_2 = mu_1 * common.rod_center + I_t / length**2
     tip_mass, coupling = mu_0 - 2 * mu_1 + mu_2, mu_1 - mu_2
-    shaft_inertia = float(crank.inertia[2]) + crank.mass * (crank.center * u) ** 2
+    shaft_inertia = common.crank_inertia + common.crank_mass * (common.crank_center * u) ** 2
     tg = u * ca.mtimes(t, g.T)
     mass = (
         (shaft_inertia + tip_mass * u**2) * ca.mtimes(g, g.T)
         + coupling * (tg + tg.T)
         + mu_2 * ca.SX.eye(3)
     )
-    lever = crank.mass * crank.center + mu_0 - mu_1  # mass that the crank tip carries, kg
+    # Mass that the crank tip carries, kg.
+    lever = common.crank_mass * common.crank_center + mu_0 - mu_1
     bias = (
         g
         * (shaft_inertia * alpha_acc + u**2 * tip_mass * alpha_acc - u * lever * ca.dot(t, gravity))
@@ -142,22 +174,23 @@ def leg_at_joint(mechanism: Mechanism, leg: int) -> ca.Function:
     k = per_radian * at_Q(across)
     mass += I_a * ca.mtimes(k, k.T)
     bias += I_a * (k * spin_acc - spin / length**2 * at_Q(ca.cross(r, d)))
-    if I_y != I_t:
+    if isinstance(I_y, ca.SX) or I_y != I_t:
         extra_mass, extra_bias = _unequal_sides(I_y - I_t, r, across, horizontal, d, a_T, length)
         mass += ca.mtimes([ca.SX.eye(3) - tg.T, extra_mass, ca.SX.eye(3) - tg])
         bias += at_Q(extra_bias)
 
     potential = -ca.dot(gravity, u * lever * c + mu_1 * q)
     mass = _symmetric(mass)
-    return ca.Function("leg", [q, w, gravity], [mass, bias, g, potential], {"cse": True})
+    arguments = [q, w, gravity, *leg.symbols, *common.symbols]
+    return ca.Function("leg", arguments, [mass, bias, g, potential], {"cse": True})
 
 
-def swing_cosine(q: ca.SX, u: float, length: float) -> ca.SX:
+def swing_cosine(q: ca.SX, u: Number, length: Number) -> ca.SX:
     """cos(delta) = C / hypot(A, B); beyond [-1, 1] the leg does not reach q."""
     return (ca.sumsqr(q) + u**2 - length**2) / (2 * u * ca.sqrt(q[0] ** 2 + q[1] ** 2))
 
 
-def crank_directions(q: ca.SX, u: float, length: float, branch: float) -> tuple[ca.SX, ca.SX]:
+def crank_directions(q: ca.SX, u: Number, length: Number, branch: Number) -> tuple[ca.SX, ca.SX]:
     """Directions c of the crank and t of its tip's motion, equation (2) without its angles.
 
     alpha = azimuth of Q + branch * delta with cos(delta) = C / hypot(A, B).
@@ -176,7 +209,13 @@ def crank_directions(q: ca.SX, u: float, length: float, branch: float) -> tuple[
 
 
 def _unequal_sides(
-    inertia: float, r: ca.SX, across: ca.SX, horizontal: ca.SX, d: ca.SX, a_T: ca.SX, length: float
+    inertia: Number,
+    r: ca.SX,
+    across: ca.SX,
+    horizontal: ca.SX,
+    d: ca.SX,
+    a_T: ca.SX,
+    length: Number,
 ) -> tuple[ca.SX, ca.SX]:
     """Mass (3, 3) and bias (3,), before D', of a moment of inertia about y = n x r / |n x r|.
 
@@ -215,48 +254,78 @@ def equations_of_motion(
     mechanism: Mechanism, pose: ca.SX, rates: ca.SX, parameters: ca.SX, gravity: ca.SX
 ) -> Motion:
     """(EOM) of the whole mechanism; `gravity` in m/s^2 along -z, `parameters` as in signals."""
-    angles, position = pose[:3], pose[3:]
-    R_WP, E = rotation(angles), angle_rate_map(angles)
-    w, v = ca.mtimes(E, rates[:3]), rates[3:]
-    E_dot_rates = ca.jtimes(w, angles, rates[:3])
-    g_W = ca.vertcat(0, 0, -gravity)
+    legs, common = numbers_of(mechanism)
+    plate = plate_motion(pose, rates, gravity)
+    sums = plate_alone(common, plate, parameters)
+    arms = []
+    for leg in legs:
+        added, arm = leg_on_plate(leg, common, plate)
+        sums = sums.plus(added)
+        arms.append(arm)
+    return assembled(sums, ca.vertcat(*arms), pose, rates)
 
-    plate_mass = mechanism.plate.mass + parameters[PAYLOAD]
-    I_W = ca.mtimes([R_WP, ca.diag(ca.DM(mechanism.plate.inertia)), R_WP.T])
-    M_ww, M_wv, M_vv = I_W, ca.SX.zeros(3, 3), plate_mass * ca.SX.eye(3)
-    h_w, h_v = ca.cross(w, ca.mtimes(I_W, w)), -plate_mass * g_W
-    energy = (ca.dot(w, ca.mtimes(I_W, w)) + plate_mass * ca.sumsqr(v)) / 2 - plate_mass * ca.dot(
-        g_W, position
+
+def plate_motion(pose: ca.SX, rates: ca.SX, gravity: ca.SX) -> PlateMotion:
+    """The plate's motion in W."""
+    angles, position = pose[:3], pose[3:]
+    w, v = ca.mtimes(angle_rate_map(angles), rates[:3]), rates[3:]
+    return PlateMotion(rotation(angles), position, w, v, ca.vertcat(0, 0, -gravity))
+
+
+def plate_alone(common: CommonNumbers, plate: PlateMotion, parameters: ca.SX) -> Sums:
+    """The plate's part of (EOM), with its payload."""
+    R_WP, position, w, v, g_W = plate
+    mass = common.plate_mass + parameters[PAYLOAD]
+    I_W = ca.mtimes([R_WP, ca.diag(common.plate_inertia), R_WP.T])
+    return Sums(
+        M_ww=I_W,
+        M_wv=ca.SX.zeros(3, 3),
+        M_vv=mass * ca.SX.eye(3),
+        h_w=ca.cross(w, ca.mtimes(I_W, w)),
+        h_v=-mass * g_W,
+        energy=(ca.dot(w, ca.mtimes(I_W, w)) + mass * ca.sumsqr(v)) / 2
+        - mass * ca.dot(g_W, position),
     )
 
-    arms = []
-    for leg in range(NUM_LEGS):
-        R_WS = ca.DM(mechanism.R_WS[leg])
-        b = ca.mtimes(R_WP, ca.DM(mechanism.p_PQ[leg]))
-        v_Q = v + ca.cross(w, b)
-        q = ca.mtimes(R_WS.T, position + b - ca.DM(mechanism.p_WS[leg]))
-        reduced = leg_at_joint(mechanism, leg)
-        at_joint = Leg(*reduced(q, ca.mtimes(R_WS.T, v_Q), ca.mtimes(R_WS.T, g_W)))
-        m = _symmetric(ca.mtimes([R_WS, at_joint.mass, R_WS.T]))
-        f = ca.mtimes(R_WS, at_joint.bias) + ca.mtimes(m, ca.cross(w, ca.cross(w, b)))
-        bx_m = ca.mtimes(cross_matrix(b), m)
-        M_ww += ca.mtimes(bx_m, cross_matrix(b).T)
-        M_wv += bx_m
-        M_vv += m
-        h_w += ca.cross(b, f)
-        h_v += f
-        arm = ca.mtimes(R_WS, at_joint.arm)
-        arms.append(ca.horzcat(ca.cross(b, arm).T, arm.T))
-        energy += ca.dot(v_Q, ca.mtimes(m, v_Q)) / 2 + at_joint.potential
 
+def leg_on_plate(leg: LegNumbers, common: CommonNumbers, plate: PlateMotion) -> tuple[Sums, ca.SX]:
+    """What a leg adds to (EOM), and its row (1, 6) of B'."""
+    R_WP, position, w, v, g_W = plate
+    R_WS = leg.R_WS
+    b = ca.mtimes(R_WP, leg.p_PQ)
+    v_Q = v + ca.cross(w, b)
+    q = ca.mtimes(R_WS.T, position + b - leg.p_WS)
+    reduced = leg_at_joint(leg, common)
+    arguments = q, ca.mtimes(R_WS.T, v_Q), ca.mtimes(R_WS.T, g_W), *leg.symbols, *common.symbols
+    at_joint = Leg(*reduced(*arguments))
+    m = _symmetric(ca.mtimes([R_WS, at_joint.mass, R_WS.T]))
+    f = ca.mtimes(R_WS, at_joint.bias) + ca.mtimes(m, ca.cross(w, ca.cross(w, b)))
+    bx_m = ca.mtimes(cross_matrix(b), m)
+    arm = ca.mtimes(R_WS, at_joint.arm)
+    added = Sums(
+        M_ww=ca.mtimes(bx_m, cross_matrix(b).T),
+        M_wv=bx_m,
+        M_vv=m,
+        h_w=ca.cross(b, f),
+        h_v=f,
+        energy=ca.dot(v_Q, ca.mtimes(m, v_Q)) / 2 + at_joint.potential,
+    )
+    return added, ca.horzcat(ca.cross(b, arm).T, arm.T)
+
+
+def assembled(sums: Sums, arm: ca.SX, pose: ca.SX, rates: ca.SX) -> Motion:
+    """(EOM) of plate and legs; `arm` is B'."""
+    E = angle_rate_map(pose[:3])
+    w = ca.mtimes(E, rates[:3])
+    M = ca.vertcat(ca.horzcat(sums.M_ww, sums.M_wv), ca.horzcat(sums.M_wv.T, sums.M_vv))
     return Motion(
-        mass=_symmetric(ca.vertcat(ca.horzcat(M_ww, M_wv), ca.horzcat(M_wv.T, M_vv))),
-        bias=ca.vertcat(h_w, h_v),
-        arm=ca.vertcat(*arms),
-        nu=ca.vertcat(w, v),
-        nu_dot_bias=ca.vertcat(E_dot_rates, ca.SX.zeros(3)),
+        mass=_symmetric(M),
+        bias=ca.vertcat(sums.h_w, sums.h_v),
+        arm=arm,
+        nu=ca.vertcat(w, rates[3:]),
+        nu_dot_bias=ca.vertcat(ca.jtimes(w, pose[:3], rates[:3]), ca.SX.zeros(3)),
         rates_map=ca.diagcat(E, ca.SX.eye(3)),
-        energy=energy,
+        energy=sums.energy,
     )
 
 
@@ -268,6 +337,35 @@ def _symmetric(matrix: ca.SX) -> ca.SX:
 def shaft_torque(motion: Motion, torque: ca.SX, parameters: ca.SX) -> ca.SX:
     """Torque (6,) that reaches the cranks: the motors' plus bias less viscous friction."""
     return torque + parameters[BIAS] - parameters[DAMPING] * ca.mtimes(motion.arm, motion.nu)
+
+
+def force(motion: Motion, torque: ca.SX, parameters: ca.SX) -> ca.SX:
+    """B torque - h, the generalised force (6,) beside M nu_dot."""
+    return ca.mtimes(motion.arm.T, shaft_torque(motion, torque, parameters)) - motion.bias
+
+
+def accelerations(motion: Motion, torque: ca.SX, parameters: ca.SX) -> ca.SX:
+    """Of the pose (6,), under motor torques."""
+    nu_dot = solve_symmetric(motion.mass, force(motion, torque, parameters))
+    return ca.solve(motion.rates_map, nu_dot - motion.nu_dot_bias)
+
+
+def inverse_dynamics(motion: Motion, accelerations: ca.SX, parameters: ca.SX) -> ca.SX:
+    """Motor torques (6,) that give these accelerations."""
+    # Without motor torque `force` is what bias, friction and h exert.
+    passive = force(motion, ca.SX.zeros(NUM_LEGS), parameters)
+    nu_dot = ca.mtimes(motion.rates_map, accelerations) + motion.nu_dot_bias
+    return ca.solve(motion.arm.T, ca.mtimes(motion.mass, nu_dot) - passive)
+
+
+def terms(motion: Motion) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """M (6, 6), bias (6,) and B (6, 6) in pose coordinates."""
+    N = motion.rates_map
+    return (
+        ca.mtimes([N.T, motion.mass, N]),
+        ca.mtimes(N.T, motion.bias + ca.mtimes(motion.mass, motion.nu_dot_bias)),
+        ca.mtimes(N.T, motion.arm.T),
+    )
 
 
 def solve_symmetric(matrix: ca.SX, right: ca.SX) -> ca.SX:
@@ -284,7 +382,4 @@ def solve_symmetric(matrix: ca.SX, right: ca.SX) -> ca.SX:
 
 def symbols() -> dict[str, ca.SX]:
     """Fresh symbols for every argument of the equations."""
-    sizes = {"pose": 6, "rates": 6, "accelerations": 6, "torque": 6, "parameters": NUM_PARAMETERS}
-    return {name: ca.SX.sym(name, size) for name, size in sizes.items()} | {
-        "gravity": ca.SX.sym("gravity")
-    }
+    return {name: ca.SX.sym(name, *shape) for name, shape in SHAPES.items()}

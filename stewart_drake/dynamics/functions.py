@@ -1,139 +1,97 @@
-"""The equations of motion of a mechanism, compiled into CasADi functions on first use."""
+"""The functions of a mechanism's dynamics: in C, or on CasADi's virtual machine."""
 
+from collections.abc import Sequence
 from functools import lru_cache
-from typing import Final
+from typing import Protocol
 
-import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from stewart_drake.dynamics import equations
-from stewart_drake.dynamics.compiled import Compiled
-from stewart_drake.dynamics.derivatives import residual_derivatives
-from stewart_drake.dynamics.threads import BUILDING, built_once
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.signals import NUM_PARAMETERS, NUM_STATE
+from stewart_drake.native.library import backend
+from stewart_drake.scenario.signals import NUM_LEGS
 
-_UNROLLED: Final = 64
-"""Steps in one piece of a prediction; longer ones are loops of such pieces, because one piece of n
-steps takes memory like n^2, 10 GB for 4000."""
+Array = NDArray[np.float64]
+
+
+class Call(Protocol):
+    """Takes what can be broadcast to its arguments, gives fresh arrays, matrices transposed."""
+
+    def __call__(self, *arguments: ArrayLike) -> Sequence[Array]:
+        """Evaluate; several threads may."""
+
+
+class DynamicsFunctions(Protocol):
+    """Functions of pose, rates, torque, parameters (8,) and gravity (m/s^2) of one mechanism."""
+
+    @property
+    def backend(self) -> str:
+        """What runs them, for `summary.json`."""
+
+    @property
+    def accelerations(self) -> Call:
+        """(pose, rates, torque, parameters, gravity) -> accelerations (6,)."""
+
+    @property
+    def inverse_dynamics(self) -> Call:
+        """(pose, rates, accelerations, parameters, gravity) -> torque (6,)."""
+
+    @property
+    def energy(self) -> Call:
+        """(pose, rates, parameters, gravity) -> J."""
+
+    @property
+    def terms(self) -> Call:
+        """(pose, rates, parameters, gravity) -> M, bias and B in pose coordinates."""
+
+    @property
+    def residual_derivatives(self) -> Call:
+        """(pose, rates, accelerations, torque, parameters, gravity) -> derivatives of
+        F = M nu_dot + h - B torque; see `StewartDynamics.derivatives`."""
+
+    @property
+    def measures(self) -> Call:
+        """(pose) -> the measures of the workspace (8,), see `dynamics.measures`."""
+
+    @property
+    def measures_of_tree(self) -> Call:
+        """(pose, angles) -> the same with crank angles (6,) that are known."""
+
+    def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
+        """d[pose; rates]/dt (12,)."""
+
+    def margin(self, pose: Array, sign: float, least: Array) -> float:
+        """`margin_of` the measures of a pose."""
+
+    def many_steps(self, steps: int) -> Call:
+        """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12), one call.
+
+        Steps of the classical Runge-Kutta method.
+        """
+
+
+def margin_of(measures: Array, sign: float, least: Array) -> float:
+    """By how much the measures (8,) are above the least (8,) allowed; NaN if one of them is.
+
+    `sign`: the parallel measure's at home.
+    """
+    above = measures - least
+    above[NUM_LEGS] = sign * measures[NUM_LEGS] - least[NUM_LEGS]
+    return float(above.min())
 
 
 @lru_cache(maxsize=64)
-def compiled_functions(mechanism: Mechanism) -> "DynamicsFunctions":
-    """The functions of a mechanism, shared by all who ask for it in this process."""
-    return DynamicsFunctions(mechanism)
+def compiled_functions(mechanism: Mechanism) -> DynamicsFunctions:
+    """The functions of a mechanism, shared by all who ask for it in this process.
 
+    Raises:
+        ConfigError: STEWART_NATIVE asks for what there is not.
+    """
+    library = backend().library
+    if library is None:
+        from stewart_drake.dynamics.virtual_machine import VirtualMachine
 
-class DynamicsFunctions:
-    """Functions of pose, rates, torque, parameters (8,) and gravity (m/s^2), built when needed."""
+        return VirtualMachine(mechanism)
+    from stewart_drake.dynamics.native_functions import NativeFunctions
 
-    def __init__(self, mechanism: Mechanism) -> None:
-        self.mechanism = mechanism
-        self._many: dict[int, Compiled] = {}
-
-    @built_once
-    def _symbols(self) -> dict[str, ca.SX]:
-        return equations.symbols()
-
-    @built_once
-    def _motion(self) -> equations.Motion:
-        s = self._symbols
-        return equations.equations_of_motion(
-            self.mechanism, s["pose"], s["rates"], s["parameters"], s["gravity"]
-        )
-
-    def _compile(self, name: str, arguments: str, *results: ca.SX) -> Compiled:
-        dense = [ca.densify(result) for result in results]
-        inputs = [self._symbols[argument] for argument in arguments.split()]
-        return Compiled(ca.Function(name, inputs, dense, {"cse": True}))
-
-    @built_once
-    def _force(self) -> ca.SX:
-        """B torque - h, the generalised force (6,) beside M nu_dot."""
-        torque = equations.shaft_torque(
-            self._motion, self._symbols["torque"], self._symbols["parameters"]
-        )
-        return ca.mtimes(self._motion.arm.T, torque) - self._motion.bias
-
-    @built_once
-    def _nu_dot(self) -> ca.SX:
-        """nu_dot (6,) that belongs to the accelerations of the pose."""
-        return (
-            ca.mtimes(self._motion.rates_map, self._symbols["accelerations"])
-            + self._motion.nu_dot_bias
-        )
-
-    @built_once
-    def accelerations(self) -> Compiled:
-        """(pose, rates, torque, parameters, gravity) -> accelerations (6,)."""
-        motion = self._motion
-        nu_dot = equations.solve_symmetric(motion.mass, self._force)
-        accelerations = ca.solve(motion.rates_map, nu_dot - motion.nu_dot_bias)
-        return self._compile("accelerations", "pose rates torque parameters gravity", accelerations)
-
-    @built_once
-    def inverse_dynamics(self) -> Compiled:
-        """(pose, rates, accelerations, parameters, gravity) -> torque (6,)."""
-        # Without motor torque `force` is what bias, friction and h exert.
-        passive = ca.substitute(self._force, self._symbols["torque"], ca.DM.zeros(6))
-        load = ca.mtimes(self._motion.mass, self._nu_dot) - passive
-        torque = ca.solve(self._motion.arm.T, load)
-        return self._compile(
-            "inverse_dynamics", "pose rates accelerations parameters gravity", torque
-        )
-
-    @built_once
-    def energy(self) -> Compiled:
-        """(pose, rates, parameters, gravity) -> J."""
-        return self._compile("energy", "pose rates parameters gravity", self._motion.energy)
-
-    @built_once
-    def terms(self) -> Compiled:
-        """(pose, rates, parameters, gravity) -> M, bias and B in pose coordinates."""
-        motion = self._motion
-        N = motion.rates_map
-        return self._compile(
-            "terms",
-            "pose rates parameters gravity",
-            ca.mtimes([N.T, motion.mass, N]),
-            ca.mtimes(N.T, motion.bias + ca.mtimes(motion.mass, motion.nu_dot_bias)),
-            ca.mtimes(N.T, motion.arm.T),
-        )
-
-    @built_once
-    def residual_derivatives(self) -> Compiled:
-        """Derivatives of F = M nu_dot + h - B torque; see `StewartDynamics.derivatives`."""
-        return self._compile(
-            "residual_derivatives",
-            "pose rates accelerations torque parameters gravity",
-            *residual_derivatives(self.mechanism, self._symbols),
-        )
-
-    @built_once
-    def _runge_kutta4(self) -> ca.Function:
-        """One step of the classical method: (state, torque, parameters, gravity, h) -> state."""
-        accelerations = self.accelerations.function
-        x, torque = ca.MX.sym("state", NUM_STATE), ca.MX.sym("torque", 6)
-        parameters, gravity = ca.MX.sym("parameters", NUM_PARAMETERS), ca.MX.sym("gravity")
-        h = ca.MX.sym("h")
-
-        def derivative(state: ca.MX) -> ca.MX:
-            rates = state[6:]
-            return ca.vertcat(rates, accelerations(state[:6], rates, torque, parameters, gravity))
-
-        k1 = derivative(x)
-        k2 = derivative(x + h / 2 * k1)
-        k3 = derivative(x + h / 2 * k2)
-        k4 = derivative(x + h * k3)
-        after = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return ca.Function("runge_kutta4", [x, torque, parameters, gravity, h], [after])
-
-    def many_steps(self, steps: int) -> Compiled:
-        """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12), one call."""
-        found = self._many.get(steps)
-        if found is None:
-            with BUILDING:
-                step = self._runge_kutta4
-                accumulated = step.mapaccum("predict", steps, {"base": _UNROLLED})
-                # Whoever has been here meanwhile has made the same.
-                found = self._many.setdefault(steps, Compiled(accumulated))
-        return found
+    return NativeFunctions(mechanism, library)

@@ -127,9 +127,9 @@ class StewartDynamics:
             pose, rates, torque, self._or_default(parameters), self.gravity
         )[0]
 
-    def accelerations_unchecked(self, pose: Array, rates: Array, torque: Array) -> Array:
-        """`accelerations` for an integrator, whose arrays have the right shape."""
-        return self._functions.accelerations(pose, rates, torque, self.parameters, self.gravity)[0]
+    def change(self, state: Array, torque: Array) -> Array:
+        """d[pose; rates]/dt (12,), for an integrator, whose arrays have the right shape."""
+        return self._functions.change(state, torque, self.parameters, self.gravity)
 
     def inverse_dynamics(
         self,
@@ -256,7 +256,7 @@ class StewartDynamics:
     ) -> Array:
         """States (n, 12) after each of n torques (n, 6) held for `durations` s, (n,) or one.
 
-        Each hold is cut into `substeps` steps of the classical Runge-Kutta method; one CasADi call.
+        Each hold is cut into `substeps` steps of the classical Runge-Kutta method; one call.
         """
         _shaped("state", state, (NUM_STATE,))
         torques = np.asarray(torques, dtype=np.float64)

@@ -3,14 +3,11 @@
 from functools import lru_cache
 from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.dynamics import equations
-from stewart_drake.dynamics.compiled import Compiled
 from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
-from stewart_drake.dynamics.threads import BUILDING
+from stewart_drake.dynamics.functions import compiled_functions, margin_of
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS
 
@@ -55,75 +52,27 @@ def standing(mechanism: Mechanism, pose: Array, crank_angles: Array | None = Non
     shows as a negative sine; from the pose alone it cannot be seen.
     """
     measures = _measures(mechanism, pose, crank_angles)
-    parallel, least = float(measures[NUM_LEGS]), _margin(mechanism, measures)
+    parallel, least = float(measures[NUM_LEGS]), margin_of(measures, home_sign(mechanism), _LEAST)
     return Standing(measures[:NUM_LEGS], parallel, float(pose[1]), least)
 
 
 def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> float:
     """Positive where `standing` is permitted, zero on the boundary, dimensionless; NaN for NaN."""
-    return _margin(mechanism, _measures(mechanism, pose, crank_angles))
+    sign = home_sign(mechanism)
+    if crank_angles is None:
+        return compiled_functions(mechanism).margin(pose, sign, _LEAST)
+    return margin_of(_measures(mechanism, pose, crank_angles), sign, _LEAST)
 
 
 _LEAST = np.array([DEAD_CENTRE_SINE] * NUM_LEGS + [SINGULARITY_LIMIT, -PITCH_LIMIT])
 
 
-def _margin(mechanism: Mechanism, measures: Array) -> float:
-    above = measures - _LEAST
-    above[NUM_LEGS] = home_sign(mechanism) * measures[NUM_LEGS] - _LEAST[NUM_LEGS]
-    return float(above.min())
-
-
 def _measures(mechanism: Mechanism, pose: Array, crank_angles: Array | None) -> Array:
     """(8,): the six sines, the parallel measure, minus the pitch's amount in rad."""
-    functions = _functions(mechanism)
+    functions = compiled_functions(mechanism)
     if crank_angles is None:
-        return functions.of_pose(pose)[0]
-    return functions.of_tree(pose, crank_angles)[0]
-
-
-class _Functions(NamedTuple):
-    """The measures, from a pose or from a pose and crank angles."""
-
-    of_pose: Compiled
-    of_tree: Compiled
-
-
-@lru_cache(maxsize=64)
-def _functions(mechanism: Mechanism) -> _Functions:
-    """Compiled, because every integration step asks."""
-    with BUILDING:
-        return _compile(mechanism)
-
-
-def _compile(mechanism: Mechanism) -> _Functions:
-    pose, angles = ca.SX.sym("pose", 6), ca.SX.sym("angles", 6)
-    R_WP = equations.rotation(pose[:3])
-    # Forces along the rods, and their moments over the plate's mean radius, are free of units.
-    radius = float(np.linalg.norm(mechanism.p_PQ, axis=1).mean())
-    legs: dict[str, list[tuple[ca.SX, ca.SX]]] = {"pose": [], "tree": []}
-    for leg in range(NUM_LEGS):
-        u, length = float(mechanism.crank_lengths[leg]), float(mechanism.rod_lengths[leg])
-        branch, R_WS = float(mechanism.branches[leg]), ca.DM(mechanism.R_WS[leg])
-        b = ca.mtimes(R_WP, ca.DM(mechanism.p_PQ[leg]))
-        q = ca.mtimes(R_WS.T, pose[3:] + b - ca.DM(mechanism.p_WS[leg]))
-        azimuth = ca.atan2(q[1], q[0])
-        cosine = equations.swing_cosine(q, u, length)
-        square = 1 - cosine**2
-        swing = ca.acos(ca.fmin(ca.fmax(cosine, -1.0), 1.0))
-        for kind, alpha, sine in (
-            ("pose", azimuth + branch * swing, ca.sign(square) * ca.sqrt(ca.fabs(square))),
-            ("tree", angles[leg], branch * ca.sin(angles[leg] - azimuth)),
-        ):
-            rod = (q - u * ca.vertcat(ca.cos(alpha), ca.sin(alpha), 0)) / length
-            e = ca.mtimes(R_WS, rod)
-            legs[kind].append((sine, ca.vertcat(ca.cross(b, e) / radius, e)))
-    functions = []
-    for kind, arguments in (("pose", [pose]), ("tree", [pose, angles])):
-        sines, wrenches = zip(*legs[kind], strict=True)
-        # CasADi expands the determinant by minors: no division, so it passes zero smoothly.
-        measures = ca.vertcat(*sines, ca.det(ca.horzcat(*wrenches)), -ca.fabs(pose[1]))
-        functions.append(Compiled(ca.Function(kind, arguments, [measures], {"cse": True})))
-    return _Functions(*functions)
+        return functions.measures(pose)[0]
+    return functions.measures_of_tree(pose, crank_angles)[0]
 
 
 @lru_cache(maxsize=64)

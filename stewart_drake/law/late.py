@@ -10,6 +10,7 @@ of the way is predicted anew, so that nothing is fed back before it is true.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,7 @@ class LateObserver:
     def start(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Belief:
         """See `law.observers.Observer.start`."""
         past = self.observer.start(timeline, sensing, plant)
-        return LateBelief(past.estimate, past.timeline, past.measured, past.fault, past, 0)
+        return LateBelief(**_told(past), fault=past.fault, past=past)
 
     def observe(
         self,
@@ -81,7 +82,13 @@ class LateObserver:
             acting = past.timeline.last_periods(in_flight, behind)
             now = plant.predict(past.state, acting, past.parameters)[-1]
             estimate = past.at(now).estimate
-        return LateBelief(estimate, past.timeline, past.measured, fault, past, behind)
+        told = _told(past) | {"estimate": estimate}
+        return LateBelief(**told, fault=fault, past=past, behind=behind)
+
+
+def _told(past: Belief) -> dict[str, Any]:
+    """What a belief goes on from."""
+    return {name: getattr(past, name) for name in ("estimate", "timeline", "measured")}
 
 
 def _nothing(sensing: Sensing) -> Measurement:

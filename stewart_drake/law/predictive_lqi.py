@@ -193,7 +193,9 @@ class PredictiveLqi:
             belief = belief.at(wanted[0])
         queue = belief.timeline.queue(memory.in_flight)
         guide = belief
-        if belief.feeds_back and memory.silence == 0:
+        # A limit spoils the plan: what it takes away is known without a measurement.
+        quiet = memory.silence > 0 and not self.plant.motors.reached(memory.in_flight)
+        if belief.feeds_back and not quiet:
             response = self._feed_back(memory, belief, queue, wanted, nodes, weights)
         else:
             guide = belief.assuming(self.plant.dynamics.parameters)

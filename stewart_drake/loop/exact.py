@@ -91,13 +91,12 @@ def ExactPlant_(T):
             if self._wrench is not None and self._wrench.HasValue(context):
                 wrench = self._wrench.Eval(context)
             if T is float:
-                a = self.dynamics.accelerations_unchecked(x[POSE], x[RATES], torque)
+                change = self.dynamics.change(x, torque)
                 if wrench is not None:
-                    a += self.dynamics.wrench_accelerations(x[POSE], wrench)
-                change = np.concatenate([x[RATES], a])
+                    change[RATES] += self.dynamics.wrench_accelerations(x[POSE], wrench)
             else:
                 change = self._with_gradient(x, torque, wrench)
-            derivatives.get_mutable_vector().SetFromVector(change)
+            derivatives.SetFromVector(change)
 
         def _with_gradient(self, x, torque, wrench):
             """d(x_dot) = A dx + B dT + (M N)^-1 dF, F the wrench."""

@@ -17,6 +17,7 @@ from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.experiment import Experiment, waits_at_rest
 from stewart_drake.loop.results import DelaySummary, RunSummary
 from stewart_drake.loop.tuner import AnnTuner
+from stewart_drake.native.library import backend
 from stewart_drake.scenario.loading import scenario_to_dict, scenario_yaml
 from stewart_drake.scenario.signals import (
     DIMENSIONS,
@@ -201,6 +202,7 @@ def summarize(
         },
         "delay": recorder.delay,
         "wall_s": wall,
+        "backend": backend().name,
         "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
         "own": experiment.own.names,
         "scenario": scenario_to_dict(sc),

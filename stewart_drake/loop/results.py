@@ -75,6 +75,8 @@ class RunSummary(TypedDict):
     delay: DelaySummary
     wall_s: float
     """Time that the run took, s."""
+    backend: str
+    """What ran the dynamics: `native`, or `casadi`, its virtual machine."""
     counts: dict[str, int]
     """What went wrong and was survived, by name (`law.memory.Counts`, `tuner_fallbacks`)."""
     own: dict[str, str]

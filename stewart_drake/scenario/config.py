@@ -367,9 +367,6 @@ class Scenario:
 
     def _delay_problem(self) -> str | None:
         c = self.controller
-        believed = self.eta
-        if c.delay_steps is not None:
-            believed = Delay(c.delay_steps, c.delay_fraction or 0.0).eta(c.period)
         if c.delay_estimator == "none":
             return None
         if not isinstance(self.link, WireConfig) or self.sensor.delay > 0:
@@ -378,6 +375,9 @@ class Scenario:
                 f"{self.link.kind!r} and a sensor.delay of {self.sensor.delay:g} s; expected "
                 "'none', or a wire and measurements of now"
             )
+        believed = self.eta
+        if c.delay_steps is not None:
+            believed = Delay(c.delay_steps, c.delay_fraction or 0.0).eta(c.period)
         if believed <= c.delay_max:
             return None
         return (

@@ -1,0 +1,1 @@
+"""The dynamics in C, generated, and what loads and calls it."""

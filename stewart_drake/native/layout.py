@@ -1,0 +1,96 @@
+"""What the functions in C take and give: one buffer, arguments, then geometry, then results."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.scenario.signals import (
+    NUM_COORDINATES,
+    NUM_LEGS,
+    NUM_PARAMETERS,
+    NUM_STATE,
+    NUM_TORQUES,
+)
+
+Array = NDArray[np.float64]
+
+LEG_NUMBERS: Final = 18
+"""Crank's and rod's lengths, branch, R_WS by columns (9), p_PQ (3), p_WS (3); each for six legs."""
+COMMON_NUMBERS: Final = 13
+"""Plate's mass and inertia (3); crank's mass, centre and inertia about the motor axis; rod's mass,
+centre and inertia (3); the plate's mean radius."""
+MEASURES: Final = NUM_LEGS + 2
+"""Of the workspace."""
+GEOMETRY: Final = NUM_LEGS * LEG_NUMBERS + COMMON_NUMBERS
+
+SHAPES: Final = {
+    "pose": (NUM_COORDINATES,),
+    "rates": (NUM_COORDINATES,),
+    "state": (NUM_STATE,),
+    "accelerations": (NUM_COORDINATES,),
+    "torque": (NUM_TORQUES,),
+    "parameters": (NUM_PARAMETERS,),
+    "gravity": (),
+    "angles": (NUM_LEGS,),
+    "sign": (),
+    "least": (MEASURES,),
+}
+"""Shape of each argument."""
+
+
+class Signature(NamedTuple):
+    """Arguments by their names in SHAPES, and the shapes of results, transposed as CasADi's are."""
+
+    arguments: tuple[str, ...]
+    results: tuple[tuple[int, ...], ...]
+
+
+def _signature(arguments: str, *results: tuple[int, ...]) -> Signature:
+    return Signature(tuple(arguments.split()), results)
+
+
+SIGNATURES: Final = {
+    "accelerations": _signature("pose rates torque parameters gravity", (6,)),
+    "inverse_dynamics": _signature("pose rates accelerations parameters gravity", (6,)),
+    "energy": _signature("pose rates parameters gravity", ()),
+    "terms": _signature("pose rates parameters gravity", (6, 6), (6,), (6, 6)),
+    "residual_derivatives": _signature(
+        "pose rates accelerations torque parameters gravity",
+        (NUM_STATE, 6),
+        (NUM_PARAMETERS, 6),
+        (6, 6),
+        (6, 6),
+    ),
+    "measures": _signature("pose", (MEASURES,)),
+    "measures_of_tree": _signature("pose angles", (MEASURES,)),
+    "change": _signature("state torque parameters gravity", (NUM_STATE,)),
+    "margin": _signature("pose sign least", ()),
+}
+"""What dynamics.c holds, and `predict`; the geometry stands between arguments and results."""
+
+
+def plate_radius(mechanism: Mechanism) -> float:
+    """Mean distance of the plate's joints from its COM, m."""
+    return float(np.linalg.norm(mechanism.p_PQ, axis=1).mean())
+
+
+def geometry_of(mechanism: Mechanism) -> Array:
+    """The numbers of a machine, (GEOMETRY,), in the order of `dynamics.numbers`."""
+    m = mechanism
+    legs = np.column_stack(
+        [
+            m.crank_lengths,
+            m.rod_lengths,
+            m.branches,
+            m.R_WS.transpose(0, 2, 1).reshape(NUM_LEGS, 9),
+            m.p_PQ,
+            m.p_WS,
+        ]
+    )
+    crank = [m.crank.mass, m.crank.center, m.crank.inertia[2]]
+    rod = [m.rod.mass, m.rod.center, *m.rod.inertia]
+    return np.array(
+        [*legs.T.ravel(), m.plate.mass, *m.plate.inertia, *crank, *rod, plate_radius(m)]
+    )
