@@ -192,14 +192,7 @@ class PredictiveLqi:
         if not belief.has_state:  # nothing else to go on with
             belief = belief.at(wanted[0])
         queue = belief.timeline.queue(memory.in_flight)
-        guide = belief
-        # A limit spoils the plan: what it takes away is known without a measurement.
-        quiet = memory.silence > 0 and not self.plant.motors.reached(memory.in_flight)
-        if belief.feeds_back and not quiet:
-            response = self._feed_back(memory, belief, queue, wanted, nodes, weights)
-        else:
-            guide = belief.assuming(self.plant.dynamics.parameters)
-            response = self._go_on_alone(memory, guide, wanted, nodes)
+        guide, response = self._respond(memory, belief, queue, wanted, nodes, weights)
         torque, error, integral, ahead, gain, trouble = response
         nonfinite = not np.all(np.isfinite(torque))
         if nonfinite:
@@ -227,6 +220,23 @@ class PredictiveLqi:
             plan=plan,
             sent=self.channel.send(sent, plan, memory.in_flight),
         )
+
+    def _respond(
+        self,
+        memory: Memory,
+        belief: Belief,
+        queue: Array,
+        wanted: Array,
+        nodes: Array,
+        weights: Array,
+    ) -> tuple[Belief, Response]:
+        """What is done, and the belief that it goes by."""
+        # A limit spoils the plan: what it takes away is known without a measurement.
+        quiet = memory.silence > 0 and not self.plant.motors.reached(memory.in_flight)
+        if belief.feeds_back and not quiet:
+            return belief, self._feed_back(memory, belief, queue, wanted, nodes, weights)
+        guide = belief.assuming(self.plant.dynamics.parameters)
+        return guide, self._go_on_alone(memory, guide, wanted, nodes)
 
     def _feed_back(
         self,
