@@ -24,11 +24,15 @@ from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.report.figures import draw_run
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, shown
+from stewart_drake.studies.verdict import loop_verdict
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]
@@ -358,3 +362,19 @@ def test_the_stated_band_covers(kind: str) -> None:
         assert last.settled
         ratios.append((last.delay_mean - eta) / last.delay_std)
     assert 0.9 <= np.mean(np.abs(ratios) < 1.96) <= 1.0
+
+
+def test_the_loop_is_judged_with_the_delay_as_it_will_be_found() -> None:
+    """Believed wrongly, a law that will find the delay is the law that knew it."""
+
+    def judged(*settings: str) -> ControllerMargin:
+        settings = ("plant.kind=exact", "start=on_reference", "queue=reference", *settings)
+        return controller_margin(prepare(load_scenario("paper", settings=settings)), until=2.0)
+
+    known, wrong = judged(), "controller.delay_steps=6"
+    lost, found = judged(wrong), judged(wrong, "controller.delay_estimator=constant")
+    assert known.stable and not lost.stable and found.stable
+    assert found.radius == pytest.approx(known.radius, rel=1e-9)
+    assert found.delay_found and not known.delay_found
+    assert "payload, friction and delay taken as found" in loop_verdict(found)
+    assert judged("delay.drift=0.01").problem == "its delay changes"

@@ -5,7 +5,8 @@ reference and plant stood still in that state of motion ("frozen"): `law.linear_
 is the true one, with its payload, friction, dimensions and delay; the law is as it is, with the
 delay it believes in, its model, prediction and the weights it starts with. What this leaves out:
 
-- the estimator: a law that has one is judged with torque bias, payload and friction already found;
+- the estimator: a law that has one is judged with torque bias, payload, friction, and the delay if
+  it estimates that, already found;
   how the estimate gets there, and what the filter adds to the loop, is no part of it;
 - a tuner, which would change the weights on the way; torque limits; the catch-up from rest;
 - that reference and gain change while an error lives.
@@ -13,7 +14,7 @@ delay it believes in, its model, prediction and the weights it starts with. What
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
+from stewart_drake.law.delay_observer import DelayObserver
 from stewart_drake.law.error_model import ContinuousModel, linear_model
 from stewart_drake.law.limits import amplification, fastest_pole, is_stable, spectral_radius
 from stewart_drake.law.linear_loop import LinearLoop, Margins, law_gain, worst_margins
@@ -64,6 +66,7 @@ class ControllerMargin:
         pole: fastest unstable pole of the open loop, 1/s, 0 without one.
         pole_time: s, when it is there.
         estimated: whether an estimator was taken to have found what nobody told the controller.
+        delay_found: whether that is true of the delay too.
         tuned: whether a tuner will change the weights.
         problem: why the loop was not judged, or empty.
         loops: that were judged, in the order of time, evenly over `span` s; none with a `problem`.
@@ -78,6 +81,7 @@ class ControllerMargin:
     pole: float
     pole_time: float
     estimated: bool
+    delay_found: bool
     tuned: bool
     problem: str = ""
     loops: tuple[LinearLoop, ...] = field(default=(), repr=False)
@@ -142,6 +146,9 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
     sc = experiment.scenario
     end = sc.duration if until is None else until
     truth, law = true_dynamics(experiment), compose_law(experiment)
+    finds_delay = isinstance(law.observer, DelayObserver)
+    if finds_delay:
+        law = replace(law, timeline=replace(law.timeline, delay=sc.true_delay))
     times = np.linspace(0.0, end, INSTANTS)
     poses = [evaluate(experiment.reference, t)[POSE] for t in times]
     inside = [margin(truth.mechanism, pose) > 0 for pose in poses]
@@ -158,6 +165,8 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
         problem = "the true machine does not reach all of the reference"
     elif isinstance(sc.link, NetworkConfig) or longest_wait(sc):
         problem = "its packets or measurements do not all take the same time"
+    elif not sc.delay.constant:
+        problem = "its delay changes"
     elif rows > _LARGEST:
         problem = (
             f"with {sc.true_delay.steps} periods of delay it has {rows} states, too many to judge"
@@ -179,6 +188,7 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
         pole=poles[fastest] if poles else 0.0,
         pole_time=float(times[fastest]),
         estimated=_estimates(law),
+        delay_found=finds_delay,
         tuned=experiment.network is not None,
         problem=problem,
         loops=tuple(loops),

@@ -110,7 +110,8 @@ def _left_out(loop: ControllerMargin) -> str:
     """What the judgement supposes, where there is something to suppose."""
     supposed = []
     if loop.estimated:
-        supposed.append("the estimator left out, payload and friction taken as found")
+        found = "payload, friction and delay" if loop.delay_found else "payload and friction"
+        supposed.append(f"the estimator left out, {found} taken as found")
     if loop.tuned:
         supposed.append("with the weights that the tuner starts from")
     return f" ({'; '.join(supposed)})" if supposed else ""
