@@ -2,7 +2,7 @@
 
 `python benchmarks/conditions.py` writes benchmarks/results/conditions.md: other machines, periods
 and motions, the delay believed a quarter too short or too long, with the estimator
-(`adaptive_lqi`) and without (`predictor_lqi`). All on the exact plant; times are the CPU's.
+(`adaptive_lqi`) and without (`predictor_lqi`). All on the exact plant.
 """
 
 import math
@@ -78,8 +78,8 @@ def main() -> None:
     about = ", ".join(f"{name} {version}" for name, version in versions().items())
     text = "# A delay believed wrongly, conditions that nothing was tuned for\n\n"
     text += f"Made by `python benchmarks/conditions.py` with {about}.\n\n"
-    text += "E_ac in % s; behind it the slowest step with the estimator. Believed are three and "
-    text += "five quarters of the true delay, or itself.\n\n"
+    text += "E_ac in % s; behind it the slowest step with the estimator, on busy cores. "
+    text += "Believed are three and five quarters of the true delay, or itself.\n\n"
     text += "\n".join(f"| {line} |" for line in lines) + "\n"
     (RESULTS / "conditions.md").write_text(text, encoding="utf-8")
     print(text)
