@@ -3,6 +3,7 @@
 Angles are shown in degrees, positions in mm. A run that ended early ends with a cross at that time.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -246,13 +247,24 @@ def _grid(
     return figure, list(axes.T.ravel())
 
 
+_ABREAST: Final = 7
+"""Names in one line above a figure; more would be cut off at its sides."""
+_LEGEND_LINE: Final = 0.25
+"""Inches."""
+
+
 def _with_legend(figure: Figure, axes: list[Axes]) -> Figure:
     # A run's cross has a line of its own, for which one entry stands.
     handles, labels = axes[0].get_legend_handles_labels()
     if any(line.get_marker() == _CROSS for ax in axes for line in ax.lines):
         handles.append(Line2D([], [], ls="", marker=_CROSS, color="#666666", ms=7, mew=2))
         labels.append("run ended")
-    figure.legend(handles, labels, loc="upper center", ncols=len(labels))
+    lines = max(1, math.ceil(len(labels) / _ABREAST))
+    if lines > 1:
+        room = _LEGEND_LINE * (lines - 1) / figure.get_figheight()
+        figure.subplots_adjust(top=figure.subplotpars.top - room)
+    columns = max(1, math.ceil(len(labels) / lines))
+    figure.legend(handles, labels, loc="upper center", ncols=columns)
     return figure
 
 
