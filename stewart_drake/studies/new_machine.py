@@ -265,7 +265,7 @@ def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
                 experiment.nominal, experiment.reference, experiment.scenario.duration
             ),
         )
-        for file in (machine, scenario):
-            with replacing(folder / file.name) as partial:
-                partial.write_bytes(file.read_bytes())
+        for path in (machine, scenario):
+            with replacing(folder / path.name) as partial:
+                partial.write_bytes(path.read_bytes())
     return made
