@@ -18,6 +18,8 @@ from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.delay_filter import delay_settings
 from stewart_drake.law.delay_observer import DelayObserver
 from stewart_drake.law.design_models import DesignModel, MultibodyModel, PaperModel
+from stewart_drake.law.encoder_observers import DifferencesObserver, EncoderObserver
+from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
     Feedforward,
@@ -37,7 +39,7 @@ from stewart_drake.law.predictors import (
     NonlinearPredictor,
     Predictor,
 )
-from stewart_drake.law.sensing import StateSensing
+from stewart_drake.law.sensing import Sensing, StateSensing
 from stewart_drake.law.startup import (
     STILL,
     choose_substeps,
@@ -51,7 +53,12 @@ from stewart_drake.loop.own import NOTHING, Own, take
 from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.config import AnnTunerConfig, NetworkConfig, Scenario
+from stewart_drake.scenario.config import (
+    AnnTunerConfig,
+    EncoderSensorConfig,
+    NetworkConfig,
+    Scenario,
+)
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import in_time, times_under_way
 from stewart_drake.scenario.signals import POSITION
@@ -315,9 +322,10 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     torque_scale = max(machine_torque(nominal), peak_torque)
     plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
     settings = filter_settings(motion, plate, torque_scale, asked, c.period)
+    encoders = isinstance(sc.sensor, EncoderSensorConfig)
     observers: dict[str, Observer] = {
-        "none": NoObserver(),
-        "parameters": ParameterObserver(settings),
+        "none": DifferencesObserver() if encoders else NoObserver(),
+        "parameters": EncoderObserver(settings) if encoders else ParameterObserver(settings),
     }
     predictors: dict[str, Predictor] = {
         "linear": LinearPredictor(),
@@ -341,7 +349,7 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     law = PredictiveLqi(
         timeline=timeline,
         plant=NominalPlant(nominal, substeps, GENTLE * torque_scale, motors),
-        sensing=StateSensing(np.array(sc.sensor.noise_std), motion),
+        sensing=_sensing(experiment, motion),
         observer=observer,
         predictor=predictors[c.prediction],
         feedforward=feedforwards[c.feedforward],
@@ -361,6 +369,21 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
             silence=0,  # until the delay is found
         )
     return experiment.own.revised(law)
+
+
+def _sensing(experiment: Experiment, motion: Array) -> Sensing:
+    """What is measured, as the controller knows it; `motion` is `motion_scale`."""
+    sensor = experiment.scenario.sensor
+    if not isinstance(sensor, EncoderSensorConfig):
+        return StateSensing(np.array(sensor.noise_std), motion)
+    return EncoderSensing(
+        mechanism=experiment.mechanism,
+        samples=sensor.samples,
+        quantum=0.0 if sensor.bits is None else 2 * np.pi / 2**sensor.bits,
+        declared=experiment.start,
+        rates_std=motion,
+        motion=motion,
+    )
 
 
 def longest_wait(scenario: Scenario) -> int:

@@ -30,7 +30,13 @@ from stewart_drake.scenario.field_types import (
     Weight,
 )
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
-from stewart_drake.scenario.timing import METRIC_PERIOD, bound_problem, log_problem, step_problem
+from stewart_drake.scenario.timing import (
+    METRIC_PERIOD,
+    bound_problem,
+    log_problem,
+    samples_problem,
+    step_problem,
+)
 
 
 @dataclass(config=STRICT)
@@ -277,10 +283,39 @@ class StateSensorConfig:
 
     def problem(self) -> str | None:
         """What is wrong with fields that are well formed one by one, or None."""
-        return fault_problem(self.faults)
+        return fault_problem(self.faults, legs=False)
 
 
-SensorConfig = Annotated[StateSensorConfig, ByKind()]
+@dataclass(config=STRICT)
+class EncoderSensorConfig:
+    """The measurement of the six crank angles, by an encoder at each motor.
+
+    Attributes:
+        kind: `encoders`.
+        bits: of a turn; null is exact.
+        samples: how often each is read per period of the controller, the last time at its sample.
+        offset: of each encoder on its shaft, which the controller is not told, rad.
+        delay: between measuring and having the measurement, s; by the next sample after that.
+        loss: share of the measurements, those of a period each, that are lost.
+        seed: of where codes begin, of spikes and losses; the same seed gives the same run.
+        faults: when legs measure nothing, the same again, or nonsense; see `fault_config`.
+    """
+
+    kind: Literal["encoders"] = "encoders"
+    bits: Annotated[int, Field(ge=4, le=32)] | None = 14
+    samples: Annotated[int, Field(ge=1, le=1000)] = 1
+    offset: Six = field(default_factory=lambda: [0.0] * 6)
+    delay: Annotated[float, Field(ge=0, le=100)] = 0.0
+    loss: Annotated[float, Field(ge=0, le=0.99)] = 0.0
+    seed: Seed = 0
+    faults: list[SensorFault] = field(default_factory=list)
+
+    def problem(self) -> str | None:
+        """What is wrong with fields that are well formed one by one, or None."""
+        return fault_problem(self.faults, legs=True)
+
+
+SensorConfig = Annotated[StateSensorConfig | EncoderSensorConfig, ByKind()]
 
 
 @dataclass(config=STRICT)
@@ -415,6 +450,10 @@ class Scenario:
     def _step_problem(self, step: float) -> str | None:
         """What does not suit the steps in s of a discrete plant, or None."""
         period, link = self.controller.period, self.link
+        if isinstance(self.sensor, EncoderSensorConfig):
+            problem = samples_problem(self.sensor.samples, period, step)
+            if problem:
+                return problem
         if isinstance(link, NetworkConfig):
             bound = None if link.playout is None else bound_problem(link.playout, step)
             return step_problem(step, period, 0.0) or bound
