@@ -1,7 +1,7 @@
 """The filter of `law.parameter_filter` for encoders: legs at several instants of a period.
 
-xi = [x_{k-1}; theta] is corrected by the residuals e_j (`law.encoder_sensing`) at the M nodes s_j of
-the period. With F_j from xi to the state there and J = dh/dq,
+xi = [x_{k-1}; theta] is corrected by the residuals e_j (`law.encoder_sensing`) at the M nodes s_j
+of the period. With F_j from xi to the state there and J = dh/dq,
 
     H_j = J(q_j) F_j[pose],   R_j = diag(var_j) + diag(s_j^2 J Q J'),
 

@@ -75,7 +75,7 @@ class DelayLqiController(LeafSystem):
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
-    | measurement | input | 12, or 6 N crank angles | rad, m, rad/s, m/s | read every period; NaN is lost |
+    | measurement | input | 12, or 6 N | rad, m, rad/s, m/s | read every period; NaN is lost |
     | preview | input | 18 p | rad, m and time derivatives | read every period |
     | weights | input | 2 | w_Q, w_R | read every period |
     | age | input | 1 | s, whole periods | of the measurement; only with a `LateObserver` |

@@ -38,13 +38,13 @@ class Encoders(LeafSystem):
     Update:     at n dt / N   window <- [window without its oldest; y(n dt / N)].
     Output:     measurement = window, with the sample of now whether or not its update has been.
 
-    Random numbers are functions of (seed, number of the sample) by a counter-based generator.
+    The window is sample by sample, the oldest first. Random numbers are functions of (seed, number
+    of the sample) by a counter-based generator.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
     | state | input | 12 | rad, m, rad/s, m/s | continuous |
-    | measurement | output | 6 N, sample by sample, the oldest first | rad | meant to be read at the \
-controller's samples |
+    | measurement | output | 6 N | rad | meant to be read at the controller's samples |
 
     Args:
         mechanism: the true machine.
