@@ -8,7 +8,7 @@ of the period. With F_j from xi to the state there and J = dh/dq,
 Q the drift of the pose over a period, which counts as noise here as it does there. With P = L L',
 
     A = sum H_j' R_j^-1 H_j,   b = sum H_j' R_j^-1 (e_j + H_j (xi - mean)),
-    C = 1 + L' A L,   xi <- mean + L C^-1 L' b,   P+ = L C^-1 L',
+    C = 1 + L' A L = W W',   xi <- mean + L C^-1 L' b,   P+ = (W^-1 L')' (W^-1 L'),
 
 which is positive whatever rounding does: exact encoders are 1e7 times as certain as a payload. Each
 leg is judged by itself at each node: one with e^2 > GATE S, S = H P H' + R, is left out, and the
@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from stewart_drake.law.belief import THETA, Estimate
 from stewart_drake.law.encoder_sensing import EncoderSensing, Reading
@@ -100,9 +99,11 @@ class EncoderFilter(ParameterFilter):
                         return None
                     partly = self._left_out(said, reading, there & ~kept)
                 R = np.where(kept, legs.R, np.inf)
-                C = cho_factor(np.eye(len(P)) + (HL / R[:, None]).T @ HL)
-                P = L @ cho_solve(C, L.T)
-                mean = prior + L @ cho_solve(C, HL.T @ (np.where(kept, wanted, 0.0) / R))
+                W = np.linalg.cholesky(np.eye(len(P)) + (HL / R[:, None]).T @ HL)
+                root = np.linalg.solve(W, L.T)
+                P = root.T @ root
+                b = HL.T @ (np.where(kept, wanted, 0.0) / R)
+                mean = prior + root.T @ np.linalg.solve(W, b)
                 moved = within_bounds(mean, P, settings.parameters)
                 shift, xi = legs.H @ (moved - xi), moved
                 if np.all(np.abs(shift[kept]) <= SMALL * np.sqrt(R[kept])):
