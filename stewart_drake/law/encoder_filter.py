@@ -15,7 +15,8 @@ leg is judged by itself at each node: one with e^2 > GATE S, S = H P H' + R, is 
 step goes on with the rest; if that is less than half, the measurement is an outlier.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -35,7 +36,8 @@ from stewart_drake.law.parameter_filter import (
     transitions,
     within_bounds,
 )
-from stewart_drake.scenario.signals import NUM_STATE, POSE
+from stewart_drake.scenario.known import OFFSETS
+from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, POSE
 
 Array = NDArray[np.float64]
 
@@ -69,6 +71,35 @@ class EncoderFilter(ParameterFilter):
 
     last: Array
     still: Array
+
+    @cached_property
+    def offsets(self) -> slice:
+        """Of xi, the offsets of the encoders, if they are estimated."""
+        names = self.settings.parameters.names
+        first = NUM_STATE + (names.index(OFFSETS[0]) if OFFSETS[0] in names else len(names))
+        return slice(first, first + len(OFFSETS))
+
+    def start(
+        self, measurement: Measurement, parameters: Array, near: Array | None = None
+    ) -> Estimate | None:
+        """See `ParameterFilter.start`; a pose is as uncertain as the offsets make it.
+
+        To first order dq = J^-1 (dy - do).
+        """
+        mean = np.concatenate([np.zeros(NUM_STATE), parameters])
+        offset = mean[self.offsets]
+        if len(offset) == 0:
+            return super().start(measurement, parameters, near)
+        values = measurement.values - np.tile(offset, self.encoders.samples)
+        first = super().start(replace(measurement, values=values), parameters, near)
+        if first is None:
+            return None
+        P = first.covariance.copy()
+        back = -np.linalg.inv(self.dynamics.actuation_map(first.state[POSE]).T)
+        P[POSE, self.offsets] = back @ P[self.offsets, self.offsets]
+        P[self.offsets, POSE] = P[POSE, self.offsets].T
+        P[POSE, POSE] += back @ P[self.offsets, self.offsets] @ back.T
+        return replace(first, covariance=P)
 
     @property
     def encoders(self) -> EncoderSensing:
@@ -125,13 +156,18 @@ class EncoderFilter(ParameterFilter):
         nodes = GAUSS_NODES if len(coarse.torques) <= 2 else MIDPOINT
         states, F = transitions(self.dynamics, xi, coarse, nodes)
         poses = integrate(self.dynamics, xi, fine)[samples][:, POSE]
-        return Along(states, F, places, encoders.angles(poses))
+        shown = encoders.angles(poses)
+        if len(xi[self.offsets]):
+            shown = shown + xi[self.offsets]
+        return Along(states, F, places, shown)
 
     def _legs(self, reading: Reading, at: "Along", drift: Array) -> Legs:
         H, spread = [], []
         for share, place in zip(self.encoders.shares, at.places, strict=True):
             J = self.dynamics.actuation_map(at.states[place, POSE]).T
-            H.append(J @ at.F[place, POSE])
+            row = J @ at.F[place, POSE]
+            row[:, self.offsets] += np.eye(NUM_LEGS)[:, : row[:, self.offsets].shape[1]]
+            H.append(row)
             spread.append(share**2 * J**2 @ drift[POSE])
         R = reading.variance + np.array(spread)
         return Legs(reading.beside(at.shown).ravel(), np.concatenate(H), R.ravel())
@@ -140,7 +176,7 @@ class EncoderFilter(ParameterFilter):
         self, said: Measurement, reading: Reading, gated: NDArray[np.bool_]
     ) -> tuple[str, ...]:
         """Causes for which legs were left out in part or wholly."""
-        legs = gated.reshape(-1, 6).any(axis=0)
+        legs = gated.reshape(-1, NUM_LEGS).any(axis=0)
         stuck = legs & (self.still > 0) & ~reading.odd
         causes = {
             "measurements_missing": not said.complete,

@@ -17,7 +17,7 @@ reach the next code says the same however often it is asked: what N samples are 
 of code changes among them; without one, after c periods without any, 1 / (1 + c)^2 of a sample.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any, NamedTuple
 
@@ -117,6 +117,7 @@ class EncoderSensing:
             with the measured angles it is.
         rates_std: (6,) rad/s and m/s, of those rates, and of those of any new start.
         motion: (6,) how far each coordinate is expected to move, rad and m.
+        offset: (6,) o, rad, as far as it is known beforehand.
     """
 
     mechanism: Mechanism
@@ -125,6 +126,7 @@ class EncoderSensing:
     declared: Array
     rates_std: Array
     motion: Array
+    offset: Array
 
     @property
     def size(self) -> int:
@@ -166,7 +168,7 @@ class EncoderSensing:
 
     def seen(self, state: Array) -> Array:
         """What all samples show of a plate that stands still there."""
-        return np.tile(self.angles(state[None, POSE])[0], self.samples)
+        return np.tile(self.angles(state[None, POSE])[0] + self.offset, self.samples)
 
     def through(self, state: Array, changes: Array) -> Array:
         """See `Sensing.through`."""
@@ -193,10 +195,7 @@ class EncoderSensing:
         if self.samples == 1:
             return self, measurement
         values, valid = (part[-1] for part in self._both(measurement))
-        single = EncoderSensing(
-            self.mechanism, 1, self.quantum, self.declared, self.rates_std, self.motion
-        )
-        return single, Measurement(values, valid, measurement.age)
+        return replace(self, samples=1), Measurement(values, valid, measurement.age)
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState | None:
         """Pose by forward kinematics, rates as they are expected.
@@ -206,7 +205,7 @@ class EncoderSensing:
         """
         expected = self.declared if near is None or not np.all(np.isfinite(near)) else near
         last, known = self._last(*self._both(measurement))
-        angles = np.where(known, last, self.angles(expected[None, POSE])[0])
+        angles = np.where(known, last - self.offset, self.angles(expected[None, POSE])[0])
         try:
             pose = self.mechanism.forward_kinematics(angles, expected[POSE])
             J = self.mechanism.jacobian(pose)
@@ -230,7 +229,7 @@ class EncoderSensing:
         values, used = self._both(measurement)
         values, odd = np.where(used, values, 0.0), np.zeros(NUM_LEGS, dtype=bool)
         if self.samples > NODES:
-            regular = self._regular(np.where(used, values - shown, np.nan))
+            regular = self._regular(np.where(used, values - self.offset - shown, np.nan))
             odd = np.any(used & ~regular, axis=0)
             used = used & regular
         number = used.sum(axis=0)
@@ -239,7 +238,7 @@ class EncoderSensing:
         worth = self._worth(number, self._changes(values, used, last), still)
         variance = self.std**2 * np.sum(G**2, axis=2).T / worth
         variance[:, ~enough] = np.inf
-        return Reading(np.where(used, values, 0.0), used, G, variance, odd)
+        return Reading(np.where(used, values - self.offset, 0.0), used, G, variance, odd)
 
     def _worth(self, number: NDArray[Any], changes: NDArray[Any], still: Array) -> Array:
         """(6,) by which variances are divided: independent samples over samples."""
