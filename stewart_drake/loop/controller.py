@@ -27,6 +27,7 @@ from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.signals import (
     NUM_PARAMETERS,
     NUM_REFERENCE,
+    NUM_STATE,
     NUM_TORQUES,
     WEIGHTS,
     ports_of,
@@ -79,17 +80,18 @@ class DelayLqiController(LeafSystem):
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
-    | measurement | input | 12 | rad, m, rad/s, m/s | read every period; NaN is lost |
+    | measurement | input | 12, or 6 N | rad, m, rad/s, m/s | read every period; NaN is lost |
     | preview | input | 18 p | rad, m and time derivatives | read every period |
     | weights | input | 2 | w_Q, w_R | read every period |
     | age | input | 1 | s, whole periods | of the measurement; only with a `LateObserver` |
     | report | input | 7 h | as of `PlayoutBuffer`, NaN is lost | only with a channel of packets |
     | plan | output | 6 (r + N) | N m, the packet to be sent | the same; direct feedthrough |
     | torque | output | 6 | N m | direct feedthrough |
+    | estimate | output | 12 | rad, m, rad/s, m/s | direct feedthrough; what T_k rests on |
     | torque_commanded | output | 6 | N m | held |
     | integral | output | 6 | rad s, m s | held |
     | weights_used | output | 2 | - | held, NaN before the first sample |
-    | measurement_used | output | 12 | as measurement | held, NaN before the first sample |
+    | measurement_used | output | as measurement | the same | held, NaN before the first sample |
     | state_estimate | output | 12 | rad, m, rad/s, m/s | held, NaN before the first sample |
     | parameters | output | 8 | N m, kg, N m s/rad | held; as the law believes |
     | parameter_std | output | 8 | the same | held; NaN without estimator |
@@ -131,6 +133,9 @@ class DelayLqiController(LeafSystem):
         )
         self.DeclareVectorOutputPort(
             "torque", NUM_TORQUES, weak(self._torque), {self._step.ticket()}
+        )
+        self.DeclareVectorOutputPort(
+            "estimate", NUM_STATE, weak(self._estimate), {self._step.ticket()}
         )
         if sends:
             size = first.memory.sent.packets[0].size
@@ -188,6 +193,10 @@ class DelayLqiController(LeafSystem):
     def _torque(self, context: Context, output: BasicVector) -> None:
         sample: Any = self._step.Eval(context)
         output.SetFromVector(sample.memory.torque)
+
+    def _estimate(self, context: Context, output: BasicVector) -> None:
+        sample: Any = self._step.Eval(context)
+        output.SetFromVector(sample.memory.belief.state)
 
     def _update(self, context: Context, state: State) -> None:
         state.get_mutable_abstract_state(int(self._memory)).set_value(self._step.Eval(context))
