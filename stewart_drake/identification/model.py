@@ -85,15 +85,17 @@ class MachineModel:
     def _motion(self) -> equations.Motion:
         (s, legs), common = self._symbols, numbers_of(self.mechanism)[1]
         plate = equations.plate_motion(s["pose"], s["rates"], ca.SX(self.gravity))
-        sums, arms = equations.plate_alone(common, plate, s["parameters"]), []
-        numbers = ca.SX.sym("leg", LEG_NUMBERS)
-        one, one_arm = equations.leg_on_plate(leg_numbers(numbers), common, plate)
-        leg = ca.Function("leg", [s["pose"], s["rates"], numbers], [*one, one_arm])
+        sums = equations.plate_alone(common, plate, s["parameters"])
+        numbers, arms, crank_rates = ca.SX.sym("leg", LEG_NUMBERS), [], []
+        one, *others = equations.leg_on_plate(leg_numbers(numbers), common, plate)
+        leg = ca.Function("leg", [s["pose"], s["rates"], numbers], [*one, *others])
         for number in range(NUM_LEGS):
-            *added, arm = leg(s["pose"], s["rates"], legs[:, number])
+            *added, arm, crank_rate = leg(s["pose"], s["rates"], legs[:, number])
             sums = sums.plus(equations.Sums(*added))
             arms.append(arm)
-        return equations.assembled(sums, ca.vertcat(*arms), s["pose"], s["rates"])
+            crank_rates.append(crank_rate)
+        rows = ca.vertcat(*arms), ca.vertcat(*crank_rates)
+        return equations.assembled(sums, *rows, s["pose"], s["rates"])
 
     def _many(self, name: str, inputs: list[ca.SX], results: list[ca.SX], shared: int) -> Compiled:
         """A function of so many points; the last `shared` inputs are the same for all."""
@@ -104,14 +106,16 @@ class MachineModel:
     @cached_property
     def _accelerations(self) -> Compiled:
         (s, legs), p = self._symbols, self._symbols.s["parameters"]
-        found = equations.accelerations(self._motion, s["torque"], p)
+        slip = equations.slip(self._motion.crank_rates, p)
+        found = equations.accelerations(self._motion, s["torque"], p, slip)
         return self._many("forward", [s["pose"], s["rates"], s["torque"], p, legs], [found], 2)
 
     @cached_property
     def _residual(self) -> Compiled:
         (s, legs), motion, p = self._symbols, self._motion, self._symbols.s["parameters"]
         nu_dot = ca.mtimes(motion.rates_map, s["accelerations"]) + motion.nu_dot_bias
-        F = ca.mtimes(motion.mass, nu_dot) - equations.force(motion, s["torque"], p)
+        force = equations.force(motion, s["torque"], p, equations.slip(motion.crank_rates, p))
+        F = ca.mtimes(motion.mass, nu_dot) - force
         by_legs = ca.jacobian(F, ca.vec(legs))
         places = [LEG_NUMBERS * leg + k for leg in range(NUM_LEGS) for k in LEG_PLACES]
         state = ca.vertcat(s["pose"], s["rates"])

@@ -13,15 +13,19 @@ from numpy.typing import NDArray
 
 from stewart_drake.identification.model import LEG_PLACES, NUM_DYNAMIC, NUM_GEOMETRY, Numbers
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.native.layout import LEG_NUMBERS, geometry_of
+from stewart_drake.native.layout import LEG_NUMBERS, geometry_of, plate_radius
 from stewart_drake.scenario.signals import (
     BIAS,
+    COULOMB,
+    COULOMB_SPEED,
     DAMPING,
     LEGS,
     NUM_LEGS,
-    PARAMETER_UNITS,
-    PARAMETERS,
     PAYLOAD,
+    PAYLOAD_POSITION,
+    PLANT_PARAMETER_UNITS,
+    PLANT_PARAMETERS,
+    USUAL_COULOMB_SPEED,
 )
 
 Array = NDArray[np.float64]
@@ -38,13 +42,13 @@ _OF_A_LEG: Final = (
     *(f"shaft_{axis}" for axis in "xyz"),
 )
 NAMES: Final = (
-    *PARAMETERS,
+    *PLANT_PARAMETERS,
     *(f"{name}_{leg}" for leg in LEGS for name in _OF_A_LEG),
     *(f"offset_A{leg}" for leg in LEGS),
     "delay",
 )
-UNITS: Final = (*PARAMETER_UNITS, *("m",) * NUM_GEOMETRY, *("rad",) * NUM_LEGS, "s")
-ONE_SIDED: Final = (DAMPING,)
+UNITS: Final = (*PLANT_PARAMETER_UNITS, *("m",) * NUM_GEOMETRY, *("rad",) * NUM_LEGS, "s")
+ONE_SIDED: Final = (DAMPING, COULOMB)
 """What no machine has less than nothing of."""
 
 
@@ -60,6 +64,8 @@ class Tolerances:
         bias: of a motor's torque, N m.
         payload: kg.
         damping: viscous friction, N m s/rad.
+        coulomb: Coulomb friction, N m.
+        position: of each coordinate of the payload in the plate, m.
     """
 
     lengths: float = 2e-4
@@ -69,6 +75,8 @@ class Tolerances:
     bias: float | None = None
     payload: float | None = None
     damping: float | None = None
+    coulomb: float | None = None
+    position: float | None = None
 
 
 @dataclass(frozen=True)
@@ -130,8 +138,13 @@ def unknowns_of(
     mean[GEOMETRY], mean[DELAY] = legs.ravel(), delay
     std[GEOMETRY] = np.tile([t.lengths] * 2 + [t.joints] * 6, NUM_LEGS)
     std[OFFSETS], std[DELAY] = t.offsets, t.delay
-    usual = {"bias": torque, "payload": m.plate.mass, "damping": torque / speed}
-    for place, name in ((BIAS, "bias"), (PAYLOAD, "payload"), (DAMPING, "damping")):
-        given = getattr(t, name)
-        std[place] = usual[name] if given is None else given
+    mean[COULOMB_SPEED] = USUAL_COULOMB_SPEED
+    for place, given, usual in (
+        (BIAS, t.bias, torque),
+        (PAYLOAD, t.payload, m.plate.mass),
+        (DAMPING, t.damping, torque / speed),
+        (COULOMB, t.coulomb, torque),
+        (PAYLOAD_POSITION, t.position, plate_radius(m) / 2),
+    ):
+        std[place] = usual if given is None else given
     return Unknowns(mechanism, mean, std)

@@ -5,19 +5,15 @@ is checked on its own, so that a message names the place to mend.
 """
 
 import dataclasses
-import io
 import typing
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-from ruamel.yaml.representer import RoundTripRepresenter
-
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import absolute_path, is_path, resolve, shipped
 from stewart_drake.files.schema import field_names, plain, sections, spelling
-from stewart_drake.files.yamlio import brief, load_yaml, parse_yaml, validate
+from stewart_drake.files.yamlio import brief, load_yaml, parse_yaml, validate, yaml_text
 from stewart_drake.scenario.config import ControllerConfig, Scenario
 
 _SETTINGS = "settings"
@@ -123,24 +119,7 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
 
 def scenario_yaml(scenario: Scenario) -> str:
     """The scenario as the text of a file that `load_scenario` reads back."""
-    yaml, text = YAML(), io.StringIO()
-    yaml.width, yaml.Representer = 96, _Representer
-    yaml.dump(scenario_to_dict(scenario), text)
-    return text.getvalue()
-
-
-class _Representer(RoundTripRepresenter):
-    """Lists on one line, and null by its name."""
-
-    def flat(self, values: list[Any]) -> Any:
-        return self.represent_sequence("tag:yaml.org,2002:seq", values, flow_style=True)
-
-    def null(self, _: None) -> Any:
-        return self.represent_scalar("tag:yaml.org,2002:null", "null")
-
-
-_Representer.add_representer(list, _Representer.flat)
-_Representer.add_representer(type(None), _Representer.null)
+    return yaml_text(scenario_to_dict(scenario))
 
 
 def setting_choices() -> list[str]:
