@@ -15,6 +15,10 @@ EXAMPLES: Final = {
     "compare": ("stewart-drake compare paper --set start=on_reference --set queue=reference",),
     "export": ("stewart-drake export out/lqi/signals.nc --out lqi.csv",),
     "report": ("stewart-drake report paper --set plant.kind=exact --out out/report",),
+    "identify": (
+        "stewart-drake identify --plan paper --out out/plan",
+        "stewart-drake identify out/lqi/signals.nc --mechanism paper --out out/machine",
+    ),
     "list": ("stewart-drake list",),
     "model check": ("stewart-drake model check paper --out out/paper",),
     "model sdf": ("stewart-drake model sdf paper --out paper.sdf",),

@@ -14,13 +14,12 @@ from stewart_drake.identification.fit import Fit, Guess, Problem, chi2_per_value
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
 from stewart_drake.identification.logs import ANGLES, POSE, Log
 from stewart_drake.identification.shooting import Segment
+from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import (
     DELAY,
     NAMES,
-    OFFSETS,
     ONE_SIDED,
     UNITS,
-    Tolerances,
     Unknowns,
     unknowns_of,
 )
@@ -218,7 +217,7 @@ def _unknowns(
     torque = max(float(np.abs(log.torques).max()) for log in logs)
     unknowns = unknowns_of(mechanism, tolerances, believed, torque, float(max(speeds)))
     if not any(log.measures(ANGLES) for log in logs):
-        unknowns.std[OFFSETS] = 0.0  # of encoders that are not there
+        unknowns = unknowns.without_encoders()
     if not any(log.measures(ANGLES) or log.measures(POSE) for log in logs):
         raise ConfigError("LOG: got neither crank angles nor poses; expected one of the two")
     return unknowns

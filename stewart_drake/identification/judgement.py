@@ -103,7 +103,11 @@ def unseen(unknowns: Unknowns, covariance: Array) -> tuple[int, list[str]]:
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
     space = vectors[:, values > UNSEEN]
     count, told = space.shape[1], list[str]()
-    singles = {NAMES[k]: np.eye(NUM_UNKNOWNS)[k] for k in free if not GEOMETRY.start <= k < OFFSETS.start}
+    singles = {
+        NAMES[k].replace("_", " "): np.eye(NUM_UNKNOWNS)[k]
+        for k in free
+        if not GEOMETRY.start <= k < GEOMETRY.stop
+    }
     for name, direction in {**named_directions(unknowns.mechanism), **singles}.items():
         d = direction[free] / std
         inside = space.T @ d

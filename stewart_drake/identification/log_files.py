@@ -48,11 +48,16 @@ LEAST_STD: Final = np.repeat([1e-6, 1e-7, 1e-5, 1e-6], 3)
 equations are integrated."""
 
 
+def angle_std(bits: int) -> float:
+    """Of a code of so many bits per turn, rad: it is off by up to half a step either way, evenly."""
+    return 2 * math.pi / 2**bits / math.sqrt(12)
+
+
 class Precision(NamedTuple):
     """What the measurements of a CSV log are worth, standard deviations."""
 
-    angle: float = 2 * math.pi / 2**14 / math.sqrt(12)
-    """rad; a code of n bits is off by up to half of 2 pi / 2^n either way, evenly."""
+    angle: float = angle_std(14)
+    """rad."""
     pose_angle: float = 1e-4
     """rad."""
     pose_position: float = 2e-5

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.model import LEG_PLACES, NUM_DYNAMIC, NUM_GEOMETRY, Numbers
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import LEG_NUMBERS, geometry_of, plate_radius
@@ -53,33 +54,6 @@ ONE_SIDED: Final = (DAMPING, COULOMB)
 
 
 @dataclass(frozen=True)
-class Tolerances:
-    """Standard deviations of the unknowns before any log; 0 is known, None is by the machine.
-
-    Attributes:
-        lengths: of cranks and rods, m.
-        joints: of each coordinate of a shaft's centre and a plate joint, m.
-        offsets: of an encoder's zero, rad.
-        delay: of the believed delay, s.
-        bias: of a motor's torque, N m.
-        payload: kg.
-        damping: viscous friction, N m s/rad.
-        coulomb: Coulomb friction, N m.
-        position: of each coordinate of the payload in the plate, m.
-    """
-
-    lengths: float = 2e-4
-    joints: float = 2e-4
-    offsets: float = 2e-3
-    delay: float = 0.3
-    bias: float | None = None
-    payload: float | None = None
-    damping: float | None = None
-    coulomb: float | None = None
-    position: float | None = None
-
-
-@dataclass(frozen=True)
 class Unknowns:
     """What is taken for what before the logs are looked at.
 
@@ -103,6 +77,12 @@ class Unknowns:
         legs = geometry_of(self.mechanism)[: LEG_NUMBERS * NUM_LEGS].reshape(-1, NUM_LEGS).T.copy()
         legs[:, LEG_PLACES] = values[GEOMETRY].reshape(NUM_LEGS, -1)
         return Numbers(values[DYNAMIC], legs)
+
+    def without_encoders(self) -> "Unknowns":
+        """Where no crank angle is measured there are no offsets."""
+        std = self.std.copy()
+        std[OFFSETS] = 0.0
+        return dataclasses.replace(self, std=std)
 
     def machine(self, values: Array) -> Mechanism:
         """The same as a mechanism.
