@@ -38,6 +38,10 @@ MOST_DELAY: Final = 0.1
 ENOUGH: Final = 0.01
 """Of chi^2; an iteration that gains less is the last."""
 _MOST_ITERATIONS: Final = 60
+_STEP_ERROR: Final = 0.02
+"""Standard deviations of a measurement by which integration may be off, root mean square."""
+_SHORTEST_STEP: Final = 1e-3
+"""s."""
 _DAMPING: Final = (1e-3, 1e-9, 1e12)
 """At first, least, and where no step helps any more."""
 
@@ -97,10 +101,12 @@ class Problem:
     Attributes:
         segments: of logs under the same gravity.
         unknowns: what is known beforehand.
+        longest_step: of the integration, s.
     """
 
     segments: list[Segment]
     unknowns: Unknowns
+    longest_step: float = 0.02
 
     @property
     def count(self) -> int:
@@ -149,7 +155,9 @@ class Evaluator:
     def _evaluate(self, guess: Guess, sensitive: bool) -> tuple[Residuals, Array]:
         unknowns, free = self.problem.unknowns, self.free
         numbers = unknowns.numbers(guess.values)
-        plan = plan_steps(self.problem.segments, guess.values[DELAY])
+        plan = plan_steps(
+            self.problem.segments, guess.values[DELAY], self.problem.longest_step
+        )
         course = integrate(self.model, numbers, guess.first, plan, sensitive)
         m, n, _ = course.states.shape
         seen = np.empty((m, n, NUM_MEASURED))
@@ -222,6 +230,19 @@ def solve(problem: Problem, start: Guess) -> Fit:
         if gained < ENOUGH:
             break
     return Fit(guess, residuals, covariance(normal), iterations)
+
+
+def finer(problem: Problem, guess: Guess) -> Problem | None:
+    """The problem with half the step, or None where that moves its residuals by next to nothing.
+
+    Coulomb friction turns round within some hundredths of a second, so that what step is fine
+    enough depends on the machine.
+    """
+    halved = replace(problem, longest_step=problem.longest_step / 2)
+    if halved.longest_step < _SHORTEST_STEP:
+        return None
+    coarse, fine = (Evaluator(one).residuals(guess).measured for one in (problem, halved))
+    return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > _STEP_ERROR else None
 
 
 def _moved(guess: Guess, unknown: Array, first: Array, free: NDArray[np.intp]) -> Guess:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification import start
-from stewart_drake.identification.fit import Fit, Guess, Problem, chi2_per_value, followed, solve
+from stewart_drake.identification.fit import Fit, Guess, Problem, chi2_per_value, finer, followed, solve
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
 from stewart_drake.identification.logs import ANGLES, POSE, Log
 from stewart_drake.identification.shooting import Segment
@@ -184,6 +184,8 @@ def identify(
     again, retried = followed(whole, Guess(fit.guess.values, first))
     if len(again.segments) > len(problem.segments):
         problem, fit = again, _solved(again, retried)
+    while (halved := finer(problem, fit.guess)) is not None:
+        problem, fit = halved, _solved(halved, fit.guess)
     every = np.vstack(poses)
     middle = np.nanmedian(every, axis=0)
     left_out = len(segments) - len(problem.segments)

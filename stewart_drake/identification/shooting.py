@@ -22,8 +22,6 @@ from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, RATES
 
 Array = NDArray[np.float64]
 
-LONGEST_STEP: Final = 0.02
-"""s of a Runge-Kutta step."""
 _INSTANT: Final = 1e-9
 """s; events closer to each other are one."""
 FIRST: Final = slice(0, NUM_STATE)
@@ -63,9 +61,9 @@ class Course(NamedTuple):
     """(m, n, 12, columns)."""
 
 
-def plan_steps(segments: list[Segment], delay: float) -> Plan:
-    """The steps from sample to sample and from torque to torque."""
-    plans = [_steps_of(segment, delay) for segment in segments]
+def plan_steps(segments: list[Segment], delay: float, longest_step: float) -> Plan:
+    """The steps from sample to sample and from torque to torque; times in s."""
+    plans = [_steps_of(segment, delay, longest_step) for segment in segments]
     longest = max(len(h) for h, *_ in plans)
     joined = Plan(
         np.zeros((longest, len(plans))),
@@ -82,7 +80,7 @@ def plan_steps(segments: list[Segment], delay: float) -> Plan:
     return joined
 
 
-def _steps_of(segment: Segment, delay: float) -> Plan:
+def _steps_of(segment: Segment, delay: float, longest_step: float) -> Plan:
     log, start = segment.log, segment.start
     samples = log.times[segment.rows]
     arrivals = log.sent + delay
@@ -90,7 +88,7 @@ def _steps_of(segment: Segment, delay: float) -> Plan:
     events = np.sort(np.concatenate([samples, inner]))
     events = events[np.diff(events, prepend=-np.inf) > _INSTANT]
     gaps = np.diff(events, prepend=start)
-    parts = np.maximum(1, np.ceil(gaps / LONGEST_STEP - 1e-9)).astype(int)
+    parts = np.maximum(1, np.ceil(gaps / longest_step - 1e-9)).astype(int)
     ends = np.cumsum(parts) - 1
     m = ends[-1] + 1
     sample = np.full(m, -1)
