@@ -17,6 +17,8 @@ from stewart_drake.files.yamlio import brief, load_yaml, parse_yaml, validate, y
 from stewart_drake.scenario.config import ControllerConfig, Scenario
 
 _SETTINGS = "settings"
+_FILES = ("file", "known")
+"""Fields that are always a path; others may be a shipped name."""
 _OVERLAY = "overlay"
 _KINDS = sections(Scenario)
 
@@ -75,6 +77,7 @@ def load_controller(name_or_path: str | Path) -> dict[str, Any]:
             "controller.period, set it there"
         )
     validate(ControllerConfig, data, str(path))
+    _make_paths_absolute({"controller": data}, path.parent)
     return data
 
 
@@ -212,9 +215,12 @@ def _make_paths_absolute(data: dict[str, Any], folder: Path) -> None:
 
     def tie(fields: dict[str, Any], name: str) -> None:
         value = fields.get(name)
-        if value is not None and (name == "file" or is_path(value)):
+        if value is not None and (name in _FILES or is_path(value)):
             fields[name] = str(absolute_path(value, folder))
 
     tie(data, "mechanism")
+    tie(data.get("plant", {}), "mechanism")
+    for fields in (data.get("controller", {}), *data.get("compare", {}).values()):
+        tie(fields, "known")
     tie(data.get("reference", {}), "file")
     tie(data.get("tuner", {}), "weights")
