@@ -4,9 +4,9 @@ Coordinate i of six moves by
 
     q_i(t) = q_0i + w(t) a_i sum_j cos(2 pi f_ij t + phi_ij) / f_ij,
 
-with frequencies f_ij = low + (j + i/6) (high - low) / n of its own, so that no two coordinates move
-alike, and Schroeder's phases phi_ij = -pi j (j + 1) / n, which keep the peaks low. The window w rises
-from rest and falls to rest. a_i makes the peak what is asked for.
+with frequencies f_ij = low + (j + i/6) (high - low) / n of its own, and phases spread evenly over the
+turn by the golden sequence, so that no two coordinates move alike even for a short while. The window
+w rises from rest and falls to rest. a_i makes the peak what is asked for.
 """
 
 from typing import Final
@@ -25,27 +25,25 @@ _LINES: Final = 5
 _LOW: Final = 0.1
 _HIGH: Final = 0.7
 """Hz."""
+_GOLDEN: Final = (np.sqrt(5) - 1) / 2
 _RISE: Final = 2.0
 """s."""
 _ROOM: Final = 0.5
 """Of the workspace's margin at the middle of the motion, what is left at least."""
 
 
-def multisine(middle: Array, peak: Array, duration: float, seed: int = 0) -> tuple[Array, Array]:
+def multisine(middle: Array, peak: Array, duration: float) -> tuple[Array, Array]:
     """Times (n,) in s and poses (n, 6).
 
     Args:
         middle: (6,) pose.
         peak: (6,) of each coordinate's departure from it, rad and m.
         duration: s.
-        seed: 0 for Schroeder's phases, else of random ones.
     """
     time = GRID * np.arange(round(duration / GRID) + 1)
     line, coordinate = np.arange(_LINES)[:, None], np.arange(6) / 6
     frequency = _LOW + (line + coordinate) * (_HIGH - _LOW) / _LINES
-    phase = np.broadcast_to(-np.pi * line * (line + 1) / _LINES, frequency.shape)
-    if seed:
-        phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, frequency.shape)
+    phase = 2 * np.pi * _GOLDEN * (line + _LINES * np.arange(6))
     waves = np.cos(2 * np.pi * frequency * time[:, None, None] + phase) / frequency
     rise = min(_RISE, duration / 4)
     y = np.clip(np.minimum(time, time[-1] - time) / rise, 0, 1)[:, None]
@@ -55,12 +53,12 @@ def multisine(middle: Array, peak: Array, duration: float, seed: int = 0) -> tup
 
 
 def fitted_multisine(
-    mechanism: Mechanism, middle: Array, peak: Array, duration: float, seed: int = 0
+    mechanism: Mechanism, middle: Array, peak: Array, duration: float
 ) -> tuple[Array, Array, float]:
     """The same, made smaller until it stays well inside the workspace; and the share of `peak`."""
     least, share = _ROOM * margin(mechanism, middle), 1.0
     while share > 0.05:
-        time, poses = multisine(middle, share * peak, duration, seed)
+        time, poses = multisine(middle, share * peak, duration)
         if min(margin(mechanism, pose) for pose in poses) > least:
             break
         share *= 0.9

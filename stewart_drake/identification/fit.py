@@ -38,7 +38,9 @@ MOST_DELAY: Final = 0.1
 ENOUGH: Final = 0.01
 """Of chi^2; an iteration that gains less is the last."""
 _MOST_ITERATIONS: Final = 60
-_STEP_ERROR: Final = 0.02
+_SLOPES_STEP: Final = 0.02
+"""s, of the integration of slopes."""
+_STEP_ERROR: Final = 0.05
 """Standard deviations of a measurement by which integration may be off, root mean square."""
 _SHORTEST_STEP: Final = 1e-3
 """s."""
@@ -101,7 +103,7 @@ class Problem:
     Attributes:
         segments: of logs under the same gravity.
         unknowns: what is known beforehand.
-        longest_step: of the integration, s.
+        longest_step: of the trajectories' integration, s.
     """
 
     segments: list[Segment]
@@ -138,13 +140,19 @@ class Evaluator:
 
     def residuals(self, guess: Guess) -> Residuals:
         """Of a guess."""
-        return self._evaluate(guess, False)[0]
+        return self._evaluate(guess, self.problem.longest_step)[0]
 
     def normal(self, guess: Guess) -> tuple[Residuals, Normal]:
-        """The same, and the normal equations there."""
-        residuals, J = self._evaluate(guess, True)
+        """The same, and the normal equations there.
+
+        Where trajectories need short steps, their slopes do with long ones: what a slope is off
+        moves the minimum by that share of a standard deviation, and costs ten times as much.
+        """
+        residuals = self.residuals(guess)
+        slopes_step = max(self.problem.longest_step, _SLOPES_STEP)
+        _, J = self._evaluate(guess, slopes_step, sensitive=True)
         # Points and values of a segment in one column.
-        m, n, _, columns = J.shape
+        _, n, _, columns = J.shape
         rows = J.transpose(1, 0, 2, 3).reshape(n, -1, columns)
         r = residuals.measured.transpose(1, 0, 2).reshape(n, -1, 1)
         turned = rows.transpose(0, 2, 1)
@@ -152,17 +160,17 @@ class Evaluator:
         normal = Normal(turned @ rows, (turned @ r)[:, :, 0], weight**2, weight * residuals.prior)
         return residuals, normal
 
-    def _evaluate(self, guess: Guess, sensitive: bool) -> tuple[Residuals, Array]:
+    def _evaluate(
+        self, guess: Guess, longest_step: float, sensitive: bool = False
+    ) -> tuple[Residuals, Array]:
+        """Residuals and, of m samples of n segments, J (m, n, 18, columns)."""
         unknowns, free = self.problem.unknowns, self.free
         numbers = unknowns.numbers(guess.values)
-        plan = plan_steps(
-            self.problem.segments, guess.values[DELAY], self.problem.longest_step
-        )
+        plan = plan_steps(self.problem.segments, guess.values[DELAY], longest_step)
         course = integrate(self.model, numbers, guess.first, plan, sensitive)
         m, n, _ = course.states.shape
         seen = np.empty((m, n, NUM_MEASURED))
-        columns = len(free) + NUM_STATE if sensitive else 0
-        J = np.zeros((m, n, NUM_MEASURED, columns))
+        J = np.zeros((m, n, NUM_MEASURED, len(free) + NUM_STATE if sensitive else 0))
         seen[:, :, POSE.start :] = course.states
         any_angle = bool(np.isfinite(self.values[:, :, ANGLES]).any())
         with np.errstate(all="ignore"):
@@ -172,16 +180,14 @@ class Evaluator:
                 )
                 seen[k, :, ANGLES] = alpha + guess.values[OFFSETS]
                 if sensitive:
-                    S = course.slopes[k]
-                    slopes = by_pose @ S[:, :6]
+                    slopes = by_pose @ course.slopes[k][:, :6]
                     slopes[:, :, NUM_STATE + NUM_DYNAMIC : NUMBERS.stop] += by_geometry
                     J[k, :, ANGLES] = self._columns(slopes, np.eye(6))
             residual = self.values - seen
             residual[:, :, ANGLES] = np.remainder(residual[:, :, ANGLES] + np.pi, 2 * np.pi) - np.pi
             residual /= self.std
         if sensitive:
-            no_offsets = np.zeros((NUM_STATE, 6))
-            J[:, :, POSE.start :] = self._columns(course.slopes, no_offsets)
+            J[:, :, POSE.start :] = self._columns(course.slopes, np.zeros((NUM_STATE, 6)))
             J *= -1 / self.std[:, :, None]
             J[np.isnan(self.values)] = 0.0
         residual[np.isnan(self.values)] = 0.0
