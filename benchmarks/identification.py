@@ -16,6 +16,7 @@ import dataclasses
 import os
 import sys
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,16 +83,20 @@ def of_ranges(seed: int, motion: Path) -> Truth:
     """A draw of the robustness study."""
     scenario = log_scenario(motion)
     experiment = prepare(scenario)
-    calm = simulate(
-        load_scenario("paper", "adaptive_lqi", _settings(motion, late=0.0)), margin=False
-    )
-    scales = uncertainty.scales_of(experiment, calm.summary["peak_torque"])
+    scales = uncertainty.scales_of(experiment, calm_torque(motion))
     one = uncertainty.draw(Ranges(), scales, scenario, FRESH, seed)
     changed = uncertainty.drawn(uncertainty.MACHINE, scenario, experiment.mechanism, one)
     machine, drawn = changed.machine(), changed.as_scenario()
     values = truth_of(machine, drawn)
     values[6] += machine.plate.mass - experiment.mechanism.plate.mass
     return Truth(machine, drawn, values)
+
+
+@cache
+def calm_torque(motion: Path) -> float:
+    """Largest that the undisturbed run commands, N m."""
+    scenario = load_scenario("paper", "adaptive_lqi", _settings(motion, late=0.0))
+    return simulate(scenario, margin=False).summary["peak_torque"]
 
 
 def of_drawing(seed: int, motion: Path) -> Truth:
@@ -146,9 +151,9 @@ def truth_of(machine: Mechanism, scenario: Scenario) -> Array:
         *plant.torque_bias,
         plant.payload_mass,
         plant.joint_damping,
-        getattr(plant,"coulomb_friction",0.0),
-        getattr(plant,"coulomb_speed",0.02),
-        *getattr(plant,"payload_position",[0.0]*3),
+        plant.coulomb_friction,
+        plant.coulomb_speed,
+        *plant.payload_position,
     ]
     legs = [machine.crank_lengths, machine.rod_lengths, machine.p_PQ, machine.p_WS]
     values[GEOMETRY] = np.column_stack(legs).ravel()
@@ -237,33 +242,38 @@ GROUPS: dict[str, Any] = {
 
 
 def machines(kind: str) -> str:
-    """The table of so many machines."""
+    """The tables of so many machines."""
     folder = RESULTS / "logs"
     folder.mkdir(parents=True, exist_ok=True)
     motion = excitation(folder)
-    text = ""
-    for poses in (False, True):
-        found = Parallel(n_jobs=int(os.environ.get("JOBS", "-1")))(delayed(find)(kind, k, motion, poses) for k in range(MACHINES))
-        late = 1e3 * np.abs([one.late for one in found])
-        chi2 = [one.chi2 for one in found]
-        seconds = [one.seconds for one in found]
-        lost = sum(one.status != "completed" for one in found)
-        title = f"{kind}, {'with pose' if poses else 'encoders alone'}"
-        text += (
-            f"## {title}: {len(found)} machines, {lost} of the runs lost\n\n"
-            f"error of the delay: rms {np.sqrt(np.mean(late**2)):.3g} ms, largest {late.max():.3g} ms; "
-            f"chi2/n {min(chi2):.3g} to {max(chi2):.3g}; CPU {np.mean(seconds):.3g} s, at most "
-            f"{max(seconds):.3g} s\n\n| unknown | rms error | 95 % intervals that hold the truth |\n"
-            "| --- | --- | --- |\n"
+    jobs = Parallel(n_jobs=int(os.environ.get("JOBS", "-1")))
+    return "\n".join(
+        table(
+            f"{kind}, {'with pose' if poses else 'encoders alone'}",
+            jobs(delayed(find)(kind, seed, motion, poses) for seed in range(MACHINES)),
         )
-        inside, away = (np.array([getattr(f, n) for f in found]) for n in ("inside", "away"))
-        for name, part in GROUPS.items():
-            if np.isfinite(inside[:, part]).any():
-                size = np.sqrt(np.nanmean(away[:, part] ** 2))
-                share = 100 * np.nanmean(inside[:, part])
-                shown = "" if name == "all" else f"{size:.2g}"
-                text += f"| {name} | {shown} | {share:.1f} % |\n"
-        text += "\n"
+        for poses in (False, True)
+    )
+
+
+def table(title: str, found: list[Found]) -> str:
+    """Errors and coverage by kind of unknown."""
+    late = 1e3 * np.abs([one.late for one in found])
+    chi2, seconds = [one.chi2 for one in found], [one.seconds for one in found]
+    lost = sum(one.status != "completed" for one in found)
+    text = (
+        f"## {title}: {len(found)} machines, {lost} of the runs lost\n\n"
+        f"error of the delay: rms {np.sqrt(np.mean(late**2)):.3g} ms, largest {late.max():.3g} ms; "
+        f"chi2/n {min(chi2):.3g} to {max(chi2):.3g}; CPU {np.mean(seconds):.3g} s, at most "
+        f"{max(seconds):.3g} s\n\n| unknown | rms error | 95 % intervals that hold the truth |\n"
+        "| --- | --- | --- |\n"
+    )
+    inside, away = (np.array([getattr(one, name) for one in found]) for name in ("inside", "away"))
+    for name, part in GROUPS.items():
+        if np.isfinite(inside[:, part]).any():
+            size = np.sqrt(np.nanmean(away[:, part] ** 2))
+            shown = "" if name == "all" else f"{size:.2g}"
+            text += f"| {name} | {shown} | {100 * np.nanmean(inside[:, part]):.1f} % |\n"
     return text
 
 

@@ -174,17 +174,20 @@ def _planned(
 
 
 def _write_found(answer: "Answer", delivery: Delivery) -> list[str]:
-    """mechanism.yaml and known.yaml, read back once."""
+    """What simulate takes."""
     from stewart_drake.files.fileio import replacing
-    from stewart_drake.mechanism.files import mechanism_yaml
+    from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
+    from stewart_drake.scenario.known import save_known
 
     if delivery.out is None:
         return []
     delivery.discard(MECHANISM, KNOWN)
+    path = delivery.out / MECHANISM
     text = mechanism_yaml(answer.study.mechanism)
-    with replacing(delivery.out / MECHANISM) as partial:
+    with replacing(path) as partial:
         partial.write_text(text)
-    return [MECHANISM]
+    save_known(delivery.out / KNOWN, answer.study.known(load_mechanism(path)))
+    return [MECHANISM, KNOWN]
 
 
 def _write_plan(answer: "Answer", delivery: Delivery) -> list[str]:

@@ -17,13 +17,16 @@ from stewart_drake.identification.shooting import Segment
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import (
     DELAY,
+    DYNAMIC,
     NAMES,
+    OFFSETS,
     ONE_SIDED,
     UNITS,
     Unknowns,
     unknowns_of,
 )
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.geometry import Mechanism, fingerprint
+from stewart_drake.scenario.known import Known
 
 Array = NDArray[np.float64]
 
@@ -90,8 +93,24 @@ class Identification:
 
     @property
     def mechanism(self) -> Mechanism:
-        """The machine that was found."""
-        return self.unknowns.machine(self.values)
+        """The machine that was found; as it was drawn where the fit is wrong."""
+        return self.unknowns.machine(self.values if self.right else self.unknowns.mean)
+
+    def known(self, mechanism: Mechanism) -> Known:
+        """What a controller of this machine may go by: all but the geometry.
+
+        Where the fit is wrong that is the delay alone, as uncertain as before.
+
+        Args:
+            mechanism: the one that was found, as it was written and read.
+        """
+        places = np.r_[DYNAMIC, OFFSETS, DELAY] if self.right else np.array([DELAY])
+        return Known(
+            fingerprint(mechanism),
+            tuple(NAMES[k] for k in places),
+            self.values[places],
+            self.covariance[np.ix_(places, places)],
+        )
 
     @cached_property
     def unseen(self) -> tuple[int, list[str]]:
