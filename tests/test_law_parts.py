@@ -211,7 +211,13 @@ class Twice:
     ) -> str | None:
         return None if measurement.complete else "measurements_missing"
 
-    def start(self, measurement: Measurement) -> FirstState:
+    def stood(self, measurement: Measurement, last: Array, still: Array) -> Array:
+        return still
+
+    def now(self, measurement: Measurement) -> tuple[Sensing, Measurement]:
+        return self, measurement
+
+    def start(self, measurement: Measurement, near: Array | None = None) -> FirstState:
         state = self.unit * measurement.values.reshape(2, 12).mean(axis=0)
         return FirstState(state, np.diag(self.std**2))
 

@@ -302,6 +302,7 @@ def test_controller_topology_and_initial_state() -> None:
     assert inputs == {"measurement": 12, "preview": 18 * len(law().preview_times), "weights": 2}
     assert outputs == {
         "torque": 6,
+        "estimate": 12,
         "measurement_used": 12,
         "state_estimate": 12,
         "torque_commanded": 6,

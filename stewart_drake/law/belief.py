@@ -1,7 +1,7 @@
 """What an observer believes: state, parameters, their covariance, delay, what it rejected."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ class Estimate:
         outlier: (m,) the last outlier, NaN without one.
         outliers: how many in a row, up to the last measurement, bear each other out.
         unseen: periods since a measurement was last used.
+        partly: why values of that were left out, as names of counts.
     """
 
     mean: Array
@@ -30,6 +31,7 @@ class Estimate:
     outlier: Array
     outliers: int = 0
     unseen: int = 0
+    partly: tuple[str, ...] = ()
 
     @property
     def state(self) -> Array:
@@ -61,6 +63,8 @@ class Belief:
         timeline: the delay that it believes in.
         measured: (m,) last value of each measured quantity that was there; NaN before any.
         fault: why the model stood in for the last measurement, as the name of a count, or None.
+        partly: why it did so for some of its values, the same.
+        still: as of `law.sensing.Sensing.stood`.
         feeds_back: whether it is good enough to act on; else the feedforward goes on alone.
         caution: how many times as much torques weigh as they should.
         settled: whether the delay is known.
@@ -72,6 +76,8 @@ class Belief:
     timeline: Timeline
     measured: Array
     fault: str | None = None
+    partly: tuple[str, ...] = ()
+    still: Array = field(default_factory=lambda: np.zeros(0))
     feeds_back: bool = True
     caution: float = 1.0
     settled: bool = True

@@ -128,6 +128,7 @@ class DelayObserver:
         """The delay is what is believed."""
         none = np.zeros((0, 6))
         first = Arrivals(timeline.period, Delay(0), self.believed, before=none)
+        sensing, _ = sensing.now(Measurement.of(np.full(sensing.size, np.nan)))
         nothing = Belief.nothing(first, sensing.size, self.settings.parameters.prior)
         return DelayBelief(nothing.estimate, first, nothing.measured, silent=self.quiet)
 
@@ -141,7 +142,10 @@ class DelayObserver:
     ) -> Belief:
         """See `law.observers.Observer.observe`."""
         assert isinstance(belief, DelayBelief) and isinstance(belief.timeline, Arrivals)
+        sensing, measurement = sensing.now(measurement)
         after = replace(told(belief, measurement, sensing, plant), found=belief.fresh, fresh=False)
+        if after.fault is None and not measurement.complete:
+            after = replace(after, fault="measurements_missing")
         y = measurement.values if after.fault is None else None
         filtering = DelayFilter(plant, sensing, self.settings, self.delay)
         if len(belief.timeline.before) == 0:  # the first sample: all in flight is others'
@@ -181,7 +185,9 @@ class _Search:
     def begun(self, belief: DelayBelief, measurement: Measurement) -> DelayBelief:
         """From one measurement alone: nothing has arrived, or something in any period so far."""
         observer, sent = self.observer, self.now.sent
-        first = self.filter.sensing.start(measurement)
+        first = self.filter.sensing.start(measurement, belief.state)
+        if first is None:
+            return belief
         prior = observer.settings.parameters
         mean = np.concatenate([first.state, prior.prior, [NEVER, 0.0]])
         covariance = np.zeros((len(mean), len(mean)))
@@ -268,7 +274,10 @@ class _Search:
         views = [(self._earlier(1), 1), (self.since, 0)]
         models = [DelayModel(self.filter.plant, v, self.in_flight, n) for v, n in views]
         sensing, settings = self.filter.sensing, self.observer.settings
-        states = [sensing.start(Measurement.of(values)) for values in seen[:2]]
+        told_by = (sensing.start(Measurement.of(y), guess.mean[:NUM_STATE]) for y in seen[:2])
+        states = [first for first in told_by if first is not None]
+        if len(states) < 2:
+            return None
         cost = np.zeros(0)
         tried = np.arange(GRID, self._longest / self.period, GRID) * self.period
         for model, first, y in zip(models, states, seen[1:], strict=True):
@@ -342,7 +351,9 @@ class _Search:
         assert guess is not None
         if not belief.locked:
             return self.begun(belief, measurement)
-        first = self.filter.sensing.start(measurement)
+        first = self.filter.sensing.start(measurement, guess.mean[:NUM_STATE])
+        if first is None:
+            return belief
         mean, P = guess.mean.copy(), np.zeros_like(guess.covariance)
         theta = slice(NUM_STATE, -2)
         mean[:NUM_STATE] = first.state

@@ -70,20 +70,21 @@ class LateObserver:
         there = bool(np.any(measurement.valid))
         wanted = min(age, self.longest) if there else self.longest
         fault: str | None = "measurements_missing" if not there else None
+        partly: tuple[str, ...] = ()
         while behind > wanted:
             behind -= 1
             then = in_flight[: len(in_flight) - behind]
             fresh = there and behind == age
             said = replace(measurement, age=0.0) if fresh else _nothing(sensing)
             past = self.observer.observe(past, said, then, sensing, plant)
-            fault = past.fault if fresh else fault
+            fault, partly = (past.fault, past.partly) if fresh else (fault, partly)
         estimate = past.estimate
         if past.has_state and behind:
             acting = past.timeline.last_periods(in_flight, behind)
             now = plant.predict(past.state, acting, past.parameters)[-1]
             estimate = past.at(now).estimate
         told = _told(past) | {"estimate": estimate}
-        return LateBelief(**told, fault=fault, past=past, behind=behind)
+        return LateBelief(**told, fault=fault, partly=partly, past=past, behind=behind)
 
 
 def _told(past: Belief) -> dict[str, Any]:

@@ -21,9 +21,9 @@ class Counts(NamedTuple):
         unreachable: samples without a model: a plate at the predicted pose cannot be regulated.
         nonfinite_torque: samples whose torque was no number, so that the last one was sent again.
         measurements_missing: measurements with values that are no numbers.
-        measurements_frozen: measurements that only repeat the last one.
+        measurements_frozen: measurements that only repeat the last one, or a leg of which does.
         measurements_rejected: measurements that the plate cannot have, or that the filter takes
-            for outliers.
+            for outliers, or values of theirs.
         saturated_steps: samples with a torque at the limit.
     """
 
@@ -41,7 +41,7 @@ class Counts(NamedTuple):
 
     @property
     def bad_measurements(self) -> int:
-        """Samples at which the model stood in for the measurement."""
+        """Samples and causes, for which the model stood in for a measurement or a part of it."""
         return self.measurements_missing + self.measurements_frozen + self.measurements_rejected
 
     def summary(self) -> dict[str, int]:

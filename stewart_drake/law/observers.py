@@ -67,9 +67,10 @@ class NoObserver:
     ) -> Belief:
         """See `Observer.observe`."""
         after = told(belief, measurement, sensing, plant)
-        if after.fault is None:
-            return after.at(sensing.start(measurement).state)
-        return after.at(_moved(belief, in_flight, plant)) if belief.has_state else after
+        first = sensing.start(measurement, belief.state) if after.fault is None else None
+        if first is not None:
+            return after.at(first.state)
+        return after.at(moved(belief, in_flight, plant)) if belief.has_state else after
 
 
 @dataclass(frozen=True)
@@ -96,12 +97,13 @@ class ParameterObserver:
     ) -> Belief:
         """See `Observer.observe`."""
         after = told(belief, measurement, sensing, plant)
-        ekf = ParameterFilter(plant.dynamics, sensing, self.settings)
+        ekf = self.filter(belief.measured, after.still, sensing, plant)
         usable = measurement if after.fault is None else None
         if not belief.estimate.uncertain:
-            if usable is not None:
-                return replace(after, estimate=ekf.start(usable, belief.parameters))
-            return after.at(_moved(belief, in_flight, plant)) if belief.has_state else after
+            first = None if usable is None else ekf.start(usable, belief.parameters, belief.state)
+            if first is not None:
+                return replace(after, estimate=first, partly=first.partly)
+            return after.at(moved(belief, in_flight, plant)) if belief.has_state else after
         acting, following = belief.timeline.last_period(in_flight)
         period = Period(*acting, following, plant.substeps_for(acting.torques))
         estimate, fault = ekf.advance(belief.estimate, period, usable), after.fault
@@ -110,7 +112,20 @@ class ParameterObserver:
             # Such a one said so before: it is no second witness.
             if np.array_equal(measurement.values, belief.measured):
                 fault, estimate = "measurements_frozen", replace(estimate, outliers=0)
-        return replace(after, estimate=estimate, fault=fault)
+        return replace(after, estimate=estimate, fault=fault, partly=estimate.partly)
+
+    def filter(
+        self, last: Array, still: Array, sensing: Sensing, plant: NominalPlant
+    ) -> ParameterFilter:
+        """The filter of a sample.
+
+        Args:
+            last: (m,) what was measured before.
+            still: as of `Sensing.stood`.
+            sensing: what is measured.
+            plant: as it is known.
+        """
+        return ParameterFilter(plant.dynamics, sensing, self.settings)
 
 
 def told(
@@ -120,10 +135,12 @@ def told(
     measurement.require_fresh()
     period = belief.timeline.period
     fault = sensing.fault(measurement, belief.measured, period, plant.mechanism)
-    return replace(belief, measured=measurement.after(belief.measured), fault=fault)
+    still = sensing.stood(measurement, belief.measured, belief.still)
+    measured = measurement.after(belief.measured)
+    return replace(belief, measured=measured, fault=fault, partly=(), still=still)
 
 
-def _moved(belief: Belief, in_flight: Array, plant: NominalPlant) -> Array:
+def moved(belief: Belief, in_flight: Array, plant: NominalPlant) -> Array:
     """The state (12,) a period later, by the model alone."""
     acting, _ = belief.timeline.last_period(in_flight)
     return plant.predict(belief.state, acting)[-1]

@@ -77,9 +77,18 @@ class ParameterFilter:
     sensing: Sensing
     settings: FilterSettings
 
-    def start(self, measurement: Measurement, parameters: Array) -> Estimate:
-        """The estimate from one measurement alone, with parameters (p,) for a guess."""
-        return self._from(self.sensing.start(measurement), parameters)
+    def start(
+        self, measurement: Measurement, parameters: Array, near: Array | None = None
+    ) -> Estimate | None:
+        """The estimate from one measurement alone, or None where it tells of no state.
+
+        Args:
+            measurement: without a fault.
+            parameters: (p,) for a guess.
+            near: (12,) as of `Sensing.start`.
+        """
+        first = self.sensing.start(measurement, near)
+        return None if first is None else self._from(first, parameters)
 
     def advance(
         self, estimate: Estimate, period: Period, measurement: Measurement | None
@@ -107,15 +116,21 @@ class ParameterFilter:
         after = self._attempt(estimate, period, y)
         if after is not None:
             lost = estimate.unseen >= PATIENCE and not self._known(estimate, LEARNT)
-            return self.start(measurement, estimate.parameters) if lost else after
+            anew = self.start(measurement, estimate.parameters, after.state) if lost else None
+            return after if anew is None else anew
         alone = self._attempt(estimate, period, None)
         outliers = 1
         if estimate.outliers > 0:
-            before = self.start(Measurement.of(estimate.outlier), estimate.parameters)
-            if self._attempt(before, period, y) is not None:
+            said = Measurement.of(estimate.outlier)
+            before = self.start(said, estimate.parameters, estimate.state)
+            if before is not None and self._attempt(before, period, y) is not None:
                 outliers += estimate.outliers
         if alone is None or outliers >= PATIENCE:
-            return self.start(measurement, estimate.parameters)
+            near = estimate.state if alone is None else alone.state
+            anew = self.start(measurement, estimate.parameters, near)
+            if anew is not None:
+                return anew
+        alone = estimate if alone is None else alone
         return replace(alone, outliers=outliers, outlier=y, unseen=estimate.unseen + 1)
 
     def _from(self, first: FirstState, parameters: Array) -> Estimate:
@@ -167,7 +182,7 @@ class ParameterFilter:
                 if np.all(np.abs(sensing.through(after, shift)) <= small):
                     after = linear
                     break
-                after = _integrate(dynamics, xi, period)[-1]
+                after = integrate(dynamics, xi, period)[-1]
                 if np.all(np.abs(sensing.through(after, after - linear)) <= small):
                     break
                 after, F = transition(dynamics, xi, period, nodes)
@@ -192,7 +207,7 @@ def kicks(dynamics: StewartDynamics, state: Array, theta: Array, period: Period)
     return np.hstack([left[:, None] * changes, changes])
 
 
-def _integrate(dynamics: StewartDynamics, xi: Array, period: Period) -> Array:
+def integrate(dynamics: StewartDynamics, xi: Array, period: Period) -> Array:
     """States (n, 12) after each of n torques, from [state; parameters] (12 + p,)."""
     torques, durations, substeps = period.torques, period.durations, period.substeps
     return dynamics.predict(xi[:NUM_STATE], torques, durations, substeps, xi[THETA])
@@ -207,9 +222,17 @@ def transition(
     nodes: Omega = h/2 (L_1 + L_2) + sqrt(3)/12 h^2 [L_2, L_1] (Magnus); MIDPOINT is of second. The
     filter divides tiny innovations by F: such an error would already look like a disturbance.
     """
+    states, F = transitions(dynamics, xi, period, nodes)
+    return states[-1], F[-1]
+
+
+def transitions(
+    dynamics: StewartDynamics, xi: Array, period: Period, nodes: Array = GAUSS_NODES
+) -> tuple[Array, Array]:
+    """`transition` after each of the n torques: states (n, 12), F (n, 12 + p, 12 + p)."""
     x, theta = xi[:NUM_STATE], xi[THETA]
-    total = np.eye(len(xi))
-    ends = _integrate(dynamics, xi, period)
+    total, totals = np.eye(len(xi)), []
+    ends = integrate(dynamics, xi, period)
     for torque, h, end in zip(period.torques, period.durations, ends, strict=True):
         L = np.zeros((len(nodes), *total.shape))
         for place, node in zip(L, nodes, strict=True):
@@ -220,7 +243,8 @@ def transition(
         if len(nodes) == 2:
             omega += np.sqrt(3) / 12 * h**2 * (L[1] @ L[0] - L[0] @ L[1])
         x, total = end, expm(omega) @ total
-    return x, total
+        totals.append(total)
+    return ends, np.array(totals)
 
 
 def _within_hold(start: Array, end: Array, h: float, s: float) -> tuple[Array, Array]:

@@ -211,6 +211,7 @@ class PredictiveLqi:
             weights=np.array(weights),
             counts=memory.counts.plus(
                 belief.fault,
+                *belief.partly,
                 trouble,
                 "nonfinite_torque" if nonfinite else None,
                 "saturated_steps" if saturated else None,

@@ -84,8 +84,31 @@ class Sensing(Protocol):
         """
         ...
 
-    def start(self, measurement: Measurement) -> FirstState:
-        """The state from a measurement without a fault alone."""
+    def start(self, measurement: Measurement, near: Array | None = None) -> FirstState | None:
+        """The state from a measurement without a fault alone, or None where it tells of none.
+
+        Args:
+            measurement: of m values.
+            near: (12,) where the plate is thought to be, for a sensor that cannot do without; None
+                is as at the beginning.
+        """
+        ...
+
+    def stood(self, measurement: Measurement, last: Array, still: Array) -> Array:
+        """For how many periods things have stood still, for a sensor that minds it.
+
+        Args:
+            measurement: of m values.
+            last: (m,) what each value was before; NaN for nothing.
+            still: what this said before; of no size before any.
+        """
+        ...
+
+    def now(self, measurement: Measurement) -> "tuple[Sensing, Measurement]":
+        """What of a measurement is of its own instant, not of the period before, and its sensing.
+
+        For an observer that compares it with the state at the sample alone.
+        """
         ...
 
 
@@ -133,6 +156,14 @@ class StateSensing:
             return "measurements_rejected"
         return None
 
-    def start(self, measurement: Measurement) -> FirstState:
+    def start(self, measurement: Measurement, near: Array | None = None) -> FirstState:
         """The measurement, as uncertain as its noise."""
         return FirstState(measurement.values, np.diag(self.noise_std**2))
+
+    def stood(self, measurement: Measurement, last: Array, still: Array) -> Array:
+        """Nothing that matters."""
+        return still
+
+    def now(self, measurement: Measurement) -> tuple[Sensing, Measurement]:
+        """All of it."""
+        return self, measurement

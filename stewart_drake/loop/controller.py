@@ -25,7 +25,9 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.signals import (
+    NUM_PARAMETERS,
     NUM_REFERENCE,
+    NUM_STATE,
     NUM_TORQUES,
     WEIGHTS,
     ports_of,
@@ -40,8 +42,8 @@ HELD: Final[dict[str, Callable[[Memory], Array]]] = {
     "weights": lambda memory: memory.weights,
     "measurement": lambda memory: memory.measurement,
     "state_estimate": lambda memory: memory.belief.state,
-    "parameters": lambda memory: memory.belief.parameters,
-    "parameter_std": lambda memory: memory.belief.estimate.parameter_std,
+    "parameters": lambda memory: memory.belief.parameters[:NUM_PARAMETERS],
+    "parameter_std": lambda memory: memory.belief.estimate.parameter_std[:NUM_PARAMETERS],
     "delay_estimate": lambda memory: memory.belief.delay,
     "delay_std": lambda memory: np.array([memory.belief.delay_std]),
 }
@@ -74,17 +76,18 @@ class DelayLqiController(LeafSystem):
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
-    | measurement | input | 12 | rad, m, rad/s, m/s | read every period; NaN is lost |
+    | measurement | input | 12, or 6 N | rad, m, rad/s, m/s | read every period; NaN is lost |
     | preview | input | 18 p | rad, m and time derivatives | read every period |
     | weights | input | 2 | w_Q, w_R | read every period |
     | age | input | 1 | s, whole periods | of the measurement; only with a `LateObserver` |
     | report | input | 7 h | as of `PlayoutBuffer`, NaN is lost | only with a channel of packets |
     | plan | output | 6 (r + N) | N m, the packet to be sent | the same; direct feedthrough |
     | torque | output | 6 | N m | direct feedthrough |
+    | estimate | output | 12 | rad, m, rad/s, m/s | direct feedthrough; what T_k rests on |
     | torque_commanded | output | 6 | N m | held |
     | integral | output | 6 | rad s, m s | held |
     | weights_used | output | 2 | - | held, NaN before the first sample |
-    | measurement_used | output | 12 | as measurement | held, NaN before the first sample |
+    | measurement_used | output | as measurement | the same | held, NaN before the first sample |
     | state_estimate | output | 12 | rad, m, rad/s, m/s | held, NaN before the first sample |
     | parameters | output | 8 | N m, kg, N m s/rad | held; as the law believes |
     | parameter_std | output | 8 | the same | held; NaN without estimator |
@@ -126,6 +129,9 @@ class DelayLqiController(LeafSystem):
         )
         self.DeclareVectorOutputPort(
             "torque", NUM_TORQUES, weak(self._torque), {self._step.ticket()}
+        )
+        self.DeclareVectorOutputPort(
+            "estimate", NUM_STATE, weak(self._estimate), {self._step.ticket()}
         )
         if sends:
             size = first.memory.sent.packets[0].size
@@ -183,6 +189,10 @@ class DelayLqiController(LeafSystem):
     def _torque(self, context: Context, output: BasicVector) -> None:
         sample: Any = self._step.Eval(context)
         output.SetFromVector(sample.memory.torque)
+
+    def _estimate(self, context: Context, output: BasicVector) -> None:
+        sample: Any = self._step.Eval(context)
+        output.SetFromVector(sample.memory.belief.state)
 
     def _update(self, context: Context, state: State) -> None:
         state.get_mutable_abstract_state(int(self._memory)).set_value(self._step.Eval(context))

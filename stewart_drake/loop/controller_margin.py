@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.law.delay_observer import DelayObserver
+from stewart_drake.law.encoder_observers import DifferencesObserver
 from stewart_drake.law.error_model import ContinuousModel, linear_model
 from stewart_drake.law.limits import amplification, fastest_pole, is_stable, spectral_radius
 from stewart_drake.law.linear_loop import LinearLoop, Margins, law_gain, worst_margins
@@ -165,6 +166,8 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
         problem = "the true machine does not reach all of the reference"
     elif isinstance(sc.link, NetworkConfig) or longest_wait(sc):
         problem = "its packets or measurements do not all take the same time"
+    elif isinstance(law.observer, DifferencesObserver):
+        problem = "its rates are differences of measured poses"
     elif not sc.delay.constant:
         problem = "its delay changes"
     elif rows > _LARGEST:

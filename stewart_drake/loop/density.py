@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 class DensityWindow(LeafSystem):
     """Keeps the last 31 samples and takes the densities (45) of the newest.
 
-    With s_k = [y_k - r_k; T_k], y the measurement, r the reference's pose and rates, T_k the torque
-    computed at t = k dt:
+    With s_k = [y_k - r_k; T_k], y the measured state, or where it is not measured the estimate, r
+    the reference's pose and rates, T_k the torque computed at t = k dt:
 
     Initialise: window = [unknown, ..., unknown], then the update of k = 0.
     Update:     at k dt   window <- [window without its oldest; s_k].

@@ -22,6 +22,7 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController, reported
 from stewart_drake.loop.delay_chain import DelayChain
 from stewart_drake.loop.density import DensityWindow
+from stewart_drake.loop.encoders import Encoders
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.experiment import (
     Experiment,
@@ -42,7 +43,7 @@ from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.start_check import StartCheck
 from stewart_drake.loop.tuner import AnnTuner
 from stewart_drake.loop.varying_delay import VaryingDelay, declare_constant
-from stewart_drake.scenario.config import NetworkConfig, Scenario
+from stewart_drake.scenario.config import EncoderSensorConfig, NetworkConfig, Scenario
 from stewart_drake.scenario.link import (
     measurement_times,
     number_sent,
@@ -62,8 +63,8 @@ from stewart_drake.scenario.signals import (
 Array = NDArray[np.float64]
 
 
-_TOLD: Final = {"density": "density", "measurement": "sensor", "reference": "reference"}
-"""What a tuner may ask for, and the system whose output of that name it is."""
+_TOLD: Final = ("density", "reference")
+"""What a tuner may ask for beside the state, and the systems whose outputs of their name it is."""
 
 
 class ClosedLoop(Diagram):
@@ -145,13 +146,35 @@ def _add_surroundings(
     """Everything but reference and controller."""
     sc = experiment.scenario
     period = sc.controller.period
-    noise, s, own = np.array(sc.sensor.noise_std), sc.sensor, experiment.own.systems
-    sensor = Sensor(noise, s.seed, period, s.faults, motion_scale(experiment))
-    builder.AddNamedSystem("sensor", own.get("sensor", sensor))
+    builder.AddNamedSystem("sensor", _sensor(experiment))
     builder.AddNamedSystem("torque_bias", add_to_torque(np.array(sc.plant.torque_bias)))
     builder.AddNamedSystem("plant", _plant(experiment, meshcat))
     kind = "magnitude" if experiment.network is None else experiment.network.density
     builder.AddNamedSystem("density", DensityWindow(period, kind))
+
+
+def _sensor(experiment: Experiment) -> System:
+    """The user's own, or the scenario's.
+
+    Raises:
+        ConfigError: encoders, with a sensor or a controller of the user's own.
+    """
+    s, own, period = (
+        experiment.scenario.sensor,
+        experiment.own.systems,
+        experiment.scenario.controller.period,
+    )
+    motion = motion_scale(experiment)
+    if not isinstance(s, EncoderSensorConfig):
+        sensor = Sensor(np.array(s.noise_std), s.seed, period, s.faults, motion)
+        return own.get("sensor", sensor)
+    for role in ("sensor", "controller"):
+        if role in own:
+            raise ConfigError(
+                f"sensor.kind: got 'encoders' with a {role} of your own; expected 'state'"
+            )
+    cranks = np.abs(experiment.truth.jacobian(experiment.start[POSE])) @ motion
+    return Encoders(experiment.truth, s.bits, s.samples, s.offset, s.seed, period, s.faults, cranks)
 
 
 def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
@@ -174,11 +197,15 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
     builder.Connect(out("delay_chain", "torque"), bias.get_input_port())
     _disturb(builder, experiment, bias.get_output_port())
     builder.Connect(out("plant", "state"), into("sensor", "state"))
-    builder.Connect(measured, into("density", "measurement"))
+    encoders = isinstance(experiment.scenario.sensor, EncoderSensorConfig)
+    state = out("controller", "estimate") if encoders else measured
+    builder.Connect(state, into("density", "measurement"))
     builder.Connect(out("reference", "reference"), into("density", "reference"))
     builder.Connect(out("controller", "torque"), into("density", "torque"))
     if builder.HasSubsystemNamed("tuner"):
-        _connect_tuner(builder, builder.GetSubsystemByName("tuner"))
+        # Weights come before the estimate of their sample, so that theirs is of the one before.
+        state = out("controller", "state_estimate") if encoders else out("sensor", "measurement")
+        _connect_tuner(builder, builder.GetSubsystemByName("tuner"), state)
     if experiment.start[RATES].any() and experiment.scenario.plant.kind == "multibody":
         builder.AddNamedSystem("start_check", StartCheck(experiment.start))
         builder.Connect(out("plant", "state"), into("start_check", "state"))
@@ -283,12 +310,12 @@ def _weights(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
     return builder.AddNamedSystem("tuner", tuner).GetOutputPort("weights")
 
 
-def _connect_tuner(builder: DiagramBuilder, tuner: System) -> None:
-    """Give it of what the loop can tell those that it has ports for."""
-    for name, source in _TOLD.items():
+def _connect_tuner(builder: DiagramBuilder, tuner: System, state: OutputPort) -> None:
+    """Give it of what the loop can tell, the state among it, those that it has ports for."""
+    told = {name: builder.GetSubsystemByName(name).GetOutputPort(name) for name in _TOLD}
+    for name, port in (told | {"measurement": state}).items():
         if tuner.HasInputPort(name):
-            told = builder.GetSubsystemByName(source).GetOutputPort(name)
-            builder.Connect(told, tuner.GetInputPort(name))
+            builder.Connect(port, tuner.GetInputPort(name))
 
 
 def _link(experiment: Experiment, channel: Channel, reports: int) -> System:

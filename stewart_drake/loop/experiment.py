@@ -18,6 +18,8 @@ from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.delay_filter import delay_settings
 from stewart_drake.law.delay_observer import DelayObserver
 from stewart_drake.law.design_models import DesignModel, MultibodyModel, PaperModel
+from stewart_drake.law.encoder_observers import DifferencesObserver, EncoderObserver
+from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
     Feedforward,
@@ -41,7 +43,7 @@ from stewart_drake.law.predictors import (
     NonlinearPredictor,
     Predictor,
 )
-from stewart_drake.law.sensing import StateSensing
+from stewart_drake.law.sensing import Sensing, StateSensing
 from stewart_drake.law.startup import (
     STILL,
     choose_substeps,
@@ -56,7 +58,12 @@ from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint
 from stewart_drake.native.layout import plate_radius
-from stewart_drake.scenario.config import AnnTunerConfig, NetworkConfig, Scenario
+from stewart_drake.scenario.config import (
+    AnnTunerConfig,
+    EncoderSensorConfig,
+    NetworkConfig,
+    Scenario,
+)
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.known import DELAY, OFFSETS, Known, load_known
 from stewart_drake.scenario.link import in_time, times_under_way
@@ -230,12 +237,21 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
         truth=simulated_machine(scenario) if truth is None else truth,
         reference=reference,
         peak_to_peak=span,
-        nominal=StewartDynamics(mechanism, scenario.plant.gravity, known_values(known)),
+        nominal=StewartDynamics(
+            mechanism, scenario.plant.gravity, known_values(known), estimated(scenario)
+        ),
         start=start,
         network=network,
         own=own,
         known=known,
     )
+
+
+def estimated(scenario: Scenario) -> tuple[str, ...]:
+    """Names of what the estimator finds, if there is one."""
+    c = scenario.controller
+    finds_offsets = c.estimate_offsets and c.estimator == "parameters"
+    return (*PARAMETERS, *OFFSETS) if finds_offsets else PARAMETERS
 
 
 def simulated_machine(scenario: Scenario) -> Mechanism:
@@ -291,6 +307,12 @@ def known_values(known: Known | None) -> Array:
         found = None if known is None else known.value(name)
         values[i] = values[i] if found is None else found
     return values
+
+
+def offsets_of(known: Known | None) -> Array:
+    """(6,) rad by which encoders are known to be mounted otherwise."""
+    found = [None if known is None else known.value(name) for name in OFFSETS]
+    return np.array([0.0 if value is None else value for value in found])
 
 
 def _network(scenario: Scenario) -> Network | None:
@@ -400,9 +422,10 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
     parameters = estimated_parameters(experiment, torque_scale)
     settings = filter_settings(motion, plate, torque_scale, asked, c.period, parameters)
+    encoders = isinstance(sc.sensor, EncoderSensorConfig)
     observers: dict[str, Observer] = {
-        "none": NoObserver(),
-        "parameters": ParameterObserver(settings),
+        "none": DifferencesObserver() if encoders else NoObserver(),
+        "parameters": EncoderObserver(settings) if encoders else ParameterObserver(settings),
     }
     predictors: dict[str, Predictor] = {
         "linear": LinearPredictor(),
@@ -426,7 +449,7 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     law = PredictiveLqi(
         timeline=timeline,
         plant=NominalPlant(nominal, substeps, GENTLE * torque_scale, motors),
-        sensing=StateSensing(np.array(sc.sensor.noise_std), motion),
+        sensing=_sensing(experiment, motion),
         observer=observer,
         predictor=predictors[c.prediction],
         feedforward=feedforwards[c.feedforward],
@@ -475,6 +498,23 @@ def estimated_parameters(experiment: Experiment, torque_scale: float) -> Paramet
         **dict.fromkeys(OFFSETS, prior.offsets),
     }
     return found.trusting({name: std for name, std in said.items() if std is not None})
+
+
+def _sensing(experiment: Experiment, motion: Array) -> Sensing:
+    """What is measured, as the controller knows it; `motion` is `motion_scale`."""
+    sensor, rates = experiment.scenario.sensor, experiment.scenario.controller.prior.rates
+    if not isinstance(sensor, EncoderSensorConfig):
+        return StateSensing(np.array(sensor.noise_std), motion)
+    finds_offsets = OFFSETS[0] in experiment.nominal.free
+    return EncoderSensing(
+        mechanism=experiment.mechanism,
+        samples=sensor.samples,
+        quantum=0.0 if sensor.bits is None else 2 * np.pi / 2**sensor.bits,
+        declared=experiment.start,
+        rates_std=motion if rates is None else np.array(rates),
+        motion=motion,
+        offset=np.zeros(len(OFFSETS)) if finds_offsets else offsets_of(experiment.known),
+    )
 
 
 def longest_wait(scenario: Scenario) -> int:

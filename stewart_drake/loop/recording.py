@@ -18,14 +18,15 @@ from stewart_drake.loop.experiment import Experiment, waits_at_rest
 from stewart_drake.loop.results import DelaySummary, RunSummary
 from stewart_drake.loop.tuner import AnnTuner
 from stewart_drake.native.library import backend
+from stewart_drake.scenario.config import EncoderSensorConfig
 from stewart_drake.scenario.loading import scenario_to_dict, scenario_yaml
 from stewart_drake.scenario.signals import (
-    DIMENSIONS,
     NUM_STATE,
     POSE,
-    SIGNALS,
     Signal,
     exported_ports,
+    run_dimensions,
+    run_signals,
 )
 from stewart_drake.scenario.timing import Instant
 
@@ -83,7 +84,10 @@ class Recorder:
         self._scale = loop.experiment.scale
         self._instant = 0.0
         self._state, self._wanted, self._error = np.empty(0), np.empty(0), np.empty(0)
-        self._recorded = [signal for signal in SIGNALS.values() if signal.source]
+        sensor = loop.experiment.scenario.sensor
+        samples = sensor.samples if isinstance(sensor, EncoderSensorConfig) else None
+        self._signals, self._dimensions = run_signals(samples), run_dimensions(samples)
+        self._recorded = [signal for signal in self._signals.values() if signal.source]
         self._log = Table(1 + sum(signal.size for signal in self._recorded))
         self.on_grid, self.samples = Table(13), Table(19)
         self.peak_applied = 0.0
@@ -140,10 +144,12 @@ class Recorder:
             stop = start + signal.size
             values[signal.name], start = self._log.columns(slice(start, stop)), stop
         values["error"] = values["pose"] - values["reference"]
-        variables = {name: _variable(signal, values[name]) for name, signal in SIGNALS.items()}
+        variables = {
+            name: _variable(signal, values[name]) for name, signal in self._signals.items()
+        }
         coordinates: dict[str, Any] = {
             name: (name, list(dimension.labels), {"long_name": dimension.long_name})
-            for name, dimension in DIMENSIONS.items()
+            for name, dimension in self._dimensions.items()
         }
         time = self._log.column(0)
         coordinates["time"] = ("time", time, {"units": "s", "long_name": "time"})

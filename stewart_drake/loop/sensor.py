@@ -1,7 +1,7 @@
 """The sensor of pose and rates, and its faults."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,28 @@ Array = NDArray[np.float64]
 
 _EARLY = 1e-9
 """s by which a sample may come before an instant and still be at it."""
+SPIKES: Final = 1
+"""Stream of random numbers."""
+_STRIKES: Final = 16
+"""The first of those that say what faults strike, one for each."""
+
+
+def draws(seed: int, stream: int, k: int) -> np.random.Generator:
+    """Random numbers of sample k."""
+    return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, stream, k]))
+
+
+def acts(fault: Any, time: float) -> bool:
+    """Whether a fault of a scenario is there at a time, s."""
+    return bool(fault["from"] <= time + _EARLY < fault["to"])
+
+
+def strikes(fault: Any, seed: int, place: int, k: int, size: int) -> NDArray[np.bool_]:
+    """(size,) whether a fault, of this place in the list, strikes each value of sample k."""
+    share = fault.get("share")
+    if share is None:
+        return np.ones(size, dtype=bool)
+    return draws(seed, _STRIKES + place, k).random(size) < share
 
 
 class Sensor(LeafSystem):
@@ -68,18 +90,19 @@ class Sensor(LeafSystem):
         return self._std * self._normal(k, 0)
 
     def _normal(self, k: int, stream: int) -> Array:
-        counter = [0, 0, stream, k]
-        return np.random.Generator(
-            np.random.Philox(key=self._seed, counter=counter)
-        ).standard_normal(NUM_STATE)
+        return draws(self._seed, stream, k).standard_normal(NUM_STATE)
 
     def _measure(self, context: Context, output: BasicVector) -> None:
         y, time = np.asarray(self._state.Eval(context)), context.get_time()
         k = round(time / self._period)
         if self._std.any():
             y = y + self.noise(k)
-        at = time + _EARLY
-        fault = next((f for f in self._faults if f["from"] <= at < f["to"]), None)
+        there = (
+            fault
+            for i, fault in enumerate(self._faults)
+            if acts(fault, time) and strikes(fault, self._seed, i, k, 1)[0]
+        )
+        fault = next(there, None)
         if fault is not None:
             y = self._faulty(fault, y, k, context)
         output.SetFromVector(y)
@@ -89,7 +112,7 @@ class Sensor(LeafSystem):
             return np.full(NUM_STATE, np.nan)
         if fault["kind"] == "spike":
             size = SPIKE if fault.get("size") is None else fault["size"]
-            return y + size * self._scale * self._normal(k, 1)
+            return y + size * self._scale * self._normal(k, SPIKES)
         last = context.get_discrete_state_vector().value()
         return y if np.all(np.isnan(last)) else last
 

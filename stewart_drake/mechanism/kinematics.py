@@ -137,6 +137,14 @@ def _margins(mechanism: Legs, p_SQ_S: Array) -> Array:
     return np.minimum(rod - np.hypot(rho - u, h), np.hypot(rho + u, h) - rod)
 
 
+def _closing(mechanism: Legs, p_SQ_S: Array) -> tuple[Array, Array]:
+    """atan2(B, A) and C / hypot(A, B) (..., 6) of joints at p_SQ_S (..., 6, 3)."""
+    u, rod = mechanism.crank_lengths, mechanism.rod_lengths
+    a, b = 2 * u * p_SQ_S[..., 0], 2 * u * p_SQ_S[..., 1]
+    c = np.einsum("...li,...li->...l", p_SQ_S, p_SQ_S) + u**2 - rod**2
+    return np.arctan2(b, a), c / np.hypot(a, b)
+
+
 def reach_margins(mechanism: Legs, pose: Array) -> Array:
     """Distance (6,) in m by which the rod end can still be moved before leg i cannot be closed."""
     return _margins(mechanism, _shaft_to_joint(mechanism, np.asarray(pose, dtype=np.float64))[1])
@@ -189,11 +197,9 @@ def leg_geometry(mechanism: Legs, pose: Array) -> LegGeometry:
     if not np.all(margins >= 0):
         raise UnreachablePoseError(margins)
     u, rod = mechanism.crank_lengths, mechanism.rod_lengths
-    a, b = 2 * u * p_SQ_S[:, 0], 2 * u * p_SQ_S[:, 1]
-    c = np.einsum("li,li->l", p_SQ_S, p_SQ_S) + u**2 - rod**2
+    direction, cosine = _closing(mechanism, p_SQ_S)
     # Rounding may lift |c| over hypot(a, b) by one ulp where the margin is exactly zero.
-    swing = np.arccos(np.clip(c / np.hypot(a, b), -1.0, 1.0))
-    alpha = np.arctan2(b, a) + mechanism.branches * swing
+    alpha = direction + mechanism.branches * np.arccos(np.clip(cosine, -1.0, 1.0))
     cos, sin = np.cos(alpha)[:, None], np.sin(alpha)[:, None]
     x, y = mechanism.R_WS[:, :, 0], mechanism.R_WS[:, :, 1]
     crank, tangent = cos * x + sin * y, -sin * x + cos * y
@@ -212,6 +218,16 @@ def leg_geometry(mechanism: Legs, pose: Array) -> LegGeometry:
 def crank_angles(mechanism: Legs, pose: Array) -> Array:
     """See `Mechanism.crank_angles`."""
     return leg_geometry(mechanism, pose).crank_angles
+
+
+def crank_angles_along(mechanism: Legs, poses: Array) -> Array:
+    """Crank angles (n, 6) in rad at poses (n, 6); NaN where a leg does not reach."""
+    R_WP = np.moveaxis(rotation(poses[:, ANGLES].T), -1, 0)
+    p_SQ_W = poses[:, None, POSITION] + mechanism.p_PQ @ R_WP.swapaxes(1, 2) - mechanism.p_WS
+    p_SQ_S = np.einsum("lij,nli->nlj", mechanism.R_WS, p_SQ_W)
+    direction, cosine = _closing(mechanism, p_SQ_S)
+    with np.errstate(invalid="ignore"):
+        return direction + mechanism.branches * np.arccos(cosine)
 
 
 def jacobian(mechanism: Legs, pose: Array) -> Array:

@@ -13,11 +13,13 @@ from stewart_drake.files.arrayio import load_netcdf
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import replacing
 from stewart_drake.files.yamlio import brief
-from stewart_drake.scenario.signals import COORDINATE_NAMES, COORDINATES, SIGNALS
+from stewart_drake.scenario.signals import COORDINATE_NAMES, COORDINATES, SIGNALS, Signal
 
 Array = NDArray[np.float64]
 
 _SPOKEN: Final = dict(zip(COORDINATES, COORDINATE_NAMES, strict=True))
+_ENCODERS: Final = ("time", "encoder")
+"""Dimensions of a measurement of crank angles."""
 _EXPECTED: Final = "a file that simulate saved (.nc)"
 
 
@@ -33,8 +35,10 @@ def signals_csv(signals: xr.Dataset) -> str:
     for name, signal in signals.data_vars.items():
         others = [dimension for dimension in signal.dims if dimension != "time"]
         labels = [f"_{_spoken(str(label))}" for other in others for label in signal[other].values]
-        known = SIGNALS.get(str(name))
+        known = _known(str(name), signal)
         units = ("1",) * len(labels or [""]) if known is None else known.quantity.units
+        if signal.dims == _ENCODERS:
+            units = ("rad",) * len(labels)
         for label, unit in zip(labels or [""], units, strict=True):
             header.append(f"{name}{label}[{'-' if unit == '1' else unit}]")
         columns.append(signal.transpose("time", *others).values.reshape(len(signal.time), -1))
@@ -88,7 +92,7 @@ def _problem(signals: xr.Dataset) -> str | None:
         if signal.dtype.kind not in "fiu" or " since " in str(signal.attrs.get("units")):
             return f"{name} is no number"
         others = [dimension for dimension in signal.dims if dimension != "time"]
-        known = SIGNALS.get(str(name))
+        known = _known(str(name), signal)
         single = name == "time" if known is None else known.quantity.dimension is None
         if "time" not in signal.dims or len(others) != (not single):
             return f"{name} is over {', '.join(map(str, signal.dims)) or 'nothing'}"
@@ -99,6 +103,11 @@ def _problem(signals: xr.Dataset) -> str | None:
     if not np.all(np.diff(time.values) > 0) or not np.isfinite(time.values).all():
         return "time does not increase"
     return None
+
+
+def _known(name: str, signal: xr.DataArray) -> Signal | None:
+    """The signal of that name, unless it is one whose size a scenario decides."""
+    return None if signal.dims == _ENCODERS else SIGNALS.get(name)
 
 
 def _spoken(label: str) -> str:

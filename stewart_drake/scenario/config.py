@@ -31,7 +31,13 @@ from stewart_drake.scenario.field_types import (
 )
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
 from stewart_drake.scenario.signals import USUAL_COULOMB_SPEED
-from stewart_drake.scenario.timing import METRIC_PERIOD, bound_problem, log_problem, step_problem
+from stewart_drake.scenario.timing import (
+    METRIC_PERIOD,
+    bound_problem,
+    log_problem,
+    samples_problem,
+    step_problem,
+)
 
 
 @dataclass(config=STRICT)
@@ -170,6 +176,8 @@ class ControllerConfig:
         known: a file of what is known of the machine (`scenario.known`), as `identify` writes it;
             means and covariance of what is estimated, and the values of what is not. A delay in it
             is believed in where `delay_steps` is null.
+        estimate_offsets: whether the estimator also finds how encoders are mounted; for
+            `sensor.kind` encoders, and a delay that is known.
     """
 
     period: Annotated[float, Field(ge=1e-4, le=10)] = 0.1
@@ -195,6 +203,7 @@ class ControllerConfig:
     rejoin: Annotated[float, Field(ge=0, le=10)] = 0.6
     prior: PriorConfig = field(default_factory=PriorConfig)
     known: Name | None = None
+    estimate_offsets: bool = False
 
 
 @dataclass(config=STRICT)
@@ -319,10 +328,39 @@ class StateSensorConfig:
 
     def problem(self) -> str | None:
         """What is wrong with fields that are well formed one by one, or None."""
-        return fault_problem(self.faults)
+        return fault_problem(self.faults, legs=False)
 
 
-SensorConfig = Annotated[StateSensorConfig, ByKind()]
+@dataclass(config=STRICT)
+class EncoderSensorConfig:
+    """The measurement of the six crank angles, by an encoder at each motor.
+
+    Attributes:
+        kind: `encoders`.
+        bits: of a turn; null is exact.
+        samples: how often each is read per period of the controller, the last time at its sample.
+        offset: of each encoder on its shaft, which the controller is not told, rad.
+        delay: between measuring and having the measurement, s; by the next sample after that.
+        loss: share of the measurements, those of a period each, that are lost.
+        seed: of where codes begin, of spikes and losses; the same seed gives the same run.
+        faults: when legs measure nothing, the same again, or nonsense; see `fault_config`.
+    """
+
+    kind: Literal["encoders"] = "encoders"
+    bits: Annotated[int, Field(ge=4, le=32)] | None = 14
+    samples: Annotated[int, Field(ge=1, le=1000)] = 1
+    offset: Six = field(default_factory=lambda: [0.0] * 6)
+    delay: Annotated[float, Field(ge=0, le=100)] = 0.0
+    loss: Annotated[float, Field(ge=0, le=0.99)] = 0.0
+    seed: Seed = 0
+    faults: list[SensorFault] = field(default_factory=list)
+
+    def problem(self) -> str | None:
+        """What is wrong with fields that are well formed one by one, or None."""
+        return fault_problem(self.faults, legs=True)
+
+
+SensorConfig = Annotated[StateSensorConfig | EncoderSensorConfig, ByKind()]
 
 
 @dataclass(config=STRICT)
@@ -429,6 +467,17 @@ class Scenario:
             "believed in; expected as much or more"
         )
 
+    def _offsets_problem(self) -> str | None:
+        if not self.controller.estimate_offsets:
+            return None
+        if self.sensor.kind == "encoders" and self.controller.delay_estimator == "none":
+            return None
+        return (
+            f"controller.estimate_offsets: got true with sensor.kind {self.sensor.kind!r} and "
+            f"delay_estimator {self.controller.delay_estimator!r}; expected false, or 'encoders' "
+            "and 'none'"
+        )
+
     def check(self, where: str = "scenario") -> None:
         """Checks every field again, and everything that takes several of them.
 
@@ -450,6 +499,7 @@ class Scenario:
             self.sensor.problem(),
             self.link.problem(),
             self._delay_problem(),
+            self._offsets_problem(),
             step and self._step_problem(step),
             log_problem(self.log_period, self.duration, step),
         ):
@@ -459,6 +509,10 @@ class Scenario:
     def _step_problem(self, step: float) -> str | None:
         """What does not suit the steps in s of a discrete plant, or None."""
         period, link = self.controller.period, self.link
+        if isinstance(self.sensor, EncoderSensorConfig):
+            problem = samples_problem(self.sensor.samples, period, step)
+            if problem:
+                return problem
         if isinstance(link, NetworkConfig):
             bound = None if link.playout is None else bound_problem(link.playout, step)
             return step_problem(step, period, 0.0) or bound

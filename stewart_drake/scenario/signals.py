@@ -205,6 +205,26 @@ the controller that is an entry in `loop.controller.HELD`.
 """
 
 
+def run_signals(samples: int | None) -> dict[str, Signal]:
+    """SIGNALS of a run whose encoders are read so many times a period; None is without any."""
+    if samples is None:
+        return SIGNALS
+    angles = Quantity("encoder", ("rad",) * (NUM_LEGS * samples))
+    said = SIGNALS["measurement"]._replace(
+        quantity=angles, long_name="crank angles that the controller got"
+    )
+    return SIGNALS | {"measurement": said}
+
+
+def run_dimensions(samples: int | None) -> dict[str, Dimension]:
+    """DIMENSIONS of `run_signals`."""
+    if samples is None:
+        return DIMENSIONS
+    labels = tuple(f"A{leg}[{n}]" for n in range(samples) for leg in LEGS)
+    said = "encoders of the legs, and the samples of each within a period, the oldest first"
+    return DIMENSIONS | {"encoder": Dimension(labels, said)}
+
+
 def exported_ports() -> dict[str, tuple[str, str]]:
     """Port of the closed loop -> system and its port, in the order of SIGNALS."""
     return {s.exported: (s.system, s.system_port) for s in SIGNALS.values() if s.source}

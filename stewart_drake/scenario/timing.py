@@ -94,6 +94,19 @@ def step_problem(time_step: float, period: float, fraction: float) -> str | None
     return None
 
 
+def samples_problem(samples: int, period: float, time_step: float) -> str | None:
+    """What is wrong with samples per period of s for a discrete plant, or None."""
+    steps = period / time_step
+    if not _is_whole(steps) or _is_whole(steps / samples):
+        return None  # the former is told elsewhere
+    fitting = [n for n in range(1, round(steps) + 1) if round(steps) % n == 0]
+    nearest = min(fitting, key=lambda n: abs(n - samples))
+    return (
+        f"sensor.samples: got {samples}; expected a number by which a period has whole steps of "
+        f"plant.time_step ({time_step!r} s), nearest {nearest}"
+    )
+
+
 def bound_problem(bound: float, time_step: float) -> str | None:
     """What is wrong with a network's bound in s for a discrete plant, or None."""
     if _is_whole(bound / time_step):

@@ -139,7 +139,8 @@ def shown(scenario_name: str | Path, settings: Iterable[str] = ()) -> dict[str, 
     rows = load_comparison(scenario_name, CONTROLLERS, settings)
     aware = rows["predictor_lqi"]
     known = aware.delay.constant and believed_delay(aware) == aware.true_delay
-    if known or not isinstance(aware.link, WireConfig) or aware.sensor.delay > 0:
+    at_once = isinstance(aware.link, WireConfig) and aware.sensor.delay == 0
+    if known or not at_once or aware.controller.estimate_offsets:
         return rows
     return load_comparison(scenario_name, (*CONTROLLERS, ADAPTIVE), settings)
 

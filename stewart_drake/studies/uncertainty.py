@@ -20,7 +20,7 @@ from stewart_drake.files.yamlio import validate
 from stewart_drake.law.startup import INSTANTS
 from stewart_drake.loop.experiment import Experiment, assemble, believed_delay, motion_scale
 from stewart_drake.mechanism.geometry import Body, Mechanism
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.config import Scenario, StateSensorConfig
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
 from stewart_drake.scenario.trajectories import spread_instants
 from stewart_drake.studies.ranges import Ranges
@@ -136,8 +136,11 @@ def add_bias(truth: Truth, bias: tuple[float, ...]) -> None:
 
 
 def add_noise(truth: Truth, share: float) -> None:
-    """Of a standard deviation that is a share of half the reference's peak to peak."""
-    if share != 0:
+    """Of a standard deviation that is a share of half the reference's peak to peak.
+
+    Encoders have none beside their codes.
+    """
+    if share != 0 and isinstance(truth.scenario.sensor, StateSensorConfig):
         moving = dataclasses.asdict(truth.scenario) | {"reference": truth.fields["reference"]}
         motion = motion_scale(assemble(validate(Scenario, moving, "drawn")))
         sensor = truth.fields["sensor"]
@@ -146,8 +149,9 @@ def add_noise(truth: Truth, share: float) -> None:
 
 
 def seed_noise(truth: Truth, seed: int) -> None:
-    """Of noise that was drawn; a sensor that is as it was has its own seed."""
-    if truth.fields["sensor"]["noise_std"] != truth.scenario.sensor.noise_std:
+    """Of noise that was drawn, or of the phases of encoders; else a sensor has its own seed."""
+    fields, sensor = truth.fields["sensor"], truth.scenario.sensor
+    if not isinstance(sensor, StateSensorConfig) or fields["noise_std"] != sensor.noise_std:
         truth.fields["sensor"]["seed"] = seed
 
 

@@ -24,7 +24,7 @@ from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.versions import versions
 from stewart_drake.files.yamlio import brief
 from stewart_drake.loop.results import SimulationResult
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.config import Scenario, StateSensorConfig
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS
 from stewart_drake.studies.disturbances import draw
@@ -130,7 +130,8 @@ def sample_run(scenario: Scenario) -> bytes:
 def samples(result: SimulationResult) -> Array:
     """(100, 18) of a run: [measurement - reference (12); commanded torque (6)], NaN after its end.
 
-    In rad, m, rad/s, m/s and N m. The log must hold every sample, as it does by default.
+    In rad, m, rad/s, m/s and N m. Where the state is not measured its estimate stands for it. The
+    log must hold every sample, as it does by default.
     """
     signals = result.signals
     rows = np.full((SAMPLES, len(TUNER_INPUTS)), np.nan)
@@ -139,7 +140,9 @@ def samples(result: SimulationResult) -> Array:
     at = at[at <= signals.time.values[-1] + 1e-9] if signals.sizes["time"] else at[:0]
     kept = signals.sel(time=at, method="nearest")
     wanted = np.hstack([kept.reference, kept.reference_rates])
-    rows[: len(at)] = np.hstack([kept.measurement - wanted, kept.torque_commanded])
+    measures_state = isinstance(result.scenario.sensor, StateSensorConfig)
+    state = kept.measurement if measures_state else kept.state_estimate
+    rows[: len(at)] = np.hstack([state - wanted, kept.torque_commanded])
     return rows
 
 
