@@ -29,6 +29,7 @@ ROOMS = (
     "law",
     "tuner",
     "loop",
+    "identification",
     "studies",
     "tuning",
     "report",
@@ -36,7 +37,7 @@ ROOMS = (
 )
 RANK = {name: number for number, name in enumerate(ROOMS)}
 
-PURE = ("mechanism", "native", "dynamics", "law", "tuner")
+PURE = ("mechanism", "native", "dynamics", "law", "tuner", "identification")
 FRAMEWORK = ("pydrake.systems.framework", "pydrake.all")
 CONNECTS = ("loop.diagram", "loop.law_design", "loop.platforms")
 SEES_PUBLIC_NAMES = ("cli",)  # may import the package itself

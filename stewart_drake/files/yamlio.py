@@ -11,6 +11,7 @@ import json
 import re
 import types
 import typing
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -171,6 +172,48 @@ def validate(type_: type[_T], data: dict[str, Any], where: str) -> _T:
     except (TypeError, ValueError, RecursionError):
         pass
     raise ConfigError(f"{where}: got {brief(data)}; expected plain numbers, text and lists")
+
+
+def validate_pairs(
+    type_: type[_T], settings: Iterable[str], option: str, units: Mapping[str, str]
+) -> _T:
+    """Builds a pydantic dataclass from `name=value` texts, the value in YAML.
+
+    Args:
+        type_: the dataclass, flat; what is not set keeps its default.
+        settings: the texts; of two with one name the later one counts.
+        option: of the command line, opening the message.
+        units: of each field, in words, told with the fields that a message speaks of.
+
+    Raises:
+        ConfigError: in one line.
+    """
+
+    def told(message: str, names: Iterable[str] = units) -> str:
+        spoken = set(re.findall(r"\w+", message)) & set(units)
+        found = [f"{name}: {units[name]}" for name in names if name in spoken]
+        return f" ({'; '.join(found)})" if found else ""
+
+    given: dict[str, Any] = {}
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if not equals or not name.strip():
+            raise ConfigError(
+                f"{option}: got {brief(setting)}; expected name=value{told(setting)}"
+            )
+        given[name.strip()] = parse_yaml(text, f"{option}: {name.strip()}")
+    try:
+        return validate(type_, given, option)
+    except ConfigError as error:
+        raise ConfigError(f"{error}{told(str(error), given)}") from None
+
+
+def units_of(type_: type) -> dict[str, str]:
+    """The `description` of each annotated field of a pydantic dataclass, by its name."""
+    return {
+        name: next(one.description for one in hint.__metadata__ if one.description)
+        for name, hint in typing.get_type_hints(type_, include_extras=True).items()
+    }
 
 
 def one_message(expected: str) -> pydantic.WrapValidator:

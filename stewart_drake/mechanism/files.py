@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.files.yamlio import load_yaml, validate
+from stewart_drake.files.yamlio import load_yaml, validate, yaml_text
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism
 from stewart_drake.mechanism.inertias import bar_inertia, disc_inertia
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
@@ -178,6 +178,39 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism:
         return build_mechanism(spec)
     except (UnreachablePoseError, ConfigError) as error:
         raise ConfigError(f"{path}: {error}") from None
+
+
+def mechanism_yaml(mechanism: Mechanism) -> str:
+    """A mechanism, leg by leg, as the text of a file that `load_mechanism` reads back."""
+    m = mechanism
+    legs = [
+        {
+            "shaft": p_WS.tolist(),
+            "motor_axis": R_WS[:, 2].tolist(),
+            "crank_zero": R_WS[:, 0].tolist(),
+            "plate_joint": p_PQ.tolist(),
+            "branch": int(branch),
+        }
+        for p_WS, R_WS, p_PQ, branch in zip(m.p_WS, m.R_WS, m.p_PQ, m.branches, strict=True)
+    ]
+
+    def link(lengths: Array, body: Link) -> dict[str, object]:
+        return {"length": lengths.tolist(), "center": float(body.center), **of(body)}
+
+    def of(body: Body) -> dict[str, object]:
+        return {"mass": float(body.mass), "inertia": body.inertia.tolist()}
+
+    data = {
+        "name": m.name,
+        "home": m.home.tolist(),
+        "legs": legs,
+        "base": of(m.base),
+        "plate": of(m.plate),
+        "crank": link(m.crank_lengths, m.crank),
+        "rod": link(m.rod_lengths, m.rod),
+        "motor": {"effort_limit": None if m.effort_limit is None else float(m.effort_limit)},
+    }
+    return yaml_text(data)
 
 
 def build_mechanism(spec: MechanismSpec) -> Mechanism:

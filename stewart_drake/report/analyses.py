@@ -1,6 +1,5 @@
 """The analyses of a scenario: what studies it, and what is told of that."""
 
-import time
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
@@ -11,9 +10,8 @@ from stewart_drake.report import (
     robustness_document,
     workspace_document,
 )
-from stewart_drake.report.answer import Answer
+from stewart_drake.report.answer import Answer, answer_of
 from stewart_drake.report.document import Document
-from stewart_drake.report.page import Provenance
 from stewart_drake.studies.delay_limits import study_delay
 from stewart_drake.studies.hautus import study_hautus
 from stewart_drake.studies.link_bound import study_link
@@ -50,7 +48,5 @@ def analyze(name: str, *subject: Any, command: str, **options: Any) -> Answer:
         command: what does the same again, as typed.
         options: of the study.
     """
-    analysis, started = ANALYSES[name], time.perf_counter()
-    study = analysis.study(*subject, **options)
-    made = Provenance(command, seconds=time.perf_counter() - started)
-    return Answer(study, study.summary, analysis.document(study), made)
+    analysis = ANALYSES[name]
+    return answer_of(lambda: analysis.study(*subject, **options), analysis.document, command)

@@ -1,6 +1,8 @@
 """A study and what is told of it, from Python, in a notebook and as files."""
 
 import html as escaping
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -60,6 +62,22 @@ class Answer:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "summary.json", self.summary)
         return self.save_page(folder)
+
+
+def answer_of(
+    study: Callable[[], Any], document: Callable[[Any], Document], command: str
+) -> Answer:
+    """Do a study and tell of it.
+
+    Args:
+        study: what does it; what it returns has a `summary`, plain data.
+        document: what tells of it.
+        command: what does the same again, as typed.
+    """
+    started = time.perf_counter()
+    found = study()
+    made = Provenance(command, seconds=time.perf_counter() - started)
+    return Answer(found, found.summary, document(found), made)
 
 
 def framed(page: str) -> str:

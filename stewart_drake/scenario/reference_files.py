@@ -3,12 +3,10 @@
 Readers return `(times, poses)`: times (n,) s, poses (n, 6) [roll, pitch, yaw, x, y, z] rad and m.
 """
 
-import csv
 import itertools
 import math
 import re
 from array import array
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
@@ -17,8 +15,8 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from stewart_drake.files.csvio import csv_rows, read_lines
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import read_bytes
 from stewart_drake.files.yamlio import brief, load_yaml, validate
 from stewart_drake.scenario.field_types import Row, Seconds
 from stewart_drake.scenario.reference_config import WaypointsConfig
@@ -122,8 +120,8 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
             samples; row and column are named, rows as a spreadsheet counts them.
     """
     path = Path(path)
-    text = _read_lines(path)
-    header = next((row for _, row in _rows(path, text)), None)
+    text = read_lines(path, _MAX_BYTES, "a CSV file of the motion's samples")
+    header = next((row for _, row in csv_rows(path, text)), None)
     if header is None:
         raise ConfigError(f"{path}: is empty; expected a header {_HEADER}")
     chosen = _motion_columns(header)
@@ -141,7 +139,7 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
     bad = _first_problem(samples)
     if bad is not None:
         before = samples[bad - 1] if bad else None
-        _, row = next(itertools.islice(_rows(path, text), bad + 1, None))
+        _, row = next(itertools.islice(csv_rows(path, text), bad + 1, None))
         _check_row(f"{path}: row {lines[bad]}", row, columns, before)
     if len(samples) < _MIN_ROWS:
         plural = "" if len(samples) == 1 else "s"
@@ -170,25 +168,6 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
     return samples[:, 0].copy(), samples[:, 1:].copy()
 
 
-def _read_lines(path: Path) -> list[str]:
-    raw = read_bytes(path, _MAX_BYTES, "a CSV file of the motion's samples")
-    try:
-        return raw.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text; expected a CSV file") from None
-
-
-def _rows(path: Path, text: list[str]) -> Iterator[tuple[int, list[str]]]:
-    """The rows that hold anything, each with its line number."""
-    reader = csv.reader(text, strict=True)
-    try:
-        for row in reader:
-            if any(map(str.strip, row)):
-                yield reader.line_num, row
-    except csv.Error as error:
-        raise ConfigError(f"{path}: row {reader.line_num}: is not CSV ({error})") from None
-
-
 class _Columns(NamedTuple):
     """Where a file has the motion: of its `width` columns those `chosen`, with their labels, their
     places in a sample and their factors to SI units."""
@@ -205,7 +184,7 @@ def _read_numbers(path: Path, text: list[str], columns: _Columns) -> tuple[list[
     another width or not seven numbers; that row is the last, with NaN."""
     lines, numbers = list[int](), array("d")
     whole = columns.chosen == list(range(columns.width))
-    for line, row in itertools.islice(_rows(path, text), 1, None):
+    for line, row in itertools.islice(csv_rows(path, text), 1, None):
         lines.append(line)
         try:
             if len(row) != columns.width:

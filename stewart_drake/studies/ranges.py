@@ -1,16 +1,14 @@
 """How far each quantity of `analyze robustness` may be off; nothing heavy is imported here."""
 
 import dataclasses
-import re
-import typing
 from collections.abc import Iterable
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.yamlio import brief, parse_yaml, validate
+from stewart_drake.files.yamlio import units_of, validate_pairs
 
 _Positive = Annotated[float, Field(gt=0)]
 
@@ -73,10 +71,7 @@ class Ranges:
     ] = 0.0
 
 
-RANGE_UNITS: Final[dict[str, str]] = {
-    name: next(one.description for one in hint.__metadata__ if one.description)
-    for name, hint in typing.get_type_hints(Ranges, include_extras=True).items()
-}
+RANGE_UNITS: Final = units_of(Ranges)
 """By name of a field of `Ranges`, what its numbers are shares of."""
 
 
@@ -86,27 +81,11 @@ def read_ranges(settings: Iterable[str]) -> Ranges:
     Raises:
         ConfigError: in one line.
     """
-    given: dict[str, Any] = {}
-    for setting in settings:
-        name, equals, text = setting.partition("=")
-        if not equals or not name.strip():
-            raise ConfigError(f"--vary: got {brief(setting)}; expected name=value{_units(setting)}")
-        given[name.strip()] = parse_yaml(text, f"--vary: {name.strip()}")
-    try:
-        ranges = validate(Ranges, given, "--vary")
-    except ConfigError as error:
-        raise ConfigError(f"{error}{_units(str(error), given)}") from None
+    ranges = validate_pairs(Ranges, settings, "--vary", RANGE_UNITS)
     limit = ranges.torque_limit
     if limit is not None and limit[0] > limit[1]:
         raise ConfigError(
             f"--vary: torque_limit: got {limit!r}; expected the lesser one first"
-            f"{_units('torque_limit')}"
+            f" (torque_limit: {RANGE_UNITS['torque_limit']})"
         )
     return ranges
-
-
-def _units(message: str, names: Iterable[str] = RANGE_UNITS) -> str:
-    """What the numbers mean of those `names` that a message speaks of."""
-    spoken = set(re.findall(r"\w+", message))
-    told = [f"{name}: {RANGE_UNITS[name]}" for name in names if name in spoken & set(RANGE_UNITS)]
-    return f" ({'; '.join(told)})" if told else ""

@@ -1,0 +1,217 @@
+"""A machine from its logs, and the plan of a log: identify."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from stewart_drake.cli.common import AsJson, Delivery, Out, Quiet, Settings
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.tolerances import TOLERANCE_UNITS, Tolerances, read_tolerances
+from stewart_drake.report.terminal import working
+
+if TYPE_CHECKING:
+    from stewart_drake.identification.log_files import Precision
+    from stewart_drake.report.answer import Answer
+
+MECHANISM = "mechanism.yaml"
+KNOWN = "known.yaml"
+SCENARIO = "scenario.yaml"
+
+Tolerance = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=VALUE",
+        help="How far off it may be, a standard deviation, 0: known. Repeatable. "
+        + "; ".join(f"{name}: {unit}" for name, unit in TOLERANCE_UNITS.items())
+        + ".",
+    ),
+]
+
+
+def identify(
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[LOG]...", help="signals.nc of simulate, or CSV; of one machine."),
+    ] = None,
+    mechanism: Annotated[
+        str | None, typer.Option(metavar="NAME|FILE", help="As drawn; needed with logs.")
+    ] = None,
+    plan: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SCENARIO", help="Instead of logs: a motion to log, and what it would tell."
+        ),
+    ] = None,
+    settings: Settings = None,
+    delay: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="Believed; that of the log by default, or 0.1 s."),
+    ] = None,
+    tolerance: Tolerance = None,
+    bits: Annotated[
+        int, typer.Option(metavar="N", help="Of the encoders of a CSV log, per turn.")
+    ] = 14,
+    pose_std: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RAD,M",
+            help="Errors of measured poses; 1e-4,2e-5 for a CSV log. With --plan poses are measured.",
+        ),
+    ] = None,
+    gravity: Annotated[
+        bool, typer.Option(help="Whether gravity acted in a CSV log, or was balanced.")
+    ] = True,
+    out: Out = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> int:
+    """Find delay, friction, payload and geometry in a log, even of a lost run.
+
+    Writes mechanism.yaml and known.yaml for simulate, and a page. A CSV log has the columns
+    time[s], torque_1[N m] to torque_6 as they were commanded, angle_1[rad] to angle_6, and
+    where they were measured roll[rad] to z[m].
+    """
+    tolerances = read_tolerances(tolerance or ())
+    precision = _precision(bits, pose_std)
+    if (plan is None) == (not logs):
+        given = "neither" if plan is None else "both"
+        raise ConfigError(f"LOG, --plan: got {given}; expected logs, or --plan SCENARIO")
+    if delay is not None and not 0 <= delay <= 100:
+        raise ConfigError(f"--delay: got {delay:g}; expected 0 to 100 s")
+    typed = {
+        "delay": delay,
+        "tolerance": tolerance,
+        "bits": None if bits == 14 else bits,
+        "pose-std": pose_std,
+        "out": out,
+    }
+    delivery = Delivery(out, quiet, as_json)
+    if plan is not None:
+        measured = pose_std is not None
+        answer = _planned(plan, settings or [], tolerances, precision, measured, typed, quiet)
+        names = _write_plan(answer, delivery)
+    else:
+        if settings:
+            raise ConfigError(f"--set: got {settings[0]!r} without --plan; expected it with --plan")
+        answer = _found(logs or [], mechanism, tolerances, precision, delay, gravity, typed, quiet)
+        names = _write_found(answer, delivery)
+    return _deliver(answer, delivery, names)
+
+
+def _precision(bits: int, pose_std: str | None) -> "Precision":
+    from stewart_drake.identification.log_files import Precision, angle_std
+
+    if not 1 <= bits <= 52:
+        raise ConfigError(f"--bits: got {bits}; expected 1 to 52")
+    if pose_std is None:
+        return Precision(angle_std(bits))
+    try:
+        angle, position = (float(part) for part in re.split(r"\s*,\s*", pose_std.strip()))
+    except ValueError:
+        angle = position = -1.0
+    if not (0 < angle < 10 and 0 < position < 10):
+        raise ConfigError(
+            f"--pose-std: got {pose_std!r}; expected two positive numbers, rad and m, as 1e-4,2e-5"
+        )
+    return Precision(angle_std(bits), angle, position)
+
+
+def _found(
+    logs: list[Path],
+    mechanism: str | None,
+    tolerances: Tolerances,
+    precision: "Precision",
+    delay: float | None,
+    gravity: bool,
+    typed: dict[str, Any],
+    quiet: bool,
+) -> "Answer":
+    from stewart_drake.identification.identify import identify as find
+    from stewart_drake.identification.log_files import read_log
+    from stewart_drake.mechanism.files import load_mechanism
+    from stewart_drake.report.answer import answer_of
+    from stewart_drake.report.identification_document import document
+    from stewart_drake.report.page import command_line
+
+    if mechanism is None:
+        raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")
+    machine = load_mechanism(mechanism)
+    with working("identify", quiet):
+        read = [read_log(path, machine, precision, gravity) for path in logs]
+        words = {"mechanism": mechanism, **typed}
+        command = command_line("identify", *map(str, logs), options=words)
+        return answer_of(lambda: find(read, machine, tolerances, delay), document, command)
+
+
+def _planned(
+    scenario: str,
+    settings: list[str],
+    tolerances: Tolerances,
+    precision: "Precision",
+    poses: bool,
+    typed: dict[str, Any],
+    quiet: bool,
+) -> "Answer":
+    import numpy as np
+
+    from stewart_drake.identification.logs import ANGLES, POSE
+    from stewart_drake.identification.plan import plan
+    from stewart_drake.loop.experiment import prepare
+    from stewart_drake.report.answer import answer_of
+    from stewart_drake.report.identification_document import plan_document
+    from stewart_drake.report.page import command_line
+    from stewart_drake.scenario.loading import load_scenario
+
+    std = np.full_like(precision.std, np.inf)
+    for part in (ANGLES, POSE) if poses else (ANGLES,):
+        std[part] = precision.std[part]
+    experiment = prepare(load_scenario(scenario, settings=settings))
+    command = command_line("identify", settings=settings, options={"plan": scenario, **typed})
+    with working("plan", quiet):
+        return answer_of(lambda: plan(experiment, std, tolerances), plan_document, command)
+
+
+def _write_found(answer: "Answer", delivery: Delivery) -> list[str]:
+    """What simulate takes."""
+    from stewart_drake.files.fileio import replacing
+    from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
+    from stewart_drake.scenario.known import save_known
+
+    if delivery.out is None:
+        return []
+    delivery.discard(MECHANISM, KNOWN)
+    path = delivery.out / MECHANISM
+    text = mechanism_yaml(answer.study.mechanism)
+    with replacing(path) as partial:
+        partial.write_text(text)
+    save_known(delivery.out / KNOWN, answer.study.known(load_mechanism(path)))
+    return [MECHANISM, KNOWN]
+
+
+def _write_plan(answer: "Answer", delivery: Delivery) -> list[str]:
+    """The motion, and the scenario that makes the plate do it."""
+    from stewart_drake.files.fileio import replacing
+    from stewart_drake.identification.plan import MOTION
+    from stewart_drake.scenario.loading import scenario_yaml
+
+    if delivery.out is None:
+        return []
+    delivery.discard(MOTION, SCENARIO)
+    texts = {MOTION: answer.study.motion_csv, SCENARIO: scenario_yaml(answer.study.scenario)}
+    for name, text in texts.items():
+        with replacing(delivery.out / name) as partial:
+            partial.write_text(text)
+    return list(texts)
+
+
+def _deliver(answer: "Answer", delivery: Delivery, names: list[str]) -> int:
+    from stewart_drake.report.answer import PAGE
+
+    delivery.say(str(answer))
+    delivery.discard(PAGE)
+    delivery.write(answer.summary)
+    delivery.wrote(*names)
+    delivery.draw(PAGE, answer.save_page)
+    return delivery.end(answer.summary)

@@ -1,0 +1,313 @@
+"""The most probable machine: multiple shooting, Gauss-Newton, Levenberg's damping.
+
+Minimised over the unknowns p and the first state x_i of every segment is
+
+    chi^2 = sum |(y - h(x(t); p)) / sigma|^2 + |(p - p_0) / sigma_0|^2,
+
+measurements and what was known before. A step solves J'J d = -J'r with J'J + lambda diag(J'J) in the
+place of J'J. A first state meets the measurements of its own segment only, so that J'J is an arrow,
+
+    J'J = [N_pp, N_pi; N_ip, N_ii],   d_i = -N_ii^-1 (g_i + N_ip d_p),
+    (N_pp - sum N_pi N_ii^-1 N_ip) d_p = -(g_p - sum N_pi N_ii^-1 g_i),
+
+and the inverse of the last matrix, without damping, is the covariance of p, whatever the x_i are.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.identification.logs import ANGLES, KINDS, NUM_MEASURED, POSE
+from stewart_drake.identification.model import NUM_DYNAMIC, MachineModel
+from stewart_drake.identification.shooting import (
+    FIRST,
+    NUMBERS,
+    Segment,
+    integrate,
+    plan_steps,
+)
+from stewart_drake.identification.unknowns import DELAY, NUM_UNKNOWNS, OFFSETS, Unknowns
+from stewart_drake.scenario.signals import NUM_STATE
+
+Array = NDArray[np.float64]
+
+MOST_DELAY: Final = 0.1
+"""s by which one iteration may change the delay."""
+ENOUGH: Final = 0.01
+"""Of chi^2; an iteration that gains less is the last."""
+_MOST_ITERATIONS: Final = 60
+_SLOPES_STEP: Final = 0.02
+"""s, of the integration of slopes."""
+_STEP_ERROR: Final = 0.05
+"""Standard deviations of a measurement by which integration may be off, root mean square."""
+_SHORTEST_STEP: Final = 1e-3
+"""s."""
+_DAMPING: Final = (1e-3, 1e-9, 1e12)
+"""At first, least, and where no step helps any more."""
+
+
+class Guess(NamedTuple):
+    """Values of all that is sought."""
+
+    values: Array
+    """(NUM_UNKNOWNS,)."""
+    first: Array
+    """(n, 12) first states of the segments."""
+
+
+class Residuals(NamedTuple):
+    """How well a guess explains the logs."""
+
+    measured: Array
+    """(m, n, 18) of n segments in standard deviations, 0 where nothing was measured."""
+    prior: Array
+    """(free unknowns,)."""
+
+    @property
+    def chi2(self) -> float:
+        """Infinite for a trajectory that ran away."""
+        with np.errstate(over="ignore"):
+            total = float(np.sum(self.measured**2) + np.sum(self.prior**2))
+        return total if np.isfinite(total) else np.inf
+
+
+class Normal(NamedTuple):
+    """J'J and J'r, segment by segment; columns: free unknowns, then a first state."""
+
+    of_segments: Array
+    """(n, k + 12, k + 12)."""
+    gradients: Array
+    """(n, k + 12)."""
+    of_prior: Array
+    """(k,) on the diagonal."""
+    prior_gradient: Array
+    """(k,)."""
+
+
+class Fit(NamedTuple):
+    """Where the iterations ended."""
+
+    guess: Guess
+    residuals: Residuals
+    covariance: Array
+    """(k, k) of the free unknowns."""
+    iterations: int
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Segments of logs, and what is not known.
+
+    Attributes:
+        segments: of logs under the same gravity.
+        unknowns: what is known beforehand.
+        longest_step: of the trajectories' integration, s.
+    """
+
+    segments: list[Segment]
+    unknowns: Unknowns
+    longest_step: float = 0.02
+
+    @property
+    def count(self) -> int:
+        """Number of measured values."""
+        values = (s.log.values[s.rows] for s in self.segments)
+        return sum(int(np.isfinite(one).sum()) for one in values)
+
+    def model(self) -> MachineModel:
+        """That evaluates all segments at once."""
+        gravity = self.segments[0].log.gravity
+        return MachineModel(self.unknowns.mechanism, gravity, len(self.segments))
+
+    def measured(self) -> tuple[Array, Array]:
+        """Values (m, n, 18) of the segments, NaN where there is none, and their std (n, 18)."""
+        longest = max(len(s.rows) for s in self.segments)
+        values = np.full((longest, len(self.segments), NUM_MEASURED), np.nan)
+        for i, s in enumerate(self.segments):
+            values[: len(s.rows), i] = s.log.values[s.rows]
+        return values, np.array([s.log.std for s in self.segments])
+
+
+class Evaluator:
+    """Residuals of guesses, and their derivatives."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self.model = problem, problem.model()
+        self.values, self.std = problem.measured()
+        self.free = problem.unknowns.free
+
+    def residuals(self, guess: Guess) -> Residuals:
+        """Of a guess."""
+        return self._evaluate(guess, self.problem.longest_step)[0]
+
+    def normal(self, guess: Guess) -> tuple[Residuals, Normal]:
+        """The same, and the normal equations there.
+
+        Where trajectories need short steps, their slopes do with long ones: what a slope is off
+        moves the minimum by that share of a standard deviation, and costs ten times as much.
+        """
+        residuals = self.residuals(guess)
+        slopes_step = max(self.problem.longest_step, _SLOPES_STEP)
+        _, J = self._evaluate(guess, slopes_step, sensitive=True)
+        # Points and values of a segment in one column.
+        _, n, _, columns = J.shape
+        rows = J.transpose(1, 0, 2, 3).reshape(n, -1, columns)
+        r = residuals.measured.transpose(1, 0, 2).reshape(n, -1, 1)
+        turned = rows.transpose(0, 2, 1)
+        weight = 1 / self.problem.unknowns.std[self.free]
+        normal = Normal(turned @ rows, (turned @ r)[:, :, 0], weight**2, weight * residuals.prior)
+        return residuals, normal
+
+    def _evaluate(
+        self, guess: Guess, longest_step: float, sensitive: bool = False
+    ) -> tuple[Residuals, Array]:
+        """Residuals and, of m samples of n segments, J (m, n, 18, columns)."""
+        unknowns, free = self.problem.unknowns, self.free
+        numbers = unknowns.numbers(guess.values)
+        plan = plan_steps(self.problem.segments, guess.values[DELAY], longest_step)
+        course = integrate(self.model, numbers, guess.first, plan, sensitive)
+        m, n, _ = course.states.shape
+        seen = np.empty((m, n, NUM_MEASURED))
+        J = np.zeros((m, n, NUM_MEASURED, len(free) + NUM_STATE if sensitive else 0))
+        seen[:, :, POSE.start :] = course.states
+        any_angle = bool(np.isfinite(self.values[:, :, ANGLES]).any())
+        with np.errstate(all="ignore"):
+            for k in range(m) if any_angle else ():
+                alpha, by_pose, by_geometry = self.model.crank_angles(
+                    course.states[k, :, :6], numbers
+                )
+                seen[k, :, ANGLES] = alpha + guess.values[OFFSETS]
+                if sensitive:
+                    slopes = by_pose @ course.slopes[k][:, :6]
+                    slopes[:, :, NUM_STATE + NUM_DYNAMIC : NUMBERS.stop] += by_geometry
+                    J[k, :, ANGLES] = self._columns(slopes, np.eye(6))
+            residual = self.values - seen
+            residual[:, :, ANGLES] = np.remainder(residual[:, :, ANGLES] + np.pi, 2 * np.pi) - np.pi
+            residual /= self.std
+        if sensitive:
+            J[:, :, POSE.start :] = self._columns(course.slopes, np.zeros((NUM_STATE, 6)))
+            J *= -1 / self.std[:, :, None]
+            J[np.isnan(self.values)] = 0.0
+        residual[np.isnan(self.values)] = 0.0
+        prior = ((guess.values - unknowns.mean)[free]) / unknowns.std[free]
+        return Residuals(residual, prior), J
+
+    def _columns(self, slopes: Array, offsets: Array) -> Array:
+        """From the columns of S to those of free unknowns and first state."""
+        rows = slopes.shape[:-1]
+        whole = np.empty((*rows, NUM_UNKNOWNS))
+        whole[..., : OFFSETS.start] = slopes[..., NUMBERS]
+        whole[..., OFFSETS] = offsets
+        whole[..., DELAY] = slopes[..., -1]
+        return np.concatenate([whole[..., self.free], slopes[..., FIRST]], axis=-1)
+
+
+def followed(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
+    """Without the segments whose first trajectory runs out of the workspace."""
+    measured = Evaluator(problem).residuals(start).measured
+    with np.errstate(over="ignore"):
+        kept = np.flatnonzero(np.isfinite(np.sum(measured**2, axis=(0, 2))))
+    segments = [problem.segments[k] for k in kept]
+    return replace(problem, segments=segments), Guess(start.values, start.first[kept])
+
+
+def solve(problem: Problem, start: Guess) -> Fit:
+    """The most probable guess, from a start whose trajectories are `followed`."""
+    evaluator = Evaluator(problem)
+    guess, damping = start, _DAMPING[0]
+    residuals, normal = evaluator.normal(guess)
+    iterations = 0
+    while iterations < _MOST_ITERATIONS:
+        iterations += 1
+        before, gained = residuals.chi2, 0.0
+        while damping < _DAMPING[2]:
+            trial = _moved(guess, *_step(normal, damping), evaluator.free)
+            chi2 = evaluator.residuals(trial).chi2
+            if chi2 < before:
+                guess, gained = trial, before - chi2
+                break
+            damping *= 10
+        if gained == 0.0:
+            break
+        damping = max(damping / 10, _DAMPING[1])
+        residuals, normal = evaluator.normal(guess)
+        if gained < ENOUGH:
+            break
+    return Fit(guess, residuals, covariance(normal), iterations)
+
+
+def finer(problem: Problem, guess: Guess) -> Problem | None:
+    """The problem with half the step, or None where that moves its residuals by next to nothing.
+
+    Coulomb friction turns round within some hundredths of a second, so that what step is fine
+    enough depends on the machine.
+    """
+    halved = replace(problem, longest_step=problem.longest_step / 2)
+    if halved.longest_step < _SHORTEST_STEP:
+        return None
+    coarse, fine = (Evaluator(one).residuals(guess).measured for one in (problem, halved))
+    return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > _STEP_ERROR else None
+
+
+def _moved(guess: Guess, unknown: Array, first: Array, free: NDArray[np.intp]) -> Guess:
+    values = guess.values.copy()
+    values[free] += unknown
+    before = guess.values[DELAY]
+    values[DELAY] = np.clip(values[DELAY], max(0.0, before - MOST_DELAY), before + MOST_DELAY)
+    return Guess(values, guess.first + first)
+
+
+def _step(normal: Normal, damping: float) -> tuple[Array, Array]:
+    """Changes of the free unknowns (k,) and of the first states (n, 12)."""
+    k = len(normal.of_prior)
+    whole, g = _joined(normal)
+    N_ip, N_ii = normal.of_segments[:, k:, :k], normal.of_segments[:, k:, k:]
+    damped = N_ii + damping * np.einsum("nij,ij->nij", N_ii, np.eye(NUM_STATE))
+    eliminated = np.linalg.solve(damped, np.dstack([N_ip, normal.gradients[:, k:, None]]))
+    turned = N_ip.transpose(0, 2, 1)
+    reduced = whole + damping * np.diag(np.diag(whole)) - (turned @ eliminated[:, :, :k]).sum(0)
+    right = g - (turned @ eliminated[:, :, k:]).sum(0)[:, 0]
+    unknown = -np.linalg.solve(reduced, right)
+    first = -(eliminated[:, :, k] + eliminated[:, :, :k] @ unknown)
+    return unknown, first
+
+
+def _joined(normal: Normal) -> tuple[Array, Array]:
+    """N_pp (k, k) and g_p (k,)."""
+    k = len(normal.of_prior)
+    whole = normal.of_segments[:, :k, :k].sum(0) + np.diag(normal.of_prior)
+    return whole, normal.gradients[:, :k].sum(0) + normal.prior_gradient
+
+
+def covariance(normal: Normal) -> Array:
+    """Of the free unknowns (k, k), with whatever first states."""
+    k = len(normal.of_prior)
+    whole, _ = _joined(normal)
+    N_ip, N_ii = normal.of_segments[:, k:, :k], normal.of_segments[:, k:, k:]
+    information = whole - (N_ip.transpose(0, 2, 1) @ np.linalg.solve(N_ii, N_ip)).sum(0)
+    scale = np.sqrt(1 / normal.of_prior)  # unknowns in units of what was known before
+    scaled = scale[:, None] * information * scale
+    found: Array = scale[:, None] * np.linalg.inv(scaled) * scale
+    return (found + found.T) / 2
+
+
+def chi2_per_value(residuals: Residuals, problem: Problem) -> dict[str, float]:
+    """chi^2 / n by kind of measurement, of the prior, and of all ("all").
+
+    Each fitted first state takes twelve values' worth of freedom, in equal shares of all values;
+    for the unknowns the prior's own terms make up.
+    """
+    values, _ = problem.measured()
+    there = np.isfinite(values)
+    fitted = NUM_STATE * len(problem.segments)
+    share = 1 - fitted / there.sum()
+    found = {
+        name: float(np.sum(residuals.measured[:, :, kind] ** 2) / (share * there[:, :, kind].sum()))
+        for name, kind in KINDS.items()
+        if there[:, :, kind].any()
+    }
+    found["prior"] = float(np.mean(residuals.prior**2))
+    found["all"] = float(residuals.chi2 / (there.sum() - fitted))
+    return found

@@ -1,0 +1,244 @@
+"""From logs to a machine: all steps, and what is told of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification import start
+from stewart_drake.identification.fit import Fit, Guess, Problem, chi2_per_value, finer, followed, solve
+from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
+from stewart_drake.identification.logs import ANGLES, POSE, Log
+from stewart_drake.identification.shooting import Segment
+from stewart_drake.identification.tolerances import Tolerances
+from stewart_drake.identification.unknowns import (
+    DELAY,
+    DYNAMIC,
+    NAMES,
+    OFFSETS,
+    ONE_SIDED,
+    UNITS,
+    Unknowns,
+    unknowns_of,
+)
+from stewart_drake.mechanism.geometry import Mechanism, fingerprint
+from stewart_drake.scenario.known import Known
+
+Array = NDArray[np.float64]
+
+WRONG: Final = 1.5
+"""chi^2 per value from which on a fit is wrong and its intervals mean nothing."""
+USUAL_DELAY: Final = 0.1
+"""s, believed where nobody says anything."""
+_COARSE: Final = 0.1
+"""s by which the delay that is begun with may be off."""
+
+
+@dataclass(frozen=True)
+class Identification:
+    """A machine as its logs tell it.
+
+    Attributes:
+        logs: that were read.
+        unknowns: what was known before.
+        problem, fit: what was solved, and how it came out.
+        left_out: stretches of the logs in which no trajectory could be followed.
+        middle: pose (6,) in the middle of what was measured.
+    """
+
+    logs: Sequence[Log]
+    unknowns: Unknowns
+    problem: Problem
+    fit: Fit
+    left_out: int
+    middle: Array
+
+    @cached_property
+    def chi2(self) -> dict[str, float]:
+        """Per value: by kind of measurement, of the prior, and of all."""
+        return chi2_per_value(self.fit.residuals, self.problem)
+
+    @property
+    def right(self) -> bool:
+        """Whether the fit explains the logs, so that its intervals mean something."""
+        return self.chi2["all"] <= WRONG
+
+    @cached_property
+    def values(self) -> Array:
+        """What was found of the unknowns, friction not below zero."""
+        found = self.fit.guess.values.copy()
+        for place in ONE_SIDED:
+            found[place] = max(0.0, found[place])
+        return found
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Of all unknowns, 0 where they are known; where the fit is wrong what it was before."""
+        unknowns = self.unknowns
+        if not self.right:
+            return np.diag(unknowns.std**2)
+        whole = np.zeros((len(unknowns.mean), len(unknowns.mean)))
+        whole[np.ix_(unknowns.free, unknowns.free)] = self.fit.covariance
+        return whole
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations of all unknowns."""
+        found: Array = np.sqrt(np.diag(self.covariance))
+        return found
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """The machine that was found; as it was drawn where the fit is wrong."""
+        return self.unknowns.machine(self.values if self.right else self.unknowns.mean)
+
+    def known(self, mechanism: Mechanism) -> Known:
+        """What a controller of this machine may go by: all but the geometry.
+
+        Where the fit is wrong that is the delay alone, as uncertain as before.
+
+        Args:
+            mechanism: the one that was found, as it was written and read.
+        """
+        places = np.r_[DYNAMIC, OFFSETS, DELAY] if self.right else np.array([DELAY])
+        return Known(
+            fingerprint(mechanism),
+            tuple(NAMES[k] for k in places),
+            self.values[places],
+            self.covariance[np.ix_(places, places)],
+        )
+
+    @cached_property
+    def unseen(self) -> tuple[int, list[str]]:
+        """How many directions the logs do not see, and what they are."""
+        return unseen(self.unknowns, self.fit.covariance)
+
+    @cached_property
+    def pose_uncertainty(self) -> PoseUncertainty | None:
+        """Over the workspace; None where the fit is wrong."""
+        if not self.right:
+            return None
+        return pose_uncertainty(self.unknowns, self.values, self.fit.covariance, self.middle)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What `summary.json` holds: intervals are null where the fit is wrong."""
+        std = self.std if self.right else np.full(len(self.values), np.nan)
+        poses = self.pose_uncertainty
+        return {
+            "logs": [log.name for log in self.logs],
+            "mechanism": self.unknowns.mechanism.name,
+            "delay_s": float(self.values[DELAY]),
+            "delay_std_s": float(std[DELAY]),
+            "chi2": self.chi2,
+            "intervals": self.right,
+            "parameters": {
+                NAMES[k]: {
+                    "value": float(self.values[k]),
+                    "std": float(std[k]),
+                    "unit": UNITS[k],
+                    "before": float(self.unknowns.mean[k]),
+                    "before_std": float(self.unknowns.std[k]),
+                }
+                for k in self.unknowns.free
+            },
+            "pose_uncertainty": None if poses is None else poses.summary,
+            "unseen": {"directions": self.unseen[0], "names": self.unseen[1]},
+            "segments": len(self.problem.segments),
+            "left_out": self.left_out,
+            "iterations": self.fit.iterations,
+        }
+
+
+def identify(
+    logs: Sequence[Log],
+    mechanism: Mechanism,
+    tolerances: Tolerances | None = None,
+    delay: float | None = None,
+) -> Identification:
+    """The machine that explains logs best.
+
+    Args:
+        logs: of one machine.
+        mechanism: as drawn.
+        tolerances: how far off it may be, the defaults if None.
+        delay: that is believed in, s; None is what the first log believed.
+
+    Raises:
+        ConfigError: one line; a log that does not suit the mechanism or is too short.
+    """
+    if len({log.gravity for log in logs}) > 1:
+        raise ConfigError(
+            "LOG: got logs with gravity and without; expected one machine, as it stands"
+        )
+    tolerances = Tolerances() if tolerances is None else tolerances
+    told = [log.delay for log in logs if log.delay is not None]
+    believed = delay if delay is not None else told[0] if told else USUAL_DELAY
+    poses = [start.measured_poses(log, mechanism) for log in logs]
+    # The longest log has most to say.
+    longest = max(range(len(logs)), key=lambda i: len(logs[i].times))
+    begun = believed
+    if tolerances.delay > 0:
+        begun = start.coarse_delay(
+            logs[longest], poses[longest], mechanism, believed, tolerances.delay
+        )
+    unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
+    segments = list[Segment]()
+    for log, own in zip(logs, poses, strict=True):
+        length = start.segment_length(log, own, mechanism, begun)
+        known_from = float(log.sent[0]) + begun + (_COARSE if tolerances.delay > 0 else 0.0)
+        segments += start.segments_of(log, known_from, length)
+    by_log = {log.name: own for log, own in zip(logs, poses, strict=True)}
+    first = start.first_states(segments, by_log)
+    values = unknowns.mean.copy()
+    values[DELAY] = begun
+    whole = Problem(segments, unknowns)
+    problem, guess = followed(whole, Guess(values, first))
+    fit = _solved(problem, guess)
+    # With what was found, what ran away before may be followed.
+    again, retried = followed(whole, Guess(fit.guess.values, first))
+    if len(again.segments) > len(problem.segments):
+        problem, fit = again, _solved(again, retried)
+    while (halved := finer(problem, fit.guess)) is not None:
+        problem, fit = halved, _solved(halved, fit.guess)
+    every = np.vstack(poses)
+    middle = np.nanmedian(every, axis=0)
+    left_out = len(segments) - len(problem.segments)
+    return Identification(logs, unknowns, problem, fit, left_out, middle)
+
+
+def _solved(problem: Problem, guess: Guess) -> Fit:
+    if not problem.segments:
+        raise ConfigError(
+            "LOG: got no stretch that the mechanism could have moved through under these torques; "
+            "expected a log of this machine, torques in N m as they were commanded"
+        )
+    return solve(problem, guess)
+
+
+def _unknowns(
+    logs: Sequence[Log],
+    poses: Sequence[Array],
+    mechanism: Mechanism,
+    tolerances: Tolerances,
+    believed: float,
+) -> Unknowns:
+    """With scales of the logs: the largest torque, and the largest speed of a crank."""
+    speeds = []
+    for log, own in zip(logs, poses, strict=True):
+        known = np.isfinite(own).all(axis=1)
+        J = mechanism.jacobian(np.median(own[known], axis=0))
+        turned = own[known] @ J.T
+        spans = np.diff(log.times[known])
+        speeds.append(np.abs(np.diff(turned, axis=0) / spans[:, None]).max())
+    torque = max(float(np.abs(log.torques).max()) for log in logs)
+    unknowns = unknowns_of(mechanism, tolerances, believed, torque, float(max(speeds)))
+    if not any(log.measures(ANGLES) for log in logs):
+        unknowns = unknowns.without_encoders()
+    if not any(log.measures(ANGLES) or log.measures(POSE) for log in logs):
+        raise ConfigError("LOG: got neither crank angles nor poses; expected one of the two")
+    return unknowns

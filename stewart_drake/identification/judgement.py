@@ -1,0 +1,194 @@
+"""What a log has told: directions that it cannot see, and how well poses are known afterwards."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.dynamics.workspace import margin
+from stewart_drake.identification.model import MachineModel, Numbers
+from stewart_drake.identification.unknowns import (
+    GEOMETRY,
+    NAMES,
+    NUM_UNKNOWNS,
+    OFFSETS,
+    Unknowns,
+)
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.scenario.signals import ANGLES, LEGS, NUM_LEGS, POSITION
+
+Array = NDArray[np.float64]
+
+UNSEEN: Final = 0.8
+"""Share of its variance before the log that a direction keeps, if the log does not see it."""
+_ALIKE: Final = 0.9
+"""Share of a named direction that lies among those the log does not see, if it is one of them."""
+_POSES: Final = 200
+_ROOM: Final = 0.3
+"""Of the margin in the middle: where the workspace counts as ended."""
+_GROUPS: Final = {
+    "torque biases": "torque_bias_",
+    "the payload's mass": "payload_mass",
+    "the payload's place": "payload_position_",
+    "viscous friction": "joint_damping",
+    "Coulomb friction": "coulomb_friction",
+    "crank lengths": "crank_length_",
+    "rod lengths": "rod_length_",
+    "plate joints": "plate_joint_",
+    "shafts": "shaft_",
+    "encoder offsets": "offset_",
+    "the delay": "delay",
+}
+
+
+class PoseUncertainty(NamedTuple):
+    """Standard deviations of a pose that is computed from crank angles, over the workspace."""
+
+    angle: tuple[float, float]
+    """rad, the largest of the three: median and worst over the workspace."""
+    position: tuple[float, float]
+    """m, alike."""
+    angle_beside: tuple[float, float]
+    """rad: of the change from the pose in the middle, for which base and plate may stand anyhow."""
+    position_beside: tuple[float, float]
+    """m, alike."""
+
+    @property
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Plain data."""
+        units = ("angle_rad", "position_m", "angle_from_middle_rad", "position_from_middle_m")
+        return {
+            name: {"median": pair[0], "worst": pair[1]}
+            for name, pair in zip(units, self, strict=True)
+        }
+
+
+def named_directions(mechanism: Mechanism) -> dict[str, Array]:
+    """Directions (NUM_UNKNOWNS,) in which machines differ as a whole, by what they are."""
+    joints, found = mechanism.p_PQ, {}
+
+    def of_legs(columns: slice | int, values: Array) -> Array:
+        legs = np.zeros((NUM_LEGS, 8))
+        legs[:, columns] = values
+        direction = np.zeros(NUM_UNKNOWNS)
+        direction[GEOMETRY] = legs.ravel()
+        return direction
+
+    for axis, unit in zip("xyz", np.eye(3), strict=True):
+        found[f"where the base stands along {axis}"] = of_legs(slice(5, 8), unit)
+        found[f"where the plate's centre of mass lies along its {axis}"] = of_legs(slice(2, 5), unit)
+        turned = np.cross(unit, joints)
+        found[f"how the plate's frame is turned about its {axis}"] = of_legs(slice(2, 5), turned)
+    lengths = [mechanism.crank_lengths[:, None], mechanism.rod_lengths[:, None]]
+    whole = np.hstack([*lengths, mechanism.p_PQ, mechanism.p_WS])
+    found["the scale of all lengths"] = of_legs(slice(0, 8), whole)
+    all_offsets = np.zeros(NUM_UNKNOWNS)
+    all_offsets[OFFSETS] = 1.0
+    found["the zero of all encoders together"] = all_offsets
+    return found
+
+
+def unseen(unknowns: Unknowns, covariance: Array) -> tuple[int, list[str]]:
+    """How many directions the log does not see, and what they are, in words.
+
+    In units of what was known before, the covariance of the unknowns has eigenvalues from 0 (found
+    by the log) to 1 (as uncertain as before). Those above UNSEEN span what it does not see. Of that,
+    whole-machine directions are named; the rest by what it consists of.
+
+    Args:
+        unknowns: before the log.
+        covariance: (k, k) of the free ones after it.
+    """
+    free, std = unknowns.free, unknowns.std[unknowns.free]
+    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
+    space = vectors[:, values > UNSEEN]
+    count, told = space.shape[1], list[str]()
+    singles = {
+        NAMES[k].replace("_", " "): np.eye(NUM_UNKNOWNS)[k]
+        for k in free
+        if not GEOMETRY.start <= k < GEOMETRY.stop
+    }
+    for name, direction in {**named_directions(unknowns.mechanism), **singles}.items():
+        d = direction[free] / std
+        inside = space.T @ d
+        if np.linalg.norm(d) == 0 or space.shape[1] == 0:
+            continue
+        if np.sum(inside**2) > _ALIKE * (d @ d):
+            told.append(name)
+            # What is left of the space is perpendicular to what has a name.
+            inside = inside / np.linalg.norm(inside)
+            space = space @ np.linalg.svd(inside[:, None])[0][:, 1:]
+    if space.shape[1]:
+        told.append(f"{space.shape[1]} mixtures of {_mixture(free, space)}")
+    return count, told
+
+
+def _mixture(free: NDArray[np.intp], space: Array) -> str:
+    """What the directions of a space (k, n) consist of, the largest shares first."""
+    weights = np.mean(space**2, axis=1)
+    shares = {
+        group: sum(w for k, w in zip(free, weights, strict=True) if NAMES[k].startswith(start))
+        for group, start in _GROUPS.items()
+    }
+    ordered = sorted(shares.items(), key=lambda item: -item[1])
+    return ", ".join(f"{group} ({100 * share:.0f} %)" for group, share in ordered if share > 0.05)
+
+
+def workspace_poses(mechanism: Mechanism, middle: Array, seed: int = 0) -> Array:
+    """Poses (n, 6) all over the workspace around a pose, which is the first of them.
+
+    On rays in random directions, up to where little of the margin in the middle is left.
+    """
+    rng, size = np.random.default_rng(seed), np.repeat([1.0, mechanism.crank_lengths.mean()], 3)
+    least, poses = _ROOM * margin(mechanism, middle), [middle]
+    for ray in size * rng.standard_normal((_POSES - 1, 6)):
+        inside, outside = 0.0, 1.0
+        for _ in range(12):
+            between = (inside + outside) / 2
+            if margin(mechanism, middle + between * ray) > least:
+                inside = between
+            else:
+                outside = between
+        # Evenly in the volume of the six-dimensional ball that the ray is a radius of.
+        poses.append(middle + inside * rng.uniform() ** (1 / 6) * ray)
+    return np.array(poses)
+
+
+def pose_uncertainty(
+    unknowns: Unknowns, values: Array, covariance: Array, middle: Array
+) -> PoseUncertainty:
+    """How well poses follow from crank angles with what is known of geometry and offsets.
+
+    alpha = h(pose; geometry) + offset stays as it is, so that
+    d pose = -J^-1 (dh/dgeometry d geometry + d offset),   J = dh/dpose.
+
+    Args:
+        unknowns: what was free.
+        values: (NUM_UNKNOWNS,) as found.
+        covariance: (k, k) of the free ones.
+        middle: pose (6,) around which the workspace is taken.
+    """
+    whole = np.zeros((NUM_UNKNOWNS, NUM_UNKNOWNS))
+    whole[np.ix_(unknowns.free, unknowns.free)] = covariance
+    of_angles = np.r_[GEOMETRY, OFFSETS]
+    P = whole[np.ix_(of_angles, of_angles)]
+    poses = workspace_poses(unknowns.mechanism, middle)
+    slopes = pose_slopes(unknowns, unknowns.numbers(values), poses)
+    return PoseUncertainty(*_spread(slopes, P), *_spread(slopes - slopes[0], P))
+
+
+def pose_slopes(unknowns: Unknowns, numbers: Numbers, poses: Array) -> Array:
+    """d pose / d[geometry; offsets] (n, 6, 54) at poses (n, 6), crank angles held."""
+    model = MachineModel(unknowns.mechanism, 0.0, len(poses))
+    _, J, by_geometry = model.crank_angles(poses, numbers)
+    offsets = np.broadcast_to(np.eye(len(LEGS)), (len(poses), NUM_LEGS, NUM_LEGS))
+    found: Array = -np.linalg.solve(J, np.concatenate([by_geometry, offsets], axis=2))
+    return found
+
+
+def _spread(slopes: Array, P: Array) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Median and worst over the poses, of angles and of positions."""
+    std = np.sqrt(np.maximum(np.einsum("nij,jk,nik->ni", slopes, P, slopes), 0.0))
+    largest = (std[:, part].max(axis=1) for part in (ANGLES, POSITION))
+    angle, position = ((float(np.median(one)), float(one.max())) for one in largest)
+    return angle, position

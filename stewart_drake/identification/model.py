@@ -1,0 +1,163 @@
+"""The machine with its numbers as unknowns: accelerations, crank angles and their derivatives.
+
+With the residual F = M nu_dot + h - B tau of the equations of motion, zero for the accelerations a
+that a torque gives, every derivative at constant a is that of a itself by
+
+    da/dz = -(M N)^-1 dF/dz,   nu_dot = N a + ...,
+
+whatever z is: state, parameters of the dynamics, or numbers of a leg. The expressions are those of
+`dynamics.equations`; only the legs' numbers are symbols.
+"""
+
+from functools import cached_property
+from typing import Final, NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.dynamics import equations
+from stewart_drake.dynamics.compiled import Compiled
+from stewart_drake.dynamics.numbers import leg_numbers, numbers_of
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.native.layout import LEG_NUMBERS, SHAPES
+from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS, NUM_STATE
+
+Array = NDArray[np.float64]
+
+LEG_PLACES: Final = (0, 1, 12, 13, 14, 15, 16, 17)
+"""In a leg's numbers (`native.layout.geometry_of`): crank, rod, plate joint, shaft centre; m."""
+PER_LEG: Final = len(LEG_PLACES)
+NUM_GEOMETRY: Final = NUM_LEGS * PER_LEG
+NUM_DYNAMIC: Final = SHAPES["parameters"][0]
+"""Parameters of the dynamics."""
+
+
+class Numbers(NamedTuple):
+    """A machine as the model takes it."""
+
+    parameters: Array
+    """(NUM_DYNAMIC,) of the dynamics."""
+    legs: Array
+    """(6, LEG_NUMBERS), see `native.layout`."""
+
+
+class Slopes(NamedTuple):
+    """Accelerations at n points, and their derivatives."""
+
+    accelerations: Array
+    """(n, 6)."""
+    state: Array
+    """(n, 6, 12)."""
+    numbers: Array
+    """(n, 6, NUM_DYNAMIC + NUM_GEOMETRY)."""
+
+
+class SymbolicLegs(NamedTuple):
+    """The symbols that stand for a machine's legs (18, 6), and those of the equations."""
+
+    s: dict[str, ca.SX]
+    legs: ca.SX
+
+    @property
+    def geometry(self) -> ca.SX:
+        """What is free of the legs' numbers (NUM_GEOMETRY,), leg by leg."""
+        return ca.vec(self.legs[list(LEG_PLACES), :])
+
+
+class MachineModel:
+    """Accelerations and crank angles of a machine whose numbers may be any, and their derivatives.
+
+    Args:
+        mechanism: bodies, motor frames and branches, which stay.
+        gravity: m/s^2 along -z.
+        points: at how many points each call evaluates.
+    """
+
+    def __init__(self, mechanism: Mechanism, gravity: float, points: int) -> None:
+        self.mechanism, self.gravity, self.points = mechanism, gravity, points
+
+    @cached_property
+    def _symbols(self) -> SymbolicLegs:
+        return SymbolicLegs(equations.symbols(), ca.SX.sym("legs", LEG_NUMBERS, NUM_LEGS))
+
+    @cached_property
+    def _motion(self) -> equations.Motion:
+        (s, legs), common = self._symbols, numbers_of(self.mechanism)[1]
+        plate = equations.plate_motion(s["pose"], s["rates"], ca.SX(self.gravity))
+        sums = equations.plate_alone(common, plate, s["parameters"])
+        numbers, arms, crank_rates = ca.SX.sym("leg", LEG_NUMBERS), [], []
+        one, *others = equations.leg_on_plate(leg_numbers(numbers), common, plate)
+        leg = ca.Function("leg", [s["pose"], s["rates"], numbers], [*one, *others])
+        for number in range(NUM_LEGS):
+            *added, arm, crank_rate = leg(s["pose"], s["rates"], legs[:, number])
+            sums = sums.plus(equations.Sums(*added))
+            arms.append(arm)
+            crank_rates.append(crank_rate)
+        rows = ca.vertcat(*arms), ca.vertcat(*crank_rates)
+        return equations.assembled(sums, *rows, s["pose"], s["rates"])
+
+    def _many(self, name: str, inputs: list[ca.SX], results: list[ca.SX], shared: int) -> Compiled:
+        """A function of so many points; the last `shared` inputs are the same for all."""
+        one = ca.Function(name, inputs, [ca.densify(one) for one in results], {"cse": True})
+        same = list(range(len(inputs) - shared, len(inputs)))
+        return Compiled(one.map(name, "serial", self.points, same, []))
+
+    @cached_property
+    def _accelerations(self) -> Compiled:
+        (s, legs), p = self._symbols, self._symbols.s["parameters"]
+        slip = equations.slip(self._motion.crank_rates, p)
+        found = equations.accelerations(self._motion, s["torque"], p, slip)
+        return self._many("forward", [s["pose"], s["rates"], s["torque"], p, legs], [found], 2)
+
+    @cached_property
+    def _residual(self) -> Compiled:
+        (s, legs), motion, p = self._symbols, self._motion, self._symbols.s["parameters"]
+        nu_dot = ca.mtimes(motion.rates_map, s["accelerations"]) + motion.nu_dot_bias
+        force = equations.force(motion, s["torque"], p, equations.slip(motion.crank_rates, p))
+        F = ca.mtimes(motion.mass, nu_dot) - force
+        by_legs = ca.jacobian(F, ca.vec(legs))
+        places = [LEG_NUMBERS * leg + k for leg in range(NUM_LEGS) for k in LEG_PLACES]
+        state = ca.vertcat(s["pose"], s["rates"])
+        slopes = ca.horzcat(ca.jacobian(F, state), ca.jacobian(F, p), by_legs[:, places])
+        inputs = [s["pose"], s["rates"], s["accelerations"], s["torque"], p, legs]
+        return self._many("residual", inputs, [slopes, ca.mtimes(motion.mass, motion.rates_map)], 2)
+
+    @cached_property
+    def _angles(self) -> Compiled:
+        (s, legs), geometry = self._symbols, self._symbols.geometry
+        R_WP, angles = equations.rotation(s["pose"][:3]), []
+        for number in range(NUM_LEGS):
+            leg = leg_numbers(legs[:, number])
+            p_SQ_W = s["pose"][3:] + ca.mtimes(R_WP, leg.p_PQ) - leg.p_WS
+            q = ca.mtimes(leg.R_WS.T, p_SQ_W)
+            cosine = equations.swing_cosine(q, leg.crank_length, leg.rod_length)
+            angles.append(ca.atan2(q[1], q[0]) + leg.branch * ca.acos(cosine))
+        alpha = ca.vertcat(*angles)
+        slopes = ca.jacobian(alpha, s["pose"]), ca.jacobian(alpha, geometry)
+        return self._many("angles", [s["pose"], legs], [alpha, *slopes], 1)
+
+    def accelerations(self, states: Array, torques: Array, numbers: Numbers) -> Array:
+        """(n, 6) of the pose, at states (n, 12) under torques (n, 6)."""
+        found: Array = self._accelerations(states[:, :6], states[:, 6:], torques, *numbers)[0]
+        return found.reshape(self.points, NUM_COORDINATES)
+
+    def slopes(self, states: Array, torques: Array, numbers: Numbers) -> Slopes:
+        """The same with derivatives."""
+        a = self.accelerations(states, torques, numbers)
+        # CasADi's columns are numpy's rows, and points follow one another in columns.
+        dF, MN = self._residual(states[:, :6], states[:, 6:], a, torques, *numbers)
+        n = self.points
+        dF, MN = dF.reshape(n, -1, NUM_COORDINATES), MN.reshape(n, 6, 6)
+        da = -np.linalg.solve(MN.transpose(0, 2, 1), dF.transpose(0, 2, 1))
+        return Slopes(a, da[:, :, :NUM_STATE], da[:, :, NUM_STATE:])
+
+    def crank_angles(self, poses: Array, numbers: Numbers) -> tuple[Array, Array, Array]:
+        """Angles (n, 6), d/dpose (n, 6, 6), d/dgeometry (n, 6, NUM_GEOMETRY); NaN out of reach."""
+        n = self.points
+        alpha, by_pose, by_geometry = self._angles(poses, numbers.legs)
+        return (
+            alpha.reshape(n, NUM_LEGS),
+            by_pose.reshape(n, 6, 6).transpose(0, 2, 1),
+            by_geometry.reshape(n, NUM_GEOMETRY, 6).transpose(0, 2, 1),
+        )

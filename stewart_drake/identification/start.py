@@ -1,0 +1,171 @@
+"""Where to begin: poses from what was measured, segments, and their first states."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.logs import ANGLES, POSE, Log
+from stewart_drake.identification.logs import RATES as MEASURED_RATES
+from stewart_drake.identification.shooting import Segment
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import ForwardKinematicsError
+from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES
+from stewart_drake.scenario.signals import POSE as STATE_POSE
+from stewart_drake.scenario.signals import RATES as STATE_RATES
+
+Array = NDArray[np.float64]
+
+LONGEST: Final = 2.0
+SHORTEST: Final = 0.2
+"""s of a segment."""
+_GROWTHS: Final = 3.0
+"""Over a segment a small error grows at most e to this."""
+_LOOKS: Final = 40
+"""Instants at which it is asked how fast errors grow."""
+_CUBIC: Final = 0.3
+"""s over which a cubic is laid through the poses to find rates."""
+_LEAST_ROWS: Final = 4
+_WINDOW: Final = 0.3
+"""s of the motion, at least, from which an acceleration is taken,"""
+_DEGREE: Final = 4
+"""by a polynomial of this degree."""
+_GRID: Final = 0.01
+"""s between two delays that are tried."""
+_LEAST_WINDOWS: Final = 8
+
+
+def measured_poses(log: Log, mechanism: Mechanism) -> Array:
+    """The plate's pose (n, 6) at the log's instants, of the sensor or from the crank angles.
+
+    Raises:
+        ConfigError: no pose of this mechanism has such angles.
+    """
+    poses, last = log.values[:, POSE].copy(), mechanism.home
+    for row in range(len(poses)):
+        angles = log.values[row, ANGLES]
+        if not np.isfinite(poses[row]).all() and np.isfinite(angles).all():
+            try:
+                poses[row] = mechanism.forward_kinematics(angles, last)
+            except ForwardKinematicsError as error:
+                raise ConfigError(
+                    f"{log.name}: at t = {log.times[row]:.4g} s the crank angles do not suit the "
+                    f"mechanism {mechanism.name} ({error}); expected a log of this machine, "
+                    "angles counted as its crank_zero and motor_axis say"
+                ) from None
+        if np.isfinite(poses[row]).all():
+            last = poses[row]
+    return poses
+
+
+def coarse_delay(
+    log: Log, poses: Array, mechanism: Mechanism, believed: float, std: float
+) -> float:
+    """The delay in s with which the torques suit the motion best, to some hundredths of a second.
+
+    Where the true one is further off than a swing of the motion lasts, iterations from a belief end
+    elsewhere. A polynomial of degree four through the poses of a window gives pose, rates and
+    accelerations in its middle, the drawing's inverse dynamics the torque for them, smoothed by
+    about (1 - s^2)^2 over the window. It is compared with the torques that were sent, smoothed
+    alike and late by each delay within three standard deviations of the belief.
+    """
+    dynamics = StewartDynamics(mechanism, log.gravity)
+    known = np.flatnonzero(np.isfinite(poses).all(axis=1))
+    times = log.times[known]
+    half = max(_WINDOW, 4.5 * float(np.median(np.diff(times)))) / 2
+    middles = np.arange(times[0] + half, times[-1] - half, _GRID * 10)
+    needed = np.empty((len(middles), NUM_TORQUES))
+    for i, middle in enumerate(middles):
+        near = known[np.abs(times - middle) <= half + 1e-9]
+        if len(near) <= _DEGREE:
+            needed[i] = np.nan
+            continue
+        powers = np.polynomial.polynomial.polyfit(log.times[near] - middle, poses[near], _DEGREE)
+        needed[i] = dynamics.inverse_dynamics(powers[0], powers[1], 2 * powers[2])
+    span = np.arange(-half, half + _GRID / 2, _GRID)
+    weights = (1 - (span / half) ** 2) ** 2
+    weights /= weights.sum()
+    delays = np.arange(max(0.0, believed - 3 * std), believed + 3 * std + _GRID / 2, _GRID)
+    costs = [
+        _misfit(needed, middles, delay, log, span, weights)
+        for delay in delays
+    ]
+    return float(delays[int(np.argmin(costs))]) if np.isfinite(costs).any() else believed
+
+
+def _misfit(
+    needed: Array, middles: Array, delay: float, log: Log, span: Array, weights: Array
+) -> float:
+    """Mean square in (N m)^2 of torques needed less those that act, whatever the bias."""
+    there = np.isfinite(needed).all(axis=1) & (middles + span[0] >= log.sent[0] + delay)
+    if there.sum() < _LEAST_WINDOWS:
+        return np.inf
+    instants = middles[there, None] + span
+    acting = log.acting(instants.ravel(), delay).reshape(*instants.shape, NUM_TORQUES)
+    apart = needed[there] - np.einsum("s,nsj->nj", weights, acting)
+    return float(np.mean((apart - apart.mean(axis=0)) ** 2))
+
+
+def segment_length(log: Log, poses: Array, mechanism: Mechanism, delay: float) -> float:
+    """How long a trajectory can be without errors growing too much, s."""
+    dynamics = StewartDynamics(mechanism, log.gravity)
+    known = np.flatnonzero(np.isfinite(poses).all(axis=1))
+    fastest = 1e-9
+    for row in known[:: max(1, len(known) // _LOOKS)]:
+        rates = _first_state(log, poses, row)[STATE_RATES]
+        torque = log.acting(log.times[row : row + 1], delay)[0]
+        A = dynamics.derivatives(poses[row], rates, torque).A
+        fastest = max(fastest, float(np.linalg.eigvals(A).real.max()))
+    return float(np.clip(_GROWTHS / fastest, SHORTEST, LONGEST))
+
+
+def segments_of(log: Log, start: float, length: float) -> list[Segment]:
+    """The log from `start` in s on, cut into equal parts; those with few values join the next.
+
+    Raises:
+        ConfigError: nothing is left of the log.
+    """
+    rows = np.flatnonzero(log.times >= start - 1e-9)
+    if len(rows) < 2 * _LEAST_ROWS or log.times[-1] - log.times[rows[0]] < SHORTEST:
+        raise ConfigError(
+            f"{log.name}: got measurements up to t = {log.times[-1]:.4g} s, of which those from "
+            f"{start:.4g} s on count, when torques act that are in the log; expected a longer log"
+        )
+    first, last = log.times[rows[0]], log.times[-1]
+    edges = np.linspace(first, last, max(1, round((last - first) / length)) + 1)
+    groups = np.split(rows, np.searchsorted(log.times[rows], edges[1:-1] - 1e-9))
+    segments, kept = list[Segment](), np.empty(0, dtype=np.intp)
+    for number, group in enumerate(groups):
+        kept = np.concatenate([kept, group])
+        values = np.isfinite(log.values[kept]).sum()
+        if values >= 2 * NUM_STATE and len(kept) >= _LEAST_ROWS:
+            segments.append(Segment(log, float(log.times[kept[0]]), kept))
+            kept = np.empty(0, dtype=np.intp)
+        elif number == len(groups) - 1 and segments:
+            before = segments.pop()
+            segments.append(before._replace(rows=np.concatenate([before.rows, kept])))
+    return segments
+
+
+def first_states(segments: list[Segment], poses: dict[str, Array]) -> Array:
+    """(n, 12) of the segments, from the poses of each log by its name."""
+    return np.array(
+        [_first_state(s.log, poses[s.log.name], s.rows[0]) for s in segments]
+    )
+
+
+def _first_state(log: Log, poses: Array, row: int) -> Array:
+    """State (12,) at a row: as measured, or of a cubic through the poses from there on."""
+    rates = log.values[row, MEASURED_RATES]
+    if np.isfinite(rates).all() and np.isfinite(poses[row]).all():
+        return np.concatenate([poses[row], rates])
+    known = np.flatnonzero(np.isfinite(poses).all(axis=1))
+    place = min(np.searchsorted(known, row), len(known) - 8)
+    near = known[max(0, place) :]
+    near = near[: max(8, int(np.searchsorted(log.times[near], log.times[row] + _CUBIC)))]
+    cubic = np.polynomial.polynomial.polyfit(log.times[near] - log.times[row], poses[near], 3)
+    state = np.empty(NUM_STATE)
+    state[STATE_POSE], state[STATE_RATES] = cubic[0], cubic[1]
+    return state

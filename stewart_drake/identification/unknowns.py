@@ -1,0 +1,130 @@
+"""What is not known of a machine and its delay: names, how far off it may be, what it changes.
+
+The vector of unknowns is [parameters of the dynamics; numbers of the legs; offsets of the encoders;
+delay]. What has no tolerance is taken as it is.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.identification.tolerances import Tolerances
+from stewart_drake.identification.model import LEG_PLACES, NUM_DYNAMIC, NUM_GEOMETRY, Numbers
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.native.layout import LEG_NUMBERS, geometry_of, plate_radius
+from stewart_drake.scenario.signals import (
+    BIAS,
+    COULOMB,
+    COULOMB_SPEED,
+    DAMPING,
+    LEGS,
+    NUM_LEGS,
+    PAYLOAD,
+    PAYLOAD_POSITION,
+    PLANT_PARAMETER_UNITS,
+    PLANT_PARAMETERS,
+    USUAL_COULOMB_SPEED,
+)
+
+Array = NDArray[np.float64]
+
+DYNAMIC: Final = slice(0, NUM_DYNAMIC)
+GEOMETRY: Final = slice(NUM_DYNAMIC, NUM_DYNAMIC + NUM_GEOMETRY)
+OFFSETS: Final = slice(GEOMETRY.stop, GEOMETRY.stop + NUM_LEGS)
+DELAY: Final = OFFSETS.stop
+NUM_UNKNOWNS: Final = DELAY + 1
+
+_OF_A_LEG: Final = (
+    *("crank_length", "rod_length"),
+    *(f"plate_joint_{axis}" for axis in "xyz"),
+    *(f"shaft_{axis}" for axis in "xyz"),
+)
+NAMES: Final = (
+    *PLANT_PARAMETERS,
+    *(f"{name}_{leg}" for leg in LEGS for name in _OF_A_LEG),
+    *(f"offset_A{leg}" for leg in LEGS),
+    "delay",
+)
+UNITS: Final = (*PLANT_PARAMETER_UNITS, *("m",) * NUM_GEOMETRY, *("rad",) * NUM_LEGS, "s")
+ONE_SIDED: Final = (DAMPING, COULOMB)
+"""What no machine has less than nothing of."""
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """What is taken for what before the logs are looked at.
+
+    Attributes:
+        mechanism: as drawn.
+        mean: (NUM_UNKNOWNS,) in SI units.
+        std: (NUM_UNKNOWNS,), 0 where it is known.
+    """
+
+    mechanism: Mechanism
+    mean: Array
+    std: Array
+
+    @property
+    def free(self) -> NDArray[np.intp]:
+        """Places of what is not known."""
+        return np.flatnonzero(self.std > 0)
+
+    def numbers(self, values: Array) -> Numbers:
+        """The machine that values (NUM_UNKNOWNS,) of the unknowns describe, for the model."""
+        legs = geometry_of(self.mechanism)[: LEG_NUMBERS * NUM_LEGS].reshape(-1, NUM_LEGS).T.copy()
+        legs[:, LEG_PLACES] = values[GEOMETRY].reshape(NUM_LEGS, -1)
+        return Numbers(values[DYNAMIC], legs)
+
+    def without_encoders(self) -> "Unknowns":
+        """Where no crank angle is measured there are no offsets."""
+        std = self.std.copy()
+        std[OFFSETS] = 0.0
+        return dataclasses.replace(self, std=std)
+
+    def machine(self, values: Array) -> Mechanism:
+        """The same as a mechanism.
+
+        Raises:
+            ConfigError, UnreachablePoseError: no such machine can be assembled at home.
+        """
+        legs = values[GEOMETRY].reshape(NUM_LEGS, -1)
+        return dataclasses.replace(
+            self.mechanism,
+            crank_lengths=legs[:, 0],
+            rod_lengths=legs[:, 1],
+            p_PQ=legs[:, 2:5],
+            p_WS=legs[:, 5:8],
+        )
+
+
+def unknowns_of(
+    mechanism: Mechanism, tolerances: Tolerances, delay: float, torque: float, speed: float
+) -> Unknowns:
+    """The unknowns of a machine.
+
+    Args:
+        mechanism: as drawn.
+        tolerances: how far off it may be.
+        delay: that is believed in, s.
+        torque: largest that was commanded, N m: a bias may be as large, and friction at `speed`.
+        speed: largest of a crank, rad/s.
+    """
+    mean, std = np.zeros(NUM_UNKNOWNS), np.zeros(NUM_UNKNOWNS)
+    m, t = mechanism, tolerances
+    legs = np.column_stack([m.crank_lengths, m.rod_lengths, m.p_PQ, m.p_WS])
+    mean[GEOMETRY], mean[DELAY] = legs.ravel(), delay
+    std[GEOMETRY] = np.tile([t.lengths] * 2 + [t.joints] * 6, NUM_LEGS)
+    std[OFFSETS], std[DELAY] = t.offsets, t.delay
+    mean[COULOMB_SPEED] = USUAL_COULOMB_SPEED
+    for place, given, usual in (
+        (BIAS, t.bias, torque),
+        (PAYLOAD, t.payload, m.plate.mass),
+        (DAMPING, t.damping, torque / speed),
+        (COULOMB, t.coulomb, torque),
+        (PAYLOAD_POSITION, t.position, plate_radius(m) / 2),
+    ):
+        std[place] = usual if given is None else given
+    return Unknowns(mechanism, mean, std)

@@ -1,0 +1,502 @@
+"""A machine from its log: every equation against an independent computation, then whole logs."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import least_squares
+
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.identification.excitation import fitted_multisine, multisine
+from stewart_drake.identification.fit import (
+    ENOUGH,
+    Evaluator,
+    Guess,
+    Problem,
+    chi2_per_value,
+    covariance,
+    finer,
+    solve,
+)
+from stewart_drake.identification.identify import identify
+from stewart_drake.identification.judgement import (
+    named_directions,
+    pose_slopes,
+    pose_uncertainty,
+    unseen,
+    workspace_poses,
+)
+from stewart_drake.identification.log_files import Precision
+from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
+from stewart_drake.identification.model import NUM_DYNAMIC, NUM_GEOMETRY, MachineModel
+from stewart_drake.identification.shooting import Segment, integrate, plan_steps
+from stewart_drake.identification.start import coarse_delay, measured_poses, segments_of
+from stewart_drake.identification.tolerances import Tolerances
+from stewart_drake.identification.unknowns import (
+    DELAY,
+    DYNAMIC,
+    GEOMETRY,
+    NAMES,
+    NUM_UNKNOWNS,
+    OFFSETS,
+    Unknowns,
+    unknowns_of,
+)
+from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
+from stewart_drake.mechanism.geometry import Mechanism
+from tests.mechanisms import PAPER, random_mechanism
+
+STILL = np.zeros(6)
+PARAMETERS = np.array(
+    [3e-3, -2e-3, 1e-3, 4e-3, -3e-3, 2e-3, 0.4, 2e-3, 1e-3, 0.02, 0.01, -0.02, 0.03]
+)
+"""Bias, payload, friction, and where the payload lies."""
+TORQUES = 0.02 * np.array([[1, -2, 1, 0, 2, -1], [-1, 1, 0, 2, -1, 1], [0, 1, -2, 1, 1, 0]])
+
+
+def some_unknowns(mechanism: Mechanism, **tolerances: float) -> Unknowns:
+    return unknowns_of(mechanism, Tolerances(**tolerances), 0.23, 0.1, 1.0)
+
+
+def exact_states(mechanism, parameters, gravity, first, sent, torques, delay, times):
+    """States (n, 12) by an adaptive integrator, from one torque's arrival to the next."""
+    dynamics = StewartDynamics(mechanism, gravity, parameters)
+    found, state, now = [], np.array(first), times[0]
+    for time in times:
+        while now < time:
+            later = sent + delay
+            stop = min([time, *later[later > now + 1e-12]])
+            acting = torques[max(0, np.searchsorted(later, now + 1e-9, side="right") - 1)]
+            path = solve_ivp(
+                lambda _, x, T=acting: dynamics.change(x, T),
+                (now, stop), state, method="DOP853", rtol=1e-11, atol=1e-13,
+            )  # fmt: skip
+            state, now = path.y[:, -1], stop
+        found.append(state)
+    return np.array(found)
+
+
+# ---------------------------------------------------------------- the model
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_model_is_that_of_the_dynamics(seed):
+    rng = np.random.default_rng(seed)
+    mechanism = random_mechanism(rng)
+    unknowns = some_unknowns(mechanism)
+    values = unknowns.mean.copy()
+    values[DYNAMIC] = PARAMETERS
+    values[GEOMETRY] += 1e-4 * rng.standard_normal(NUM_GEOMETRY)
+    machine = unknowns.machine(values)
+    model, numbers = MachineModel(mechanism, 9.81, 4), unknowns.numbers(values)
+    states = np.tile(np.concatenate([mechanism.home, STILL]), (4, 1))
+    states += 0.02 * rng.standard_normal((4, 12))
+    torques = rng.standard_normal((4, 6))
+    dynamics = StewartDynamics(machine, 9.81, PARAMETERS)
+    expected = [
+        dynamics.accelerations(x[:6], x[6:], T) for x, T in zip(states, torques, strict=True)
+    ]
+    np.testing.assert_allclose(model.accelerations(states, torques, numbers), expected, rtol=1e-9)
+    alpha, J, _ = model.crank_angles(states[:, :6], numbers)
+    np.testing.assert_allclose(alpha, [machine.crank_angles(x[:6]) for x in states], atol=1e-13)
+    np.testing.assert_allclose(J, [machine.jacobian(x[:6]) for x in states], rtol=1e-9, atol=1e-9)
+
+
+def test_its_derivatives_are_those_of_other_machines():
+    """Central differences of the dynamics of machines that are built anew for each number."""
+    rng = np.random.default_rng(5)
+    unknowns = some_unknowns(PAPER)
+    values = unknowns.mean.copy()
+    values[DYNAMIC] = PARAMETERS
+    state = np.concatenate([PAPER.home, STILL]) + 0.05 * rng.standard_normal(12)
+    torque = 0.1 * rng.standard_normal(6)
+    model = MachineModel(PAPER, 9.81, 1)
+    numbers = unknowns.numbers(values)
+    found = model.slopes(state[None], torque[None], numbers)
+    by_geometry = model.crank_angles(state[None, :6], numbers)[2][0]
+
+    def at(values, state=state):
+        machine = unknowns.machine(values)
+        dynamics = StewartDynamics(machine, 9.81, values[DYNAMIC])
+        a = dynamics.accelerations(state[:6], state[6:], torque)
+        return np.concatenate([a, machine.crank_angles(state[:6])])
+
+    def difference(f, size):
+        return (f(size) - f(-size)) / (2 * size)
+
+    for k in range(NUM_DYNAMIC + NUM_GEOMETRY):
+        unit = np.eye(NUM_UNKNOWNS)[k]
+        slope = difference(lambda h, unit=unit: at(values + h * unit), 1e-6)
+        scale = np.abs(slope[:6]).max() + 1e-3
+        np.testing.assert_allclose(found.numbers[0][:, k], slope[:6], atol=1e-5 * scale)
+        if k >= NUM_DYNAMIC:
+            expected = by_geometry[:, k - NUM_DYNAMIC]
+            np.testing.assert_allclose(expected, slope[6:], atol=1e-6 * (1 + np.abs(slope).max()))
+    for k in range(12):
+        unit = np.eye(12)[k]
+        slope = difference(lambda h, unit=unit: at(values, state + h * unit), 1e-6)[:6]
+        np.testing.assert_allclose(found.state[0][:, k], slope, atol=1e-5 * np.abs(slope).max())
+
+
+# ---------------------------------------------------------------- trajectories
+
+
+def short_log(times, mechanism=PAPER, delay=0.23, gravity=0.0) -> tuple[Log, np.ndarray]:
+    """A log of torques at 0, 0.1, ... s, and the states behind it."""
+    first = np.concatenate([mechanism.home, [0.1, -0.1, 0.2, 0.02, -0.01, 0.03]])
+    sent = 0.1 * np.arange(8)
+    torques = np.vstack([TORQUES, -TORQUES, TORQUES[:2]])
+    states = exact_states(mechanism, PARAMETERS, gravity, first, sent, torques, delay, times)
+    values = np.full((len(times), NUM_MEASURED), np.nan)
+    values[:, ANGLES] = [mechanism.crank_angles(x[:6]) for x in states]
+    return Log("short", sent, torques, times, values, Precision().std, gravity), states
+
+
+def test_trajectories_are_those_of_an_adaptive_integrator():
+    times = np.array([0.25, 0.26, 0.31, 0.33, 0.34, 0.45, 0.53, 0.6])
+    log, states = short_log(times)
+    segments = [Segment(log, 0.25, np.arange(8)), Segment(log, 0.31, np.arange(2, 5))]
+    unknowns = some_unknowns(PAPER)
+    values = unknowns.mean.copy()
+    values[DYNAMIC] = PARAMETERS
+    model, numbers = MachineModel(PAPER, 0.0, 2), unknowns.numbers(values)
+    course = integrate(model, numbers, states[[0, 2]], plan_steps(segments, 0.23, 1e-3), False)
+    np.testing.assert_allclose(course.states[:, 0], states, atol=2e-7)
+    np.testing.assert_allclose(course.states[:3, 1], states[2:5], atol=2e-7)
+    assert np.isnan(course.states[3:, 1]).all()
+
+
+@pytest.mark.parametrize("delay", [0.23, 0.2, 0.271])
+def test_sensitivities_are_differences_of_trajectories(delay):
+    """Also that of the delay, where 0.2 s puts switches on samples; there slopes differ by side."""
+    times = np.arange(0.255, 0.6, 0.02)
+    log, states = short_log(times, delay=delay)
+    segment = [Segment(log, 0.255, np.arange(len(times)))]
+    unknowns = some_unknowns(PAPER)
+    values = unknowns.mean.copy()
+    values[DYNAMIC], values[DELAY] = PARAMETERS, delay
+    model = MachineModel(PAPER, 0.0, 1)
+
+    def at(values, first=states[0], sensitive=False):
+        plan = plan_steps(segment, values[DELAY], 1e-3)
+        return integrate(model, unknowns.numbers(values), first[None], plan, sensitive)
+
+    slopes = at(values, sensitive=True).slopes[:, 0]
+    column = {DELAY: -1, 0: 12, 6: 18, 7: 19, 8: 20, 11: 23}
+    column |= {GEOMETRY.start + k: 12 + NUM_DYNAMIC + k for k in (0, 1, 3, 7, 41, 47)}
+    for place, k in column.items():
+        h = 1e-5 * np.eye(NUM_UNKNOWNS)[place]
+        expected = (at(values + h).states - at(values - h).states)[:, 0] / 2e-5
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(slopes[:, :, k], expected, atol=2e-4 * scale, err_msg=NAMES[place])
+    for k in range(12):
+        h = 1e-5 * np.eye(12)[k]
+        expected = (at(values, states[0] + h).states - at(values, states[0] - h).states)[:, 0] / 2e-5
+        np.testing.assert_allclose(slopes[:, :, k], expected, atol=1e-6)
+
+
+def test_the_delay_s_slope_is_that_of_exact_trajectories():
+    times = np.arange(0.255, 0.6, 0.02)
+    log, states = short_log(times)
+    values = some_unknowns(PAPER).mean.copy()
+    values[DYNAMIC], values[DELAY] = PARAMETERS, 0.23
+    model = MachineModel(PAPER, 0.0, 1)
+    plan = plan_steps([Segment(log, 0.255, np.arange(len(times)))], 0.23, 1e-3)
+    numbers = some_unknowns(PAPER).numbers(values)
+    slope = integrate(model, numbers, states[:1], plan, True).slopes[:, 0, :, -1]
+    later, sooner = (
+        exact_states(PAPER, PARAMETERS, 0.0, states[0], log.sent, log.torques, 0.23 + h, times)
+        for h in (1e-5, -1e-5)
+    )
+    expected = (later - sooner) / 2e-5
+    np.testing.assert_allclose(slope, expected, atol=1e-4 * np.abs(expected).max())
+
+
+# ---------------------------------------------------------------- the fit
+
+
+def few_unknowns() -> tuple[Problem, Guess]:
+    """Two short segments with noise, and little that is not known."""
+    times = np.arange(0.25, 0.9, 0.02)
+    log, states = short_log(times)
+    rng = np.random.default_rng(3)
+    log.values[:, ANGLES] += log.std[0] * rng.standard_normal((len(times), 6))
+    half = len(times) // 2
+    rows = np.arange(half), np.arange(half, len(times))
+    segments = [Segment(log, float(times[part[0]]), part) for part in rows]
+    unknowns = some_unknowns(PAPER)
+    unknowns.mean[DYNAMIC], unknowns.mean[DELAY] = PARAMETERS, 0.23
+    std = np.zeros(NUM_UNKNOWNS)
+    std[[0, 6, GEOMETRY.start + 1, OFFSETS.start, DELAY]] = 1e-3, 0.1, 2e-4, 1e-3, 0.01
+    unknowns = dataclasses.replace(unknowns, std=std)
+    first = np.array([states[part[0]] for part in rows])
+    start = unknowns.mean.copy()
+    start[[0, 6, DELAY]] += 5e-4, -0.05, 0.004
+    return Problem(segments, unknowns), Guess(start, first + 1e-4)
+
+
+def test_the_fit_is_that_of_a_general_solver():
+    """scipy's, on the residuals alone, without the structure of segments."""
+    problem, guess = few_unknowns()
+    evaluator, free = Evaluator(problem), problem.unknowns.free
+
+    def residuals(z):
+        values = guess.values.copy()
+        values[free] = z[: len(free)]
+        r = evaluator.residuals(Guess(values, z[len(free) :].reshape(-1, 12)))
+        return np.concatenate([r.measured.ravel(), r.prior])
+
+    start = np.concatenate([guess.values[free], guess.first.ravel()])
+    scale = np.concatenate([problem.unknowns.std[free], np.full(24, 1e-3)])
+    other = least_squares(residuals, start, x_scale=scale, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    found = solve(problem, guess)
+    spread = np.linalg.inv(other.jac.T @ other.jac)[: len(free), : len(free)]
+    std = np.sqrt(np.diag(spread))
+    np.testing.assert_allclose(found.guess.values[free] / std, other.x[: len(free)] / std, atol=0.02)
+    np.testing.assert_allclose(found.covariance / np.outer(std, std), spread / np.outer(std, std), atol=2e-3)
+    assert found.residuals.chi2 == pytest.approx(2 * other.cost, abs=2 * ENOUGH)
+    true = problem.unknowns.mean.copy()
+    away = (found.guess.values - true)[free] / np.sqrt(np.diag(found.covariance))
+    assert np.abs(away).max() < 4
+    assert 0.7 < chi2_per_value(found.residuals, problem)["all"] < 1.3
+
+
+def test_a_log_under_no_tolerance_leaves_nothing_to_find():
+    problem, guess = few_unknowns()
+    known = dataclasses.replace(problem.unknowns, std=np.zeros(NUM_UNKNOWNS))
+    found = solve(dataclasses.replace(problem, unknowns=known), guess)
+    assert found.covariance.shape == (0, 0)
+    np.testing.assert_array_equal(found.guess.values, guess.values)
+
+
+# ---------------------------------------------------------------- what is seen
+
+
+def test_moving_the_base_or_turning_the_plate_s_frame_is_no_news_to_encoders():
+    """The four directions are gauges: poses that follow show the same crank angles, and more."""
+    unknowns = some_unknowns(PAPER)
+    model, poses = MachineModel(PAPER, 0.0, 1), np.array([[0.1, -0.05, 0.2, 0.01, 0.02, 0.39]])
+    directions = named_directions(PAPER)
+    for name in (
+        *(f"where the base stands along {axis}" for axis in "xyz"),
+        "how the plate's frame is turned about its z",
+    ):
+        alpha = []
+        for size in (1e-6, -1e-6):
+            values = unknowns.mean + size * directions[name]
+            numbers, pose = unknowns.numbers(values), poses[0].copy()
+            if "base" in name:
+                pose[3 + "xyz".index(name[-1])] += size
+            else:
+                pose[2] -= size  # exact only without roll and pitch: psi turns about z of W
+                pose[:2] = 0
+            alpha.append(model.crank_angles(pose[None], numbers)[0])
+        np.testing.assert_allclose(alpha[0], alpha[1], atol=1e-11)
+
+
+def test_unseen_directions_are_named():
+    unknowns = some_unknowns(PAPER)
+    free = unknowns.free
+    assert unseen(unknowns, np.diag(1e-6 * unknowns.std[free] ** 2)) == (0, [])
+    count, names = unseen(unknowns, np.diag(unknowns.std[free] ** 2))
+    assert count == len(free)
+    assert "where the base stands along x" in names and "payload mass" in names
+    # The log sees all but the base's place along y and the scale of the payload.
+    direction = named_directions(PAPER)["where the base stands along y"][free] / unknowns.std[free]
+    direction /= np.linalg.norm(direction)
+    payload = (free == 6).astype(float)
+    kept = np.outer(direction, direction) + np.outer(payload, payload) + 1e-6 * np.eye(len(free))
+    spread = kept * np.outer(unknowns.std[free], unknowns.std[free])
+    count, names = unseen(unknowns, spread)
+    assert count == 2 and sorted(names) == ["payload mass", "where the base stands along y"]
+
+
+def test_pose_uncertainty_is_that_of_drawn_machines():
+    """Forward kinematics of machines drawn from the covariance, at one pose."""
+    unknowns, rng = some_unknowns(PAPER, offsets=1e-3), np.random.default_rng(2)
+    pose = workspace_poses(PAPER, PAPER.home)[5]
+    angles = PAPER.crank_angles(pose)
+    slopes = pose_slopes(unknowns, unknowns.numbers(unknowns.mean), pose[None])[0]
+    P = np.diag(np.concatenate([unknowns.std[GEOMETRY], unknowns.std[OFFSETS]]) ** 2)
+    std = np.sqrt(np.diag(slopes @ P @ slopes.T))
+    away = []
+    for _ in range(400):
+        values = unknowns.mean + unknowns.std * rng.standard_normal(NUM_UNKNOWNS)
+        machine = unknowns.machine(values)
+        away.append(machine.forward_kinematics(angles - values[OFFSETS], pose) - pose)
+    np.testing.assert_allclose(np.std(away, axis=0), std, rtol=0.15)
+    spread = np.diag(unknowns.std[unknowns.free] ** 2)
+    whole = pose_uncertainty(unknowns, unknowns.mean, spread, PAPER.home)
+    assert whole.angle[0] <= whole.angle[1] and whole.position_beside[0] < whole.position[0]
+
+
+# ---------------------------------------------------------------- where to begin
+
+
+def sine_log(truth: Mechanism, parameters, delay: float, duration=6.0, seed=0) -> Log:
+    """Open loop along a multisine: torques that would follow it, as far as they do; 14 bit.
+
+    Torques are those of the true machine with true parameters, sent early by the true delay, and the
+    plate is pulled back to the motion every second, as by hand: a log of several stretches.
+    """
+    rng = np.random.default_rng(seed)
+    times, poses = multisine(
+        truth.home, np.array([0.1, 0.1, 0.1, 0.01, 0.01, 0.03]), duration
+    )
+    rates = np.gradient(poses, times, axis=0, edge_order=2)
+    accelerations = np.gradient(rates, times, axis=0, edge_order=2)
+    dynamics = StewartDynamics(truth, 0.0, parameters)
+    sent = 0.1 * np.arange(round(duration / 0.1) + 1) - delay
+    torques = []
+    for start in sent + delay:
+        k = min(np.searchsorted(times, start + 0.05), len(times) - 1)
+        torques.append(dynamics.inverse_dynamics(poses[k], rates[k], accelerations[k]))
+    torques = np.array(torques) + 2e-3 * rng.standard_normal((len(sent), 6))
+    first = np.concatenate([poses[0], STILL])
+    states = exact_states(truth, parameters, 0.0, first, sent, torques, delay, times)
+    step = 2 * np.pi / 2**14
+    angles = np.array([truth.crank_angles(x[:6]) for x in states])
+    values = np.full((len(times), NUM_MEASURED), np.nan)
+    values[:, ANGLES] = step * np.round(angles / step)
+    return Log("sine", sent, torques, times, values, Precision().std, 0.0, 0.8)
+
+
+def off_drawing(seed: int, size: float = 2e-4) -> Mechanism:
+    rng = np.random.default_rng(seed)
+
+    def off(value):
+        return value + size * rng.standard_normal(value.shape)
+
+    return dataclasses.replace(
+        PAPER,
+        crank_lengths=off(PAPER.crank_lengths),
+        rod_lengths=off(PAPER.rod_lengths),
+        p_WS=off(PAPER.p_WS),
+        p_PQ=off(PAPER.p_PQ),
+    )
+
+
+def truth_of(machine: Mechanism, parameters, delay: float):
+    values = np.zeros(NUM_UNKNOWNS)
+    legs = [machine.crank_lengths, machine.rod_lengths, machine.p_PQ, machine.p_WS]
+    values[DYNAMIC], values[GEOMETRY] = parameters, np.column_stack(legs).ravel()
+    values[DELAY] = delay
+    return values
+
+
+@pytest.fixture(scope="module")
+def log_and_truth():
+    machine, parameters = off_drawing(1), PARAMETERS.copy()
+    parameters[:6] *= 0.1
+    parameters[8] = 3e-4
+    return sine_log(machine, parameters, 0.93), truth_of(machine, parameters, 0.93)
+
+
+@pytest.mark.parametrize("believed", [0.4, 0.8, 1.3])
+def test_a_delay_to_begin_with_is_found_from_far_away(log_and_truth, believed):
+    log, _ = log_and_truth
+    poses = measured_poses(log, PAPER)
+    assert coarse_delay(log, poses, PAPER, believed, 0.3) == pytest.approx(0.93, abs=0.06)
+
+
+def test_a_machine_is_found_from_encoders_of_14_bit(log_and_truth):
+    log, true = log_and_truth
+    found = identify([log], PAPER, Tolerances(offsets=0.0))
+    free, std = found.unknowns.free, np.sqrt(np.diag(found.fit.covariance))
+    away = (found.fit.guess.values - true)[free]
+    assert found.right and 0.9 < found.chi2["all"] < 1.1
+    assert abs(found.values[DELAY] - 0.93) < 1e-4
+    assert 0.85 < np.mean(np.abs(away) < 1.96 * std) <= 1
+    # The joint test: the error weighs as much as its covariance says.
+    assert 0.5 < away @ np.linalg.solve(found.fit.covariance, away) / len(free) < 1.6
+    assert {f"where the base stands along {axis}" for axis in "xyz"} <= set(found.unseen[1])
+    for name, size in {"torque_bias_1": 1e-4, "payload_mass": 0.02, "joint_damping": 1e-4}.items():
+        assert abs(found.values[NAMES.index(name)] - true[NAMES.index(name)]) < size
+
+
+def test_a_drawing_that_is_trusted_too_much_is_refused(log_and_truth):
+    log, _ = log_and_truth
+    found = identify([log], PAPER, Tolerances(lengths=0.0, joints=0.0, offsets=0.0))
+    summary = found.summary
+    assert not found.right and found.chi2["all"] > 1.5
+    assert np.isnan(summary["delay_std_s"]) and summary["pose_uncertainty"] is None
+    assert all(np.isnan(one["std"]) for one in summary["parameters"].values())
+    assert abs(summary["delay_s"] - 0.93) < 1e-3  # the delay stands all the same
+
+
+def test_two_logs_tell_more_than_one(log_and_truth):
+    log, true = log_and_truth
+    half = len(log.times) // 2
+    parts = [
+        dataclasses.replace(log, name=name, times=log.times[rows], values=log.values[rows])
+        for name, rows in (("first", slice(None, half)), ("second", slice(half, None)))
+    ]
+    both = identify(parts, PAPER, Tolerances(offsets=0.0))
+    one = identify(parts[1:], PAPER, Tolerances(offsets=0.0))
+    assert both.std[DELAY] < one.std[DELAY]
+    assert abs(both.values[DELAY] - true[DELAY]) < 4 * both.std[DELAY]
+
+
+def test_segments_hold_all_samples_once(log_and_truth):
+    log, _ = log_and_truth
+    segments = segments_of(log, 1.0, 0.7)
+    rows = np.concatenate([segment.rows for segment in segments])
+    np.testing.assert_array_equal(rows, np.flatnonzero(log.times >= 1.0))
+    assert all(log.times[s.rows[-1]] - s.start < 0.9 for s in segments)
+
+
+# ---------------------------------------------------------------- excitation and files
+
+
+def test_a_multisine_rests_at_both_ends_and_stays_inside():
+    times, poses, share = fitted_multisine(
+        PAPER, PAPER.home, np.array([0.5, 0.5, 0.5, 0.05, 0.05, 0.2]), 20.0
+    )
+    assert share < 1 and times[-1] == pytest.approx(20.0)
+    np.testing.assert_allclose(poses[[0, 1, -2, -1]], np.tile(PAPER.home, (4, 1)), atol=1e-6)
+    assert min(PAPER.reach_margins(pose).min() for pose in poses) > 0
+    moved = (poses - PAPER.home)[100:-100]
+    assert np.linalg.cond(moved / moved.std(axis=0)) < 10  # no two coordinates move alike
+
+
+def test_a_mechanism_s_file_is_read_back(tmp_path: Path):
+    machine = off_drawing(4)
+    path = tmp_path / "machine.yaml"
+    path.write_text(mechanism_yaml(machine))
+    read = load_mechanism(path)
+    for field in ("p_WS", "p_PQ", "crank_lengths", "rod_lengths", "home", "branches"):
+        np.testing.assert_array_equal(getattr(read, field), getattr(machine, field))
+    np.testing.assert_allclose(read.R_WS, machine.R_WS, atol=1e-15)
+    assert (read.plate.mass, read.rod.center) == (machine.plate.mass, machine.rod.center)
+    assert read.effort_limit == machine.effort_limit
+
+
+def test_pose_covariance_shrinks_with_the_information():
+    problem, guess = few_unknowns()
+    normal = Evaluator(problem).normal(guess)[1]
+    once = covariance(normal)
+    twice = covariance(normal._replace(of_segments=2 * normal.of_segments))
+    assert np.all(np.diag(twice) <= np.diag(once)) and np.all(np.linalg.eigvalsh(once) > 0)
+    assert POSE.start == 6
+
+
+def test_steps_are_halved_until_they_do_not_matter():
+    """Coulomb friction of a few mN m that turns round within 20 ms."""
+    problem, guess = few_unknowns()
+    values = guess.values.copy()
+    values[8], guess = 2e-3, Guess(guess.values, guess.first)
+    guess = Guess(values, guess.first)
+    halved = finer(problem, guess)
+    assert halved is not None and halved.longest_step == problem.longest_step / 2
+    while (more := finer(halved, guess)) is not None:
+        halved = more
+    one, exact = (
+        Evaluator(dataclasses.replace(problem, longest_step=h)).residuals(guess).measured
+        for h in (halved.longest_step, 2e-4)
+    )
+    assert np.sqrt(np.mean((one - exact) ** 2)) < 0.05
+    values = guess.values.copy()
+    values[8] = 0.0
+    assert finer(problem, Guess(values, guess.first)) is None
