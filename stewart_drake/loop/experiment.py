@@ -51,7 +51,13 @@ from stewart_drake.loop.own import NOTHING, Own, take
 from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.config import AnnTunerConfig, NetworkConfig, Scenario
+from stewart_drake.mechanism.rotors import with_rotors
+from stewart_drake.scenario.config import (
+    AnnTunerConfig,
+    NetworkConfig,
+    Scenario,
+    ServoActuatorConfig,
+)
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import in_time, times_under_way
 from stewart_drake.scenario.signals import POSITION
@@ -189,7 +195,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     """
     scenario.check()
     network = _network(scenario)
-    mechanism = load_mechanism(scenario.mechanism)
+    mechanism = _with_motors(load_mechanism(scenario.mechanism), scenario)
     if own.reference is None:
         reference = make_reference(scenario.reference, scenario.duration)
         span = peak_to_peak(scenario.reference, reference, scenario.duration)
@@ -202,7 +208,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     return Experiment(
         scenario=scenario,
         mechanism=mechanism,
-        truth=mechanism if truth is None else truth,
+        truth=mechanism if truth is None else _with_motors(truth, scenario),
         reference=reference,
         peak_to_peak=span,
         nominal=StewartDynamics(mechanism, gravity=scenario.plant.gravity),
@@ -210,6 +216,14 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
         network=network,
         own=own,
     )
+
+
+def _with_motors(mechanism: Mechanism, scenario: Scenario) -> Mechanism:
+    """The machine with the rotors of its servos."""
+    actuator = scenario.actuator
+    if not isinstance(actuator, ServoActuatorConfig):
+        return mechanism
+    return with_rotors(mechanism, actuator.reflected_inertia)
 
 
 def _network(scenario: Scenario) -> Network | None:
@@ -306,8 +320,17 @@ def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
 
 
 def compose_law(experiment: Experiment) -> PredictiveLqi:
-    """The parts that a scenario asks for; the only place that knows their names in it."""
+    """The parts that a scenario asks for; the only place that knows their names in it.
+
+    Raises:
+        ConfigError: it asks for no law that sends torques; see `loop.servo_design`.
+    """
     sc, nominal = experiment.scenario, experiment.nominal
+    if sc.controller.command != "torque":
+        raise ConfigError(
+            f"controller.command: got {sc.controller.command!r}; expected 'torque', for a law that "
+            "closes its loop across the delay"
+        )
     c, motion = sc.controller, motion_scale(experiment)
     timeline = Timeline(c.period, believed_delay(sc))
     substeps = choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration)
