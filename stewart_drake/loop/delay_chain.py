@@ -33,7 +33,7 @@ class DelayChain(LeafSystem):
     | --- | --- | --- | --- | --- |
     | commanded | input | 6, or n | N m | read every period |
     | torque, or `carries` | output | the same | N m | piecewise constant |
-    | arrived | output | 1 | s, when that began to act; NaN before anything has | the same |
+    | arrived | output | 1, with commands | s, when that arrived; NaN for nothing yet | the same |
 
     Args:
         period: dt in s.
@@ -64,9 +64,9 @@ class DelayChain(LeafSystem):
         began = (fraction - 1) * period if fraction > 0 else 0.0
         self._arrived = self.DeclareDiscreteState([began if length > 0 else np.nan])
         self._commanded = self.DeclareVectorInputPort("commanded", size)
-        for name, width, state in ((carries, size, self._applied), ("arrived", 1, self._arrived)):
-            ticket = self.discrete_state_ticket(state)
-            self.DeclareVectorOutputPort(name, width, weak(self._output, state), {ticket})
+        self._put_out(carries, size, self._applied)
+        if carries == "command":
+            self._put_out("arrived", 1, self._arrived)
         update_every(self, period, self._take)
         if fraction > 0:
             self.DeclarePeriodicUnrestrictedUpdateEvent(
@@ -86,6 +86,10 @@ class DelayChain(LeafSystem):
     def _apply(self, waiting: Array, context: Context, state: State) -> None:
         state.get_mutable_discrete_state(self._applied).SetFromVector(waiting[: self._size])
         state.get_mutable_discrete_state(self._arrived).SetFromVector([context.get_time()])
+
+    def _put_out(self, name: str, size: int, index: DiscreteStateIndex) -> None:
+        ticket = self.discrete_state_ticket(index)
+        self.DeclareVectorOutputPort(name, size, weak(self._output, index), {ticket})
 
     def _output(self, index: DiscreteStateIndex, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state(index).value())

@@ -39,7 +39,7 @@ class VaryingDelay(LeafSystem):
     | --- | --- | --- | --- | --- |
     | commanded | input | 6, or n | N m | read every period |
     | torque, or `carries` | output | the same | N m | piecewise constant |
-    | arrived | output | 1 | s, when that began to act; NaN before anything has | the same |
+    | arrived | output | 1, with commands | s, when that arrived; NaN for nothing yet | the same |
     | delay | output | 1 | s, of the torque sent last | held |
     | packets | output | 5 | 1, NaN: nothing is sent in packets | constant |
 
@@ -90,9 +90,9 @@ class VaryingDelay(LeafSystem):
         self._arrived = self.DeclareDiscreteState([began])
         self._taken = self.DeclareDiscreteState(1)
         self._commanded = self.DeclareVectorInputPort("commanded", size)
-        for name, width, state in ((carries, size, self._applied), ("arrived", 1, self._arrived)):
-            ticket = self.discrete_state_ticket(state)
-            self.DeclareVectorOutputPort(name, width, weak(self._output, state), {ticket})
+        self._put_out(carries, size, self._applied)
+        if carries == "command":
+            self._put_out("arrived", 1, self._arrived)
         taken_ticket = self.discrete_state_ticket(self._taken)
         self.DeclareVectorOutputPort("delay", 1, weak(self._delay), {taken_ticket})
         declare_constant(self, "packets", np.full(len(PACKETS), np.nan))
@@ -120,6 +120,10 @@ class VaryingDelay(LeafSystem):
     def _apply(self, torque: Array, context: Context, state: State) -> None:
         state.get_mutable_discrete_state(self._applied).SetFromVector(torque)
         state.get_mutable_discrete_state(self._arrived).SetFromVector([context.get_time()])
+
+    def _put_out(self, name: str, size: int, index: DiscreteStateIndex) -> None:
+        ticket = self.discrete_state_ticket(index)
+        self.DeclareVectorOutputPort(name, size, weak(self._output, index), {ticket})
 
     def _output(self, index: DiscreteStateIndex, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state(index).value())
