@@ -19,25 +19,41 @@
 /* Of what it was compiled; a library that is older than its source is not used. */
 EXPORT const char *source(void) { return SOURCE; }
 
-/* Plate and legs, summed, and B' by columns. */
+/* `equations.slip` of six cranks. */
+static void slips(const double *crank_rates, const double *parameters, double *slip)
+{
+    for (int leg = 0; leg < NUM_LEGS; leg++)
+        slip[leg] = tanh(crank_rates[leg] / parameters[COULOMB_SPEED]);
+}
+
+/* Plate and legs, summed, B' by columns, rates and slips of the cranks. */
+typedef struct {
+    double sums[SUMS], arms[36], rates[NUM_LEGS], slip[NUM_LEGS];
+} Motion;
+
 static void motion(const double *pose, const double *rates, const double *parameters,
-                   const double *gravity, const double *geometry, double *sums, double *arms)
+                   const double *gravity, const double *geometry, Motion *m)
 {
     double plate[21], added[SUMS * NUM_LEGS];
-    plate_motion(pose, rates, parameters, gravity, geometry + COMMON, plate, sums);
-    leg_motion(plate, geometry + COMMON, geometry, added, arms);
+    plate_motion(pose, rates, parameters, gravity, geometry + COMMON, plate, m->sums);
+    leg_motion(plate, geometry + COMMON, geometry, added, m->arms, m->rates);
     for (int i = 0; i < SUMS; i++)
         for (int leg = 0; leg < NUM_LEGS; leg++)
-            sums[i] += added[NUM_LEGS * i + leg];
+            m->sums[i] += added[NUM_LEGS * i + leg];
+    /* They cost a tenth of all this, and nobody reads them without Coulomb friction. */
+    memset(m->slip, 0, sizeof m->slip);
+    if (parameters[COULOMB] != 0.)
+        slips(m->rates, parameters, m->slip);
 }
 
 static void accelerate(const double *pose, const double *rates, const double *torque,
                        const double *parameters, const double *gravity, const double *geometry,
                        double *accelerations)
 {
-    double sums[SUMS], arms[36];
-    motion(pose, rates, parameters, gravity, geometry, sums, arms);
-    solve_accelerations(pose, rates, torque, parameters, sums, arms, accelerations);
+    Motion m;
+    motion(pose, rates, parameters, gravity, geometry, &m);
+    solve_accelerations(pose, rates, torque, parameters, m.rates, m.slip, m.sums, m.arms,
+                        accelerations);
 }
 
 EXPORT void accelerations(double *b)
@@ -58,25 +74,27 @@ EXPORT void change(double *b)
 EXPORT void inverse_dynamics(double *b)
 {
     double *parameters = b + 18, *gravity = parameters + PARAMETERS, *geometry = gravity + 1;
-    double sums[SUMS], arms[36];
-    motion(b, b + 6, parameters, gravity, geometry, sums, arms);
-    solve_torque(b, b + 6, b + 12, parameters, sums, arms, geometry + GEOMETRY);
+    Motion m;
+    motion(b, b + 6, parameters, gravity, geometry, &m);
+    solve_torque(b, b + 6, b + 12, parameters, m.rates, m.slip, m.sums, m.arms,
+                 geometry + GEOMETRY);
 }
 
 EXPORT void energy(double *b)
 {
     double *parameters = b + 12, *gravity = parameters + PARAMETERS, *geometry = gravity + 1;
-    double sums[SUMS], arms[36];
-    motion(b, b + 6, parameters, gravity, geometry, sums, arms);
-    geometry[GEOMETRY] = sums[SUMS - 1];
+    Motion m;
+    motion(b, b + 6, parameters, gravity, geometry, &m);
+    geometry[GEOMETRY] = m.sums[SUMS - 1];
 }
 
 EXPORT void terms(double *b)
 {
     double *parameters = b + 12, *gravity = parameters + PARAMETERS, *geometry = gravity + 1;
-    double *M = geometry + GEOMETRY, sums[SUMS], arms[36];
-    motion(b, b + 6, parameters, gravity, geometry, sums, arms);
-    pose_terms(b, b + 6, sums, arms, M, M + 36, M + 42);
+    double *M = geometry + GEOMETRY;
+    Motion m;
+    motion(b, b + 6, parameters, gravity, geometry, &m);
+    pose_terms(b, b + 6, m.sums, m.arms, M, M + 36, M + 42);
 }
 
 EXPORT void residual_derivatives(double *b)
@@ -84,18 +102,20 @@ EXPORT void residual_derivatives(double *b)
     double *torque = b + 18, *parameters = b + 24, *gravity = parameters + PARAMETERS;
     double *geometry = gravity + 1, *common = geometry + COMMON;
     double *dF_dx = geometry + GEOMETRY, *dF_dp = dF_dx + 72, *MN = dF_dp + 6 * PARAMETERS;
-    double *arms = MN + 36, M[36], arm_rates[NUM_LEGS];
+    double *arms = MN + 36, M[36], arm_rates[NUM_LEGS], slip[NUM_LEGS];
     double change_of_legs[72 * NUM_LEGS], mass_of_legs[36 * NUM_LEGS];
-    plate_derivatives(b, b + 6, b + 12, parameters, common, dF_dx, M);
+    plate_derivatives(b, b + 6, b + 12, parameters, gravity, common, dF_dx, M);
+    crank_rates(b, b + 6, geometry, arm_rates);
+    slips(arm_rates, parameters, slip);
     leg_derivatives(b, b + 6, b + 12, parameters, gravity, common, geometry, torque, parameters,
-                    change_of_legs, mass_of_legs, arms, arm_rates);
+                    slip, change_of_legs, mass_of_legs, arms);
     for (int i = 0; i < 72; i++)
         for (int leg = 0; leg < NUM_LEGS; leg++)
             dF_dx[i] += change_of_legs[NUM_LEGS * i + leg];
     for (int i = 0; i < 36; i++)
         for (int leg = 0; leg < NUM_LEGS; leg++)
             M[i] += mass_of_legs[NUM_LEGS * i + leg];
-    pose_derivatives(b, b + 12, gravity, M, arms, arm_rates, dF_dp, MN);
+    pose_derivatives(b, b + 6, b + 12, parameters, gravity, M, arms, arm_rates, slip, dF_dp, MN);
 }
 
 EXPORT void measures(double *b)
