@@ -13,7 +13,14 @@ from stewart_drake.files.resources import shipped
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, LABELS, SERVOS, compare, save_comparison
+from stewart_drake.studies.compare import (
+    ADAPTIVE,
+    CONTROLLERS,
+    LABELS,
+    SERVOS,
+    compare,
+    save_comparison,
+)
 from stewart_drake.studies.verdict import Verdict, delay_verdict
 
 SHORT = ("plant.kind=exact", "duration=1.0")

@@ -108,10 +108,10 @@ class ServoLoop:
         With u = -p e - q e' held for h, p = w^2 J / m and q = 2 d w J / m, the mode goes from
         (e, e') to e' + h u, e + h e' (an engine's semi-implicit step) or e + h e' + h^2 u / 2
         (exactly). By Jury's criterion the first is stable for q h + p h^2 / 2 < 2, the second for
-        q h < 2 where p h < 2 q: the first is the stricter. Solved for w, with the least m.
+        q h < 2 and p h < 2 q. The first and the last of these, solved for w, with the least m.
         """
         d, ratio = self.damping, inertias.min() / self.inertia
-        return float((-2 * d + math.sqrt(4 * d**2 + 4 * ratio)) / self.period)
+        return min(math.sqrt(4 * d**2 + 4 * ratio) - 2 * d, 4 * d) / self.period
 
 
 class Segment(NamedTuple):

@@ -141,9 +141,9 @@ def commands_in_flight(
     wanted[0, RATES] = experiment.start[RATES]
     if sc.queue == "reference":
         ends = delay.eta(law.timeline.period) - law.timeline.period * np.arange(length)[::-1]
-        wanted[1:] = [evaluate(experiment.reference, t) for t in ends]
-        if sc.start != "rest":
-            wanted[0] = evaluate(experiment.reference, 0.0)
+        moving = 1 if sc.start == "rest" else 0  # a plate at rest is not on the reference yet
+        for row, t in zip(wanted[moving:], [0.0, *ends][moving:], strict=True):
+            row[:] = evaluate(experiment.reference, t)
     commands = np.array([law.command(x, law.plant.dynamics.parameters) for x in wanted])
     if sc.queue == "zero":
         commands[:, MODEL_TORQUE] = 0.0

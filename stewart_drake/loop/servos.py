@@ -87,7 +87,7 @@ class Servos(LeafSystem):
         reports: ReportLayout,
     ) -> None:
         super().__init__()
-        self._loop, self._dynamics, self._period, self._reports = loop, dynamics, period, reports
+        self._loop, self._dynamics, self._period, self.reports = loop, dynamics, period, reports
         nothing = np.full((reports.periods * round(period / loop.period), NUM_TORQUES), np.nan)
         setpoint, asked = command[SETPOINT], np.zeros(NUM_TORQUES)
         first = ServoState(still(command, 0.0), np.nan, setpoint, asked, nothing)
@@ -100,12 +100,13 @@ class Servos(LeafSystem):
         self.DeclareVectorOutputPort("report", reports.size, weak(self._report), ticket)
         update_every(self, loop.period, self._tick, servo_time)
 
-    def _remembered(self, context: Context) -> ServoState:
+    def remembered(self, context: Context) -> ServoState:
+        """What is remembered in a context of this system."""
         value: Any = context.get_abstract_state(int(self._memory))
         return value.get_value()
 
     def _tick(self, context: Context, state: State) -> None:
-        before, now = self._remembered(context), context.get_time()
+        before, now = self.remembered(context), context.get_time()
         segment, arrived = self._segment(before, context)
         wanted = segment.at(now, self._period)
         setpoint = self._loop.limited(wanted[SETPOINT], before.setpoint[POSE])
@@ -132,9 +133,9 @@ class Servos(LeafSystem):
         return np.concatenate([angles, rates])
 
     def _torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._remembered(context).torque)
+        output.SetFromVector(self.remembered(context).torque)
 
     def _report(self, context: Context, output: BasicVector) -> None:
-        memory = self._remembered(context)
-        report = self._reports.written(memory.put_out, memory.asked, self._loop.motors)
+        memory = self.remembered(context)
+        report = self.reports.written(memory.put_out, memory.asked, self._loop.motors)
         output.SetFromVector(report)
