@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from threadpoolctl import threadpool_info
 
-import stewart_drake as sd
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.scenario.loading import load_controller, load_understood
-from stewart_drake.scenario.timing import event_time, look_time
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES
+from stewart_drake.scenario.timing import event_time, look_time
 from tests.backends import switched
 
 Array = NDArray[np.float64]
