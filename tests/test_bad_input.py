@@ -44,6 +44,8 @@ SCENARIO_RANGES: dict[str, list[float]] = {
     "plant.accuracy": [0, -1e-8, 1e-16, 0.5],
     "plant.payload_mass": [-1.0],
     "plant.joint_damping": [-1.0],
+    "plant.coulomb_friction": [-1.0],
+    "plant.coulomb_speed": [0, -1.0],
     "delay.steps": [-1, 1001],
     "delay.fraction": [-0.1, 1.0],
     "delay.drift": [-1.0, 11.0],
@@ -79,6 +81,8 @@ SCENARIO_RANGES: dict[str, list[float]] = {
     "controller.delay_std": [0, 11.0],
     "controller.delay_max": [0, 11.0],
     "controller.rejoin": [-0.1, 11.0],
+    **{f"controller.prior.{name}": [0, -1.0] for name in ("torque_bias", "payload", "damping")},
+    "controller.prior.offsets": [0, -1.0],
     "actuator.torque_limit": [0, -1.0],
     "actuator.bandwidth": [0, -1.0, 1e4],
     "actuator.damping": [0, -0.7, 101.0],
@@ -95,6 +99,8 @@ SCENARIO_LISTS: dict[str, list[Any]] = {
     "reference.times": [0.0, 1.0],
     "reference.poses": [ROW, ROW],
     "plant.torque_bias": [0.0] * 6,
+    "plant.payload_position": [0.0] * 3,
+    "controller.prior.rates": [1.0] * 6,
     "sensor.noise_std": [0.0] * 12,
 }
 FOR_KIND = {

@@ -6,6 +6,7 @@ these into a pydantic dataclass. Both report the first problem as a one-line `Co
 
 import dataclasses
 import difflib
+import io
 import json
 import re
 import types
@@ -20,6 +21,7 @@ from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent
 from ruamel.yaml.nodes import ScalarNode
+from ruamel.yaml.representer import RoundTripRepresenter
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import read_bytes
@@ -120,6 +122,29 @@ def parse_yaml(text: str, where: str) -> Any:
     except (YAMLError, ValueError, RecursionError, AssertionError, LookupError) as error:
         problem = _cut((str(error).strip() or type(error).__name__).splitlines()[0], 160)
         raise ConfigError(f"{where}: is not YAML ({problem}); expected plain YAML") from None
+
+
+class _Representer(RoundTripRepresenter):
+    """Lists on one line, those of sections apart; and null by its name."""
+
+    def flat(self, values: list[Any]) -> Any:
+        plain = not any(isinstance(value, dict) for value in values)
+        return self.represent_sequence("tag:yaml.org,2002:seq", values, flow_style=plain)
+
+    def null(self, _: None) -> Any:
+        return self.represent_scalar("tag:yaml.org,2002:null", "null")
+
+
+_Representer.add_representer(list, _Representer.flat)
+_Representer.add_representer(type(None), _Representer.null)
+
+
+def yaml_text(data: dict[str, Any]) -> str:
+    """Plain data as the text of a file that `load_yaml` reads back."""
+    yaml, text = YAML(), io.StringIO()
+    yaml.width, yaml.Representer = 96, _Representer
+    yaml.dump(data, text)
+    return text.getvalue()
 
 
 def validate(type_: type[_T], data: dict[str, Any], where: str) -> _T:

@@ -197,7 +197,7 @@ class DelayFilter:
     def _filter(self, model: "DelayModel", guess: Guess, y: Array | None) -> Guess | None:
         P, xi = guess.covariance, guess.mean
         std = np.sqrt(np.diag(P)[NUM_STATE:-2])
-        known = bool(np.all(std <= KNOWN * self.settings.parameters.std))
+        known = bool(np.all(std <= KNOWN * self.settings.parameters.usual_std))
         nodes, period = MIDPOINT if known else GAUSS_NODES, model.timeline.period
         at = model.at(xi, nodes)
         sooner = self._sooner(at, xi)

@@ -186,7 +186,7 @@ class _Search:
         mean = np.concatenate([first.state, prior.prior, [NEVER, 0.0]])
         covariance = np.zeros((len(mean), len(mean)))
         covariance[:NUM_STATE, :NUM_STATE] = first.covariance
-        covariance[NUM_STATE:-2, NUM_STATE:-2] = np.diag(prior.std**2)
+        covariance[NUM_STATE:-2, NUM_STATE:-2] = prior.covariance
         master = Cell(Guess(mean, covariance, 0.0, observer.delay.longest), 0.0)
         cells = []
         for k in range(1, sent + 1):

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
+from scipy.linalg import block_diag, expm
 from scipy.special import chdtri
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -120,15 +120,14 @@ class ParameterFilter:
 
     def _from(self, first: FirstState, parameters: Array) -> Estimate:
         mean = np.concatenate([first.state, parameters])
-        covariance = np.diag(np.concatenate([np.zeros(NUM_STATE), self.settings.parameters.std**2]))
-        covariance[:NUM_STATE, :NUM_STATE] = first.covariance
+        covariance = block_diag(first.covariance, self.settings.parameters.covariance)
         return Estimate(mean, covariance, self._no_outlier())
 
     def _no_outlier(self) -> Array:
         return np.full(self.sensing.size, np.nan)
 
     def _known(self, estimate: Estimate, share: float = KNOWN) -> bool:
-        return bool(np.all(estimate.parameter_std <= share * self.settings.parameters.std))
+        return bool(np.all(estimate.parameter_std <= share * self.settings.parameters.usual_std))
 
     def _attempt(self, estimate: Estimate, period: Period, y: Array | None) -> Estimate | None:
         """`advance` for values (m,) that fit; None for an outlier, or without a finite result."""

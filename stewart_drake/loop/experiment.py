@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
@@ -24,7 +24,11 @@ from stewart_drake.law.feedforward import (
     InverseDynamicsFeedforward,
     NoFeedforward,
 )
-from stewart_drake.law.filter_settings import filter_settings
+from stewart_drake.law.filter_settings import (
+    ParameterSet,
+    filter_settings,
+    usual_parameters,
+)
 from stewart_drake.law.late import LateObserver
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
@@ -50,8 +54,9 @@ from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.own import NOTHING, Own, take
 from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.geometry import Mechanism, fingerprint
 from stewart_drake.mechanism.rotors import with_rotors
+from stewart_drake.native.layout import plate_radius
 from stewart_drake.scenario.config import (
     AnnTunerConfig,
     NetworkConfig,
@@ -59,8 +64,17 @@ from stewart_drake.scenario.config import (
     ServoActuatorConfig,
 )
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.known import DELAY, OFFSETS, Known, load_known
 from stewart_drake.scenario.link import in_time, times_under_way
-from stewart_drake.scenario.signals import POSITION
+from stewart_drake.scenario.signals import (
+    BIAS,
+    DAMPING,
+    PARAMETERS,
+    PAYLOAD,
+    PLANT_PARAMETERS,
+    POSE,
+    POSITION,
+)
 from stewart_drake.scenario.trajectories import evaluate, make_reference, moved, peak_to_peak
 from stewart_drake.tuner.network import DEFAULT, Network, load_network
 
@@ -97,6 +111,8 @@ class Experiment(NamedTuple):
     """What sets the weights, or None."""
     own: Own = NOTHING
     """What takes the place of the scenario's."""
+    known: Known | None = None
+    """What the controller knows of the machine beside its drawing."""
 
     def __repr__(self) -> str:
         return f"Experiment({self.mechanism}, {self.scenario})"
@@ -119,7 +135,7 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
 
     Args:
         scenario: what to run.
-        truth: the machine to simulate where it is not the one that the controller knows.
+        truth: the machine to simulate, that of the scenario's plant if None.
         own: what takes the place of the scenario's.
 
     Raises:
@@ -138,6 +154,12 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
                 if failure.time > 0
                 else f": {first_pose_text(first, experiment.mechanism)}"
             )
+        )
+    outside = diagnose(experiment.truth, 0.0, experiment.start[POSE])
+    if outside is not None:
+        raise ConfigError(
+            f"plant.mechanism: got {experiment.truth.name}, which does not reach the first pose "
+            f"({outside.reason}); expected a machine that does"
         )
     return experiment
 
@@ -195,7 +217,11 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     """
     scenario.check()
     network = _network(scenario)
-    mechanism = _with_motors(load_mechanism(scenario.mechanism), scenario)
+    drawn = load_mechanism(scenario.mechanism)
+    known = known_of(scenario)
+    if known is not None:
+        _check_known(known, scenario, drawn)
+    mechanism = _with_motors(drawn, scenario)
     if own.reference is None:
         reference = make_reference(scenario.reference, scenario.duration)
         span = peak_to_peak(scenario.reference, reference, scenario.duration)
@@ -208,13 +234,14 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     return Experiment(
         scenario=scenario,
         mechanism=mechanism,
-        truth=mechanism if truth is None else _with_motors(truth, scenario),
+        truth=_with_motors(simulated_machine(scenario) if truth is None else truth, scenario),
         reference=reference,
         peak_to_peak=span,
-        nominal=StewartDynamics(mechanism, gravity=scenario.plant.gravity),
+        nominal=StewartDynamics(mechanism, scenario.plant.gravity, known_values(known)),
         start=start,
         network=network,
         own=own,
+        known=known,
     )
 
 
@@ -224,6 +251,61 @@ def _with_motors(mechanism: Mechanism, scenario: Scenario) -> Mechanism:
     if not isinstance(actuator, ServoActuatorConfig):
         return mechanism
     return with_rotors(mechanism, actuator.reflected_inertia)
+
+
+def simulated_machine(scenario: Scenario) -> Mechanism:
+    """That of the scenario's plant, else the one that the controller knows.
+
+    Raises:
+        ConfigError: one line.
+    """
+    name = scenario.plant.mechanism
+    if name is None:
+        return load_mechanism(scenario.mechanism)
+    try:
+        path = resolve("mechanism", name)
+    except ConfigError as error:
+        raise ConfigError(f"plant.{error}") from None
+    return load_mechanism(path)
+
+
+def known_of(scenario: Scenario) -> Known | None:
+    """What `controller.known` holds.
+
+    Raises:
+        ConfigError: one line.
+    """
+    c = scenario.controller
+    if c.known is None:
+        return None
+    try:
+        return load_known(c.known)
+    except ConfigError as error:
+        raise ConfigError(f"controller.known: {error}") from None
+
+
+def _check_known(known: Known, scenario: Scenario, mechanism: Mechanism) -> None:
+    c, own = scenario.controller, fingerprint(mechanism)
+    if known.mechanism != own:
+        raise ConfigError(
+            f"controller.known: got {c.known}, of another machine ({known.mechanism}); expected "
+            f"what is known of {mechanism.name} ({own})"
+        )
+    believed = believed_delay(scenario).eta(c.period)
+    if c.delay_estimator != "none" and believed > c.delay_max:
+        raise ConfigError(
+            f"controller.delay_max: got {c.delay_max:g} s, less than the {believed:g} s that are "
+            "believed in; expected as much or more"
+        )
+
+
+def known_values(known: Known | None) -> Array:
+    """All parameters of the plant (13,) as the controller takes them before it measures."""
+    values = plant_parameters()
+    for i, name in enumerate(PLANT_PARAMETERS):
+        found = None if known is None else known.value(name)
+        values[i] = values[i] if found is None else found
+    return values
 
 
 def _network(scenario: Scenario) -> Network | None:
@@ -249,13 +331,16 @@ def waits_at_rest(scenario: Scenario) -> bool:
 
 
 def believed_delay(scenario: Scenario) -> Delay:
-    """The delay that the controller assumes; null means the true one.
+    """The delay that the controller assumes; null means the known one, else the true one.
 
     When torques act that are sent over a network says the controller itself, unless it knows of no
     delay.
     """
     controller = scenario.controller
     says = isinstance(scenario.link, NetworkConfig) and controller.delay_steps != 0
+    known = None if says or controller.delay_steps is not None else known_of(scenario)
+    if known is not None and (seconds := known.value(DELAY)) is not None:
+        return Delay.of(seconds, controller.period)
     if controller.delay_steps is None or says:
         return scenario.true_delay
     return Delay(controller.delay_steps, controller.delay_fraction or 0.0)
@@ -337,7 +422,8 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
     torque_scale = max(machine_torque(nominal), peak_torque)
     plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
-    settings = filter_settings(motion, plate, torque_scale, asked, c.period)
+    parameters = estimated_parameters(experiment, torque_scale)
+    settings = filter_settings(motion, plate, torque_scale, asked, c.period, parameters)
     observers: dict[str, Observer] = {
         "none": NoObserver(),
         "parameters": ParameterObserver(settings),
@@ -384,6 +470,35 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
             silence=0,  # until the delay is found
         )
     return experiment.own.revised(law)
+
+
+def estimated_parameters(experiment: Experiment, torque_scale: float) -> ParameterSet:
+    """What the estimator is to find, and what is known of that; the torque in N m is the motion's.
+
+    Raises:
+        ConfigError: what is known is beyond the bounds of such a machine.
+    """
+    sc, machine = experiment.scenario, experiment.mechanism
+    found = usual_parameters(
+        machine.plate.mass,
+        torque_scale,
+        planned_limit(sc),
+        plate_radius(machine),
+        experiment.nominal.free,
+    )
+    if experiment.known is not None:
+        try:
+            found = found.knowing(experiment.known)
+        except ValueError as error:
+            raise ConfigError(f"controller.known: {error}") from None
+    prior = sc.controller.prior
+    said = {
+        **dict.fromkeys(PARAMETERS[BIAS], prior.torque_bias),
+        PARAMETERS[PAYLOAD]: prior.payload,
+        PARAMETERS[DAMPING]: prior.damping,
+        **dict.fromkeys(OFFSETS, prior.offsets),
+    }
+    return found.trusting({name: std for name, std in said.items() if std is not None})
 
 
 def longest_wait(scenario: Scenario) -> int:

@@ -11,6 +11,7 @@ Frames, in Drake's monogram notation, leg by leg (leading axis of length six):
 | Q | spherical joint between rod and plate | |
 """
 
+import hashlib
 import re
 from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
@@ -262,6 +263,21 @@ class Mechanism:
             SingularPoseError: a leg is at its dead centre, where the derivative does not exist.
         """
         return kinematics.jacobian(self, _six("pose", pose))
+
+
+def fingerprint(mechanism: Mechanism) -> str:
+    """Of the numbers that a machine moves by: what was found of one is not used for another.
+
+    Lengths count to a nanometre, masses and inertias to nine digits: writing a machine to a file
+    and reading it again changes nothing. Name, home, base and motors do not count.
+    """
+    m = mechanism
+    places = (m.p_WS, m.R_WS, m.p_PQ, m.crank_lengths, m.rod_lengths, m.branches)
+    words = [f"{round(x, 9) + 0.0:.9f}" for x in np.concatenate([np.ravel(x) for x in places])]
+    for body in (m.plate, m.crank, m.rod):
+        words += [f"{x:.8e}" for x in (body.mass, *body.inertia)]
+    words += [f"{link.center:.9f}" for link in (m.crank, m.rod)]
+    return hashlib.sha256(" ".join(words).encode()).hexdigest()[:16]
 
 
 def _six(name: str, values: ArrayLike) -> Array:

@@ -30,12 +30,13 @@ from stewart_drake.scenario.field_types import (
     Weight,
 )
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
+from stewart_drake.scenario.signals import USUAL_COULOMB_SPEED
 from stewart_drake.scenario.timing import METRIC_PERIOD, bound_problem, log_problem, step_problem
 
 
 @dataclass(config=STRICT)
 class PlantConfig:
-    """The simulated platform; the controller is not told the last three fields.
+    """The simulated platform; from the payload on nobody tells the controller.
 
     Attributes:
         kind: `multibody` (MultibodyPlant with constraints, fixed steps) or `exact` (closed-form
@@ -43,9 +44,14 @@ class PlantConfig:
         gravity: whether gravity acts, 9.81 m/s^2; false stands for a counterbalanced platform.
         time_step: of the multibody plant, s.
         accuracy: of the exact plant's integrator, relative, 1e-12 to 1e-2.
-        payload_mass: a point mass at the plate's centre of mass, kg.
+        payload_mass: a point mass, kg.
         torque_bias: added to each motor's torque, N m.
         joint_damping: viscous damping on each crank shaft, N m s/rad.
+        mechanism: the machine that is simulated, a shipped name or a path; null is the one that the
+            controller knows, the scenario's `mechanism`.
+        coulomb_friction: on each crank shaft, N m, times tanh(rate / coulomb_speed).
+        coulomb_speed: over which that builds up, rad/s.
+        payload_position: of the payload in the plate's frame, from its centre of mass, m.
     """
 
     kind: Literal["multibody", "exact"] = "multibody"
@@ -55,11 +61,18 @@ class PlantConfig:
     payload_mass: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     torque_bias: Six = field(default_factory=lambda: [0.0] * 6)
     joint_damping: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    mechanism: Name | None = None
+    coulomb_friction: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    coulomb_speed: Annotated[float, Field(ge=1e-6, le=1e3)] = USUAL_COULOMB_SPEED
+    payload_position: Annotated[
+        list[Annotated[float, Field(ge=-1e3, le=1e3)]], Field(min_length=3, max_length=3)
+    ] = field(default_factory=lambda: [0.0] * 3)
 
     @property
     def parameters(self) -> list[float]:
-        """What the controller is not told, in the order of `scenario.signals.PARAMETERS`."""
-        return [*self.torque_bias, self.payload_mass, self.joint_damping]
+        """All of the plant, in the order of `scenario.signals.PLANT_PARAMETERS`."""
+        shafts = (self.joint_damping, self.coulomb_friction, self.coulomb_speed)
+        return [*self.torque_bias, self.payload_mass, *shafts, *self.payload_position]
 
 
 @dataclass(config=STRICT)
@@ -95,6 +108,29 @@ class DelayConfig:
     def constant(self) -> bool:
         """Whether every torque waits as long."""
         return self.drift == self.swing == self.jump == self.jitter_std == 0
+
+
+@dataclass(config=STRICT)
+class PriorConfig:
+    """How far may be off what nobody tells the controller: standard deviations of the estimator.
+
+    null is what `controller.known` says, and without it what machine and motion say. A number
+    stands before both.
+
+    Attributes:
+        torque_bias: of each motor, N m; null is 0.3 of the torque that the motion takes.
+        payload: kg; null is a quarter of the plate.
+        damping: N m s/rad; null is 0.1 s/rad times the torque that the motion takes.
+        rates: of the plate at the first sample, of which encoders tell nothing, rad/s and m/s; null
+            is half the motion's peak to peak per second.
+        offsets: of an encoder's mounting, rad; null is 0.1 degrees.
+    """
+
+    torque_bias: Positive | None = None
+    payload: Positive | None = None
+    damping: Positive | None = None
+    rates: Annotated[list[Positive], Field(min_length=6, max_length=6)] | None = None
+    offsets: Positive | None = None
 
 
 @dataclass(config=STRICT)
@@ -134,6 +170,10 @@ class ControllerConfig:
             have acted.
         rejoin: with a delay estimator: a plan back onto the reference takes so long, in s, where
             the prediction is off it, as when the delay was found or has jumped; 0 is none.
+        prior: standard deviations of what is estimated, a section of its own; null all of them.
+        known: a file of what is known of the machine (`scenario.known`), as `identify` writes it;
+            means and covariance of what is estimated, and the values of what is not. A delay in it
+            is believed in where `delay_steps` is null.
     """
 
     period: Annotated[float, Field(ge=1e-4, le=10)] = 0.1
@@ -158,6 +198,8 @@ class ControllerConfig:
     delay_max: Annotated[float, Field(gt=0, le=10)] = 1.5
     quiet_start: bool = True
     rejoin: Annotated[float, Field(ge=0, le=10)] = 0.6
+    prior: PriorConfig = field(default_factory=PriorConfig)
+    known: Name | None = None
 
 
 @dataclass(config=STRICT)
@@ -422,6 +464,8 @@ class Scenario:
                 f"{self.link.kind!r} and a sensor.delay of {self.sensor.delay:g} s; expected "
                 "'none', or a wire and measurements of now"
             )
+        if c.delay_steps is None and c.known is not None:
+            return None  # what is known may say a delay, see `loop.experiment`
         believed = self.eta
         if c.delay_steps is not None:
             believed = Delay(c.delay_steps, c.delay_fraction or 0.0).eta(c.period)

@@ -5,22 +5,20 @@ is checked on its own, so that a message names the place to mend.
 """
 
 import dataclasses
-import io
 import typing
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-from ruamel.yaml.representer import RoundTripRepresenter
-
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import absolute_path, is_path, resolve, shipped
 from stewart_drake.files.schema import field_names, plain, sections, spelling
-from stewart_drake.files.yamlio import brief, load_yaml, parse_yaml, validate
+from stewart_drake.files.yamlio import brief, load_yaml, parse_yaml, validate, yaml_text
 from stewart_drake.scenario.config import ControllerConfig, Scenario, understanding
 
 _SETTINGS = "settings"
+_FILES = ("file", "known")
+"""Fields that are always a path; others may be a shipped name."""
 _OVERLAY = "overlay"
 _KINDS = sections(Scenario)
 
@@ -105,6 +103,7 @@ def load_controller(name_or_path: str | Path) -> dict[str, Any]:
             "controller.period, set it there"
         )
     validate(ControllerConfig, data, str(path))
+    _make_paths_absolute({"controller": data}, path.parent)
     return data
 
 
@@ -151,24 +150,7 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
 
 def scenario_yaml(scenario: Scenario) -> str:
     """The scenario as the text of a file that `load_scenario` reads back."""
-    yaml, text = YAML(), io.StringIO()
-    yaml.width, yaml.Representer = 96, _Representer
-    yaml.dump(scenario_to_dict(scenario), text)
-    return text.getvalue()
-
-
-class _Representer(RoundTripRepresenter):
-    """Lists on one line, and null by its name."""
-
-    def flat(self, values: list[Any]) -> Any:
-        return self.represent_sequence("tag:yaml.org,2002:seq", values, flow_style=True)
-
-    def null(self, _: None) -> Any:
-        return self.represent_scalar("tag:yaml.org,2002:null", "null")
-
-
-_Representer.add_representer(list, _Representer.flat)
-_Representer.add_representer(type(None), _Representer.null)
+    return yaml_text(scenario_to_dict(scenario))
 
 
 def setting_choices() -> list[str]:
@@ -261,9 +243,12 @@ def _make_paths_absolute(data: dict[str, Any], folder: Path) -> None:
 
     def tie(fields: dict[str, Any], name: str) -> None:
         value = fields.get(name)
-        if value is not None and (name == "file" or is_path(value)):
+        if value is not None and (name in _FILES or is_path(value)):
             fields[name] = str(absolute_path(value, folder))
 
     tie(data, "mechanism")
+    tie(data.get("plant", {}), "mechanism")
+    for fields in (data.get("controller", {}), *data.get("compare", {}).values()):
+        tie(fields, "known")
     tie(data.get("reference", {}), "file")
     tie(data.get("tuner", {}), "weights")

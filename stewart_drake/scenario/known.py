@@ -1,0 +1,143 @@
+"""What is known of a machine beforehand: means and their covariance, as `identify` writes them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pydantic.dataclasses
+from numpy.typing import NDArray
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import replacing
+from stewart_drake.files.yamlio import brief, load_yaml, validate, yaml_text
+from stewart_drake.scenario.field_types import STRICT
+from stewart_drake.scenario.signals import COULOMB_SPEED, LEGS, PLANT_PARAMETERS
+
+Array = NDArray[np.float64]
+
+DELAY: Final = "delay"
+"""Between computing a torque and feeling it, s."""
+OFFSETS: Final = tuple(f"offset_A{leg}" for leg in LEGS)
+"""Of the motors' encoders: what they say less the crank's angle, rad."""
+KNOWABLE: Final = (*PLANT_PARAMETERS, DELAY, *OFFSETS)
+ROUNDING: Final = 1e-9
+"""Of a covariance, as a share, that makes it neither unsymmetric nor negative."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of one machine.
+
+    Attributes:
+        mechanism: fingerprint of the machine's numbers, `mechanism.geometry.fingerprint`.
+        names: (n,) out of KNOWABLE, each at the most once; SI units.
+        mean: (n,).
+        covariance: (n, n); zero where something is known exactly.
+
+    Raises:
+        ConfigError: one line, opened by the attribute.
+    """
+
+    mechanism: str
+    names: tuple[str, ...]
+    mean: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        n, mean, P = len(self.names), np.array(self.mean), np.array(self.covariance)
+        for name in self.names:
+            if name not in KNOWABLE:
+                raise ConfigError(
+                    f"names: got {brief(name)}; expected some of {', '.join(KNOWABLE)}"
+                )
+        if len(set(self.names)) < n:
+            raise ConfigError(f"names: got {', '.join(self.names)}; expected each once")
+        for field, value, shape in (("mean", mean, (n,)), ("covariance", P, (n, n))):
+            if value.shape != shape:
+                raise ConfigError(
+                    f"{field}: got shape {value.shape}; expected {shape}, for {n} names"
+                )
+            if not np.all(np.isfinite(value)):
+                raise ConfigError(f"{field}: got {brief(value.tolist())}; expected finite numbers")
+        self._check_covariance(P)
+        speed = self.value(PLANT_PARAMETERS[COULOMB_SPEED])
+        if speed is not None and not speed > 0:
+            raise ConfigError(f"mean: got a coulomb_speed of {speed:g} rad/s; expected above 0")
+        delay = self.value(DELAY)
+        if delay is not None and not delay >= 0:
+            raise ConfigError(f"mean: got a delay of {delay:g} s; expected 0 or more")
+
+    def _check_covariance(self, P: Array) -> None:
+        variances = np.diag(P)
+        for name, variance in zip(self.names, variances, strict=True):
+            if variance < 0:
+                raise ConfigError(
+                    f"covariance: got a variance of {variance:g} for {name}; expected 0 or more"
+                )
+        # In units of the standard deviations; what is known exactly goes together with nothing.
+        std = np.sqrt(np.where(variances > 0, variances, 1.0))
+        scaled = P / np.outer(std, std)
+        if np.abs(scaled - scaled.T).max(initial=0.0) > ROUNDING:
+            i, j = np.unravel_index(np.abs(scaled - scaled.T).argmax(), P.shape)
+            raise ConfigError(
+                f"covariance: got {P[i, j]:g} and {P[j, i]:g} for {self.names[i]} and "
+                f"{self.names[j]}; expected a symmetric matrix"
+            )
+        least = np.linalg.eigvalsh((scaled + scaled.T) / 2).min(initial=0.0)
+        if least < -ROUNDING * max(1, len(P)):
+            raise ConfigError(
+                f"covariance: got one with an eigenvalue of {least:.3g}, in units of its standard "
+                "deviations; expected none below 0"
+            )
+
+    def value(self, name: str) -> float | None:
+        """The mean of one, None where nothing is known of it."""
+        return float(self.mean[self.names.index(name)]) if name in self.names else None
+
+
+@pydantic.dataclasses.dataclass(config=STRICT)
+class _File:
+    mechanism: str
+    names: list[str]
+    mean: list[float]
+    covariance: list[list[float]]
+
+
+def load_known(path: str | Path) -> Known:
+    """Reads what is known of a machine.
+
+    Args:
+        path: a YAML file with the keys `mechanism`, `names`, `mean`, `covariance`.
+
+    Raises:
+        ConfigError: unreadable, or what `Known` refuses; one line, opened by the path.
+    """
+    found = validate(_File, load_yaml(path), str(path))
+    n = len(found.names)
+    for row in found.covariance:
+        if len(row) != n:
+            raise ConfigError(
+                f"{path}: covariance: got a row of {len(row)} numbers; expected {n}, as of names"
+            )
+    try:
+        return Known(
+            found.mechanism,
+            tuple(found.names),
+            np.array(found.mean),
+            np.array(found.covariance).reshape(len(found.covariance), n),
+        )
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def save_known(path: str | Path, known: Known) -> None:
+    """Writes a file that `load_known` reads back to the last digit."""
+    data = {
+        "mechanism": known.mechanism,
+        "names": list(known.names),
+        "mean": known.mean.tolist(),
+        "covariance": known.covariance.tolist(),
+    }
+    with replacing(Path(path)) as partial:
+        partial.write_text(yaml_text(data), encoding="utf-8")

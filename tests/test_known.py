@@ -1,0 +1,266 @@
+"""What is known of a machine: the file, and what the law makes of it."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import stewart_drake as sd
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.yamlio import yaml_text
+from stewart_drake.law.filter_settings import CHANCE, EXACT, ParameterSet, usual_parameters
+from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.loop.experiment import GENTLE, Experiment, believed_delay, compose_law, prepare
+from stewart_drake.mechanism.geometry import Body, fingerprint
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.known import KNOWABLE, OFFSETS, Known, load_known, save_known
+from stewart_drake.scenario.signals import DAMPING, PARAMETERS, PAYLOAD, PLANT_PARAMETERS
+from tests.mechanisms import PAPER
+
+Array = NDArray[np.float64]
+NAMES = ("payload_mass", "joint_damping", "coulomb_friction", "delay")
+MEAN = np.array([0.4, 1e-3, 2e-3, 0.73])
+SPREAD = np.array([[3e-2, 0, 0, 0], [1e-4, 2e-4, 0, 0], [0, 1e-4, 1e-4, 0], [0, 0, 0, 1e-3]])
+KNOWN = Known(fingerprint(PAPER), NAMES, MEAN, SPREAD @ SPREAD.T)
+ON_REFERENCE = ("plant.kind=exact", "start=on_reference", "queue=reference")
+
+
+# The file.
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.sets(st.sampled_from(KNOWABLE)), st.integers(0, 2**32 - 1))
+def test_a_file_is_read_back_to_the_last_digit(
+    tmp_path_factory: pytest.TempPathFactory, names: set[str], seed: int
+) -> None:
+    rng, n, path = np.random.default_rng(seed), len(names), tmp_path_factory.mktemp("k") / "k.yaml"
+    spread = rng.normal(0, 1, (n, max(0, n - 1)))  # of less than full rank
+    known = Known("abc", tuple(sorted(names)), rng.uniform(1e-3, 1, n), spread @ spread.T)
+    save_known(path, known)
+    found = load_known(path)
+    assert (found.mechanism, found.names) == (known.mechanism, known.names)
+    assert np.array_equal(found.mean, known.mean)
+    assert np.array_equal(found.covariance, known.covariance)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"names": ["payload_mass", "mass"]}, "names: got 'mass'; expected some of torque_bias_1,"),
+        ({"names": ["delay", "delay"]}, "names: got delay, delay; expected each once"),
+        ({"mean": [0.1]}, r"mean: got shape \(1,\); expected \(2,\), for 2 names"),
+        ({"mean": [0.1, float("nan")]}, r"mean\[1\]: got nan; expected a finite number"),
+        ({"mean": [0.1, -0.1]}, "mean: got a delay of -0.1 s; expected 0 or more"),
+        ({"names": ["coulomb_speed", "delay"], "mean": [0.0, 0.1]}, "coulomb_speed of 0 rad/s"),
+        ({"covariance": [[1.0, 0.0]]}, r"covariance: got shape \(1, 2\); expected \(2, 2\)"),
+        ({"covariance": [[1.0], [0.0, 1.0]]}, "covariance: got a row of 1 numbers; expected 2"),
+        ({"covariance": [[1.0, 0.5], [0.4, 1.0]]}, "got 0.5 and 0.4 .* expected a symmetric"),
+        ({"covariance": [[1.0, 2.0], [2.0, 1.0]]}, "an eigenvalue of -1, in units"),
+        ({"covariance": [[-1.0, 0.0], [0.0, 1.0]]}, "a variance of -1 for payload_mass"),
+        ({"covariance": [[0.0, 0.1], [0.1, 1.0]]}, "an eigenvalue of"),
+        ({"covariance": "none"}, "covariance: got 'none'; expected a list"),
+        ({"means": [1.0]}, "means: unknown key; did you mean mean"),
+        ({"mechanism": 3}, "mechanism: got 3; expected text"),
+    ],
+)
+def test_a_wrong_file_is_refused_in_one_line(
+    tmp_path: Path, wrong: dict[str, Any], message: str
+) -> None:
+    right = {
+        "mechanism": "abc",
+        "names": ["payload_mass", "delay"],
+        "mean": [0.1, 0.7],
+        "covariance": [[1.0, 0.0], [0.0, 1.0]],
+    }
+    path = tmp_path / "known.yaml"
+    path.write_text(yaml_text(right))
+    assert load_known(path).value("delay") == 0.7
+    path.write_text(yaml_text(right | wrong))
+    with pytest.raises(ConfigError, match=message) as refused:
+        load_known(path)
+    assert str(refused.value).startswith(f"{path}: ")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_fingerprint_is_of_the_numbers_that_a_machine_moves_by() -> None:
+    own = fingerprint(PAPER)
+    same = ({"name": "other"}, {"effort_limit": 1.0}, {"home": PAPER.home + 1e-3})
+    rounded = ({"p_WS": PAPER.p_WS + 1e-13}, {"plate": _heavier(1e-12)})
+    for change in (*same, *rounded):
+        assert fingerprint(dataclasses.replace(PAPER, **change)) == own
+    others: tuple[dict[str, Any], ...] = (
+        {"p_WS": PAPER.p_WS + 1e-8},
+        {"p_PQ": PAPER.p_PQ - 1e-8},
+        {"rod_lengths": PAPER.rod_lengths + 1e-8},
+        {"crank_lengths": PAPER.crank_lengths + 1e-8},
+        {"plate": _heavier(1e-6)},
+        {"rod": dataclasses.replace(PAPER.rod, center=0.4)},
+    )
+    prints = {fingerprint(dataclasses.replace(PAPER, **change)) for change in others}
+    assert len(prints) == len(others)
+    assert own not in prints
+
+
+def _heavier(share: float) -> Body:
+    return Body(PAPER.plate.mass * (1 + share), PAPER.plate.inertia)
+
+
+# What it is taken for.
+
+
+def usual(free: tuple[str, ...] = PARAMETERS) -> ParameterSet:
+    return usual_parameters(4.0, 0.1, None, 0.2, free)
+
+
+def test_what_is_known_is_the_prior_of_what_is_estimated() -> None:
+    before, after = usual(), usual().knowing(KNOWN)
+    assert np.array_equal(after.prior, [0, 0, 0, 0, 0, 0, 0.4, 1e-3])
+    expected = np.diag(before.std**2)
+    expected[PAYLOAD:, PAYLOAD:] = KNOWN.covariance[:2, :2]
+    assert after.covariance == pytest.approx(expected, rel=1e-14)
+    assert np.array_equal(after.usual_std, before.std)
+    assert np.array_equal(before.covariance, np.diag(before.std**2))
+    assert np.array_equal(after.upper, before.upper)
+
+
+def test_what_is_known_exactly_is_nearly_so() -> None:
+    exactly = Known("abc", ("payload_mass", "delay"), np.array([0.4, 1.0]), np.zeros((2, 2)))
+    found = usual().knowing(exactly)
+    assert found.std[PAYLOAD] == EXACT * usual().std[PAYLOAD]
+    assert np.linalg.eigvalsh(found.covariance).min() > 0
+
+
+@pytest.mark.parametrize(("off", "taken"), [(0.9 * CHANCE, True), (1.1 * CHANCE, False)])
+def test_a_mean_is_beyond_a_bound_by_chance_or_refused(off: float, taken: bool) -> None:
+    names, std = ("joint_damping",), 1e-4
+    found = Known("abc", names, np.array([-off * std]), np.array([[std**2]]))
+    if taken:
+        assert usual().knowing(found).prior[DAMPING] == 0.0
+        return
+    with pytest.raises(ValueError, match=r"joint_damping: got -0.00033 .*between 0 and"):
+        usual().knowing(found)
+
+
+def test_a_standard_deviation_that_is_said_goes_together_with_nothing() -> None:
+    found = usual().knowing(KNOWN).trusting({"joint_damping": 5e-4})
+    assert found.std[DAMPING] == 5e-4
+    assert found.covariance[PAYLOAD, DAMPING] == 0
+    assert found.covariance[PAYLOAD, PAYLOAD] == pytest.approx(KNOWN.covariance[0, 0], rel=1e-14)
+    assert np.array_equal(found.prior, usual().knowing(KNOWN).prior)
+    assert usual().trusting({}).correlation is None
+
+
+def test_every_parameter_can_be_free() -> None:
+    every = usual((*PLANT_PARAMETERS, *OFFSETS))
+    assert every.names == (*PLANT_PARAMETERS, *OFFSETS)
+    assert set(every.units) == {"N m", "kg", "N m s/rad", "rad/s", "m", "rad"}
+    only = usual(("coulomb_speed", "offset_A3"))
+    assert only.prior.tolist() == [0.02, 0.0]
+    with pytest.raises(ValueError, match="payload_position_x: got 0 with a standard deviation"):
+        usual_parameters(4.0, 0.1, None, free=("payload_position_x",))  # of no size
+
+
+# What the law makes of it.
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "known.yaml"
+    save_known(path, KNOWN)
+    return path
+
+
+def experiment(*given: str) -> Experiment:
+    return prepare(sd.load_scenario("paper", "predictor_lqi", (*ON_REFERENCE, *given)))
+
+
+def observer(law: PredictiveLqi) -> ParameterObserver:
+    assert isinstance(law.observer, ParameterObserver)
+    return law.observer
+
+
+def test_the_law_begins_with_what_is_known(file: Path) -> None:
+    found = experiment(f"controller.known={file}", "controller.prior={payload: 0.2}")
+    nominal = found.nominal
+    known = dict(zip(PLANT_PARAMETERS, nominal.plant_parameters, strict=True))
+    assert known["coulomb_friction"] == 2e-3
+    assert known["coulomb_speed"] == 0.02
+    assert np.array_equal(nominal.parameters, [0, 0, 0, 0, 0, 0, 0.4, 1e-3])
+    law = compose_law(found)
+    prior = observer(law).settings.parameters
+    assert np.array_equal(prior.prior, nominal.parameters)
+    assert prior.std[PAYLOAD] == 0.2
+    assert prior.std[DAMPING] == pytest.approx(np.sqrt(KNOWN.covariance[1, 1]), rel=1e-14)
+    belief = law.observer.start(law.timeline, law.sensing, law.plant)
+    assert np.array_equal(belief.parameters, nominal.parameters)
+
+
+def test_without_a_file_the_law_is_as_machine_and_motion_say() -> None:
+    found = experiment()
+    assert found.known is None
+    law = compose_law(found)
+    prior, torque = observer(law).settings.parameters, law.plant.gentle_torque / GENTLE
+    assert not prior.prior.any()
+    expected = [0.3 * torque] * 6 + [PAPER.plate.mass / 4, 0.1 * torque]
+    assert prior.std == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_known_delay_is_believed_where_nothing_else_is_said(file: Path) -> None:
+    known = f"controller.known={file}"
+    assert believed_delay(experiment(known).scenario) == Delay.of(0.73, 0.1)
+    assert believed_delay(experiment(known, "controller.delay_steps=6").scenario) == Delay(6)
+    assert believed_delay(experiment().scenario) == Delay(8)
+
+
+def test_a_path_starts_from_the_file_that_says_it(file: Path) -> None:
+    scenario, controller = file.parent / "my.yaml", file.parent / "law.yaml"
+    scenario.write_text("controller: {known: known.yaml}\nplant: {mechanism: ./m.yaml}")
+    controller.write_text("known: known.yaml")
+    found = sd.load_scenario(scenario)
+    assert found.controller.known == str(file)
+    assert found.plant.mechanism == str(file.parent / "m.yaml")
+    assert sd.load_scenario("paper", controller).controller.known == str(file)
+
+
+@pytest.mark.parametrize(
+    ("change", "given", "message"),
+    [
+        ({"mechanism": "abc"}, (), "controller.known: got .*, of another machine .abc.; expected"),
+        ({"mean": np.array([99.0, 0, 0, 0.7])}, (), "controller.known: payload_mass: got 99"),
+        (
+            {"mean": np.array([0.1, 0, 0, 1.7])},
+            ("controller.delay_estimator=constant",),
+            "controller.delay_max: got 1.5 s, less than the 1.7 s that are believed in",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(
+    file: Path, change: dict[str, Any], given: tuple[str, ...], message: str
+) -> None:
+    save_known(file, dataclasses.replace(KNOWN, **change))
+    with pytest.raises(ConfigError, match=message):
+        compose_law(experiment(f"controller.known={file}", *given))
+
+
+def test_a_file_that_is_not_there_names_the_field() -> None:
+    with pytest.raises(ConfigError, match=r"^controller\.known: .*nowhere"):
+        experiment("controller.known=/nowhere/known.yaml")
+
+
+def test_what_is_known_is_worth_something(file: Path) -> None:
+    """Friction that the estimator does not have, and parameters that it has to learn otherwise."""
+    true = ("plant.payload_mass=0.4", "plant.joint_damping=1e-3", "plant.coulomb_friction=5e-4")
+    save_known(file, dataclasses.replace(KNOWN, mean=np.array([0.4, 1e-3, 5e-4, 0.8])))
+    settings = (*ON_REFERENCE, *true, "duration=5")
+    told, not_told = (
+        sd.simulate(sd.load_scenario("paper", "predictor_lqi", (*settings, *more)), margin=False)
+        for more in ((f"controller.known={file}",), ())
+    )
+    assert told.status == "completed"
+    assert told.accumulated_error < 0.1 * not_told.accumulated_error
