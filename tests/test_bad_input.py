@@ -84,6 +84,11 @@ SCENARIO_RANGES: dict[str, list[float]] = {
     **{f"controller.prior.{name}": [0, -1.0] for name in ("torque_bias", "payload", "damping")},
     "controller.prior.offsets": [0, -1.0],
     "actuator.torque_limit": [0, -1.0],
+    "actuator.bandwidth": [0, -1.0, 1e4],
+    "actuator.damping": [0, -0.7, 101.0],
+    "actuator.speed_limit": [0, -1.0],
+    "actuator.gear_ratio": [0, -1.0, 1e5],
+    "actuator.rotor_inertia": [-1e-6, 1e4],
     "sensor.seed": [-1, 2**32],
     "sensor.delay": [-0.1, 101.0],
     "sensor.loss": [-0.1, 1.0],
@@ -103,6 +108,10 @@ FOR_KIND = {
     "reference.poses": {"kind": "waypoints", "times": [0.0, 1.0]},
     "reference.file": {"kind": "csv"},
     "tuner.weights": {"kind": "ann"},
+    **{
+        f"actuator.{name}": {"kind": "servo"}
+        for name in ("bandwidth", "damping", "speed_limit", "gear_ratio", "rotor_inertia")
+    },
     **{
         f"link.{name}": {"kind": "network"}
         for name in ("distribution", "return.distribution", "dry", "acknowledged")

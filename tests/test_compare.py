@@ -13,7 +13,14 @@ from stewart_drake.files.resources import shipped
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, LABELS, compare, save_comparison
+from stewart_drake.studies.compare import (
+    ADAPTIVE,
+    CONTROLLERS,
+    LABELS,
+    SERVOS,
+    compare,
+    save_comparison,
+)
 from stewart_drake.studies.verdict import Verdict, delay_verdict
 
 SHORT = ("plant.kind=exact", "duration=1.0")
@@ -25,8 +32,8 @@ def results():
 
 
 def test_every_shipped_controller_takes_part():
-    assert sorted([*CONTROLLERS, ADAPTIVE]) == shipped("controller")
-    assert tuple(LABELS) == (*CONTROLLERS, ADAPTIVE)
+    assert sorted([*CONTROLLERS, ADAPTIVE, *SERVOS]) == shipped("controller")
+    assert tuple(LABELS) == (*CONTROLLERS, ADAPTIVE, *SERVOS)
 
 
 def test_the_order_is_kept_and_each_run_is_that_of_its_controller(results):

@@ -27,9 +27,15 @@ from stewart_drake.scenario.config import (
     FixedTunerConfig,
     PlantConfig,
     Scenario,
+    ServoActuatorConfig,
 )
 from stewart_drake.scenario.field_types import STRICT
-from stewart_drake.scenario.loading import load_controller, load_scenario, scenario_to_dict
+from stewart_drake.scenario.loading import (
+    load_controller,
+    load_scenario,
+    load_understood,
+    scenario_to_dict,
+)
 from stewart_drake.scenario.reference_config import (
     CsvConfig,
     HoldConfig,
@@ -110,6 +116,7 @@ def test_the_defaults_are_the_papers_experiment() -> None:
             "packet_torques": 8,
             "packet_repeats": 1,
             "catch_up": None,
+            "command": "torque",
             "delay_estimator": "none",
             "delay_std": 0.3,
             "delay_max": 1.5,
@@ -159,8 +166,15 @@ def test_the_gravity_scenario_is_short_delayed_and_starts_on_the_reference() -> 
 def test_every_shipped_controller_fits_every_shipped_scenario(
     scenario: str, controller: str
 ) -> None:
-    plain = load_scenario(scenario)
-    laid_over = load_scenario(scenario, controller=controller)
+    servos = load_controller(controller).get("command") == "cranks"
+    settings = ("actuator.kind=servo",) if servos else ()
+    plain = load_understood(scenario, settings=settings)
+    laid_over = load_scenario(scenario, controller=controller, settings=settings)
+    if servos:
+        with pytest.raises(ConfigError, match=r"actuator.kind: got .torque. with .* .servo."):
+            load_scenario(scenario, controller=controller)
+        assert isinstance(laid_over.actuator, ServoActuatorConfig)
+        laid_over.actuator = plain.actuator
     assert laid_over.controller.period == plain.controller.period
     laid_over.controller = plain.controller
     assert laid_over == plain

@@ -180,7 +180,7 @@ def compare(
     from stewart_drake.loop.experiment import prepare
     from stewart_drake.report.run_document import comparison_document
     from stewart_drake.report.words import wrap
-    from stewart_drake.scenario.loading import load_scenario
+    from stewart_drake.scenario.loading import load_understood
     from stewart_drake.studies import compare as study
     from stewart_drake.studies.verdict import delay_verdict
 
@@ -189,7 +189,7 @@ def compare(
 
         return comparison_figures(results, folder)
 
-    experiment = prepare(load_scenario(scenario, settings=settings or ()))
+    experiment = prepare(load_understood(scenario, settings=settings or ()))
     delivery = Delivery(out, quiet, as_json)
     names = tuple(study.shown(scenario, settings or ()))
     delivery.say(wrap(str(delay_verdict(experiment))))

@@ -13,6 +13,7 @@ it takes to plan no longer grows with the number of periods.
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,21 +75,41 @@ def plan_catch_up(
     Raises:
         ConfigError: with the given duration the plate would leave its workspace.
     """
+
+    def attempt(periods: int, limit: float) -> Trajectory | None:
+        return _plan(dynamics, reference, start, t_start, period, periods, limit)
+
+    motion, span = shortest(attempt, period, duration, torque_limit)
+    return (reference, 0.0) if motion is None else (motion, span)
+
+
+def shortest(
+    attempt: Callable[[int, float], Trajectory | None],
+    period: float,
+    duration: float | None,
+    torque_limit: float | None,
+) -> tuple[Trajectory | None, float]:
+    """The plan of the duration that was asked for, or the shortest one there is, and its s.
+
+    Args:
+        attempt: a plan of so many periods within so many N m, or None.
+        period: s.
+        duration, torque_limit: as of `plan_catch_up`.
+
+    Raises:
+        ConfigError: there is none of the given duration.
+    """
     wanted = DEFAULT_CATCH_UP if duration is None else duration
     fewest = 2 if torque_limit is not None and duration is None else _periods(wanted, period)
     most = fewest if duration is not None else _periods(LONGEST_CATCH_UP, period)
     limit = math.inf if torque_limit is None or duration is not None else HEADROOM * torque_limit
-
-    def attempt(periods: int) -> Trajectory | None:
-        return _plan(dynamics, reference, start, t_start, period, periods, limit)
-
     # What n periods can do, more can do with less torque: double n, then halve the bracket.
-    failed, periods, motion = fewest - 1, fewest, attempt(fewest)
+    failed, periods, motion = fewest - 1, fewest, attempt(fewest, limit)
     while motion is None and periods < most:
         failed, periods = periods, min(2 * periods, most)
-        motion = attempt(periods)
+        motion = attempt(periods, limit)
     if motion is None and duration is None:
-        return reference, 0.0
+        return None, 0.0
     if motion is None:
         raise ConfigError(
             f"controller.catch_up: got {duration:g} s, with which the plate would leave its "
@@ -96,7 +117,7 @@ def plan_catch_up(
         )
     while periods - failed > 1:
         middle = (failed + periods) // 2
-        shorter = attempt(middle)
+        shorter = attempt(middle, limit)
         if shorter is None:
             failed = middle
         else:

@@ -92,3 +92,15 @@ def state_within_hold(change: Array, B: Array, period: float, passed: float) -> 
     return np.concatenate(
         [period * left * (1 - 2 * passed) / 12 * push, (1 / 12 - left / 2) * push]
     )
+
+
+def cubic(start: Array, end: Array, h: float, s: float) -> tuple[Array, Array]:
+    """Pose and rates (6,) when the share s of h seconds is over, between two states (12,).
+
+    The cubic through both; the same for crank angles and their rates.
+    """
+    rise, v_0, v_1 = (end[POSE] - start[POSE]) / h, start[RATES], end[RATES]
+    a, b = v_0 - rise, v_1 - rise
+    left = 1 - s
+    pose = left * start[POSE] + s * end[POSE] + h * s * left * (left * a - s * b)
+    return pose, rise + left * (1 - 3 * s) * a + s * (3 * s - 2) * b

@@ -23,7 +23,7 @@ from scipy.special import chdtri
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import THETA, Estimate
 from stewart_drake.law.filter_settings import FilterSettings, ParameterSet
-from stewart_drake.law.holds import GAUSS_NODES
+from stewart_drake.law.holds import GAUSS_NODES, cubic
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.sensing import FirstState, Sensing
 from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
@@ -236,7 +236,7 @@ def transitions(
     for torque, h, end in zip(period.torques, period.durations, ends, strict=True):
         L = np.zeros((len(nodes), *total.shape))
         for place, node in zip(L, nodes, strict=True):
-            pose, rates = _within_hold(x, end, h, node)
+            pose, rates = cubic(x, end, h, node)
             derivatives = dynamics.derivatives(pose, rates, torque, theta)
             place[:NUM_STATE, :NUM_STATE], place[:NUM_STATE, THETA] = derivatives.A, derivatives.G
         omega = h * L.mean(axis=0)
@@ -245,15 +245,6 @@ def transitions(
         x, total = end, expm(omega) @ total
         totals.append(total)
     return ends, np.array(totals)
-
-
-def _within_hold(start: Array, end: Array, h: float, s: float) -> tuple[Array, Array]:
-    """Pose and rates (6,) when the share s of h seconds is over: the cubic through both states."""
-    rise, v_0, v_1 = (end[POSE] - start[POSE]) / h, start[RATES], end[RATES]
-    a, b = v_0 - rise, v_1 - rise
-    left = 1 - s
-    pose = left * start[POSE] + s * end[POSE] + h * s * left * (left * a - s * b)
-    return pose, rise + left * (1 - 3 * s) * a + s * (3 * s - 2) * b
 
 
 def within_bounds(mean: Array, covariance: Array, parameters: ParameterSet) -> Array:

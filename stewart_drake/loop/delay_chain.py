@@ -2,12 +2,12 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.signals import NUM_TORQUES
+from stewart_drake.scenario.signals import CARRIED, Carried
 from stewart_drake.scenario.timing import event_time
 
 Array = NDArray[np.float64]
@@ -31,38 +31,42 @@ class DelayChain(LeafSystem):
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
-    | commanded | input | 6 | N m | read every period |
-    | torque | output | 6 | N m | piecewise constant |
+    | commanded | input | 6, or n | N m | read every period |
+    | torque, or `carries` | output | the same | N m | piecewise constant |
+    | arrived | output | 1, with commands | s, when that arrived; NaN for nothing yet | the same |
 
     Args:
         period: dt in s.
         steps: mu.
         fraction: eta0 / dt, in [0, 1).
-        queue: (L, 6) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
+        queue: (L, n) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
+        carries: what it delays: torques, of six motors, or commands to servos.
 
     Raises:
         ValueError: a queue of the wrong shape.
     """
 
-    def __init__(self, period: float, steps: int, fraction: float, queue: Array) -> None:
+    def __init__(
+        self, period: float, steps: int, fraction: float, queue: Array, carries: Carried = "torque"
+    ) -> None:
         super().__init__()
-        length = Delay(steps, fraction).queue_length
+        length, size = Delay(steps, fraction).queue_length, CARRIED[carries]
         queue = np.asarray(queue, dtype=np.float64)
-        if queue.shape != (length, NUM_TORQUES):
-            raise ValueError(f"queue: got shape {queue.shape}; expected {(length, NUM_TORQUES)}")
+        if queue.shape != (length, size):
+            raise ValueError(f"queue: got shape {queue.shape}; expected {(length, size)}")
         # `line` is [applied; waiting ...]: T_{k-mu} ... T_k after the update at k dt, with the
         # applied torque kept apart because it changes eta0 later than the rest.
-        self._fraction = fraction
-        applied = queue[0] if length > 0 else np.zeros(NUM_TORQUES)
+        self._fraction, self._size = fraction, size
+        applied = queue[0] if length > 0 else np.zeros(size)
         waiting = queue[1:] if fraction > 0 else queue
         self._applied = self.DeclareDiscreteState(applied)
-        self._waiting = self.DeclareDiscreteState(
-            np.vstack([np.zeros(NUM_TORQUES), waiting]).ravel()
-        )
-        self._commanded = self.DeclareVectorInputPort("commanded", NUM_TORQUES)
-        self.DeclareVectorOutputPort(
-            "torque", NUM_TORQUES, weak(self._output), {self.discrete_state_ticket(self._applied)}
-        )
+        self._waiting = self.DeclareDiscreteState(np.vstack([np.zeros(size), waiting]).ravel())
+        began = (fraction - 1) * period if fraction > 0 else 0.0
+        self._arrived = self.DeclareDiscreteState([began if length > 0 else np.nan])
+        self._commanded = self.DeclareVectorInputPort("commanded", size)
+        self._put_out(carries, size, self._applied)
+        if carries == "command":
+            self._put_out("arrived", 1, self._arrived)
         update_every(self, period, self._take)
         if fraction > 0:
             self.DeclarePeriodicUnrestrictedUpdateEvent(
@@ -71,14 +75,21 @@ class DelayChain(LeafSystem):
 
     def _take(self, context: Context, state: State) -> None:
         waiting = context.get_discrete_state(self._waiting).value()
-        moved = np.concatenate([waiting[NUM_TORQUES:], self._commanded.Eval(context)])
+        moved = np.concatenate([waiting[self._size :], self._commanded.Eval(context)])
         state.get_mutable_discrete_state(self._waiting).SetFromVector(moved)
         if self._fraction == 0:
-            state.get_mutable_discrete_state(self._applied).SetFromVector(moved[:NUM_TORQUES])
+            self._apply(moved, context, state)
 
     def _release(self, context: Context, state: State) -> None:
-        waiting = context.get_discrete_state(self._waiting).value()
-        state.get_mutable_discrete_state(self._applied).SetFromVector(waiting[:NUM_TORQUES])
+        self._apply(context.get_discrete_state(self._waiting).value(), context, state)
 
-    def _output(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._applied).value())
+    def _apply(self, waiting: Array, context: Context, state: State) -> None:
+        state.get_mutable_discrete_state(self._applied).SetFromVector(waiting[: self._size])
+        state.get_mutable_discrete_state(self._arrived).SetFromVector([context.get_time()])
+
+    def _put_out(self, name: str, size: int, index: DiscreteStateIndex) -> None:
+        ticket = self.discrete_state_ticket(index)
+        self.DeclareVectorOutputPort(name, size, weak(self._output, index), {ticket})
+
+    def _output(self, index: DiscreteStateIndex, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(index).value())

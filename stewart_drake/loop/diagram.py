@@ -40,10 +40,18 @@ from stewart_drake.loop.platforms import add_to_torque
 from stewart_drake.loop.playout import PlayoutBuffer
 from stewart_drake.loop.reference import Reference
 from stewart_drake.loop.sensor import Sensor
+from stewart_drake.loop.servo_controller import ServoController
+from stewart_drake.loop.servo_design import commands_in_flight, servo_law, servo_loop
+from stewart_drake.loop.servos import Servos
 from stewart_drake.loop.start_check import StartCheck
 from stewart_drake.loop.tuner import AnnTuner
 from stewart_drake.loop.varying_delay import VaryingDelay, declare_constant
-from stewart_drake.scenario.config import EncoderSensorConfig, NetworkConfig, Scenario
+from stewart_drake.scenario.config import (
+    EncoderSensorConfig,
+    NetworkConfig,
+    Scenario,
+    ServoActuatorConfig,
+)
 from stewart_drake.scenario.link import (
     measurement_times,
     number_sent,
@@ -57,6 +65,7 @@ from stewart_drake.scenario.signals import (
     POSE,
     RATES,
     SIGNALS,
+    Carried,
     exported_ports,
 )
 
@@ -71,12 +80,13 @@ class ClosedLoop(Diagram):
     """The whole loop; output ports are named after the signals.
 
     Subsystems: `reference`, `sensor`, `weights` or `tuner`, `controller`, `saturation`,
-    `delay_chain`, `torque_bias`, `plant`, `density`; with the user's own `own_controller`,
-    `disturbance`, `disturbed_torque`. Output ports: `state`, `reference`,
-    `torque_commanded` (what the law asks for), `torque_applied` (what arrives of it: within the
-    motors' limit, late, before the bias), `integral`, `weights_used`, `parameters`,
-    `parameter_std`, `density`, `measurement` (held, as the controller read it), `state_estimate`,
-    `delay_estimate`, `delay_std`, `delay_true` (of the torque sent last), `packets`.
+    `delay_chain`, `torque_bias`, `plant`, `density`; with servos `servos`, without `weights` and
+    `saturation`; with the user's own `own_controller`, `disturbance`, `disturbed_torque`. Output
+    ports: `state`, `reference`, `torque_commanded` (what the law asks for, or the servos did),
+    `torque_applied` (what acts of it: within the motors' limit, late, before the bias),
+    `integral`, `weights_used`, `parameters`, `parameter_std`, `density`, `measurement` (held, as
+    the controller read it), `state_estimate`, `delay_estimate`, `delay_std`, `delay_true` (of the
+    torque sent last), `packets`.
 
     Attributes:
         experiment: what it was built from.
@@ -121,6 +131,20 @@ def build_closed_loop(
     experiment.own.claim()
     builder = DiagramBuilder()
     _add_surroundings(builder, experiment, meshcat)
+    if isinstance(experiment.scenario.actuator, ServoActuatorConfig):
+        catch_up = _add_servos(builder, experiment)
+    else:
+        catch_up = _add_torques(builder, experiment)
+    _connect_loop(builder, experiment)
+    loop = ClosedLoop()
+    builder.BuildInto(loop)
+    loop.set_name("closed_loop")
+    loop.experiment, loop.catch_up = experiment, catch_up
+    return loop
+
+
+def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
+    """A controller that sends torques, their limit and their delay; the law's catch-up, s."""
     channel: Channel = Wire()
     reports, catch_up = 1, 0.0
     if "controller" in experiment.own.systems:
@@ -132,12 +156,46 @@ def build_closed_loop(
     limit = np.full(link.GetInputPort("commanded").size(), experiment.torque_limit)
     builder.AddNamedSystem("saturation", Saturation(-limit, limit))
     builder.AddNamedSystem("delay_chain", link)
-    _connect_loop(builder, experiment)
-    loop = ClosedLoop()
-    builder.BuildInto(loop)
-    loop.set_name("closed_loop")
-    loop.experiment, loop.catch_up = experiment, catch_up
-    return loop
+    sends = builder.GetSubsystemByName("controller").HasOutputPort("plan")
+    wanted = builder.GetSubsystemByName("controller").GetOutputPort("plan" if sends else "torque")
+    limited = builder.GetSubsystemByName("saturation")
+    builder.Connect(wanted, limited.get_input_port())
+    builder.Connect(limited.get_output_port(), link.GetInputPort("commanded"))
+    return catch_up
+
+
+def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
+    """The law for servos, the delay of its commands, and the servos; its catch-up, s.
+
+    Raises:
+        ConfigError: a controller or a link of the user's own, which are for torques.
+    """
+    for role in ("controller", "link"):
+        if role in experiment.own.systems:
+            raise ConfigError(
+                f"actuator.kind: got 'servo' with a {role} of your own; expected 'torque'"
+            )
+    sc, machine = experiment.scenario, StewartDynamics(experiment.truth)
+    law, planned, catch_up = servo_law(experiment)
+    first, believed = commands_in_flight(experiment, law, law.timeline.delay)
+    last = believed[-1] if len(believed) else first
+    controller = builder.AddNamedSystem("controller", ServoController(law, last))
+    reference = builder.AddNamedSystem(
+        "reference", Reference(experiment.reference, planned, law.preview_times)
+    )
+    builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
+    _, flying = commands_in_flight(experiment, law, sc.true_delay)
+    chain = builder.AddNamedSystem("delay_chain", _wire(experiment, flying, "command"))
+    builder.Connect(controller.GetOutputPort("command"), chain.GetInputPort("commanded"))
+    servos = builder.AddNamedSystem(
+        "servos",
+        Servos(servo_loop(experiment), machine, first, sc.controller.period, law.reports),
+    )
+    for port in ("command", "arrived"):
+        builder.Connect(chain.GetOutputPort(port), servos.GetInputPort(port))
+    plant = builder.GetSubsystemByName("plant")
+    builder.Connect(plant.GetOutputPort("state"), servos.GetInputPort("state"))
+    return catch_up
 
 
 def _add_surroundings(
@@ -186,15 +244,12 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
     def into(target: str, port: str) -> InputPort:
         return builder.GetSubsystemByName(target).GetInputPort(port)
 
-    saturation, bias = (builder.GetSubsystemByName(name) for name in ("saturation", "torque_bias"))
+    bias, motors = builder.GetSubsystemByName("torque_bias"), _motors(builder)
     measured = _measured(builder, experiment)
     builder.Connect(measured, into("controller", "measurement"))
     if "controller" in experiment.own.systems:
         builder.Connect(measured, into("own_controller", "measurement"))
-    sends = builder.GetSubsystemByName("controller").HasOutputPort("plan")
-    builder.Connect(out("controller", "plan" if sends else "torque"), saturation.get_input_port())
-    builder.Connect(saturation.get_output_port(), into("delay_chain", "commanded"))
-    builder.Connect(out("delay_chain", "torque"), bias.get_input_port())
+    builder.Connect(motors.GetOutputPort("torque"), bias.get_input_port())
     _disturb(builder, experiment, bias.get_output_port())
     builder.Connect(out("plant", "state"), into("sensor", "state"))
     encoders = isinstance(experiment.scenario.sensor, EncoderSensorConfig)
@@ -210,8 +265,9 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
         builder.AddNamedSystem("start_check", StartCheck(experiment.start))
         builder.Connect(out("plant", "state"), into("start_check", "state"))
     for name, (source, port) in exported_ports().items():
-        if builder.GetSubsystemByName(source).HasOutputPort(port):
-            builder.ExportOutput(out(source, port), name)
+        system = motors if name == "torque_applied" else builder.GetSubsystemByName(source)
+        if system.HasOutputPort(port):
+            builder.ExportOutput(system.GetOutputPort(port), name)
         else:  # of a system of one's own
             size = sum(s.size for s in SIGNALS.values() if s.exported == name)
             unknown = ConstantVectorSource(np.full(size, np.nan))
@@ -219,12 +275,18 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
             builder.ExportOutput(unknown.get_output_port(), name)
 
 
+def _motors(builder: DiagramBuilder) -> System:
+    """Whose torque acts: the servos' where there are some, else what comes over the link."""
+    servos = builder.HasSubsystemNamed("servos")
+    return builder.GetSubsystemByName("servos" if servos else "delay_chain")
+
+
 def _measured(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
     """Where the controller has its measurements from: the sensor, or what they are delayed by."""
     sc, controller = experiment.scenario, builder.GetSubsystemByName("controller")
     measured = builder.GetSubsystemByName("sensor").GetOutputPort("measurement")
-    link = builder.GetSubsystemByName("delay_chain")
-    report = link.GetOutputPort("report") if link.HasOutputPort("report") else None
+    motors = _motors(builder)
+    report = motors.GetOutputPort("report") if motors.HasOutputPort("report") else None
     times = measurement_times(sc)
     if np.any(times != 0):
 
@@ -240,11 +302,9 @@ def _measured(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
             builder.Connect(way.GetOutputPort("age"), controller.GetInputPort("age"))
         if report is not None:
             report = late("late_report", report).GetOutputPort("measurement")
-    if report is not None and controller.HasInputPort("report"):
-        link_config = sc.link
-        assert isinstance(link_config, NetworkConfig)
-        if link_config.acknowledged:
-            builder.Connect(report, controller.GetInputPort("report"))
+    told = not isinstance(sc.link, NetworkConfig) or sc.link.acknowledged
+    if report is not None and told and controller.HasInputPort("report"):
+        builder.Connect(report, controller.GetInputPort("report"))
     return measured
 
 
@@ -340,12 +400,19 @@ def _link(experiment: Experiment, channel: Channel, reports: int) -> System:
             dry=sc.link.dry,
             history=reports,
         )
-    if sc.delay.constant:
-        chain = DelayChain(period, delay.steps, delay.fraction, queue)
-        declare_constant(chain, "delay", np.array([sc.eta]))  # for the record alone
-        declare_constant(chain, "packets", np.full(len(PACKETS), np.nan))
-        return chain
-    return VaryingDelay(period, torque_delays(sc), delay, queue)
+    return _wire(experiment, queue, "torque")
+
+
+def _wire(experiment: Experiment, queue: Array, carries: Carried) -> System:
+    """A wire, with what is under way on it at t = 0, (L, n)."""
+    sc, delay = experiment.scenario, experiment.scenario.true_delay
+    period = sc.controller.period
+    if not sc.delay.constant:
+        return VaryingDelay(period, torque_delays(sc), delay, queue, carries)
+    chain = DelayChain(period, delay.steps, delay.fraction, queue, carries)
+    declare_constant(chain, "delay", np.array([sc.eta]))  # for the record alone
+    declare_constant(chain, "packets", np.full(len(PACKETS), np.nan))
+    return chain
 
 
 def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | MultibodyStewart:

@@ -57,12 +57,14 @@ from stewart_drake.loop.own import NOTHING, Own, take
 from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint
+from stewart_drake.mechanism.rotors import with_rotors
 from stewart_drake.native.layout import plate_radius
 from stewart_drake.scenario.config import (
     AnnTunerConfig,
     EncoderSensorConfig,
     NetworkConfig,
     Scenario,
+    ServoActuatorConfig,
 )
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.known import DELAY, OFFSETS, Known, load_known
@@ -218,10 +220,11 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     """
     scenario.check()
     network = _network(scenario)
-    mechanism = load_mechanism(scenario.mechanism)
+    drawn = load_mechanism(scenario.mechanism)
     known = known_of(scenario)
     if known is not None:
-        _check_known(known, scenario, mechanism)
+        _check_known(known, scenario, drawn)
+    mechanism = _with_motors(drawn, scenario)
     if own.reference is None:
         reference = make_reference(scenario.reference, scenario.duration)
         span = peak_to_peak(scenario.reference, reference, scenario.duration)
@@ -234,7 +237,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     return Experiment(
         scenario=scenario,
         mechanism=mechanism,
-        truth=simulated_machine(scenario) if truth is None else truth,
+        truth=_with_motors(simulated_machine(scenario) if truth is None else truth, scenario),
         reference=reference,
         peak_to_peak=span,
         nominal=StewartDynamics(
@@ -252,6 +255,14 @@ def estimated(scenario: Scenario) -> tuple[str, ...]:
     c = scenario.controller
     finds_offsets = c.estimate_offsets and c.estimator == "parameters"
     return (*PARAMETERS, *OFFSETS) if finds_offsets else PARAMETERS
+
+
+def _with_motors(mechanism: Mechanism, scenario: Scenario) -> Mechanism:
+    """The machine with the rotors of its servos."""
+    actuator = scenario.actuator
+    if not isinstance(actuator, ServoActuatorConfig):
+        return mechanism
+    return with_rotors(mechanism, actuator.reflected_inertia)
 
 
 def simulated_machine(scenario: Scenario) -> Mechanism:
@@ -412,8 +423,17 @@ def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
 
 
 def compose_law(experiment: Experiment) -> PredictiveLqi:
-    """The parts that a scenario asks for; the only place that knows their names in it."""
+    """The parts that a scenario asks for; the only place that knows their names in it.
+
+    Raises:
+        ConfigError: it asks for no law that sends torques; see `loop.servo_design`.
+    """
     sc, nominal = experiment.scenario, experiment.nominal
+    if sc.controller.command != "torque":
+        raise ConfigError(
+            f"controller.command: got {sc.controller.command!r}; expected 'torque', for a law that "
+            "closes its loop across the delay"
+        )
     c, motion = sc.controller, motion_scale(experiment)
     timeline = Timeline(c.period, believed_delay(sc))
     substeps = choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 from weakref import WeakSet
 
 from pydrake.systems.framework import InputPort, OutputPort, PortDataType, System
@@ -10,6 +10,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.scenario.signals import (
     NUM_REFERENCE,
     NUM_STATE,
@@ -21,8 +22,10 @@ from stewart_drake.scenario.signals import (
 OwnSystem = System | Callable[[], System]
 """A system, which serves one run, or what makes one, such as its class."""
 OwnReference = Trajectory | Callable[[], Trajectory]
-OwnLaw = Callable[[PredictiveLqi], PredictiveLqi]
-"""Takes the law that the scenario asks for; returns the one to be used."""
+OwnLaw = Callable[[Any], Any]
+"""Takes the law that the scenario asks for, a `PredictiveLqi`, or `ServoPreview` for servos;
+returns the one to be used, of that class."""
+AnyLaw = TypeVar("AnyLaw", PredictiveLqi, ServoPreview)
 
 
 class Role(NamedTuple):
@@ -106,7 +109,7 @@ class Own(NamedTuple):
                 )
             _used.add(system)
 
-    def revised(self, law: PredictiveLqi) -> PredictiveLqi:
+    def revised(self, law: AnyLaw) -> AnyLaw:
         """The law to be used in the place of the scenario's.
 
         Raises:
@@ -114,10 +117,10 @@ class Own(NamedTuple):
         """
         if self.law is None:
             return law
-        made = self.law(law)
-        if not isinstance(made, PredictiveLqi):
+        made, kind = self.law(law), type(law)
+        if not isinstance(made, kind):
             raise ConfigError(
-                f"law: got a {type(made).__name__} from the function; expected a PredictiveLqi, "
+                f"law: got a {type(made).__name__} from the function; expected a {kind.__name__}, "
                 "such as dataclasses.replace(law, ...)"
             )
         return made

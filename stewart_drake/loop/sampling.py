@@ -9,7 +9,12 @@ from stewart_drake.loop.lifetime import weak
 from stewart_drake.scenario.timing import event_time
 
 
-def update_every(system: LeafSystem, period: float, update: Callable[[Context, Any], None]) -> None:
+def update_every(
+    system: LeafSystem,
+    period: float,
+    update: Callable[[Context, Any], None],
+    when: Callable[[float], float] = event_time,
+) -> None:
     """Call a method of `system` at t = 0 and every `period` s, before a plant steps out of there.
 
     The first call is at initialisation, ahead of all periodic events: nothing else is earlier than
@@ -20,8 +25,9 @@ def update_every(system: LeafSystem, period: float, update: Callable[[Context, A
         system: in its constructor.
         period: s.
         update: takes a Context and the State to be changed.
+        when: how early, of the functions in `scenario.timing`.
     """
-    call, early = weak(update), event_time(period)
+    call, early = weak(update), when(period)
 
     def first(context: Context, state: Any) -> EventStatus:
         call(context, state)

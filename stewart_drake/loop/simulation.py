@@ -115,7 +115,8 @@ def simulate(
             tuner=tuner,
         )
         if isinstance(margin, bool):
-            judgeable = margin and experiment.own.unjudged is None
+            torques = experiment.scenario.controller.command == "torque"  # else no loop to judge
+            judgeable = margin and torques and experiment.own.unjudged is None
             judged = controller_margin(experiment) if judgeable else None
         else:
             judged = margin

@@ -4,13 +4,13 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import acting
-from stewart_drake.scenario.signals import NUM_TORQUES, PACKETS
+from stewart_drake.scenario.signals import CARRIED, PACKETS, Carried
 from stewart_drake.scenario.timing import event_time
 
 Array = NDArray[np.float64]
@@ -37,8 +37,9 @@ class VaryingDelay(LeafSystem):
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
-    | commanded | input | 6 | N m | read every period |
-    | torque | output | 6 | N m | piecewise constant |
+    | commanded | input | 6, or n | N m | read every period |
+    | torque, or `carries` | output | the same | N m | piecewise constant |
+    | arrived | output | 1, with commands | s, when that arrived; NaN for nothing yet | the same |
     | delay | output | 1 | s, of the torque sent last | held |
     | packets | output | 5 | 1, NaN: nothing is sent in packets | constant |
 
@@ -46,18 +47,26 @@ class VaryingDelay(LeafSystem):
         period: dt in s.
         delays: (n,) eta_k of T_0 to T_{n-1}, s; the last of them stays.
         delay: mu and eta0, those of the torques sent before t = 0.
-        queue: (L, 6) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
+        queue: (L, n) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
+        carries: as of `DelayChain`.
 
     Raises:
         ValueError: a queue of the wrong shape, a delay that is negative or no number.
     """
 
-    def __init__(self, period: float, delays: Array, delay: Delay, queue: Array) -> None:
+    def __init__(
+        self,
+        period: float,
+        delays: Array,
+        delay: Delay,
+        queue: Array,
+        carries: Carried = "torque",
+    ) -> None:
         super().__init__()
         queue, delays = np.asarray(queue, np.float64), np.asarray(delays, np.float64)
-        length = delay.queue_length
-        if queue.shape != (length, NUM_TORQUES):
-            raise ValueError(f"queue: got shape {queue.shape}; expected {(length, NUM_TORQUES)}")
+        length, size = delay.queue_length, CARRIED[carries]
+        if queue.shape != (length, size):
+            raise ValueError(f"queue: got shape {queue.shape}; expected {(length, size)}")
         if delays.ndim != 1 or not len(delays) or not np.all(delays >= 0):
             raise ValueError("delays: got an empty or negative one; expected (n,) of at least 0 s")
         self._delays = np.where(delays > _TOGETHER * period, delays, 0.0)
@@ -70,16 +79,20 @@ class VaryingDelay(LeafSystem):
         # Sent by the time each of them acts, and one more where both fall on a sample.
         sent_by_then = np.floor(times / period + _TOGETHER) + 1
         kept = int(np.max(sent_by_then - self._numbers, initial=1)) + 1
-        sent = np.zeros((max(kept, length + 1), NUM_TORQUES))
+        sent = np.zeros((max(kept, length + 1), size))
         sent[len(sent) - length :] = queue
-        first = self._numbers[(times <= 0) & (self._numbers < 0)]
-        applied = queue[first[-1] + length] if len(first) else np.zeros(NUM_TORQUES)
+        at_first = (times <= 0) & (self._numbers < 0)
+        first = self._numbers[at_first]
+        applied = queue[first[-1] + length] if len(first) else np.zeros(size)
         self._applied = self.DeclareDiscreteState(applied)
-        self._sent = self.DeclareDiscreteState(sent.ravel())
+        self._size, self._sent = size, self.DeclareDiscreteState(sent.ravel())
+        began = times[at_first][-1] if len(first) else np.nan
+        self._arrived = self.DeclareDiscreteState([began])
         self._taken = self.DeclareDiscreteState(1)
-        self._commanded = self.DeclareVectorInputPort("commanded", NUM_TORQUES)
-        applied_ticket = self.discrete_state_ticket(self._applied)
-        self.DeclareVectorOutputPort("torque", NUM_TORQUES, weak(self._output), {applied_ticket})
+        self._commanded = self.DeclareVectorInputPort("commanded", size)
+        self._put_out(carries, size, self._applied)
+        if carries == "command":
+            self._put_out("arrived", 1, self._arrived)
         taken_ticket = self.discrete_state_ticket(self._taken)
         self.DeclareVectorOutputPort("delay", 1, weak(self._delay), {taken_ticket})
         declare_constant(self, "packets", np.full(len(PACKETS), np.nan))
@@ -93,19 +106,27 @@ class VaryingDelay(LeafSystem):
         number = int(context.get_discrete_state(self._taken).value()[0])
         sent = context.get_discrete_state(self._sent).value()
         torque = self._commanded.Eval(context)
-        moved = np.concatenate([sent[NUM_TORQUES:], torque])
+        moved = np.concatenate([sent[self._size :], torque])
         state.get_mutable_discrete_state(self._sent).SetFromVector(moved)
         state.get_mutable_discrete_state(self._taken).SetFromVector([number + 1])
         if number in self._at_once:
-            state.get_mutable_discrete_state(self._applied).SetFromVector(torque)
+            self._apply(torque, context, state)
 
     def _arrive(self, number: int, context: Context, state: State) -> None:
         taken = int(context.get_discrete_state(self._taken).value()[0])
-        sent = context.get_discrete_state(self._sent).value().reshape(-1, NUM_TORQUES)
-        state.get_mutable_discrete_state(self._applied).SetFromVector(sent[number - taken])
+        sent = context.get_discrete_state(self._sent).value().reshape(-1, self._size)
+        self._apply(sent[number - taken], context, state)
 
-    def _output(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._applied).value())
+    def _apply(self, torque: Array, context: Context, state: State) -> None:
+        state.get_mutable_discrete_state(self._applied).SetFromVector(torque)
+        state.get_mutable_discrete_state(self._arrived).SetFromVector([context.get_time()])
+
+    def _put_out(self, name: str, size: int, index: DiscreteStateIndex) -> None:
+        ticket = self.discrete_state_ticket(index)
+        self.DeclareVectorOutputPort(name, size, weak(self._output, index), {ticket})
+
+    def _output(self, index: DiscreteStateIndex, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(index).value())
 
     def _delay(self, context: Context, output: BasicVector) -> None:
         taken = int(context.get_discrete_state(self._taken).value()[0])

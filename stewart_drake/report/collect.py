@@ -17,7 +17,7 @@ from stewart_drake.report.analyses import analyze
 from stewart_drake.report.answer import Answer
 from stewart_drake.report.figures import TORQUE_CONTROLLERS
 from stewart_drake.scenario.config import AnnTunerConfig, Scenario
-from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.loading import load_understood
 from stewart_drake.studies.compare import shown
 from stewart_drake.studies.jobs import Job, run_jobs
 from stewart_drake.tuner.network import DEFAULT
@@ -68,7 +68,7 @@ def collect(
         KeyboardInterrupt: Ctrl-C.
     """
     settings = tuple(settings)
-    scenario = load_scenario(scenario_name, settings=settings)
+    scenario = load_understood(scenario_name, settings=settings)
     failure = reference_failure(assemble(scenario))
     scenarios: dict[str, Scenario] = {}
     rows: set[str] = set()
@@ -80,7 +80,7 @@ def collect(
         if has_network(scenario):
             tuned = (*settings, "tuner.kind=ann")
             for name in TORQUE_CONTROLLERS:
-                scenarios[_TUNED + name] = load_scenario(scenario_name, name, tuned)
+                scenarios[_TUNED + name] = load_understood(scenario_name, name, tuned)
     done = _work(scenario, scenarios, progress)
     return Collected(
         scenario=scenario,

@@ -27,7 +27,7 @@ from stewart_drake.scenario.signals import (
     PARAMETERS,
     POSITION,
 )
-from stewart_drake.studies.compare import ADAPTIVE, LABELS
+from stewart_drake.studies.compare import ADAPTIVE, LABELS, SERVOS
 from stewart_drake.studies.compare import label as spoken
 
 Array = NDArray[np.float64]
@@ -78,7 +78,12 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
         return {}
     lines = {spoken(name): style.controller_line(name) for name in results}
     runs = {spoken(name): result for name, result in results.items()}
-    shown = (*TORQUE_CONTROLLERS, ADAPTIVE, *(name for name in results if name not in LABELS))
+    shown = (
+        *TORQUE_CONTROLLERS,
+        ADAPTIVE,
+        *SERVOS,
+        *(name for name in results if name not in LABELS),
+    )
     aware = {name: results[name] for name in shown if name in results}
     with figure_style():
         figures = {"states": _states(runs, lines), "errors": _errors(runs, lines)}

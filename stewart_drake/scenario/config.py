@@ -164,6 +164,10 @@ class ControllerConfig:
         packet_repeats: how many earlier torques it says again, each for a period more of delay.
         catch_up: blend onto the reference after a start from rest, s; 0 is none, null the shortest
             one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
+        command: what is sent to the motors: a `torque` each, or `cranks`: to servos, crank angles
+            and rates of the reference for the instant at which they are reached, and the torque
+            that `feedforward` says. With `cranks` nothing is fed back but what `estimator` finds,
+            and only period, delay, feedforward, estimator and catch_up count.
         delay_estimator: `none`; or the delay is estimated, beginning with the one that is believed
             in, as `constant`, or as `drifting` with a rate of its own.
         delay_std: of that belief, s.
@@ -196,6 +200,7 @@ class ControllerConfig:
     packet_torques: Annotated[int, Field(ge=1, le=100)] = 8
     packet_repeats: Annotated[int, Field(ge=0, le=100)] = 1
     catch_up: Annotated[float, Field(ge=0, le=10)] | None = None
+    command: Literal["torque", "cranks"] = "torque"
     delay_estimator: Literal["none", "constant", "drifting"] = "none"
     delay_std: Annotated[float, Field(ge=1e-3, le=10)] = 0.3
     delay_max: Annotated[float, Field(gt=0, le=10)] = 1.5
@@ -220,7 +225,47 @@ class TorqueActuatorConfig:
     torque_limit: TorqueLimit = None
 
 
-ActuatorConfig = Annotated[TorqueActuatorConfig, ByKind()]
+@dataclass(config=STRICT)
+class ServoActuatorConfig:
+    """Position servos: a local loop at each motor that follows the crank angle which arrives.
+
+    It puts out J (w^2 (a_r - a) + 2 d w (a_r' - a')) and the torque that came with the angle, at
+    least 1000 times a second; w = 2 pi bandwidth, d the damping, J the mean inertia per motor at
+    home, that of the rotors included. See `law.servos`.
+
+    Attributes:
+        kind: `servo`.
+        bandwidth: Hz.
+        damping: relative to critical damping, for an inertia of J.
+        speed_limit: of the angle that is followed, rad/s; null is none.
+        gear_ratio: turns of the rotor per turn of the crank.
+        rotor_inertia: about the rotor's axis, kg m^2; at the crank gear_ratio^2 times as much.
+        torque_limit: at the crank, as of `TorqueActuatorConfig`.
+    """
+
+    kind: Literal["servo"] = "servo"
+    bandwidth: Annotated[float, Field(ge=0.01, le=1e3)] = 10.0
+    damping: Annotated[float, Field(ge=0.01, le=100)] = 0.7
+    speed_limit: Positive | None = None
+    gear_ratio: Annotated[float, Field(ge=1e-3, le=1e4)] = 1.0
+    rotor_inertia: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    torque_limit: TorqueLimit = None
+
+    @property
+    def reflected_inertia(self) -> float:
+        """What the rotor adds to the inertia of its crank, kg m^2."""
+        return self.gear_ratio**2 * self.rotor_inertia
+
+
+ActuatorConfig = Annotated[TorqueActuatorConfig | ServoActuatorConfig, ByKind()]
+
+
+def understanding(
+    command: str, actuator: TorqueActuatorConfig | ServoActuatorConfig
+) -> TorqueActuatorConfig | ServoActuatorConfig:
+    """Motors of the kind that a controller's command is for: these, or others of their limit."""
+    wanted = TorqueActuatorConfig if command == "torque" else ServoActuatorConfig
+    return actuator if isinstance(actuator, wanted) else wanted(torque_limit=actuator.torque_limit)
 
 
 @dataclass(config=STRICT)
@@ -401,14 +446,16 @@ class Scenario:
         duration: of the simulation, s.
         start: `rest` (at the reference's first pose, zero rates) or `on_reference`.
         queue: torques in flight at t = 0: `zero`, `equilibrium`, or `reference` (the inverse
-            dynamics of the reference).
+            dynamics of the reference). With servos the cranks of the first pose, or of the
+            reference, are in flight too, where the controller sends torques with such torques.
         reference, plant, delay, link, controller, actuator, sensor, tuner: the sections; all but
             plant, delay and controller come in kinds, each a class of its own.
         log_period: of the recorded signals, s; null is every 20 ms and every sample of the
             controller. The multibody plant is seen on its own steps only, so that it must be a
             multiple of `plant.time_step`. What is measured of a run does not depend on it.
         compare: what `compare` lays over each controller last, by its name. Another name is one
-            row more, of the shipped or own file that its `controller` says.
+            row more, of the shipped or own file that its `controller` says; `actuator` in a row is
+            laid over that section.
     """
 
     mechanism: Name = "paper"
@@ -490,12 +537,16 @@ class Scenario:
         # Assignment is validated, but a list can also be changed in place.
         validate(Scenario, dataclasses.asdict(self), where)
         for row, change in self.compare.items():
-            fields = {name: value for name, value in change.items() if name != "controller"}
-            validate(ControllerConfig, fields, f"{where}: compare.{row}")
+            place, fields = f"{where}: compare.{row}", dict(change)
+            fields.pop("controller", None)
+            actuator = {"kind": "servo", **fields.pop("actuator", {})}  # which knows every field
+            validate(Scenario, {"actuator": actuator}, place)
+            validate(ControllerConfig, fields, place)
         step = self.plant.time_step if self.plant.kind == "multibody" else None
         for problem in (
             self.reference.problem(),
             _controller_problem(self.controller),
+            self._command_problem(),
             self.sensor.problem(),
             self.link.problem(),
             self._delay_problem(),
@@ -505,6 +556,28 @@ class Scenario:
         ):
             if problem:
                 raise ConfigError(f"{where}: {problem}")
+
+    def _command_problem(self) -> str | None:
+        """Whether the motors understand what they are sent, and who else would have a say."""
+        c, kind = self.controller, self.actuator.kind
+        if c.command == "torque":
+            if kind == "torque":
+                return None
+            return (
+                f"controller.command: got 'torque' with actuator.kind {kind!r}; expected 'cranks', "
+                "as of the controllers servo_preview and servo_feedforward"
+            )
+        for name, got, expected in (
+            ("actuator.kind", kind, "servo"),
+            ("link.kind", self.link.kind, "wire"),
+            ("tuner.kind", self.tuner.kind, "fixed"),
+            ("controller.delay_estimator", c.delay_estimator, "none"),
+        ):
+            if got != expected:
+                return (
+                    f"{name}: got {got!r} with controller.command 'cranks'; expected {expected!r}"
+                )
+        return None
 
     def _step_problem(self, step: float) -> str | None:
         """What does not suit the steps in s of a discrete plant, or None."""

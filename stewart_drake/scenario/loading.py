@@ -14,7 +14,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import absolute_path, is_path, resolve, shipped
 from stewart_drake.files.schema import field_names, plain, sections, spelling
 from stewart_drake.files.yamlio import brief, load_yaml, parse_yaml, validate, yaml_text
-from stewart_drake.scenario.config import ControllerConfig, Scenario
+from stewart_drake.scenario.config import ControllerConfig, Scenario, understanding
 
 _SETTINGS = "settings"
 _FILES = ("file", "known")
@@ -42,6 +42,33 @@ def load_scenario(
     Raises:
         ConfigError: the first problem, in one line.
     """
+    scenario, where = read_scenario(name_or_path, controller, settings)
+    scenario.check(where)
+    return scenario
+
+
+def load_understood(
+    name_or_path: str | Path,
+    controller: str | Path | None = None,
+    settings: Iterable[str] = (),
+) -> Scenario:
+    """As `load_scenario`, with motors that understand the controller whatever the scenario's are.
+
+    What the scenario says of servos is for controllers that send cranks. Others drive the same
+    machine without them, within the same torque limit.
+    """
+    scenario, where = read_scenario(name_or_path, controller, settings)
+    scenario.actuator = understanding(scenario.controller.command, scenario.actuator)
+    scenario.check(where)
+    return scenario
+
+
+def read_scenario(
+    name_or_path: str | Path,
+    controller: str | Path | None = None,
+    settings: Iterable[str] = (),
+) -> tuple[Scenario, str]:
+    """As `load_scenario`, its fields checked one by one only; and what it is, for messages."""
     path = resolve("scenario", name_or_path)
     data = load_yaml(path)
     _drop_foreign_nulls(data)
@@ -52,9 +79,8 @@ def load_scenario(
     overlay = _parse_settings(settings, data)
     for name, change in overlay.items():
         data[name] = _laid_over(name, data.get(name), change)
-    scenario = validate(Scenario, data, str(path))
-    scenario.check(f"{path} with settings" if overlay else str(path))
-    return scenario
+    where = f"{path} with settings" if overlay else str(path)
+    return validate(Scenario, data, str(path)), where
 
 
 def load_controller(name_or_path: str | Path) -> dict[str, Any]:
@@ -87,7 +113,7 @@ def load_comparison(
     """Reads a scenario once for every controller, and for every further row of its `compare`.
 
     What `settings` say of the delay that is believed in does not change a controller that knows of
-    none.
+    none. Each has motors that understand it, see `load_understood`.
 
     Args:
         name_or_path, settings: as of `load_scenario`.
@@ -101,15 +127,17 @@ def load_comparison(
     """
     settings = tuple(settings)
     others = tuple(s for s in settings if not s.strip().startswith("controller.delay_"))
-    changes = load_scenario(name_or_path, settings=settings).compare
+    changes = read_scenario(name_or_path, settings=settings)[0].compare
     rows = {}
     for row in dict.fromkeys([*controllers, *changes]):
         where, change = f"{name_or_path}: compare.{row}", dict(changes.get(row, {}))
-        controller = change.pop("controller", row)
+        controller, actuator = change.pop("controller", row), change.pop("actuator", {})
         blind = load_controller(controller).get("delay_steps") == 0
-        scenario = load_scenario(name_or_path, controller, others if blind else settings)
+        scenario, _ = read_scenario(name_or_path, controller, others if blind else settings)
         changed = dataclasses.asdict(scenario.controller) | change
         scenario.controller = validate(ControllerConfig, changed, where)
+        motors = understanding(scenario.controller.command, scenario.actuator)
+        scenario.actuator = dataclasses.replace(motors, **actuator)
         scenario.check(where)
         rows[row] = scenario
     return rows

@@ -3,7 +3,7 @@
 Nothing else in the package does index arithmetic on these vectors.
 """
 
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 COORDINATES: Final = ("phi", "theta", "psi", "x", "y", "z")
 COORDINATE_NAMES: Final = ("roll", "pitch", "yaw", "x", "y", "z")
@@ -29,6 +29,14 @@ ANGLES: Final = slice(0, 3)
 """Roll, pitch, yaw inside a pose."""
 POSITION: Final = slice(3, 6)
 """xyz inside a pose."""
+
+SETPOINT: Final = slice(0, 12)
+"""Crank angles (6) and rates (6) inside a command to servos, which has the size of a reference."""
+MODEL_TORQUE: Final = slice(12, 18)
+"""Torques (6) inside it."""
+Carried = Literal["torque", "command"]
+CARRIED: Final[dict[Carried, int]] = {"torque": NUM_TORQUES, "command": NUM_REFERENCE}
+"""What can be on the way to the motors, and its size."""
 
 PARAMETERS: Final = (*(f"torque_bias_{leg}" for leg in LEGS), "payload_mass", "joint_damping")
 """Constant plant parameters that nobody tells the controller, in this order."""

@@ -1,5 +1,6 @@
 """Which steps, periods and delays fit each other."""
 
+import math
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
@@ -8,10 +9,14 @@ METRIC_PERIOD: Final = 0.02
 MOST_INSTANTS: Final = 5_000_000
 """In a log of the user's own period; each takes 1 kB of memory."""
 
+SERVO_RATE: Final = 1000.0
+"""Hz; how often at least servos compute their torques."""
+
 LEAST_FRACTION: Final = 1e-9
 """Of a period. A delay's part below it is 0: events so close to each other lose their order."""
 
 _EARLY: Final = 1 - 1e-14
+_SERVO: Final = 1 - 7e-15
 _LOOK: Final = 1 - 5e-15
 
 
@@ -53,12 +58,33 @@ def event_time(nominal: float) -> float:
     return nominal * _EARLY
 
 
+def servo_time(nominal: float) -> float:
+    """As `event_time`, for an event that follows those and still precedes a look at the loop.
+
+    Servos read at once what has just arrived, and the plant what they make of it.
+    """
+    return nominal * _SERVO
+
+
 def look_time(nominal: float) -> float:
     """When to look at a running loop so as to see t = `nominal`.
 
     After the events of that instant, before a discrete plant's step out of it.
     """
     return nominal * _LOOK
+
+
+def servo_ticks(period: float, time_step: float | None) -> int:
+    """Samples of the servos' local loops in a period of the controller, in s.
+
+    As few as make it at least SERVO_RATE a second; with a discrete plant of this step in s every
+    one on a step, which also is the most.
+    """
+    wanted = max(1, math.ceil(period * SERVO_RATE - 1e-9))
+    if time_step is None:
+        return wanted
+    steps = round(period / time_step)
+    return next((n for n in range(wanted, steps) if steps % n == 0), steps)
 
 
 def step_problem(time_step: float, period: float, fraction: float) -> str | None:

@@ -23,8 +23,8 @@ from stewart_drake.loop.experiment import believed_delay
 from stewart_drake.loop.own import OwnReference
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.scenario.config import Scenario, WireConfig
-from stewart_drake.scenario.loading import load_comparison, load_scenario
+from stewart_drake.scenario.config import Scenario, ServoActuatorConfig, WireConfig
+from stewart_drake.scenario.loading import load_comparison, load_understood, read_scenario
 from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.studies.jobs import run_jobs
 
@@ -32,6 +32,8 @@ ADAPTIVE: Final = "adaptive_lqi"
 """Shown beside the others where the delay that they go by is not the true one."""
 CONTROLLERS: Final = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
 """Shipped names, in the order of tables and legends: the paper's four, and ours."""
+SERVOS: Final = ("servo_preview", "servo_feedforward")
+"""Shown beside the others where the machine has servos."""
 LABELS: Final = {
     "lqr": "LQR, delay-blind",
     "lqi": "LQI, delay-blind",
@@ -39,6 +41,8 @@ LABELS: Final = {
     "delay_lqi": "LQI, delay-aware",
     "predictor_lqi": "LQI, predictor",
     "adaptive_lqi": "LQI, delay found",
+    "servo_preview": "servos",
+    "servo_feedforward": "servos, torque sent",
 }
 PAPER_ERRORS: Final = {"lqr": None, "lqi": None, "delay_lqr": 225.0, "delay_lqi": 80.0}
 """E_ac in % s that the paper reports in its Table II, None where it reports a failure."""
@@ -90,7 +94,7 @@ def compare(
     settings, controllers = tuple(settings), dict(controllers or {})
     _check_makers(controllers, reference, disturbance)
     scenarios = shown(scenario_name, settings)
-    scenarios |= {name: load_scenario(scenario_name, settings=settings) for name in controllers}
+    scenarios |= {name: load_understood(scenario_name, settings=settings) for name in controllers}
     given = {
         name: {
             "controller": controllers.get(name),
@@ -130,19 +134,23 @@ def shown(scenario_name: str | Path, settings: Iterable[str] = ()) -> dict[str, 
     """Scenarios of the shipped controllers, then of the rows that the scenario's `compare` adds.
 
     ADAPTIVE is among them where the others' delay is not the true one, or changes, unless the
-    scenario is one that it is not for.
+    scenario is one that it is not for. SERVOS are where the scenario's motors are servos.
 
     Raises:
         ConfigError: bad input.
     """
     settings = tuple(settings)
-    rows = load_comparison(scenario_name, CONTROLLERS, settings)
+    rows, further = load_comparison(scenario_name, CONTROLLERS, settings), list[str]()
     aware = rows["predictor_lqi"]
     known = aware.delay.constant and believed_delay(aware) == aware.true_delay
     at_once = isinstance(aware.link, WireConfig) and aware.sensor.delay == 0
-    if known or not at_once or aware.controller.estimate_offsets:
+    if not known and at_once and not aware.controller.estimate_offsets:
+        further.append(ADAPTIVE)
+    if isinstance(read_scenario(scenario_name, settings=settings)[0].actuator, ServoActuatorConfig):
+        further += SERVOS
+    if not further:
         return rows
-    return load_comparison(scenario_name, (*CONTROLLERS, ADAPTIVE), settings)
+    return load_comparison(scenario_name, (*CONTROLLERS, *further), settings)
 
 
 def label(name: str) -> str:

@@ -4,13 +4,15 @@
     python -m tests.recorded.runs paper/lqi/exact ...   # these rows anew, after a deliberate change
 
 A row holds what the controller was given and what it answered at its first samples, so that the
-law can be checked step by step without a plant, and the loop as a whole.
+law can be checked step by step without a plant, and the loop as a whole. With servos a measurement
+has what they report of the last period at its end, and the answers are commands (n, 18).
 """
 
 import hashlib
 import sys
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,10 +21,11 @@ from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from pydrake.systems.analysis import Simulator
 from scipy.linalg import expm
 
-import stewart_drake as sd
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.loop.simulation import make_simulator
+from stewart_drake.scenario.loading import load_controller, load_understood
+from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES
 from stewart_drake.scenario.timing import event_time, look_time
 from tests.backends import switched
 
@@ -30,6 +33,8 @@ Array = NDArray[np.float64]
 FILE = Path(__file__).with_name("torques.npz")
 SAMPLES = 60
 """At the most; a plate that leaves its workspace ends the row."""
+SERVO_SAMPLES = 20
+"""As many where servos report."""
 ROWS = tuple(
     f"{scenario}/{controller}/{kind}"
     for scenario in shipped("scenario")
@@ -38,15 +43,47 @@ ROWS = tuple(
 )
 
 
+def is_servo(row: str) -> bool:
+    """Whether it is of a controller for servos."""
+    return load_controller(row.split("/")[1]).get("command") == "cranks"
+
+
 def closed_loop(row: str) -> ClosedLoop:
     """The loop of a row."""
     scenario, controller, kind = row.split("/")
     settings = (f"plant.kind={kind}",)
-    return build_closed_loop(sd.load_scenario(scenario, controller, settings))
+    return build_closed_loop(load_understood(scenario, controller, settings))
+
+
+def run_servos(row: str) -> tuple[Array, Array]:
+    """As `run`, for controllers that send commands to servos."""
+    loop = closed_loop(row)
+    simulator = make_simulator(loop)
+    context = simulator.get_context()
+    period = loop.experiment.scenario.controller.period
+    servos: Any = loop.GetSubsystemByName("servos")
+    controller: Any = loop.GetSubsystemByName("controller")
+    told = servos.reports.width + NUM_TORQUES
+    measurements, commands = [], []
+    for k in range(SERVO_SAMPLES):
+        # Before the sample, whose event comes early: the servos' next torque would be in it.
+        if k > 0:
+            simulator.AdvanceTo(event_time(event_time(k * period)))
+        report = servos.GetOutputPort("report").Eval(servos.GetMyContextFromRoot(context))
+        if k > 0:
+            simulator.AdvanceTo(look_time(k * period))
+        else:
+            simulator.Initialize()
+        memory = controller.sample(controller.GetMyContextFromRoot(context)).memory
+        measurements.append(np.append(memory.measurement, report[-told:]))
+        commands.append(memory.command)
+    return np.array(measurements), np.array(commands)
 
 
 def run(row: str) -> tuple[Array, Array]:
     """Measurements (n, 12) and torques (n, 6) at the controller's first samples."""
+    if is_servo(row):
+        return run_servos(row)
     loop = closed_loop(row)
     simulator = make_simulator(loop)
     context = simulator.get_context()
@@ -75,19 +112,30 @@ def answers(row: str, measurements: Array) -> Array:
     context = controller.CreateDefaultContext()
     simulator = None
     torques = []
+    weighted = controller.HasInputPort("weights")
     for k, measurement in enumerate(measurements):
         early = event_time(period)
         whole.SetTime(early + (k - 1) * early if k else 0.0)  # as Drake computes it
+        if not weighted:
+            report = np.full(controller.GetInputPort("report").size(), np.nan)
+            report[NUM_STATE - len(measurement) :] = measurement[NUM_STATE:]
+            measurement = measurement[:NUM_STATE]
+            controller.GetInputPort("report").FixValue(context, report)
         controller.GetInputPort("measurement").FixValue(context, measurement)
         preview = reference.GetOutputPort("preview").Eval(reference.GetMyContextFromRoot(whole))
         controller.GetInputPort("preview").FixValue(context, preview)
-        controller.GetInputPort("weights").FixValue(context, weights)
+        if weighted:
+            controller.GetInputPort("weights").FixValue(context, weights)
         if simulator is None:
             simulator = Simulator(controller, context)
             simulator.Initialize()
         else:
             simulator.AdvanceTo(look_time(k * period))
-        torques.append(controller.GetOutputPort("torque_commanded").Eval(context))
+        if weighted:
+            torques.append(controller.GetOutputPort("torque_commanded").Eval(context))
+        else:
+            own: Any = controller
+            torques.append(own.sample(context).memory.command)
     return np.array(torques)
 
 

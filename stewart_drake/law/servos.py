@@ -1,0 +1,211 @@
+"""Position servos: what a local loop at each motor makes of the crank angles that arrive.
+
+In the motors' coordinates, the crank angles a (6,), the machine is
+
+    H a'' + ... = tau,    H = Jac^-T M Jac^-1,    Jac = d a / d pose,
+
+and each servo knows one number of that, the inertia J that a motor moves at home while the others
+are free, on average: 1 / J = trace(H^-1) / 6, the mean acceleration of a crank per its own torque.
+
+    tau = J (w^2 (a_r - a) + 2 d w (a_r' - a')) + tau_model.                          (servo)
+
+A direction in which H has the eigenvalue m follows the setpoint a_r with the error e = a_r - a,
+
+    m e'' + 2 d w J e' + w^2 J e = m a_r'' - (tau_model + what else acts),
+
+a second-order loop with the frequency w sqrt(J / m) and the damping d sqrt(J / m). A constant
+torque b that nobody tells leaves e = b / (J w^2), whatever the model; a motion that comes without
+its torque leaves m a_r'' / (J w^2). That is stiffness instead of knowledge.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.holds import cubic
+from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.scenario.signals import (
+    MODEL_TORQUE,
+    NUM_REFERENCE,
+    NUM_TORQUES,
+    POSE,
+    RATES,
+    SETPOINT,
+)
+
+Array = NDArray[np.float64]
+
+
+def crank_inertia(dynamics: StewartDynamics, pose: Array) -> Array:
+    """H (6, 6) in kg m^2, of which Jac' H Jac is the mass matrix in pose coordinates."""
+    inverse = np.linalg.inv(dynamics.actuation_map(pose))  # of Jac'
+    return inverse @ dynamics.mass_matrix(pose) @ inverse.T
+
+
+def mean_inertia(dynamics: StewartDynamics) -> float:
+    """J in kg m^2."""
+    return NUM_TORQUES / float(
+        np.trace(np.linalg.inv(crank_inertia(dynamics, dynamics.mechanism.home)))
+    )
+
+
+def turned(angles: Array, near: Array) -> Array:
+    """The same angles in rad, by whole turns within half a turn of others."""
+    return near + (angles - near + np.pi) % (2 * np.pi) - np.pi
+
+
+@dataclass(frozen=True)
+class ServoLoop:
+    """(servo), sampled: what each motor's local loop does.
+
+    Attributes:
+        inertia: J, kg m^2.
+        bandwidth: w, rad/s.
+        damping: d.
+        period: h between two torques, s.
+        motors: the limit of their torque.
+        speed_limit: of the setpoint, rad/s, infinite for none.
+    """
+
+    inertia: float
+    bandwidth: float
+    damping: float
+    period: float
+    motors: TorqueLimit
+    speed_limit: float = math.inf
+
+    def torque(self, setpoint: Array, model: Array, cranks: Array) -> Array:
+        """(servo), before any limit, N m.
+
+        Args:
+            setpoint: (12,) crank angles and rates to follow, rad and rad/s.
+            model: (6,) torque that came with it, N m.
+            cranks: (12,) as they are; whole turns do not count.
+        """
+        error = turned(setpoint[POSE], cranks[POSE]) - cranks[POSE]
+        rates = setpoint[RATES] - cranks[RATES]
+        w = self.bandwidth
+        return np.asarray(self.inertia * (w**2 * error + 2 * self.damping * w * rates) + model)
+
+    def limited(self, wanted: Array, last: Array) -> Array:
+        """The setpoint (12,) that the speed limit makes of `wanted`, a period after `last` (6,)."""
+        if self.speed_limit == math.inf:
+            return wanted
+        most = self.speed_limit * self.period
+        moved = turned(wanted[POSE], last) - last
+        late = np.abs(moved) > most
+        rates = np.clip(wanted[RATES], -self.speed_limit, self.speed_limit)
+        rates = np.where(late, np.sign(moved) * self.speed_limit, rates)
+        return np.concatenate([last + np.clip(moved, -most, most), rates])
+
+    def highest_bandwidth(self, inertias: Array) -> float:
+        """w in rad/s below which the loop, sampled and held, is stable for modes of `inertias`.
+
+        With u = -p e - q e' held for h, p = w^2 J / m and q = 2 d w J / m, the mode goes from
+        (e, e') to e' + h u, e + h e' (an engine's semi-implicit step) or e + h e' + h^2 u / 2
+        (exactly). By Jury's criterion the first is stable for q h + p h^2 / 2 < 2, the second for
+        q h < 2 and p h < 2 q. The first and the last of these, solved for w, with the least m.
+        """
+        d, ratio = self.damping, inertias.min() / self.inertia
+        return min(math.sqrt(4 * d**2 + 4 * ratio) - 2 * d, 4 * d) / self.period
+
+
+class Segment(NamedTuple):
+    """The way of the setpoint from where it is to what a command asks for.
+
+    Angles are cubic in time, with the angles and rates of both ends, and the model's torque is
+    linear: with commands a period apart, setpoint, rates and torque are continuous.
+    """
+
+    begin: float
+    """s."""
+    end: float
+    """s; when the command is to be reached."""
+    start: Array
+    """(18,) angles, rates, torques."""
+    stop: Array
+    """(18,)."""
+
+    def at(self, time: float, coast: float) -> Array:
+        """(18,) at a time in s; beyond the end on at its rates for `coast` s, then still."""
+        h = self.end - self.begin
+        if time < self.end:
+            s = (time - self.begin) / h
+            torques = (1 - s) * self.start[MODEL_TORQUE] + s * self.stop[MODEL_TORQUE]
+            return np.concatenate(
+                [*cubic(self.start[SETPOINT], self.stop[SETPOINT], h, s), torques]
+            )
+        angles, rates, torques = np.split(self.stop, 3)
+        past = time - self.end
+        angles = angles + rates * min(past, coast)
+        return np.concatenate([angles, rates if past < coast else 0 * rates, torques])
+
+    def then(self, command: Array, begin: float, end: float, coast: float) -> "Segment":
+        """On from where it is at `begin` to a command (18,) that is to be reached at `end`, s."""
+        start, stop = self.at(begin, coast), np.array(command)
+        stop[POSE] = turned(command[POSE], start[POSE])
+        return Segment(begin, end, start, stop)
+
+
+def still(command: Array, time: float) -> Segment:
+    """The setpoint of a command (18,), reached at a time in s."""
+    assert command.shape == (NUM_REFERENCE,)
+    return Segment(time, time, command, command)
+
+
+class Reported(NamedTuple):
+    """What servos put out between two measurements."""
+
+    torques: Array
+    """(n, 6) N m, means over equal parts of the time."""
+    asked: Array
+    """(6,) N m, before the limit, when it ended."""
+    saturated: int
+    """Periods of the controller in which a torque was at its limit."""
+
+
+@dataclass(frozen=True)
+class ReportLayout:
+    """What a machine with servos says with each measurement, of the periods before it.
+
+    A row for each period, the oldest first: the means of the torques over equal parts of it
+    (6 parts), and whether one was at the limit (1 or 0). Then what was asked for last (6).
+
+    Attributes:
+        parts: of a period.
+        periods: rows; so many reports less one may be lost in a row without losing what they said.
+    """
+
+    parts: int
+    periods: int
+
+    @property
+    def width(self) -> int:
+        """Of a row."""
+        return NUM_TORQUES * self.parts + 1
+
+    @property
+    def size(self) -> int:
+        """Of the whole report."""
+        return self.periods * self.width + NUM_TORQUES
+
+    def written(self, put_out: Array, asked: Array, motors: TorqueLimit) -> Array:
+        """A report (size,) of torques (n, 6), the oldest first, n a multiple of all parts."""
+        means = put_out.reshape(self.periods, self.parts, -1, NUM_TORQUES).mean(axis=2)
+        at_limit = np.array([motors.reached(part) for part in np.split(put_out, self.periods)])
+        rows = np.column_stack([means.reshape(self.periods, -1), at_limit])
+        return np.concatenate([rows.ravel(), asked])
+
+    def read(self, report: Array, periods: int) -> Reported | None:
+        """The last so many periods of a report (size,), or None where it does not tell of them."""
+        if periods > self.periods:
+            return None
+        rows = report[:-NUM_TORQUES].reshape(self.periods, self.width)[self.periods - periods :]
+        if not np.all(np.isfinite(rows)):
+            return None
+        torques = rows[:, :-1].reshape(-1, NUM_TORQUES)
+        return Reported(torques, report[-NUM_TORQUES:], int(rows[:, -1].sum()))

@@ -1,0 +1,150 @@
+"""A scenario with servos made concrete: the law, what is in flight, the local loops."""
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.trajectories import Trajectory
+
+from stewart_drake.dynamics.workspace import margin
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.catch_up import PIECE, shortest
+from stewart_drake.law.late import LateObserver
+from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.servo_preview import ReportedTimeline, ServoPreview
+from stewart_drake.law.servos import ReportLayout, ServoLoop, crank_inertia, mean_inertia
+from stewart_drake.law.startup import INSTANTS
+from stewart_drake.loop.experiment import Experiment, compose_law, planned_limit
+from stewart_drake.loop.own import NOTHING
+from stewart_drake.scenario.config import Scenario, ServoActuatorConfig, understanding
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
+    MODEL_TORQUE,
+    NUM_REFERENCE,
+    POSE,
+    RATES,
+)
+from stewart_drake.scenario.timing import servo_ticks
+from stewart_drake.scenario.trajectories import catch_up, evaluate, spread_instants
+
+Array = NDArray[np.float64]
+
+_PART: Final = 0.005
+"""s, about as long as the parts of a period over which servos report mean torques."""
+_REPORTED: Final = 10
+"""Periods in a report."""
+
+
+def servo_loop(experiment: Experiment) -> ServoLoop:
+    """What runs at each motor, tuned by the machine as it is known.
+
+    Raises:
+        ConfigError: sampled, it would be unstable at home or along the reference.
+    """
+    sc, nominal = experiment.scenario, experiment.nominal
+    actuator = sc.actuator
+    assert isinstance(actuator, ServoActuatorConfig)
+    loop = ServoLoop(
+        inertia=mean_inertia(nominal),
+        bandwidth=2 * math.pi * actuator.bandwidth,
+        damping=actuator.damping,
+        period=sc.controller.period / _ticks(sc),
+        motors=TorqueLimit(experiment.torque_limit),
+        speed_limit=math.inf if actuator.speed_limit is None else actuator.speed_limit,
+    )
+    instants = spread_instants(sc.duration, INSTANTS)
+    poses = [experiment.mechanism.home, *(experiment.reference.value(t)[:, 0] for t in instants)]
+    inertias = np.array([np.linalg.eigvalsh(crank_inertia(nominal, pose)) for pose in poses])
+    highest = loop.highest_bandwidth(inertias) / (2 * math.pi)
+    if actuator.bandwidth >= highest:
+        raise ConfigError(
+            f"actuator.bandwidth: got {actuator.bandwidth:g} Hz; expected less than {highest:.3g} "
+            f"Hz, from which on loops of {1 / loop.period:.4g} Hz are unstable with this machine"
+        )
+    return loop
+
+
+def _ticks(scenario: Scenario) -> int:
+    plant = scenario.plant
+    step = plant.time_step if plant.kind == "multibody" else None
+    return servo_ticks(scenario.controller.period, step)
+
+
+def compose_servo_law(experiment: Experiment) -> ServoPreview:
+    """The parts that a scenario with servos asks for: those of the law for torques, where alike."""
+    like = _law_for_torques(experiment)
+    period, ticks = like.timeline.period, _ticks(experiment.scenario)
+    wanted = max(1, round(period / _PART))
+    parts = next(n for n in range(min(wanted, ticks), 0, -1) if ticks % n == 0)
+    observer = like.observer.observer if isinstance(like.observer, LateObserver) else like.observer
+    if isinstance(observer, ParameterObserver):  # what acted when is not guessed but reported
+        observer = replace(observer, settings=replace(observer.settings, timing_std=0.0))
+    law = ServoPreview(
+        timeline=ReportedTimeline(period, like.timeline.delay, parts),
+        plant=replace(like.plant, substeps=1),
+        sensing=like.sensing,
+        observer=observer,
+        feedforward=like.feedforward,
+        reports=ReportLayout(parts, _REPORTED),
+    )
+    return experiment.own.revised(law)
+
+
+def _law_for_torques(experiment: Experiment) -> PredictiveLqi:
+    sc = experiment.scenario
+    controller = replace(sc.controller, command="torque")
+    actuator = understanding("torque", sc.actuator)
+    alike = replace(sc, controller=controller, actuator=actuator)
+    return compose_law(experiment._replace(scenario=alike, own=NOTHING))
+
+
+def servo_law(experiment: Experiment) -> tuple[ServoPreview, Trajectory, float]:
+    """The law, the motion that it follows, and the length of the blend onto the reference."""
+    sc, law = experiment.scenario, compose_servo_law(experiment)
+    law.warm_up()
+    period, eta, reference = law.timeline.period, law.timeline.eta, experiment.reference
+    if sc.start != "rest" or sc.controller.catch_up == 0:
+        return law, reference, 0.0
+
+    def attempt(periods: int, limit: float) -> Trajectory | None:
+        span = periods * period
+        start = experiment.start[POSE], experiment.start[RATES]
+        planned = catch_up(*start, reference, eta, span)
+        for t in np.linspace(eta, eta + span, math.ceil(span / PIECE) + 1):
+            x = evaluate(planned, t)
+            if not margin(experiment.mechanism, x[POSE]) > 0:
+                return None
+            torque = experiment.nominal.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
+            if np.abs(torque).max() > limit:
+                return None
+        return planned
+
+    planned, span = shortest(attempt, period, sc.controller.catch_up, planned_limit(sc))
+    return (law, reference, 0.0) if planned is None else (law, planned, span)
+
+
+def commands_in_flight(
+    experiment: Experiment, law: ServoPreview, delay: Delay
+) -> tuple[Array, Array]:
+    """What servos begin with (18,), and the commands (L, 18) under way at t = 0, oldest first.
+
+    The oldest is reached at t = dt, or eta0 where that is above 0.
+    """
+    sc, length = experiment.scenario, delay.queue_length
+    wanted = np.zeros((length + 1, NUM_REFERENCE))
+    wanted[:, POSE] = experiment.start[POSE]
+    wanted[0, RATES] = experiment.start[RATES]
+    if sc.queue == "reference":
+        ends = delay.eta(law.timeline.period) - law.timeline.period * np.arange(length)[::-1]
+        moving = 1 if sc.start == "rest" else 0  # a plate at rest is not on the reference yet
+        for row, t in zip(wanted[moving:], [0.0, *ends][moving:], strict=True):
+            row[:] = evaluate(experiment.reference, t)
+    commands = np.array([law.command(x, law.plant.dynamics.parameters) for x in wanted])
+    if sc.queue == "zero":
+        commands[:, MODEL_TORQUE] = 0.0
+    return commands[0], commands[1:]
