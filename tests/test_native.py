@@ -230,7 +230,7 @@ def test_other_equations_are_told_from_these(native, tmp_path: Path) -> None:
 def test_it_is_compiled_without_a_warning(native, tmp_path: Path) -> None:
     strict = ["-pedantic", "-Wall", "-Wextra", "-Werror", "-o", str(tmp_path / "lib.so")]
     command = [*(build.compiler() or ()), *build.FLAGS, "-O1", *strict]
-    subprocess.run([*command, str(build.FOLDER / "dynamics.c"), "-lm"], check=True)
+    subprocess.run([*command, *build.SOURCES, "-lm"], check=True)
 
 
 def test_a_library_older_than_its_source_is_not_used(native, monkeypatch) -> None:

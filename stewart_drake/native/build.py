@@ -1,4 +1,4 @@
-"""`python -m stewart_drake.native.build` compiles dynamics.c beside it, as an installation does.
+"""`python -m stewart_drake.native.build` compiles the C beside it, as an installation does.
 
 The build hook loads this file by its path, before anything is installed: nothing but Python in it.
 """
@@ -21,6 +21,9 @@ FLAGS = (
     *("-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
     *("-fPIC", "-shared", "-fvisibility=hidden"),
 )
+
+
+SOURCES = sorted(str(path) for path in FOLDER.glob("*.c"))
 
 
 def source_hash() -> str:
@@ -47,7 +50,7 @@ def compile_library(target: Path = LIBRARY) -> str | None:
         with tempfile.TemporaryDirectory(dir=target.parent) as folder:
             made = Path(folder) / target.name
             options = [*FLAGS, f'-DSOURCE="{source_hash()}"', "-o", str(made)]
-            arguments = [*command, *options, str(FOLDER / "dynamics.c"), "-lm"]
+            arguments = [*command, *options, *SOURCES, "-lm"]
             done = subprocess.run(arguments, capture_output=True, text=True, errors="replace")
             if done.returncode == 0:
                 os.replace(made, target)  # a process that has the former one open keeps it
