@@ -196,13 +196,13 @@ _START = np.concatenate([PAPER.home, np.zeros(6)])
 
 
 def made_of(equations: str, folder: Path) -> ctypes.CDLL:
-    """dynamics.c compiled with other equations, quickly."""
-    folder.mkdir()
-    shutil.copy(build.FOLDER / "dynamics.c", folder)
+    """The dynamics compiled with other equations, quickly."""
+    shutil.copytree(build.FOLDER, folder, ignore=shutil.ignore_patterns("*.so", "*.py"))
     (folder / "equations.h").write_text(equations)
     target = folder / "lib.so"
     command = [*(build.compiler() or ()), *build.FLAGS, "-O0", "-o", str(target)]
-    subprocess.run([*command, str(folder / "dynamics.c"), "-lm"], check=True)
+    sources = [str(folder / name) for name in ("dynamics.c", "packed.c")]
+    subprocess.run([*command, *sources, "-lm"], check=True)
     return ctypes.CDLL(str(target))
 
 
@@ -228,9 +228,10 @@ def test_other_equations_are_told_from_these(native, tmp_path: Path) -> None:
 
 
 def test_it_is_compiled_without_a_warning(native, tmp_path: Path) -> None:
-    strict = ["-pedantic", "-Wall", "-Wextra", "-Werror", "-o", str(tmp_path / "lib.so")]
+    strict = ["-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror"]
     command = [*(build.compiler() or ()), *build.FLAGS, "-O1", *strict]
-    subprocess.run([*command, *build.SOURCES, "-lm"], check=True)
+    target = str(tmp_path / "lib.so")
+    subprocess.run([*command, "-o", target, *build.SOURCES, "-lm"], check=True)
 
 
 def test_a_library_older_than_its_source_is_not_used(native, monkeypatch) -> None:

@@ -8,9 +8,9 @@ import casadi as ca
 _UNARY: Final = {
     ca.OP_ASSIGN: "{0}",
     ca.OP_NEG: "-{0}",
-    ca.OP_INV: "1. / {0}",
+    ca.OP_INV: "1 / {0}",
     ca.OP_SQ: "{0} * {0}",
-    ca.OP_TWICE: "2. * {0}",
+    ca.OP_TWICE: "2 * {0}",
     ca.OP_SQRT: "sqrt({0})",
     ca.OP_SIN: "sin({0})",
     ca.OP_COS: "cos({0})",
@@ -56,8 +56,8 @@ def c_function(name: str, inputs: Sequence[Input], outputs: Sequence[Output]) ->
     function = ca.Function(name, [i.symbols for i in inputs], values, {"cse": True})
     looped = any(i.own for i in inputs)
     before, inside = _statements(function, inputs, outputs, looped)
-    parameters = [f"real *restrict {i.name}" for i in inputs]
-    parameters += [f"double *restrict {o.name}" for o in outputs]
+    parameters = [f"fixed *restrict {i.name}" for i in inputs]
+    parameters += [f"real *restrict {o.name}" for o in outputs]
     lines = [f"static void {name}({', '.join(parameters)})", "{"]
     lines += [f"    {line}" for line in before]
     if looped:
@@ -91,7 +91,7 @@ def _statements(
             operands = [held[place] for place in of]
             text = _FORMS[operation].format(*(_factor(operand) for operand, _ in operands))
             own = any(own for _, own in operands)
-            (inside if own else before).append(f"real a{k} = {text};")
+            (inside if own else before).append(f"fixed a{k} = {text};")
             held[to[0]] = f"a{k}", own
     return before, inside
 
@@ -102,4 +102,4 @@ def _factor(operand: str) -> str:
 
 def _literal(value: float) -> str:
     text = repr(value)
-    return text if "." in text or "e" in text else f"{text}."
+    return f"(real){text}"

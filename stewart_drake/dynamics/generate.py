@@ -25,11 +25,11 @@ _HEAD: Final = f"""/* Written by python -m stewart_drake.dynamics.generate; not 
 #define GEOMETRY {GEOMETRY}
 #define LEG_NUMBERS {LEG_NUMBERS}
 
-typedef const double real;
+typedef const real fixed;
 
 #define MIN(x, y) ((x) < (y) ? (x) : (y))
 #define MAX(x, y) ((x) > (y) ? (x) : (y))
-#define SIGN(x) ((x) > 0. ? 1. : (x) < 0. ? -1. : (x))
+#define SIGN(x) ((x) > 0 ? 1 : (x) < 0 ? -1 : (x))
 """
 
 

@@ -1,154 +1,105 @@
-/* The dynamics of a mechanism behind one packed buffer per function: its arguments, the geometry, its
-   results, matrices by columns (native/layout.py). No state, no allocation: any thread may call, with
-   a buffer of its own. */
+/* The dynamics of a mechanism: see dynamics.h. What is long is written by a program, in equations.h. */
 
-#include <math.h>
 #include <string.h>
+#include <tgmath.h>
+
+#include "dynamics.h"
 
 #include "equations.h"
 
-#ifndef SOURCE
-#define SOURCE ""
+#if PARAMETERS != STEWART_PARAMETERS || GEOMETRY != STEWART_GEOMETRY
+#error "dynamics.h and equations.h are of different equations"
 #endif
 
-#define EXPORT __attribute__((visibility("default")))
 #define NUM_LEGS 6
 #define SUMS 28 /* numbers of `equations.Sums`, each triangle of a symmetric matrix once */
 #define COMMON (NUM_LEGS * LEG_NUMBERS) /* where the geometry goes on after the legs */
 
-/* Of what it was compiled; a library that is older than its source is not used. */
-EXPORT const char *source(void) { return SOURCE; }
-
 /* Plate and legs, summed, and B' by columns. */
-static void motion(const double *pose, const double *rates, const double *parameters,
-                   const double *gravity, const double *geometry, double *sums, double *arms)
+static void motion(const stewart_plant *plant, const real *pose, const real *rates, real *sums,
+                   real *arms)
 {
-    double plate[21], added[SUMS * NUM_LEGS];
-    plate_motion(pose, rates, parameters, gravity, geometry + COMMON, plate, sums);
-    leg_motion(plate, geometry + COMMON, geometry, added, arms);
+    const real *legs = plant->geometry, *common = legs + COMMON;
+    real moving[21], added[SUMS * NUM_LEGS];
+    plate_motion(pose, rates, plant->parameters, plant->gravity, common, moving, sums);
+    leg_motion(moving, common, legs, added, arms);
     for (int i = 0; i < SUMS; i++)
         for (int leg = 0; leg < NUM_LEGS; leg++)
             sums[i] += added[NUM_LEGS * i + leg];
 }
 
-static void accelerate(const double *pose, const double *rates, const double *torque,
-                       const double *parameters, const double *gravity, const double *geometry,
-                       double *accelerations)
+void stewart_accelerations(const stewart_plant *plant, const real *pose, const real *rates,
+                           const real *torque, real *accelerations)
 {
-    double sums[SUMS], arms[36];
-    motion(pose, rates, parameters, gravity, geometry, sums, arms);
-    solve_accelerations(pose, rates, torque, parameters, sums, arms, accelerations);
+    real sums[SUMS], arms[36];
+    motion(plant, pose, rates, sums, arms);
+    solve_accelerations(pose, rates, torque, plant->parameters, sums, arms, accelerations);
 }
 
-EXPORT void accelerations(double *b)
+void stewart_inverse_dynamics(const stewart_plant *plant, const real *pose, const real *rates,
+                              const real *accelerations, real *torque)
 {
-    double *parameters = b + 18, *gravity = parameters + PARAMETERS, *geometry = gravity + 1;
-    accelerate(b, b + 6, b + 12, parameters, gravity, geometry, geometry + GEOMETRY);
+    real sums[SUMS], arms[36];
+    motion(plant, pose, rates, sums, arms);
+    solve_torque(pose, rates, accelerations, plant->parameters, sums, arms, torque);
 }
 
-/* d[pose; rates]/dt, with the arguments of `accelerations`. */
-EXPORT void change(double *b)
+real stewart_energy(const stewart_plant *plant, const real *pose, const real *rates)
 {
-    double *parameters = b + 18, *gravity = parameters + PARAMETERS, *geometry = gravity + 1;
-    double *result = geometry + GEOMETRY;
-    memcpy(result, b + 6, 6 * sizeof(double));
-    accelerate(b, b + 6, b + 12, parameters, gravity, geometry, result + 6);
+    real sums[SUMS], arms[36];
+    motion(plant, pose, rates, sums, arms);
+    return sums[SUMS - 1];
 }
 
-EXPORT void inverse_dynamics(double *b)
+void stewart_terms(const stewart_plant *plant, const real *pose, const real *rates, real *M,
+                   real *h, real *B)
 {
-    double *parameters = b + 18, *gravity = parameters + PARAMETERS, *geometry = gravity + 1;
-    double sums[SUMS], arms[36];
-    motion(b, b + 6, parameters, gravity, geometry, sums, arms);
-    solve_torque(b, b + 6, b + 12, parameters, sums, arms, geometry + GEOMETRY);
+    real sums[SUMS], arms[36];
+    motion(plant, pose, rates, sums, arms);
+    pose_terms(pose, rates, sums, arms, M, h, B);
 }
 
-EXPORT void energy(double *b)
+void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, const real *rates,
+                                  const real *accelerations, const real *torque, real *dF_dx,
+                                  real *dF_dp, real *M, real *B)
 {
-    double *parameters = b + 12, *gravity = parameters + PARAMETERS, *geometry = gravity + 1;
-    double sums[SUMS], arms[36];
-    motion(b, b + 6, parameters, gravity, geometry, sums, arms);
-    geometry[GEOMETRY] = sums[SUMS - 1];
-}
-
-EXPORT void terms(double *b)
-{
-    double *parameters = b + 12, *gravity = parameters + PARAMETERS, *geometry = gravity + 1;
-    double *M = geometry + GEOMETRY, sums[SUMS], arms[36];
-    motion(b, b + 6, parameters, gravity, geometry, sums, arms);
-    pose_terms(b, b + 6, sums, arms, M, M + 36, M + 42);
-}
-
-EXPORT void residual_derivatives(double *b)
-{
-    double *torque = b + 18, *parameters = b + 24, *gravity = parameters + PARAMETERS;
-    double *geometry = gravity + 1, *common = geometry + COMMON;
-    double *dF_dx = geometry + GEOMETRY, *dF_dp = dF_dx + 72, *MN = dF_dp + 6 * PARAMETERS;
-    double *arms = MN + 36, M[36], arm_rates[NUM_LEGS];
-    double change_of_legs[72 * NUM_LEGS], mass_of_legs[36 * NUM_LEGS];
-    plate_derivatives(b, b + 6, b + 12, parameters, common, dF_dx, M);
-    leg_derivatives(b, b + 6, b + 12, parameters, gravity, common, geometry, torque, parameters,
-                    change_of_legs, mass_of_legs, arms, arm_rates);
+    const real *legs = plant->geometry, *common = legs + COMMON;
+    const real *parameters = plant->parameters, *gravity = plant->gravity;
+    real mass[36], arm_rates[NUM_LEGS], change_of_legs[72 * NUM_LEGS], mass_of_legs[36 * NUM_LEGS];
+    plate_derivatives(pose, rates, accelerations, parameters, common, dF_dx, mass);
+    leg_derivatives(pose, rates, accelerations, parameters, gravity, common, legs, torque, parameters,
+                    change_of_legs, mass_of_legs, B, arm_rates);
     for (int i = 0; i < 72; i++)
         for (int leg = 0; leg < NUM_LEGS; leg++)
             dF_dx[i] += change_of_legs[NUM_LEGS * i + leg];
     for (int i = 0; i < 36; i++)
         for (int leg = 0; leg < NUM_LEGS; leg++)
-            M[i] += mass_of_legs[NUM_LEGS * i + leg];
-    pose_derivatives(b, b + 12, gravity, M, arms, arm_rates, dF_dp, MN);
+            mass[i] += mass_of_legs[NUM_LEGS * i + leg];
+    pose_derivatives(pose, accelerations, gravity, mass, B, arm_rates, dF_dp, M);
 }
 
-EXPORT void measures(double *b)
+void stewart_measures(const real *geometry, const real *pose, const real *angles, real *measures)
 {
-    double *geometry = b + 6, sines[NUM_LEGS], wrenches[36];
-    leg_measures(b, geometry + COMMON, geometry, sines, wrenches);
-    all_measures(b, sines, wrenches, geometry + GEOMETRY);
+    real sines[NUM_LEGS], wrenches[36];
+    if (angles)
+        leg_measures_of_tree(pose, geometry + COMMON, geometry, angles, sines, wrenches);
+    else
+        leg_measures(pose, geometry + COMMON, geometry, sines, wrenches);
+    all_measures(pose, sines, wrenches, measures);
 }
 
-EXPORT void measures_of_tree(double *b)
+void stewart_move(const stewart_plant *plant, const real *torque, real h, real *x)
 {
-    double *angles = b + 6, *geometry = b + 12, sines[NUM_LEGS], wrenches[36];
-    leg_measures_of_tree(b, geometry + COMMON, geometry, angles, sines, wrenches);
-    all_measures(b, sines, wrenches, geometry + GEOMETRY);
-}
-
-/* pose (6), sign, least (8), geometry -> the least that the measures are above `least`; a NaN stays. */
-EXPORT void margin(double *b)
-{
-    double *sign = b + 6, *least = b + 7, *geometry = b + 15, *result = geometry + GEOMETRY;
-    double sines[NUM_LEGS], wrenches[36], found[8];
-    leg_measures(b, geometry + COMMON, geometry, sines, wrenches);
-    all_measures(b, sines, wrenches, found);
-    found[6] *= *sign;
-    *result = found[0] - least[0];
-    for (int i = 1; i < 8; i++) {
-        double above = found[i] - least[i];
-        if (above < *result || isnan(above))
-            *result = above;
+    static const real part[3] = {(real)0.5, (real)0.5, 1};
+    real y[12], k[4][12];
+    memcpy(y, x, sizeof y);
+    for (int stage = 0; stage < 4; stage++) {
+        memcpy(k[stage], y + 6, 6 * sizeof(real));
+        stewart_accelerations(plant, y, y + 6, torque, k[stage] + 6);
+        if (stage < 3)
+            for (int i = 0; i < 12; i++)
+                y[i] = x[i] + part[stage] * h * k[stage][i];
     }
-}
-
-/* steps, state (12), torques (6 each), parameters, gravity, durations, geometry -> states (12 each):
-   steps of the classical Runge-Kutta method, in the order of operations of `virtual_machine`. */
-EXPORT void predict(double *b)
-{
-    int n = (int)b[0];
-    double *torque = b + 13, *parameters = torque + 6 * n, *gravity = parameters + PARAMETERS;
-    double *h = gravity + 1, *geometry = h + n, *result = geometry + GEOMETRY;
-    double x[12], y[12], k[4][12];
-    static const double part[3] = {0.5, 0.5, 1.};
-    memcpy(x, b + 1, sizeof x);
-    for (int step = 0; step < n; step++, torque += 6, h++, result += 12) {
-        memcpy(y, x, sizeof x);
-        for (int stage = 0; stage < 4; stage++) {
-            memcpy(k[stage], y + 6, 6 * sizeof(double));
-            accelerate(y, y + 6, torque, parameters, gravity, geometry, k[stage] + 6);
-            if (stage < 3)
-                for (int i = 0; i < 12; i++)
-                    y[i] = x[i] + part[stage] * *h * k[stage][i];
-        }
-        for (int i = 0; i < 12; i++)
-            x[i] += *h / 6. * (k[0][i] + 2. * k[1][i] + 2. * k[2][i] + k[3][i]);
-        memcpy(result, x, sizeof x);
-    }
+    for (int i = 0; i < 12; i++)
+        x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
 }

@@ -1,0 +1,122 @@
+/* A predictive LQI controller with delay compensation for a rotary Stewart platform.
+
+   Once:           stewart_init(&config, &memory, queue);
+   every period:   status = stewart_step(&config, &memory, &work, measurement, 0, preview, weights,
+                                         torque);
+   and only if something else was sent than `torque`, limited:   stewart_sent(&config, &memory, sent);
+
+   A pose is roll, pitch, yaw (rad) and x, y, z (m) of the plate's centre of mass, a state the pose
+   and its rates, a reference the pose, its rates and its accelerations. Matrices are stored by rows.
+   Nothing is allocated, nothing kept but in what the caller hands over. */
+
+#ifndef STEWART_H
+#define STEWART_H
+
+#include "dynamics.h"
+#include "riccati.h"
+
+#ifndef STEWART_MAX_QUEUE
+#define STEWART_MAX_QUEUE 64 /* torques in flight at a sample: the delay in periods, rounded up */
+#endif
+#ifndef STEWART_MAX_KEPT
+#define STEWART_MAX_KEPT 32 /* further torques, for measurements that come late */
+#endif
+
+#define STEWART_STATES 12
+#define STEWART_MOTORS 6
+#define STEWART_REFERENCE 18
+#define STEWART_ESTIMATED 8 /* the first of the parameters: torque biases, payload, damping */
+#define STEWART_MEANS (STEWART_STATES + STEWART_ESTIMATED)
+#define STEWART_IN_FLIGHT (1 + STEWART_MAX_KEPT + STEWART_MAX_QUEUE)
+#define STEWART_PREVIEW (1 + STEWART_MAX_QUEUE + 8) /* rows of a reference, at the most */
+
+/* What went wrong in a step and was survived; counts[i] of the memory is of bit i. */
+enum {
+    STEWART_RICCATI_FAILURE = 1,      /* no new gain: the last one was used */
+    STEWART_UNREACHABLE = 2,          /* no model where the torque will act: feedforward alone */
+    STEWART_NONFINITE_TORQUE = 4,     /* no number: the last torque was used */
+    STEWART_MEASUREMENT_MISSING = 8,  /* the model stood in for it, and for the next two */
+    STEWART_MEASUREMENT_FROZEN = 16,
+    STEWART_MEASUREMENT_REJECTED = 32,
+    STEWART_SATURATED = 64            /* a torque is at the limit */
+};
+#define STEWART_CAUSES 7
+
+/* What the controller knows; constant. */
+typedef struct {
+    real geometry[STEWART_GEOMETRY];
+    real parameters[STEWART_PARAMETERS]; /* as they are known beforehand */
+    real gravity;                        /* m/s^2 */
+    real period;                         /* s */
+    real fraction;                       /* of a period, that the delay is beyond `steps` */
+    real torque_limit;                   /* of each motor, N m; infinite for none */
+    real gentle_torque;                  /* N m, beyond which twice as many substeps are taken */
+    real noise_std[STEWART_STATES];      /* of the measurement */
+    real motion[6];                      /* how far each coordinate is expected to move, rad and m */
+    real error_weights[6], integral_weights[6], torque_weights[6];
+    /* The filter: of the parameters that it estimates, and of the model. */
+    real prior[STEWART_ESTIMATED], std[STEWART_ESTIMATED];
+    real lower[STEWART_ESTIMATED], upper[STEWART_ESTIMATED];
+    real model_std[STEWART_STATES]; /* by which a step of the model may be off */
+    real timing_std;                /* by which a torque may come early or late, s */
+    real gate;                      /* squared innovation that makes an outlier */
+    int estimates;                  /* whether there is a filter */
+    int steps;                      /* of the delay, whole periods */
+    int kept;                       /* torques that are remembered beyond the delay's */
+    int longest_wait;               /* for a late measurement, periods */
+    int substeps;                   /* Runge-Kutta steps per torque */
+    int silence;                    /* samples at the start at which nothing is fed back */
+} stewart_config;
+
+/* What it remembers from one sample to the next. */
+typedef struct {
+    real in_flight[STEWART_IN_FLIGHT][STEWART_MOTORS]; /* the oldest first, as limited */
+    real mean[STEWART_MEANS]; /* state and parameters, at the last measurement; NaN before any */
+    real covariance[STEWART_MEANS * STEWART_MEANS];
+    real state[STEWART_STATES];       /* now */
+    real measurement[STEWART_STATES]; /* the last, as it came */
+    real measured[STEWART_STATES];    /* last of each value that was there */
+    real outlier[STEWART_STATES];     /* the last one */
+    real error[6];                    /* of the pose */
+    real integral[6];
+    real gain[STEWART_MOTORS * STEWART_MAX_ORDER]; /* the last good one, (6, n) */
+    real torque[STEWART_MOTORS];                   /* the last, as asked for */
+    real weights[2];
+    int has_covariance, has_gain, has_started;
+    int outliers; /* in a row that bear each other out */
+    int unseen;   /* periods since a measurement was last used */
+    int behind;   /* periods since that of `mean` */
+    int silence;  /* samples that are still to go on without feedback */
+    int counts[STEWART_CAUSES];
+} stewart_memory;
+
+/* Place to compute in, between 40 and 60 kB; keeps nothing from one call to the next. */
+typedef struct stewart_workspace stewart_workspace;
+
+/* Torques in flight at a sample. */
+int stewart_queue_length(const stewart_config *config);
+
+/* Instants (s from now) at which the reference must be known for a step; returns how many. */
+int stewart_preview_times(const stewart_config *config, real *times);
+
+/* Before the first step; `queue` has the torques that are under way, the oldest first. */
+void stewart_init(const stewart_config *config, stewart_memory *memory, const real *queue);
+
+/* One sample.
+
+   measurement: a state; what is lost is NaN.
+   age: of it in periods, 0 where measurements are those of now.
+   preview: the reference at the instants of `stewart_preview_times`, a row each.
+   weights: of errors and of torques.
+   torque: what to send, as asked for; the motors' limit stands behind it.
+   Returns what went wrong, bits of the enumeration above. */
+int stewart_step(const stewart_config *config, stewart_memory *memory, stewart_workspace *work,
+                 const real *measurement, int age, const real *preview, const real *weights,
+                 real *torque);
+
+/* Something else was sent at the last sample than its torque within the limit. */
+void stewart_sent(const stewart_config *config, stewart_memory *memory, const real *torque);
+
+#include "workspace.h"
+
+#endif
