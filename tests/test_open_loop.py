@@ -1,8 +1,6 @@
 """The exact plant without Drake: DOP853 against scipy, energy, order, events, where it ends."""
 
 import math
-import subprocess
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -219,13 +217,3 @@ def test_what_cannot_be_is_refused(changes: dict[str, Any], message: str) -> Non
     given: dict[str, Any] = {"start": AT_HOME, "drives": [Drive()], "times": [0.1]} | changes
     with pytest.raises(ValueError, match=message):
         integrate(HEAVY, **given)
-
-
-def test_the_c_is_free_of_warnings(tmp_path: Path, backend: str) -> None:
-    command = build.compiler()
-    if command is None or backend == "0":
-        pytest.skip("once, and with a compiler")
-    strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror"]
-    for name in ("dop853.c", "plant.c"):
-        made = ["-O1", "-c", str(build.FOLDER / name), "-o", str(tmp_path / "made.o")]
-        subprocess.run([*command, *strict, *made], check=True)

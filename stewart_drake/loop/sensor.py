@@ -18,6 +18,12 @@ _EARLY = 1e-9
 """s by which a sample may come before an instant and still be at it."""
 
 
+def white_noise(seed: int, k: int, stream: int = 0) -> Array:
+    """Normal numbers (12,) of sample k, a function of (seed, k); stream 1 is that of spikes."""
+    bits = np.random.Philox(key=seed, counter=[0, 0, stream, k])
+    return np.random.Generator(bits).standard_normal(NUM_STATE)
+
+
 class Sensor(LeafSystem):
     """Adds white Gaussian noise, new at every sample of the controller, and has faults.
 
@@ -65,13 +71,7 @@ class Sensor(LeafSystem):
 
     def noise(self, k: int) -> Array:
         """The noise (12,) of sample k."""
-        return self._std * self._normal(k, 0)
-
-    def _normal(self, k: int, stream: int) -> Array:
-        counter = [0, 0, stream, k]
-        return np.random.Generator(
-            np.random.Philox(key=self._seed, counter=counter)
-        ).standard_normal(NUM_STATE)
+        return self._std * white_noise(self._seed, k)
 
     def _measure(self, context: Context, output: BasicVector) -> None:
         y, time = np.asarray(self._state.Eval(context)), context.get_time()
@@ -89,7 +89,7 @@ class Sensor(LeafSystem):
             return np.full(NUM_STATE, np.nan)
         if fault["kind"] == "spike":
             size = SPIKE if fault.get("size") is None else fault["size"]
-            return y + size * self._scale * self._normal(k, 1)
+            return y + size * self._scale * white_noise(self._seed, k, 1)
         last = context.get_discrete_state_vector().value()
         return y if np.all(np.isnan(last)) else last
 
