@@ -13,6 +13,7 @@ it takes to plan no longer grows with the number of periods.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,34 +75,80 @@ def plan_catch_up(
     Raises:
         ConfigError: with the given duration the plate would leave its workspace.
     """
-    wanted = DEFAULT_CATCH_UP if duration is None else duration
-    fewest = 2 if torque_limit is not None and duration is None else _periods(wanted, period)
-    most = fewest if duration is not None else _periods(LONGEST_CATCH_UP, period)
-    limit = math.inf if torque_limit is None or duration is not None else HEADROOM * torque_limit
+    return CatchUp(dynamics, reference, start, t_start, period).plan(duration, torque_limit)
 
-    def attempt(periods: int) -> Trajectory | None:
-        return _plan(dynamics, reference, start, t_start, period, periods, limit)
 
-    # What n periods can do, more can do with less torque: double n, then halve the bracket.
-    failed, periods, motion = fewest - 1, fewest, attempt(fewest)
-    while motion is None and periods < most:
-        failed, periods = periods, min(2 * periods, most)
-        motion = attempt(periods)
-    if motion is None and duration is None:
-        return reference, 0.0
-    if motion is None:
-        raise ConfigError(
-            f"controller.catch_up: got {duration:g} s, with which the plate would leave its "
-            "workspace; expected a longer time, or null for the shortest possible"
-        )
-    while periods - failed > 1:
-        middle = (failed + periods) // 2
-        shorter = attempt(middle)
-        if shorter is None:
-            failed = middle
-        else:
-            periods, motion = middle, shorter
-    return motion, periods * period
+class _Holds(NamedTuple):
+    """States, the start first, under torques that are held from edge to edge, s."""
+
+    states: Array
+    torques: Array
+    edges: Array
+
+
+class CatchUp:
+    """The plans from one state, each made once, whatever the limit is that they are asked for.
+
+    Args:
+        dynamics, reference, start, t_start, period: as of `plan_catch_up`.
+    """
+
+    def __init__(
+        self,
+        dynamics: StewartDynamics,
+        reference: Trajectory,
+        start: Array,
+        t_start: float,
+        period: float,
+    ) -> None:
+        self._dynamics, self._reference, self._period = dynamics, reference, period
+        self._start, self._t_start = start, t_start
+        self._holds: dict[int, _Holds | None] = {}
+        self._motions: dict[int, Trajectory] = {}
+
+    def plan(
+        self, duration: float | None, torque_limit: float | None
+    ) -> tuple[Trajectory, float]:
+        """As `plan_catch_up`; the same plan is the same trajectory."""
+        period = self._period
+        wanted = DEFAULT_CATCH_UP if duration is None else duration
+        fewest = 2 if torque_limit is not None and duration is None else _periods(wanted, period)
+        most = fewest if duration is not None else _periods(LONGEST_CATCH_UP, period)
+        limit = math.inf if torque_limit is None or duration is not None else HEADROOM * torque_limit
+
+        # What n periods can do, more can do with less torque: double n, then halve the bracket.
+        failed, periods = fewest - 1, fewest
+        while not (possible := self._possible(periods, limit)) and periods < most:
+            failed, periods = periods, min(2 * periods, most)
+        if not possible and duration is None:
+            return self._reference, 0.0
+        if not possible:
+            raise ConfigError(
+                f"controller.catch_up: got {duration:g} s, with which the plate would leave its "
+                "workspace; expected a longer time, or null for the shortest possible"
+            )
+        while periods - failed > 1:
+            middle = (failed + periods) // 2
+            if self._possible(middle, limit):
+                periods = middle
+            else:
+                failed = middle
+        return self._motion(periods), periods * period
+
+    def _possible(self, periods: int, limit: float) -> bool:
+        if periods not in self._holds:
+            self._holds[periods] = _plan(
+                self._dynamics, self._reference, self._start, self._t_start, self._period, periods
+            )
+        found = self._holds[periods]
+        return found is not None and bool(np.abs(found.torques).max() <= limit)
+
+    def _motion(self, periods: int) -> Trajectory:
+        if periods not in self._motions:
+            found = self._holds[periods]
+            assert found is not None
+            self._motions[periods] = _motion(self._dynamics, self._reference, *found)
+        return self._motions[periods]
 
 
 def _periods(duration: float, period: float) -> int:
@@ -115,9 +162,8 @@ def _plan(
     t_start: float,
     period: float,
     periods: int,
-    torque_limit: float,
-) -> Trajectory | None:
-    """The planned motion over so many periods, or None where there is none."""
+) -> _Holds | None:
+    """The plan over so many periods, or None where there is none."""
     samples = np.round(np.linspace(0, periods, min(periods, MOST_HOLDS) + 1))
     edges, holds = t_start + period * samples, period * np.diff(samples)
     pieces = math.ceil(holds.max() / PIECE)
@@ -132,9 +178,7 @@ def _plan(
             return None
         miss = (target - states[-1]) / size
         if np.abs(miss).max() <= TOLERANCE:
-            if np.abs(torques).max() > torque_limit:
-                return None
-            return _motion(dynamics, reference, states, torques, edges)
+            return _Holds(states, torques, edges)
         J = _sensitivity(dynamics, states, torques, holds) / size[:, None]
         torques = torques + np.reshape(np.linalg.lstsq(J, miss)[0], torques.shape)
     return None

@@ -1,0 +1,142 @@
+"""One run of many: how it ended, and no record of it.
+
+It takes the loop of native/plant.c where that has all that the scenario asks for, and Drake's where it
+has not; both come to the same.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.dynamics.open_loop import IntegrationError
+from stewart_drake.dynamics.threads import one_blas_thread
+from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.motion import KnownMotion, Motion, Preview
+from stewart_drake.loop.experiment import first_queue, followed_motion
+from stewart_drake.loop.metrics import Figures, figures
+from stewart_drake.loop.native_loop import Course, Instants, run_loop, uncovered
+from stewart_drake.loop.preparation import Preparation, Prepared, preparation_of
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.signals import POSE
+
+Array = NDArray[np.float64]
+
+
+class Ending(NamedTuple):
+    """How a run ended.
+
+    Attributes:
+        status: as of `loop.results.RunSummary`.
+        stopped: when and why it did not complete, or None.
+        figures: what it came to.
+        counts: what went wrong and was survived, by name, as in the summary.
+        loop: what ran it: `native`, or another loop, and the field of the scenario that took it.
+    """
+
+    status: str
+    stopped: Failure | None
+    figures: Figures
+    counts: dict[str, int]
+    loop: str
+
+
+def run_to_its_end(scenario: Scenario, truth: Mechanism | None = None) -> Ending:
+    """Run a scenario, without a judgement beforehand.
+
+    Args:
+        scenario: what to run.
+        truth: the machine to simulate where it is not the one that the controller knows.
+
+    Raises:
+        ConfigError: bad input, an unreachable reference.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    with one_blas_thread:
+        preparation = preparation_of(scenario)
+        experiment = preparation.experiment(scenario, truth)
+        only_drake = uncovered(experiment)
+        if only_drake is None:
+            try:
+                return _in_c(preparation, preparation.prepared(experiment))
+            except IntegrationError:
+                only_drake = "plant.accuracy"
+        return _in_drake(scenario, truth, only_drake)
+
+
+class PythonLaw:
+    """The law of a prepared run, sample by sample.
+
+    Attributes:
+        memory: as of the last sample.
+    """
+
+    def __init__(self, prepared: Prepared, when: Instants) -> None:
+        experiment, law = prepared.experiment, prepared.law
+        c = experiment.scenario.controller
+        self._law, self._previews, self._when = law, prepared.previews, when
+        self._weights = np.array([c.w_Q, c.w_R])
+        self._followed = followed_motion(experiment, law, prepared.planned)
+        self.memory = law.initial_memory(first_queue(experiment, law))
+
+    def __call__(self, sample: int, measurement: Array) -> Array:
+        """The torque (6,) of a sample."""
+        motion: Motion = Preview(self._law.preview_times, self._previews[sample])
+        if self._followed is not None:
+            motion = KnownMotion(*self._followed, self._when.samples[sample])
+        measured = Measurement.of(measurement)
+        self.memory = self._law.step(self.memory, measured, motion, self._weights)
+        return self.memory.torque
+
+
+def _in_c(preparation: Preparation, prepared: Prepared) -> Ending:
+    law = PythonLaw(prepared, preparation.when)
+    course = run_loop(prepared.experiment, preparation.when, law)
+    counts = law.memory.counts.summary() | {"tuner_fallbacks": 0}
+    return _ending(preparation, prepared, course, counts, "native, law in Python")
+
+
+def _ending(
+    preparation: Preparation, prepared: Prepared, course: Course, counts: dict[str, int], loop: str
+) -> Ending:
+    when, looked = preparation.when, len(course.states)
+    error = course.states[:, POSE] - preparation.references[:looked, POSE]
+    grid, sampled = when.on_grid[:looked], when.sampled[:looked]
+    taken = int(sampled.sum())
+    experiment = prepared.experiment
+    found = figures(
+        when.nominal[:looked][grid],
+        error[grid],
+        experiment.scale,
+        error[sampled],
+        course.asked[:taken],
+        course.sent[:taken],
+        experiment.scenario.controller,
+        course.stopped is None,
+    )
+    status = "completed" if course.stopped is None else "left_workspace"
+    return Ending(status, course.stopped, found, counts, loop)
+
+
+def _in_drake(scenario: Scenario, truth: Mechanism | None, field: str) -> Ending:
+    result = simulate(scenario, truth=truth, margin=False)
+    if result.status == "interrupted":
+        raise KeyboardInterrupt
+    return ending_of(result, f"drake, {field}")
+
+
+def ending_of(result: SimulationResult, loop: str = "drake") -> Ending:
+    """How a simulation ended."""
+    summary = result.summary
+    found = Figures(
+        accumulated_error=summary["accumulated_error"],
+        cost=summary["cost"],
+        peak_torque=summary["peak_torque"],
+        rms_torque=summary["rms_torque"],
+        torque_variation=summary["torque_variation"],
+    )
+    return Ending(result.status, result.stopped, found, summary["counts"], loop)
