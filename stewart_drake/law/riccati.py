@@ -1,5 +1,6 @@
 """The delayed LQI gain, equations (40)-(44), and its reduction to a delay-free Riccati equation."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,8 @@ from stewart_drake.law.delay_model import DelayedModel, chain
 from stewart_drake.law.hautus import distinct, pbh_margins
 
 Array = NDArray[np.float64]
+Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
+"""What takes and gives what `lqr` does."""
 
 
 RESIDUAL = 1e-4
@@ -60,7 +63,9 @@ def lqr(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
     return K, P
 
 
-def full_gain(model: DelayedModel, Q: Array, R: Array) -> tuple[Array, Array]:
+def full_gain(
+    model: DelayedModel, Q: Array, R: Array, solver: Solver = lqr
+) -> tuple[Array, Array]:
     """(42)-(44) on the whole chain (37)-(39): K (m, n + m L) and P, with Q (p, p) on y = C e.
 
     The queue makes the equation large; `augmented_gain` finds the same K without it.
@@ -73,7 +78,7 @@ def full_gain(model: DelayedModel, Q: Array, R: Array) -> tuple[Array, Array]:
     u = _units(np.zeros_like(R), R)
     x = np.concatenate([_units(model.A, model.C.T @ Q @ model.C), np.tile(u, model.queue_length)])
     Q = C.T @ Q @ C
-    K, P = lqr(A * x / x[:, None], B * u / x[:, None], Q * np.outer(x, x), R * np.outer(u, u))
+    K, P = solver(A * x / x[:, None], B * u / x[:, None], Q * np.outer(x, x), R * np.outer(u, u))
     return K * u[:, None] / x, P / np.outer(x, x)
 
 
@@ -90,7 +95,7 @@ def _units(A: Array, Q: Array) -> Array:
     return 1 / np.sqrt(np.where(useful, cost, 1.0))
 
 
-def reduced_gain(model: DelayedModel, Q: Array, R: Array) -> Array:
+def reduced_gain(model: DelayedModel, Q: Array, R: Array, solver: Solver = lqr) -> Array:
     """K (m, n) on the state predicted to when the next torque starts to act; the same for any mu.
 
     T_k cannot change e_k ... e_{k+mu}, and the cost puts no weight on the queue. What is left to
@@ -101,7 +106,7 @@ def reduced_gain(model: DelayedModel, Q: Array, R: Array) -> Array:
     Raises:
         RiccatiError: see `lqr`.
     """
-    return full_gain(replace(model, steps=0), Q, R)[0]
+    return full_gain(replace(model, steps=0), Q, R, solver)[0]
 
 
 def prediction_matrix(model: DelayedModel) -> Array:

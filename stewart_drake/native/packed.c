@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "dynamics.h"
+#include "riccati.h"
 
 #ifndef SOURCE
 #define SOURCE ""
@@ -107,4 +108,14 @@ EXPORT void predict(double *b)
         stewart_move(&plant, torque, h[step], x);
         memcpy(result, x, sizeof x);
     }
+}
+
+/* order, A, B, Q, R -> K, P by rows, and the number of doublings, 0 for a failure. */
+EXPORT void riccati(double *b)
+{
+    stewart_riccati_work work;
+    int n = (int)b[0];
+    double *A = b + 1, *B = A + n * n, *Q = B + STEWART_INPUTS * n, *R = Q + n * n;
+    double *K = R + STEWART_INPUTS * STEWART_INPUTS, *P = K + STEWART_INPUTS * n;
+    P[n * n] = stewart_riccati(n, A, B, Q, R, K, P, &work);
 }

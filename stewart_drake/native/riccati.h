@@ -8,16 +8,16 @@
 #define STEWART_MAX_ORDER 24 /* states: pose, rates, integral, and a torque that is still to act */
 #define STEWART_INPUTS 6
 
-/* Matrices (n, STEWART_MAX_ORDER) by rows: the padding makes all loops of one length. */
+/* The first n rows and columns of a matrix. */
 typedef real stewart_matrix[STEWART_MAX_ORDER][STEWART_MAX_ORDER];
 
 typedef struct {
     stewart_matrix A, G, H, W, left, right, product, other, closed;
-    real inputs[STEWART_INPUTS][STEWART_MAX_ORDER], small[STEWART_INPUTS][STEWART_INPUTS];
 } stewart_riccati_work;
 
 /* Gain K (6, n) of u = -K x that minimises sum x'Qx + u'Ru of x+ = A x + B u, and P (n, n), its cost
-   x'Px, or NULL. A (n, n), B (n, 6), Q (n, n), R (6, 6) by rows; Q and R are symmetric.
+   x'Px, or NULL. A (n, n), B (n, 6), Q (n, n), R (6, 6) by rows; Q and R are symmetric, n is 6, 12,
+   18 or 24.
 
    Returns the number of doublings, or 0 where there is no stabilising solution, or none was found. */
 int stewart_riccati(int n, const real *A, const real *B, const real *Q, const real *R, real *K,

@@ -11,7 +11,7 @@ typedef struct {
 } stewart_estimate;
 
 typedef struct {
-    stewart_estimate found, alone, before; /* of an attempt, without the measurement, of an outlier */
+    stewart_estimate prior, found, alone; /* of an attempt, and without the measurement */
     real A[2][144], B[72], G[2][96];       /* of d state/dt, at the nodes */
     real omega[144], turned[96], hold[144], hold_S[96]; /* of one torque */
     real H[12 * STEWART_MEANS], HP[12 * STEWART_MEANS], gain[STEWART_MEANS * 12];

@@ -1,0 +1,50 @@
+"""The Riccati equation by structure-preserving doubling, in C: see native/riccati.c.
+
+The law in C designs with it. `law.riccati.lqr`, by Drake's solver, is what the law in Python and the
+analyses use, and what this is compared with.
+"""
+
+import ctypes
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.dynamics.native_functions import NativeFunction
+from stewart_drake.law.riccati import RiccatiError
+from stewart_drake.scenario.signals import NUM_TORQUES
+
+Array = NDArray[np.float64]
+
+MAX_ORDER = 24
+"""States, at the most."""
+
+
+class Doubling:
+    """Gain and cost of n states, (n, n) and (n, 6), as `law.riccati.lqr` gives them.
+
+    Args:
+        library: the compiled one.
+        order: n.
+
+    Raises:
+        ValueError: more states than it has place for.
+    """
+
+    def __init__(self, library: ctypes.CDLL, order: int) -> None:
+        if not 0 < order <= MAX_ORDER:
+            raise ValueError(f"order: got {order}; expected 1 to {MAX_ORDER}")
+        n, m = order, NUM_TORQUES
+        arguments, results = [(n, n), (n, m), (n, n), (m, m)], [(m, n), (n, n), (1,)]
+        nothing = np.empty(0)
+        self._call = NativeFunction(library, "riccati", nothing, arguments, results, [n])
+
+    def __call__(self, A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
+        """K (6, n) and P (n, n).
+
+        Raises:
+            RiccatiError: there is no stabilising solution, or none was found.
+        """
+        K, P, count = self._call(A, B, Q, R)
+        if not count[0]:
+            raise RiccatiError("Riccati equation: doubling has found no solution")
+        return K, P
