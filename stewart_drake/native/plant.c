@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "dop853.h"
+#include "stewart.h"
 
 #define EXPORT __attribute__((visibility("default")))
 #define MOTORS 6
@@ -194,4 +195,37 @@ EXPORT int closed_loop(run *r, machine *m, looks *l, loop *o, controller law, vo
                 m->torque[i] = o->waiting[MOTORS * k + i] + o->bias[i];
     }
     return ended(r, &s, how);
+}
+
+/* law.c as a controller. */
+typedef struct {
+    const stewart_config *config;
+    stewart_memory memory;
+    stewart_workspace work;
+    const double *previews; /* of each sample one after the other */
+    int rows;               /* of one of them */
+    const double *weights;
+} law_in_c;
+
+static int step(void *about, long k, const double *measurement, double *torque)
+{
+    law_in_c *law = about;
+    const double *preview = law->previews + STEWART_REFERENCE * law->rows * k;
+    stewart_step(law->config, &law->memory, &law->work, measurement, 0, preview, law->weights, torque);
+    return 0;
+}
+
+/* `closed_loop` with the law in C. `queue` is what it believes in flight, counts (STEWART_CAUSES) what
+   went wrong. */
+EXPORT int closed_loop_of_law(run *r, machine *m, looks *l, loop *o, const stewart_config *config,
+                              const double *queue, const double *previews, const double *weights,
+                              int *counts)
+{
+    law_in_c law = {.config = config, .previews = previews, .weights = weights};
+    double times[STEWART_PREVIEW];
+    law.rows = stewart_preview_times(config, times);
+    stewart_init(config, &law.memory, queue);
+    int how = closed_loop(r, m, l, o, step, &law);
+    memcpy(counts, law.memory.counts, sizeof law.memory.counts);
+    return how;
 }
