@@ -106,15 +106,15 @@ class CatchUp:
         self._holds: dict[int, _Holds | None] = {}
         self._motions: dict[int, Trajectory] = {}
 
-    def plan(
-        self, duration: float | None, torque_limit: float | None
-    ) -> tuple[Trajectory, float]:
+    def plan(self, duration: float | None, torque_limit: float | None) -> tuple[Trajectory, float]:
         """As `plan_catch_up`; the same plan is the same trajectory."""
         period = self._period
         wanted = DEFAULT_CATCH_UP if duration is None else duration
         fewest = 2 if torque_limit is not None and duration is None else _periods(wanted, period)
         most = fewest if duration is not None else _periods(LONGEST_CATCH_UP, period)
-        limit = math.inf if torque_limit is None or duration is not None else HEADROOM * torque_limit
+        limit = (
+            math.inf if torque_limit is None or duration is not None else HEADROOM * torque_limit
+        )
 
         # What n periods can do, more can do with less torque: double n, then halve the bracket.
         failed, periods = fewest - 1, fewest

@@ -1,7 +1,7 @@
 """One run of many: how it ended, and no record of it.
 
-It takes the loop of native/plant.c where that has all that the scenario asks for, and Drake's where it
-has not; both come to the same.
+It takes the loop of native/plant.c where that has all that the scenario asks for, and Drake's where
+it has not; both come to the same.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
-from stewart_drake.loop.experiment import first_queue, followed_motion
+from stewart_drake.loop.experiment import assemble, first_queue, followed_motion
 from stewart_drake.loop.metrics import Figures, figures
 from stewart_drake.loop.native_loop import Course, Instants, run_loop, uncovered
 from stewart_drake.loop.preparation import Preparation, Prepared, preparation_of
@@ -35,7 +35,7 @@ class Ending(NamedTuple):
         stopped: when and why it did not complete, or None.
         figures: what it came to.
         counts: what went wrong and was survived, by name, as in the summary.
-        loop: what ran it: `native`, or another loop, and the field of the scenario that took it.
+        loop: what ran it: `native`, or what else, and what of the scenario made it necessary.
     """
 
     status: str
@@ -45,7 +45,7 @@ class Ending(NamedTuple):
     loop: str
 
 
-def run_to_its_end(scenario: Scenario, truth: Mechanism | None = None) -> Ending:
+def run_in_bulk(scenario: Scenario, truth: Mechanism | None = None) -> Ending:
     """Run a scenario, without a judgement beforehand.
 
     Args:
@@ -56,16 +56,27 @@ def run_to_its_end(scenario: Scenario, truth: Mechanism | None = None) -> Ending
         ConfigError: bad input, an unreachable reference.
         KeyboardInterrupt: Ctrl-C.
     """
+    only_drake = uncovered(scenario)
+    if only_drake is not None:
+        return _in_drake(scenario, truth, only_drake)
     with one_blas_thread:
         preparation = preparation_of(scenario)
-        experiment = preparation.experiment(scenario, truth)
-        only_drake = uncovered(experiment)
-        if only_drake is None:
-            try:
-                return _in_c(preparation, preparation.prepared(experiment))
-            except IntegrationError:
-                only_drake = "plant.accuracy"
-        return _in_drake(scenario, truth, only_drake)
+        prepared = preparation.prepared(preparation.experiment(scenario, truth))
+        try:
+            return _in_c(preparation, prepared)
+        except IntegrationError:
+            return _in_drake(scenario, truth, "plant.accuracy")
+
+
+def start_of(scenario: Scenario) -> Array:
+    """The state (12,) in which a run begins.
+
+    Raises:
+        ConfigError: as `run_in_bulk`.
+    """
+    if uncovered(scenario) is not None:
+        return assemble(scenario).start
+    return preparation_of(scenario).experiment(scenario).start
 
 
 class PythonLaw:

@@ -1,5 +1,5 @@
-"""The closed loop without Drake, for many runs: the exact plant of native/plant.c behind the same delay
-chain, limit, bias and noise, seen and judged at the same instants (docs/theory.md, section 32).
+"""The closed loop without Drake, for many runs: the exact plant of native/plant.c behind the same
+delay chain, limit, bias and noise, seen and judged at the same instants (docs/theory.md, section 32).
 """
 
 import ctypes
@@ -15,11 +15,10 @@ from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.loop.experiment import Experiment, torques_in_flight
-from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.sensor import white_noise
 from stewart_drake.native.library import backend
 from stewart_drake.native.plant import Controller, Ended, LoopStruct
-from stewart_drake.scenario.config import WireConfig
+from stewart_drake.scenario.config import FixedTunerConfig, Scenario, WireConfig
 from stewart_drake.scenario.signals import BIAS, NUM_STATE, NUM_TORQUES, POSE
 from stewart_drake.scenario.timing import event_time, instants, look_time
 
@@ -87,28 +86,27 @@ Law = Callable[[int, Array], Array]
 """(sample, measurement (12)) -> torque (6), N m."""
 
 
-def uncovered(experiment: Experiment) -> str | None:
-    """What of an experiment only Drake's loop has, as the field of the scenario, or None."""
-    sc = experiment.scenario
-    told = {
-        "STEWART_NATIVE": backend().library is None,
-        "own": experiment.own != NOTHING,
+def uncovered(scenario: Scenario) -> str | None:
+    """What of a scenario only Drake's loop has, by its field, or None."""
+    sc = scenario
+    only_drake = {
+        str(backend()): backend().library is None,
         "plant.kind": sc.plant.kind != "exact",
         "delay": not sc.delay.constant,
         "link.kind": not isinstance(sc.link, WireConfig),
         "sensor.faults": bool(sc.sensor.faults),
         "sensor.delay": sc.sensor.delay != 0,
         "sensor.loss": sc.sensor.loss != 0,
-        "tuner.kind": experiment.network is not None,
+        "tuner.kind": not isinstance(sc.tuner, FixedTunerConfig),
     }
-    return next((name for name, only_drake in told.items() if only_drake), None)
+    return next((name for name, there in only_drake.items() if there), None)
 
 
 def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
-    """Run an experiment that nothing is `uncovered` of to its end.
+    """Run an experiment to its end.
 
     Args:
-        experiment: what to run.
+        experiment: what to run; nothing of its scenario is `uncovered`.
         when: `instants_of` its duration and period.
         law: of the torques.
 

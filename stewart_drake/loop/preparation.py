@@ -1,7 +1,8 @@
 """What many runs of one scenario have in common, computed once in a process.
 
-Runs differ in what a machine is, in its disturbances, its noise, its torque limit. Mechanism, motion,
-their check, the sizes that the law takes from them, the ways onto the reference and its previews stay.
+Runs differ in what a machine is, in its disturbances, its noise, its torque limit. Mechanism and
+motion, their check, the sizes that the law takes from them, the ways onto the reference and its
+previews stay.
 """
 
 import json

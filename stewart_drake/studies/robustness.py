@@ -7,7 +7,8 @@ from typing import Any
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
-from stewart_drake.loop.experiment import assemble, prepare
+from stewart_drake.loop.bulk import run_in_bulk, start_of
+from stewart_drake.loop.experiment import prepare
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.config import Scenario
@@ -21,7 +22,6 @@ from stewart_drake.studies.runs import (
     outcome_of,
     read_outcome,
     run_file,
-    run_to_its_end,
 )
 from stewart_drake.studies.uncertainty import MACHINE, Draw, draw, drawn, scales_of
 
@@ -98,9 +98,9 @@ def _run(scenario: Scenario, one: Draw) -> Outcome:
     except (ConfigError, UnreachablePoseError) as error:
         return Outcome("not_assembled", str(error), time=0.0)
     try:
-        outside = diagnose(truth, 0.0, assemble(variant, truth).start[POSE])
+        outside = diagnose(truth, 0.0, start_of(variant)[POSE])
         if outside is not None:
             return Outcome("left_workspace", outside.reason, outside.leg, 0.0)
-        return outcome_of(run_to_its_end(variant, truth))
+        return outcome_of(run_in_bulk(variant, truth))
     except ConfigError as error:
         return Outcome("refused", str(error), time=0.0)

@@ -93,6 +93,12 @@ class RobustnessStudy(NamedTuple):
         counts = Counter(self.reason_of(one) for one in self.outcomes)
         return {reason: n for reason, n in counts.most_common() if reason}
 
+    @property
+    def loops(self) -> dict[str, int]:
+        """Number of runs by what ran them, the most frequent first."""
+        counts = Counter(one.loop for one in self.outcomes if one.loop)
+        return dict(counts.most_common())
+
     def quantile(self, probability: float) -> Interval:
         """Of E_ac over all runs, % s; a run that did not complete counts as infinite."""
         return quantile_interval(np.where(np.isnan(self.errors), np.inf, self.errors), probability)
@@ -136,6 +142,7 @@ class RobustnessStudy(NamedTuple):
             else None,
             "influences": [_influence_summary(one) for one in self.influences()],
             "explanation": self.explanation.summary,
+            "loops": self.loops,
             "undisturbed": dataclasses.asdict(self.undisturbed),
             "ranges": dataclasses.asdict(self.ranges),
             "scales": self.scales._asdict(),
