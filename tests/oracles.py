@@ -37,14 +37,25 @@ from pydrake.multibody.tree import (
 )
 from scipy.integrate import solve_ivp
 
+from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, leg_geometry
 from stewart_drake.mechanism.sdformat import to_sdformat
-from stewart_drake.scenario.signals import ANGLES, BIAS, DAMPING, LEGS, PAYLOAD, POSITION
+from stewart_drake.scenario.signals import (
+    ANGLES,
+    BIAS,
+    COULOMB,
+    COULOMB_SPEED,
+    DAMPING,
+    LEGS,
+    PAYLOAD,
+    PAYLOAD_POSITION,
+    POSITION,
+)
 
 Array = NDArray[np.float64]
 
-NO_PARAMETERS = np.zeros(8)
+NO_PARAMETERS = plant_parameters()
 CLOSURE_TOLERANCE = 1e-14
 """Largest gap in m between rod end and plate joint at which Newton's method stops."""
 ORIGIN = np.zeros((3, 1))
@@ -177,13 +188,22 @@ class PartitionedTree:
         gamma_dot_nu = np.zeros(24)
         gamma_dot_nu[self._legs] = -np.linalg.solve(phi_l, bias[..., None])[..., 0]
 
-        self._payload.SetMass(context, parameters[PAYLOAD])
+        place, point = parameters[PAYLOAD_POSITION], UnitInertia.PointMass
+        self._payload.SetSpatialInertiaInBodyFrame(
+            context, SpatialInertia(parameters[PAYLOAD], place, point(place))
+        )
         for crank in self._cranks:
             crank.SetDamping(context, parameters[DAMPING])
         plant.CalcForceElementsContribution(context, self._forces)  # gravity and joint damping
         M = plant.CalcMassMatrix(context)
         h = plant.CalcInverseDynamics(context, gamma_dot_nu, self._forces)
         return gamma.T @ M @ gamma, gamma.T @ h, gamma.T @ self._actuation
+
+    def _passive(self, parameters: Array) -> Array:
+        """Torque (6,) at the shafts beside the motors', at the state that was reduced last."""
+        rates = np.array([crank.get_angular_rate(self.context) for crank in self._cranks])
+        friction = parameters[COULOMB] * np.tanh(rates / parameters[COULOMB_SPEED])
+        return parameters[BIAS] - friction
 
     # The answers, in pose coordinates.
 
@@ -192,7 +212,7 @@ class PartitionedTree:
     ) -> Array:
         """Second derivative (6,) of the pose."""
         M, h, B = self._reduce(pose, rates, parameters)
-        nu_dot = np.linalg.solve(M, B @ (torque + parameters[BIAS]) - h)
+        nu_dot = np.linalg.solve(M, B @ (torque + self._passive(parameters)) - h)
         rpy_dd = RollPitchYaw(pose[ANGLES]).CalcRpyDDtFromRpyDtAndAngularAccelInParent(
             rates[ANGLES], nu_dot[:3]
         )
@@ -208,7 +228,7 @@ class PartitionedTree:
         rest = rpy.CalcRpyDDtFromRpyDtAndAngularAccelInParent(rates[ANGLES], np.zeros(3))
         w_dot = rpy.CalcAngularVelocityInParentFromRpyDt(accelerations[ANGLES] - rest)
         nu_dot = np.concatenate([w_dot, accelerations[POSITION]])
-        return np.linalg.solve(B, M @ nu_dot + h) - parameters[BIAS]
+        return np.linalg.solve(B, M @ nu_dot + h) - self._passive(parameters)
 
     def equilibrium_torque(self, pose: Array, parameters: Array = NO_PARAMETERS) -> Array:
         """Motor torques (6,) in N m that hold the plate still."""

@@ -12,8 +12,21 @@ from numpy.typing import NDArray
 
 from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE, STANDARD_GRAVITY
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.scenario.signals import BIAS, DAMPING
+from stewart_drake.mechanism.kinematics import (
+    UnreachablePoseError,
+    angle_rate_map,
+    rotation,
+)
+from stewart_drake.scenario.signals import (
+    BIAS,
+    COULOMB,
+    COULOMB_SPEED,
+    DAMPING,
+    PARAMETERS,
+    PAYLOAD,
+    PAYLOAD_POSITION,
+    PLANT_PARAMETERS,
+)
 from tests.mechanisms import PAPER, SPREAD, random_mechanism, random_pose
 from tests.oracles import (
     PartitionedTree,
@@ -36,16 +49,27 @@ ALTERNATING = np.array([1.0, -1, 1, -1, 1, -1])
 AT_REST = np.zeros(6)
 
 
+all_free = functools.partial(StewartDynamics, free=PLANT_PARAMETERS)
+"""Dynamics whose methods take all parameters of the plant (13,)."""
+
+
 def random_parameters(rng: np.random.Generator) -> Array:
-    """Torque bias, payload and damping (8,)."""
-    return np.concatenate([rng.normal(0, 0.1, 6), rng.uniform([0.1, 0.0], [2.0, 0.1])])
+    """Torque bias, payload, damping, Coulomb friction and its speed, place of the payload (13,)."""
+    friction = rng.uniform([0.1, 0.0, 0.0, 0.05], [2.0, 0.1, 0.1, 1.0])
+    return np.concatenate([rng.normal(0, 0.1, 6), friction, rng.normal(0, 0.05, 3)])
 
 
 @functools.cache
 def shared(index: int) -> StewartDynamics:
     """Dynamics with gravity of the paper's mechanism (-1) or of a random one (0, 1, ...)."""
     rng = np.random.default_rng(abs(index))
-    return StewartDynamics(PAPER if index < 0 else random_mechanism(rng))
+    return all_free(PAPER if index < 0 else random_mechanism(rng))
+
+
+def friction(parameters: Array, crank_rates: Array) -> Array:
+    """Torque (6,) against the cranks."""
+    coulomb, speed = parameters[COULOMB], parameters[COULOMB_SPEED]
+    return parameters[DAMPING] * crank_rates + coulomb * np.tanh(crank_rates / speed)
 
 
 def trajectory(t: float) -> tuple[Array, Array, Array]:
@@ -80,13 +104,13 @@ def assert_agrees(
 @pytest.mark.parametrize("gravity", [True, False])
 def test_agrees_with_the_oracle_for_the_paper(gravity: bool) -> None:
     rng = np.random.default_rng(46)
-    assert_agrees(StewartDynamics(PAPER, gravity), PartitionedTree(PAPER, gravity), rng, 500)
+    assert_agrees(all_free(PAPER, gravity), PartitionedTree(PAPER, gravity), rng, 500)
 
 
 @pytest.mark.parametrize("index", range(50))
 def test_agrees_with_the_oracle_for_random_mechanisms(index: int) -> None:
     rng = np.random.default_rng(index)
-    dynamics = StewartDynamics(random_mechanism(rng))
+    dynamics = all_free(random_mechanism(rng))
     for gravity in (True, False):
         # An argument of the compiled functions: nothing is built a second time.
         dynamics.gravity = STANDARD_GRAVITY * gravity
@@ -114,10 +138,11 @@ def test_energy_is_kept_without_torque_and_gravity(index: int) -> None:
 
 
 @pytest.mark.parametrize("index", range(-1, 3))
-def test_energy_changes_by_the_work_of_torque_bias_and_damping(index: int) -> None:
+def test_energy_changes_by_the_work_of_torque_bias_and_friction(index: int) -> None:
     dynamics, rng = shared(index), np.random.default_rng(index + 1)
     mechanism = dynamics.mechanism
-    parameters = np.concatenate([rng.normal(0, 0.05, 6), [0.5, 0.05]])
+    parameters = np.concatenate([rng.normal(0, 0.05, 6), [0.5, 0.05, 0.03, 0.2]])
+    parameters = np.append(parameters, [0.03, -0.02, 0.05])
     span = size(mechanism) * (1.0 if mechanism is PAPER else 0.3)
 
     def with_work(x: Array) -> Array:
@@ -126,7 +151,7 @@ def test_energy_changes_by_the_work_of_torque_bias_and_damping(index: int) -> No
         accelerations = 100 * (target - pose) - 20 * rates
         torque = dynamics.inverse_dynamics(pose, rates, accelerations, parameters)
         crank_rates = mechanism.jacobian(pose) @ rates
-        power = (torque + parameters[BIAS] - parameters[DAMPING] * crank_rates) @ crank_rates
+        power = (torque + parameters[BIAS] - friction(parameters, crank_rates)) @ crank_rates
         x_dot = field(dynamics.accelerations, torque, parameters)(x[:12])
         return np.concatenate([x_dot, [power, 1.0]])
 
@@ -152,7 +177,8 @@ def states(draw: st.DrawFn) -> State:
 @given(states(), st.floats(0, 5))
 def test_mass_matrix_is_symmetric_positive_definite(state: State, payload: float) -> None:
     dynamics, pose, rates = state
-    parameters = np.array([0.0] * 6 + [payload, 0.0])
+    parameters = np.zeros(13)
+    parameters[PAYLOAD], parameters[PAYLOAD_POSITION] = payload, 0.1 * pose[:3]
     mass = dynamics.mass_matrix(pose, parameters)
     assert relative(mass.T, mass) < 1e-14
     assert np.linalg.eigvalsh(mass).min() > 0
@@ -172,7 +198,7 @@ def test_inverse_dynamics_inverts_accelerations(state: State, seed: int) -> None
     assert relative(again, accelerations) < 1e-10
     jacobian = dynamics.mechanism.jacobian(pose)
     assert relative(dynamics.actuation_map(pose), jacobian.T) < 1e-11
-    shaft = torque + parameters[BIAS] - parameters[DAMPING] * (jacobian @ rates)
+    shaft = torque + parameters[BIAS] - friction(parameters, jacobian @ rates)
     left = dynamics.mass_matrix(pose, parameters) @ accelerations
     assert relative(left, jacobian.T @ shaft - dynamics.bias(pose, rates, parameters)) < 1e-9
 
@@ -183,8 +209,8 @@ def test_inverse_dynamics_inverts_accelerations(state: State, seed: int) -> None
 @pytest.mark.parametrize("gravity", [True, False])
 @pytest.mark.parametrize("t", TIMES)
 def test_derivatives_equal_central_differences_of_the_oracle(t: float, gravity: bool) -> None:
-    dynamics, tree = StewartDynamics(PAPER, gravity), PartitionedTree(PAPER, gravity)
-    parameters = np.array([0.01, -0.02, 0.03, 0.01, 0, 0.02, 0.5, 0.01])
+    dynamics, tree = all_free(PAPER, gravity), PartitionedTree(PAPER, gravity)
+    parameters = np.array([0.01, -0.02, 0.03, 0.01, 0, 0.02, 0.5, 0.01, 0.02, 0.5, 0.1, -0.05, 0.2])
     pose, rates, accelerations = trajectory(t)
     torque = tree.inverse_dynamics(pose, rates, accelerations, parameters) + 0.1 * ALTERNATING
     state = np.concatenate([pose, rates])
@@ -193,6 +219,52 @@ def test_derivatives_equal_central_differences_of_the_oracle(t: float, gravity: 
     found = dynamics.derivatives(pose, rates, torque, parameters)
     for value, expected in zip(found, (A, B, G), strict=True):
         assert relative(value, expected) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "free",
+    [("coulomb_friction",), ("payload_position_z", "offset_A1", "payload_mass"), PARAMETERS, ()],
+)
+def test_what_is_free_is_taken_out_of_all_parameters(free: tuple[str, ...]) -> None:
+    """In its order; what the plant does not have changes nothing, and has a column of zeros."""
+    rng = np.random.default_rng(1)
+    whole, other = random_parameters(rng), random_parameters(rng)
+    (pose, rates, _), torque = trajectory(0.4), 0.1 * ALTERNATING
+    some, every = StewartDynamics(PAPER, True, whole, free), all_free(PAPER)
+    assert np.array_equal(
+        some.accelerations(pose, rates, torque), every.accelerations(pose, rates, torque, whole)
+    )
+    theta, expected = rng.normal(0, 1, len(free)), whole.copy()
+    places = [PLANT_PARAMETERS.index(name) if name in PLANT_PARAMETERS else None for name in free]
+    for i, place in enumerate(places):
+        if place is not None:
+            expected[place] = theta[i] = other[place]
+    assert np.array_equal(some.complete(theta), expected)
+    assert np.array_equal(some.plant_parameters, whole)
+    found = some.derivatives(pose, rates, torque, theta)
+    of_all = every.derivatives(pose, rates, torque, expected)
+    assert relative(found.A, of_all.A) < 1e-12
+    assert found.G.shape == (12, len(free))
+    for i, place in enumerate(places):
+        column = np.zeros(12) if place is None else of_all.G[:, place]
+        assert found.G[:, i] == pytest.approx(column, rel=1e-12)
+    moved = some.assuming(theta)
+    assert np.array_equal(moved.plant_parameters, expected)
+    assert moved.free == free
+    known = [0.0 if place is None else value for place, value in zip(places, theta, strict=True)]
+    assert np.array_equal(moved.parameters, known)
+
+
+def test_a_point_mass_is_where_it_is_said_to_be() -> None:
+    """Its weight asks for a moment r x m g more, at rest; turned with the plate."""
+    mass, r, pose = 0.7, np.array([0.04, -0.03, 0.1]), trajectory(0.4)[0]
+    at_com = all_free(PAPER, True, [*np.zeros(6), mass, 0.0])
+    parameters = at_com.plant_parameters.copy()
+    parameters[PAYLOAD_POSITION] = r
+    torque = at_com.equilibrium_torque(pose, parameters) - at_com.equilibrium_torque(pose)
+    moment = np.cross(rotation(pose[:3]) @ r, [0, 0, -9.81 * mass])
+    generalised = np.append(angle_rate_map(pose[:3]).T @ moment, np.zeros(3))
+    assert at_com.actuation_map(pose) @ torque == pytest.approx(-generalised, abs=1e-12)
 
 
 def test_poles_under_gravity() -> None:
@@ -218,12 +290,13 @@ def test_prediction_converges_at_fourth_order(index: int) -> None:
     home = dynamics.mechanism.home
     torques = dynamics.equilibrium_torque(home) + rng.normal(0, 0.1, (4, 6))
     durations, parameters = np.array([0.04, 0.05, 0.03, 0.06]), random_parameters(rng) * 0.1
+    parameters[COULOMB_SPEED] = 1.0  # far longer than a step
     state = np.concatenate([home, rng.normal(0, 0.1, 6) * size(dynamics.mechanism)])
     exact, now = [], state
     for torque, duration in zip(torques, durations, strict=True):
         now = integrate(field(dynamics.accelerations, torque, parameters), now, duration)[-1]
         exact.append(now)
-    substeps = (2, 4, 8, 16)
+    substeps = (4, 8, 16, 32)
     found = [dynamics.predict(state, torques, durations, n, parameters) for n in substeps]
     errors = [relative(states, np.array(exact)) for states in found]
     order = -np.polyfit(np.log(substeps), np.log(errors), 1)[0]

@@ -21,6 +21,7 @@ from stewart_drake.cli import main
 from stewart_drake.dynamics import generate
 from stewart_drake.dynamics.functions import DynamicsFunctions, compiled_functions, margin_of
 from stewart_drake.dynamics.native_functions import NativeFunctions
+from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.dynamics.virtual_machine import VirtualMachine
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
@@ -33,6 +34,7 @@ from tests.backends import switched
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
 Array = NDArray[np.float64]
+NO_PARAMETERS = plant_parameters()
 CLOSE = 1e-13
 """Relative to the largest number of a result; they differ by the order of sums."""
 QUICK = ("accelerations", "energy", "measures", "measures_of_tree", "change", "margin")
@@ -59,7 +61,7 @@ def arguments(rng: np.random.Generator, mechanism: Mechanism) -> dict[str, Array
         "state": np.concatenate([pose, rates]),
         "accelerations": accelerations,
         "torque": torque,
-        "parameters": rng.normal(0, 0.1, 8),
+        "parameters": rng.normal(0, 0.1, 13),
         "gravity": rng.uniform(0, 10),
         "angles": angles,
         "sign": rng.choice([-1.0, 1.0]),
@@ -120,7 +122,7 @@ def test_predictions_are_those_of_the_virtual_machine(native, steps: int) -> Non
     rng = np.random.default_rng(steps)
     torque = PAPER_HOLD + rng.normal(0, 0.01, (steps, 6))
     state = np.concatenate([PAPER.home, 0.01 * rng.normal(0, 1, 6)])
-    given = state, torque, np.zeros(8), 9.81, rng.uniform(1e-4, 5e-4, steps)
+    given = state, torque, NO_PARAMETERS, 9.81, rng.uniform(1e-4, 5e-4, steps)
     found, expected = (
         functions.many_steps(steps)(*given)[0].reshape(steps, 12)
         for functions in (NativeFunctions(PAPER, native), VirtualMachine(PAPER))
@@ -139,7 +141,7 @@ def test_far_out_of_reach_and_without_numbers_they_agree_too(native) -> None:
     for distance in (0.1, 0.3, 1.0, 1e3):
         pose = PAPER.home + rng.normal(0, 1, 6) * ([1.0] * 3 + [distance] * 3)
         rates, torque = rng.normal(0, 1, (2, 6))
-        values = (pose, rates, torque, np.zeros(8), 9.81)
+        values = (pose, rates, torque, NO_PARAMETERS, 9.81)
         assert difference(one.accelerations(*values), other.accelerations(*values)) < 1e-11
         assert difference(one.measures(pose), other.measures(pose)) < 1e-12
     for coordinate in range(6):
@@ -148,7 +150,7 @@ def test_far_out_of_reach_and_without_numbers_they_agree_too(native) -> None:
         zero = np.zeros(6)
         for functions in (one, other):
             assert math.isnan(functions.margin(pose, 1.0, np.zeros(8)))
-            found = functions.accelerations(pose, zero, zero, np.zeros(8), 9.81)[0]
+            found = functions.accelerations(pose, zero, zero, NO_PARAMETERS, 9.81)[0]
             assert np.isnan(found).any()
 
 
@@ -175,13 +177,13 @@ def test_threads_have_buffers_of_their_own(native) -> None:
     expected = {}
     for n in range(8):
         torque = np.full((200, 6), 0.01 * n)
-        expected[n] = functions.many_steps(200)(_START, torque, np.zeros(8), 9.81, 1e-4)[0]
+        expected[n] = functions.many_steps(200)(_START, torque, NO_PARAMETERS, 9.81, 1e-4)[0]
 
     def repeated(n: int) -> bool:
         meeting.wait(10)
         torque = np.full((200, 6), 0.01 * n)
         call = functions.many_steps(200)
-        given = _START, torque, np.zeros(8), 9.81, 1e-4
+        given = _START, torque, NO_PARAMETERS, 9.81, 1e-4
         return all(np.array_equal(call(*given)[0], expected[n]) for _ in range(50))
 
     with ThreadPoolExecutor(8) as pool:

@@ -7,6 +7,14 @@ With F = M nu_dot + h - B torque and the reduction of each leg to its plate join
 q, w and a being position, velocity and acceleration of Q in the leg's frame S, R = R_WS.
 Only f is long; it is differentiated once with respect to six scalars, and the short kinematics of
 q, w, a do the rest. Differentiating F as a whole takes three times as long to build.
+
+The torque is that at the shaft, with d = damping, c = coulomb_friction, s = coulomb_speed,
+
+    torque = T + bias - (d alpha_dot + c slip),   slip = tanh(alpha_dot / s),
+    -d torque / d alpha_dot = d + c (1 - slip^2) / s,
+    -d torque / ds = -c (1 - slip^2) alpha_dot / s^2.
+
+Slips are an argument here: tanh, for which no compiler does several legs at once, is taken outside.
 """
 
 from typing import NamedTuple
@@ -16,7 +24,15 @@ import casadi as ca
 from stewart_drake.dynamics import equations
 from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers, numbers_of
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.signals import BIAS, DAMPING, PAYLOAD
+from stewart_drake.scenario.signals import (
+    BIAS,
+    COULOMB,
+    COULOMB_SPEED,
+    DAMPING,
+    NUM_PLANT_PARAMETERS,
+    PAYLOAD,
+    PAYLOAD_POSITION,
+)
 
 
 class Plate(NamedTuple):
@@ -29,7 +45,7 @@ class Plate(NamedTuple):
 
 
 def residual_derivatives(mechanism: Mechanism, s: dict[str, ca.SX]) -> list[ca.SX]:
-    """dF/d[pose; rates] (6, 12), dF/dparameters (6, 8), M N (6, 6) and B' (6, 6).
+    """dF/d[pose; rates] (6, 12), dF/dparameters (6, 13), M N (6, 6) and B' (6, 6).
 
     Args:
         mechanism: the machine.
@@ -37,16 +53,21 @@ def residual_derivatives(mechanism: Mechanism, s: dict[str, ca.SX]) -> list[ca.S
     """
     legs, common = numbers_of(mechanism)
     dF_dx, M = plate_alone(common, s)
+    slips = equations.slip(
+        ca.vertcat(*(crank_rate(leg, common, s) for leg in legs)), s["parameters"]
+    )
     arms, arm_rates = [], []
     for number, leg in enumerate(legs):
-        torque = s["torque"][number] + s["parameters"][BIAS][number]
-        change, turn, mass, arm, arm_rate = leg_on_plate(leg, common, s, torque)
+        torque, bias = s["torque"][number], s["parameters"][BIAS][number]
+        change, turn, mass, arm, arm_rate = leg_on_plate(
+            leg, common, s, torque, bias, slips[number]
+        )
         dF_dx += change
         dF_dx[:3, :] -= turn
         M += mass
         arms.append(arm)
         arm_rates.append(arm_rate)
-    return assembled(dF_dx, M, ca.vertcat(*arms), ca.vertcat(*arm_rates), s)
+    return assembled(dF_dx, M, ca.vertcat(*arms), ca.vertcat(*arm_rates), slips, s)
 
 
 def _plate(s: dict[str, ca.SX]) -> Plate:
@@ -59,32 +80,66 @@ def _plate(s: dict[str, ca.SX]) -> Plate:
 
 def plate_alone(common: CommonNumbers, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
     """Its part of dF/d[pose; rates] (6, 12) and of M (6, 6)."""
-    R_WP, w, w_dot, g_W = _plate(s)
-    mass = common.plate_mass + s["parameters"][PAYLOAD]
+    R_WP, w, _, g_W = plate = _plate(s)
+    payload = s["parameters"][PAYLOAD]
     I_W = ca.mtimes([R_WP, ca.diag(common.plate_inertia), R_WP.T])
-    force = mass * (s["accelerations"][3:] - g_W)
-    plate = ca.vertcat(ca.mtimes(I_W, w_dot) + ca.cross(w, ca.mtimes(I_W, w)), force)
+    r, moved = _payload(plate, s)
+    moment = ca.mtimes(I_W, plate.w_dot) + ca.cross(w, ca.mtimes(I_W, w))
+    force = common.plate_mass * (s["accelerations"][3:] - g_W) + payload * moved
+    whole = ca.vertcat(moment + ca.cross(r, payload * moved), force)
     state = ca.vertcat(s["pose"], s["rates"])
-    return ca.jacobian(plate, state), ca.diagcat(I_W, mass * ca.SX.eye(3))
+    lever = payload * equations.cross_matrix(r)
+    mass = (common.plate_mass + payload) * ca.SX.eye(3)
+    M_ww = I_W + ca.mtimes(lever, equations.cross_matrix(r).T)
+    M = ca.vertcat(ca.horzcat(M_ww, lever), ca.horzcat(lever.T, mass))
+    return ca.jacobian(whole, state), M
+
+
+def _payload(plate: Plate, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
+    """Its place r from the COM, and its acceleration less gravity's; (3,) each, in W."""
+    R_WP, w, w_dot, g_W = plate
+    r = ca.mtimes(R_WP, s["parameters"][PAYLOAD_POSITION])
+    turned = ca.cross(w_dot, r) + ca.cross(w, ca.cross(w, r))
+    return r, s["accelerations"][3:] - g_W + turned
+
+
+def _joint(leg: LegNumbers, plate: Plate, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """b (3,) in W; position q and velocity (3,) of Q in S."""
+    b = ca.mtimes(plate.R_WP, leg.p_PQ)
+    q = ca.mtimes(leg.R_WS.T, s["pose"][3:] + b - leg.p_WS)
+    return b, q, ca.mtimes(leg.R_WS.T, s["rates"][3:] + ca.cross(plate.w, b))
+
+
+def crank_rate(leg: LegNumbers, common: CommonNumbers, s: dict[str, ca.SX]) -> ca.SX:
+    """alpha_dot of a leg, rad/s."""
+    _, q, velocity = _joint(leg, _plate(s), s)
+    numbers = (*leg.symbols, *common.symbols)
+    reduced = equations.Leg(*equations.leg_at_joint(leg, common)(q, velocity, 0, *numbers))
+    return ca.dot(reduced.arm, velocity)
 
 
 def leg_on_plate(
-    leg: LegNumbers, common: CommonNumbers, s: dict[str, ca.SX], torque: ca.SX
+    leg: LegNumbers,
+    common: CommonNumbers,
+    s: dict[str, ca.SX],
+    torque: ca.SX,
+    bias: ca.SX,
+    slip: ca.SX,
 ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
-    """What a leg adds to both, its row (1, 6) of B', and its crank's rate; `torque` with bias.
+    """What a leg adds to both, its row (1, 6) of B', and its crank's rate.
 
     To the first in two parts: (6, 12), and less (3, 12) in the first rows, because b turns.
     """
-    (R_WP, w, w_dot, g_W), R_WS = _plate(s), leg.R_WS
-    pose, v, v_dot = s["pose"], s["rates"][3:], s["accelerations"][3:]
-    state = ca.vertcat(pose, s["rates"])
-    b = ca.mtimes(R_WP, leg.p_PQ)
-    q = ca.mtimes(R_WS.T, pose[3:] + b - leg.p_WS)
-    velocity = ca.mtimes(R_WS.T, v + ca.cross(w, b))
-    acceleration = ca.mtimes(R_WS.T, v_dot + ca.cross(w_dot, b) + ca.cross(w, ca.cross(w, b)))
-    damping, numbers = s["parameters"][DAMPING], (*leg.symbols, *common.symbols)
+    plate, R_WS = _plate(s), leg.R_WS
+    w, w_dot = plate.w, plate.w_dot
+    state = ca.vertcat(s["pose"], s["rates"])
+    b, q, velocity = _joint(leg, plate, s)
+    turned = ca.cross(w_dot, b) + ca.cross(w, ca.cross(w, b))
+    acceleration = ca.mtimes(R_WS.T, s["accelerations"][3:] + turned)
+    numbers = (*leg.symbols, *common.symbols)
+    gravity = ca.mtimes(R_WS.T, plate.gravity)
     f, df, m, g = _leg_residual(leg, common)(
-        q, velocity, acceleration, torque, damping, ca.mtimes(R_WS.T, g_W), *numbers
+        q, velocity, acceleration, torque, bias, slip, s["parameters"], gravity, *numbers
     )
     at_joint = ca.vertcat(ca.mtimes(equations.cross_matrix(b), R_WS), R_WS)  # [b x R .; R .]
     motion = ca.jacobian(ca.vertcat(q, velocity), state)
@@ -95,23 +150,42 @@ def leg_on_plate(
 
 
 def assembled(
-    dF_dx: ca.SX, M: ca.SX, arm: ca.SX, arm_rates: ca.SX, s: dict[str, ca.SX]
+    dF_dx: ca.SX, M: ca.SX, arm: ca.SX, arm_rates: ca.SX, slips: ca.SX, s: dict[str, ca.SX]
 ) -> list[ca.SX]:
-    """The results of `residual_derivatives` from sums over plate and legs, B' and cranks' rates."""
-    payload = ca.vertcat(ca.SX.zeros(3), s["accelerations"][3:] + ca.vertcat(0, 0, s["gravity"]))
-    dF_dp = ca.horzcat(-arm.T, payload, ca.mtimes(arm.T, arm_rates))
+    """The results of `residual_derivatives` from sums over plate and legs, and of single legs.
+
+    The payload m takes the force m k, k its acceleration less gravity's, which its place changes:
+
+        dr = R dp,   dk = ([w_dot x] + [w x]^2) dr,   d[r x m k; m k] = m [dr x k + r x dk; dk].
+    """
+    plate, p, cross = _plate(s), s["parameters"], equations.cross_matrix
+    r, k = _payload(plate, s)
+    K = cross(plate.w_dot) + ca.mtimes(cross(plate.w), cross(plate.w))
+    moving = ca.vertcat(ca.mtimes(cross(r), K) - cross(k), K)
+    steep = p[COULOMB] * (1 - slips**2) * arm_rates / p[COULOMB_SPEED] ** 2
+    dF_dp = ca.horzcat(
+        -arm.T,
+        ca.vertcat(ca.cross(r, k), k),
+        ca.mtimes(arm.T, ca.horzcat(arm_rates, slips, -steep)),
+        p[PAYLOAD] * ca.mtimes(moving, plate.R_WP),
+    )
     E = equations.angle_rate_map(s["pose"][:3])
     return [dF_dx, dF_dp, ca.mtimes(M, ca.diagcat(E, ca.SX.eye(3))), arm]
 
 
 def _leg_residual(leg: LegNumbers, common: CommonNumbers) -> ca.Function:
-    """(q, w, a, torque, damping, gravity) in S -> f (3,), df/d[q; w] (3, 6), m (3, 3), g (3,)."""
+    """(q, w, a, torque, bias, slip, parameters, gravity) -> f, df/d[q; w] (3, 6), m and g, in S."""
     q, w, a, gravity = (ca.SX.sym(name, 3) for name in ("q", "w", "a", "gravity"))
-    torque, damping = ca.SX.sym("torque"), ca.SX.sym("damping")
+    torque, bias, slip = (ca.SX.sym(name) for name in ("torque", "bias", "slip"))
+    p, held, moved = ca.SX.sym("parameters", NUM_PLANT_PARAMETERS), ca.SX.sym("T"), ca.vertcat(q, w)
     numbers = (*leg.symbols, *common.symbols)
     reduced = equations.Leg(*equations.leg_at_joint(leg, common)(q, w, gravity, *numbers))
-    shaft = torque - damping * ca.dot(reduced.arm, w)
-    f = ca.mtimes(reduced.mass, a) + reduced.bias - reduced.arm * shaft
-    df = ca.jacobian(f, ca.vertcat(q, w))
-    arguments = [q, w, a, torque, damping, gravity, *numbers]
+    rate = ca.dot(reduced.arm, w)
+    shaft = equations.shaft_torque(torque, bias, rate, slip, p)
+    slope = p[DAMPING] + p[COULOMB] * (1 - slip**2) / p[COULOMB_SPEED]
+    # At a shaft torque that is held, and what its change with the crank's rate adds.
+    f = ca.mtimes(reduced.mass, a) + reduced.bias - reduced.arm * held
+    df = ca.jacobian(f, moved) + slope * ca.mtimes(reduced.arm, ca.jacobian(rate, moved))
+    f, df = ca.substitute([f, df], [held], [shaft])
+    arguments = [q, w, a, torque, bias, slip, p, gravity, *numbers]
     return ca.Function("leg_residual", arguments, [f, df, reduced.mass, reduced.arm], {"cse": True})

@@ -22,7 +22,15 @@ import casadi as ca
 from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers, Number, numbers_of
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import SHAPES
-from stewart_drake.scenario.signals import BIAS, DAMPING, NUM_LEGS, PAYLOAD
+from stewart_drake.scenario.signals import (
+    BIAS,
+    COULOMB,
+    COULOMB_SPEED,
+    DAMPING,
+    NUM_LEGS,
+    PAYLOAD,
+    PAYLOAD_POSITION,
+)
 
 STANDARD_GRAVITY = 9.81
 """m/s^2, along -z of W; Drake's default."""
@@ -56,8 +64,8 @@ class Motion(NamedTuple):
     """h (6,)."""
     arm: ca.SX
     """B' (6, 6): d alpha_dot / d nu."""
-    nu: ca.SX
-    """(6,)."""
+    crank_rates: ca.SX
+    """alpha_dot (6,) rad/s."""
     nu_dot_bias: ca.SX
     """(6,): nu_dot at zero accelerations of the pose."""
     rates_map: ca.SX
@@ -257,12 +265,13 @@ def equations_of_motion(
     legs, common = numbers_of(mechanism)
     plate = plate_motion(pose, rates, gravity)
     sums = plate_alone(common, plate, parameters)
-    arms = []
+    arms, crank_rates = [], []
     for leg in legs:
-        added, arm = leg_on_plate(leg, common, plate)
+        added, arm, crank_rate = leg_on_plate(leg, common, plate)
         sums = sums.plus(added)
         arms.append(arm)
-    return assembled(sums, ca.vertcat(*arms), pose, rates)
+        crank_rates.append(crank_rate)
+    return assembled(sums, ca.vertcat(*arms), ca.vertcat(*crank_rates), pose, rates)
 
 
 def plate_motion(pose: ca.SX, rates: ca.SX, gravity: ca.SX) -> PlateMotion:
@@ -273,23 +282,35 @@ def plate_motion(pose: ca.SX, rates: ca.SX, gravity: ca.SX) -> PlateMotion:
 
 
 def plate_alone(common: CommonNumbers, plate: PlateMotion, parameters: ca.SX) -> Sums:
-    """The plate's part of (EOM), with its payload."""
+    """The plate's part of (EOM), with its payload.
+
+    That is a point mass m at r, fixed in the plate. It moves with v + w x r and takes the force
+    f = m (v_dot + w_dot x r + w x (w x r) - g), which enters as [r x f; f]. At r = 0 it is a part
+    of the plate's mass; here is what r adds to that.
+    """
     R_WP, position, w, v, g_W = plate
-    mass = common.plate_mass + parameters[PAYLOAD]
+    payload = parameters[PAYLOAD]
+    mass = common.plate_mass + payload
     I_W = ca.mtimes([R_WP, ca.diag(common.plate_inertia), R_WP.T])
+    r = ca.mtimes(R_WP, parameters[PAYLOAD_POSITION])
+    lever, turning = payload * cross_matrix(r), ca.cross(w, r)
+    pull = payload * ca.cross(w, turning)
     return Sums(
-        M_ww=I_W,
-        M_wv=ca.SX.zeros(3, 3),
+        M_ww=I_W + ca.mtimes(lever, cross_matrix(r).T),
+        M_wv=lever,
         M_vv=mass * ca.SX.eye(3),
-        h_w=ca.cross(w, ca.mtimes(I_W, w)),
-        h_v=-mass * g_W,
+        h_w=ca.cross(w, ca.mtimes(I_W, w)) + ca.cross(r, pull - payload * g_W),
+        h_v=pull - mass * g_W,
         energy=(ca.dot(w, ca.mtimes(I_W, w)) + mass * ca.sumsqr(v)) / 2
-        - mass * ca.dot(g_W, position),
+        - mass * ca.dot(g_W, position)
+        + payload * (ca.dot(v + turning / 2, turning) - ca.dot(g_W, r)),
     )
 
 
-def leg_on_plate(leg: LegNumbers, common: CommonNumbers, plate: PlateMotion) -> tuple[Sums, ca.SX]:
-    """What a leg adds to (EOM), and its row (1, 6) of B'."""
+def leg_on_plate(
+    leg: LegNumbers, common: CommonNumbers, plate: PlateMotion
+) -> tuple[Sums, ca.SX, ca.SX]:
+    """What a leg adds to (EOM), its row (1, 6) of B', and its crank's rate."""
     R_WP, position, w, v, g_W = plate
     R_WS = leg.R_WS
     b = ca.mtimes(R_WP, leg.p_PQ)
@@ -310,10 +331,10 @@ def leg_on_plate(leg: LegNumbers, common: CommonNumbers, plate: PlateMotion) -> 
         h_v=f,
         energy=ca.dot(v_Q, ca.mtimes(m, v_Q)) / 2 + at_joint.potential,
     )
-    return added, ca.horzcat(ca.cross(b, arm).T, arm.T)
+    return added, ca.horzcat(ca.cross(b, arm).T, arm.T), ca.dot(arm, v_Q)
 
 
-def assembled(sums: Sums, arm: ca.SX, pose: ca.SX, rates: ca.SX) -> Motion:
+def assembled(sums: Sums, arm: ca.SX, crank_rates: ca.SX, pose: ca.SX, rates: ca.SX) -> Motion:
     """(EOM) of plate and legs; `arm` is B'."""
     E = angle_rate_map(pose[:3])
     w = ca.mtimes(E, rates[:3])
@@ -322,7 +343,7 @@ def assembled(sums: Sums, arm: ca.SX, pose: ca.SX, rates: ca.SX) -> Motion:
         mass=_symmetric(M),
         bias=ca.vertcat(sums.h_w, sums.h_v),
         arm=arm,
-        nu=ca.vertcat(w, rates[3:]),
+        crank_rates=crank_rates,
         nu_dot_bias=ca.vertcat(ca.jtimes(w, pose[:3], rates[:3]), ca.SX.zeros(3)),
         rates_map=ca.diagcat(E, ca.SX.eye(3)),
         energy=sums.energy,
@@ -334,26 +355,38 @@ def _symmetric(matrix: ca.SX) -> ca.SX:
     return ca.tril2symm(ca.tril(matrix))
 
 
-def shaft_torque(motion: Motion, torque: ca.SX, parameters: ca.SX) -> ca.SX:
-    """Torque (6,) that reaches the cranks: the motors' plus bias less viscous friction."""
-    return torque + parameters[BIAS] - parameters[DAMPING] * ca.mtimes(motion.arm, motion.nu)
+def slip(crank_rates: ca.SX, parameters: ca.SX) -> ca.SX:
+    """(6,) in [-1, 1]: Coulomb friction by its size, tanh(alpha_dot / its speed).
+
+    Real Coulomb friction jumps where a crank turns back. This one has a slope, so that integrators
+    keep their order, and a crank that holds a load creeps: coulomb_speed says how slowly.
+    """
+    return ca.tanh(crank_rates / parameters[COULOMB_SPEED])
 
 
-def force(motion: Motion, torque: ca.SX, parameters: ca.SX) -> ca.SX:
+def shaft_torque(
+    torque: ca.SX, bias: ca.SX, crank_rate: ca.SX, slip: ca.SX, parameters: ca.SX
+) -> ca.SX:
+    """What reaches the crank, or each of six: motor and bias less viscous and Coulomb friction."""
+    return torque + bias - (parameters[DAMPING] * crank_rate + parameters[COULOMB] * slip)
+
+
+def force(motion: Motion, torque: ca.SX, parameters: ca.SX, slip: ca.SX) -> ca.SX:
     """B torque - h, the generalised force (6,) beside M nu_dot."""
-    return ca.mtimes(motion.arm.T, shaft_torque(motion, torque, parameters)) - motion.bias
+    shaft = shaft_torque(torque, parameters[BIAS], motion.crank_rates, slip, parameters)
+    return ca.mtimes(motion.arm.T, shaft) - motion.bias
 
 
-def accelerations(motion: Motion, torque: ca.SX, parameters: ca.SX) -> ca.SX:
+def accelerations(motion: Motion, torque: ca.SX, parameters: ca.SX, slip: ca.SX) -> ca.SX:
     """Of the pose (6,), under motor torques."""
-    nu_dot = solve_symmetric(motion.mass, force(motion, torque, parameters))
+    nu_dot = solve_symmetric(motion.mass, force(motion, torque, parameters, slip))
     return ca.solve(motion.rates_map, nu_dot - motion.nu_dot_bias)
 
 
-def inverse_dynamics(motion: Motion, accelerations: ca.SX, parameters: ca.SX) -> ca.SX:
+def inverse_dynamics(motion: Motion, accelerations: ca.SX, parameters: ca.SX, slip: ca.SX) -> ca.SX:
     """Motor torques (6,) that give these accelerations."""
     # Without motor torque `force` is what bias, friction and h exert.
-    passive = force(motion, ca.SX.zeros(NUM_LEGS), parameters)
+    passive = force(motion, ca.SX.zeros(NUM_LEGS), parameters, slip)
     nu_dot = ca.mtimes(motion.rates_map, accelerations) + motion.nu_dot_bias
     return ca.solve(motion.arm.T, ca.mtimes(motion.mass, nu_dot) - passive)
 

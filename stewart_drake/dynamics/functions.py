@@ -22,7 +22,7 @@ class Call(Protocol):
 
 
 class DynamicsFunctions(Protocol):
-    """Functions of pose, rates, torque, parameters (8,) and gravity (m/s^2) of one mechanism."""
+    """Functions of pose, rates, torque, parameters (13,) and gravity (m/s^2) of one mechanism."""
 
     @property
     def backend(self) -> str:

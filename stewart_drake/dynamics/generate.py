@@ -15,13 +15,15 @@ from stewart_drake.dynamics.emit import Input, Output, c_function
 from stewart_drake.dynamics.equations import PlateMotion, Sums
 from stewart_drake.dynamics.numbers import common_numbers, leg_numbers
 from stewart_drake.native.layout import COMMON_NUMBERS, GEOMETRY, LEG_NUMBERS
-from stewart_drake.scenario.signals import NUM_PARAMETERS
+from stewart_drake.scenario.signals import COULOMB, COULOMB_SPEED, NUM_PLANT_PARAMETERS
 
 FILE: Final = Path(__file__).resolve().parents[1] / "native" / "equations.h"
 
 _HEAD: Final = f"""/* Written by python -m stewart_drake.dynamics.generate; not by hand. */
 
-#define PARAMETERS {NUM_PARAMETERS}
+#define PARAMETERS {NUM_PLANT_PARAMETERS}
+#define COULOMB {COULOMB}
+#define COULOMB_SPEED {COULOMB_SPEED}
 #define GEOMETRY {GEOMETRY}
 #define LEG_NUMBERS {LEG_NUMBERS}
 
@@ -74,18 +76,19 @@ def _motion() -> list[str]:
     s, (common, legs) = equations.symbols(), _numbers()
     plate = equations.plate_motion(s["pose"], s["rates"], s["gravity"])
     alone = equations.plate_alone(common_numbers(common.symbols), plate, s["parameters"])
-    moving = Input("plate", ca.SX.sym("plate", 21))
-    R_WP, *vectors = ca.vertsplit(moving.symbols, [0, 9, 12, 15, 18, 21])
-    added, arm = equations.leg_on_plate(
-        leg_numbers(legs.symbols),
-        common_numbers(common.symbols),
-        PlateMotion(ca.reshape(R_WP, 3, 3), *vectors),
+    platform = Input("plate", ca.SX.sym("plate", 21))
+    R_WP, *vectors = ca.vertsplit(platform.symbols, [0, 9, 12, 15, 18, 21])
+    of_plate = PlateMotion(ca.reshape(R_WP, 3, 3), *vectors)
+    added, arm, crank_rate = equations.leg_on_plate(
+        leg_numbers(legs.symbols), common_numbers(common.symbols), of_plate
     )
     sums, arms = Input("sums", ca.SX.sym("sums", 28)), Input("arms", ca.SX.sym("arms", 6, 6))
-    whole = equations.assembled(_sums(sums.symbols), arms.symbols, s["pose"], s["rates"])
+    moving = tuple(Input(name, ca.SX.sym(name, 6)) for name in ("crank_rates", "slip"))
+    rates, slip = (i.symbols for i in moving)
+    whole = equations.assembled(_sums(sums.symbols), arms.symbols, rates, s["pose"], s["rates"])
     p = s["parameters"]
-    forward = equations.accelerations(whole, s["torque"], p)
-    inverse = equations.inverse_dynamics(whole, s["accelerations"], p)
+    forward = equations.accelerations(whole, s["torque"], p, slip)
+    inverse = equations.inverse_dynamics(whole, s["accelerations"], p, slip)
     M, h, B = equations.terms(whole)
     state = _inputs(s, "pose rates")
     return [
@@ -96,17 +99,21 @@ def _motion() -> list[str]:
         ),
         c_function(
             "leg_motion",
-            [moving, common, legs],
-            [Output("added", _lower(added)), Output("arms", arm)],
+            [platform, common, legs],
+            [
+                Output("added", _lower(added)),
+                Output("arms", arm),
+                Output("crank_rates", crank_rate),
+            ],
         ),
         c_function(
             "solve_accelerations",
-            [*state, *_inputs(s, "torque parameters"), sums, arms],
+            [*state, *_inputs(s, "torque parameters"), *moving, sums, arms],
             [Output("accelerations", forward)],
         ),
         c_function(
             "solve_torque",
-            [*state, *_inputs(s, "accelerations parameters"), sums, arms],
+            [*state, *_inputs(s, "accelerations parameters"), *moving, sums, arms],
             [Output("torque", inverse)],
         ),
         c_function(
@@ -119,39 +126,38 @@ def _motion() -> list[str]:
 
 def _derivatives() -> list[str]:
     s, (common, legs) = equations.symbols(), _numbers()
-    torque = Input("torque", ca.SX.sym("torque"), own=True)
-    bias = Input("bias", ca.SX.sym("bias"), own=True)
-    dF_dx, M = derivatives.plate_alone(common_numbers(common.symbols), s)
-    change, turn, mass, arm, rate = derivatives.leg_on_plate(
-        leg_numbers(legs.symbols), common_numbers(common.symbols), s, torque.symbols + bias.symbols
-    )
+    own = [Input(name, ca.SX.sym(name), own=True) for name in ("torque", "bias", "slip")]
+    leg, of_all = leg_numbers(legs.symbols), common_numbers(common.symbols)
+    dF_dx, M = derivatives.plate_alone(of_all, s)
+    crank_rate = derivatives.crank_rate(leg, of_all, s)
+    change, turn, mass, arm, _ = derivatives.leg_on_plate(leg, of_all, s, *(i.symbols for i in own))
     change[:3, :] -= turn
-    both = Input("dF_dx", ca.SX.sym("dF_dx", 6, 12)), Input("M", ca.SX.sym("M", 6, 6))
-    arms, arm_rates = Input("arms", ca.SX.sym("arms", 6, 6)), Input("rates", ca.SX.sym("rates", 6))
-    whole = derivatives.assembled(
-        both[0].symbols, both[1].symbols, arms.symbols, arm_rates.symbols, s
+    M_sum, arms = (Input(name, ca.SX.sym(name, 6, 6)) for name in ("M", "arms"))
+    arm_rates, slips = (Input(name, ca.SX.sym(name, 6)) for name in ("arm_rates", "slips"))
+    _, dF_dp, MN, _ = derivatives.assembled(
+        dF_dx, M_sum.symbols, arms.symbols, arm_rates.symbols, slips.symbols, s
     )
     plain = _inputs(s, "pose rates accelerations")
     return [
         c_function(
             "plate_derivatives",
-            [*plain, *_inputs(s, "parameters"), common],
+            [*plain, *_inputs(s, "parameters gravity"), common],
             [Output("dF_dx", dF_dx), Output("M", M)],
         ),
         c_function(
+            "crank_rates",
+            [*_inputs(s, "pose rates"), legs],
+            [Output("arm_rates", crank_rate)],
+        ),
+        c_function(
             "leg_derivatives",
-            [*plain, *_inputs(s, "parameters gravity"), common, legs, torque, bias],
-            [
-                Output("dF_dx", change),
-                Output("M", mass),
-                Output("arms", arm),
-                Output("arm_rates", rate),
-            ],
+            [*plain, *_inputs(s, "parameters gravity"), common, legs, *own],
+            [Output("dF_dx", change), Output("M", mass), Output("arms", arm)],
         ),
         c_function(
             "pose_derivatives",
-            [*_inputs(s, "pose accelerations gravity"), both[1], arms, arm_rates],
-            [Output("dF_dp", whole[1]), Output("MN", whole[2])],
+            [*plain, *_inputs(s, "parameters gravity"), M_sum, arms, arm_rates, slips],
+            [Output("dF_dp", dF_dp), Output("MN", MN)],
         ),
     ]
 

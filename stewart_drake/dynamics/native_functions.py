@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stewart_drake.dynamics.compiled import Buffered, Buffers
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import SHAPES, SIGNATURES, geometry_of
-from stewart_drake.scenario.signals import NUM_PARAMETERS, NUM_STATE, NUM_TORQUES
+from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, NUM_STATE, NUM_TORQUES
 
 Array = NDArray[np.float64]
 Shape = tuple[int, ...]
@@ -100,10 +100,10 @@ class NativeFunctions:
         """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12), one call."""
         found = self._many.get(steps)
         if found is None:
-            arguments = [(NUM_STATE,), (steps, NUM_TORQUES), (NUM_PARAMETERS,), (), (steps,)]
+            shapes = (NUM_STATE,), (steps, NUM_TORQUES), (NUM_PLANT_PARAMETERS,), (), (steps,)
             results = [(steps, NUM_STATE)]
             made = NativeFunction(
-                self._library, "predict", self._geometry, arguments, results, [steps]
+                self._library, "predict", self._geometry, shapes, results, [steps]
             )
             found = self._many.setdefault(steps, made)
         return found

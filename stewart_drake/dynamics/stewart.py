@@ -1,5 +1,6 @@
 """`StewartDynamics`: the exact dynamics of a mechanism as a pure calculator, no LeafSystem."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,12 +13,17 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, angle_rate_map
 from stewart_drake.scenario.signals import (
     ANGLES,
+    COULOMB_SPEED,
     NUM_COORDINATES,
     NUM_PARAMETERS,
+    NUM_PLANT_PARAMETERS,
     NUM_STATE,
     NUM_TORQUES,
+    PARAMETERS,
+    PLANT_PARAMETERS,
     POSE,
     RATES,
+    USUAL_COULOMB_SPEED,
 )
 
 Array = NDArray[np.float64]
@@ -31,10 +37,7 @@ class Linearization(NamedTuple):
     B: Array
     """(12, 6) with respect to the torque."""
     G: Array
-    """(12, 8) with respect to the parameters (torque bias, payload, damping)."""
-
-
-_EIGHT = (NUM_PARAMETERS,)
+    """(12, p) with respect to the free parameters."""
 
 
 def _check(**arguments: ArrayLike) -> None:
@@ -64,20 +67,63 @@ def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     return numbers
 
 
+def plant_parameters(values: ArrayLike | None = None) -> Array:
+    """All parameters of the plant (13,), in the order of `scenario.signals.PLANT_PARAMETERS`.
+
+    Args:
+        values: all of them, or the first eight; the rest is no Coulomb friction, and a payload at
+            the plate's COM. None is a plant without any.
+
+    Raises:
+        ConfigError: another shape, numbers that are not finite, a speed that is not positive.
+    """
+    whole = np.zeros(NUM_PLANT_PARAMETERS)
+    whole[COULOMB_SPEED] = USUAL_COULOMB_SPEED
+    if values is None:
+        return whole
+    if np.shape(values) == (NUM_PARAMETERS,):
+        whole[:NUM_PARAMETERS] = _finite("parameters", values, (NUM_PARAMETERS,))
+        return whole
+    whole = _finite("parameters", values, (NUM_PLANT_PARAMETERS,))
+    if not whole[COULOMB_SPEED] > 0:
+        raise ConfigError(
+            f"parameters: got a coulomb_speed of {whole[COULOMB_SPEED]:g} rad/s; expected more "
+            "than 0"
+        )
+    return whole
+
+
+def _slice(indices: list[int]) -> slice | list[int]:
+    """The same as a slice, which is ten times as fast, where they follow one another."""
+    if indices and indices == list(range(indices[0], indices[-1] + 1)):
+        return slice(indices[0], indices[-1] + 1)
+    return indices
+
+
 class StewartDynamics:
     """Equations of motion of a `Mechanism` in the pose coordinates of its plate.
 
-    Loops are closed exactly: the state is [pose; rates] (12,). `parameters` (8,) are torque bias
-    (6, N m), payload at the plate's COM (kg) and viscous damping of the crank shafts
-    (N m s/rad), zero by default; they are arguments of the compiled functions.
+    Loops are closed exactly: the state is [pose; rates] (12,). The plant's parameters (13,) are
+    torque bias (6, N m), payload (kg), viscous damping of the crank shafts (N m s/rad), their
+    Coulomb friction (N m) with the speed over which it builds up (rad/s), and where the payload is
+    (3, m in the plate's frame, from its COM). They are arguments of the compiled functions.
+
+    Some of them are `free`: the methods' `parameters` (p,), and the columns of G, are these, the
+    rest is as the calculator has it. By default bias, payload and damping are free (8,). A free
+    name that is none of the plant's, such as a constant of a sensor, changes nothing here.
 
     Args:
         mechanism: the machine.
         gravity: True for 9.81 m/s^2 along -z, which is Drake's default, False for none, or m/s^2.
-        parameters: (8,) defaults for the methods' `parameters`.
+        parameters: (13,) or the first eight, see `plant_parameters`.
+        free: names (p,) out of `scenario.signals.PLANT_PARAMETERS`, and others.
 
     Raises:
         ConfigError: gravity or parameters of another shape, or not finite.
+
+    Attributes:
+        plant_parameters: (13,) all of them.
+        parameters: (p,) those that are free, the default of the methods' `parameters`.
 
     Every method raises ValueError for an argument of another shape than it names: one number does
     not stand for six. Values are not looked at, so that NaN gives NaN.
@@ -93,26 +139,46 @@ class StewartDynamics:
         mechanism: Mechanism,
         gravity: bool | float = True,
         parameters: ArrayLike | None = None,
+        free: Sequence[str] = PARAMETERS,
     ) -> None:
         self.mechanism = mechanism
         switch = isinstance(gravity, bool | np.bool_)
         scale = STANDARD_GRAVITY if switch else 1.0
         self.gravity = float(scale * _finite("gravity", gravity, ()))
-        given = np.zeros(NUM_PARAMETERS) if parameters is None else parameters
-        self.parameters = _finite("parameters", given, _EIGHT)
+        self.plant_parameters = plant_parameters(parameters)
+        self.free = tuple(free)
+        # Which of the free ones are the plant's, and where among all of those.
+        own = [i for i, name in enumerate(free) if name in PLANT_PARAMETERS]
+        place = [PLANT_PARAMETERS.index(free[i]) for i in own]
+        self._own, self._place = _slice(own), _slice(place)
+        self.parameters = self.free_of(self.plant_parameters)
         self._functions = compiled_functions(mechanism)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Compiled functions cannot be copied, but made again, or found.
-        return type(self), (self.mechanism, self.gravity, self.parameters)
+        return type(self), (self.mechanism, self.gravity, self.plant_parameters, self.free)
 
     def __repr__(self) -> str:
         return f"StewartDynamics({self.mechanism}, gravity {self.gravity:g} m/s^2)"
 
-    def _or_default(self, parameters: ArrayLike | None) -> ArrayLike:
+    def assuming(self, parameters: ArrayLike) -> "StewartDynamics":
+        """The same with other free parameters (p,)."""
+        return type(self)(self.mechanism, self.gravity, self.complete(parameters), self.free)
+
+    def complete(self, parameters: ArrayLike | None) -> Array:
+        """All of the plant's (13,) with these free ones (p,), None for those that it has."""
         if parameters is None:
-            return self.parameters
-        return _shaped("parameters", parameters, _EIGHT)
+            return self.plant_parameters
+        _shaped("parameters", parameters, (len(self.free),))
+        whole = self.plant_parameters.copy()
+        whole[self._place] = np.asarray(parameters)[self._own]
+        return whole
+
+    def free_of(self, of_plant: Array) -> Array:
+        """Those (p, ...) that are free of all of a plant's (13, ...), 0 for what is none of its."""
+        spread = np.zeros((len(self.free), *of_plant.shape[1:]))
+        spread[self._own] = of_plant[self._place]
+        return spread
 
     def accelerations(
         self,
@@ -124,12 +190,12 @@ class StewartDynamics:
         """Second derivative (6,) of the pose under motor torques (6,) in N m."""
         _check(pose=pose, rates=rates, torque=torque)
         return self._functions.accelerations(
-            pose, rates, torque, self._or_default(parameters), self.gravity
+            pose, rates, torque, self.complete(parameters), self.gravity
         )[0]
 
     def change(self, state: Array, torque: Array) -> Array:
         """d[pose; rates]/dt (12,), for an integrator, whose arrays have the right shape."""
-        return self._functions.change(state, torque, self.parameters, self.gravity)
+        return self._functions.change(state, torque, self.plant_parameters, self.gravity)
 
     def inverse_dynamics(
         self,
@@ -141,7 +207,7 @@ class StewartDynamics:
         """Motor torques (6,) in N m that give these accelerations (6,)."""
         _check(pose=pose, rates=rates, accelerations=accelerations)
         return self._functions.inverse_dynamics(
-            pose, rates, accelerations, self._or_default(parameters), self.gravity
+            pose, rates, accelerations, self.complete(parameters), self.gravity
         )[0]
 
     def equilibrium_torque(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> Array:
@@ -161,18 +227,18 @@ class StewartDynamics:
         """Kinetic plus potential energy in J."""
         _check(pose=pose, rates=rates)
         return float(
-            self._functions.energy(pose, rates, self._or_default(parameters), self.gravity)[0]
+            self._functions.energy(pose, rates, self.complete(parameters), self.gravity)[0]
         )
 
     def mass_matrix(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> Array:
         """Mass matrix (6, 6) in pose coordinates: kinetic energy = rates' M rates / 2."""
         _check(pose=pose)
-        return self._functions.terms(pose, 0.0, self._or_default(parameters), self.gravity)[0]
+        return self._functions.terms(pose, 0.0, self.complete(parameters), self.gravity)[0]
 
     def bias(self, pose: ArrayLike, rates: ArrayLike, parameters: ArrayLike | None = None) -> Array:
         """Bias (6,): M accelerations + bias = actuation_map (torque + torque bias - friction)."""
         _check(pose=pose, rates=rates)
-        return self._functions.terms(pose, rates, self._or_default(parameters), self.gravity)[1]
+        return self._functions.terms(pose, rates, self.complete(parameters), self.gravity)[1]
 
     def wrench_accelerations(
         self, pose: ArrayLike, wrench: ArrayLike, parameters: ArrayLike | None = None
@@ -191,7 +257,7 @@ class StewartDynamics:
         Args:
             pose: (6,).
             wrench: (6,) N m and N.
-            parameters: (8,) or the defaults.
+            parameters: (p,) or the defaults.
         """
         _check(pose=pose, wrench=wrench)
         force = np.array(wrench, dtype=np.float64)
@@ -231,16 +297,16 @@ class StewartDynamics:
         constant part of F, so that it changes nothing but the accelerations there.
         """
         _check(pose=pose, rates=rates, torque=torque)
-        parameters = self._or_default(parameters)
-        at = (pose, rates, torque, parameters, self.gravity)
+        whole = self.complete(parameters)
+        at = (pose, rates, torque, whole, self.gravity)
         accelerations = self._functions.accelerations(*at)[0]
         if wrench is not None:
             accelerations += self.wrench_accelerations(pose, wrench, parameters)
         dF_dx, dF_dp, MN, arm = self._functions.residual_derivatives(
-            pose, rates, accelerations, torque, parameters, self.gravity
+            pose, rates, accelerations, torque, whole, self.gravity
         )
         # Results come transposed (column order); `arm`' s transpose is B.
-        right = np.concatenate([-dF_dx, arm.T, -dF_dp]).T
+        right = np.concatenate([-dF_dx, arm.T, -self.free_of(dF_dp)]).T
         both = np.zeros((NUM_STATE, right.shape[1]))
         both[POSE, RATES] = np.eye(NUM_COORDINATES)
         both[RATES] = np.linalg.solve(MN.T, right)
@@ -272,7 +338,7 @@ class StewartDynamics:
         states = self._functions.many_steps(n * substeps)(
             state,
             np.repeat(torques, substeps, axis=0),
-            self._or_default(parameters),
+            self.complete(parameters),
             self.gravity,
             np.repeat(h, substeps),
         )[0]

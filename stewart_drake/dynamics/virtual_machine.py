@@ -13,7 +13,7 @@ from stewart_drake.dynamics.functions import margin_of
 from stewart_drake.dynamics.measures import measures
 from stewart_drake.dynamics.threads import BUILDING, built_once
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.signals import NUM_PARAMETERS, NUM_STATE, POSE, RATES
+from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, NUM_STATE, POSE, RATES
 
 Array = NDArray[np.float64]
 
@@ -42,6 +42,10 @@ class VirtualMachine:
             self.mechanism, s["pose"], s["rates"], s["parameters"], s["gravity"]
         )
 
+    @built_once
+    def _slip(self) -> ca.SX:
+        return equations.slip(self._motion.crank_rates, self._symbols["parameters"])
+
     def _compile(self, name: str, arguments: str, *results: ca.SX) -> Compiled:
         dense = [ca.densify(result) for result in results]
         inputs = [self._symbols[argument] for argument in arguments.split()]
@@ -51,14 +55,16 @@ class VirtualMachine:
     def accelerations(self) -> Compiled:
         """(pose, rates, torque, parameters, gravity) -> accelerations (6,)."""
         s = self._symbols
-        found = equations.accelerations(self._motion, s["torque"], s["parameters"])
+        found = equations.accelerations(self._motion, s["torque"], s["parameters"], self._slip)
         return self._compile("accelerations", "pose rates torque parameters gravity", found)
 
     @built_once
     def inverse_dynamics(self) -> Compiled:
         """(pose, rates, accelerations, parameters, gravity) -> torque (6,)."""
         s = self._symbols
-        found = equations.inverse_dynamics(self._motion, s["accelerations"], s["parameters"])
+        found = equations.inverse_dynamics(
+            self._motion, s["accelerations"], s["parameters"], self._slip
+        )
         return self._compile(
             "inverse_dynamics", "pose rates accelerations parameters gravity", found
         )
@@ -101,7 +107,7 @@ class VirtualMachine:
         """One step of the classical method: (state, torque, parameters, gravity, h) -> state."""
         accelerations = self.accelerations.function
         x, torque = ca.MX.sym("state", NUM_STATE), ca.MX.sym("torque", 6)
-        parameters, gravity = ca.MX.sym("parameters", NUM_PARAMETERS), ca.MX.sym("gravity")
+        parameters, gravity = ca.MX.sym("parameters", NUM_PLANT_PARAMETERS), ca.MX.sym("gravity")
         h = ca.MX.sym("h")
 
         def derivative(state: ca.MX) -> ca.MX:

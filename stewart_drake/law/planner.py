@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.catch_up import plan_catch_up
@@ -116,7 +115,7 @@ class Rejoin:
         away = np.abs(states[-1] - wanted) / np.tile(self.size, 2)
         if not away.max() > (SURPRISE if belief.found else OFF):  # or NaN
             return before
-        dynamics = StewartDynamics(plant.mechanism, plant.dynamics.gravity, belief.parameters)
+        dynamics = plant.dynamics.assuming(belief.parameters)
         begin = motion.now + belief.timeline.eta
         period = belief.timeline.period
         try:

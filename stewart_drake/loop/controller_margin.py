@@ -247,7 +247,8 @@ def _estimates(law: PredictiveLqi) -> bool:
 def _gain(experiment: Experiment, truth: StewartDynamics, law: PredictiveLqi, time: float) -> Array:
     """`law_gain` of a law about the reference at `time`."""
     plant, timeline, c = law.plant, law.timeline, experiment.scenario.controller
-    theta = truth.parameters if _estimates(law) else plant.dynamics.parameters
+    known = plant.dynamics
+    theta = known.free_of(truth.plant_parameters) if _estimates(law) else known.parameters
     x = evaluate(experiment.reference, time)
     # The torques in flight are those that move the true plant, the model's is the feedforward.
     acting = truth.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])

@@ -15,48 +15,64 @@
 #define SUMS 28 /* numbers of `equations.Sums`, each triangle of a symmetric matrix once */
 #define COMMON (NUM_LEGS * LEG_NUMBERS) /* where the geometry goes on after the legs */
 
-/* Plate and legs, summed, and B' by columns. */
-static void motion(const stewart_plant *plant, const real *pose, const real *rates, real *sums,
-                   real *arms)
+/* `equations.slip` of six cranks. */
+static void slips(const real *crank_rates, const real *parameters, real *slip)
 {
-    const real *legs = plant->geometry, *common = legs + COMMON;
+    for (int leg = 0; leg < NUM_LEGS; leg++)
+        slip[leg] = tanh(crank_rates[leg] / parameters[COULOMB_SPEED]);
+}
+
+/* Plate and legs, summed, B' by columns, rates and slips of the cranks. */
+typedef struct {
+    real sums[SUMS], arms[36], rates[NUM_LEGS], slip[NUM_LEGS];
+} Motion;
+
+static void motion(const stewart_plant *plant, const real *pose, const real *rates, Motion *m)
+{
+    const real *legs = plant->geometry, *common = legs + COMMON, *parameters = plant->parameters;
     real moving[21], added[SUMS * NUM_LEGS];
-    plate_motion(pose, rates, plant->parameters, plant->gravity, common, moving, sums);
-    leg_motion(moving, common, legs, added, arms);
+    plate_motion(pose, rates, parameters, plant->gravity, common, moving, m->sums);
+    leg_motion(moving, common, legs, added, m->arms, m->rates);
     for (int i = 0; i < SUMS; i++)
         for (int leg = 0; leg < NUM_LEGS; leg++)
-            sums[i] += added[NUM_LEGS * i + leg];
+            m->sums[i] += added[NUM_LEGS * i + leg];
+    /* They cost a tenth of all this, and nobody reads them without Coulomb friction. */
+    memset(m->slip, 0, sizeof m->slip);
+    if (parameters[COULOMB] != 0)
+        slips(m->rates, parameters, m->slip);
 }
 
 void stewart_accelerations(const stewart_plant *plant, const real *pose, const real *rates,
                            const real *torque, real *accelerations)
 {
-    real sums[SUMS], arms[36];
-    motion(plant, pose, rates, sums, arms);
-    solve_accelerations(pose, rates, torque, plant->parameters, sums, arms, accelerations);
+    Motion m;
+    motion(plant, pose, rates, &m);
+    solve_accelerations(pose, rates, torque, plant->parameters, m.rates, m.slip, m.sums, m.arms,
+                        accelerations);
 }
 
 void stewart_inverse_dynamics(const stewart_plant *plant, const real *pose, const real *rates,
                               const real *accelerations, real *torque)
 {
-    real sums[SUMS], arms[36];
-    motion(plant, pose, rates, sums, arms);
-    solve_torque(pose, rates, accelerations, plant->parameters, sums, arms, torque);
+    Motion m;
+    motion(plant, pose, rates, &m);
+    solve_torque(pose, rates, accelerations, plant->parameters, m.rates, m.slip, m.sums, m.arms,
+                 torque);
 }
 
 real stewart_energy(const stewart_plant *plant, const real *pose, const real *rates)
 {
-    real sums[SUMS], arms[36];
-    motion(plant, pose, rates, sums, arms);
-    return sums[SUMS - 1];
+    Motion m;
+    motion(plant, pose, rates, &m);
+    return m.sums[SUMS - 1];
 }
 
 void stewart_terms(const stewart_plant *plant, const real *pose, const real *rates, real *M,
                    real *h, real *B)
 {
-    real sums[SUMS], arms[36];
-    motion(plant, pose, rates, sums, arms);
-    pose_terms(pose, rates, sums, arms, M, h, B);
+    Motion m;
+    motion(plant, pose, rates, &m);
+    pose_terms(pose, rates, m.sums, m.arms, M, h, B);
 }
 
 void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, const real *rates,
@@ -65,17 +81,21 @@ void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, 
 {
     const real *legs = plant->geometry, *common = legs + COMMON;
     const real *parameters = plant->parameters, *gravity = plant->gravity;
-    real mass[36], arm_rates[NUM_LEGS], change_of_legs[72 * NUM_LEGS], mass_of_legs[36 * NUM_LEGS];
-    plate_derivatives(pose, rates, accelerations, parameters, common, dF_dx, mass);
+    real mass[36], arm_rates[NUM_LEGS], slip[NUM_LEGS];
+    real change_of_legs[72 * NUM_LEGS], mass_of_legs[36 * NUM_LEGS];
+    plate_derivatives(pose, rates, accelerations, parameters, gravity, common, dF_dx, mass);
+    crank_rates(pose, rates, legs, arm_rates);
+    slips(arm_rates, parameters, slip);
     leg_derivatives(pose, rates, accelerations, parameters, gravity, common, legs, torque, parameters,
-                    change_of_legs, mass_of_legs, B, arm_rates);
+                    slip, change_of_legs, mass_of_legs, B);
     for (int i = 0; i < 72; i++)
         for (int leg = 0; leg < NUM_LEGS; leg++)
             dF_dx[i] += change_of_legs[NUM_LEGS * i + leg];
     for (int i = 0; i < 36; i++)
         for (int leg = 0; leg < NUM_LEGS; leg++)
             mass[i] += mass_of_legs[NUM_LEGS * i + leg];
-    pose_derivatives(pose, accelerations, gravity, mass, B, arm_rates, dF_dp, M);
+    pose_derivatives(pose, rates, accelerations, parameters, gravity, mass, B, arm_rates, slip, dF_dp,
+                     M);
 }
 
 void stewart_measures(const real *geometry, const real *pose, const real *angles, real *measures)

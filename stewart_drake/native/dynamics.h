@@ -5,14 +5,14 @@
 
 #include "real.h"
 
-#define STEWART_PARAMETERS 8 /* of the equations, see scenario/signals.py */
+#define STEWART_PARAMETERS 13 /* of the equations, see scenario/signals.py */
 #define STEWART_GEOMETRY 121 /* numbers of a machine, see native/layout.py */
 #define STEWART_MEASURES 8   /* of the workspace */
 
 /* A machine, and what is known of it. */
 typedef struct {
     const real *geometry;   /* STEWART_GEOMETRY numbers */
-    const real *parameters; /* STEWART_PARAMETERS: torque biases (6, N m), payload (kg), damping, .. */
+    const real *parameters; /* STEWART_PARAMETERS: torque biases (6, N m), payload (kg), .. */
     const real *gravity;    /* m/s^2, along -z */
 } stewart_plant;
 

@@ -9,7 +9,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
     NUM_LEGS,
-    NUM_PARAMETERS,
+    NUM_PLANT_PARAMETERS,
     NUM_STATE,
     NUM_TORQUES,
 )
@@ -31,7 +31,7 @@ SHAPES: Final = {
     "state": (NUM_STATE,),
     "accelerations": (NUM_COORDINATES,),
     "torque": (NUM_TORQUES,),
-    "parameters": (NUM_PARAMETERS,),
+    "parameters": (NUM_PLANT_PARAMETERS,),
     "gravity": (),
     "angles": (NUM_LEGS,),
     "sign": (),
@@ -59,7 +59,7 @@ SIGNATURES: Final = {
     "residual_derivatives": _signature(
         "pose rates accelerations torque parameters gravity",
         (NUM_STATE, 6),
-        (NUM_PARAMETERS, 6),
+        (NUM_PLANT_PARAMETERS, 6),
         (6, 6),
         (6, 6),
     ),

@@ -38,6 +38,21 @@ BIAS: Final = slice(0, 6)
 PAYLOAD: Final = 6
 DAMPING: Final = 7
 
+PLANT_PARAMETERS: Final = (
+    *PARAMETERS,
+    "coulomb_friction",
+    "coulomb_speed",
+    *(f"payload_position_{axis}" for axis in "xyz"),
+)
+"""All constants of the equations of motion that are not the mechanism's, in their order."""
+PLANT_PARAMETER_UNITS: Final = (*PARAMETER_UNITS, "N m", "rad/s", "m", "m", "m")
+NUM_PLANT_PARAMETERS: Final = len(PLANT_PARAMETERS)
+COULOMB: Final = 8
+COULOMB_SPEED: Final = 9
+PAYLOAD_POSITION: Final = slice(10, 13)
+USUAL_COULOMB_SPEED: Final = 0.02
+"""rad/s, where nothing else is said."""
+
 WEIGHTS: Final = ("w_Q", "w_R")
 
 PACKETS: Final = ("sent", "lost", "late", "played", "dry")
