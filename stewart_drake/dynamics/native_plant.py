@@ -46,7 +46,10 @@ class NativePlant:
         assert isinstance(functions, NativeFunctions)
         # Buffers of its own: a controller that is called back may know the same machine.
         change, margin = functions.own_buffers("change"), functions.own_buffers("margin")
-        change.arguments[2][...], change.arguments[3][...] = dynamics.parameters, dynamics.gravity
+        change.arguments[2][...], change.arguments[3][...] = (
+            dynamics.plant_parameters,
+            dynamics.gravity,
+        )
         margin.arguments[1][...], margin.arguments[2][...] = home_sign(dynamics.mechanism), LEAST
         self.states = np.empty((len(times), NUM_STATE))
         self._kept = change, margin, times
