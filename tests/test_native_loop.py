@@ -17,7 +17,7 @@ from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.loop import bulk
 from stewart_drake.loop.bulk import Ending, PythonLaw, ending_of, run_in_bulk
 from stewart_drake.loop.experiment import control_law, prepare
-from stewart_drake.loop.native_loop import instants_of, run_loop, uncovered
+from stewart_drake.loop.native_loop import InPython, instants_of, run_loop, uncovered
 from stewart_drake.loop.preparation import preparation_of
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.loop.sensor import Sensor
@@ -112,7 +112,8 @@ def test_states_torques_and_measurements_are_drakes() -> None:
     one = LOOPS["late"]
     preparation = preparation_of(one)
     prepared = preparation.prepared(preparation.experiment(one))
-    course = run_loop(prepared.experiment, preparation.when, PythonLaw(prepared, preparation.when))
+    law = InPython(PythonLaw(prepared, preparation.when).torque)
+    course = run_loop(prepared.experiment, preparation.when, law)
     signals = simulate(one, margin=False).signals
     assert np.array_equal(signals.time.values, preparation.when.nominal)
     states = np.hstack([signals.pose.values, signals.rates.values])
@@ -138,11 +139,13 @@ def test_noise_is_drakes_to_the_last_bit() -> None:
         return np.zeros(6)
 
     still = dataclasses.replace(one, plant=dataclasses.replace(one.plant, torque_bias=[0.0] * 6))
-    experiment = preparation_of(still).experiment(still)._replace(
-        start=np.concatenate([PAPER.home, np.zeros(6)])
+    experiment = (
+        preparation_of(still)
+        .experiment(still)
+        ._replace(start=np.concatenate([PAPER.home, np.zeros(6)]))
     )
     queue = dataclasses.replace(still, queue="zero")
-    run_loop(experiment._replace(scenario=queue), preparation.when, law)
+    run_loop(experiment._replace(scenario=queue), preparation.when, InPython(law))
     state = np.concatenate([PAPER.home, np.zeros(6)])
     assert len(seen) == len(preparation.when.samples) > 10
     for k, measurement in enumerate(seen):
@@ -185,7 +188,7 @@ def test_what_a_law_raises_comes_through() -> None:
         return np.zeros(6)
 
     with pytest.raises(KeyboardInterrupt, match="stop"):
-        run_loop(experiment, preparation.when, law)
+        run_loop(experiment, preparation.when, InPython(law))
     assert taken == [0, 1, 2, 3]
 
 

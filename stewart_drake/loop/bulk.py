@@ -12,11 +12,20 @@ from numpy.typing import NDArray
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.law import native_law
 from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.loop.experiment import assemble, first_queue, followed_motion
 from stewart_drake.loop.metrics import Figures, figures
-from stewart_drake.loop.native_loop import Course, Instants, run_loop, uncovered
+from stewart_drake.loop.native_loop import (
+    Course,
+    InC,
+    InPython,
+    Instants,
+    run_loop,
+    uncovered,
+)
 from stewart_drake.loop.preparation import Preparation, Prepared, preparation_of
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
@@ -94,7 +103,7 @@ class PythonLaw:
         self._followed = followed_motion(experiment, law, prepared.planned)
         self.memory = law.initial_memory(first_queue(experiment, law))
 
-    def __call__(self, sample: int, measurement: Array) -> Array:
+    def torque(self, sample: int, measurement: Array) -> Array:
         """The torque (6,) of a sample."""
         motion: Motion = Preview(self._law.preview_times, self._previews[sample])
         if self._followed is not None:
@@ -105,14 +114,22 @@ class PythonLaw:
 
 
 def _in_c(preparation: Preparation, prepared: Prepared) -> Ending:
-    law = PythonLaw(prepared, preparation.when)
-    course = run_loop(prepared.experiment, preparation.when, law)
-    counts = law.memory.counts.summary() | {"tuner_fallbacks": 0}
-    return _ending(preparation, prepared, course, counts, "native, law in Python")
+    experiment, law, when = prepared.experiment, prepared.law, preparation.when
+    only_python = native_law.uncovered(law)
+    if only_python is None:
+        c = experiment.scenario.controller
+        queue = first_queue(experiment, law)
+        in_c = InC(law, queue, prepared.previews, np.array([c.w_Q, c.w_R]))
+        course = run_loop(experiment, when, in_c)
+        return _ending(preparation, prepared, course, in_c.counts, "native")
+    in_python = PythonLaw(prepared, when)
+    course = run_loop(experiment, when, InPython(in_python.torque))
+    loop = f"native, law in Python ({only_python})"
+    return _ending(preparation, prepared, course, in_python.memory.counts, loop)
 
 
 def _ending(
-    preparation: Preparation, prepared: Prepared, course: Course, counts: dict[str, int], loop: str
+    preparation: Preparation, prepared: Prepared, course: Course, counts: Counts, loop: str
 ) -> Ending:
     when, looked = preparation.when, len(course.states)
     error = course.states[:, POSE] - preparation.references[:looked, POSE]
@@ -130,7 +147,8 @@ def _ending(
         course.stopped is None,
     )
     status = "completed" if course.stopped is None else "left_workspace"
-    return Ending(status, course.stopped, found, counts, loop)
+    told = counts.summary() | {"tuner_fallbacks": 0}
+    return Ending(status, course.stopped, found, told, loop)
 
 
 def _in_drake(scenario: Scenario, truth: Mechanism | None, field: str) -> Ending:

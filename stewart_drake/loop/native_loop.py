@@ -5,7 +5,7 @@ delay chain, limit, bias and noise, seen and judged at the same instants (docs/t
 import ctypes
 import math
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,12 @@ from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.law.memory import Counts
+from stewart_drake.law.native_law import configuration
+from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.experiment import Experiment, torques_in_flight
 from stewart_drake.loop.sensor import white_noise
+from stewart_drake.native.law_layout import CAUSES, address
 from stewart_drake.native.library import backend
 from stewart_drake.native.plant import Controller, Ended, LoopStruct
 from stewart_drake.scenario.config import FixedTunerConfig, Scenario, WireConfig
@@ -82,8 +86,68 @@ class Course(NamedTuple):
     stopped: Failure | None
 
 
-Law = Callable[[int, Array], Array]
-"""(sample, measurement (12)) -> torque (6), N m."""
+class Law(Protocol):
+    """What gives a loop its torques."""
+
+    def run(self, plant: NativePlant, loop: LoopStruct) -> Ended:
+        """Take the plant to its end."""
+
+
+class InPython:
+    """A law that C calls at every sample.
+
+    Args:
+        torque: (sample, measurement (12)) -> (6,) N m.
+    """
+
+    def __init__(self, torque: Callable[[int, Array], Array]) -> None:
+        self._torque = torque
+
+    def run(self, plant: NativePlant, loop: LoopStruct) -> Ended:
+        """Raises whatever the law does."""
+        raised: list[BaseException] = []
+
+        def step(_: object, sample: int, measurement: Any, torque: Any) -> int:
+            try:
+                torque[:NUM_TORQUES] = self._torque(sample, np.array(measurement[:NUM_STATE]))
+            except BaseException as error:  # which cannot pass through C; it goes on below
+                raised.append(error)
+                return 1
+            return 0
+
+        ended = plant.call("closed_loop", ctypes.byref(loop), Controller(step), None)
+        if raised:
+            raise raised[0]
+        return ended
+
+
+class InC:
+    """The law of native/law.c.
+
+    Args:
+        law: one of which nothing is `law.native_law.uncovered`.
+        queue: (L, 6) torques in flight at t = 0, as it believes, N m.
+        previews: (k, p, 18) the motion that it follows, for each sample.
+        weights: (2,) w_Q and w_R.
+
+    Attributes:
+        counts: what went wrong and was survived, once it has run.
+    """
+
+    def __init__(self, law: PredictiveLqi, queue: Array, previews: Array, weights: Array) -> None:
+        given = [np.ascontiguousarray(a, np.float64) for a in (queue, previews, weights)]
+        self._given = [configuration(law), *given]
+        self._counts = np.zeros(len(CAUSES), dtype=np.intc)
+
+    def run(self, plant: NativePlant, loop: LoopStruct) -> Ended:
+        """See `Law`."""
+        places = [ctypes.c_void_p(address(a)) for a in (*self._given, self._counts)]
+        return plant.call("closed_loop_of_law", ctypes.byref(loop), *places)
+
+    @property
+    def counts(self) -> Counts:
+        """By cause."""
+        return Counts(**dict(zip(CAUSES, self._counts.tolist(), strict=True)))
 
 
 def uncovered(scenario: Scenario) -> str | None:
@@ -144,19 +208,7 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
         measured=measured.ctypes.data,
         asked=asked.ctypes.data,
     )
-    raised: list[BaseException] = []
-
-    def step(_: object, sample: int, measurement: object, torque: object) -> int:
-        try:
-            asked[sample] = law(sample, measured[sample].copy())
-        except BaseException as error:  # it cannot pass through C; raised again below
-            raised.append(error)
-            return 1
-        return 0
-
-    ended = plant.call("closed_loop", ctypes.byref(loop), Controller(step), None)
-    if raised:
-        raise raised[0]
+    ended = law.run(plant, loop)
     if ended == Ended.TOO_SHORT_STEPS:
         raise IntegrationError(f"no step is short enough at t = {plant.time:.6g} s")
     stopped = None

@@ -211,7 +211,8 @@ static int step(void *about, long k, const double *measurement, double *torque)
 {
     law_in_c *law = about;
     const double *preview = law->previews + STEWART_REFERENCE * law->rows * k;
-    stewart_step(law->config, &law->memory, &law->work, measurement, 0, preview, law->weights, torque);
+    stewart_step(law->config, &law->memory, &law->work, measurement, 0, preview, law->weights,
+                 torque);
     return 0;
 }
 
