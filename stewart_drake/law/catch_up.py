@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.delay_model import sample
@@ -137,9 +138,9 @@ class CatchUp:
 
     def _possible(self, periods: int, limit: float) -> bool:
         if periods not in self._holds:
-            self._holds[periods] = _plan(
-                self._dynamics, self._reference, self._start, self._t_start, self._period, periods
-            )
+            given = self._dynamics, self._reference, self._start, self._t_start, self._period
+            with one_blas_thread:
+                self._holds[periods] = _plan(*given, periods)
         found = self._holds[periods]
         return found is not None and bool(np.abs(found.torques).max() <= limit)
 

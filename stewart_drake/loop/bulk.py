@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.dynamics.threads import one_blas_thread
-from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law import native_law
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
-from stewart_drake.loop.experiment import assemble, first_queue, followed_motion
+from stewart_drake.loop.experiment import Experiment, assemble, first_queue, followed_motion
 from stewart_drake.loop.metrics import Figures, figures
 from stewart_drake.loop.native_loop import (
     Course,
@@ -44,7 +44,8 @@ class Ending(NamedTuple):
         stopped: when and why it did not complete, or None.
         figures: what it came to.
         counts: what went wrong and was survived, by name, as in the summary.
-        loop: what ran it: `native`, or what else, and what of the scenario made it necessary.
+        loop: what ran it: `native`, or what else, and what of the scenario made it necessary;
+            nothing where the true machine cannot stand where the run begins.
     """
 
     status: str
@@ -67,25 +68,23 @@ def run_in_bulk(scenario: Scenario, truth: Mechanism | None = None) -> Ending:
     """
     only_drake = uncovered(scenario)
     if only_drake is not None:
-        return _in_drake(scenario, truth, only_drake)
-    with one_blas_thread:
-        preparation = preparation_of(scenario)
-        prepared = preparation.prepared(preparation.experiment(scenario, truth))
-        try:
-            return _in_c(preparation, prepared)
-        except IntegrationError:
-            return _in_drake(scenario, truth, "plant.accuracy")
+        outside = _outside(assemble(scenario, truth))
+        return outside or _in_drake(scenario, truth, only_drake)
+    preparation = preparation_of(scenario)
+    experiment = preparation.experiment(scenario, truth)
+    try:
+        return _outside(experiment) or _in_c(preparation, preparation.prepared(experiment))
+    except IntegrationError:
+        return _in_drake(scenario, truth, "plant.accuracy")
 
 
-def start_of(scenario: Scenario) -> Array:
-    """The state (12,) in which a run begins.
-
-    Raises:
-        ConfigError: as `run_in_bulk`.
-    """
-    if uncovered(scenario) is not None:
-        return assemble(scenario).start
-    return preparation_of(scenario).experiment(scenario).start
+def _outside(experiment: Experiment) -> Ending | None:
+    """The end of a run whose true machine cannot stand where it begins."""
+    failure = diagnose(experiment.truth, 0.0, experiment.start[POSE])
+    if failure is None:
+        return None
+    counts = Counts().summary() | {"tuner_fallbacks": 0}
+    return Ending("left_workspace", failure, Figures(*[np.nan] * len(Figures._fields)), counts, "")
 
 
 class PythonLaw:
@@ -123,7 +122,8 @@ def _in_c(preparation: Preparation, prepared: Prepared) -> Ending:
         course = run_loop(experiment, when, in_c)
         return _ending(preparation, prepared, course, in_c.counts, "native")
     in_python = PythonLaw(prepared, when)
-    course = run_loop(experiment, when, InPython(in_python.torque))
+    with one_blas_thread:
+        course = run_loop(experiment, when, InPython(in_python.torque))
     loop = f"native, law in Python ({only_python})"
     return _ending(preparation, prepared, course, in_python.memory.counts, loop)
 

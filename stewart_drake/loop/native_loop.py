@@ -1,5 +1,5 @@
 """The closed loop without Drake, for many runs: the exact plant of native/plant.c behind the same
-delay chain, limit, bias and noise, seen and judged at the same instants (docs/theory.md, section 32).
+delay chain, limit, bias and noise, seen and judged at the same instants (theory.md, section 32).
 """
 
 import ctypes
@@ -18,7 +18,7 @@ from stewart_drake.law.memory import Counts
 from stewart_drake.law.native_law import configuration
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.experiment import Experiment, torques_in_flight
-from stewart_drake.loop.sensor import white_noise
+from stewart_drake.loop.sensor import white_noises
 from stewart_drake.native.law_layout import CAUSES, address
 from stewart_drake.native.library import backend
 from stewart_drake.native.plant import Controller, Ended, LoopStruct
@@ -109,7 +109,9 @@ class InPython:
 
         def step(_: object, sample: int, measurement: Any, torque: Any) -> int:
             try:
-                torque[:NUM_TORQUES] = self._torque(sample, np.array(measurement[:NUM_STATE]))
+                asked = self._torque(sample, np.array(measurement[:NUM_STATE]))
+                for i in range(NUM_TORQUES):
+                    torque[i] = asked[i]
             except BaseException as error:  # which cannot pass through C; it goes on below
                 raised.append(error)
                 return 1
@@ -190,7 +192,7 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
     measured, asked = np.empty((number, NUM_STATE)), np.empty((number, NUM_TORQUES))
     drawn = None
     if noise.any():
-        drawn = np.array([noise * white_noise(sc.sensor.seed, k) for k in range(number)])
+        drawn = noise * white_noises(sc.sensor.seed, number)
     released = None
     if delay.fraction > 0:
         period = sc.controller.period

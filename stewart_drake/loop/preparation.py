@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
 from stewart_drake.law.catch_up import CatchUp
@@ -162,4 +163,5 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 @lru_cache(maxsize=16)
 def _preparation(key: _Key) -> Preparation:
-    return Preparation(key.scenario)
+    with one_blas_thread:
+        return Preparation(key.scenario)
