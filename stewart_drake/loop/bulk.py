@@ -4,6 +4,7 @@ It takes the loop of native/plant.c where that has all that the scenario asks fo
 it has not; both come to the same.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +32,7 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.signals import POSE
+from stewart_drake.scenario.signals import POSE, TUNER_INPUTS
 
 Array = NDArray[np.float64]
 
@@ -44,6 +45,8 @@ class Ending(NamedTuple):
         stopped: when and why it did not complete, or None.
         figures: what it came to.
         counts: what went wrong and was survived, by name, as in the summary.
+        samples: (k, 18) at the controller's samples [measurement - reference (12); torque that the
+            law asked for (6)], in rad, m, rad/s, m/s and N m.
         loop: what ran it: `native`, or what else, and what of the scenario made it necessary;
             nothing where the true machine cannot stand where the run begins.
     """
@@ -52,6 +55,7 @@ class Ending(NamedTuple):
     stopped: Failure | None
     figures: Figures
     counts: dict[str, int]
+    samples: Array
     loop: str
 
 
@@ -84,7 +88,8 @@ def _outside(experiment: Experiment) -> Ending | None:
     if failure is None:
         return None
     counts = Counts().summary() | {"tuner_fallbacks": 0}
-    return Ending("left_workspace", failure, Figures(*[np.nan] * len(Figures._fields)), counts, "")
+    nothing = Figures(*[np.nan] * len(Figures._fields))
+    return Ending("left_workspace", failure, nothing, counts, np.empty((0, len(TUNER_INPUTS))), "")
 
 
 class PythonLaw:
@@ -147,19 +152,22 @@ def _ending(
         course.stopped is None,
     )
     status = "completed" if course.stopped is None else "left_workspace"
+    wanted = preparation.references[:looked][sampled]
+    samples = np.hstack([course.measured[:taken] - wanted, course.asked[:taken]])
     told = counts.summary() | {"tuner_fallbacks": 0}
-    return Ending(status, course.stopped, found, told, loop)
+    return Ending(status, course.stopped, found, told, samples, loop)
 
 
 def _in_drake(scenario: Scenario, truth: Mechanism | None, field: str) -> Ending:
-    result = simulate(scenario, truth=truth, margin=False)
+    # A log of one's own period need not hold the samples.
+    result = simulate(dataclasses.replace(scenario, log_period=None), truth=truth, margin=False)
     if result.status == "interrupted":
         raise KeyboardInterrupt
     return ending_of(result, f"drake, {field}")
 
 
 def ending_of(result: SimulationResult, loop: str = "drake") -> Ending:
-    """How a simulation ended."""
+    """How a simulation ended, whose log holds every sample, as it does by default."""
     summary = result.summary
     found = Figures(
         accumulated_error=summary["accumulated_error"],
@@ -168,4 +176,18 @@ def ending_of(result: SimulationResult, loop: str = "drake") -> Ending:
         rms_torque=summary["rms_torque"],
         torque_variation=summary["torque_variation"],
     )
-    return Ending(result.status, result.stopped, found, summary["counts"], loop)
+    samples = samples_of(result)
+    return Ending(result.status, result.stopped, found, summary["counts"], samples, loop)
+
+
+def samples_of(result: SimulationResult) -> Array:
+    """(k, 18), see `Ending`, of a log that holds every sample."""
+    signals, sc = result.signals, result.scenario
+    if not signals.sizes["time"]:
+        return np.empty((0, len(TUNER_INPUTS)))
+    # Held signals show the value from an instant on, so that of k dt is T_k.
+    number = int(float(signals.time.values[-1]) / sc.controller.period + 1e-9) + 1
+    at = sc.controller.period * np.arange(number)
+    kept = signals.sel(time=at, method="nearest")
+    wanted = np.hstack([kept.reference, kept.reference_rates])
+    return np.hstack([kept.measurement - wanted, kept.torque_commanded])

@@ -16,7 +16,7 @@ from stewart_drake.loop.experiment import Experiment
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.failures import Explanation, explain
 from stewart_drake.studies.ranges import Ranges
-from stewart_drake.studies.runs import Outcome
+from stewart_drake.studies.runs import Outcome, loops_of
 from stewart_drake.studies.statistics import (
     Correlation,
     Interval,
@@ -95,9 +95,8 @@ class RobustnessStudy(NamedTuple):
 
     @property
     def loops(self) -> dict[str, int]:
-        """Number of runs by what ran them, the most frequent first."""
-        counts = Counter(one.loop for one in self.outcomes if one.loop)
-        return dict(counts.most_common())
+        """Number of runs by what ran them, see `loop.bulk.Ending`."""
+        return loops_of(self.outcomes)
 
     def quantile(self, probability: float) -> Interval:
         """Of E_ac over all runs, % s; a run that did not complete counts as infinite."""

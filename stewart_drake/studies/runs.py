@@ -7,6 +7,8 @@ completed run has is there; whatever breaks a rule is a ConfigError, never a suc
 import dataclasses
 import json
 import math
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -17,9 +19,6 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable, load_json
 from stewart_drake.files.yamlio import brief, validate
 from stewart_drake.loop.bulk import Ending, run_in_bulk
-from stewart_drake.loop.results import SimulationResult
-from stewart_drake.loop.simulation import simulate
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 
 _MAX_BYTES: Final = 1_000_000
@@ -68,19 +67,6 @@ class _File:
     outcome: Outcome
 
 
-def run_to_its_end(scenario: Scenario, truth: Mechanism | None = None) -> SimulationResult:
-    """Simulate without a judgement beforehand.
-
-    Raises:
-        ConfigError: as `simulate`.
-        KeyboardInterrupt: Ctrl-C.
-    """
-    result = simulate(scenario, truth=truth, margin=False)
-    if result.status == "interrupted":
-        raise KeyboardInterrupt
-    return result
-
-
 def outcome_of(ending: Ending) -> Outcome:
     """How a run ended."""
     stopped = ending.stopped
@@ -95,6 +81,11 @@ def outcome_of(ending: Ending) -> Outcome:
         loop=ending.loop,
         **ended,
     )
+
+
+def loops_of(outcomes: Iterable[Outcome]) -> dict[str, int]:
+    """Number of runs by what ran them, the most frequent first."""
+    return dict(Counter(one.loop for one in outcomes if one.loop).most_common())
 
 
 def run_file(outcome: Outcome, draw: dict[str, Any] | None = None) -> bytes:
