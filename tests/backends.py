@@ -5,7 +5,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from unittest.mock import patch
 
+import pytest
+
 from stewart_drake.dynamics.functions import compiled_functions
+from stewart_drake.law.native_law import Serving
+from stewart_drake.loop import controller
 from stewart_drake.native import library
 
 
@@ -26,3 +30,8 @@ def switched(value: str | None) -> Iterator[None]:
 def _forget() -> None:
     library.backend.cache_clear()
     compiled_functions.cache_clear()
+
+
+def stepped_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Controllers that are made from now on step their law in Python, whatever is compiled."""
+    monkeypatch.setattr(controller, "serving", lambda law: Serving(law, "python (asked for)"))

@@ -21,6 +21,7 @@ from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
+from tests.backends import stepped_in_python
 
 Array = NDArray[np.float64]
 Spoil = Callable[[int, Array, dict[int, Array]], Array]
@@ -136,6 +137,7 @@ def test_a_spike(size, monkeypatch):
 @pytest.mark.parametrize("failing", [range(1), range(8, 9), range(8, 18)])
 def test_gains_that_cannot_be_found(failing, controller, monkeypatch):
     """The last gain serves on; before the first one the feedforward goes alone."""
+    stepped_in_python(monkeypatch)
     solve, calls = cost_module.reduced_gain, {"started": -1}
 
     def sometimes(*arguments: Any) -> Array:

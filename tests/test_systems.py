@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
+from stewart_drake.law.native_law import serving
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.delay_chain import DelayChain
@@ -34,6 +36,7 @@ from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate, make_reference
+from tests.backends import stepped_in_python
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]
@@ -346,15 +349,21 @@ def fixed(controller: DelayLqiController, context: Context) -> dict[str, Array]:
     return values
 
 
-def test_controller_output_and_forced_update_are_steps_of_the_law() -> None:
+@pytest.mark.parametrize("in_python", [False, True])
+def test_controller_output_and_forced_update_are_steps_of_the_law(
+    in_python: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if in_python:
+        stepped_in_python(monkeypatch)
     controller = DelayLqiController(law(), np.zeros((2, 6)))
     context = controller.CreateDefaultContext()
     inputs = fixed(controller, context)
-    expected = law().initial_memory(np.zeros((2, 6)))
+    steps: Any = law() if in_python else serving(law()).law
+    expected = steps.initial_memory(np.zeros((2, 6)))
     for _ in range(3):
         preview = Preview(law().preview_times, inputs["preview"].reshape(-1, 18))
         measurement = Measurement.of(inputs["measurement"])
-        expected = law().step(expected, measurement, preview, inputs["weights"])
+        expected = steps.step(expected, measurement, preview, inputs["weights"])
         held = controller.GetOutputPort("torque_commanded").Eval(context).copy()
         torque = controller.GetOutputPort("torque").Eval(context)
         assert np.array_equal(torque, expected.torque)
@@ -380,6 +389,7 @@ def short_loop(plant: str, *settings: str) -> ClosedLoop:
 def test_the_law_is_evaluated_once_per_sample(
     fraction: float, plant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    stepped_in_python(monkeypatch)
     step, calls = PredictiveLqi.step, []
 
     def counted(self, memory, *inputs):  # type: ignore[no-untyped-def]

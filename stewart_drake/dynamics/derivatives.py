@@ -28,7 +28,6 @@ from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,
     COULOMB_SPEED,
-    DAMPING,
     NUM_PLANT_PARAMETERS,
     PAYLOAD,
     PAYLOAD_POSITION,
@@ -83,24 +82,22 @@ def plate_alone(common: CommonNumbers, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.S
     R_WP, w, _, g_W = plate = _plate(s)
     payload = s["parameters"][PAYLOAD]
     I_W = ca.mtimes([R_WP, ca.diag(common.plate_inertia), R_WP.T])
-    r, moved = _payload(plate, s)
+    mass = common.plate_mass + payload
+    (r, turned), at_com = _payload(plate, s), s["accelerations"][3:] - g_W
     moment = ca.mtimes(I_W, plate.w_dot) + ca.cross(w, ca.mtimes(I_W, w))
-    force = common.plate_mass * (s["accelerations"][3:] - g_W) + payload * moved
-    whole = ca.vertcat(moment + ca.cross(r, payload * moved), force)
+    moment += ca.cross(r, payload * (at_com + turned))
+    whole = ca.vertcat(moment, mass * at_com + payload * turned)
     state = ca.vertcat(s["pose"], s["rates"])
     lever = payload * equations.cross_matrix(r)
-    mass = (common.plate_mass + payload) * ca.SX.eye(3)
     M_ww = I_W + ca.mtimes(lever, equations.cross_matrix(r).T)
-    M = ca.vertcat(ca.horzcat(M_ww, lever), ca.horzcat(lever.T, mass))
+    M = ca.vertcat(ca.horzcat(M_ww, lever), ca.horzcat(lever.T, mass * ca.SX.eye(3)))
     return ca.jacobian(whole, state), M
 
 
 def _payload(plate: Plate, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
-    """Its place r from the COM, and its acceleration less gravity's; (3,) each, in W."""
-    R_WP, w, w_dot, g_W = plate
-    r = ca.mtimes(R_WP, s["parameters"][PAYLOAD_POSITION])
-    turned = ca.cross(w_dot, r) + ca.cross(w, ca.cross(w, r))
-    return r, s["accelerations"][3:] - g_W + turned
+    """Its place r from the COM, and how it accelerates against that; (3,) each, in W."""
+    r = ca.mtimes(plate.R_WP, s["parameters"][PAYLOAD_POSITION])
+    return r, ca.cross(plate.w_dot, r) + ca.cross(plate.w, ca.cross(plate.w, r))
 
 
 def _joint(leg: LegNumbers, plate: Plate, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX, ca.SX]:
@@ -134,8 +131,8 @@ def leg_on_plate(
     w, w_dot = plate.w, plate.w_dot
     state = ca.vertcat(s["pose"], s["rates"])
     b, q, velocity = _joint(leg, plate, s)
-    turned = ca.cross(w_dot, b) + ca.cross(w, ca.cross(w, b))
-    acceleration = ca.mtimes(R_WS.T, s["accelerations"][3:] + turned)
+    v_dot = s["accelerations"][3:] + ca.cross(w_dot, b) + ca.cross(w, ca.cross(w, b))
+    acceleration = ca.mtimes(R_WS.T, v_dot)
     numbers = (*leg.symbols, *common.symbols)
     gravity = ca.mtimes(R_WS.T, plate.gravity)
     f, df, m, g = _leg_residual(leg, common)(
@@ -159,7 +156,8 @@ def assembled(
         dr = R dp,   dk = ([w_dot x] + [w x]^2) dr,   d[r x m k; m k] = m [dr x k + r x dk; dk].
     """
     plate, p, cross = _plate(s), s["parameters"], equations.cross_matrix
-    r, k = _payload(plate, s)
+    r, turned = _payload(plate, s)
+    k = s["accelerations"][3:] - plate.gravity + turned
     K = cross(plate.w_dot) + ca.mtimes(cross(plate.w), cross(plate.w))
     moving = ca.vertcat(ca.mtimes(cross(r), K) - cross(k), K)
     steep = p[COULOMB] * (1 - slips**2) * arm_rates / p[COULOMB_SPEED] ** 2
@@ -177,15 +175,14 @@ def _leg_residual(leg: LegNumbers, common: CommonNumbers) -> ca.Function:
     """(q, w, a, torque, bias, slip, parameters, gravity) -> f, df/d[q; w] (3, 6), m and g, in S."""
     q, w, a, gravity = (ca.SX.sym(name, 3) for name in ("q", "w", "a", "gravity"))
     torque, bias, slip = (ca.SX.sym(name) for name in ("torque", "bias", "slip"))
-    p, held, moved = ca.SX.sym("parameters", NUM_PLANT_PARAMETERS), ca.SX.sym("T"), ca.vertcat(q, w)
+    p, moved = ca.SX.sym("parameters", NUM_PLANT_PARAMETERS), ca.vertcat(q, w)
     numbers = (*leg.symbols, *common.symbols)
     reduced = equations.Leg(*equations.leg_at_joint(leg, common)(q, w, gravity, *numbers))
     rate = ca.dot(reduced.arm, w)
     shaft = equations.shaft_torque(torque, bias, rate, slip, p)
-    slope = p[DAMPING] + p[COULOMB] * (1 - slip**2) / p[COULOMB_SPEED]
-    # At a shaft torque that is held, and what its change with the crank's rate adds.
-    f = ca.mtimes(reduced.mass, a) + reduced.bias - reduced.arm * held
+    f = ca.mtimes(reduced.mass, a) + reduced.bias - reduced.arm * shaft
+    # At a slip that is held, and what its change with the crank's rate adds.
+    slope = p[COULOMB] * (1 - slip**2) / p[COULOMB_SPEED]
     df = ca.jacobian(f, moved) + slope * ca.mtimes(reduced.arm, ca.jacobian(rate, moved))
-    f, df = ca.substitute([f, df], [held], [shaft])
     arguments = [q, w, a, torque, bias, slip, p, gravity, *numbers]
     return ca.Function("leg_residual", arguments, [f, df, reduced.mass, reduced.arm], {"cse": True})

@@ -331,7 +331,8 @@ def leg_on_plate(
         h_v=f,
         energy=ca.dot(v_Q, ca.mtimes(m, v_Q)) / 2 + at_joint.potential,
     )
-    return added, ca.horzcat(ca.cross(b, arm).T, arm.T), ca.dot(arm, v_Q)
+    row = ca.horzcat(ca.cross(b, arm).T, arm.T)
+    return added, row, ca.mtimes(row, ca.vertcat(w, v))
 
 
 def assembled(sums: Sums, arm: ca.SX, crank_rates: ca.SX, pose: ca.SX, rates: ca.SX) -> Motion:

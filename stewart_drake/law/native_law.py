@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from stewart_drake.law.belief import Belief, Estimate
 from stewart_drake.law.channel import Report, Sent, Wire
 from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.delay_observer import DelayObserver
 from stewart_drake.law.design_models import MultibodyModel
 from stewart_drake.law.feedforward import InverseDynamicsFeedforward
 from stewart_drake.law.late import LateObserver
@@ -67,6 +68,7 @@ def uncovered(law: PredictiveLqi) -> str | None:
         estimated = observer.settings.parameters.names
     covered = {
         "law": type(law) is PredictiveLqi and type(law.plant) is NominalPlant,
+        "controller.delay_estimator": not isinstance(observer, DelayObserver),
         "controller.estimator": type(observer) in _OBSERVERS and type(timeline) is Timeline,
         "controller.prior": estimated == PARAMETERS and dynamics.free == PARAMETERS,
         "controller.rejoin": type(law.planner) is NoPlanner,

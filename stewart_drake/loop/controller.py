@@ -19,8 +19,8 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.late import LateObserver
 from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
+from stewart_drake.law.native_law import AnyMemory, serving
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
@@ -34,7 +34,7 @@ from stewart_drake.scenario.signals import (
 Array = NDArray[np.float64]
 
 
-HELD: Final[dict[str, Callable[[Memory], Array]]] = {
+HELD: Final[dict[str, Callable[[AnyMemory], Array]]] = {
     "torque_commanded": lambda memory: memory.torque,
     "integral": lambda memory: memory.integral,
     "weights": lambda memory: memory.weights,
@@ -56,13 +56,13 @@ def reported(kept: int) -> int:
 class Sample(NamedTuple):
     """What one step of the law left behind."""
 
-    memory: Memory
+    memory: AnyMemory
     seconds: float
     """Time that it took to compute; 0 before the first."""
 
 
 class DelayLqiController(LeafSystem):
-    """Predictive LQI, whatever parts its law is made of.
+    """Predictive LQI, whatever parts its law is made of; in C where that is the same (`backend`).
 
     With m the memory (`law.memory.Memory`) and `step` the law (`law.predictive_lqi.PredictiveLqi`):
 
@@ -91,6 +91,9 @@ class DelayLqiController(LeafSystem):
     | delay_estimate | output | 1 | s | held; as the law believes |
     | delay_std | output | 1 | s | held; NaN without delay estimator |
 
+    Attributes:
+        backend: what steps the law, see `law.native_law.serving`.
+
     Args:
         law: the control law.
         queue: (L, 6) torques in flight at t = 0 in N m, oldest first, as the controller believes.
@@ -106,7 +109,8 @@ class DelayLqiController(LeafSystem):
     ) -> None:
         super().__init__()
         self._law, self._motion = law, motion
-        first = Sample(law.initial_memory(queue), 0.0)
+        self._served, self.backend = serving(law)
+        first = Sample(self._served.initial_memory(queue), 0.0)
         self._memory = self.DeclareAbstractState(Value(first))
         self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
         self._times = law.preview_times
@@ -141,11 +145,11 @@ class DelayLqiController(LeafSystem):
         value: Any = context.get_abstract_state(int(self._memory))
         return value.get_value()
 
-    def memory(self, context: Context) -> Memory:
+    def memory(self, context: Context) -> AnyMemory:
         """The memory in a context of this system."""
         return self.sample(context).memory
 
-    def _held(self, part: Callable[[Memory], Array], context: Context, output: BasicVector) -> None:
+    def _held(self, part: Callable[[AnyMemory], Array], context: Context, output: BasicVector) -> None:
         output.SetFromVector(part(self.memory(context)))
 
     def _calc_step(self, context: Context, result: AbstractValue) -> None:
@@ -157,7 +161,7 @@ class DelayLqiController(LeafSystem):
         memory, motion = self.memory(context), self._followed(context)
         report = self._reported(context, age)
         started = time.perf_counter()
-        after = self._law.step(memory, measurement, motion, weights, report)
+        after = self._served.step(memory, measurement, motion, weights, report)
         result.set_value(Sample(after, time.perf_counter() - started))
 
     def _reported(self, context: Context, age: float) -> Report | None:

@@ -71,6 +71,7 @@ class Recorder:
         peak_applied: largest torque that acted, N m.
         counts: what went wrong and was survived, as of the last sample.
         tuner_fallbacks: samples at which the tuner passed its network over.
+        controller_backend: what stepped the law.
         delay: at the last sample, s: true, as it is believed in or estimated, standard deviation.
     """
 
@@ -88,6 +89,7 @@ class Recorder:
         self.on_grid, self.samples = Table(13), Table(19)
         self.peak_applied = 0.0
         self.counts, self.tuner_fallbacks = Counts(), 0
+        self.controller_backend: str = self._controller.backend
         nan = float("nan")
         self.delay: DelaySummary = {"true_s": nan, "estimated_s": nan, "std_s": nan}
 
@@ -201,6 +203,7 @@ def summarize(
         "delay": recorder.delay,
         "wall_s": wall,
         "backend": backend().name,
+        "controller_backend": recorder.controller_backend,
         "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
         "own": experiment.own.names,
         "scenario": scenario_to_dict(sc),

@@ -77,6 +77,8 @@ class RunSummary(TypedDict):
     """Time that the run took, s."""
     backend: str
     """What ran the dynamics: `native`, or `casadi`, its virtual machine."""
+    controller_backend: str
+    """What stepped the controller: `native`, `own`, or `python`, and the field that C has not."""
     counts: dict[str, int]
     """What went wrong and was survived, by name (`law.memory.Counts`, `tuner_fallbacks`)."""
     own: dict[str, str]

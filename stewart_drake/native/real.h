@@ -3,6 +3,8 @@
 #ifndef STEWART_REAL_H
 #define STEWART_REAL_H
 
+#include "limits.h"
+
 #ifdef STEWART_FLOAT
 typedef float real;
 #else

@@ -13,14 +13,8 @@
 #define STEWART_H
 
 #include "dynamics.h"
+#include "limits.h"
 #include "riccati.h"
-
-#ifndef STEWART_MAX_QUEUE
-#define STEWART_MAX_QUEUE 64 /* torques in flight at a sample: the delay in periods, rounded up */
-#endif
-#ifndef STEWART_MAX_KEPT
-#define STEWART_MAX_KEPT 32 /* further torques, for measurements that come late */
-#endif
 
 #define STEWART_STATES 12
 #define STEWART_MOTORS 6
