@@ -1,6 +1,7 @@
 """The loop without Drake against Drake's: the same instants, noise, torques, ends and figures."""
 
 import dataclasses
+import functools
 import math
 import os
 from pathlib import Path
@@ -26,6 +27,8 @@ from stewart_drake.native import library
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.uncertainty import MACHINE, Scales, draw, drawn, scales_of
 from tests.backends import switched
 from tests.mechanisms import PAPER
 
@@ -108,6 +111,33 @@ def test_the_loop_is_drakes(name: str) -> None:
     found = run_in_bulk(LOOPS[name])
     assert found.loop == IN_PYTHON.get(name, "native")
     assert_same(found, drake(LOOPS[name]))
+
+
+@functools.cache
+def scales() -> Scales:
+    one = LOOPS["from rest"]
+    return scales_of(prepare(one), run_in_bulk(one).figures.peak_torque)
+
+
+def assert_drawn(indices: range, duration: float) -> None:
+    """Machines as of `analyze robustness`, from rest, in Drake and in C."""
+    one = scenario("paper", f"duration={duration}")
+    for index in indices:
+        changed = drawn(MACHINE, one, PAPER, draw(Ranges(), scales(), one, 9, index))
+        variant, truth = changed.as_scenario(), changed.machine()
+        found = run_in_bulk(variant, truth)
+        assert found.loop == "native"
+        assert_same(found, drake(variant, truth))
+
+
+def test_drawn_machines_end_as_in_drake() -> None:
+    assert_drawn(range(4), 3.0)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("part", range(5))
+def test_many_drawn_machines_end_as_in_drake(part: int) -> None:
+    assert_drawn(range(4 + 20 * part, 24 + 20 * part), 10.0)
 
 
 def test_cases_are_what_they_are_named_for() -> None:

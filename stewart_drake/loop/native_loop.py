@@ -28,6 +28,8 @@ from stewart_drake.scenario.timing import event_time, instants, look_time
 
 Array = NDArray[np.float64]
 
+SHARE: Final = 0.1
+"""Of the scenario's accuracy, for a step: those of order 8 are long, and a digit costs a sixth."""
 LONGEST_STEP: Final = math.inf
 """s; the plate is looked at every 20 ms whatever the steps are."""
 
@@ -184,7 +186,8 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
     parameters = np.array(sc.plant.parameters)
     parameters[BIAS] = 0.0  # added where torques arrive, as in the diagram
     truth = StewartDynamics(experiment.truth, sc.plant.gravity, parameters)
-    plant = NativePlant(truth, experiment.start, when.looks, sc.plant.accuracy, LONGEST_STEP)
+    accuracy = SHARE * sc.plant.accuracy
+    plant = NativePlant(truth, experiment.start, when.looks, accuracy, LONGEST_STEP)
     delay, number = sc.true_delay, len(when.samples)
     queue = torques_in_flight(experiment, delay)
     waiting = np.zeros((number + delay.steps, NUM_TORQUES))
