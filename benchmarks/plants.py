@@ -1,5 +1,8 @@
 """Error against computing time of the exact plant, Drake's SAP and MuJoCo on two open-loop motions.
 
+The exact plant is integrated in Drake, and by the compiled DOP853 of
+`stewart_drake.dynamics.open_loop`.
+
 All start at home, at rest, under torques amplitude * sin(frequency t + phase). The error is that of
 the pose at the end, its worst coordinate in rad or m, against an integration to 1e-13. The time is
 that of the stepping alone, per simulated second, the least of several interleaved repeats.
@@ -25,6 +28,8 @@ from pydrake.systems.primitives import Sine
 from scipy.integrate import solve_ivp
 
 import stewart_drake as sd
+from stewart_drake.dynamics.native_plant import NativePlant
+from stewart_drake.dynamics.open_loop import Drive, in_c
 from stewart_drake.files.versions import versions
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
@@ -111,6 +116,22 @@ def drake_run(motion: Motion, plant: Any, scheme: str | None, accuracy: float) -
     return run
 
 
+def dop853_run(motion: Motion, accuracy: float) -> Run:
+    """The compiled DOP853."""
+    dynamics = sd.StewartDynamics(MECHANISM, motion.gravity)
+    drive = Drive(amplitude=motion.amplitude, frequency=motion.frequency, phase=motion.phase)
+    end = np.array([motion.duration])
+
+    def run() -> tuple[float, Array]:
+        plant = NativePlant(dynamics, START, end, accuracy, np.inf)
+        drives = in_c([drive])
+        started = time.perf_counter()
+        plant.call("open_loop", *drives)
+        return time.perf_counter() - started, plant.final
+
+    return run
+
+
 def mujoco_run(motion: Motion, time_step: float, closure: Closure) -> Run:
     """MuJoCo's RK4."""
     plant = MujocoStewart(MECHANISM, motion.gravity, closure)
@@ -129,6 +150,8 @@ def candidates(motion: Motion) -> dict[tuple[str, str], Run]:
             plant = ExactPlant(sd.StewartDynamics(MECHANISM, motion.gravity))
             setting = f"accuracy 1e-{digit:02d}"
             runs[f"exact, {scheme}", setting] = drake_run(motion, plant, scheme, 10.0**-digit)
+    for digit in range(4, 14):
+        runs["exact, DOP853", f"accuracy 1e-{digit:02d}"] = dop853_run(motion, 10.0**-digit)
     for step in SAP_STEPS:
         plant = MultibodyStewart(MECHANISM, step, gravity=motion.gravity)
         runs["SAP", f"step {1e3 * step:g} ms"] = drake_run(motion, plant, None, 0.0)
@@ -187,23 +210,28 @@ def claims(curves: Sequence[dict[str, Curve]]) -> list[list[str]]:
     for motion, families in zip(motions(), curves, strict=True):
         exact, sap = families["exact, runge_kutta5"], families["SAP"]
         ratio = sap.time[-1] / exact.time_at(sap.error[-1])
+        fast = families["exact, DOP853"].time_at(1e-9)
         order = np.log(sap.error[0] / sap.error[-1]) / np.log(SAP_STEPS[0] / SAP_STEPS[-1])
         rows += [
             ["exact against SAP's smallest step, at SAP's error", motion.title, f"{ratio:.3g}"],
             ["order of SAP", motion.title, f"{order:.2f}"],
             ["exact, ms per simulated s at 1e-9", motion.title, f"{exact.time_at(1e-9):.3g}"],
+            ["exact, DOP853, ms per simulated s at 1e-9", motion.title, f"{fast:.3g}"],
         ]
-        for name in ("exact, runge_kutta3", "MuJoCo RK4", "MuJoCo RK4, hardened"):
-            ratio = families[name].time_at(1e-9) / exact.time_at(1e-9)
-            rows.append(
-                [f"exact, runge_kutta5 against {name}, at 1e-9", motion.title, f"{ratio:.3g}"]
-            )
+        others = ("exact, runge_kutta3", "MuJoCo RK4", "MuJoCo RK4, hardened")
+        for own, against in (
+            ("exact, runge_kutta5", others),
+            ("exact, DOP853", ("exact, runge_kutta5", *others[1:])),
+        ):
+            for name in against:
+                ratio = families[name].time_at(1e-9) / families[own].time_at(1e-9)
+                rows.append([f"{own} against {name}, at 1e-9", motion.title, f"{ratio:.3g}"])
     return rows
 
 
 def figure(curves: Sequence[dict[str, Curve]]) -> Figure:
     """Error against time, a panel per motion."""
-    styles = dict(zip(curves[0], ("ok-", "sk:", "^r-", "vb-", "Db:"), strict=True))
+    styles = dict(zip(curves[0], ("ok-", "sk:", "*g-", "^r-", "vb-", "Db:"), strict=True))
     drawn, panels = plt.subplots(1, 2, figsize=(7.4, 3.4), sharey=True, layout="constrained")
     for panel, motion, families in zip(panels, motions(), curves, strict=True):
         for family, curve in families.items():

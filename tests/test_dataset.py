@@ -14,6 +14,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.delay_model import delayed_model
 from stewart_drake.law.error_model import linear_model
 from stewart_drake.law.riccati import reduced_gain
+from stewart_drake.loop.bulk import samples_of
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario
@@ -23,10 +24,10 @@ from stewart_drake.tuning import dataset as module
 from stewart_drake.tuning import grid
 from stewart_drake.tuning.dataset import (
     data_hash,
+    first_samples,
     load_dataset,
     make_dataset,
     sample_run,
-    samples,
 )
 from stewart_drake.tuning.grid import (
     DELAYS,
@@ -126,7 +127,7 @@ def test_scenarios_that_do_not_suit_are_refused(settings, said):
 def test_rows_are_the_densities_that_the_loop_records():
     scenario = base("delay.steps=1", *NOISE, controller="predictor_lqi")
     result = simulate(scenario, margin=False)
-    own = densities(samples(result))
+    own = densities(first_samples(samples_of(result)))
     recorded = result.signals.density.values[::5][:100]
     # The loop reads its sample 5e-15 of the time earlier, and an error is a small difference.
     np.testing.assert_allclose(own, recorded, rtol=1e-8, atol=1e-10)  # of densities around 1

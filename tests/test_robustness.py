@@ -23,13 +23,15 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable
+from stewart_drake.loop import bulk
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism import kinematics
+from stewart_drake.native.library import backend
 from stewart_drake.report.page import Provenance, html
 from stewart_drake.report.robustness_document import document
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.studies import robustness, runs, statistics
+from stewart_drake.studies import robustness, statistics
 from stewart_drake.studies.failures import auc_interval, explain
 from stewart_drake.studies.ranges import Ranges, read_ranges
 from stewart_drake.studies.robustness import run_draw, study_robustness
@@ -418,7 +420,7 @@ def test_what_cannot_be_prepared_is_an_outcome(monkeypatch: pytest.MonkeyPatch) 
     def refuse(*_: Any, **__: Any) -> None:
         raise ConfigError("controller.catch_up: got 1 s")
 
-    monkeypatch.setattr(runs, "simulate", refuse)
+    monkeypatch.setattr(bulk, "preparation_of", refuse)
     found = json.loads(run_draw(short(), {}))["outcome"]
     assert found["status"] == "refused"
     assert found["reason"] == "controller.catch_up: got 1 s"
@@ -440,6 +442,20 @@ def test_a_draw_beyond_all_scenarios_is_an_outcome(one: Draw, field: str) -> Non
 
 
 # ---------------------------------------------------------------- the study
+
+
+@pytest.mark.parametrize(
+    ("changes", "loop"),
+    [({}, "native"), ({"sensor": {"kind": "state", "delay": 0.1}}, "drake, sensor.delay")],
+)
+def test_the_summary_counts_runs_by_what_ran_them(
+    tmp_path: Path, changes: dict[str, Any], loop: str
+) -> None:
+    if loop == "native" and backend().library is None:
+        pytest.skip(backend().reason)
+    study = study_robustness(short(**changes), tmp_path, runs=2, workers=1)
+    assert study.summary["loops"] == {loop: 2}
+    assert document(study).facts["loop"] == f"{loop}: 2"
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -524,7 +540,9 @@ def test_nothing_drawn_changes_nothing(tmp_path: Path) -> None:
     ranges = Ranges(**NOTHING, torque_limit=None)
     study = study_robustness(short(), tmp_path, ranges=ranges, runs=2, workers=1)
     assert told(study.outcomes) == told([study.undisturbed] * 2)
-    assert study.undisturbed.error == simulate(short()).accumulated_error
+    assert study.undisturbed.error == bulk.run_in_bulk(short()).figures.accumulated_error
+    drake = simulate(short(), margin=False).accumulated_error
+    assert study.undisturbed.error == pytest.approx(drake, rel=1e-6)
     assert all(math.isnan(one.error.rho) for one in study.influences())
     document(study).plain()
     html(document(study), Provenance("command"))

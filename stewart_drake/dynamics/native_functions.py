@@ -77,6 +77,10 @@ class NativeFunctions:
         arguments = [SHAPES[argument] for argument in signature.arguments]
         return NativeFunction(self._library, name, self._geometry, arguments, signature.results)
 
+    def own_buffers(self, name: str) -> Buffers:
+        """Fresh ones of a function of SIGNATURES, for C that calls it."""
+        return self._function(name).buffers()
+
     def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
         """d[pose; rates]/dt (12,): a plain call of `_change`, in half its time."""
         places, results, evaluate, _ = self._change.own_buffers()

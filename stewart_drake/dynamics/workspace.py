@@ -17,6 +17,8 @@ PITCH_LIMIT = np.deg2rad(85.0)
 """Roll and yaw become one rotation at a pitch of 90 degrees."""
 SINGULARITY_LIMIT = 1e-3
 """Least |det| of the dimensionless wrenches of the six rods, see `parallel_measure`."""
+LEAST = np.array([DEAD_CENTRE_SINE] * NUM_LEGS + [SINGULARITY_LIMIT, -PITCH_LIMIT])
+"""What the measures (8,) must be above."""
 
 
 class Failure(NamedTuple):
@@ -52,7 +54,7 @@ def standing(mechanism: Mechanism, pose: Array, crank_angles: Array | None = Non
     shows as a negative sine; from the pose alone it cannot be seen.
     """
     measures = _measures(mechanism, pose, crank_angles)
-    parallel, least = float(measures[NUM_LEGS]), margin_of(measures, home_sign(mechanism), _LEAST)
+    parallel, least = float(measures[NUM_LEGS]), margin_of(measures, home_sign(mechanism), LEAST)
     return Standing(measures[:NUM_LEGS], parallel, float(pose[1]), least)
 
 
@@ -60,11 +62,8 @@ def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None)
     """Positive where `standing` is permitted, zero on the boundary, dimensionless; NaN for NaN."""
     sign = home_sign(mechanism)
     if crank_angles is None:
-        return compiled_functions(mechanism).margin(pose, sign, _LEAST)
-    return margin_of(_measures(mechanism, pose, crank_angles), sign, _LEAST)
-
-
-_LEAST = np.array([DEAD_CENTRE_SINE] * NUM_LEGS + [SINGULARITY_LIMIT, -PITCH_LIMIT])
+        return compiled_functions(mechanism).margin(pose, sign, LEAST)
+    return margin_of(_measures(mechanism, pose, crank_angles), sign, LEAST)
 
 
 def _measures(mechanism: Mechanism, pose: Array, crank_angles: Array | None) -> Array:

@@ -81,8 +81,20 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
             several documents, duplicate keys, anchors or tags, or is not YAML. The message names
             the file, and the line where there is one.
     """
-    path = Path(path)
-    raw = read_bytes(path, _MAX_BYTES, "a small YAML file")
+    return yaml_of(read_yaml(path), Path(path))
+
+
+def read_yaml(path: str | Path) -> bytes:
+    """The content of a file for `yaml_of`.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    return read_bytes(Path(path), _MAX_BYTES, "a small YAML file")
+
+
+def yaml_of(raw: bytes, path: Path) -> dict[str, Any]:
+    """What `load_yaml` returns, of a file's content."""
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -198,9 +210,7 @@ def validate_pairs(
     for setting in settings:
         name, equals, text = setting.partition("=")
         if not equals or not name.strip():
-            raise ConfigError(
-                f"{option}: got {brief(setting)}; expected name=value{told(setting)}"
-            )
+            raise ConfigError(f"{option}: got {brief(setting)}; expected name=value{told(setting)}")
         given[name.strip()] = parse_yaml(text, f"{option}: {name.strip()}")
     try:
         return validate(type_, given, option)

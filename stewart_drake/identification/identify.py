@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification import start
-from stewart_drake.identification.fit import Fit, Guess, Problem, chi2_per_value, finer, followed, solve
+from stewart_drake.identification.fit import (
+    Fit,
+    Guess,
+    Problem,
+    chi2_per_value,
+    finer,
+    followed,
+    solve,
+)
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
 from stewart_drake.identification.logs import ANGLES, POSE, Log
 from stewart_drake.identification.shooting import Segment

@@ -76,7 +76,9 @@ def named_directions(mechanism: Mechanism) -> dict[str, Array]:
 
     for axis, unit in zip("xyz", np.eye(3), strict=True):
         found[f"where the base stands along {axis}"] = of_legs(slice(5, 8), unit)
-        found[f"where the plate's centre of mass lies along its {axis}"] = of_legs(slice(2, 5), unit)
+        found[f"where the plate's centre of mass lies along its {axis}"] = of_legs(
+            slice(2, 5), unit
+        )
         turned = np.cross(unit, joints)
         found[f"how the plate's frame is turned about its {axis}"] = of_legs(slice(2, 5), turned)
     lengths = [mechanism.crank_lengths[:, None], mechanism.rod_lengths[:, None]]

@@ -14,12 +14,14 @@ it takes to plan no longer grows with the number of periods.
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.delay_model import sample
@@ -75,24 +77,70 @@ def plan_catch_up(
     Raises:
         ConfigError: with the given duration the plate would leave its workspace.
     """
+    return CatchUp(dynamics, reference, start, t_start, period).plan(duration, torque_limit)
 
-    def attempt(periods: int, limit: float) -> Trajectory | None:
-        return _plan(dynamics, reference, start, t_start, period, periods, limit)
 
-    motion, span = shortest(attempt, period, duration, torque_limit)
-    return (reference, 0.0) if motion is None else (motion, span)
+class _Holds(NamedTuple):
+    """States, the start first, under torques that are held from edge to edge, s."""
+
+    states: Array
+    torques: Array
+    edges: Array
+
+
+class CatchUp:
+    """The plans from one state, each made once, whatever the limit is that they are asked for.
+
+    Args:
+        dynamics, reference, start, t_start, period: as of `plan_catch_up`.
+    """
+
+    def __init__(
+        self,
+        dynamics: StewartDynamics,
+        reference: Trajectory,
+        start: Array,
+        t_start: float,
+        period: float,
+    ) -> None:
+        self._dynamics, self._reference, self._period = dynamics, reference, period
+        self._start, self._t_start = start, t_start
+        self._holds: dict[int, _Holds | None] = {}
+        self._motions: dict[int, Trajectory] = {}
+
+    def plan(self, duration: float | None, torque_limit: float | None) -> tuple[Trajectory, float]:
+        """As `plan_catch_up`; the same plan is the same trajectory."""
+        periods = shortest(self._possible, self._period, duration, torque_limit)
+        if periods is None:
+            return self._reference, 0.0
+        return self._motion(periods), periods * self._period
+
+    def _possible(self, periods: int, limit: float) -> bool:
+        if periods not in self._holds:
+            given = self._dynamics, self._reference, self._start, self._t_start, self._period
+            with one_blas_thread:
+                self._holds[periods] = _plan(*given, periods)
+        found = self._holds[periods]
+        return found is not None and bool(np.abs(found.torques).max() <= limit)
+
+    def _motion(self, periods: int) -> Trajectory:
+        if periods not in self._motions:
+            found = self._holds[periods]
+            assert found is not None
+            self._motions[periods] = _motion(self._dynamics, self._reference, *found)
+        return self._motions[periods]
 
 
 def shortest(
-    attempt: Callable[[int, float], Trajectory | None],
+    possible: Callable[[int, float], bool],
     period: float,
     duration: float | None,
     torque_limit: float | None,
-) -> tuple[Trajectory | None, float]:
-    """The plan of the duration that was asked for, or the shortest one there is, and its s.
+) -> int | None:
+    """Periods of the plan that was asked for, or of the shortest one there is, or None.
 
     Args:
-        attempt: a plan of so many periods within so many N m, or None.
+        possible: whether there is a plan of so many periods within so many N m.
         period: s.
         duration, torque_limit: as of `plan_catch_up`.
 
@@ -104,25 +152,20 @@ def shortest(
     most = fewest if duration is not None else _periods(LONGEST_CATCH_UP, period)
     limit = math.inf if torque_limit is None or duration is not None else HEADROOM * torque_limit
     # What n periods can do, more can do with less torque: double n, then halve the bracket.
-    failed, periods, motion = fewest - 1, fewest, attempt(fewest, limit)
-    while motion is None and periods < most:
+    failed, periods = fewest - 1, fewest
+    while not (found := possible(periods, limit)) and periods < most:
         failed, periods = periods, min(2 * periods, most)
-        motion = attempt(periods, limit)
-    if motion is None and duration is None:
-        return None, 0.0
-    if motion is None:
+    if not found and duration is None:
+        return None
+    if not found:
         raise ConfigError(
             f"controller.catch_up: got {duration:g} s, with which the plate would leave its "
             "workspace; expected a longer time, or null for the shortest possible"
         )
     while periods - failed > 1:
         middle = (failed + periods) // 2
-        shorter = attempt(middle, limit)
-        if shorter is None:
-            failed = middle
-        else:
-            periods, motion = middle, shorter
-    return motion, periods * period
+        failed, periods = (failed, middle) if possible(middle, limit) else (middle, periods)
+    return periods
 
 
 def _periods(duration: float, period: float) -> int:
@@ -136,9 +179,8 @@ def _plan(
     t_start: float,
     period: float,
     periods: int,
-    torque_limit: float,
-) -> Trajectory | None:
-    """The planned motion over so many periods, or None where there is none."""
+) -> _Holds | None:
+    """The plan over so many periods, or None where there is none."""
     samples = np.round(np.linspace(0, periods, min(periods, MOST_HOLDS) + 1))
     edges, holds = t_start + period * samples, period * np.diff(samples)
     pieces = math.ceil(holds.max() / PIECE)
@@ -153,9 +195,7 @@ def _plan(
             return None
         miss = (target - states[-1]) / size
         if np.abs(miss).max() <= TOLERANCE:
-            if np.abs(torques).max() > torque_limit:
-                return None
-            return _motion(dynamics, reference, states, torques, edges)
+            return _Holds(states, torques, edges)
         J = _sensitivity(dynamics, states, torques, holds) / size[:, None]
         torques = torques + np.reshape(np.linalg.lstsq(J, miss)[0], torques.shape)
     return None

@@ -12,7 +12,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.law.catch_up import plan_catch_up
+from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.channel import Channel, Packets, Wire
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.delay_filter import delay_settings
@@ -422,8 +422,37 @@ def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
     return QuadraticCost(errors, c.integral_weight * integrals if c.integral else None, torques)
 
 
-def compose_law(experiment: Experiment) -> PredictiveLqi:
+class Sizing(NamedTuple):
+    """What a law takes from the machine and the motion as they are known, found by computing.
+
+    Attributes:
+        substeps: of the prediction, per period.
+        reference_torque: largest along the reference, N m.
+        machine_torque: see `law.startup.machine_torque`, N m.
+    """
+
+    substeps: int
+    reference_torque: float
+    machine_torque: float
+
+
+def sizing_of(experiment: Experiment) -> Sizing:
+    """It depends on mechanism, reference, duration, period and the believed delay."""
+    sc, nominal, reference = experiment.scenario, experiment.nominal, experiment.reference
+    period, steps = sc.controller.period, believed_delay(sc).steps
+    return Sizing(
+        choose_substeps(nominal, reference, period, steps, sc.duration),
+        reference_torque(nominal, reference, sc.duration),
+        machine_torque(nominal),
+    )
+
+
+def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> PredictiveLqi:
     """The parts that a scenario asks for; the only place that knows their names in it.
+
+    Args:
+        experiment: of the scenario.
+        sizing: `sizing_of` it, where that is known.
 
     Raises:
         ConfigError: it asks for no law that sends torques; see `loop.servo_design`.
@@ -436,9 +465,8 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
         )
     c, motion = sc.controller, motion_scale(experiment)
     timeline = Timeline(c.period, believed_delay(sc))
-    substeps = choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration)
-    peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
-    torque_scale = max(machine_torque(nominal), peak_torque)
+    substeps, peak_torque, least = sizing or sizing_of(experiment)
+    torque_scale = max(least, peak_torque)
     plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
     parameters = estimated_parameters(experiment, torque_scale)
     settings = filter_settings(motion, plate, torque_scale, asked, c.period, parameters)
@@ -565,21 +593,20 @@ def _channel(scenario: Scenario, timeline: Timeline, waits: int) -> Channel:
 
 def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, float]:
     """The control law, the motion it follows, and the length of the blend onto the reference."""
-    sc, nominal, law = experiment.scenario, experiment.nominal, compose_law(experiment)
+    sc, law = experiment.scenario, compose_law(experiment)
     law.warm_up()
-    c, timeline = sc.controller, law.timeline
-    if sc.start != "rest" or c.catch_up == 0:
+    way = way_onto(experiment, law)
+    if way is None:
         return law, experiment.reference, 0.0
+    return law, *way.plan(sc.controller.catch_up, planned_limit(sc))
+
+
+def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
+    """The ways onto the reference after a start from rest, or None where there is none."""
+    sc, nominal, timeline = experiment.scenario, experiment.nominal, law.timeline
+    if sc.start != "rest" or sc.controller.catch_up == 0:
+        return None
     state, queue = experiment.start, believed_queue(experiment, timeline)
     if len(queue):
         state = nominal.predict(state, *timeline.until_next(queue), law.plant.substeps)[-1]
-    planned, span = plan_catch_up(
-        nominal,
-        experiment.reference,
-        state,
-        timeline.eta,
-        c.period,
-        c.catch_up,
-        planned_limit(sc),
-    )
-    return law, planned, span
+    return CatchUp(nominal, experiment.reference, state, timeline.eta, sc.controller.period)

@@ -1,9 +1,55 @@
 """How well a run went: equation (47) and what stands beside it."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.scenario.config import ControllerConfig
+
 Array = NDArray[np.float64]
+
+
+class Figures(NamedTuple):
+    """What a run comes to, see `loop.results.RunSummary`; NaN where it has no value."""
+
+    accumulated_error: float
+    cost: float
+    peak_torque: float
+    rms_torque: float
+    torque_variation: float
+
+
+def figures(
+    time: Array,
+    error: Array,
+    scale: Array,
+    errors: Array,
+    asked: Array,
+    sent: Array,
+    controller: ControllerConfig,
+    completed: bool,
+) -> Figures:
+    """The figures of merit of a run.
+
+    Args:
+        time, error: on the metric's grid, as of `accumulated_error`.
+        scale: (6,) as of `accumulated_error`.
+        errors: (k, 6) pose error at the controller's samples.
+        asked: (k, 6) torques that the law asked for there, N m.
+        sent: (k, 6) what the limit let through, N m.
+        controller: of the scenario.
+        completed: whether the run did; otherwise it has no error and no cost.
+    """
+    c, nan, some = controller, float("nan"), len(asked) > 0
+    cost = quadratic_cost(errors, sent, c.period, c.w_Q, c.w_R, c.integral) if completed else nan
+    return Figures(
+        accumulated_error=accumulated_error(time, error, scale) if completed else nan,
+        cost=cost,
+        peak_torque=float(np.abs(asked).max()) if some else nan,
+        rms_torque=float(np.sqrt(np.mean(asked**2))) if some else nan,
+        torque_variation=total_variation(asked) if some else nan,
+    )
 
 
 def accumulated_error(time: Array, error: Array, scale: Array) -> float:

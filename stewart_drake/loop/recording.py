@@ -188,27 +188,25 @@ def summarize(
     margin: ControllerMargin | None,
 ) -> RunSummary:
     """How a run went, without warnings yet."""
-    sc, c, nan = experiment.scenario, experiment.scenario.controller, float("nan")
+    sc, nan = experiment.scenario, float("nan")
     # Not from the log, whose instants are the scenario's choice.
     time, error = recorder.on_grid.column(0), recorder.on_grid.columns(slice(1, 7))
     reference = recorder.on_grid.columns(slice(7, 13))
     errors, torques, sent = (recorder.samples.columns(slice(n, n + 6)) for n in (0, 6, 12))
     seconds = recorder.samples.column(18)
-    some, done = len(torques) > 0, status == "completed"
-    peaks = metrics.peak_error(error, experiment.scale).tolist() if len(error) else [nan] * 6
+    some, scale = len(torques) > 0, experiment.scale
+    done, c = status == "completed", sc.controller
+    found = metrics.figures(time, error, scale, errors, torques, sent, c, done)
+    peaks = metrics.peak_error(error, scale).tolist() if len(error) else [nan] * 6
     return {
         "status": status,
-        "accumulated_error": metrics.accumulated_error(time, error, experiment.scale)
-        if done
-        else nan,
+        "accumulated_error": found.accumulated_error,
         "failure": None if stopped is None else stopped._asdict(),
-        "cost": metrics.quadratic_cost(errors, sent, c.period, c.w_Q, c.w_R, c.integral)
-        if done
-        else nan,
-        "peak_torque": float(np.abs(torques).max()) if some else nan,
+        "cost": found.cost,
+        "peak_torque": found.peak_torque,
         "peak_torque_applied": recorder.peak_applied if some else nan,
-        "rms_torque": float(np.sqrt(np.mean(torques**2))) if some else nan,
-        "torque_variation": metrics.total_variation(torques) if some else nan,
+        "rms_torque": found.rms_torque,
+        "torque_variation": found.torque_variation,
         "peak_error": peaks,
         "delay_floor": _floor(experiment, time, reference),
         "controller_step_ms": {

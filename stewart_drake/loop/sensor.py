@@ -40,6 +40,22 @@ def strikes(fault: Any, seed: int, place: int, k: int, size: int) -> NDArray[np.
     return draws(seed, _STRIKES + place, k).random(size) < share
 
 
+def white_noise(seed: int, k: int, stream: int = 0) -> Array:
+    """Normal numbers (12,) of sample k, a function of (seed, k)."""
+    return draws(seed, stream, k).standard_normal(NUM_STATE)
+
+
+def white_noises(seed: int, number: int) -> Array:
+    """`white_noise` of the first samples, (number, 12), in a seventh of the time."""
+    bits = np.random.Philox(key=seed)
+    generator, state, rows = np.random.Generator(bits), bits.state, np.empty((number, NUM_STATE))
+    for k in range(number):  # each begins a block of random numbers of its own
+        state["state"]["counter"][:] = 0, 0, 0, k
+        bits.state = state
+        rows[k] = generator.standard_normal(NUM_STATE)
+    return rows
+
+
 class Sensor(LeafSystem):
     """Adds white Gaussian noise, new at every sample of the controller, and has faults.
 
@@ -87,10 +103,7 @@ class Sensor(LeafSystem):
 
     def noise(self, k: int) -> Array:
         """The noise (12,) of sample k."""
-        return self._std * self._normal(k, 0)
-
-    def _normal(self, k: int, stream: int) -> Array:
-        return draws(self._seed, stream, k).standard_normal(NUM_STATE)
+        return self._std * white_noise(self._seed, k)
 
     def _measure(self, context: Context, output: BasicVector) -> None:
         y, time = np.asarray(self._state.Eval(context)), context.get_time()
@@ -112,7 +125,7 @@ class Sensor(LeafSystem):
             return np.full(NUM_STATE, np.nan)
         if fault["kind"] == "spike":
             size = SPIKE if fault.get("size") is None else fault["size"]
-            return y + size * self._scale * self._normal(k, SPIKES)
+            return y + size * self._scale * white_noise(self._seed, k, SPIKES)
         last = context.get_discrete_state_vector().value()
         return y if np.all(np.isnan(last)) else last
 

@@ -111,21 +111,23 @@ def servo_law(experiment: Experiment) -> tuple[ServoPreview, Trajectory, float]:
     if sc.start != "rest" or sc.controller.catch_up == 0:
         return law, reference, 0.0
 
-    def attempt(periods: int, limit: float) -> Trajectory | None:
-        span = periods * period
+    def blend(periods: int) -> Trajectory:
         start = experiment.start[POSE], experiment.start[RATES]
-        planned = catch_up(*start, reference, eta, span)
+        return catch_up(*start, reference, eta, periods * period)
+
+    def possible(periods: int, limit: float) -> bool:
+        planned, span = blend(periods), periods * period
         for t in np.linspace(eta, eta + span, math.ceil(span / PIECE) + 1):
             x = evaluate(planned, t)
             if not margin(experiment.mechanism, x[POSE]) > 0:
-                return None
+                return False
             torque = experiment.nominal.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
             if np.abs(torque).max() > limit:
-                return None
-        return planned
+                return False
+        return True
 
-    planned, span = shortest(attempt, period, sc.controller.catch_up, planned_limit(sc))
-    return (law, reference, 0.0) if planned is None else (law, planned, span)
+    periods = shortest(possible, period, sc.controller.catch_up, planned_limit(sc))
+    return (law, reference, 0.0) if periods is None else (law, blend(periods), periods * period)
 
 
 def commands_in_flight(

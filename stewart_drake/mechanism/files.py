@@ -3,6 +3,7 @@
 Moments of inertia may be left out; `mechanism.inertias` says what stands in for them.
 """
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -13,7 +14,7 @@ from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.files.yamlio import load_yaml, validate, yaml_text
+from stewart_drake.files.yamlio import read_yaml, validate, yaml_of, yaml_text
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism
 from stewart_drake.mechanism.inertias import bar_inertia, disc_inertia
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
@@ -173,7 +174,13 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism:
         ConfigError: one line naming the file, the field, its value and what is allowed.
     """
     path = resolve("mechanism", name_or_path)
-    spec = validate(MechanismSpec, load_yaml(path), str(path))
+    return _of_content(read_yaml(path), path)
+
+
+@lru_cache(maxsize=16)
+def _of_content(raw: bytes, path: Path) -> Mechanism:
+    """Read once as long as the file stays as it is."""
+    spec = validate(MechanismSpec, yaml_of(raw, path), str(path))
     try:
         return build_mechanism(spec)
     except (UnreachablePoseError, ConfigError) as error:

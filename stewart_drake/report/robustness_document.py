@@ -99,6 +99,8 @@ def document(study: RobustnessStudy) -> Document:
         "delay": f"{sc.eta:g} s",
         "runs": f"{len(study.outcomes)}, seed {study.seed}, {sc.plant.kind} plant",
     }
+    if study.loops:
+        facts["loop"] = ", ".join(f"{loop}: {n}" for loop, n in study.loops.items())
     name = study.experiment.mechanism.name
     return Document(f"Robustness of {name}", verdict, sections, tone, facts)
 

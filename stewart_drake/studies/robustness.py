@@ -4,14 +4,13 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
-from stewart_drake.loop.experiment import assemble, prepare, simulated_machine
+from stewart_drake.loop.bulk import run_in_bulk
+from stewart_drake.loop.experiment import prepare, simulated_machine
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.scenario.signals import POSE
 from stewart_drake.studies.jobs import Progress, run_jobs, write_atomically
 from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.robustness_result import RobustnessStudy, table
@@ -20,7 +19,6 @@ from stewart_drake.studies.runs import (
     outcome_of,
     read_outcome,
     run_file,
-    run_to_its_end,
 )
 from stewart_drake.studies.uncertainty import MACHINE, Draw, draw, drawn, scales_of
 
@@ -97,9 +95,6 @@ def _run(scenario: Scenario, one: Draw) -> Outcome:
     except (ConfigError, UnreachablePoseError) as error:
         return Outcome("not_assembled", str(error), time=0.0)
     try:
-        outside = diagnose(truth, 0.0, assemble(variant, truth).start[POSE])
-        if outside is not None:
-            return Outcome("left_workspace", outside.reason, outside.leg, 0.0)
-        return outcome_of(run_to_its_end(variant, truth))
+        return outcome_of(run_in_bulk(variant, truth))
     except ConfigError as error:
         return Outcome("refused", str(error), time=0.0)

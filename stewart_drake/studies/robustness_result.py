@@ -16,7 +16,7 @@ from stewart_drake.loop.experiment import Experiment
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.failures import Explanation, explain
 from stewart_drake.studies.ranges import Ranges
-from stewart_drake.studies.runs import Outcome
+from stewart_drake.studies.runs import Outcome, loops_of
 from stewart_drake.studies.statistics import (
     Correlation,
     Interval,
@@ -91,6 +91,11 @@ class RobustnessStudy(NamedTuple):
         counts = Counter(self.reason_of(one) for one in self.outcomes)
         return {reason: n for reason, n in counts.most_common() if reason}
 
+    @property
+    def loops(self) -> dict[str, int]:
+        """Number of runs by what ran them, see `loop.bulk.Ending`."""
+        return loops_of(self.outcomes)
+
     def quantile(self, probability: float) -> Interval:
         """Of E_ac over all runs, % s; a run that did not complete counts as infinite."""
         return quantile_interval(np.where(np.isnan(self.errors), np.inf, self.errors), probability)
@@ -134,6 +139,7 @@ class RobustnessStudy(NamedTuple):
             else None,
             "influences": [_influence_summary(one) for one in self.influences()],
             "explanation": self.explanation.summary,
+            "loops": self.loops,
             "undisturbed": dataclasses.asdict(self.undisturbed),
             "ranges": dataclasses.asdict(self.ranges),
             "scales": self.scales._asdict(),

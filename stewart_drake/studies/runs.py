@@ -7,6 +7,8 @@ completed run has is there; whatever breaks a rule is a ConfigError, never a suc
 import dataclasses
 import json
 import math
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -16,9 +18,7 @@ from pydantic.dataclasses import dataclass
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable, load_json
 from stewart_drake.files.yamlio import brief, validate
-from stewart_drake.loop.results import SimulationResult
-from stewart_drake.loop.simulation import simulate
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.loop.bulk import Ending, run_in_bulk
 from stewart_drake.scenario.config import Scenario
 
 _MAX_BYTES: Final = 1_000_000
@@ -48,6 +48,7 @@ class Outcome:
         error: E_ac in % s, NaN for a run that did not complete.
         peak_torque: N m, as commanded, NaN where nothing ran.
         tuner_fallbacks: samples at which a tuner passed its network over.
+        loop: what ran it, see `loop.bulk.Ending`; nothing where nothing ran.
     """
 
     status: Literal["completed", "left_workspace", "solver_failed", "not_assembled", "refused"]
@@ -57,6 +58,7 @@ class Outcome:
     error: _Number = math.nan
     peak_torque: _Number = math.nan
     tuner_fallbacks: Annotated[int, Field(ge=0)] = 0
+    loop: str = ""
 
 
 @dataclass(config=_STRICT)
@@ -65,32 +67,25 @@ class _File:
     outcome: Outcome
 
 
-def run_to_its_end(scenario: Scenario, truth: Mechanism | None = None) -> SimulationResult:
-    """Simulate without a judgement beforehand.
-
-    Raises:
-        ConfigError: as `simulate`.
-        KeyboardInterrupt: Ctrl-C.
-    """
-    result = simulate(scenario, truth=truth, margin=False)
-    if result.status == "interrupted":
-        raise KeyboardInterrupt
-    return result
-
-
-def outcome_of(result: SimulationResult) -> Outcome:
-    """How a simulation ended."""
-    stopped = result.stopped
+def outcome_of(ending: Ending) -> Outcome:
+    """How a run ended."""
+    stopped = ending.stopped
     ended: dict[str, Any] = {}
     if stopped is not None:
         ended = {"reason": stopped.reason, "leg": stopped.leg, "time": stopped.time}
     return Outcome(
-        status=result.status,  # type: ignore[arg-type]  # never `interrupted`, which is checked
-        error=result.accumulated_error,
-        peak_torque=result.summary["peak_torque"],
-        tuner_fallbacks=result.summary["counts"]["tuner_fallbacks"],
+        status=ending.status,  # type: ignore[arg-type]  # never `interrupted`, which is checked
+        error=ending.figures.accumulated_error,
+        peak_torque=ending.figures.peak_torque,
+        tuner_fallbacks=ending.counts["tuner_fallbacks"],
+        loop=ending.loop,
         **ended,
     )
+
+
+def loops_of(outcomes: Iterable[Outcome]) -> dict[str, int]:
+    """Number of runs by what ran them, the most frequent first."""
+    return dict(Counter(one.loop for one in outcomes if one.loop).most_common())
 
 
 def run_file(outcome: Outcome, draw: dict[str, Any] | None = None) -> bytes:
@@ -100,12 +95,12 @@ def run_file(outcome: Outcome, draw: dict[str, Any] | None = None) -> bytes:
 
 
 def run_scenario(scenario: Scenario) -> bytes:
-    """Simulate a scenario as it stands: the file of the run.
+    """Run a scenario as it stands: the file of the run.
 
     Raises:
-        As `run_to_its_end`.
+        As `run_in_bulk`.
     """
-    return run_file(outcome_of(run_to_its_end(scenario)))
+    return run_file(outcome_of(run_in_bulk(scenario)))
 
 
 def read_outcome(path: Path) -> Outcome:

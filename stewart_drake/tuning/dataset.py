@@ -5,7 +5,6 @@ belongs to a run with its delay, frequency, disturbance and weights. The rows of
 early stay, empty (NaN) and not valid, so that runs are never dropped quietly.
 """
 
-import dataclasses
 import hashlib
 import io
 import json
@@ -23,13 +22,12 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.versions import versions
 from stewart_drake.files.yamlio import brief
-from stewart_drake.loop.results import SimulationResult
-from stewart_drake.scenario.config import Scenario, StateSensorConfig
+from stewart_drake.loop.bulk import run_in_bulk
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS
 from stewart_drake.studies.disturbances import draw
 from stewart_drake.studies.jobs import Progress, run_jobs
-from stewart_drake.studies.runs import run_to_its_end
 from stewart_drake.tuner.density import densities
 from stewart_drake.tuning.grid import PAPER_ROWS, SAMPLES, Run, disturbed_runs, paper_runs
 
@@ -115,34 +113,21 @@ def make_dataset(
 
 def sample_run(scenario: Scenario) -> bytes:
     """One run as the bytes of an .npz file: the samples, and how the run ended."""
-    # A log of one's own period need not hold the samples.
-    result = run_to_its_end(dataclasses.replace(scenario, log_period=None))
-    buffer, summary = io.BytesIO(), dict[str, Any](result.summary)
+    ending, buffer = run_in_bulk(scenario), io.BytesIO()
+    numbers = ending.figures._asdict()
     arrays: dict[str, Any] = {
-        "samples": samples(result),
-        "status": np.array(result.status),
-        "stopped": np.nan if result.stopped is None else result.stopped.time,
+        "samples": first_samples(ending.samples),
+        "status": np.array(ending.status),
+        "stopped": np.nan if ending.stopped is None else ending.stopped.time,
     }
-    np.savez(buffer, **arrays, **{name: summary[name] for name in _NUMBERS})
+    np.savez(buffer, **arrays, **{name: numbers[name] for name in _NUMBERS})
     return buffer.getvalue()
 
 
-def samples(result: SimulationResult) -> Array:
-    """(100, 18) of a run: [measurement - reference (12); commanded torque (6)], NaN after its end.
-
-    In rad, m, rad/s, m/s and N m. Where the state is not measured its estimate stands for it. The
-    log must hold every sample, as it does by default.
-    """
-    signals = result.signals
+def first_samples(samples: Array) -> Array:
+    """(100, 18) of those of a run, see `loop.bulk.Ending`, NaN after its end."""
     rows = np.full((SAMPLES, len(TUNER_INPUTS)), np.nan)
-    # Held signals show the value from an instant on, so that of k dt is T_k.
-    at = result.scenario.controller.period * np.arange(SAMPLES)
-    at = at[at <= signals.time.values[-1] + 1e-9] if signals.sizes["time"] else at[:0]
-    kept = signals.sel(time=at, method="nearest")
-    wanted = np.hstack([kept.reference, kept.reference_rates])
-    measures_state = isinstance(result.scenario.sensor, StateSensorConfig)
-    state = kept.measurement if measures_state else kept.state_estimate
-    rows[: len(at)] = np.hstack([state - wanted, kept.torque_commanded])
+    rows[: len(samples)] = samples[:SAMPLES]
     return rows
 
 

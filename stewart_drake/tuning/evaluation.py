@@ -21,7 +21,7 @@ from stewart_drake.scenario.config import AnnTunerConfig, Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.disturbances import disturbed, draw, with_gain
 from stewart_drake.studies.jobs import Job, Progress, run_jobs
-from stewart_drake.studies.runs import Outcome, read_outcome, run_scenario
+from stewart_drake.studies.runs import Outcome, loops_of, read_outcome, run_scenario
 from stewart_drake.studies.uncertainty import Draw
 from stewart_drake.tuner.network import DEFAULT, EXPECTED, MAX_BYTES, load_network
 from stewart_drake.tuning.grid import PAIRS
@@ -129,6 +129,7 @@ def _evaluation(
     error = np.array([[run.error for run in row] for row in table])
     summary = {
         **compare(candidates, error, settings["seed"]),
+        "loops": loops_of(run for row in table for run in row),
         "fallbacks": sum(run.tuner_fallbacks for run in table[-1]),
         "scenarios": [
             one | {"E_ac": dict(zip(candidates, error[:, number], strict=True))}

@@ -1,0 +1,102 @@
+"""Runs of `analyze robustness` in C and in Drake, one after the other, machine by machine.
+
+Drake's ends are those at an accuracy of 1e-12; its time is that of the scenario as it stands. Times
+are of the processor, all that belongs to a run included: what is drawn, the law's parts, the file's
+text.
+"""
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+import stewart_drake as sd
+from stewart_drake.files.versions import versions
+from stewart_drake.loop.bulk import run_in_bulk
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.robustness import run_draw
+from stewart_drake.studies.uncertainty import MACHINE, Draw, draw, drawn, scales_of
+
+RESULTS: Final = Path(__file__).parent / "results"
+TIMED: Final = 5
+"""Every so many runs, one is timed in Drake."""
+
+
+def timed(call: Callable[[], Any]) -> tuple[float, Any]:
+    """Processor time in s, and what is returned."""
+    started = time.process_time()
+    found = call()
+    return time.process_time() - started, found
+
+
+def in_drake(scenario: Scenario, one: Draw) -> sd.SimulationResult:
+    """A run as a simulation."""
+    changed = drawn(MACHINE, scenario, sd.load_mechanism(scenario.mechanism), one)
+    return simulate(changed.as_scenario(), truth=changed.machine(), margin=False)
+
+
+def measure(scenario: Scenario, runs: int, seed: int) -> dict[str, str]:
+    """What is claimed, by name."""
+    exact = replace(scenario, plant=replace(scenario.plant, accuracy=1e-12))
+    peak = run_in_bulk(scenario).figures.peak_torque
+    scales = scales_of(prepare(scenario), peak)
+    same, errors, stops, native, drake, loops = 0, [0.0], [0.0], [], [], set()
+    for index in range(runs):
+        one = draw(Ranges(), scales, scenario, seed, index)
+        seconds, file = timed(lambda one=one: json.loads(run_draw(scenario, one)))
+        found, expected = file["outcome"], in_drake(exact, one)
+        native.append(seconds)
+        loops.add(found["loop"])
+        if index % TIMED == 0:
+            drake.append(timed(lambda one=one: in_drake(scenario, one))[0] / seconds)
+        same += found["status"] == expected.status
+        if expected.stopped is None and found["error"] is not None:
+            errors.append(abs(found["error"] / expected.accumulated_error - 1))
+        elif expected.stopped is not None and found["time"] is not None:
+            stops.append(abs(found["time"] - expected.stopped.time))
+    return {
+        "runs, seed": f"{runs}, {seed}",
+        "what ran them": ", ".join(sorted(loops)),
+        "equal status": f"{same}",
+        "E_ac, largest relative difference": f"{max(errors):.1e}",
+        "instant of leaving, largest difference": f"{max(stops):.1e} s",
+        "ms of a run in C": f"{1e3 * np.mean(native):.1f}",
+        "Drake's time over that, median": f"{np.median(drake):.1f}",
+        "100 000 runs on two cores": f"{1e5 * np.mean(native) / 7200:.2f} h",
+    }
+
+
+def main() -> None:
+    """Measure, print, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=20261)
+    given = parser.parse_args()
+    scenario = sd.load_scenario("paper", settings=["plant.kind=exact"])
+    rows = measure(scenario, given.runs, given.seed)
+    told = ", ".join(f"{name} {number}" for name, number in versions().items())
+    lines = [
+        "# Monte Carlo in C",
+        "",
+        f"Made by `python benchmarks/monte_carlo.py` with {told}.",
+        "",
+    ]
+    lines += ["| what | value |", "| --- | --- |", *(f"| {a} | {b} |" for a, b in rows.items())]
+    print("\n".join(lines))
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "monte_carlo.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,229 @@
+"""The exact plant alone, under torques that are known beforehand, without Drake.
+
+DOP853, the Runge-Kutta method of order 8 of Dormand and Prince, goes from one change of the torques
+to the next and stops where the plate leaves its workspace (docs/theory.md, section 32). It is that
+of native/plant.c, and where nothing is compiled scipy's, with the same decisions.
+"""
+
+import ctypes
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.integrate import DOP853
+
+from stewart_drake.dynamics.functions import compiled_functions
+from stewart_drake.dynamics.native_functions import NativeFunctions
+from stewart_drake.dynamics.native_plant import NativePlant
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import Failure, diagnose, margin
+from stewart_drake.native.plant import DriveStruct, Ended
+from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
+
+Array = NDArray[np.float64]
+
+_NONE: Final = (0.0,) * NUM_TORQUES
+_SHORTEST: Final = 1e-13
+"""s, relative to the time where that is above 1 s, in which the workspace's edge is found."""
+
+
+class IntegrationError(ArithmeticError):
+    """No step is short enough for the accuracy."""
+
+
+class Drive(NamedTuple):
+    """Motor torques constant + amplitude sin(frequency t + phase), from `start` on.
+
+    Attributes:
+        constant: (6,) N m.
+        amplitude: (6,) N m.
+        frequency: rad/s.
+        phase: (6,) rad.
+        start: s.
+    """
+
+    constant: ArrayLike = _NONE
+    amplitude: ArrayLike = _NONE
+    frequency: float = 0.0
+    phase: ArrayLike = _NONE
+    start: float = 0.0
+
+    def torque(self, time: float) -> Array:
+        """(6,) N m at a time in s."""
+        swing = np.sin(self.frequency * time + np.asarray(self.phase))
+        return np.asarray(np.asarray(self.constant) + np.asarray(self.amplitude) * swing)
+
+
+class Course(NamedTuple):
+    """What a plant did.
+
+    Attributes:
+        times: (n,) s, those that were asked for, up to the end.
+        states: (n, 12) there.
+        end: s, the last of the times that were asked for, or when the plate left.
+        final: (12,) state there.
+        failure: how it left its workspace, or None.
+        steps: of the integrator.
+        evaluations: of the dynamics.
+    """
+
+    times: Array
+    states: Array
+    end: float
+    final: Array
+    failure: Failure | None
+    steps: int
+    evaluations: int
+
+
+def integrate(
+    dynamics: StewartDynamics,
+    start: ArrayLike,
+    drives: Sequence[Drive],
+    times: ArrayLike,
+    accuracy: float = 1e-9,
+    longest_step: float = math.inf,
+) -> Course:
+    """Follow the exact plant from t = 0 up to the last of `times`, or out of its workspace.
+
+    Whether it is in there is looked at where steps end and at `times`; the instant at which it left
+    is found to 1e-13 s.
+
+    Args:
+        dynamics: equations of motion, with the true parameters.
+        start: (12,) state at t = 0, in the workspace.
+        drives: torques, each until the next one starts, the first at t = 0.
+        times: (n,) s, ascending, where states are wanted.
+        accuracy: error of a step in a coordinate x, in units of 1 + |x| (rad, m, and per s).
+        longest_step: s.
+
+    Raises:
+        ValueError: a shape, an order or a range that is none of these.
+        IntegrationError: the accuracy cannot be had.
+    """
+    x0, looks = np.array(start, dtype=np.float64), np.array(times, dtype=np.float64)
+    _check(x0, drives, looks, accuracy, longest_step)
+    if not margin(dynamics.mechanism, x0[POSE]) > 0:
+        raise ValueError(f"start: got pose {x0[POSE]}; expected one in the workspace")
+    functions = compiled_functions(dynamics.mechanism)
+    follow = _native if isinstance(functions, NativeFunctions) else _scipy
+    return follow(dynamics, x0, drives, looks, accuracy, longest_step)
+
+
+def _check(
+    start: Array, drives: Sequence[Drive], times: Array, accuracy: float, longest_step: float
+) -> None:
+    if start.shape != (NUM_STATE,):
+        raise ValueError(f"start: got shape {start.shape}; expected {(NUM_STATE,)}")
+    ascending = times.ndim == 1 and len(times) > 0 and bool(np.all(np.diff(times) >= 0))
+    if not ascending or not 0 <= times[0] <= times[-1] < math.inf:
+        raise ValueError(f"times: got {times}; expected ascending ones from 0 s on")
+    if not 1e-14 <= accuracy <= 1e-2:
+        raise ValueError(f"accuracy: got {accuracy!r}; expected a number from 1e-14 to 1e-2")
+    if not longest_step > 0:
+        raise ValueError(f"longest_step: got {longest_step!r}; expected a time above 0 s")
+    starts = [drive.start for drive in drives]
+    if not drives or starts[0] != 0 or not all(a < b for a, b in pairwise(starts)):
+        raise ValueError(f"drives: got starts {starts}; expected ascending ones from 0 s on")
+    for drive in drives:
+        for name in ("constant", "amplitude", "phase"):
+            shape = np.shape(getattr(drive, name))
+            if shape != (NUM_TORQUES,):
+                raise ValueError(f"drives: {name}: got shape {shape}; expected {(NUM_TORQUES,)}")
+
+
+def _native(
+    dynamics: StewartDynamics,
+    start: Array,
+    drives: Sequence[Drive],
+    times: Array,
+    accuracy: float,
+    longest_step: float,
+) -> Course:
+    plant = NativePlant(dynamics, start, times, accuracy, longest_step)
+    ended = plant.call("open_loop", *in_c(drives))
+    failure = None
+    if ended == Ended.TOO_SHORT_STEPS:
+        raise IntegrationError(_too_short(plant.time, accuracy))
+    if ended == Ended.LEFT:
+        failure = diagnose(dynamics.mechanism, plant.time, plant.final[POSE])
+    seen, run = plant.seen, plant.run
+    end, final = plant.time, plant.final
+    return Course(
+        times[:seen], plant.states[:seen], end, final, failure, run.steps, run.evaluations
+    )
+
+
+def in_c(drives: Sequence[Drive]) -> tuple[Any, ...]:
+    """Drives as the arguments of `open_loop` of plant.c."""
+    structs = (DriveStruct * len(drives))()
+    for struct, drive in zip(structs, drives, strict=True):
+        for name in ("constant", "amplitude", "phase"):
+            getattr(struct, name)[:] = np.asarray(getattr(drive, name), dtype=np.float64)
+        struct.frequency = drive.frequency
+    starts = (ctypes.c_double * len(drives))(*(drive.start for drive in drives))
+    return structs, starts, ctypes.c_long(len(drives))
+
+
+def _too_short(time: float, accuracy: float) -> str:
+    return f"no step is short enough at t = {time:.6g} s for an accuracy of {accuracy:g}"
+
+
+@np.errstate(over="ignore", invalid="ignore")  # the outcome is checked instead
+def _scipy(
+    dynamics: StewartDynamics,
+    start: Array,
+    drives: Sequence[Drive],
+    times: Array,
+    accuracy: float,
+    longest_step: float,
+) -> Course:
+    """The loop of `advance` in plant.c around scipy's steps."""
+    time, x, states, steps, evaluations = 0.0, start, list[Array](), 0, 0
+    failure: Failure | None = None
+    for drive, until in zip(drives, [*(d.start for d in drives[1:]), math.inf], strict=True):
+        end = min(until, float(times[-1]))
+        states += [x] * int(np.sum(times[len(states) :] <= time))
+        if failure is not None or not time < end:
+            break
+
+        def slope(t: float, y: Array, drive: Drive = drive) -> Array:
+            return dynamics.change(y, drive.torque(t))
+
+        limits = {"max_step": longest_step, "rtol": accuracy, "atol": accuracy}
+        solver = DOP853(slope, time, x, end, **limits)
+        while failure is None and solver.status == "running":
+            message, before = solver.step(), time
+            if message is not None:
+                raise IntegrationError(f"{_too_short(time, accuracy)}: {message}")
+            time, x, steps = solver.t, solver.y, steps + 1
+            within = solver.dense_output()
+            looks = times[len(states) :]
+            for t in [*looks[looks <= time], time]:
+                y = within(t)
+                if not margin(dynamics.mechanism, y[POSE]) > 0:
+                    time = _edge(dynamics, within, before, t)
+                    x = within(time)
+                    failure = diagnose(dynamics.mechanism, time, x[POSE])
+                    break
+                before = t
+                if len(states) < len(times) and t == times[len(states)]:
+                    states.append(y)
+        evaluations += solver.nfev
+    kept = np.array(states).reshape(-1, NUM_STATE)
+    return Course(times[: len(kept)], kept, time, x, failure, steps, evaluations)
+
+
+def _edge(dynamics: StewartDynamics, within: object, inside: float, outside: float) -> float:
+    """When the plate is no longer inside, s, by halves."""
+    assert callable(within)
+    while outside - inside > _SHORTEST * max(1.0, outside):
+        middle = inside + (outside - inside) / 2
+        if margin(dynamics.mechanism, within(middle)[POSE]) > 0:
+            inside = middle
+        else:
+            outside = middle
+    return outside

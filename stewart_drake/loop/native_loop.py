@@ -1,0 +1,228 @@
+"""The closed loop without Drake, for many runs: the exact plant of native/plant.c behind the same
+delay chain, limit, bias and noise, seen and judged at the same instants (theory.md, section 32).
+"""
+
+import ctypes
+import math
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.dynamics.native_plant import NativePlant
+from stewart_drake.dynamics.open_loop import IntegrationError
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.law.memory import Counts
+from stewart_drake.law.native_law import configuration
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.loop.experiment import Experiment, torques_in_flight
+from stewart_drake.loop.sensor import white_noises
+from stewart_drake.native.law_layout import CAUSES, address
+from stewart_drake.native.library import backend
+from stewart_drake.native.plant import Controller, Ended, LoopStruct
+from stewart_drake.scenario.config import FixedTunerConfig, Scenario, WireConfig
+from stewart_drake.scenario.signals import BIAS, NUM_STATE, NUM_TORQUES, POSE
+from stewart_drake.scenario.timing import event_time, instants, look_time
+
+Array = NDArray[np.float64]
+
+SHARE: Final = 0.1
+"""Of the scenario's accuracy, for a step: those of order 8 are long, and a digit costs a sixth."""
+LONGEST_STEP: Final = math.inf
+"""s; the plate is looked at every 20 ms whatever the steps are."""
+
+
+class Instants(NamedTuple):
+    """When a run is looked at and sampled, as Drake's simulator does.
+
+    Attributes:
+        nominal: (n,) s, of the looks.
+        looks: (n,) s, when they take place.
+        on_grid: (n,) which are the metric's.
+        sampled: (n,) which are the controller's.
+        samples: (k,) s, when the controller takes its samples.
+    """
+
+    nominal: Array
+    looks: Array
+    on_grid: NDArray[np.bool_]
+    sampled: NDArray[np.bool_]
+    samples: Array
+
+
+def instants_of(duration: float, period: float) -> Instants:
+    """Those of a run of so many s with a controller of such a period, s."""
+    all_of_them = list(instants(duration, period, None))
+    nominal = np.array([one.time for one in all_of_them])
+    early = event_time(period)
+    number = int(duration / period) + 2
+    samples = np.concatenate([[0.0], early + early * np.arange(number)])
+    return Instants(
+        nominal=nominal,
+        looks=look_time(1.0) * nominal,
+        on_grid=np.array([one.on_grid for one in all_of_them]),
+        sampled=np.array([one.sampled for one in all_of_them]),
+        samples=samples[samples <= look_time(duration)],
+    )
+
+
+class Course(NamedTuple):
+    """What a loop did until its end.
+
+    Attributes:
+        states: (n, 12) at the looks that it came to.
+        measured: (k, 12) at the samples.
+        asked: (k, 6) torques in N m that the law asked for there.
+        sent: (k, 6) what the limit let through.
+        end: s.
+        stopped: why it came no further, or None.
+    """
+
+    states: Array
+    measured: Array
+    asked: Array
+    sent: Array
+    end: float
+    stopped: Failure | None
+
+
+class Law(Protocol):
+    """What gives a loop its torques."""
+
+    def run(self, plant: NativePlant, loop: LoopStruct) -> Ended:
+        """Take the plant to its end."""
+
+
+class InPython:
+    """A law that C calls at every sample.
+
+    Args:
+        torque: (sample, measurement (12)) -> (6,) N m.
+    """
+
+    def __init__(self, torque: Callable[[int, Array], Array]) -> None:
+        self._torque = torque
+
+    def run(self, plant: NativePlant, loop: LoopStruct) -> Ended:
+        """Raises whatever the law does."""
+        raised: list[BaseException] = []
+
+        def step(_: object, sample: int, measurement: Any, torque: Any) -> int:
+            try:
+                asked = self._torque(sample, np.array(measurement[:NUM_STATE]))
+                for i in range(NUM_TORQUES):
+                    torque[i] = asked[i]
+            except BaseException as error:  # which cannot pass through C; it goes on below
+                raised.append(error)
+                return 1
+            return 0
+
+        ended = plant.call("closed_loop", ctypes.byref(loop), Controller(step), None)
+        if raised:
+            raise raised[0]
+        return ended
+
+
+class InC:
+    """The law of native/law.c.
+
+    Args:
+        law: one of which nothing is `law.native_law.uncovered`.
+        queue: (L, 6) torques in flight at t = 0, as it believes, N m.
+        previews: (k, p, 18) the motion that it follows, for each sample.
+        weights: (2,) w_Q and w_R.
+
+    Attributes:
+        counts: what went wrong and was survived, once it has run.
+    """
+
+    def __init__(self, law: PredictiveLqi, queue: Array, previews: Array, weights: Array) -> None:
+        given = [np.ascontiguousarray(a, np.float64) for a in (queue, previews, weights)]
+        self._given = [configuration(law), *given]
+        self._counts = np.zeros(len(CAUSES), dtype=np.intc)
+
+    def run(self, plant: NativePlant, loop: LoopStruct) -> Ended:
+        """See `Law`."""
+        places = [ctypes.c_void_p(address(a)) for a in (*self._given, self._counts)]
+        return plant.call("closed_loop_of_law", ctypes.byref(loop), *places)
+
+    @property
+    def counts(self) -> Counts:
+        """By cause."""
+        return Counts(**dict(zip(CAUSES, self._counts.tolist(), strict=True)))
+
+
+def uncovered(scenario: Scenario) -> str | None:
+    """What of a scenario only Drake's loop has, by its field, or None."""
+    sc = scenario
+    only_drake = {
+        str(backend()): backend().library is None,
+        "plant.kind": sc.plant.kind != "exact",
+        "delay": not sc.delay.constant,
+        "link.kind": not isinstance(sc.link, WireConfig),
+        "actuator.kind": not isinstance(sc.actuator, TorqueActuatorConfig),
+        "sensor.kind": not isinstance(sc.sensor, StateSensorConfig),
+        "sensor.faults": bool(sc.sensor.faults),
+        "sensor.delay": sc.sensor.delay != 0,
+        "sensor.loss": sc.sensor.loss != 0,
+        "tuner.kind": not isinstance(sc.tuner, FixedTunerConfig),
+    }
+    return next((name for name, there in only_drake.items() if there), None)
+
+
+def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
+    """Run an experiment to its end.
+
+    Args:
+        experiment: what to run; nothing of its scenario is `uncovered`.
+        when: `instants_of` its duration and period.
+        law: of the torques.
+
+    Raises:
+        IntegrationError: the accuracy cannot be had.
+        Whatever the law raises.
+    """
+    sc, noise = experiment.scenario, np.array(experiment.scenario.sensor.noise_std)
+    parameters = np.array(sc.plant.parameters)
+    parameters[BIAS] = 0.0  # added where torques arrive, as in the diagram
+    truth = StewartDynamics(experiment.truth, sc.plant.gravity, parameters)
+    accuracy = SHARE * sc.plant.accuracy
+    plant = NativePlant(truth, experiment.start, when.looks, accuracy, LONGEST_STEP)
+    delay, number = sc.true_delay, len(when.samples)
+    queue = torques_in_flight(experiment, delay)
+    waiting = np.zeros((number + delay.steps, NUM_TORQUES))
+    waiting[: delay.steps] = queue[len(queue) - delay.steps :]
+    measured, asked = np.empty((number, NUM_STATE)), np.empty((number, NUM_TORQUES))
+    drawn = None
+    if noise.any():
+        drawn = noise * white_noises(sc.sensor.seed, number)
+    released = None
+    if delay.fraction > 0:
+        period = sc.controller.period
+        released = event_time(delay.fraction * period) + event_time(period) * np.arange(number)
+    loop = LoopStruct(
+        samples=number,
+        delay=delay.steps,
+        sampled=when.samples.ctypes.data,
+        released=None if released is None else released.ctypes.data,
+        noise=None if drawn is None else drawn.ctypes.data,
+        waiting=waiting.ctypes.data,
+        applied=tuple(queue[0]) if len(queue) else (0.0,) * NUM_TORQUES,
+        bias=tuple(sc.plant.torque_bias),
+        limit=experiment.torque_limit,
+        measured=measured.ctypes.data,
+        asked=asked.ctypes.data,
+    )
+    ended = law.run(plant, loop)
+    if ended == Ended.TOO_SHORT_STEPS:
+        raise IntegrationError(f"no step is short enough at t = {plant.time:.6g} s")
+    stopped = None
+    if ended == Ended.LEFT:
+        stopped = diagnose(experiment.truth, plant.time, plant.final[POSE])
+    taken = loop.taken
+    sent = waiting[delay.steps : delay.steps + taken]
+    return Course(
+        plant.states[: plant.seen], measured[:taken], asked[:taken], sent, plant.time, stopped
+    )

@@ -1,0 +1,35 @@
+/* Runge-Kutta steps of order 8 with error control, and the polynomial of order 7 within each. */
+
+#ifndef DOP853_H
+#define DOP853_H
+
+#define STATES 12
+#define STAGES 16
+
+/* dx/dt of a system at a time in s. */
+typedef void (*slope_function)(void *system, double time, const double *x, double *slope);
+
+typedef struct {
+    slope_function slope;
+    void *system;
+    double tolerance;  /* of the error of a step: relative and absolute */
+    double longest;    /* step, s */
+    double time, x[STATES];
+    double wish;       /* the step that the error allows, s; 0 for none known yet */
+    double before, start[STATES]; /* where the last step began */
+    double slopes[STAGES][STATES]; /* of its stages */
+    double within[7][STATES];     /* coefficients of its polynomial */
+    int has_polynomial;
+    long steps, evaluations;
+} dop853;
+
+/* To be called at first, and wherever the slope has jumped. */
+void dop853_begin(dop853 *s);
+
+/* One step, up to `end` and not beyond; 0 where no step is short enough. */
+int dop853_step(dop853 *s, double end);
+
+/* The state at a time within the last step. */
+void dop853_at(dop853 *s, double time, double *x);
+
+#endif

@@ -1,0 +1,321 @@
+"""The loop without Drake against Drake's: the same instants, noise, torques, ends and figures."""
+
+import dataclasses
+import functools
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, LeafSystem
+
+import stewart_drake as sd
+from stewart_drake.dynamics.open_loop import IntegrationError
+from stewart_drake.loop import bulk
+from stewart_drake.loop.bulk import Ending, PythonLaw, ending_of, run_in_bulk
+from stewart_drake.loop.experiment import control_law, prepare
+from stewart_drake.loop.native_loop import InPython, instants_of, run_loop, uncovered
+from stewart_drake.loop.preparation import preparation_of
+from stewart_drake.loop.sampling import update_every
+from stewart_drake.loop.sensor import Sensor, white_noise, white_noises
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.native import library
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.timing import look_time
+from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.uncertainty import MACHINE, Scales, draw, drawn, scales_of
+from tests.backends import switched
+from tests.mechanisms import PAPER
+
+Array = NDArray[np.float64]
+NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
+FOLLOWS = ("start=on_reference", "queue=reference")
+DIRTY = (
+    *(NOISE, "sensor.seed=3", "plant.torque_bias=[.001,.002,0,0,-.001,0]"),
+    *("plant.payload_mass=0.2", "plant.joint_damping=0.001"),
+)
+
+
+@pytest.fixture(autouse=True)
+def native() -> None:
+    """Where STEWART_NATIVE=require it cannot be missing."""
+    if library.backend().library is None:
+        pytest.skip(library.backend().reason)
+
+
+def scenario(name: str = "paper", *settings: str, controller: str | None = None) -> Scenario:
+    """On the exact plant, as tight as it can be."""
+    tight = ["plant.kind=exact", "plant.accuracy=1e-12"]
+    return sd.load_scenario(name, controller, [*tight, *settings])
+
+
+LOOPS = {
+    "from rest": scenario("paper", "duration=3"),
+    "dirty": scenario("paper", "duration=2", *FOLLOWS, *DIRTY),
+    "late": scenario("paper", "duration=2", "delay.fraction=0.37", *FOLLOWS, *DIRTY),
+    "limited": scenario("paper", "duration=2", "actuator.torque_limit=0.015", *FOLLOWS, *DIRTY),
+    "gravity": scenario("gravity", "duration=0.6", *DIRTY[:2]),
+    "off the grid": scenario(
+        "paper", "duration=1.01", "controller.period=0.03", "delay.steps=3", "delay.fraction=0.4"
+    ),
+    "no delay": scenario("paper", "duration=1", "delay.steps=0", "start=on_reference"),
+    "part of a period": scenario(
+        "paper", "duration=1", "delay.steps=0", "delay.fraction=0.6", "start=on_reference"
+    ),
+    "blind": scenario("paper", "duration=3", controller="lqi"),
+    "leaves": scenario("paper", "plant.payload_mass=3.0", "controller.estimator=none"),
+    "linear": scenario("paper", "duration=2", controller="delay_lqr"),
+    "printed": scenario(
+        "paper", "duration=1", "controller.model=paper", "controller.estimator=none",
+        "start=on_reference", "queue=reference",
+    ),
+    "adaptive": scenario(
+        "paper", "duration=2", "controller.delay_estimator=constant", "controller.delay_steps=6",
+        "start=on_reference", "queue=reference",
+    ),
+}  # fmt: skip
+
+
+IN_PYTHON = {
+    "blind": "native, law in Python (controller.prediction)",
+    "linear": "native, law in Python (controller.prediction)",
+    "printed": "native, law in Python (controller.model)",
+    "adaptive": "native, law in Python (controller.estimator)",
+}
+"""What the law in C has not."""
+
+
+def drake(one: Scenario, truth: sd.Mechanism | None = None) -> Ending:
+    return ending_of(simulate(one, truth=truth, margin=False))
+
+
+def assert_same(found: Ending, expected: Ending) -> None:
+    assert found.status == expected.status
+    for name, value in expected.figures._asdict().items():
+        assert getattr(found.figures, name) == pytest.approx(value, rel=1e-6, nan_ok=True), name
+    assert found.counts == expected.counts
+    assert (found.stopped is None) == (expected.stopped is None)
+    if found.stopped is not None and expected.stopped is not None:
+        assert found.stopped.time == pytest.approx(expected.stopped.time, abs=1e-6)
+        assert found.stopped.reason == expected.stopped.reason
+        assert found.stopped.leg == expected.stopped.leg
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_the_loop_is_drakes(name: str) -> None:
+    found = run_in_bulk(LOOPS[name])
+    assert found.loop == IN_PYTHON.get(name, "native")
+    assert_same(found, drake(LOOPS[name]))
+
+
+@functools.cache
+def scales() -> Scales:
+    one = LOOPS["from rest"]
+    return scales_of(prepare(one), run_in_bulk(one).figures.peak_torque)
+
+
+def assert_drawn(indices: range, duration: float) -> None:
+    """Machines as of `analyze robustness`, from rest, in Drake and in C."""
+    one = scenario("paper", f"duration={duration}")
+    for index in indices:
+        changed = drawn(MACHINE, one, PAPER, draw(Ranges(), scales(), one, 9, index))
+        variant, truth = changed.as_scenario(), changed.machine()
+        found = run_in_bulk(variant, truth)
+        assert found.loop == "native"
+        assert_same(found, drake(variant, truth))
+
+
+def test_drawn_machines_end_as_in_drake() -> None:
+    assert_drawn(range(4), 3.0)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("part", range(5))
+def test_many_drawn_machines_end_as_in_drake(part: int) -> None:
+    assert_drawn(range(4 + 20 * part, 24 + 20 * part), 10.0)
+
+
+def test_cases_are_what_they_are_named_for() -> None:
+    found = {name: run_in_bulk(LOOPS[name]) for name in ("leaves", "limited", "blind")}
+    assert found["leaves"].status == "left_workspace"
+    assert found["limited"].counts["saturated_steps"] > 0
+    assert found["blind"].status == "left_workspace"
+
+
+def test_states_torques_and_measurements_are_drakes() -> None:
+    one = LOOPS["late"]
+    preparation = preparation_of(one)
+    prepared = preparation.prepared(preparation.experiment(one))
+    law = InPython(PythonLaw(prepared, preparation.when).torque)
+    course = run_loop(prepared.experiment, preparation.when, law)
+    signals = simulate(one, margin=False).signals
+    assert np.array_equal(signals.time.values, preparation.when.nominal)
+    states = np.hstack([signals.pose.values, signals.rates.values])
+    assert np.abs(course.states - states).max() < 1e-9
+    sampled = preparation.when.sampled
+    torques = signals.torque_commanded.values[sampled]
+    assert np.abs(course.asked - torques).max() < 1e-9 * np.abs(torques).max()
+    measured = signals.measurement.values[sampled]
+    assert np.array_equal(course.measured[0], measured[0])
+    assert np.abs(course.measured - measured).max() < 1e-9
+
+
+def test_noise_is_drakes_to_the_last_bit() -> None:
+    """What a measurement has beyond the state, which is known exactly where a plate stays."""
+    one = LOOPS["dirty"]
+    preparation = preparation_of(one)
+    experiment = preparation.experiment(one)
+    sensor = Sensor(np.array(one.sensor.noise_std), one.sensor.seed, one.controller.period)
+    seen: list[Array] = []
+
+    def law(sample: int, measurement: Array) -> Array:
+        seen.append(measurement)
+        return np.zeros(6)
+
+    still = dataclasses.replace(one, plant=dataclasses.replace(one.plant, torque_bias=[0.0] * 6))
+    experiment = (
+        preparation_of(still)
+        .experiment(still)
+        ._replace(start=np.concatenate([PAPER.home, np.zeros(6)]))
+    )
+    queue = dataclasses.replace(still, queue="zero")
+    run_loop(experiment._replace(scenario=queue), preparation.when, InPython(law))
+    state = np.concatenate([PAPER.home, np.zeros(6)])
+    assert len(seen) == len(preparation.when.samples) > 10
+    for k, measurement in enumerate(seen):
+        assert np.array_equal(measurement, state + sensor.noise(k))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**31 - 1])
+def test_noise_of_many_samples_is_that_of_each(seed: int) -> None:
+    assert np.array_equal(white_noises(seed, 9), [white_noise(seed, k) for k in range(9)])
+
+
+class Clock(LeafSystem):
+    """Keeps the times of its samples."""
+
+    def __init__(self, period: float) -> None:
+        super().__init__()
+        self.times: list[float] = []
+        update_every(self, period, self._keep)
+
+    def _keep(self, context: Context, state: Any) -> None:
+        self.times.append(context.get_time())
+
+
+@pytest.mark.parametrize(("duration", "period"), [(10.0, 0.1), (1.01, 0.03), (2.0, 1 / 30)])
+def test_samples_are_taken_when_drake_takes_them(duration: float, period: float) -> None:
+    clock = Clock(period)
+    simulator = Simulator(clock)
+    simulator.Initialize()
+    simulator.AdvanceTo(look_time(duration))
+    when = instants_of(duration, period)
+    assert when.samples.tolist() == clock.times
+    assert when.sampled.sum() == len(clock.times)
+    assert np.all(when.looks <= when.nominal) and np.all(np.diff(when.looks) > 0)
+
+
+def test_what_a_law_raises_comes_through() -> None:
+    preparation = preparation_of(LOOPS["from rest"])
+    experiment = preparation.experiment(LOOPS["from rest"])
+    taken = []
+
+    def law(sample: int, measurement: Array) -> Array:
+        taken.append(sample)
+        if sample == 3:
+            raise KeyboardInterrupt("stop")
+        return np.zeros(6)
+
+    with pytest.raises(KeyboardInterrupt, match="stop"):
+        run_loop(experiment, preparation.when, InPython(law))
+    assert taken == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("field", "settings"),
+    [
+        ("plant.kind", ["plant.kind=multibody"]),
+        ("delay", ["delay.drift=0.01"]),
+        ("link.kind", ["link.kind=network"]),
+        ("sensor.faults", ["sensor.faults=[{kind: missing, from: 0.05, to: 0.15}]"]),
+        ("sensor.delay", ["sensor.delay=0.1"]),
+        ("sensor.loss", ["sensor.loss=0.1"]),
+        ("tuner.kind", ["tuner.kind=ann", "controller.delay_steps=8"]),
+    ],
+)
+def test_what_it_has_not_runs_in_drake_and_says_so(field: str, settings: list[str]) -> None:
+    usual = ["duration=0.2", "start=on_reference", "queue=reference", "plant.accuracy=1e-8"]
+    one = scenario("paper", *usual, *settings)
+    assert uncovered(one) == field
+    found, expected = run_in_bulk(one), drake(one)
+    assert found.loop == f"drake, {field}"
+    assert found._replace(loop="") == expected._replace(loop="")
+
+
+def test_without_a_library_it_is_drakes() -> None:
+    one = scenario("paper", "duration=0.2", "plant.accuracy=1e-8")
+    with switched("0"):
+        assert run_in_bulk(one).loop == "drake, casadi (STEWART_NATIVE=0)"
+
+
+def test_where_no_step_is_short_enough_drake_tries(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any) -> None:
+        raise IntegrationError("no step is short enough")
+
+    one = scenario("paper", "duration=0.2", "plant.accuracy=1e-8")
+    monkeypatch.setattr(bulk, "run_loop", fails)
+    assert run_in_bulk(one).loop == "drake, plant.accuracy"
+
+
+# ---------------------------------------------------------------- what runs have in common
+
+
+@pytest.mark.parametrize("limit", ["null", "none", "0.3", "0.9", "5.0"])
+def test_a_prepared_run_is_that_of_the_scenario_alone(limit: str) -> None:
+    """Law, previews and start, with what is drawn, as they are without anything in common."""
+    first = preparation_of(scenario("paper", "duration=2"))
+    one = scenario("paper", "duration=2", f"actuator.torque_limit={limit}", *DIRTY)
+    preparation = preparation_of(one)
+    assert preparation is first
+    prepared, alone = preparation.prepared(preparation.experiment(one)), prepare(one)
+    law, planned, _ = control_law(alone)
+    assert repr(prepared.law) == repr(law)
+    times = np.maximum(0.0, preparation.when.samples[:, None] + law.preview_times)
+    expected = [[evaluate(planned, t) for t in ahead] for ahead in times]
+    assert np.array_equal(prepared.previews, expected)
+    assert np.array_equal(prepared.experiment.start, alone.start)
+    assert prepared.experiment.torque_limit == alone.torque_limit
+
+
+def test_a_late_truth_that_is_not_believed_has_the_same_preparation() -> None:
+    believed = "controller.delay_steps=8"
+    first = preparation_of(scenario("paper", "duration=2"))
+    assert preparation_of(scenario("paper", "duration=2", believed, "delay.fraction=0.1")) is first
+    assert preparation_of(scenario("paper", "duration=2", "delay.fraction=0.1")) is not first
+    assert preparation_of(scenario("paper", "duration=2", "controller.delay_steps=7")) is not first
+    assert preparation_of(scenario("paper", "duration=2", "controller.catch_up=1")) is not first
+
+
+def test_another_mechanism_file_is_another_preparation(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    text = (Path(__file__).parents[1] / "models" / "paper.yaml").read_text()
+    path.write_text(text)
+    one = scenario("paper", f"mechanism={path}", "duration=0.2")
+    first = preparation_of(one)
+    assert preparation_of(one) is first
+    path.write_text(text + "# changed\n")
+    os.utime(path, ns=(1, 1))
+    assert preparation_of(one) is not first
+
+
+def test_a_motion_that_cannot_be_is_refused_each_time() -> None:
+    one = scenario("paper", "reference.amplitude=[0,0,0,0,0,0.3]", "duration=2")
+    for _ in range(2):
+        with pytest.raises(sd.ConfigError, match="reference: leg"):
+            run_in_bulk(one)
+    assert math.isnan(run_in_bulk(LOOPS["leaves"]).figures.accumulated_error)

@@ -1,0 +1,219 @@
+"""The exact plant without Drake: DOP853 against scipy, energy, order, events, where it ends."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydrake.systems.primitives import ConstantVectorSource
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from stewart_drake.dynamics import open_loop
+from stewart_drake.dynamics.open_loop import Course, Drive, IntegrationError, integrate
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import margin
+from stewart_drake.loop.exact import ExactPlant, set_accuracy
+from stewart_drake.native import build
+from stewart_drake.scenario.signals import POSE, RATES
+from tests.backends import switched
+from tests.mechanisms import PAPER, random_mechanism
+
+Array = NDArray[np.float64]
+HEAVY = StewartDynamics(PAPER, parameters=[*[0.01] * 6, 0.5, 0.02])
+HOLD = StewartDynamics(PAPER).equilibrium_torque(PAPER.home)
+AT_HOME = np.concatenate([PAPER.home, np.zeros(6)])
+PUSH = HOLD + 0.02 * np.abs(HOLD) * [1.0, 0.6, -0.4, 0.8, -0.2, 0.5]
+SWING = Drive(HOLD, 0.05 * HOLD, 9.0, np.arange(6.0))
+
+
+@pytest.fixture(params=["require", "0"], autouse=True)
+def backend(request: pytest.FixtureRequest) -> Any:
+    """Compiled, and scipy's in its place."""
+    if request.param == "require" and build.compiler() is None:
+        pytest.skip("there is no C compiler")
+    with switched(request.param):
+        yield request.param
+
+
+def of_scipy(dynamics: StewartDynamics, drives: list[Drive], times: Array, rtol: float) -> Array:
+    """States (n, 12) at the times, each drive a problem of its own."""
+    states, x = np.full((len(times), 12), np.nan), AT_HOME
+    for i, drive in enumerate(drives):
+        end = drives[i + 1].start if i + 1 < len(drives) else times[-1]
+        solution = solve_ivp(
+            lambda t, y, drive=drive: np.concatenate(
+                [y[RATES], dynamics.accelerations(y[POSE], y[RATES], drive.torque(t))]
+            ),
+            (drive.start, end), x, method="DOP853", rtol=rtol, atol=rtol, dense_output=True,
+        )  # fmt: skip
+        here = (times >= drive.start) & (times <= end)
+        states[here] = solution.sol(times[here]).T
+        x = solution.y[:, -1]
+    return states
+
+
+def test_states_are_those_of_scipy_at_any_time() -> None:
+    """Gravity, payload, damping, bias; a sine, and torques that change between the looks."""
+    times = np.sort(np.random.default_rng(1).uniform(0, 0.4, 57))
+    drives = [Drive(PUSH), SWING._replace(start=0.1234), Drive(HOLD, start=0.3)]
+    found = integrate(HEAVY, AT_HOME, drives, times, 1e-12)
+    expected = of_scipy(HEAVY, drives, times, 1e-13)
+    assert found.failure is None and found.end == times[-1]
+    assert np.array_equal(found.times, times)
+    assert np.abs(expected - AT_HOME).max() > 0.01
+    assert np.abs(found.states - expected).max() < 1e-10
+    assert np.array_equal(found.final, found.states[-1])
+
+
+def test_any_machine_is_followed() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        mechanism = random_mechanism(rng)
+        dynamics = StewartDynamics(mechanism, gravity=3.0)
+        start = np.concatenate([mechanism.home, 0.1 * rng.normal(0, 1, 6)])
+        torque = dynamics.equilibrium_torque(mechanism.home)
+        found = integrate(dynamics, start, [Drive(torque)], [0.05], 1e-12)
+        expected = solve_ivp(
+            lambda t, y, dynamics=dynamics, torque=torque: dynamics.change(y, torque),
+            (0, 0.05), start, rtol=1e-12, atol=1e-13, method="DOP853",
+        ).y[:, -1]  # fmt: skip
+        assert np.abs(found.final - expected).max() < 1e-11 * max(1.0, np.abs(expected).max())
+
+
+def test_energy_is_kept() -> None:
+    """A fall from home and back up, without torque or friction, in steps of its own choice."""
+    free = StewartDynamics(PAPER, gravity=1.0)
+    start = AT_HOME + 0.2 * np.eye(12)[11]
+    found = integrate(free, start, [Drive()], np.linspace(0, 0.15, 40), 1e-13)
+    energies = np.array([free.energy(x[POSE], x[RATES]) for x in found.states])
+    speeds = [np.linalg.norm(x[RATES]) for x in found.states]
+    assert found.failure is None and np.ptp(speeds) > 0.1
+    assert np.ptp(energies) < 1e-12 * energies[0]
+
+
+@pytest.mark.parametrize(("looks", "order"), [(1, 8), (50, 7)])
+def test_order(looks: int, order: int) -> None:
+    """Error of equal steps at their end, and of their polynomials at many instants."""
+    errors, numbers, times = [], np.array([12, 16, 24]), np.linspace(0.4, 0.1, looks)[::-1]
+    expected = of_scipy(HEAVY, [SWING], times, 1e-13)
+    for number in numbers:
+        found = integrate(HEAVY, AT_HOME, [SWING], times, 1e-2, 0.4 / number)
+        assert found.steps in (number, number + 1)  # the first one may be shorter
+        errors.append(np.abs(found.states - expected).max())
+    slope = -np.polyfit(np.log(numbers), np.log(errors), 1)[0]
+    assert order - 0.5 < slope < 10
+    assert errors[-1] > 1e-12  # the slope is not that of rounding
+
+
+def test_errors_are_of_the_size_of_the_accuracy() -> None:
+    times = np.linspace(0, 0.4, 9)
+    expected = of_scipy(HEAVY, [SWING], times, 1e-13)
+    steps = []
+    for accuracy in (1e-6, 1e-8, 1e-10):
+        found = integrate(HEAVY, AT_HOME, [SWING], times, accuracy)
+        assert np.abs(found.states - expected).max() < 30 * accuracy
+        steps.append(found.steps)
+    assert steps[0] < steps[1] < steps[2] < 12 * steps[0]
+
+
+def falling() -> tuple[StewartDynamics, list[Drive]]:
+    """With hardly any torque the platform falls out of its workspace."""
+    return StewartDynamics(PAPER), [Drive(PUSH - HOLD)]
+
+
+def test_the_edge_is_found_where_a_tight_solution_crosses_it() -> None:
+    dynamics, drives = falling()
+    found = integrate(dynamics, AT_HOME, drives, np.linspace(0, 2, 101), 1e-11)
+    solution = solve_ivp(
+        lambda t, y: dynamics.change(y, PUSH - HOLD),
+        (0, found.end + 1e-3), AT_HOME, method="DOP853", rtol=1e-13, atol=1e-13, dense_output=True,
+    ).sol  # fmt: skip
+    end = brentq(lambda t: margin(PAPER, solution(t)[POSE]), 0.0, found.end + 1e-4, xtol=1e-14)
+    assert 0.05 < found.end < 2 and found.failure is not None
+    assert found.end == pytest.approx(end, abs=1e-9)
+    assert found.failure.time == found.end
+    assert margin(PAPER, found.final[POSE]) <= 0 < margin(PAPER, solution(found.end - 1e-8)[POSE])
+    assert found.times[-1] < found.end <= found.times[-1] + 0.02
+    assert np.abs(found.states - solution(found.times).T).max() < 1e-9
+
+
+def test_the_edge_is_where_drake_stops() -> None:
+    from pydrake.systems.analysis import Simulator
+    from pydrake.systems.framework import DiagramBuilder
+
+    dynamics, drives = falling()
+    found = integrate(dynamics, AT_HOME, drives, [2.0], 1e-12)
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(ExactPlant(dynamics, AT_HOME))
+    source = builder.AddSystem(ConstantVectorSource(PUSH - HOLD))
+    builder.Connect(source.get_output_port(), plant.GetInputPort("torque"))
+    simulator = Simulator(builder.Build())
+    set_accuracy(simulator, 1e-12)
+    simulator.AdvanceTo(2.0)
+    assert simulator.get_context().get_time() == pytest.approx(found.end, abs=1e-8)
+
+
+def test_a_look_outside_ends_a_run_within_a_step() -> None:
+    """One long step across the edge and back: only who looks in between sees it."""
+    dynamics, drives = falling()
+    end = integrate(dynamics, AT_HOME, drives, [2.0], 1e-12).end
+    seen = integrate(dynamics, AT_HOME, drives, np.linspace(0, end + 5e-4, 50), 1e-6)
+    assert seen.failure is not None
+    assert seen.end == pytest.approx(end, abs=1e-5)
+
+
+def test_native_and_scipy_agree(monkeypatch: pytest.MonkeyPatch, backend: str) -> None:
+    if backend == "0":
+        pytest.skip("with the other one")
+    dynamics, drives = falling()
+    times = np.linspace(0, 2, 101)
+    one = integrate(dynamics, AT_HOME, drives, times, 1e-11)
+    other = open_loop._scipy(dynamics, AT_HOME, drives, times, 1e-11, math.inf)
+    assert_same(one, other, 1e-9)
+
+
+def assert_same(one: Course, other: Course, tolerance: float) -> None:
+    assert len(one.times) == len(other.times)
+    assert np.abs(one.states - other.states).max() < tolerance
+    assert one.end == pytest.approx(other.end, abs=tolerance)
+    assert (one.failure is None) == (other.failure is None)
+    if one.failure is not None and other.failure is not None:
+        assert one.failure.reason == other.failure.reason
+
+
+def test_several_looks_at_one_instant_and_at_the_start() -> None:
+    found = integrate(HEAVY, AT_HOME, [SWING], [0.0, 0.0, 0.1, 0.1], 1e-9)
+    assert np.array_equal(found.states[0], AT_HOME) and np.array_equal(found.states[1], AT_HOME)
+    assert np.array_equal(found.states[2], found.states[3])
+    alone = integrate(HEAVY, AT_HOME, [SWING], [0.0], 1e-9)
+    assert alone.end == 0 and alone.steps == 0 and np.array_equal(alone.final, AT_HOME)
+
+
+def test_torques_beyond_all_bounds_end_in_an_error() -> None:
+    with pytest.raises(IntegrationError, match="no step is short enough at t = 0 s"):
+        integrate(HEAVY, AT_HOME, [Drive(np.full(6, 1e300))], [0.1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"start": np.zeros(6)}, "start: got shape"),
+        ({"start": AT_HOME + 10}, "start: got pose"),
+        ({"times": [0.2, 0.1]}, "times: got"),
+        ({"times": []}, "times: got"),
+        ({"times": [-1.0]}, "times: got"),
+        ({"times": [np.nan]}, "times: got"),
+        ({"accuracy": 0.0}, "accuracy: got 0.0"),
+        ({"longest_step": 0.0}, "longest_step: got 0.0"),
+        ({"drives": []}, "drives: got starts"),
+        ({"drives": [Drive(start=0.1)]}, "drives: got starts"),
+        ({"drives": [Drive(), Drive()]}, "drives: got starts"),
+        ({"drives": [Drive(constant=[1.0])]}, "drives: constant: got shape"),
+    ],
+)
+def test_what_cannot_be_is_refused(changes: dict[str, Any], message: str) -> None:
+    given: dict[str, Any] = {"start": AT_HOME, "drives": [Drive()], "times": [0.1]} | changes
+    with pytest.raises(ValueError, match=message):
+        integrate(HEAVY, **given)
