@@ -25,6 +25,7 @@ from stewart_drake.law.feedforward import (
     NoFeedforward,
 )
 from stewart_drake.law.filter_settings import filter_settings
+from stewart_drake.law.gaps import GapObserver
 from stewart_drake.law.late import LateObserver
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
@@ -317,7 +318,7 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     settings = filter_settings(motion, plate, torque_scale, asked, c.period)
     observers: dict[str, Observer] = {
         "none": NoObserver(),
-        "parameters": ParameterObserver(settings),
+        "parameters": GapObserver(ParameterObserver(settings)),
     }
     predictors: dict[str, Predictor] = {
         "linear": LinearPredictor(),
@@ -349,7 +350,7 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
         cost=quadratic_cost(experiment, peak_torque),
         channel=channel,
         kept=waits + (_REPORTS if isinstance(channel, Packets) else 0),
-        silence=math.ceil(timeline.delay.periods) if quiet else 0,
+        silence=_until_seen(timeline.delay, waits) if quiet else 0,
     )
     if c.delay_estimator != "none":
         delay = delay_settings(c.delay_estimator, c.delay_std, c.delay_max)
@@ -361,6 +362,16 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
             silence=0,  # until the delay is found
         )
     return experiment.own.revised(law)
+
+
+def _until_seen(delay: Delay, waits: int) -> int:
+    """Samples until a whole hold of the first own torque has been seen.
+
+    Before that the measurements are of a plate on which nothing but its bias acts: what they make
+    of payload and friction is noise, and feedback through them puts it on the motors for eta.
+    """
+    late = max(waits - _PATIENCE, 0)
+    return math.ceil(delay.periods + 1 - 1e-9) + late
 
 
 def longest_wait(scenario: Scenario) -> int:
