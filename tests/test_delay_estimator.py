@@ -313,7 +313,7 @@ def test_the_figure_has_the_estimate_its_band_and_the_truth() -> None:
     assert "delay" not in draw_run(looped("duration=0.3", kind="none"))
 
 
-def test_nothing_is_fed_back_before_the_first_torque_can_act() -> None:
+def test_nothing_is_fed_back_before_the_first_torque_has_acted_for_a_period() -> None:
     """From rest the first torques do not depend on what was measured; then they do."""
     noisy = "sensor.noise_std=[" + ",".join(f"{n:g}" for n in 1e-3 * np.tile(AMPLITUDES, 2)) + "]"
 
@@ -323,7 +323,7 @@ def test_nothing_is_fed_back_before_the_first_torque_can_act() -> None:
         return np.asarray(samples.torque_commanded.values)
 
     quiet, same = first(noisy), first(noisy, "sensor.seed=1")
-    assert np.array_equal(quiet[:8], same[:8]) and np.all(quiet[8] != same[8])
+    assert np.array_equal(quiet[:9], same[:9]) and np.all(quiet[9] != same[9])
     loud = [
         first(noisy, seed, "controller.quiet_start=false")
         for seed in ("sensor.seed=0", "sensor.seed=1")

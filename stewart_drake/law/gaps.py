@@ -50,18 +50,12 @@ class GapBelief(Belief):
 
 
 @dataclass(frozen=True)
-class GapObserver:
-    """The filter over state and parameters, which looks back over gaps between measurements.
-
-    Attributes:
-        observer: where there is none.
-    """
-
-    observer: ParameterObserver
+class GapObserver(ParameterObserver):
+    """The filter over state and parameters, which looks back over gaps between measurements."""
 
     def start(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Belief:
         """See `law.observers.Observer.start`."""
-        first = self.observer.start(timeline, sensing, plant)
+        first = super().start(timeline, sensing, plant)
         return GapBelief(**{field.name: getattr(first, field.name) for field in fields(first)})
 
     def observe(
@@ -74,7 +68,7 @@ class GapObserver:
     ) -> Belief:
         """See `law.observers.Observer.observe`."""
         assert isinstance(belief, GapBelief)
-        after = self.observer.observe(belief, measurement, in_flight, sensing, plant)
+        after = super().observe(belief, measurement, in_flight, sensing, plant)
         assert isinstance(after, GapBelief)
         acting, following = belief.timeline.last_period(in_flight)
         since = Acting(*(np.concatenate(pair) for pair in zip(belief.since, acting, strict=True)))
@@ -96,7 +90,7 @@ class GapObserver:
 
     def _filter(self, n: int, dt: float, sensing: Sensing, plant: NominalPlant) -> ParameterFilter:
         """The filter for n periods at a time."""
-        settings = self.observer.settings
+        settings = self.settings
         variance = n * settings.model_std**2
         drifts = (n - 1) * n * (2 * n - 1) / 6 * dt**2
         variance[POSE] += drifts * settings.model_std[RATES] ** 2

@@ -29,7 +29,7 @@ from stewart_drake.law.gaps import GapObserver
 from stewart_drake.law.late import LateObserver
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.law.observers import NoObserver, Observer, ParameterObserver
+from stewart_drake.law.observers import NoObserver, Observer
 from stewart_drake.law.planner import NoPlanner, Rejoin
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import (
@@ -318,7 +318,7 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     settings = filter_settings(motion, plate, torque_scale, asked, c.period)
     observers: dict[str, Observer] = {
         "none": NoObserver(),
-        "parameters": GapObserver(ParameterObserver(settings)),
+        "parameters": GapObserver(settings),
     }
     predictors: dict[str, Predictor] = {
         "linear": LinearPredictor(),

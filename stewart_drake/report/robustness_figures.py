@@ -1,5 +1,6 @@
 """Figures of a robustness study: distribution of E_ac, what matters, every run, when it failed."""
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -40,9 +41,13 @@ TITLES: Final = {
     "delay": "delay error",
     "lengths": "lengths, rms",
     "anchors": "anchors, rms",
+    "jitter": "jitter of the delay",
+    "loss": "lost on the way",
 }
 SIGNIFICANT: Final = 0.05
 """Adjusted p-value below which an influence counts as found."""
+_ABREAST: Final = 4
+"""Panels in a row."""
 _SOFT: Final = "#666666"
 # Of many points, which are a bitmap that a dark page cannot change: readable on both.
 _SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
@@ -97,10 +102,14 @@ def influence_figure(influences: Sequence[Influence]) -> Figure:
 @figure_style()
 def runs_figure(study: RobustnessStudy) -> Figure:
     """E_ac of every run over every drawn quantity, failures in a strip of their own on top."""
-    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
-    axes = figure.subplots(2, 4, sharey=True)
+    rows = math.ceil(len(FACTORS) / _ABREAST)
+    figure = Figure(figsize=(WIDTH, 2.6 * rows), layout="constrained")
+    panels = figure.subplots(rows, _ABREAST, sharey=True, squeeze=False)
+    axes, spare = np.split(panels.ravel(), [len(FACTORS)])
+    for ax in spare:
+        ax.remove()
     values, done = factor_values(study.draws), np.isfinite(study.errors)
-    for ax, (name, unit) in zip(axes.ravel(), FACTORS.items(), strict=True):
+    for ax, (name, unit) in zip(axes, FACTORS.items(), strict=True):
         x = values[name]
         kept = done & ~study.failed
         _scatter(ax, x[kept], study.errors[kept], "o", _SUCCESS, "success")
@@ -113,7 +122,7 @@ def runs_figure(study: RobustnessStudy) -> Figure:
     low, high = _log_range(study.errors[done])
     strip = high * (high / low) ** 0.06
     top = high * (high / low) ** 0.18
-    for ax, name in zip(axes.ravel(), FACTORS, strict=True):
+    for ax, name in zip(axes, FACTORS, strict=True):
         ax.set_ylim(low, top)
         ax.axhspan(strip, top, color="#F1EAE6", zorder=0)
         # Spread over the strip by the number of the run, so that marks do not hide each other.

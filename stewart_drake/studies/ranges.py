@@ -35,6 +35,8 @@ class Ranges:
         lengths: error of crank and rod lengths, rms over the twelve, uniform from 0.
         anchors: error of the coordinates of motor shafts and plate joints, rms over the 36,
             uniform from 0.
+        jitter: standard deviation of the delay from torque to torque, uniform from 0; over a wire.
+        loss: share of the measurements that are lost, uniform from 0; over a network of packets.
     """
 
     payload: Annotated[float, Field(ge=0, lt=1, description="+-share of the plate's mass")] = 0.1
@@ -62,6 +64,10 @@ class Ranges:
     anchors: Annotated[float, Field(ge=0, lt=1, description="share of the mean crank length")] = (
         2e-4
     )
+    jitter: Annotated[float, Field(ge=0, le=1, description="periods of the controller")] = 0.0
+    loss: Annotated[
+        float, Field(ge=0, lt=0.99, description="share of measurements, of packets over a network")
+    ] = 0.0
 
 
 RANGE_UNITS: Final[dict[str, str]] = {
