@@ -189,7 +189,8 @@ def coverage() -> str:
         ratio = np.array([one.late / one.std for one in found])
         inside = np.mean(np.abs(ratio) <= 1.96)
         text += (
-            f"- {kind}, drifts up to {steepest:g} s/s: {100 * inside:.1f} % of {len(found)} runs that completed, of {COVERED}; "
+            f"- {kind}, drifts up to {steepest:g} s/s: {100 * inside:.1f} % of {len(found)} runs "
+            f"that completed, of {COVERED}; "
             f"deviations of {np.mean(ratio):+.2f} +- {np.std(ratio):.2f} times what is stated\n"
         )
     return text
