@@ -104,8 +104,8 @@ def runs_figure(study: RobustnessStudy) -> Figure:
     """E_ac of every run over every drawn quantity, failures in a strip of their own on top."""
     rows = math.ceil(len(FACTORS) / _ABREAST)
     figure = Figure(figsize=(WIDTH, 2.6 * rows), layout="constrained")
-    panels = figure.subplots(rows, _ABREAST, sharey=True, squeeze=False)
-    axes, spare = np.split(panels.ravel(), [len(FACTORS)])
+    grid = figure.subplots(rows, _ABREAST, sharey=True, squeeze=False)
+    axes, spare = np.split(grid.ravel(), [len(FACTORS)])
     for ax in spare:
         ax.remove()
     values, done = factor_values(study.draws), np.isfinite(study.errors)
@@ -129,10 +129,10 @@ def runs_figure(study: RobustnessStudy) -> Figure:
         spread = (np.arange(len(done)) * 0.618034) % 1 * 0.8 + 0.1
         y = strip * (top / strip) ** spread[~done]
         _scatter(ax, values[name][~done], y, "x", _FAILED, "did not complete")
-    plain_log_ticks(axes[0, 0].yaxis)  # which all share
-    for ax in axes[:, 0]:
+    plain_log_ticks(axes[0].yaxis)  # which all share
+    for ax in grid[:, 0]:
         ax.set_ylabel("E_ac  [% s]")
-    return legend_above(figure, axes[0, 0])
+    return legend_above(figure, axes[0])
 
 
 @figure_style()
