@@ -125,11 +125,14 @@ def test_sensitivity_to_the_delay_equals_a_finer_difference(eta: float) -> None:
     assert np.abs(found - expected).max() < 1e-3 * np.abs(expected).max()
 
 
-def record(eta: float, samples: int, seed: int, rate: float = 0.0) -> tuple[Array, Array, Array]:
+def record(
+    eta: float, samples: int, seed: int, rate: float = 0.0, jitter: float = 0.0
+) -> tuple[Array, Array, Array]:
     """Torques, states and measurements at the samples, by fine integration of its own."""
     torques = np.array([swing(k) for k in range(samples)])
     step, states, x = 5e-3, [HOME], HOME
     arrive = DT * np.arange(samples) + eta + rate * DT * np.arange(samples)
+    arrive = arrive + jitter * np.random.default_rng([seed, 1]).normal(0, 1, samples)
     for k in range(samples - 1):
         edges = [k * DT, *arrive[(arrive > k * DT) & (arrive < (k + 1) * DT)], (k + 1) * DT]
         for begin, end in pairwise(edges):
@@ -157,6 +160,38 @@ def observed(torques: Array, measured: Array, believed: float, **changes: Any) -
         assert isinstance(belief, DelayBelief)
         found.append(belief)
     return found
+
+
+@pytest.mark.parametrize("eta", [0.2, 0.237])
+def test_a_torque_that_is_early_or_late_does_what_the_filter_says(eta: float) -> None:
+    """Second moment over normal errors; next to a sample each period has half of them."""
+    torques, std = np.array([swing(k) for k in range(12)]), 2e-3
+    view = Arrivals(DT, Delay(0), 0.0, 0.0, 12, np.zeros((1, 6)))
+    model, xi = DelayModel(PLANT, view, torques), np.concatenate([HOME, THETA, [eta, 0.0]])
+    on_time = model.end(xi)
+    errors = std * norm.ppf((np.arange(200) + 0.5) / 200)
+    late = [model.end(np.concatenate([HOME, THETA, [eta + error, 0.0]])) for error in errors]
+    expected = np.array(late) - on_time
+    expected = expected.T @ expected / len(errors) / std**2
+    found = model.late(xi, on_time, std)
+    # To first order: the acceleration is that of the pose and the rates at the end.
+    assert np.abs(found.own - expected).max() < 0.12 * expected.max()
+    for part in (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)):
+        own, true = (np.trace(matrix[part, part]) for matrix in (found.own, expected))
+        assert own == pytest.approx(true, rel=0.2)
+    assert not np.any(found.others)
+
+
+@pytest.mark.parametrize(("jitter", "least", "most"), [(0.0, 0.0, 3e-4), (3e-3, 1.5e-3, 4.5e-3)])
+def test_how_early_or_late_single_torques_come_is_found(
+    jitter: float, least: float, most: float
+) -> None:
+    for seed in range(5):
+        torques, _, measured = record(0.337, 30, seed, jitter=jitter)
+        guess = observed(torques, measured, 0.3)[-1].guess
+        assert guess is not None and least <= np.sqrt(guess.timing) <= most
+        # Of 26 torques the mean delay cannot be known better than this.
+        assert guess.std >= 0.5 * jitter / np.sqrt(26)
 
 
 def test_the_filter_finds_what_batch_least_squares_finds() -> None:
@@ -294,6 +329,14 @@ def test_a_delay_believed_wrongly_is_found_in_the_loop(
     assert 0 < result.summary["delay"]["std_s"] < 3e-4
 
 
+@pytest.mark.parametrize("fraction", [0.1, 0.37, 0.5, 0.63])
+def test_a_right_belief_of_a_part_of_a_period_is_kept(fraction: float) -> None:
+    """What was in flight at t = 0 was held from instants that the controller does not know."""
+    run = looped(*ON_REFERENCE, f"delay.fraction={fraction}", "duration=6")
+    assert run.stopped is None and run.accumulated_error < 0.5
+    assert run.signals.delay_estimate[-1] == pytest.approx(0.8 + 0.1 * fraction, abs=2e-4)
+
+
 def test_a_jump_is_followed() -> None:
     result = looped(*ON_REFERENCE, "delay.jump=0.1", "delay.jump_time=2", "duration=5")
     assert result.status == "completed"
@@ -313,7 +356,7 @@ def test_the_figure_has_the_estimate_its_band_and_the_truth() -> None:
     assert "delay" not in draw_run(looped("duration=0.3", kind="none"))
 
 
-def test_nothing_is_fed_back_before_the_first_torque_can_act() -> None:
+def test_nothing_is_fed_back_before_the_first_torque_has_acted_for_a_period() -> None:
     """From rest the first torques do not depend on what was measured; then they do."""
     noisy = "sensor.noise_std=[" + ",".join(f"{n:g}" for n in 1e-3 * np.tile(AMPLITUDES, 2)) + "]"
 
@@ -323,7 +366,7 @@ def test_nothing_is_fed_back_before_the_first_torque_can_act() -> None:
         return np.asarray(samples.torque_commanded.values)
 
     quiet, same = first(noisy), first(noisy, "sensor.seed=1")
-    assert np.array_equal(quiet[:8], same[:8]) and np.all(quiet[8] != same[8])
+    assert np.array_equal(quiet[:9], same[:9]) and np.all(quiet[9] != same[9])
     loud = [
         first(noisy, seed, "controller.quiet_start=false")
         for seed in ("sensor.seed=0", "sensor.seed=1")

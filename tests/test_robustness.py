@@ -216,13 +216,13 @@ def test_a_new_quantity_is_one_entry_and_leaves_the_other_draws_alone() -> None:
     values = []
     for i in range(40):
         fixed = draw_from(MACHINE, np.random.default_rng(i), about)
-        more = draw_from({**MACHINE, "loss": loss._replace(sometimes=False)},
+        more = draw_from({**MACHINE, "silence": loss._replace(sometimes=False)},
                          np.random.default_rng(i), about)  # fmt: skip
         assert {name: more[name] for name in MACHINE} == fixed
-        values.append(draw_from({"loss": loss}, np.random.default_rng(i), about)["loss"])
+        values.append(draw_from({"silence": loss}, np.random.default_rng(i), about)["silence"])
     assert 8 < values.count(0.0) < 32
     assert loss.told(max(values)) == pytest.approx(1e3 * max(values))
-    truth = drawn({"loss": loss}, scenario, PAPER, {"loss": 0.05})
+    truth = drawn({"silence": loss}, scenario, PAPER, {"silence": 0.05})
     assert truth.as_scenario().sensor.faults != []
     assert truth.machine() is PAPER and scenario.sensor.faults == []
 
@@ -305,6 +305,46 @@ def test_the_scenario_changes_as_drawn_and_the_belief_stays() -> None:
     assert (other.sensor.seed, scenario.sensor.seed) == (7, 0)
     assert other.sensor.faults == scenario.sensor.faults != []
     other.check()
+
+
+def test_what_the_link_does_is_drawn_too() -> None:
+    wire = short()
+    wire.sensor.loss = 0.5
+    one: Draw = {"jitter": 0.003, "loss": 0.2, "link_seed": 9}
+    other = changed(wire, one)
+    assert (other.delay.jitter_std, other.delay.seed) == (0.003, 9)
+    assert other.sensor.loss == pytest.approx(1 - 0.5 * 0.8) and other.sensor.seed == 9
+    network = sd.load_scenario("paper", None, ["link.kind=network", "link.loss=0.1"])
+    lossy = changed(network, {**one, "jitter": 0.0}).link
+    assert (lossy.loss, lossy.seed) == (pytest.approx(1 - 0.9 * 0.8), 9)  # type: ignore[union-attr]
+    same = changed(wire, {"jitter": 0.0, "loss": 0.0, "link_seed": 9})
+    assert (same.delay.seed, same.sensor.seed) == (0, 0)
+    scales = SCALES._replace(period=0.02)
+    draws = [draw(Ranges(jitter=0.5, loss=0.3), scales, wire, 0, i) for i in range(200)]
+    jitter, loss = (np.array([one[name] for one in draws]) for name in ("jitter", "loss"))
+    assert 0 <= jitter.min() < 1e-3 and 9e-3 < jitter.max() <= 10e-3
+    assert 0 <= loss.min() < 0.02 and 0.28 < loss.max() <= 0.3
+
+
+def test_other_controllers_run_the_same_machines(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["analyze", "robustness", "paper", "--controller", "predictor_lqi", "--runs", "2"]
+    words += ["--set", "duration=0.2", "--vary", "delay=1", "--out", str(out)]
+    assert main([*words, "--beside", "adaptive_lqi"]) == 0
+    assert "With adaptive_lqi, on the same machines: 2 of 2" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["beside"]["adaptive_lqi"]["success"]["runs"] == 2
+    assert "adaptive_lqi" in (out / "report.html").read_text()
+    # Alone it has the same draws and the same outcomes.
+    words[4], words[-1] = "adaptive_lqi", str(tmp_path / "alone")
+    assert main(words) == 0
+    alone = json.loads((tmp_path / "alone" / "summary.json").read_text())
+    assert alone["E_ac_of_all"] == summary["beside"]["adaptive_lqi"]["E_ac_of_all"]
+    assert alone["beside"] == {}
 
 
 def test_a_scenarios_own_limit_is_kept() -> None:

@@ -1,6 +1,7 @@
 """What an engineer reads before building anything: analyze hautus, delay, link, and so on."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +26,7 @@ from stewart_drake.studies.ranges import RANGE_UNITS
 
 if TYPE_CHECKING:
     from stewart_drake.report.answer import Answer
+    from stewart_drake.scenario.config import Scenario
 
 app = typer.Typer(rich_markup_mode=None, help="Tell beforehand what can be controlled, and how.")
 
@@ -130,6 +132,14 @@ def robustness(
     limit: Annotated[
         float | None, typer.Option(metavar="E_AC", help="A run above, in % s, counts as failed.")
     ] = None,
+    beside: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="CONTROLLER",
+            help="Run the same machines with this controller too, such as adaptive_lqi, which "
+            "finds the delay. Repeatable.",
+        ),
+    ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     out: Out = None,
@@ -154,7 +164,8 @@ def robustness(
                 controller,
                 settings,
                 fixed=("plant.kind=exact",),
-                typed={"vary": vary or (), **given},
+                typed={"vary": vary or (), **given, "beside": beside or ()},
+                beside={Path(name).stem: _load(scenario, name, settings) for name in beside or ()},
                 directory=out or scratch,
                 ranges=ranges,
                 workers=workers,
@@ -163,6 +174,12 @@ def robustness(
                 **given,
             )
     return _deliver(answer, delivery, "runs.csv", "runs/")
+
+
+def _load(scenario: str, controller: str, settings: list[str] | None) -> "Scenario":
+    from stewart_drake.scenario.loading import load_scenario
+
+    return load_scenario(scenario, controller, ("plant.kind=exact", *(settings or [])))
 
 
 def _answer(

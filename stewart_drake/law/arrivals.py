@@ -49,6 +49,11 @@ class Arrivals(Timeline):
         return self.arrival * (1 + self.rate)
 
     @property
+    def first(self) -> float:
+        """When the first of the controller's own torques arrives, s from now, of those kept."""
+        return float((self.arrival - (self.sent - 1) * self.period) * (1 + self.rate))
+
+    @property
     def samples(self) -> Array:
         """(s,) s from now at which another torque begins to act, up to the next one's."""
         return np.append(self._switches(0.0, self.eta, -1), self.eta)

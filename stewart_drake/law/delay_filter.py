@@ -19,8 +19,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
-from stewart_drake.law.arrivals import Arrivals
+from stewart_drake.law.arrivals import INSTANT, Arrivals
 from stewart_drake.law.belief import Estimate
 from stewart_drake.law.filter_settings import FilterSettings, ParameterSet
 from stewart_drake.law.holds import GAUSS_NODES
@@ -31,13 +32,12 @@ from stewart_drake.law.parameter_filter import (
     SMALL,
     Period,
     gate,
-    kicks,
     transition,
     within_bounds,
 )
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Acting
-from stewart_drake.scenario.signals import NUM_STATE
+from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
 
 Array = NDArray[np.float64]
 
@@ -51,12 +51,18 @@ TRIED = 15
 """Values of the delay that are tried where a filter is to begin with its iterations."""
 MEMORY = 5.0
 """s over which the timing of single torques is judged."""
-TIMING_WEIGHT = 1e10
-"""1/s^4; as if it had been measured to (3 ms)^2 before."""
+TORQUES = 1.0
+"""So many torques are taken to have been on time before any was looked at."""
 UNTIMELY = 0.05
 """Periods by which a single torque may come early or late at the most."""
 JERKED = 0.02
 """Periods by which the delay itself may have changed where it did."""
+EDGE = 0.1
+"""Periods before and after one from which torques may come into it."""
+BEFORE = 1 / 120
+"""Squared periods; variance of the timing of what was in flight at t = 0, see `DelayModel.late`."""
+ASIDE = 0.01
+"""Share of the variance that a torque at another time has in every other direction too."""
 LARGEST_RATE = 0.5
 """s/s."""
 NEVER = 1e6
@@ -107,7 +113,8 @@ class Guess:
         fits: whether that was no outlier.
         outliers: in a row; with those that a torque at another time explains.
         timing: s^2, variance by which single torques come early or late, as it is estimated.
-        weight: 1/s^4, information behind that.
+        weight: torques behind that.
+        heard: measurements that an own torque had to do with.
     """
 
     mean: Array
@@ -118,7 +125,8 @@ class Guess:
     fits: bool = True
     outliers: int = 0
     timing: float = 0.0
-    weight: float = TIMING_WEIGHT
+    weight: float = TORQUES
+    heard: int = 0
 
     @property
     def eta(self) -> float:
@@ -172,7 +180,8 @@ class DelayFilter:
         if y is not None:
             after = self._attempt(model, guess, y)
             if after is None and self._precise(guess, period):
-                after = self._attempt(model, self._untimely(guess, period), y)
+                most = (UNTIMELY * period) ** 2
+                after = self._attempt(model, self._jerked(guess, period), y, most)
                 if after is not None:  # explained, but one more of these may be a jump
                     after = replace(after, outliers=guess.outliers + 1)
             if after is not None:
@@ -184,111 +193,123 @@ class DelayFilter:
             return alone
         return replace(alone, fits=False, outliers=guess.outliers + 1, log_likelihood=UNLIKELY)
 
-    def _attempt(self, model: "DelayModel", guess: Guess, y: Array | None) -> Guess | None:
+    def _attempt(
+        self, model: "DelayModel", guess: Guess, y: Array | None, timing: float = 0.0
+    ) -> Guess | None:
+        """The guess afterwards, with a variance of the timing of at least so many s^2, or None."""
         try:
             with np.errstate(all="ignore"):
-                after = self._filter(model, guess, y)
+                after = self._filter(model, guess, y, max(timing, self._timing(guess)))
         except (np.linalg.LinAlgError, ArithmeticError):
             return None
         if after is None or not np.all(np.isfinite(after.covariance)):
             return None
         return after if np.all(np.isfinite(after.mean)) else None
 
-    def _filter(self, model: "DelayModel", guess: Guess, y: Array | None) -> Guess | None:
+    def _filter(
+        self, model: "DelayModel", guess: Guess, y: Array | None, used: float
+    ) -> Guess | None:
         P, xi = guess.covariance, guess.mean
         std = np.sqrt(np.diag(P)[NUM_STATE:-2])
         known = bool(np.all(std <= KNOWN * self.settings.parameters.usual_std))
         nodes, period = MIDPOINT if known else GAUSS_NODES, model.timeline.period
         at = model.at(xi, nodes)
-        sooner = self._sooner(at, xi)
-        likelihood, timing, weight, odd = 0.0, guess.timing, guess.weight, 0
+        late = model.late(xi, at.state, np.sqrt(used))
+        likelihood, odd = 0.0, guess.outliers
+        timed = guess
         if y is not None:
             if guess.std > period / 10:
                 xi = self._best_of_many(model, guess, y, at.F[:NUM_STATE, :-2])
                 at = model.at(xi, nodes)
-                sooner = self._sooner(at, xi)
-            found = self._correct(model, guess, y, (xi, at, sooner), nodes)
+                late = model.late(xi, at.state, np.sqrt(used))
+            found = self._correct(model, guess, y, (xi, at, late, used), nodes)
             if found is None:
                 return None
             xi, at, P, likelihood = found.xi, found.at, found.covariance, found.log_likelihood
+            timed, odd = replace(guess, heard=guess.heard + int(guess.eta < NEVER)), 0
             if self._precise(guess, period):
-                timing, weight, odd = self._timed(guess, found, period)
+                timed, odd = self._timed(timed, found, used, period)
         mean = np.concatenate([at.state, xi[NUM_STATE:]])
         mean[-2] += period * xi[-1]
         P = at.F @ P @ at.F.T
-        P[:NUM_STATE, :NUM_STATE] += self._drift(guess, sooner)
+        P[:NUM_STATE, :NUM_STATE] += self._drift(late, used)
+        if timed.heard:
+            less_sure = max(0.0, self._timing(timed) - self._timing(guess)) / timed.heard
+            P[-2, -2] += less_sure
         if guess.eta < NEVER:
             P[-2, -2] += self.delay.walk**2 * period
             P[-1, -1] += self.delay.rate_walk**2 * period
         return replace(
-            guess,
+            timed,
             mean=mean,
             covariance=(P + P.T) / 2,
             log_likelihood=likelihood,
             fits=True,
-            outliers=guess.outliers if y is None else odd,
-            timing=timing,
-            weight=weight,
+            outliers=odd,
         )
 
-    def _sooner(self, at: "Linearized", xi: Array) -> Array:
-        """(12, 12) covariance of the state per s^2 by which torques come early or late."""
-        early = kicks(self.plant.dynamics, at.state, xi[NUM_STATE:-2], at.period)
-        return np.asarray(early.T @ early + np.diag(np.sum(early**2, axis=0)))
+    def _timing(self, guess: Guess) -> float:
+        """s^2, variance by which single torques come early or late."""
+        return max(guess.timing, self.delay.timing_std**2)
 
-    def _drift(self, guess: Guess, sooner: Array) -> Array:
+    def _drift(self, late: "Late", timing: float) -> Array:
         """(12, 12) covariance of what the model itself may be off after the period."""
-        timing = max(guess.timing, self.delay.timing_std**2)
-        return np.diag(self.settings.model_std**2) + timing * sooner
+        return np.diag(self.settings.model_std**2) + timing * _about(late.own) + late.others
 
     def _precise(self, guess: Guess, period: float) -> bool:
         """Whether what a single torque does can be told from what the delay does."""
         return guess.std < period / 50 and guess.eta < NEVER
 
-    def _untimely(self, guess: Guess, period: float) -> Guess:
-        """The same where the last torque may have come very early or late, or all from now on."""
+    def _jerked(self, guess: Guess, period: float) -> Guess:
+        """The same where the delay itself may have changed a little."""
         P = guess.covariance.copy()
         P[-2, -2] += (JERKED * period) ** 2
-        return replace(guess, covariance=P, timing=max(guess.timing, (UNTIMELY * period) ** 2))
+        return replace(guess, covariance=P)
 
-    def _timed(self, guess: Guess, found: "Corrected", period: float) -> tuple[float, float, int]:
-        """Variance of the timing, the information behind it, and `outliers`, after a measurement.
+    def _timed(
+        self, guess: Guess, found: "Corrected", used: float, period: float
+    ) -> tuple[Guess, int]:
+        """The guess with what a measurement tells of the timing, and `outliers` after it.
 
         With S = S_0 + s M, s the variance, the log-likelihood has the slope and the information
 
             dL/ds = 1/2 (nu' S^-1 M S^-1 nu - tr S^-1 M),   I = 1/2 tr S^-1 M S^-1 M,
 
-        so that s + (dL/ds) / I is what this measurement alone tells of it (Fisher scoring).
+        so that s + (dL/ds) / I is what this measurement alone tells of it (Fisher scoring). One
+        torque whose timing is all that is uncertain tells it to I = 1 / (2 s^2): a measurement
+        counts as 2 s^2 I torques. The mean over those is the estimate; a weight that is itself
+        1 / s^4 would for ever believe the first ones that happened to be on time.
         """
-        used = max(guess.timing, self.delay.timing_std**2)
         share = np.linalg.solve(found.S, found.M)
         pull = np.linalg.solve(found.S, found.innovation)
         information = 0.5 * float(np.sum(share * share.T))
+        if not information > 0:  # no torque has changed
+            return guess, 0
         slope = 0.5 * float(pull @ found.M @ pull - np.trace(share))
-        kept = guess.weight * float(np.exp(-period / MEMORY))
-        weight = kept + information
-        timing = (kept * guess.timing + information * used + slope) / weight
+        told, torques = used + slope / information, 2 * used**2 * information
+        kept = min(guess.weight, MEMORY / period)
         most = (UNTIMELY * period) ** 2
-        odd = guess.outliers + 1 if used + slope / information > 2 * most else 0
-        return min(max(timing, 0.0), most), weight, odd
+        timing = (kept * guess.timing + torques * told) / (kept + torques)
+        timed = replace(guess, timing=min(max(timing, 0.0), most), weight=kept + torques)
+        return timed, guess.outliers + 1 if told > 2 * most else 0
 
     def _correct(
         self,
         model: "DelayModel",
         guess: Guess,
         y: Array,
-        start: "tuple[Array, Linearized, Array]",
+        start: "tuple[Array, Linearized, Late, float]",
         nodes: Array,
     ) -> "Corrected | None":
         """The iterations of `ParameterFilter.advance`; None for an outlier."""
         sensing, prior, P = self.sensing, guess.mean, guess.covariance
-        xi, at, sooner = start
+        xi, at, late, timing = start
 
         def seen(covariance: Array) -> Array:
             return sensing.through(at.state, sensing.through(at.state, covariance).T)
 
-        R = np.diag(sensing.noise_std**2) + seen(self._drift(guess, sooner))
-        M, small = seen(sooner), SMALL * np.sqrt(np.diag(R))
+        R = np.diag(sensing.noise_std**2) + seen(self._drift(late, timing))
+        M, small = seen(late.own), SMALL * np.sqrt(np.diag(R))
         for _ in range(ITERATIONS if guess.std > model.timeline.period / 100 else FEW):
             H = sensing.through(at.state, at.F[:NUM_STATE])
             innovation = y - sensing.seen(at.state) - H @ (prior - xi)
@@ -380,8 +401,15 @@ class Linearized:
     """(12,) at its end."""
     F: Array
     """(12 + p + 2, 12 + p + 2) of xi."""
-    period: Period
-    """What acted."""
+
+
+class Late(NamedTuple):
+    """What the state at a period's end owes to torques that come early or late."""
+
+    own: Array
+    """(12, 12) covariance per s^2, of the controller's torques, without what lies beside."""
+    others: Array
+    """(12, 12) covariance, of those that were in flight before."""
 
 
 @dataclass(frozen=True)
@@ -420,9 +448,7 @@ class DelayModel:
     def at(self, xi: Array, nodes: Array) -> Linearized:
         """Linearised at xi."""
         acting, size = self.acting(xi), len(xi) - 2
-        following = self.acting(xi, self.timeline.period).torques
-        after_end = following[min(len(acting.torques), len(following) - 1)]
-        period = Period(*acting, after_end, self.plant.substeps_for(acting.torques))
+        period = Period(*acting, acting.torques[-1], self.plant.substeps_for(acting.torques))
         state, F_known = transition(self.plant.dynamics, xi[:-2], period, nodes)
         F = np.eye(size + 2)
         F[:size, :size] = F_known
@@ -430,4 +456,34 @@ class DelayModel:
         if xi[-2] < NEVER:
             F[:NUM_STATE, -2] = self.sensitivity(xi)
             F[:NUM_STATE, -1] = self.timeline.period / 2 * F[:NUM_STATE, -2]
-        return Linearized(state, F, period)
+        return Linearized(state, F)
+
+    def late(self, xi: Array, state: Array, std: float) -> Late:
+        """What comes of it when single torques are early or late by a standard deviation, s.
+
+        A change of torque at c that comes a second earlier leaves B dT in the rates at the end and
+        moves the pose by that for the rest of the period; it does so in this period if c + j is
+        within, j its error: next to a sample with the probability Phi. What was in flight at t = 0
+        was held from instants that nobody knows, phi dt off the samples. Held mean torques of
+        changes dT per period leave the rates off by B dT dt phi (1 - phi) / 2 at the samples, of
+        which the mean square is BEFORE (B dT dt)^2 for phi uniform in [0, 1].
+        """
+        dt, theta = self.timeline.period, xi[NUM_STATE:-2]
+        timeline = replace(self.timeline, arrival=float(xi[-2]), rate=float(xi[-1]))
+        torques, durations = timeline.within(
+            self.in_flight, -EDGE * dt, (1 + EDGE) * dt, self.newest
+        )
+        dynamics, pose, rates = self.plant.dynamics, state[POSE], state[RATES]
+        changes = np.diff([dynamics.accelerations(pose, rates, T, theta) for T in torques], axis=0)
+        at = np.cumsum(durations)[:-1] - EDGE * dt
+        left = np.clip(dt - at, 0.0, dt)
+        early = np.hstack([left[:, None] * changes, changes])
+        within = ndtr((dt - at) / std) - ndtr(-at / std)
+        own = at >= timeline.first - INSTANT
+        mine = np.sqrt(within[own])[:, None] * early[own]
+        return Late(mine.T @ mine, BEFORE * dt**2 * _about(early[~own].T @ early[~own]))
+
+
+def _about(kicks: Array) -> Array:
+    """(12, 12) a covariance of kicks, and a little beside them."""
+    return kicks + ASIDE * np.diag(np.diag(kicks))

@@ -300,6 +300,8 @@ class _Search:
             cost = distance if not len(cost) else cost + distance
         valleys = _valleys(cost)[:BEST]
         chosen = [i for i in valleys if cost[i] <= HOPELESS + 10 * cost[valleys[0]]]
+        if not chosen:  # no number: astray
+            return None
         begun = [
             self._begin_at(guess, float(tried[i]), states[0].covariance, states[0].state)
             for i in chosen

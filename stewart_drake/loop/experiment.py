@@ -31,6 +31,7 @@ from stewart_drake.law.filter_settings import (
     filter_settings,
     usual_parameters,
 )
+from stewart_drake.law.gaps import GapObserver
 from stewart_drake.law.late import LateObserver
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
@@ -471,9 +472,10 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     parameters = estimated_parameters(experiment, torque_scale)
     settings = filter_settings(motion, plate, torque_scale, asked, c.period, parameters)
     encoders = isinstance(sc.sensor, EncoderSensorConfig)
+    filters = GapObserver if sc.sensor.loss > 0 else ParameterObserver
     observers: dict[str, Observer] = {
         "none": DifferencesObserver() if encoders else NoObserver(),
-        "parameters": EncoderObserver(settings) if encoders else ParameterObserver(settings),
+        "parameters": EncoderObserver(settings) if encoders else filters(settings),
     }
     predictors: dict[str, Predictor] = {
         "linear": LinearPredictor(),
@@ -505,7 +507,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         cost=quadratic_cost(experiment, peak_torque),
         channel=channel,
         kept=waits + (_REPORTS if isinstance(channel, Packets) else 0),
-        silence=math.ceil(timeline.delay.periods) if quiet else 0,
+        silence=_until_seen(timeline.delay, waits) if quiet else 0,
     )
     if c.delay_estimator != "none":
         delay = delay_settings(c.delay_estimator, c.delay_std, c.delay_max)
@@ -563,6 +565,16 @@ def _sensing(experiment: Experiment, motion: Array) -> Sensing:
         motion=motion,
         offset=np.zeros(len(OFFSETS)) if finds_offsets else offsets_of(experiment.known),
     )
+
+
+def _until_seen(delay: Delay, waits: int) -> int:
+    """Samples until a whole hold of the first own torque has been seen.
+
+    Before that the measurements are of a plate on which nothing but its bias acts: what they make
+    of payload and friction is noise, and feedback through them puts it on the motors for eta.
+    """
+    late = max(waits - _PATIENCE, 0)
+    return math.ceil(delay.periods + 1 - 1e-9) + late
 
 
 def longest_wait(scenario: Scenario) -> int:

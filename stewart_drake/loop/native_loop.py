@@ -22,7 +22,13 @@ from stewart_drake.loop.sensor import white_noises
 from stewart_drake.native.law_layout import CAUSES, address
 from stewart_drake.native.library import backend
 from stewart_drake.native.plant import Controller, Ended, LoopStruct
-from stewart_drake.scenario.config import FixedTunerConfig, Scenario, WireConfig
+from stewart_drake.scenario.config import (
+    FixedTunerConfig,
+    Scenario,
+    StateSensorConfig,
+    TorqueActuatorConfig,
+    WireConfig,
+)
 from stewart_drake.scenario.signals import BIAS, NUM_STATE, NUM_TORQUES, POSE
 from stewart_drake.scenario.timing import event_time, instants, look_time
 

@@ -157,6 +157,7 @@ def analyze_robustness(
     seed: int = 0,
     limit: float | None = None,
     directory: str | Path | None = None,
+    beside: Mapping[str, Scenario] | None = None,
 ) -> Answer:
     """Monte Carlo over what is not known of the machine: how often it works, and what matters.
 
@@ -167,26 +168,31 @@ def analyze_robustness(
         seed: of all draws.
         limit: E_ac in % s above which a completed run counts as failed, or None.
         directory: where runs are kept, so that a second call goes on with them; None is nowhere.
+        beside: by a name, the scenario with other controllers, for the same machines; on the exact
+            plant too.
 
     Raises:
         ConfigError: bad input.
         ChildProcessError: a worker process died.
     """
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-    base = dataclasses.replace(loaded, plant=dataclasses.replace(loaded.plant, kind="exact"))
-
     command = f"sd.analyze_robustness({loaded!r}, {runs})"
     with TemporaryDirectory() as scratch:
         return analyze(
             "robustness",
-            base,
+            _on_exact_plant(loaded),
             directory or scratch,
             command=command,
             ranges=ranges,
             runs=runs,
             seed=seed,
             limit=limit,
+            beside={name: _on_exact_plant(other) for name, other in (beside or {}).items()},
         )
+
+
+def _on_exact_plant(scenario: Scenario) -> Scenario:
+    return dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, kind="exact"))
 
 
 def analyze_hautus(scenario: Scenario | str | Path) -> Answer:

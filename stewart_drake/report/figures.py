@@ -24,6 +24,7 @@ from stewart_drake.scenario.signals import (
     COORDINATES,
     LEGS,
     NUM_PARAMETERS,
+    PACKETS,
     PARAMETERS,
     POSITION,
 )
@@ -48,6 +49,12 @@ the band narrows by orders of magnitude, and the estimate counts."""
 _LEAST_SPAN: Final = 0.02
 """A coordinate's axis spans at least this share of the widest motion among those of its unit: where
 the reference rests, rounding is not to fill it."""
+_LEFT: Final = 0.09
+_RIGHT: Final = 0.985
+"""Of a figure's width, where its axes begin and end."""
+_STRIP: Final = 1.6
+_STRIP_FOOT: Final = 0.45
+"""Inches: the strip of packets, and its room for the time axis."""
 _MARGIN: Final = 0.06
 """Empty share of an axis beyond the data."""
 
@@ -167,7 +174,7 @@ def _errors(runs: Mapping[str, SimulationResult], lines: Mapping[str, style.Line
 def _torques(
     run: SimulationResult, label: str, line: style.Line, commanded: bool = False
 ) -> Figure:
-    figure, axes = _grid([run], sharey=True)
+    figure, axes = _grid([run], sharey=True, strip=_STRIP if _has_packets(run) else 0.0)
     steps: dict[str, Any] = {"drawstyle": "steps-post"}
     for k, ax in enumerate(axes):
         time = run.signals.time.values
@@ -177,7 +184,31 @@ def _torques(
         values = run.signals.torque_applied.values[:, k]
         _plot(ax, {label: run}, {label: line}, {label: values}, **steps)
         ax.set_ylabel(f"motor {LEGS[k]}{'' if commanded else ' applied'}  [N m]")
+    if _has_packets(run):
+        _packet_strip(figure, run, axes[0].get_xlim())
     return _with_legend(figure, axes)
+
+
+def _has_packets(run: SimulationResult) -> bool:
+    return bool(np.isfinite(run.signals.packets.values).any())
+
+
+def _packet_strip(figure: Figure, run: SimulationResult, span: tuple[float, float]) -> None:
+    """A row of ticks for each kind of packet and of period, where its count rises."""
+    height = figure.get_figheight()
+    low = _STRIP_FOOT / height
+    ax = figure.add_axes((_LEFT, low, _RIGHT - _LEFT, (_STRIP - 0.45) / height))
+    counts = run.signals.packets.values
+    rises = np.diff(counts, axis=0, prepend=np.zeros((1, len(PACKETS)))) > 0
+    time = run.signals.time.values
+    for row, (name, rose) in enumerate(zip(PACKETS, rises.T, strict=True)):
+        color = style.LIMIT.color if name in ("lost", "late", "dry") else style.RUN.color
+        ax.vlines(time[rose], row - 0.35, row + 0.35, color=color, linewidth=1.0)
+    last = counts[-1].astype(int)
+    labels = [f"{name}  {n}" for name, n in zip(PACKETS, last, strict=True)]
+    ax.set(xlim=span, ylim=(len(PACKETS) - 0.5, -0.5), xlabel="time  [s]")
+    ax.set_yticks(range(len(PACKETS)), labels, fontsize=8)
+    ax.grid(visible=False)
 
 
 def _parameters(run: SimulationResult) -> Figure:
@@ -240,14 +271,17 @@ def _delay(run: SimulationResult) -> Figure:
 
 
 def _grid(
-    runs: Iterable[SimulationResult], rows: int = 3, sharey: bool = False
+    runs: Iterable[SimulationResult], rows: int = 3, sharey: bool = False, strip: float = 0.0
 ) -> tuple[Figure, list[Axes]]:
-    """Two columns of axes over one time axis, filled column by column."""
-    height = 1.5 + 1.8 * rows
+    """Two columns of axes over one time axis, filled column by column.
+
+    `strip` is room below them, in inches.
+    """
+    height = 1.5 + 1.8 * rows + strip
     # Fixed margins, in inches over the height: a layout engine takes most of the drawing time.
-    room = {"left": 0.09, "right": 0.985, "wspace": 0.24, "hspace": 0.12}
+    room = {"left": _LEFT, "right": _RIGHT, "wspace": 0.24, "hspace": 0.12}
     figure = Figure(figsize=(10, height))
-    figure.subplots_adjust(bottom=0.5 / height, top=1 - 0.45 / height, **room)
+    figure.subplots_adjust(bottom=(0.5 + strip) / height, top=1 - 0.45 / height, **room)
     axes = figure.subplots(rows, 2, sharex=True, sharey=sharey, squeeze=False)
     for ax in axes.ravel():
         ax.yaxis.set_label_coords(-0.14, 0.5)

@@ -58,7 +58,9 @@ _PAPER_FIGURES: Final = {
 _RUN_CAPTIONS: Final = {
     "states": "Where the plate was, and where it should have been.",
     "errors": "The difference.",
-    "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay.",
+    "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay. "
+    "Over a network, below: packets that were sent, lost, or late, and periods in which one was "
+    "played, or the buffer was dry.",
     "delay": "The delay as it was found, with its band, and its error.",
     "parameters": "What the controller found out about the plant, which nobody told it.",
     "weights": "The weights that the tuner set.",

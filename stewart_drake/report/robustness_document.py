@@ -57,6 +57,10 @@ _MATTERS: Final = (
     "|...|: by size, which shows what hurts in both directions. *, full marks in the figure: "
     f"beyond chance, adjusted p below {SIGNIFICANT:g}. A dash: the same in all runs."
 )
+_SAME: Final = (
+    "Each drawn machine under each controller. Quantiles are of E_ac, over all runs; undisturbed "
+    "is the run in which nothing was drawn."
+)
 _QUANTILES: Final = "Quantiles; a run that did not complete counts as infinite."
 _CURVE: Final = (
     "Share of all runs with at most this error. The curve ends below 100 % where runs did not "
@@ -87,6 +91,8 @@ def document(study: RobustnessStudy) -> Document:
         Picture(partial(distribution_figure, study), _CURVE),
     )
     sections = [error, matters]
+    if study.beside:
+        sections.insert(0, _beside(study))
     if study.failed.any():
         sections.append(_failures(study))
     sections += [
@@ -103,6 +109,22 @@ def document(study: RobustnessStudy) -> Document:
         facts["loop"] = ", ".join(f"{loop}: {n}" for loop, n in study.loops.items())
     name = study.experiment.mechanism.name
     return Document(f"Robustness of {name}", verdict, sections, tone, facts)
+
+
+def _beside(study: RobustnessStudy) -> Section:
+    """The same machines under each controller, the one that is asked about first."""
+    rows = []
+    for name, one in {"as asked": study, **study.others}.items():
+        median, most = one.quantile(0.5).value, one.quantile(0.95).value
+        kept = int(np.sum(~one.failed))
+        cells = (f"{kept} of {len(one.outcomes)}", _percent(one.success))
+        alone = (
+            _failed(one.undisturbed.error) if one.undisturbed.status == "completed" else "failed"
+        )
+        rows.append((name, alone, *cells, _failed(median), _failed(most)))
+    columns = ("controller", "undisturbed, % s", "runs kept", "share", "median, % s", "95 %, % s")
+    brief = ("controller", "alone", "runs kept", None, "median", "95 %")
+    return Section("Controllers", _SAME, Table(columns, rows, brief=brief))
 
 
 def _verdict(study: RobustnessStudy) -> tuple[str, Tone]:
@@ -124,6 +146,9 @@ def _verdict(study: RobustnessStudy) -> tuple[str, Tone]:
     names = list(dict.fromkeys(title(one.factor.strip("|")) for one in errors))
     if names:
         text += f" What matters for E_ac, of those that completed: {', '.join(names[:3])}."
+    for name, one in study.others.items():
+        n = int(np.sum(~one.failed))
+        text += f" With {name}, on the same machines: {n} of {total}."
     low = study.success.low
     return text, "good" if low >= _GOOD else "fair" if low >= _FAIR else "bad"
 
@@ -228,7 +253,7 @@ def _range_table(study: RobustnessStudy) -> Table:
         f"torque_bias={r.torque_bias:g}, noise={r.noise:g}, torque_limit={r.torque_limit}, "
         f"damping={r.damping:g}, delay={r.delay:g}, delay_steps={r.delay_steps}, "
         f"lengths={r.lengths:g}, anchors={r.anchors:g}, coulomb={r.coulomb:g}, "
-        f"payload_position={r.payload_position:g}."
+        f"payload_position={r.payload_position:g}, jitter={r.jitter:g}, loss={r.loss:g}."
     )
     rows = [(TITLES[name], spans[name]) for name in factors(study.draws)]
     return Table(("quantity", "from, to"), rows, caption)

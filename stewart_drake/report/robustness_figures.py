@@ -43,9 +43,13 @@ TITLES: Final = {
     "anchors": "anchors, rms",
     "coulomb": "Coulomb friction",
     "payload_position": "payload's place, rms",
+    "jitter": "jitter of the delay",
+    "loss": "lost on the way",
 }
 SIGNIFICANT: Final = 0.05
 """Adjusted p-value below which an influence counts as found."""
+_ABREAST: Final = 4
+"""Panels in a row."""
 _SOFT: Final = "#666666"
 # Of many points, which are a bitmap that a dark page cannot change: readable on both.
 _SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
@@ -101,13 +105,14 @@ def influence_figure(influences: Sequence[Influence]) -> Figure:
 def runs_figure(study: RobustnessStudy) -> Figure:
     """E_ac of every run over every drawn quantity, failures in a strip of their own on top."""
     told = factors(study.draws)
-    rows = math.ceil(len(told) / 4)
+    rows = math.ceil(len(told) / _ABREAST)
     figure = Figure(figsize=(WIDTH, 2.6 * rows), layout="constrained")
-    axes = figure.subplots(rows, 4, sharey=True)
-    for ax in axes.ravel()[len(told) :]:
+    grid = figure.subplots(rows, _ABREAST, sharey=True, squeeze=False)
+    axes, spare = np.split(grid.ravel(), [len(told)])
+    for ax in spare:
         ax.remove()
     values, done = factor_values(study.draws), np.isfinite(study.errors)
-    for ax, (name, unit) in zip(axes.ravel(), told.items(), strict=False):
+    for ax, (name, unit) in zip(axes, told.items(), strict=True):
         x = values[name]
         kept = done & ~study.failed
         _scatter(ax, x[kept], study.errors[kept], "o", _SUCCESS, "success")
@@ -120,17 +125,17 @@ def runs_figure(study: RobustnessStudy) -> Figure:
     low, high = _log_range(study.errors[done])
     strip = high * (high / low) ** 0.06
     top = high * (high / low) ** 0.18
-    for ax, name in zip(axes.ravel(), told, strict=False):
+    for ax, name in zip(axes, told, strict=True):
         ax.set_ylim(low, top)
         ax.axhspan(strip, top, color="#F1EAE6", zorder=0)
         # Spread over the strip by the number of the run, so that marks do not hide each other.
         spread = (np.arange(len(done)) * 0.618034) % 1 * 0.8 + 0.1
         y = strip * (top / strip) ** spread[~done]
         _scatter(ax, values[name][~done], y, "x", _FAILED, "did not complete")
-    plain_log_ticks(axes[0, 0].yaxis)  # which all share
-    for ax in axes[:, 0]:
+    plain_log_ticks(axes[0].yaxis)  # which all share
+    for ax in grid[:, 0]:
         ax.set_ylabel("E_ac  [% s]")
-    return legend_above(figure, axes[0, 0])
+    return legend_above(figure, axes[0])
 
 
 @figure_style()

@@ -36,6 +36,8 @@ class Ranges:
         coulomb: Coulomb friction of a crank, uniform from 0.
         payload_position: error of the coordinates of the payload's place, rms over the three,
             uniform from 0; it matters where there is a payload.
+        jitter: standard deviation of the delay from torque to torque, uniform from 0; over a wire.
+        loss: share of the measurements that are lost, uniform from 0; over a network of packets.
     """
 
     payload: Annotated[float, Field(ge=0, lt=1, description="+-share of the plate's mass")] = 0.1
@@ -68,6 +70,10 @@ class Ranges:
     ] = 0.0
     payload_position: Annotated[
         float, Field(ge=0, description="share of the mean crank length")
+    ] = 0.0
+    jitter: Annotated[float, Field(ge=0, le=1, description="periods of the controller")] = 0.0
+    loss: Annotated[
+        float, Field(ge=0, lt=0.99, description="share of measurements, of packets over a network")
     ] = 0.0
 
 

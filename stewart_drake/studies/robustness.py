@@ -1,6 +1,7 @@
 """How a scenario bears what is not known of the machine: many runs, each with one drawn machine."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ def study_robustness(
     runs: int = 200,
     seed: int = 0,
     limit: float | None = None,
+    beside: Mapping[str, Scenario] | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
@@ -44,6 +46,8 @@ def study_robustness(
         runs: number of draws.
         seed: of all draws.
         limit: E_ac in % s above which a completed run counts as failed, or None.
+        beside: by a name that a folder may have, the scenario with other controllers, for the same
+            machines.
         workers, scheduler, progress: as `run_jobs` takes them.
 
     Raises:
@@ -55,12 +59,13 @@ def study_robustness(
         raise ConfigError(f"--limit: got {limit:g}; expected a positive E_ac in % s")
     ranges = Ranges() if ranges is None else ranges
     experiment, directory = prepare(scenario), Path(directory)
+    settings: dict[str, Any] = {
+        "scenario": scenario_to_dict(scenario),
+        "ranges": dataclasses.asdict(ranges),
+        "seed": seed,
+    }
     common: dict[str, Any] = {
-        "settings": {
-            "scenario": scenario_to_dict(scenario),
-            "ranges": dataclasses.asdict(ranges),
-            "seed": seed,
-        },
+        "settings": settings,
         "workers": workers,
         "scheduler": scheduler,
         "read": read_outcome,
@@ -71,8 +76,18 @@ def study_robustness(
     draws = [draw(ranges, scales, scenario, seed, index) for index in range(runs)]
     jobs = {f"run{i:06d}": (scenario, one) for i, one in enumerate(draws)}
     outcomes = run_jobs(jobs, run_draw, directory / "runs", progress=progress, **common)
+    others = {}
+    for name, other in (beside or {}).items():
+        settings["scenario"] = scenario_to_dict(other)
+        again = {
+            "undisturbed": (other, Draw()),
+            **{key: (other, d) for key, (_, d) in jobs.items()},
+        }
+        place = directory / f"runs_{name}"
+        found = run_jobs(again, run_draw, place, progress=progress, **common)
+        others[name] = (found.pop("undisturbed"), list(found.values()))
     study = RobustnessStudy(
-        experiment, ranges, scales, seed, limit, undisturbed, draws, list(outcomes.values())
+        experiment, ranges, scales, seed, limit, undisturbed, draws, list(outcomes.values()), others
     )
     remove_partials(directory)
     write_atomically(directory / "runs.csv", table(study).encode())

@@ -61,6 +61,16 @@ class RobustnessStudy(NamedTuple):
     undisturbed: Outcome
     draws: list[Draw]
     outcomes: list[Outcome]
+    beside: dict[str, tuple[Outcome, list[Outcome]]] = {}
+    """By name of another controller: undisturbed, and on the same draws."""
+
+    @property
+    def others(self) -> "dict[str, RobustnessStudy]":
+        """The study as it would be with each of the other controllers."""
+        return {
+            name: self._replace(undisturbed=undisturbed, outcomes=outcomes, beside={})
+            for name, (undisturbed, outcomes) in self.beside.items()
+        }
 
     @property
     def failed(self) -> NDArray[np.bool_]:
@@ -113,6 +123,15 @@ class RobustnessStudy(NamedTuple):
         ]
         return sorted(found, key=lambda one: -_strength(one))
 
+    def _of_all(self) -> dict[str, Any]:
+        """Of `summary` what is told of a controller beside others."""
+        return {
+            "success": {"runs": int(np.sum(~self.failed)), **self.success._asdict()},
+            "failures": self.reasons,
+            "E_ac_of_all": {str(q): self.quantile(q)._asdict() for q in QUANTILES},
+            "undisturbed": dataclasses.asdict(self.undisturbed),
+        }
+
     @property
     def explanation(self) -> Explanation:
         """How the failing runs differ from the others."""
@@ -141,6 +160,7 @@ class RobustnessStudy(NamedTuple):
             "explanation": self.explanation.summary,
             "loops": self.loops,
             "undisturbed": dataclasses.asdict(self.undisturbed),
+            "beside": {name: one._of_all() for name, one in self.others.items()},
             "ranges": dataclasses.asdict(self.ranges),
             "scales": self.scales._asdict(),
             "scenario": scenario_to_dict(self.experiment.scenario),

@@ -20,7 +20,7 @@ from stewart_drake.files.yamlio import validate
 from stewart_drake.law.startup import INSTANTS
 from stewart_drake.loop.experiment import Experiment, assemble, believed_delay, motion_scale
 from stewart_drake.mechanism.geometry import Body, Mechanism
-from stewart_drake.scenario.config import Scenario, StateSensorConfig
+from stewart_drake.scenario.config import NetworkConfig, Scenario, StateSensorConfig
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
 from stewart_drake.scenario.trajectories import spread_instants
 from stewart_drake.studies.ranges import Ranges
@@ -160,6 +160,32 @@ def seed_noise(truth: Truth, seed: int) -> None:
 def draw_seed(rng: Generator, _: Any) -> int:
     """A seed for the sensor."""
     return int(rng.integers(2**31))
+
+
+def _jitter(truth: Truth, std: float) -> None:
+    truth.fields["delay"]["jitter_std"] += std
+
+
+def _lose(truth: Truth, share: float) -> None:
+    """Of what gets there already."""
+    place = _lossy(truth)
+    place["loss"] += share * (1 - place["loss"])
+
+
+def _lossy(truth: Truth) -> dict[str, Any]:
+    """What loses something: a network its packets, else the sensor its measurements."""
+    over_network = isinstance(truth.scenario.link, NetworkConfig)
+    return truth.fields["link" if over_network else "sensor"]
+
+
+def _seed_link(truth: Truth, seed: int) -> None:
+    """Of jitter and losses that were drawn; a link that is as it was has its own seed."""
+    if truth.fields["delay"]["jitter_std"] != truth.scenario.delay.jitter_std:
+        truth.fields["delay"]["seed"] = seed
+    own = dataclasses.asdict(truth.scenario)
+    for place in ("link", "sensor"):
+        if truth.fields[place].get("loss") != own[place].get("loss"):
+            truth.fields[place]["seed"] = seed
 
 
 def _limit_torque(truth: Truth, limit: float | None) -> None:
@@ -328,5 +354,11 @@ MACHINE: Final[Model] = {
         lambda rng, a: _of_random_size(rng, 3, a.ranges.payload_position * a.scales.crank),
         _move_payload, "mm", 1e3, optional=True,
     ),
+    "jitter": Quantity(
+        lambda rng, a: float(a.ranges.jitter * a.scales.period * rng.uniform()), _jitter, "ms", 1e3,
+        optional=True,
+    ),
+    "loss": Quantity(lambda rng, a: float(a.ranges.loss * rng.uniform()), _lose, "%", 100, optional=True),
+    "link_seed": Quantity(draw_seed, _seed_link),
 }  # fmt: skip
 """True less believed, of what `Ranges` says how far it may be off."""
