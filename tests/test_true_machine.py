@@ -10,7 +10,10 @@ from ruamel.yaml import YAML
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import data_root
+from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.experiment import prepare, simulated_machine
+from stewart_drake.loop.simulation import make_simulator
+from stewart_drake.scenario.signals import COULOMB
 from tests.mechanisms import PAPER
 
 ON_REFERENCE = ("start=on_reference", "queue=reference")
@@ -37,6 +40,25 @@ def test_both_plants_go_the_same_way() -> None:
     plain = run("plant.kind=exact", "duration=1.5")
     assert float(np.abs(plain.signals.pose - exact).max()) > 30 * coarse
     assert coarse / fine == pytest.approx(2, rel=0.2)
+
+
+@pytest.mark.parametrize("controller", ["predictor_lqi", "adaptive_lqi"])
+def test_friction_is_found_where_it_is_asked_for(controller: str) -> None:
+    """Without it is taken for bias and damping, which it is not, and the run is lost or bad."""
+    settings = ("plant.kind=exact", "duration=6", "plant.coulomb_friction=1e-3", *ON_REFERENCE)
+    asked = "controller.estimate_coulomb=true"
+    loop = build_closed_loop(sd.load_scenario("paper", controller, (*settings, asked)))
+    simulator = make_simulator(loop)
+    simulator.AdvanceTo(6.0)
+    held = loop.GetSubsystemByName("controller")
+    context = held.GetMyContextFromRoot(simulator.get_context())
+    belief = held.memory(context).belief
+    assert belief.parameters[COULOMB] == pytest.approx(1e-3, rel=0.05)
+    found, without = (
+        run(*settings, *more, controller=controller).accumulated_error for more in ((asked,), ())
+    )
+    assert found < 4
+    assert not without < 5 * found  # or lost
 
 
 @pytest.fixture

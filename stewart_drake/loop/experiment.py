@@ -72,6 +72,7 @@ from stewart_drake.scenario.known import DELAY, OFFSETS, Known, load_known
 from stewart_drake.scenario.link import in_time, times_under_way
 from stewart_drake.scenario.signals import (
     BIAS,
+    COULOMB,
     DAMPING,
     PARAMETERS,
     PAYLOAD,
@@ -252,10 +253,13 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
 
 
 def estimated(scenario: Scenario) -> tuple[str, ...]:
-    """Names of what the estimator finds, if there is one."""
+    """Names of what the estimator finds, if there is one; the eight of the record first."""
     c = scenario.controller
-    finds_offsets = c.estimate_offsets and c.estimator == "parameters"
-    return (*PARAMETERS, *OFFSETS) if finds_offsets else PARAMETERS
+    found = list(PARAMETERS)
+    if c.estimator == "parameters":
+        found += [PLANT_PARAMETERS[COULOMB]] * c.estimate_coulomb
+        found += OFFSETS * c.estimate_offsets
+    return tuple(found)
 
 
 def _with_motors(mechanism: Mechanism, scenario: Scenario) -> Mechanism:
