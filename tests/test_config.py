@@ -125,6 +125,7 @@ def test_the_defaults_are_the_papers_experiment() -> None:
             "estimate_coulomb": False,
             "prior": dict.fromkeys(["torque_bias", "payload", "damping", "rates", "offsets"]),
             "known": None,
+            "estimate_offsets": False,
         },
         "link": {"kind": "wire"},
         "actuator": {"kind": "torque", "torque_limit": None},
