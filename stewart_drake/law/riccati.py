@@ -63,9 +63,7 @@ def lqr(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
     return K, P
 
 
-def full_gain(
-    model: DelayedModel, Q: Array, R: Array, solver: Solver = lqr
-) -> tuple[Array, Array]:
+def full_gain(model: DelayedModel, Q: Array, R: Array, solver: Solver = lqr) -> tuple[Array, Array]:
     """(42)-(44) on the whole chain (37)-(39): K (m, n + m L) and P, with Q (p, p) on y = C e.
 
     The queue makes the equation large; `augmented_gain` finds the same K without it.

@@ -149,7 +149,9 @@ class DelayLqiController(LeafSystem):
         """The memory in a context of this system."""
         return self.sample(context).memory
 
-    def _held(self, part: Callable[[AnyMemory], Array], context: Context, output: BasicVector) -> None:
+    def _held(
+        self, part: Callable[[AnyMemory], Array], context: Context, output: BasicVector
+    ) -> None:
         output.SetFromVector(part(self.memory(context)))
 
     def _calc_step(self, context: Context, result: AbstractValue) -> None:
