@@ -190,7 +190,9 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
         IntegrationError: the accuracy cannot be had.
         Whatever the law raises.
     """
-    sc, noise = experiment.scenario, np.array(experiment.scenario.sensor.noise_std)
+    sc, sensor = experiment.scenario, experiment.scenario.sensor
+    assert isinstance(sensor, StateSensorConfig)
+    noise = np.array(sensor.noise_std)
     parameters = np.array(sc.plant.parameters)
     parameters[BIAS] = 0.0  # added where torques arrive, as in the diagram
     truth = StewartDynamics(experiment.truth, sc.plant.gravity, parameters)
@@ -203,7 +205,7 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
     measured, asked = np.empty((number, NUM_STATE)), np.empty((number, NUM_TORQUES))
     drawn = None
     if noise.any():
-        drawn = noise * white_noises(sc.sensor.seed, number)
+        drawn = noise * white_noises(sensor.seed, number)
     released = None
     if delay.fraction > 0:
         period = sc.controller.period

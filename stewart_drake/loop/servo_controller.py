@@ -53,6 +53,8 @@ class ServoController(LeafSystem):
         command: (18,) that was sent before t = 0.
     """
 
+    backend = "python (controller.command)"
+
     def __init__(self, law: ServoPreview, command: Array) -> None:
         super().__init__()
         self._law = law
