@@ -51,6 +51,7 @@ from stewart_drake.law.startup import (
     initial_queue,
     machine_torque,
     reference_torque,
+    turning_substeps,
     weight_scales,
 )
 from stewart_drake.law.timeline import Timeline
@@ -445,8 +446,9 @@ def sizing_of(experiment: Experiment) -> Sizing:
     """It depends on mechanism, reference, duration, period and the believed delay."""
     sc, nominal, reference = experiment.scenario, experiment.nominal, experiment.reference
     period, steps = sc.controller.period, believed_delay(sc).steps
+    substeps = choose_substeps(nominal, reference, period, steps, sc.duration)
     return Sizing(
-        choose_substeps(nominal, reference, period, steps, sc.duration),
+        max(substeps, turning_substeps(nominal, reference, period, sc.duration)),
         reference_torque(nominal, reference, sc.duration),
         machine_torque(nominal),
     )
