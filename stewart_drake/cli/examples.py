@@ -15,6 +15,7 @@ EXAMPLES: Final = {
     "compare": ("stewart-drake compare paper --set start=on_reference --set queue=reference",),
     "export": ("stewart-drake export out/lqi/signals.nc --out lqi.csv",),
     "report": ("stewart-drake report paper --set plant.kind=exact --out out/report",),
+    "new": ("stewart-drake new mine --torque-limit 6 --delay 0.08",),
     "list": ("stewart-drake list",),
     "model check": ("stewart-drake model check paper --out out/paper",),
     "model sdf": ("stewart-drake model sdf paper --out paper.sdf",),
