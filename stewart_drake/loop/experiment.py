@@ -69,6 +69,7 @@ from stewart_drake.scenario.known import DELAY, OFFSETS, Known, load_known
 from stewart_drake.scenario.link import in_time, times_under_way
 from stewart_drake.scenario.signals import (
     BIAS,
+    COULOMB,
     DAMPING,
     PARAMETERS,
     PAYLOAD,
@@ -248,10 +249,11 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
 
 
 def estimated(scenario: Scenario) -> tuple[str, ...]:
-    """Names of what the estimator finds, if there is one."""
+    """Names of what the estimator finds, if there is one; the eight of the record first."""
     c = scenario.controller
+    friction = (PLANT_PARAMETERS[COULOMB],) if c.estimate_coulomb else ()
     finds_offsets = c.estimate_offsets and c.estimator == "parameters"
-    return (*PARAMETERS, *OFFSETS) if finds_offsets else PARAMETERS
+    return (*PARAMETERS, *friction, *(OFFSETS if finds_offsets else ()))
 
 
 def simulated_machine(scenario: Scenario) -> Mechanism:
