@@ -1,7 +1,7 @@
 """Motor encoders instead of the state: `python benchmarks/encoders.py [section ...]`.
 
 Writes benchmarks/results/encoders.md; SEEDS of the environment is the number of runs of a row, each
-with encoders whose codes begin elsewhere. Sections: codes, rest, known, unknown, gravity, offsets,
+with encoders whose codes begin elsewhere, FIRST the first seed. Sections: codes, rest, known, unknown, gravity, offsets,
 faults, delay, time. All runs are on the exact plant with the paper's motion and delay of 0.8 s, on
 the reference, with the shipped priors, where a row says nothing else. "Identified" are standard
 deviations as a log leaves them: 6e-5 N m, 10 g and 6e-5 N m s/rad. Times are the CPU's.
@@ -27,7 +27,7 @@ from stewart_drake.loop.simulation import make_simulator, simulate
 
 RESULTS = Path(__file__).parent / "results"
 SEEDS = int(os.environ.get("SEEDS", "5"))
-FRESH = 100
+FRESH = int(os.environ.get("FIRST", "100"))
 """The first seed."""
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 FINE = ("sensor.samples=100",)

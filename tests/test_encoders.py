@@ -167,7 +167,7 @@ def test_a_share_strikes_that_share_from_the_first_sample_on() -> None:
     ],
 )
 def test_the_error_on_the_reference(settings: tuple[str, ...], bound: float) -> None:
-    """Means over seeds are in benchmarks/results/encoders.md; with the state 0.026."""
+    """Means over seeds: `python benchmarks/encoders.py`; with the state 0.026."""
     assert run(*ON_REFERENCE, *settings).accumulated_error < bound
 
 
