@@ -404,6 +404,15 @@ def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
     return QuadraticCost(errors, c.integral_weight * integrals if c.integral else None, torques)
 
 
+def _check_sends_torques(scenario: Scenario) -> None:
+    command = scenario.controller.command
+    if command != "torque":
+        raise ConfigError(
+            f"controller.command: got {command!r}; expected 'torque', for a law that closes its "
+            "loop across the delay"
+        )
+
+
 def compose_law(experiment: Experiment) -> PredictiveLqi:
     """The parts that a scenario asks for; the only place that knows their names in it.
 
@@ -411,11 +420,7 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
         ConfigError: it asks for no law that sends torques; see `loop.servo_design`.
     """
     sc, nominal = experiment.scenario, experiment.nominal
-    if sc.controller.command != "torque":
-        raise ConfigError(
-            f"controller.command: got {sc.controller.command!r}; expected 'torque', for a law that "
-            "closes its loop across the delay"
-        )
+    _check_sends_torques(sc)
     c, motion = sc.controller, motion_scale(experiment)
     timeline = Timeline(c.period, believed_delay(sc))
     substeps = choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration)
