@@ -122,6 +122,7 @@ def test_the_defaults_are_the_papers_experiment() -> None:
             "delay_max": 1.5,
             "quiet_start": True,
             "rejoin": 0.6,
+            "estimate_coulomb": False,
             "prior": dict.fromkeys(["torque_bias", "payload", "damping", "rates", "offsets"]),
             "known": None,
         },

@@ -25,6 +25,7 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.signals import (
+    NUM_PARAMETERS,
     NUM_REFERENCE,
     NUM_TORQUES,
     WEIGHTS,
@@ -40,8 +41,8 @@ HELD: Final[dict[str, Callable[[Memory], Array]]] = {
     "weights": lambda memory: memory.weights,
     "measurement": lambda memory: memory.measurement,
     "state_estimate": lambda memory: memory.belief.state,
-    "parameters": lambda memory: memory.belief.parameters,
-    "parameter_std": lambda memory: memory.belief.estimate.parameter_std,
+    "parameters": lambda memory: memory.belief.parameters[:NUM_PARAMETERS],
+    "parameter_std": lambda memory: memory.belief.estimate.parameter_std[:NUM_PARAMETERS],
     "delay_estimate": lambda memory: memory.belief.delay,
     "delay_std": lambda memory: np.array([memory.belief.delay_std]),
 }

@@ -68,6 +68,7 @@ from stewart_drake.scenario.known import DELAY, OFFSETS, Known, load_known
 from stewart_drake.scenario.link import in_time, times_under_way
 from stewart_drake.scenario.signals import (
     BIAS,
+    COULOMB,
     DAMPING,
     PARAMETERS,
     PAYLOAD,
@@ -237,7 +238,9 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
         truth=_with_motors(simulated_machine(scenario) if truth is None else truth, scenario),
         reference=reference,
         peak_to_peak=span,
-        nominal=StewartDynamics(mechanism, scenario.plant.gravity, known_values(known)),
+        nominal=StewartDynamics(
+            mechanism, scenario.plant.gravity, known_values(known), estimated(scenario)
+        ),
         start=start,
         network=network,
         own=own,
@@ -251,6 +254,12 @@ def _with_motors(mechanism: Mechanism, scenario: Scenario) -> Mechanism:
     if not isinstance(actuator, ServoActuatorConfig):
         return mechanism
     return with_rotors(mechanism, actuator.reflected_inertia)
+
+
+def estimated(scenario: Scenario) -> tuple[str, ...]:
+    """Names of what the estimator finds, if there is one; the eight of the record first."""
+    rubs = scenario.controller.estimate_coulomb
+    return (*PARAMETERS, PLANT_PARAMETERS[COULOMB]) if rubs else PARAMETERS
 
 
 def simulated_machine(scenario: Scenario) -> Mechanism:
