@@ -40,7 +40,7 @@ from stewart_drake.loop.metrics import accumulated_error
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.config import ControllerConfig, Scenario
-from stewart_drake.scenario.loading import load_controller, setting_choices
+from stewart_drake.scenario.loading import load_controller, load_understood, setting_choices
 from stewart_drake.scenario.reference_files import read_waypoints
 from stewart_drake.scenario.signals import SIGNALS, exported_ports, ports_of
 from stewart_drake.scenario.trajectories import evaluate, make_reference
@@ -315,7 +315,8 @@ def test_commands_parse(block: Block) -> None:
         if scenario is None or resources.is_path(scenario):
             continue
         overlay = (parameters.get("controller"), parameters.get("settings") or ())
-        sd.load_scenario(scenario, *overlay)
+        load = load_understood if arguments[0] == "compare" else sd.load_scenario
+        load(scenario, *overlay)
 
 
 @pytest.mark.parametrize(

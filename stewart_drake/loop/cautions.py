@@ -27,8 +27,8 @@ def cautions_before(experiment: Experiment, margin: ControllerMargin | None) -> 
     """What can be said before the run; `margin` is None where the loop was not judged."""
     if experiment.own.unjudged:
         return [f"the loop was not judged: its {experiment.own.unjudged} is not the scenario's"]
-    if margin is None:
-        return []
+    if margin is None or experiment.scenario.controller.command != "torque":
+        return []  # servos have no loop across the delay
     if margin.problem:
         return [f"the loop was not judged: {margin.problem}"]
     coarse = coarse_step(experiment, margin)

@@ -146,6 +146,8 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
     """
     sc = experiment.scenario
     end = sc.duration if until is None else until
+    if sc.controller.command != "torque":
+        return _at_the_machine(experiment, end)
     truth, law = true_dynamics(experiment), compose_law(experiment)
     finds_delay = isinstance(law.observer, DelayObserver)
     if finds_delay:
@@ -195,6 +197,27 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
         tuned=experiment.network is not None,
         problem=problem,
         loops=tuple(loops),
+        span=end,
+    )
+
+
+def _at_the_machine(experiment: Experiment, end: float) -> ControllerMargin:
+    """Of servos: no error waits for the delay to pass, and there is no loop across it to judge.
+
+    That their own loops are stable along the reference is checked where they are made.
+    """
+    return ControllerMargin(
+        period=experiment.scenario.controller.period,
+        eta=experiment.scenario.eta,
+        radius=math.nan,
+        time=math.nan,
+        margins=Margins(*[math.nan] * 4),
+        pole=0.0,
+        pole_time=0.0,
+        estimated=False,
+        delay_found=False,
+        tuned=False,
+        problem="servos close theirs at the machine, and nothing is fed back across the delay",
         span=end,
     )
 

@@ -465,11 +465,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         ConfigError: it asks for no law that sends torques; see `loop.servo_design`.
     """
     sc, nominal = experiment.scenario, experiment.nominal
-    if sc.controller.command != "torque":
-        raise ConfigError(
-            f"controller.command: got {sc.controller.command!r}; expected 'torque', for a law that "
-            "closes its loop across the delay"
-        )
+    _check_sends_torques(sc)
     c, motion = sc.controller, motion_scale(experiment)
     timeline = Timeline(c.period, believed_delay(sc))
     substeps, peak_torque, least = sizing or sizing_of(experiment)

@@ -26,6 +26,10 @@ class ServoSample(NamedTuple):
     seconds: float
     """Time that it took to compute; 0 before the first."""
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> "ServoSample":
+        """See `loop.controller.Sample`."""
+        return self
+
 
 class ServoController(LeafSystem):
     """Sends crank angles ahead, in the place of `loop.controller.DelayLqiController`.

@@ -46,6 +46,10 @@ class ServoState(NamedTuple):
         """(6,) what acts, N m."""
         return np.nan_to_num(self.put_out[-1])
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> "ServoState":
+        """Drake copies what it keeps; nobody changes this, so that itself will do."""
+        return self
+
 
 class Servos(LeafSystem):
     """Follows the crank angles that arrive, with a local loop at each motor (`law.servos`).

@@ -117,8 +117,7 @@ def simulate(
             tuner=tuner,
         )
         if isinstance(margin, bool):
-            torques = experiment.scenario.controller.command == "torque"  # else no loop to judge
-            judgeable = margin and torques and experiment.own.unjudged is None
+            judgeable = margin and experiment.own.unjudged is None
             judged = controller_margin(experiment) if judgeable else None
         else:
             judged = margin

@@ -4,6 +4,7 @@ import math
 from functools import partial
 from typing import Final
 
+from stewart_drake.law.servos import mean_inertia
 from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.report.analysis_figures import growth_figure, loop_figure, map_figure
 from stewart_drake.report.document import (
@@ -25,6 +26,8 @@ from stewart_drake.studies.verdict import loop_verdict, milliseconds
 
 _TONES: Final[dict[str, Tone]] = {"yes": "good", "hardly": "fair", "no": "bad"}
 
+_BANDWIDTH: Final = 10.0
+"""Hz, of the servos that torques are compared with."""
 FRAGILE: Final = 0.05
 """Of the delay: a loop that bears less error of it is not called good."""
 
@@ -49,6 +52,14 @@ _LOOP_TEXT: Final = (
     "along the reference."
 )
 _LOOP_CAPTION: Final = "Peaks and tolerable errors over the delay; dotted: this scenario's own."
+_SERVO_TEXT: Final = (
+    "A law across the delay is needed where the delay is inside the actuator, or nothing may "
+    "compute at the machine. Else position servos at the motors (actuator.kind servo, controllers "
+    "servo_preview and servo_feedforward) are the answer, and under gravity with a long delay the "
+    "only one: crank angles of the reference are sent ahead, and nothing waits for the delay. That "
+    "is stiffness instead of knowledge, unless the model's torque is sent too."
+)
+_SERVO_CAPTION: Final = "Torques across the delay, or servos of 10 Hz that see their cranks."
 _MAP_TEXT: Final = (
     "Simulations on the exact plant, everything else as in the scenario. E_ac is relative to each "
     "amplitude; in the figure, darker is further above the floor."
@@ -61,7 +72,7 @@ def document(study: DelayStudy) -> Document:
     verdict, tone = _verdict(study)
     sc, found = study.basis.experiment.scenario, study.basis
     sections = [_growth_section(study)] if study.poles else []
-    sections += [_floor_section(study), _loop_section(study)]
+    sections += [_floor_section(study), _loop_section(study), _servo_section(study)]
     if study.cells:
         text = "Interrupted: not all simulations were run."
         more = [Paragraph(text, brief=True)] * study.interrupted
@@ -168,6 +179,35 @@ def _loop_section(study: DelayStudy) -> Section:
     if any(one.radius < 1 for one in study.loops):
         parts.append(Picture(partial(loop_figure, study), _LOOP_CAPTION))
     return Section("The closed loop", *parts)
+
+
+def _servo_section(study: DelayStudy) -> Section:
+    """When a law across the delay is needed, and when loops at the motors are the answer."""
+    loop, verdict = study.controller, study.verdict
+    stiffness = mean_inertia(study.basis.experiment.nominal) * (2 * math.pi * _BANDWIDTH) ** 2
+    knows = loop is not None and loop.stable and math.isfinite(loop.delay_margin)
+    rows = [
+        (
+            "an error of the state grows, before it is answered",
+            "-" if verdict is None else f"{number(verdict.amplification)} fold",
+            "hardly: it is answered within a ms",
+        ),
+        (
+            "an unknown torque of 1 mN m at a shaft",
+            "is found, and answered a delay later",
+            f"leaves {number(1.0 / stiffness)} mrad at the crank",
+        ),
+        (
+            "a delay that is not known",
+            f"bears {milliseconds(loop.delay_margin)}" if loop and knows else "must be estimated",
+            "never unstable; as late as that",
+        ),
+        ("a plate that is not where its cranks say", "is seen and corrected", "is not seen"),
+        ("a push on the plate", "is answered a delay later", "gives way as stiffness allows"),
+        ("needs", "a measured plate, nothing at the machine", "a fast loop at each motor"),
+    ]
+    head = ("", "torques across the delay", "servos at the motors")
+    return Section("Torques, or servos", _SERVO_TEXT, Table(head, rows, _SERVO_CAPTION))
 
 
 def _loop_table(loops: tuple[LoopMargins, ...]) -> Table:

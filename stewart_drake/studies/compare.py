@@ -42,7 +42,7 @@ LABELS: Final = {
     "predictor_lqi": "LQI, predictor",
     "adaptive_lqi": "LQI, delay found",
     "servo_preview": "servos",
-    "servo_feedforward": "servos, torque sent",
+    "servo_feedforward": "servos + torque",
 }
 PAPER_ERRORS: Final = {"lqr": None, "lqi": None, "delay_lqr": 225.0, "delay_lqi": 80.0}
 """E_ac in % s that the paper reports in its Table II, None where it reports a failure."""
