@@ -189,21 +189,33 @@ def identify(
     poses = [start.measured_poses(log, mechanism) for log in logs]
     # The longest log has most to say.
     longest = max(range(len(logs)), key=lambda i: len(logs[i].times))
-    begun = believed
+    unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
+    begun = [believed]
     if tolerances.delay > 0:
-        begun = start.coarse_delay(
+        coarse = start.coarse_delay(
             logs[longest], poses[longest], mechanism, believed, tolerances.delay
         )
-    unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
-    segments = list[Segment]()
+        begun = [coarse, believed]
+    tried = list[Identification]()
+    for delay_at_first in begun:
+        tried.append(_from(delay_at_first, logs, poses, unknowns))
+        if tried[-1].right:
+            break
+    return min(tried, key=lambda one: one.chi2["all"])
+
+
+def _from(
+    delay: float, logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns
+) -> Identification:
+    """The fit that begins with a delay in s."""
+    segments, mechanism = list[Segment](), unknowns.mechanism
+    late = _COARSE if unknowns.std[DELAY] > 0 else 0.0
     for log, own in zip(logs, poses, strict=True):
-        length = start.segment_length(log, own, mechanism, begun)
-        known_from = float(log.sent[0]) + begun + (_COARSE if tolerances.delay > 0 else 0.0)
-        segments += start.segments_of(log, known_from, length)
+        length = start.segment_length(log, own, mechanism, delay)
+        segments += start.segments_of(log, float(log.sent[0]) + delay + late, length)
     by_log = {log.name: own for log, own in zip(logs, poses, strict=True)}
-    first = start.first_states(segments, by_log)
-    values = unknowns.mean.copy()
-    values[DELAY] = begun
+    first, values = start.first_states(segments, by_log), unknowns.mean.copy()
+    values[DELAY] = delay
     whole = Problem(segments, unknowns)
     problem, guess = followed(whole, Guess(values, first))
     fit = _solved(problem, guess)
@@ -213,8 +225,7 @@ def identify(
         problem, fit = again, _solved(again, retried)
     while (halved := finer(problem, fit.guess)) is not None:
         problem, fit = halved, _solved(halved, fit.guess)
-    every = np.vstack(poses)
-    middle = np.nanmedian(every, axis=0)
+    middle = np.nanmedian(np.vstack(poses), axis=0)
     left_out = len(segments) - len(problem.segments)
     return Identification(logs, unknowns, problem, fit, left_out, middle)
 

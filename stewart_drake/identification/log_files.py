@@ -18,8 +18,8 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import brief, parse_yaml, validate
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_STATE, NUM_TORQUES
+from stewart_drake.scenario.config import Scenario, StateSensorConfig
+from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE, NUM_TORQUES
 
 Array = NDArray[np.float64]
 
@@ -51,6 +51,9 @@ equations are integrated."""
 def angle_std(bits: int) -> float:
     """Of a code of so many bits per turn, rad: it is off by up to half a step either way, evenly."""
     return 2 * math.pi / 2**bits / math.sqrt(12)
+
+LEAST_ANGLE: Final = 1e-6
+"""rad, alike of encoders without a code."""
 
 
 class Precision(NamedTuple):
@@ -109,17 +112,14 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
     torques = signals.torque_commanded.transpose("time", "leg").values[rows]
     own = scenario.actuator.torque_limit
     limit = mechanism.effort_limit if own is None else own
-    values = np.full((len(rows), NUM_MEASURED), np.nan)
-    values[:, 6:] = signals.measurement.transpose("time", "state").values[rows]
-    noise = np.array(scenario.sensor.noise_std)
-    std = np.concatenate([np.full(6, np.inf), np.hypot(noise, LEAST_STD)])
+    times, values, std = _measured(signals.measurement, scenario, samples, rows)
     believed = float(signals.delay_estimate.values[-1])
     return _checked(
         Log(
-            name=path.name,
+            name=str(path),
             sent=samples,
             torques=_limited(torques, limit),
-            times=samples,
+            times=times,
             values=values,
             std=std,
             gravity=STANDARD_GRAVITY if scenario.plant.gravity else 0.0,
@@ -127,6 +127,33 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
         ),
         path,
     )
+
+
+def _measured(
+    signal: xr.DataArray, scenario: Scenario, samples: Array, rows: NDArray[np.intp]
+) -> tuple[Array, Array, Array]:
+    """Instants (n,), values (n, 18) and their std (18,) of a run's measurements.
+
+    Args:
+        signal: of the record.
+        scenario: of the run.
+        samples: instants of the controller's samples, s.
+        rows: of the record that show them.
+    """
+    sensor, said = scenario.sensor, signal.transpose("time", ...).values[rows]
+    if isinstance(sensor, StateSensorConfig):
+        values = np.full((len(rows), NUM_MEASURED), np.nan)
+        values[:, POSE.start :] = said
+        noise = np.hypot(sensor.noise_std, LEAST_STD)
+        return samples, values, np.concatenate([np.full(6, np.inf), noise])
+    # What was read in the period before a sample, the oldest first; before the first one, nothing.
+    ago = np.arange(sensor.samples - 1, -1, -1) * scenario.controller.period / sensor.samples
+    times, angles = (samples[:, None] - ago).ravel(), said.reshape(-1, NUM_LEGS)
+    kept = times > -1e-9
+    values = np.full((kept.sum(), NUM_MEASURED), np.nan)
+    values[:, ANGLES] = angles[kept]
+    error = LEAST_ANGLE if sensor.bits is None else angle_std(sensor.bits)
+    return times[kept], values, np.concatenate([np.full(6, error), np.full(NUM_STATE, np.inf)])
 
 
 def _scenario_of(path: Path, signals: xr.Dataset) -> Scenario:
@@ -139,9 +166,11 @@ def _scenario_of(path: Path, signals: xr.Dataset) -> Scenario:
 
 def _run_problem(signals: xr.Dataset, scenario: Scenario) -> str | None:
     """Why a run cannot serve as a log, or None."""
+    sensor = scenario.sensor
+    states = isinstance(sensor, StateSensorConfig)
     shapes = {
         "torque_commanded": {"leg": NUM_TORQUES},
-        "measurement": {"state": NUM_STATE},
+        "measurement": {"state": NUM_STATE} if states else {"encoder": NUM_LEGS * sensor.samples},
         "delay_estimate": {},
     }
     for name, others in shapes.items():
@@ -205,7 +234,7 @@ def _of_csv(path: Path, mechanism: Mechanism, precision: Precision, gravity: flo
         if columns[0] in table:
             values[:, part] = np.column_stack([table[name] for name in columns])
     log = Log(
-        name=path.name,
+        name=str(path),
         sent=time[said][changed],
         torques=_limited(torques[said][changed], mechanism.effort_limit),
         times=time,

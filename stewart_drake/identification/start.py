@@ -95,14 +95,16 @@ def coarse_delay(
 def _misfit(
     needed: Array, middles: Array, delay: float, log: Log, span: Array, weights: Array
 ) -> float:
-    """Mean square in (N m)^2 of torques needed less those that act, whatever the bias."""
+    """Mean square of torques needed less those that act, whatever the bias, as a share of the
+    former's own: late delays leave fewer windows to compare, in which less may have moved."""
     there = np.isfinite(needed).all(axis=1) & (middles + span[0] >= log.sent[0] + delay)
     if there.sum() < _LEAST_WINDOWS:
         return np.inf
     instants = middles[there, None] + span
     acting = log.acting(instants.ravel(), delay).reshape(*instants.shape, NUM_TORQUES)
     apart = needed[there] - np.einsum("s,nsj->nj", weights, acting)
-    return float(np.mean((apart - apart.mean(axis=0)) ** 2))
+    left, whole = (np.var(one, axis=0).sum() for one in (apart, needed[there]))
+    return float(left / whole) if whole > 0 else np.inf
 
 
 def segment_length(log: Log, poses: Array, mechanism: Mechanism, delay: float) -> float:
