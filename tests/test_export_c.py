@@ -14,8 +14,8 @@ from stewart_drake.scenario.loading import load_scenario
 
 NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
 FAULTS = (
-    "sensor.faults=[{kind: missing, from: 1.0, to: 1.2}, {kind: frozen, from: 2.0, to: 2.2}, "
-    "{kind: spike, from: 3.0, to: 3.2}, {kind: spike, size: 0.3, from: 3.5, to: 3.6}]"
+    "sensor.faults=[{kind: missing, from: 0.5, to: 0.6}, {kind: frozen, from: 0.9, to: 1.0}, "
+    "{kind: spike, from: 1.2, to: 1.3}, {kind: spike, size: 0.3, from: 1.5, to: 1.55}]"
 )
 SHORT = ("plant.kind=exact", "duration=5.0")
 RUNS = {
