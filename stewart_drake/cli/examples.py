@@ -14,6 +14,7 @@ EXAMPLES: Final = {
     ),
     "compare": ("stewart-drake compare paper --set start=on_reference --set queue=reference",),
     "export": ("stewart-drake export out/lqi/signals.nc --out lqi.csv",),
+    "export-c": ("stewart-drake export-c paper --out out/board",),
     "report": ("stewart-drake report paper --set plant.kind=exact --out out/report",),
     "list": ("stewart-drake list",),
     "model check": ("stewart-drake model check paper --out out/paper",),

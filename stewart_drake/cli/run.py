@@ -17,6 +17,7 @@ from stewart_drake.cli.common import (
     ScenarioName,
     Settings,
     check_file,
+    check_writable,
     open_meshcat,
 )
 from stewart_drake.files.errors import ConfigError
@@ -167,6 +168,28 @@ def export(
     check_file(out)
     write_csv(dataset, out)
     echo(f"written to {out}")
+
+
+def export_c(
+    scenario: ScenarioName = "paper",
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where it goes.")] = Path("out/export-c"),
+    controller: Controller = None,
+    settings: Settings = None,
+    single: Annotated[
+        bool, typer.Option("--single", help="Numbers of single precision; without estimator.")
+    ] = False,
+) -> None:
+    """Write the controller as C, for a board.
+
+    A folder that builds with its own Makefile; its test replays a run of the scenario.
+    """
+    from stewart_drake.report.export_c import exported, write
+    from stewart_drake.scenario.loading import load_scenario
+
+    check_writable(out)
+    files = exported(load_scenario(scenario, controller, settings or ()), single)
+    write(files, out)
+    echo(f"written to {out}: {len(files)} files; make test replays the run")
 
 
 def compare(

@@ -1,7 +1,7 @@
 """The Riccati equation by structure-preserving doubling, in C: see native/riccati.c.
 
-The law in C designs with it. `law.riccati.lqr`, by Drake's solver, is what the law in Python and the
-analyses use, and what this is compared with.
+The law in C designs with it. `law.riccati.lqr`, by Drake's solver, is what the law in Python and
+the analyses use, and what this is compared with.
 """
 
 import ctypes

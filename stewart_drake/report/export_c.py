@@ -44,6 +44,7 @@ MOST_SAMPLES: Final = 100
 """Of a run that the test replays."""
 TOLERANCES: Final = {"double": 1e-9, "float": 1e-2}
 """Of the torque that the replay may differ by, as a share of its peak."""
+_UNMEASURED: Final = "It was not compiled where it was written: `make size` and `make test` tell.\n"
 
 
 class Step(NamedTuple):
@@ -121,16 +122,21 @@ def recorded_law(scenario: Scenario) -> RecordedLqi:
         found.append(RecordedLqi(**parts))
         return found[-1]
 
-    simulate(scenario, law=recorded, margin=False)
+    result = simulate(scenario, law=recorded, margin=False)
+    if result.failure is not None:
+        raise ConfigError(
+            f"scenario: {result.failure}; expected one whose run the test can replay to its end"
+        )
     return found[-1]
 
 
-def exported(scenario: Scenario, single: bool = False) -> dict[str, str]:
+def exported(scenario: Scenario, single: bool = False, measured: bool = True) -> dict[str, str]:
     """Name -> text of the files of an export.
 
     Args:
         scenario: whose controller it is.
         single: numbers of single precision.
+        measured: whether it is compiled and run here, for what its README tells.
 
     Raises:
         ConfigError: see `recorded_law`; single precision with the estimator.
@@ -162,7 +168,9 @@ def exported(scenario: Scenario, single: bool = False) -> dict[str, str]:
         values[name.upper()] = ", ".join(str(getattr(step, name)) for step in law.steps)
     for path in sorted(TEMPLATES.iterdir()):
         files[path.name] = _filled(path.read_text("utf-8"), values)
-    files["README.md"] = _filled(files["README.md"], {"SIZES": _sizes(files)})
+    files["README.md"] = _filled(
+        files["README.md"], {"SIZES": _sizes(files) if measured else _UNMEASURED}
+    )
     return files
 
 
@@ -210,7 +218,7 @@ def _sizes(files: Mapping[str, str]) -> str:
     """What `make test` and `make size` say here, or how to find out."""
     command = compiler()
     if command is None or shutil.which("make") is None:
-        return "There was no compiler where this was written: `make size` and `make test` tell.\n"
+        return _UNMEASURED
     with tempfile.TemporaryDirectory() as folder:
         for name, text in files.items():
             Path(folder, name).write_text(text, "utf-8")
@@ -225,5 +233,5 @@ def _made(folder: str, command: Iterable[str], target: str) -> str:
         arguments, cwd=folder, env=surroundings, capture_output=True, text=True, check=False
     )
     if done.returncode != 0:
-        raise ConfigError(f"export-c: make {target} failed: {done.stderr.strip() or done.stdout}")
+        raise ConfigError(f"export-c: make {target} failed: {done.stdout}{done.stderr}".strip())
     return done.stdout.strip()

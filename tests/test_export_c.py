@@ -1,0 +1,164 @@
+"""The controller as a folder of C: it builds strictly, and replays what Python answered."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from stewart_drake.cli import main
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.native import build
+from stewart_drake.report import export_c
+from stewart_drake.scenario.loading import load_scenario
+
+NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-3,1e-3,1e-3,1e-4,1e-4,1e-4]"
+FAULTS = (
+    "sensor.faults=[{kind: missing, from: 1.0, to: 1.3}, {kind: frozen, from: 2.0, to: 2.3}, "
+    "{kind: spike, from: 3.0, to: 3.2}, {kind: spike, size: 0.3, from: 3.5, to: 3.6}]"
+)
+SHORT = ("plant.kind=exact", "duration=5.0")
+RUNS = {
+    "paper": ("paper", ()),
+    "bad measurements and outliers": ("gravity", (NOISE, FAULTS)),
+    "saturation, a fraction of a period": (
+        *("desktop", ("delay.fraction=0.37", "actuator.torque_limit=0.025")),
+    ),
+    "late measurements": ("motion_base", ("sensor.delay=0.2",)),
+    "without estimator": ("gravity", ("controller.estimator=none",)),
+}
+QUICK = ("bad measurements and outliers", "saturation, a fraction of a period")
+BITS = {"bad measurements and outliers": (8, 32), "saturation, a fraction of a period": (64,)}
+
+
+@pytest.fixture(autouse=True)
+def compiler() -> list[str]:
+    found = build.compiler()
+    if found is None or shutil.which("make") is None:
+        pytest.skip("there is no C compiler, or no make")
+    return found
+
+
+def exported(folder: Path, name: str, settings: tuple[str, ...], single: bool = False) -> Path:
+    """Of a short run, without what is measured for the README."""
+    scenario = load_scenario(name, settings=(*SHORT, *settings))
+    export_c.write(export_c.exported(scenario, single, measured=False), folder)
+    return folder
+
+
+def made(folder: Path, target: str, *variables: str) -> str:
+    """What make says; it must succeed."""
+    done = subprocess.run(
+        ["make", "-s", target, *variables], cwd=folder, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(n, marks=() if n in QUICK else pytest.mark.soak) for n in RUNS]
+)
+def test_the_replay_is_exact(case: str, tmp_path: Path) -> None:
+    """1e-9 of the peak torque, the same statuses; strict, and under the sanitizers."""
+    name, settings = RUNS[case]
+    folder = exported(tmp_path, name, settings)
+    said = made(folder, "test")
+    assert "50 steps" in said and "statuses that differ: 0" in said
+    made(folder, "check")
+    statuses = (folder / "stewart_test.c").read_text().split("status[STEPS] = {")[1].split("}")[0]
+    seen = {int(status) for status in statuses.split(",")}
+    for bit in BITS.get(case, ()):
+        assert any(status & bit for status in seen)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("compiler", ["clang", "arm-linux-gnueabihf-gcc -static"])
+def test_other_compilers_and_processors(compiler: str, tmp_path: Path) -> None:
+    emulator = "qemu-arm" if compiler.startswith("arm") else ""
+    for needed in (compiler.split()[0], emulator or "make"):
+        if shutil.which(needed) is None:
+            pytest.skip(f"there is no {needed}")
+    folder = exported(tmp_path, "paper", ("duration=2.0",))
+    assert "statuses that differ: 0" in made(
+        folder, "test", f"CC={compiler}", f"EMULATOR={emulator}"
+    )
+
+
+def test_a_controller_that_is_off_is_told(tmp_path: Path) -> None:
+    """What the replay says to a change of one weight, and to another fault."""
+    folder = exported(tmp_path, "paper", ("duration=2.0",))
+    config, test = folder / "stewart_config.c", folder / "stewart_test.c"
+    right = config.read_text(), test.read_text()
+    made(folder, "test", "CFLAGS=-O0")
+    for place, old, new in (
+        (0, ".period = 0.1", ".period = 0.1000001"),
+        (1, "status[STEPS] = {0", "status[STEPS] = {8"),
+    ):
+        texts = list(right)
+        assert old in texts[place]
+        texts[place] = texts[place].replace(old, new)
+        config.write_text(texts[0])
+        test.write_text(texts[1])
+        done = subprocess.run(["make", "-s", "test", "CFLAGS=-O0"], cwd=folder, capture_output=True)
+        assert done.returncode != 0
+
+
+def test_single_precision_without_the_filter_only(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"controller.estimator: got 'parameters' with --single"):
+        exported(tmp_path, "paper", (), single=True)
+    folder = exported(tmp_path, "gravity", ("controller.estimator=none",), single=True)
+    said = made(folder, "test")
+    assert "tolerance 1e-02" in said
+    error = float(said.split("largest error ")[1].split()[0])
+    assert 1e-9 < error < 1e-2
+
+
+def test_the_sizes_are_told_and_kept_to(tmp_path: Path) -> None:
+    """For `paper`: text of 180 kB at the most, state of 8 kB."""
+    files = export_c.exported(load_scenario("paper", settings=(*SHORT, "duration=1.0")))
+    readme = files["README.md"]
+    text = int(readme.split("(TOTALS)")[0].splitlines()[-1].split()[0])
+    state = int(readme.split("state ")[1].split()[0])
+    assert 50_000 < text <= 180_000 and 3000 < state <= 8000
+    assert "@" not in readme
+
+
+@pytest.mark.parametrize(
+    ("settings", "field"),
+    [
+        (("controller.prediction=linear",), "controller.prediction"),
+        (("controller.delay_estimator=constant",), "controller.delay_estimator"),
+        (("link.kind=network",), "link.kind"),
+    ],
+)
+def test_what_is_not_exported_is_refused_by_its_field(
+    settings: tuple[str, ...], field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "board"
+    options = [word for setting in settings for word in ("--set", setting)]
+    assert main(["export-c", "paper", "--out", str(folder), *options]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and f"{field}: is not exported as it is" in error
+    assert not folder.exists()
+
+
+def test_a_run_that_does_not_end_is_refused() -> None:
+    scenario = load_scenario("gravity", settings=("plant.kind=exact", "queue=zero"))
+    with pytest.raises(ConfigError, match="expected one whose run the test can replay"):
+        export_c.exported(scenario, measured=False)
+
+
+def test_the_command_writes_all_files_or_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "board"
+    command = ["export-c", "paper", "--out", str(folder), "--set", "duration=0.5"]
+    assert main(command) == 0
+    assert "make test" in capsys.readouterr().out
+    names = sorted(path.name for path in folder.iterdir())
+    assert {"stewart.h", "law.c", "stewart_config.c", "stewart_test.c", "Makefile"} < set(names)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    files = {**dict.fromkeys(names, "other"), "nowhere/law.c": ""}
+    with pytest.raises(FileNotFoundError):
+        export_c.write(files, folder)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before

@@ -1,0 +1,361 @@
+"""The law in C against the law in Python, step by step, and the Riccati equation behind it."""
+
+import ctypes
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import stewart_drake as sd
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.delay_model import DelayedModel, delayed_model
+from stewart_drake.law.doubling import Doubling
+from stewart_drake.law.error_model import linear_model
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.motion import Preview
+from stewart_drake.law.native_law import NativeLqi, serving, uncovered
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.riccati import RiccatiError, lqr, reduced_gain
+from stewart_drake.loop.experiment import believed_queue, compose_law, control_law, prepare
+from stewart_drake.native import library as native_library
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.trajectories import evaluate
+from tests.backends import switched
+from tests.mechanisms import PAPER, random_mechanism
+from tests.test_riccati import riccati_gain
+
+Array = NDArray[np.float64]
+Spoil = Callable[[int, Array], Array]
+NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-3,1e-3,1e-3,1e-4,1e-4,1e-4]"
+DIRTY = (
+    NOISE,
+    "plant.payload_mass=0.02",
+    "plant.joint_damping=1e-4",
+    "plant.torque_bias=[1e-3,-1e-3,2e-3,0,1e-3,-2e-3]",
+)
+
+
+@pytest.fixture(scope="module")
+def library() -> ctypes.CDLL:
+    """The compiled one."""
+    with switched(None):
+        found = native_library.backend()
+    if found.library is None:
+        pytest.skip(found.reason)
+    return found.library
+
+
+# The Riccati equation.
+
+
+def problem(seed: int) -> tuple[DelayedModel, Array, Array]:
+    """A random machine at home, moving, with any delay and weights."""
+    rng = np.random.default_rng(seed)
+    mechanism = random_mechanism(rng)
+    dynamics = StewartDynamics(mechanism, gravity=bool(rng.integers(2)))
+    size = 0.05 * np.repeat([1.0, mechanism.crank_lengths.min()], 3)
+    pose = mechanism.home + size * rng.normal(0, 1, 6)
+    A, B, _ = dynamics.derivatives(
+        pose, size * rng.normal(0, 5, 6), dynamics.inverse_dynamics(pose, np.zeros(6), np.zeros(6))
+    )
+    fraction = rng.choice([0.0, rng.uniform(0.05, 0.95)])
+    model = delayed_model(
+        linear_model(A, B), rng.uniform(0.01, 0.1), int(rng.integers(20)), fraction, integral=True
+    )
+    peak = np.abs(dynamics.inverse_dynamics(pose, np.zeros(6), 20 * size)).max()
+    Q = np.diag(10 ** rng.uniform(-1, 1) / np.tile(size, 2) ** 2)
+    return model, Q, np.eye(6) * 10 ** rng.uniform(-1, 1) / peak**2
+
+
+def exact_gain(A: Array, B: Array, Q: Array, R: Array, P: Array) -> Array:
+    """In extended precision, by value iteration from a solution that is nearly right."""
+    a, b, q, r, p = (np.asarray(x, np.longdouble) for x in (A, B, Q, R, P))
+    for _ in range(5000):
+        after = q + a.T @ p @ (a - b @ riccati_gain(p, a, b, r))
+        after = (after + after.T) / 2
+        settled = np.abs(after - p).max() < 1e-17 * np.abs(p).max()
+        p = after
+        if settled:
+            break
+    return riccati_gain(p, a, b, r).astype(np.float64)
+
+
+def assert_exact(library: ctypes.CDLL, seed: int) -> None:
+    """1e-12 of the largest entry from the exact gain, and from Drake's as far as that is exact."""
+    model, Q, R = problem(seed)
+    given: list[Array] = []
+
+    def by_drake(*matrices: Array) -> tuple[Array, Array]:
+        given[:] = matrices
+        return lqr(*matrices)
+
+    expected = reduced_gain(model, Q, R, by_drake)
+    doubling = Doubling(library, len(given[0]))
+    found = reduced_gain(model, Q, R, doubling)
+    K, P = doubling(*given)
+    exact = exact_gain(*given, P)
+    assert np.abs(K - exact).max() < 1e-12 * np.abs(exact).max(), seed
+    drakes = np.abs(lqr(*given)[0] - exact).max() / np.abs(exact).max()
+    size = np.abs(expected).max()
+    assert np.abs(found - expected).max() < max(1e-12, 100 * drakes) * size, seed
+
+
+@pytest.mark.parametrize("part", range(3))
+def test_gains_are_exact(library, part: int) -> None:
+    for seed in range(10 * part, 10 * part + 10):
+        assert_exact(library, seed)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("part", range(20))
+def test_gains_of_a_thousand_machines_are_exact(library, part: int) -> None:
+    for seed in range(50 * part, 50 * part + 50):
+        assert_exact(library, seed)
+
+
+@pytest.mark.parametrize("order", [6, 12, 18, 24])
+def test_the_cost_of_a_run_is_what_the_solution_says(library, order: int) -> None:
+    """Brute force: x'Px is what the loop costs from x on."""
+    rng = np.random.default_rng(order)
+    A = rng.normal(0, 1.2 / np.sqrt(order), (order, order))
+    B, Q, R = rng.normal(0, 1, (order, 6)), np.eye(order), np.diag(rng.uniform(0.5, 2, 6))
+    K, P = Doubling(library, order)(A, B, Q, R)
+    x = first = rng.normal(0, 1, order)
+    cost = 0.0
+    for _ in range(2000):
+        u = -K @ x
+        cost += x @ Q @ x + u @ R @ u
+        x = A @ x + B @ u
+    assert np.linalg.norm(x) < 1e-12
+    assert cost == pytest.approx(first @ P @ first, rel=1e-11)
+
+
+def test_what_has_no_solution_is_a_failure(library) -> None:
+    one, nothing = np.eye(12), np.zeros((12, 6))
+    B = np.vstack([np.eye(6), np.zeros((6, 6))])
+    doubling = Doubling(library, 12)
+    for A, b, Q, R in (
+        (2 * one, nothing, one, np.eye(6)),  # no torque reaches it
+        (2 * one, B, one, np.eye(6)),  # nor half of it
+        (one, B, 0 * one, np.eye(6)),  # the cost does not see it
+        (one * np.nan, B, one, np.eye(6)),
+        (one, B, one, np.zeros((6, 6))),
+    ):
+        with pytest.raises(RiccatiError, match="doubling"):
+            doubling(A, b, Q, R)
+    with pytest.raises(ValueError, match="order: got 25; expected 1 to 24"):
+        Doubling(library, 25)
+
+
+# Step by step.
+
+
+def spoiled(k: int, y: Array) -> Array:
+    """Lost, frozen, impossible and outlying measurements, and a plate that was moved by hand."""
+    y = y.copy()
+    if k in (12, 13):
+        y[3] = np.nan
+    if 30 <= k < 34:
+        y[:] = np.nan
+    if k in (40, 41):
+        y[0] += 0.3
+    if k in (46, 47):
+        y = STUCK
+    if k == 52:
+        y[5] += 1.0
+    if 60 <= k < 66:
+        y[3] += 0.004
+    return y
+
+
+STUCK = np.concatenate([PAPER.home + 1e-4, np.full(6, 1e-3)])
+CASES: dict[str, tuple[str, tuple[str, ...], Spoil | None]] = {
+    "paper": ("paper", (), None),
+    "gravity": ("gravity", (NOISE,), None),
+    "a fraction of a period": ("desktop", ("delay.fraction=0.3",), None),
+    "no delay": ("gravity", ("delay.steps=0",), None),
+    "less than a period": ("paper", ("delay.steps=0", "delay.fraction=0.5"), None),
+    "without estimator": ("motion_base", ("controller.estimator=none",), None),
+    "saturation": ("paper", (*DIRTY, "actuator.torque_limit=0.03"), None),
+    "bad measurements": ("gravity", DIRTY, spoiled),
+    "bad measurements without estimator": (
+        *("gravity", (NOISE, "controller.estimator=none"), spoiled),
+    ),
+    "late measurements": ("gravity", (*DIRTY, "sensor.delay=0.2"), spoiled),
+    "from the reference": (
+        *("paper", ("queue=reference", "start=on_reference", "controller.quiet_start=false"), None),
+    ),
+}
+HAPPENED = {
+    "saturation": ("saturated_steps",),
+    "bad measurements": (
+        *("measurements_missing", "measurements_frozen", "measurements_rejected"),
+    ),
+}
+
+
+class Pair:
+    """Both laws in one loop with the plant as it is: what the one in Python says acts."""
+
+    def __init__(self, library: ctypes.CDLL, name: str, settings: tuple[str, ...]) -> None:
+        self.scenario = load_scenario(name, settings=("plant.kind=exact", *settings))
+        experiment = prepare(self.scenario)
+        self.law, self.planned, _ = control_law(experiment)
+        self.native = NativeLqi(self.law, library)
+        queue = believed_queue(experiment, self.law.timeline)
+        self.one: Any = self.law.initial_memory(queue)
+        self.other: Any = self.native.initial_memory(queue)
+        sc = self.scenario
+        self.truth = StewartDynamics(
+            experiment.truth, gravity=sc.plant.gravity, parameters=sc.plant.parameters
+        )
+        self.states = [experiment.start]
+        self.late = round(sc.sensor.delay / sc.controller.period)
+        self.weights = np.array([sc.controller.w_Q, sc.controller.w_R])
+
+    def step(self, k: int, noise: Array, spoil: Spoil | None) -> float:
+        """By how much the torques differ."""
+        law, period = self.law, self.law.timeline.period
+        age = min(self.late, k)
+        y = self.states[-1 - age] + noise
+        y = y if spoil is None else spoil(k, y)
+        times = law.preview_times
+        reference = [evaluate(self.planned, max(0.0, k * period + t)) for t in times]
+        given = (
+            Measurement.of(y, age * period),
+            Preview(times, np.array(reference)),
+            self.weights,
+        )
+        self.one = law.step(self.one, *given)
+        self.other = self.native.step(self.other, *given)
+        gap = float(np.abs(self.one.torque - self.other.torque).max())
+        self.other.data["in_flight"][: self.other.length] = self.one.in_flight
+        (torques, durations), _ = law.timeline.last_period(self.one.in_flight)
+        self.states.append(self.truth.predict(self.states[-1], torques, durations, 8)[-1])
+        return gap
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_step_by_step_the_torques_are_those_of_python(library, case: str) -> None:
+    """1e-9 of the peak torque; and all that is recorded, to the same."""
+    name, settings, spoil = CASES[case]
+    pair, rng = Pair(library, name, settings), np.random.default_rng(7)
+    noise = np.array(pair.scenario.sensor.noise_std)
+    gaps, peak = [], 0.0
+    for k in range(70):
+        gaps.append(pair.step(k, noise * rng.normal(0, 1, 12), spoil))
+        one, other = pair.one, pair.other
+        peak = max(peak, float(np.abs(one.torque).max()))
+        assert one.counts == other.counts, k
+        for part in (
+            lambda m: m.error,
+            lambda m: m.integral,
+            lambda m: m.gain,
+            lambda m: m.measurement,
+            lambda m: m.weights,
+            lambda m: m.belief.state,
+            lambda m: m.belief.measured,
+            lambda m: m.belief.parameters,
+            lambda m: m.belief.estimate.parameter_std,
+            lambda m: m.belief.delay,
+        ):
+            a, b = part(one), part(other)
+            assert a.shape == b.shape
+            assert np.array_equal(np.isnan(a), np.isnan(b)), k
+            size = np.abs(a[np.isfinite(a)]).max(initial=1e-9)
+            assert np.nanmax(np.abs(a - b), initial=0.0) <= 1e-7 * size + 1e-11, k
+    assert max(gaps) <= 1e-9 * peak
+    for count in HAPPENED.get(case, ()):
+        assert getattr(pair.one.counts, count) > 0
+
+
+def test_what_was_sent_in_its_place_is_in_flight(library) -> None:
+    pair = Pair(library, "paper", ())
+    for k in range(3):
+        pair.step(k, np.zeros(12), None)
+    torque, data = np.arange(6.0), pair.other.data
+    config = pair.native._config
+    library.law_sent(*(ctypes.c_void_p(a.ctypes.data) for a in (config, data, torque)))
+    assert np.array_equal(pair.other.in_flight[-1], torque)
+    assert np.array_equal(pair.other.in_flight[:-1], pair.one.in_flight[:-1])
+
+
+# Which of them steps.
+
+
+def law_of(*settings: str, controller: str | None = None) -> PredictiveLqi:
+    return compose_law(prepare(load_scenario("paper", controller, settings=settings)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "field"),
+    [
+        (("controller.prediction=linear",), "controller.prediction"),
+        (("controller.feedforward=none",), "controller.feedforward"),
+        (("controller.model=paper",), "controller.model"),
+        (("controller.integral=false",), "controller.integral"),
+        (("controller.delay_estimator=constant",), "controller.delay_estimator"),
+        (("controller.period=0.01", "delay.steps=80"), "controller.delay_steps"),
+        (("controller.period=0.01", "sensor.delay=0.3"), "sensor.delay"),
+        (("link.kind=network",), "link.kind"),
+        (("controller.estimator=none",), None),
+        ((), None),
+    ],
+)
+def test_what_the_law_in_c_has_not_is_named(settings: tuple[str, ...], field: str | None) -> None:
+    assert uncovered(law_of(*settings)) == field
+
+
+def test_a_part_of_ones_own_is_stepped_in_python(library) -> None:
+    class Mine(PredictiveLqi):
+        pass
+
+    law = law_of()
+    mine = replace(law, planner=type("Planner", (), {})())
+    assert uncovered(mine) == "controller.rejoin"
+    assert uncovered(Mine(**{name: getattr(law, name) for name in law.__dataclass_fields__})) == (
+        "law"
+    )
+    with switched(None):
+        assert serving(law).backend == "native"
+        assert serving(mine) == (mine, "python (controller.rejoin)")
+    with switched("0"):
+        assert serving(law) == (law, "python (STEWART_NATIVE=0)")
+
+
+def test_the_summary_says_which(library) -> None:
+    for setting, expected in (
+        ("controller.estimator=parameters", "native"),
+        ("controller.prediction=linear", "python (controller.prediction)"),
+    ):
+        scenario = load_scenario("paper", settings=["duration=0.3", setting])
+        with switched(None):
+            summary = sd.simulate(scenario, margin=False).summary
+        assert summary["controller_backend"] == expected
+        assert json.dumps(summary["controller_backend"])
+
+
+def test_shapes_that_do_not_fit_are_refused(library) -> None:
+    law = law_of()
+    native = NativeLqi(law, library)
+    with pytest.raises(ValueError, match=r"queue: got shape \(2, 6\); expected \(8, 6\)"):
+        native.initial_memory(np.zeros((2, 6)))
+    memory = native.initial_memory(np.zeros((8, 6)))
+    preview = np.tile(np.concatenate([PAPER.home, np.zeros(12)]), (len(law.preview_times), 1))
+    motion = Preview(law.preview_times, preview)
+    y, weights = np.concatenate([PAPER.home, np.zeros(6)]), np.ones(2)
+    for arguments, field in (
+        ((Measurement.of(y[:6]), motion, weights), "measurement"),
+        ((Measurement.of(y), lambda times: preview[:, :6], weights), "preview"),
+        ((Measurement.of(y), motion, np.ones(3)), "weights"),
+        ((Measurement.of(y, 0.1), motion, weights), "measurement: got an age of 0.1 s"),
+    ):
+        with pytest.raises(ValueError, match=field):
+            native.step(memory, *arguments)
+    after = native.step(memory, Measurement.of(y), motion, weights)
+    assert not np.array_equal(after.data, memory.data)  # which stays as it was
+    assert np.isnan(memory.weights).all()
