@@ -9,12 +9,15 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import fields
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import Sine
@@ -22,8 +25,17 @@ from pydrake.systems.primitives import Sine
 import stewart_drake as sd
 from stewart_drake.dynamics.compiled import Buffered
 from stewart_drake.files.versions import versions
+from stewart_drake.law.delay_model import delayed_model
+from stewart_drake.law.doubling import Doubling
+from stewart_drake.law.error_model import linear_model
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.motion import Preview
+from stewart_drake.law.native_law import NativeLqi
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.riccati import lqr, reduced_gain
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.native.library import SWITCH, backend
+from stewart_drake.report.export_c import recorded_law
 from stewart_drake.scenario.signals import NUM_PARAMETERS
 
 RESULTS = Path(__file__).parent / "results"
@@ -119,6 +131,75 @@ WORK: dict[str, tuple[Callable[..., float], tuple[object, ...]]] = {
 }
 
 
+def replayed_steps(name: str, samples: int = 60, repeats: int = 8) -> dict[str, list[float]]:
+    """Seconds of each step of a scenario's law, in Python and in C, least of the repeats.
+
+    Both are given what happened in a run, in turns; the law in Python on this process's dynamics.
+    """
+    scenario = sd.load_scenario(name, settings=["plant.kind=exact", f"duration={samples / 10}"])
+    recorded = recorded_law(scenario)
+    law = PredictiveLqi(**{f.name: getattr(recorded, f.name) for f in fields(PredictiveLqi)})
+    library = backend().library
+    assert library is not None
+    steppers: dict[str, Any] = {"python": law, "c": NativeLqi(law, library)}
+    least = {which: [np.inf] * len(recorded.steps) for which in steppers}
+    for which, stepper in [*steppers.items()] * repeats:
+        memory = stepper.initial_memory(recorded.queue[0])
+        for k, step in enumerate(recorded.steps):
+            given = Measurement.of(step.measurement), Preview(law.preview_times, step.preview)
+            started = time.perf_counter()
+            memory = stepper.step(memory, *given, step.weights)
+            least[which][k] = min(least[which][k], time.perf_counter() - started)
+            memory.in_flight[-1] = step.sent
+    return least
+
+
+def riccati_times(fraction: float) -> tuple[int, float, float]:
+    """States, and seconds of Drake's solver and of doubling, in turns, at home under gravity."""
+    dynamics = sd.StewartDynamics(MECHANISM)
+    model = delayed_model(
+        linear_model(*dynamics.linearize(MECHANISM.home)), 0.1, 8, fraction, integral=True
+    )
+    given: list[Any] = []
+
+    def keep(*matrices: Any) -> Any:
+        given[:] = [np.asfortranarray(matrix) for matrix in matrices]
+        return lqr(*matrices)
+
+    reduced_gain(model, 1e4 * np.eye(12), np.eye(6), keep)
+    library = backend().library
+    assert library is not None
+    doubling, times = Doubling(library, len(given[0])), []
+    for _ in range(60):
+        one = repeated(lambda: DiscreteAlgebraicRiccatiEquation(*given), 3)
+        times.append((one, repeated(lambda: doubling(*given), 3)))
+    drake, ours = np.min(times, axis=0)
+    return len(given[0]), float(drake), float(ours)
+
+
+def controller_lines() -> list[str]:
+    """Rows of the law's step and of the Riccati equation."""
+    lines = [
+        "| step of the law | Python, median us | C, median us | ratio | C, worst / median |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for name in ("paper", "gravity"):
+        python, c = replayed_steps(name).values()
+        fed = [k for k, seconds in enumerate(c) if k >= 8]  # before, nothing is fed back
+        mid = [float(np.median([times[k] for k in fed])) for times in (python, c)]
+        worst = max(c[k] for k in fed) / mid[1]
+        lines.append(
+            f"| `{name}` | {1e6 * mid[0]:.4g} | {1e6 * mid[1]:.4g} | {mid[0] / mid[1]:.1f} | "
+            f"{worst:.2f} |"
+        )
+    lines += ["", "| Riccati equation, states | Drake, us | doubling, us | ratio |"]
+    lines += ["| --- | --- | --- | --- |"]
+    for fraction in (0.0, 0.5):
+        order, drake, ours = riccati_times(fraction)
+        lines.append(f"| {order} | {1e6 * drake:.4g} | {1e6 * ours:.4g} | {drake / ours:.1f} |")
+    return lines
+
+
 def use(value: str) -> None:
     """Of a process that has not made any function yet."""
     os.environ[SWITCH] = value
@@ -152,6 +233,9 @@ def main() -> None:
     for work, times in measure().items():
         numbers = " | ".join(f"{1e6 * times[name]:.4g}" for name in BACKENDS)
         lines.append(f"| {work} | {numbers} | {times['casadi'] / times['native']:.2f} |")
+    lines += ["", "Least times of repeats, both in turns; the law in Python on the compiled dynamics:", ""]
+    with ProcessPoolExecutor(1, get_context("spawn"), use, ("require",)) as pool:
+        lines += pool.submit(controller_lines).result()
     text = "\n".join(lines) + "\n"
     print(text)
     RESULTS.mkdir(exist_ok=True)

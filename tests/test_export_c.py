@@ -12,15 +12,15 @@ from stewart_drake.native import build
 from stewart_drake.report import export_c
 from stewart_drake.scenario.loading import load_scenario
 
-NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-3,1e-3,1e-3,1e-4,1e-4,1e-4]"
+NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
 FAULTS = (
-    "sensor.faults=[{kind: missing, from: 1.0, to: 1.3}, {kind: frozen, from: 2.0, to: 2.3}, "
-    "{kind: spike, from: 3.0, to: 3.2}, {kind: spike, size: 0.3, from: 3.5, to: 3.6}]"
+    "sensor.faults=[{kind: missing, from: 0.5, to: 0.6}, {kind: frozen, from: 0.9, to: 1.0}, "
+    "{kind: spike, from: 1.2, to: 1.3}, {kind: spike, size: 0.3, from: 1.5, to: 1.55}]"
 )
 SHORT = ("plant.kind=exact", "duration=5.0")
 RUNS = {
     "paper": ("paper", ()),
-    "bad measurements and outliers": ("gravity", (NOISE, FAULTS)),
+    "bad measurements and outliers": ("desktop", (NOISE, FAULTS)),
     "saturation, a fraction of a period": (
         *("desktop", ("delay.fraction=0.37", "actuator.torque_limit=0.025")),
     ),
@@ -28,7 +28,7 @@ RUNS = {
     "without estimator": ("gravity", ("controller.estimator=none",)),
 }
 QUICK = ("bad measurements and outliers", "saturation, a fraction of a period")
-BITS = {"bad measurements and outliers": (8, 32), "saturation, a fraction of a period": (64,)}
+BITS = {"bad measurements and outliers": (8, 16, 32), "saturation, a fraction of a period": (64,)}
 
 
 @pytest.fixture(autouse=True)
@@ -63,7 +63,7 @@ def test_the_replay_is_exact(case: str, tmp_path: Path) -> None:
     name, settings = RUNS[case]
     folder = exported(tmp_path, name, settings)
     said = made(folder, "test")
-    assert "50 steps" in said and "statuses that differ: 0" in said
+    assert int(said.split()[0]) >= 50 and "statuses that differ: 0" in said
     made(folder, "check")
     statuses = (folder / "stewart_test.c").read_text().split("status[STEPS] = {")[1].split("}")[0]
     seen = {int(status) for status in statuses.split(",")}

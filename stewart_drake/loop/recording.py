@@ -74,14 +74,15 @@ class Recorder:
         peak_applied: largest torque that acted, N m.
         counts: what went wrong and was survived, as of the last sample.
         tuner_fallbacks: samples at which the tuner passed its network over.
-        controller_backend: what stepped the law.
+        controller_backend: what steps the law.
         delay: at the last sample, s: true, as it is believed in or estimated, standard deviation.
     """
 
     def __init__(self, loop: ClosedLoop) -> None:
         self._loop = loop
         self._ports: dict[str, Any] = {}
-        self._controller: Any = loop.GetSubsystemByName("controller")
+        controller: Any = loop.GetSubsystemByName("controller")
+        self._controller, self.controller_backend = controller, str(controller.backend)
         tuner = loop.GetSubsystemByName("tuner") if loop.HasSubsystemNamed("tuner") else None
         self._tuner = tuner if isinstance(tuner, AnnTuner) else None
         self._scale = loop.experiment.scale
@@ -94,7 +95,6 @@ class Recorder:
         self.on_grid, self.samples = Table(13), Table(19)
         self.peak_applied = 0.0
         self.counts, self.tuner_fallbacks = Counts(), 0
-        self.controller_backend: str = self._controller.backend
         nan = float("nan")
         self.delay: DelaySummary = {"true_s": nan, "estimated_s": nan, "std_s": nan}
 
