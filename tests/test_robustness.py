@@ -30,7 +30,7 @@ from stewart_drake.mechanism import kinematics
 from stewart_drake.native.library import backend
 from stewart_drake.report.page import Provenance, html
 from stewart_drake.report.robustness_document import document
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.config import Scenario, StateSensorConfig
 from stewart_drake.studies import robustness, statistics
 from stewart_drake.studies.failures import auc_interval, explain
 from stewart_drake.studies.ranges import Ranges, read_ranges
@@ -486,7 +486,7 @@ def test_a_draw_beyond_all_scenarios_is_an_outcome(one: Draw, field: str) -> Non
 
 @pytest.mark.parametrize(
     ("changes", "loop"),
-    [({}, "native"), ({"sensor": {"kind": "state", "delay": 0.1}}, "drake, sensor.delay")],
+    [({}, "native"), ({"sensor": StateSensorConfig(delay=0.1)}, "drake, sensor.delay")],
 )
 def test_the_summary_counts_runs_by_what_ran_them(
     tmp_path: Path, changes: dict[str, Any], loop: str
