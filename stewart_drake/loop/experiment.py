@@ -454,6 +454,15 @@ def sizing_of(experiment: Experiment) -> Sizing:
     )
 
 
+def _check_sends_torques(scenario: Scenario) -> None:
+    command = scenario.controller.command
+    if command != "torque":
+        raise ConfigError(
+            f"controller.command: got {command!r}; expected 'torque', for a law that closes its "
+            "loop across the delay"
+        )
+
+
 def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> PredictiveLqi:
     """The parts that a scenario asks for; the only place that knows their names in it.
 
