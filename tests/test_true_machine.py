@@ -11,7 +11,7 @@ import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import data_root
 from stewart_drake.loop.diagram import build_closed_loop
-from stewart_drake.loop.experiment import prepare, simulated_machine
+from stewart_drake.loop.experiment import compose_law, prepare, simulated_machine
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.scenario.signals import COULOMB
 from tests.mechanisms import PAPER
@@ -59,6 +59,23 @@ def test_friction_is_found_where_it_is_asked_for(controller: str) -> None:
     )
     assert found < 4
     assert not without < 5 * found  # or lost
+
+
+def test_the_law_sees_a_crank_turn_back() -> None:
+    """While its rate passes coulomb_speed; the paper's cranks accelerate by about 1 rad/s^2."""
+
+    def substeps(*settings: str) -> int:
+        return compose_law(prepare(sd.load_scenario("paper", settings=settings))).plant.substeps
+
+    plain = substeps("plant.coulomb_friction=1e-3")  # which nobody told
+    asked = substeps("controller.estimate_coulomb=true")
+    reference, state = prepare(sd.load_scenario("paper")).reference, []
+    for t in np.linspace(0, 10, 2001):
+        pose, rates = reference.value(t)[:, 0], reference.EvalDerivative(t, 1)[:, 0]
+        state.append(PAPER.jacobian(pose) @ rates)
+    fastest = np.abs(np.diff(state, axis=0)).max() / 5e-3
+    assert plain == 1
+    assert asked == np.ceil(0.1 * fastest / 0.02)
 
 
 @pytest.fixture

@@ -50,6 +50,7 @@ from stewart_drake.law.startup import (
     initial_queue,
     machine_torque,
     reference_torque,
+    turning_substeps,
     weight_scales,
 )
 from stewart_drake.law.timeline import Timeline
@@ -418,7 +419,10 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     sc, nominal = experiment.scenario, experiment.nominal
     c, motion = sc.controller, motion_scale(experiment)
     timeline = Timeline(c.period, believed_delay(sc))
-    substeps = choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration)
+    substeps = max(
+        choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration),
+        turning_substeps(nominal, experiment.reference, c.period, sc.duration),
+    )
     peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
     torque_scale = max(machine_torque(nominal), peak_torque)
     plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
