@@ -1,10 +1,11 @@
 """Motor encoders instead of the state: `python benchmarks/encoders.py [section ...]`.
 
 Writes benchmarks/results/encoders.md; SEEDS of the environment is the number of runs of a row, each
-with encoders whose codes begin elsewhere, FIRST the first seed. Sections: codes, rest, known, unknown, gravity, offsets,
-faults, delay, time. All runs are on the exact plant with the paper's motion and delay of 0.8 s, on
-the reference, with the shipped priors, where a row says nothing else. "Identified" are standard
-deviations as a log leaves them: 6e-5 N m, 10 g and 6e-5 N m s/rad. Times are the CPU's.
+with encoders whose codes begin elsewhere, FIRST the first seed. Sections: codes, rest, known,
+unknown, gravity, offsets, faults, delay, time. All runs are on the exact plant with the paper's
+motion and delay of 0.8 s, on the reference, with the shipped priors, where a row says nothing else.
+"Identified" are standard deviations as a log leaves them: 6e-5 N m, 10 g and 6e-5 N m s/rad. Times
+are the CPU's.
 """
 
 import os

@@ -309,7 +309,8 @@ def test_a_wrong_shape_is_an_exception(wrong: str) -> None:
 def seven(observer: Any) -> FilterSettings:
     """Without the last parameter of the equations of motion."""
     known = observer.settings.parameters
-    fewer = {f.name: getattr(known, f.name)[:7] for f in dataclasses.fields(known)}
+    columns = {f.name: getattr(known, f.name) for f in dataclasses.fields(known)}
+    fewer = {name: column[:7] for name, column in columns.items() if column is not None}
     return dataclasses.replace(observer.settings, parameters=dataclasses.replace(known, **fewer))
 
 
