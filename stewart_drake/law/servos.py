@@ -40,17 +40,21 @@ from stewart_drake.scenario.signals import (
 Array = NDArray[np.float64]
 
 
+def crank_mobility(dynamics: StewartDynamics, pose: Array) -> Array:
+    """H^-1 = Jac M^-1 Jac' (6, 6): accelerations of the cranks per torque, rad/s^2 per N m."""
+    map_ = dynamics.actuation_map(pose)  # Jac'
+    return np.asarray(map_.T @ np.linalg.solve(dynamics.mass_matrix(pose), map_))
+
+
 def crank_inertia(dynamics: StewartDynamics, pose: Array) -> Array:
     """H (6, 6) in kg m^2, of which Jac' H Jac is the mass matrix in pose coordinates."""
-    inverse = np.linalg.inv(dynamics.actuation_map(pose))  # of Jac'
-    return inverse @ dynamics.mass_matrix(pose) @ inverse.T
+    return np.linalg.inv(crank_mobility(dynamics, pose))
 
 
 def mean_inertia(dynamics: StewartDynamics) -> float:
     """J in kg m^2."""
-    return NUM_TORQUES / float(
-        np.trace(np.linalg.inv(crank_inertia(dynamics, dynamics.mechanism.home)))
-    )
+    mobility = crank_mobility(dynamics, dynamics.mechanism.home)
+    return NUM_TORQUES / float(np.trace(mobility))
 
 
 def turned(angles: Array, near: Array) -> Array:

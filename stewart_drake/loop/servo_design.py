@@ -16,7 +16,7 @@ from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ReportedTimeline, ServoPreview
-from stewart_drake.law.servos import ReportLayout, ServoLoop, crank_inertia, mean_inertia
+from stewart_drake.law.servos import ReportLayout, ServoLoop, crank_mobility, mean_inertia
 from stewart_drake.law.startup import INSTANTS
 from stewart_drake.loop.experiment import Experiment, compose_law, planned_limit
 from stewart_drake.loop.own import NOTHING
@@ -59,8 +59,8 @@ def servo_loop(experiment: Experiment) -> ServoLoop:
     )
     instants = spread_instants(sc.duration, INSTANTS)
     poses = [experiment.mechanism.home, *(experiment.reference.value(t)[:, 0] for t in instants)]
-    inertias = np.array([np.linalg.eigvalsh(crank_inertia(nominal, pose)) for pose in poses])
-    highest = loop.highest_bandwidth(inertias) / (2 * math.pi)
+    most = max(np.linalg.eigvalsh(crank_mobility(nominal, pose)).max() for pose in poses)
+    highest = loop.highest_bandwidth(np.array([1 / most])) / (2 * math.pi)
     if actuator.bandwidth >= highest:
         raise ConfigError(
             f"actuator.bandwidth: got {actuator.bandwidth:g} Hz; expected less than {highest:.3g} "
