@@ -198,9 +198,7 @@ def validate_pairs(
     for setting in settings:
         name, equals, text = setting.partition("=")
         if not equals or not name.strip():
-            raise ConfigError(
-                f"{option}: got {brief(setting)}; expected name=value{told(setting)}"
-            )
+            raise ConfigError(f"{option}: got {brief(setting)}; expected name=value{told(setting)}")
         given[name.strip()] = parse_yaml(text, f"{option}: {name.strip()}")
     try:
         return validate(type_, given, option)

@@ -112,7 +112,9 @@ def integrate(
     x, S = first.copy(), np.zeros((n, NUM_STATE, columns))
     if sensitive:
         S[:, :, FIRST] = np.eye(NUM_STATE)
-    course = Course(np.full((count, n, NUM_STATE), np.nan), np.zeros((count, n, NUM_STATE, columns)))
+    course = Course(
+        np.full((count, n, NUM_STATE), np.nan), np.zeros((count, n, NUM_STATE, columns))
+    )
     step = _sensitive_step if sensitive else _step
     with np.errstate(all="ignore"):
         for h, torques, after, sample in zip(*plan, strict=True):

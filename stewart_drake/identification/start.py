@@ -88,10 +88,7 @@ def coarse_delay(
     weights = (1 - (span / half) ** 2) ** 2
     weights /= weights.sum()
     delays = np.arange(max(0.0, believed - 3 * std), believed + 3 * std + _GRID / 2, _GRID)
-    costs = [
-        _misfit(needed, middles, delay, log, span, weights)
-        for delay in delays
-    ]
+    costs = [_misfit(needed, middles, delay, log, span, weights) for delay in delays]
     return float(delays[int(np.argmin(costs))]) if np.isfinite(costs).any() else believed
 
 
@@ -153,9 +150,7 @@ def segments_of(log: Log, start: float, length: float) -> list[Segment]:
 
 def first_states(segments: list[Segment], poses: dict[str, Array]) -> Array:
     """(n, 12) of the segments, from the poses of each log by its name."""
-    return np.array(
-        [_first_state(s.log, poses[s.log.name], s.rows[0]) for s in segments]
-    )
+    return np.array([_first_state(s.log, poses[s.log.name], s.rows[0]) for s in segments])
 
 
 def _first_state(log: Log, poses: Array, row: int) -> Array:
