@@ -19,6 +19,7 @@ EXAMPLES: Final = {
         "stewart-drake identify --plan paper --out out/plan",
         "stewart-drake identify out/lqi/signals.nc --mechanism paper --out out/machine",
     ),
+    "new": ("stewart-drake new mine --torque-limit 6 --delay 0.08",),
     "list": ("stewart-drake list",),
     "model check": ("stewart-drake model check paper --out out/paper",),
     "model sdf": ("stewart-drake model sdf paper --out paper.sdf",),

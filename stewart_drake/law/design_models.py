@@ -41,9 +41,9 @@ class DesignModel(ABC):
 
 def require_reach(mechanism: Mechanism, pose: Array) -> None:
     """Raises UnreachablePoseError for a pose (6,) out of reach or at a dead centre."""
-    margins = mechanism.reach_margins(pose)
-    if not np.all(margins > 0) or standing(mechanism, pose).sines.min() < DEAD_CENTRE_SINE:
-        raise UnreachablePoseError(margins)
+    # Beyond a leg's reach its sine is below that, too; a sine of NaN is none above it.
+    if not standing(mechanism, pose).sines.min() >= DEAD_CENTRE_SINE:
+        raise UnreachablePoseError(mechanism.reach_margins(pose))
 
 
 @dataclass(frozen=True)

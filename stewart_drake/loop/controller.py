@@ -62,6 +62,10 @@ class Sample(NamedTuple):
     seconds: float
     """Time that it took to compute; 0 before the first."""
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Sample":
+        """Drake copies what it keeps; nobody changes a memory, so that itself will do."""
+        return self
+
 
 class DelayLqiController(LeafSystem):
     """Predictive LQI, whatever parts its law is made of.

@@ -33,6 +33,8 @@ from stewart_drake.scenario.timing import Instant
 Array = NDArray[np.float64]
 
 _CHUNK = 1024
+_HELD_BY = ("controller", "density")
+"""Systems whose signals change at the controller's samples only."""
 
 
 class Table:
@@ -49,7 +51,8 @@ class Table:
         if self._used == _CHUNK:
             self._chunks.append(np.empty((_CHUNK, self._width)))
             self._used = 0
-        np.concatenate([np.atleast_1d(part) for part in parts], out=self._chunks[-1][self._used])
+        arrays = [part if isinstance(part, np.ndarray) else np.array([part]) for part in parts]
+        np.concatenate(arrays, out=self._chunks[-1][self._used])
         self._used += 1
 
     def columns(self, part: slice) -> Array:
@@ -88,6 +91,8 @@ class Recorder:
         samples = sensor.samples if isinstance(sensor, EncoderSensorConfig) else None
         self._signals, self._dimensions = run_signals(samples), run_dimensions(samples)
         self._recorded = [signal for signal in self._signals.values() if signal.source]
+        self._systems = {port: system for port, (system, _) in exported_ports().items()}
+        self._held: dict[str, Array] = {}
         self._log = Table(1 + sum(signal.size for signal in self._recorded))
         self.on_grid, self.samples = Table(13), Table(19)
         self.peak_applied = 0.0
@@ -124,12 +129,14 @@ class Recorder:
                 "std_s": float(self._port(context, "delay_std")[0]),
             }
             self.samples.append(self._error, memory.torque, memory.in_flight[-1], seconds)
+            held = (port for port, system in self._systems.items() if system in _HELD_BY)
+            self._held = {port: self._port(context, port) for port in held}
         if instant.on_grid:
             self.on_grid.append(self._instant, self._error, self._wanted[POSE])
         if instant.logged:
             # Plant and reference as they were looked at: the plant may have gone on since.
-            seen = {"state": self._state, "reference": self._wanted}
-            seen |= {n: self._port(context, n) for n in exported_ports() if n not in seen}
+            seen = self._held | {"state": self._state, "reference": self._wanted}
+            seen |= {n: self._port(context, n) for n in self._systems if n not in seen}
             row = [seen[signal.exported][signal.part] for signal in self._recorded]
             self._log.append(self._instant, *row)
 

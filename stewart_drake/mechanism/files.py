@@ -4,7 +4,7 @@ Moments of inertia may be left out; `mechanism.inertias` says what stands in for
 """
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,6 +155,17 @@ class MechanismSpec:
     legs: Annotated[list[LegSpec], Field(min_length=6, max_length=6)] | None = None
 
 
+class SixLegs(NamedTuple):
+    """What kinematics needs (`mechanism.kinematics.Legs`); see `Mechanism`."""
+
+    p_WS: Array
+    R_WS: Array
+    p_PQ: Array
+    branches: Array
+    crank_lengths: Array
+    rod_lengths: Array
+
+
 def load_mechanism(name_or_path: str | Path) -> Mechanism:
     """A shipped mechanism by name, or one from a YAML file (anything with a slash or `.yaml`).
 
@@ -212,10 +223,11 @@ def build_mechanism(spec: MechanismSpec) -> Mechanism:
         given = "neither" if spec.pattern is None else "both"
         raise ConfigError(f"pattern, legs: got {given}; expected exactly one of the two")
     if spec.pattern is not None:
-        p_WS, R_WS, p_PQ, branches = _pattern_anchors(spec.pattern)
+        legs = pattern_legs(spec.pattern, spec.crank.length, spec.rod.length)
     else:
         assert spec.legs is not None
-        p_WS, R_WS, p_PQ, branches = _explicit_anchors(spec.legs)
+        legs = _explicit_legs(spec.legs, spec.crank.length, spec.rod.length)
+    p_WS, R_WS, p_PQ, branches, crank_lengths, rod_lengths = legs
     base_radius, plate_radius = (np.hypot(p[:, 0], p[:, 1]).max() for p in (p_WS, p_PQ))
     if plate_radius >= 1 and 0 < spec.plate.mass < _PAPER * np.pi * plate_radius**2:
         raise ConfigError(
@@ -228,8 +240,8 @@ def build_mechanism(spec: MechanismSpec) -> Mechanism:
         p_WS=p_WS,
         R_WS=R_WS,
         p_PQ=p_PQ,
-        crank_lengths=np.broadcast_to(np.array(spec.crank.length), 6),
-        rod_lengths=np.broadcast_to(np.array(spec.rod.length), 6),
+        crank_lengths=crank_lengths,
+        rod_lengths=rod_lengths,
         branches=branches,
         base=_disc(spec.base, base_radius),
         plate=_disc(spec.plate, plate_radius),
@@ -264,7 +276,14 @@ def _pairs(first_deg: float, separation_deg: float) -> Array:
     return np.deg2rad(first_deg + pairs)
 
 
-def _pattern_anchors(pattern: PatternSpec) -> tuple[Array, Array, Array, Array]:
+def pattern_legs(
+    pattern: PatternSpec, crank: float | list[float], rod: float | list[float]
+) -> SixLegs:
+    """The legs of a pattern with these lengths in m, one or six of each.
+
+    Raises:
+        ConfigError: the order of the joints is none.
+    """
     if sorted(pattern.plate_order) != list(range(6)):
         raise ConfigError(
             f"pattern.plate_order: got {pattern.plate_order}; expected each of 0 to 5 once"
@@ -287,10 +306,17 @@ def _pattern_anchors(pattern: PatternSpec) -> tuple[Array, Array, Array, Array]:
             zero + pattern.plate_height,
         ]
     )
-    return p_WS, R_WS, p_PQ, np.array(pattern.branches, dtype=np.float64)
+    branches = np.array(pattern.branches, dtype=np.float64)
+    return SixLegs(p_WS, R_WS, p_PQ, branches, _six(crank), _six(rod))
 
 
-def _explicit_anchors(legs: list[LegSpec]) -> tuple[Array, Array, Array, Array]:
+def _six(lengths: float | list[float]) -> Array:
+    return np.broadcast_to(np.array(lengths, dtype=np.float64), 6)
+
+
+def _explicit_legs(
+    legs: list[LegSpec], crank: float | list[float], rod: float | list[float]
+) -> SixLegs:
     frames = []
     for leg, spec in zip(LEGS, legs, strict=True):
         axis, zero = np.array(spec.motor_axis), np.array(spec.crank_zero)
@@ -311,9 +337,11 @@ def _explicit_anchors(legs: list[LegSpec]) -> tuple[Array, Array, Array, Array]:
         x = x - (n @ x) * n
         x /= np.linalg.norm(x)
         frames.append(np.column_stack([x, np.cross(n, x), n]))
-    return (
+    return SixLegs(
         np.array([spec.shaft for spec in legs]),
         np.array(frames),
         np.array([spec.plate_joint for spec in legs]),
         np.array([spec.branch for spec in legs], dtype=np.float64),
+        _six(crank),
+        _six(rod),
     )

@@ -1,0 +1,271 @@
+"""A machine, a scenario and a first look, from a handful of measurements with a ruler and scales.
+
+The legs of a machine of threefold symmetry follow from two circles. Shafts that are d apart on a
+circle of radius R are seen from its centre under
+
+    separation = 2 asin(d / (2 R)),
+
+and so are the joints of the plate. Each of its pairs sits between two pairs of the base, and holds
+one rod of either. The height of home is that at which rods push their crank tips best: the largest
+smallest |r.t| of the six legs, r along the rod and t along the crank tip's circle, which is 0 at a
+dead centre.
+"""
+
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import replacing
+from stewart_drake.law.startup import reference_torque
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.mechanism.files import PatternSpec, SixLegs, load_mechanism, pattern_legs
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import leg_geometry, reachable_heights
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.signals import COORDINATES
+from stewart_drake.studies.mechanism_check import MechanismCheck, check_mechanism
+from stewart_drake.studies.workspace_map import travel
+
+MACHINE: Final = "machine.yaml"
+SCENARIO: Final = "scenario.yaml"
+
+LARGEST: Final = 5.0
+"""m; the parts of a larger machine are more likely in millimetres."""
+_HEIGHTS: Final = 400
+_SHARE: Final = 0.25
+"""Of the travel of z, what the first motion takes."""
+_PERIODS: Final = 25
+"""Periods of delay up to which torques are computed every 20 ms, beyond that every 100 ms."""
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What is measured on a machine; lengths in m, masses in kg.
+
+    Attributes:
+        base_radius: of the circle on which the six motor shafts lie.
+        shaft_distance: between the two shafts of a pair.
+        plate_radius: of the circle on which the rods meet the plate.
+        joint_distance: between two neighbouring joints of the plate.
+        crank: from shaft to rod.
+        rod: between the joints at its ends.
+        plate_mass: of the plate with what it carries.
+        crank_mass, rod_mass: of one.
+        shaft_height: of the shafts above the base.
+        upright: degrees from the horizon of the planes in which the cranks turn.
+        cranks: whether the cranks of a pair point `apart` or `together`.
+        torque_limit: of each motor, N m, or None.
+        delay: from computing a torque to feeling it, s.
+        gravity: whether it acts; a counterbalanced plate feels none.
+    """
+
+    base_radius: float
+    shaft_distance: float
+    plate_radius: float
+    joint_distance: float
+    crank: float
+    rod: float
+    plate_mass: float
+    crank_mass: float
+    rod_mass: float
+    shaft_height: float = 0.0
+    upright: float = 90.0
+    cranks: Literal["apart", "together"] = "apart"
+    torque_limit: float | None = None
+    delay: float = 0.1
+    gravity: bool = True
+
+    def __post_init__(self) -> None:
+        for name, value in self.lengths().items():
+            if not 0 < value < math.inf:
+                raise ConfigError(f"{name}: got {value:g} m; expected a positive length")
+            if value > LARGEST:
+                raise ConfigError(
+                    f"{name}: got {value:g} m; expected metres, {value / 1000:g} for {value:g} mm"
+                )
+        for name in ("plate_mass", "crank_mass", "rod_mass"):
+            if not 0 < getattr(self, name) < 1e6:
+                raise ConfigError(f"{name}: got {getattr(self, name):g}; expected a mass in kg")
+        for name, radius in (("shaft", self.base_radius), ("joint", self.plate_radius)):
+            distance = getattr(self, f"{name}_distance")
+            if distance >= math.sqrt(3) * radius:
+                raise ConfigError(
+                    f"{name}_distance: got {distance:g} m on a circle of radius {radius:g} m; "
+                    f"expected less than {math.sqrt(3) * radius:.4g}, where pairs meet"
+                )
+        if self.torque_limit is not None and not 0 < self.torque_limit < 1e6:
+            raise ConfigError(f"torque_limit: got {self.torque_limit:g}; expected N m above 0")
+        if not 0 <= self.delay <= 5:
+            raise ConfigError(f"delay: got {self.delay:g}; expected 0 to 5 s")
+        if not 0 <= abs(self.shaft_height) <= LARGEST:
+            raise ConfigError(f"shaft_height: got {self.shaft_height:g}; expected metres")
+        if not -180 <= self.upright <= 180:
+            raise ConfigError(f"upright: got {self.upright:g}; expected degrees, -180 to 180")
+
+    def lengths(self) -> dict[str, float]:
+        """By name, m."""
+        names = (field.name for field in fields(self)[:6])
+        return {name: getattr(self, name) for name in names}
+
+
+class NewMachine(NamedTuple):
+    """What was made, and what a first look at it says."""
+
+    check: MechanismCheck
+    margin: ControllerMargin
+    peak_torque: float
+    """N m that the proposed motion takes."""
+
+    @property
+    def verdict(self) -> str:
+        """Whether the motors can do what is proposed, in a sentence."""
+        limit = self.check.mechanism.effort_limit
+        takes = f"the proposed motion takes motor torques of up to {self.peak_torque:.3g} N m"
+        if limit is None:
+            return takes
+        return f"{takes}, the motors have {limit:.3g}" + (
+            "" if self.peak_torque < limit else ": too weak"
+        )
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What `summary.json` holds."""
+        return self.check.summary | {
+            "peak_torque": self.peak_torque,
+            "controller_margin": self.margin.summary,
+        }
+
+
+def separation(distance: float, radius: float) -> float:
+    """Degrees under which two points of a circle are seen from its centre; both in m."""
+    return math.degrees(2 * math.asin(distance / (2 * radius)))
+
+
+def proposed_pattern(m: Measurements) -> PatternSpec:
+    """Where the legs are."""
+    return PatternSpec(
+        rotation_deg=0.0,
+        base_radius=m.base_radius,
+        base_separation_deg=round(separation(m.shaft_distance, m.base_radius), 4),
+        plate_radius=m.plate_radius,
+        plate_separation_deg=round(separation(m.joint_distance, m.plate_radius), 4),
+        plate_offset_deg=60.0,
+        plate_order=[5, 0, 1, 2, 3, 4],
+        shaft_height=m.shaft_height,
+        installation_deg=m.upright,
+        branches=[1, -1] * 3 if m.cranks == "apart" else [-1, 1] * 3,
+    )
+
+
+def best_height(pattern: PatternSpec, m: Measurements) -> float:
+    """z of the plate's joints in m at which every rod pushes its crank best, above the base.
+
+    Raises:
+        ConfigError: no height is within reach of all legs.
+    """
+    legs = pattern_legs(pattern, m.crank, m.rod)
+    above = m.shaft_height + m.rod
+    found = reachable_heights(legs, np.array([0, 0, 0, 0, 0, above]))
+    if found is None:
+        raise ConfigError(
+            f"rod: got {m.rod:g} m; expected rods that reach the plate, whose joints are "
+            f"{_gap(legs):.3g} m beside the shafts, with cranks of {m.crank:g} m"
+        )
+    low, high = found
+    heights = np.linspace(low, high, _HEIGHTS + 2)[1:-1]
+    push = [
+        np.abs(leg_geometry(legs, np.array([0, 0, 0, 0, 0, z])).transmission).min() for z in heights
+    ]
+    return float(heights[int(np.argmax(push))])
+
+
+def _gap(legs: SixLegs) -> float:
+    """Largest horizontal distance of a shaft from its joint, m."""
+    return float(np.linalg.norm((legs.p_PQ - legs.p_WS)[:, :2], axis=1).max())
+
+
+def machine_text(m: Measurements, name: str) -> str:
+    """The machine's file."""
+    pattern = proposed_pattern(m)
+    rows = "\n".join(f"  {field.name}: {getattr(pattern, field.name)}" for field in fields(pattern))
+    height = float(f"{best_height(pattern, m):.4g}")
+    limit = "null" if m.torque_limit is None else f"{m.torque_limit!r}"
+    return f"""# Lengths in m, masses in kg. Moments of inertia that are not listed are
+# estimated, of a uniform disc and bars, a motor's rotor not among them.
+name: {name}
+home: [0, 0, 0, 0, 0, {height}]       # proposed: where the rods push the cranks best
+
+pattern:
+{rows}
+
+base: {{mass: 0}}                  # stands still: nobody needs it
+plate: {{mass: {m.plate_mass!r}}}
+crank: {{length: {m.crank!r}, mass: {m.crank_mass!r}}}
+rod: {{length: {m.rod!r}, mass: {m.rod_mass!r}}}
+motor: {{effort_limit: {limit}}}
+"""
+
+
+def scenario_text(m: Measurements, mechanism: Mechanism) -> str:
+    """A first scenario: up and down, over a quarter of the way that the plate has."""
+    z = next(t for t in travel(mechanism) if t.coordinate == COORDINATES[5])
+    amplitude = float(f"{_SHARE * min(-z.low, z.high):.1g}")
+    period = 0.02 if m.delay <= 0.02 * _PERIODS else 0.1
+    delay = Delay.of(m.delay, period)
+    home = [float(value) for value in mechanism.home]
+    return f"""# A first motion of {mechanism.name}; all fields are in the shipped paper.yaml.
+mechanism: {MACHINE}
+duration: 10.0          # s
+start: on_reference
+queue: reference        # the motors hold the plate already
+
+reference:              # up and down
+  kind: sine
+  amplitude: [0, 0, 0, 0, 0, {amplitude}]
+  offset: {home}
+  frequency: 0.5
+  frequency_unit: Hz
+
+plant: {{kind: exact, gravity: {str(m.gravity).lower()}}}
+controller: {{period: {period}}}       # s
+delay: {{steps: {delay.steps}, fraction: {round(delay.fraction, 9)}}}   # of {m.delay:g} s in all
+"""
+
+
+def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
+    """Write MACHINE and SCENARIO into a folder and look at them; nothing is written of a bad one.
+
+    Raises:
+        ConfigError: one line; a file is there already, a machine that cannot stand, or not be
+            moved.
+    """
+    for file in (MACHINE, SCENARIO):
+        if (folder / file).exists():
+            raise ConfigError(f"{folder / file}: is there already; expected a folder without")
+    with TemporaryDirectory() as place:
+        machine, scenario = Path(place) / MACHINE, Path(place) / SCENARIO
+        machine.write_text(machine_text(m, name))
+        mechanism = load_mechanism(machine)
+        check = check_mechanism(mechanism)
+        if check.failure is not None:
+            raise ConfigError(f"{check.verdict}; expected other lengths")
+        scenario.write_text(scenario_text(m, mechanism))
+        experiment = prepare(load_scenario(scenario))
+        made = NewMachine(
+            check,
+            controller_margin(experiment),
+            reference_torque(
+                experiment.nominal, experiment.reference, experiment.scenario.duration
+            ),
+        )
+        for path in (machine, scenario):
+            with replacing(folder / path.name) as partial:
+                partial.write_bytes(path.read_bytes())
+    return made
