@@ -87,6 +87,8 @@ SCENARIO_RANGES: dict[str, list[float]] = {
     "sensor.seed": [-1, 2**32],
     "sensor.delay": [-0.1, 101.0],
     "sensor.loss": [-0.1, 1.0],
+    "sensor.bits": [3, 33],
+    "sensor.samples": [0, 1001],
 }
 SCENARIO_LISTS: dict[str, list[Any]] = {
     "reference.amplitude": [0.1] * 6,
@@ -97,12 +99,14 @@ SCENARIO_LISTS: dict[str, list[Any]] = {
     "plant.payload_position": [0.0] * 3,
     "controller.prior.rates": [1.0] * 6,
     "sensor.noise_std": [0.0] * 12,
+    "sensor.offset": [0.0] * 6,
 }
 FOR_KIND = {
     "reference.times": {"kind": "waypoints", "poses": [ROW, ROW]},
     "reference.poses": {"kind": "waypoints", "times": [0.0, 1.0]},
     "reference.file": {"kind": "csv"},
     "tuner.weights": {"kind": "ann"},
+    **{f"sensor.{name}": {"kind": "encoders"} for name in ("bits", "samples", "offset")},
     **{
         f"link.{name}": {"kind": "network"}
         for name in ("distribution", "return.distribution", "dry", "acknowledged")

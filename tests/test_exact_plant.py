@@ -132,7 +132,9 @@ def test_multibody_plant_converges_to_it_at_first_order(gravity: bool) -> None:
     held = StewartDynamics(PAPER, gravity).equilibrium_torque(PAPER.home)
     source = (0.05 * rng.normal(0, 1, 6), 20.0, rng.uniform(0, 6, 6))
     start = np.concatenate([PAPER.home, rng.normal(0, [0.2] * 3 + [0.02] * 3)])
-    parameters = np.concatenate([held, [0.3, 2e-3]])  # the holding torque comes as a bias
+    place, friction = [0.05, -0.03, 0.1], {"coulomb_friction": 5e-3, "coulomb_speed": 0.1}
+    # The holding torque comes as a bias.
+    parameters = np.concatenate([held, [0.3, 2e-3, *friction.values()], place])
 
     def motion(plant: System, added: Array) -> Array:
         builder = DiagramBuilder()
@@ -152,8 +154,8 @@ def test_multibody_plant_converges_to_it_at_first_order(gravity: bool) -> None:
     assert np.abs(expected - start)[:6].max() > 0.02
 
     def error(step: float) -> float:
-        other = {"payload_mass": 0.3, "joint_damping": 2e-3}
-        found = motion(MultibodyStewart(PAPER, step, gravity=gravity, **other), held)
+        loads = {"payload_mass": 0.3, "joint_damping": 2e-3, "payload_position": place} | friction
+        found = motion(MultibodyStewart(PAPER, step, gravity=gravity, **loads), held)
         return float(np.abs(found - expected)[:6].max())
 
     steps = [2e-3, 1e-3, 5e-4, 2e-4, 1e-4]

@@ -263,4 +263,5 @@ def test_what_is_known_is_worth_something(file: Path) -> None:
         for more in ((f"controller.known={file}",), ())
     )
     assert told.status == "completed"
-    assert told.accumulated_error < 0.1 * not_told.accumulated_error
+    assert told.accumulated_error < 0.1
+    assert not not_told.accumulated_error < 1  # or lost

@@ -82,6 +82,7 @@ def run(build, until=0.1, state=None):
 def test_both_kinds_in_a_diagram_of_ones_own_agree():
     state = np.concatenate([PAPER.home + 0.02, np.full(6, 0.05)])
     loads = {"gravity": True, "payload_mass": 0.2, "torque_bias": [0.3] * 6}
+    loads |= {"payload_position": [0.1, 0.0, 0.05], "coulomb_friction": 0.05, "coulomb_speed": 0.5}
     exact, coarse, fine = (
         run(
             lambda b, c=c: sd.AddStewartPlatform(b, PAPER, sd.PlantConfig(**c, **loads)), 0.1, state

@@ -251,6 +251,24 @@ def test_draws_fill_their_ranges() -> None:
     assert directions.T @ directions / n == pytest.approx(np.eye(6) / 6, abs=0.02)
 
 
+def test_friction_and_the_payloads_place_are_drawn_where_they_are_asked_for() -> None:
+    """And leave all other draws, and what is told of them, as they are."""
+    scenario, asked = short(), Ranges(coulomb=0.1, payload_position=0.3)
+    scenario.plant.coulomb_friction, scenario.plant.payload_position = 1e-3, [0.0, 0.0, 0.05]
+    draws = [draw(asked, SCALES, scenario, 0, i) for i in range(200)]
+    without = [draw(Ranges(), SCALES, scenario, 0, i) for i in range(200)]
+    for one, other in zip(draws, without, strict=True):
+        assert one | {"coulomb": 0.0, "payload_position": (0.0,) * 3} == other
+    values = factor_values(draws)
+    assert set(values) - set(factor_values(without)) == {"coulomb", "payload_position"}
+    for name, high in (("coulomb", 100 * 0.0133), ("payload_position", 0.3 * 110)):
+        assert scipy.stats.kstest(values[name], scipy.stats.uniform(0, high).cdf).pvalue > 1e-3
+    plant = changed(scenario, draws[0]).plant
+    assert plant.coulomb_friction == 1e-3 + draws[0]["coulomb"]
+    x, y, z = draws[0]["payload_position"]
+    assert plant.payload_position == [x, y, 0.05 + z]
+
+
 def test_a_delay_is_never_negative() -> None:
     scenario = short()
     scenario.delay.steps = 1

@@ -332,3 +332,17 @@ def test_the_causes_are_counted_apart() -> None:
         "bad_measurements",
         "tuner_fallbacks",
     ]
+
+
+def test_a_share_of_the_samples_is_struck() -> None:
+    faults = [{"kind": "missing", "from": 0.0, "to": 1e5, "share": 0.2}]
+    sensor = Sensor(np.zeros(12), 3, 0.1, faults)
+    context = sensor.CreateDefaultContext()
+    sensor.GetInputPort("state").FixValue(context, np.ones(12))
+    lost = 0
+    for k in range(1000):
+        context.SetTime(0.1 * k)
+        said = sensor.GetOutputPort("measurement").Eval(context)
+        assert np.all(np.isnan(said)) or np.array_equal(said, np.ones(12))
+        lost += int(np.isnan(said[0]))
+    assert lost == pytest.approx(200, abs=4 * np.sqrt(160))

@@ -318,7 +318,7 @@ def test_controller_topology_and_initial_state() -> None:
         through = any(
             controller.HasDirectFeedthrough(i, port) for i in range(controller.num_input_ports())
         )
-        assert through == (name == "torque")
+        assert through == (name in ("torque", "estimate"))
     context = controller.CreateDefaultContext()
     memory = controller.memory(context)
     assert np.array_equal(memory.in_flight[1:], in_flight)

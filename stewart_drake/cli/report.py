@@ -23,7 +23,7 @@ def report(
 
     It is run, compared under all shipped controllers, and analysed.
     """
-    from stewart_drake.mechanism.files import load_mechanism
+    from stewart_drake.loop.experiment import simulated_machine
     from stewart_drake.report import report_document
     from stewart_drake.report.answer import PAGE, Answer
     from stewart_drake.report.collect import collect
@@ -44,7 +44,7 @@ def report(
         from stewart_drake.report.replay import write_replay
 
         assert found.run is not None
-        mechanism = load_mechanism(found.scenario.mechanism)
+        mechanism = simulated_machine(found.scenario)
         replay = write_replay(found.run, mechanism, folder / REPLAY, name).read_text("utf-8")
 
     def page(folder: Path) -> None:

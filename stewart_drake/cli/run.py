@@ -85,12 +85,12 @@ def simulate(
     with progress_bars([name], experiment.scenario.duration, quiet) as progress:
         result = run(experiment, progress=progress[name], meshcat=viewer, margin=margin)
     delivery.say(run_document(result).plain())
-    _write_run(delivery, result, experiment.mechanism, name, csv, replay or meshcat)
+    _write_run(delivery, result, experiment.truth, name, csv, replay or meshcat)
     status = delivery.end(result.summary, interrupted=result.status == "interrupted")
     if viewer is not None:
         from stewart_drake.report.replay import replay as play
 
-        play(result.signals, experiment.mechanism, viewer)
+        play(result.signals, experiment.truth, viewer)
         if sys.stdin.isatty():
             input(f"replay at {viewer.web_url()}, Enter ends")
     return status

@@ -6,6 +6,7 @@ else in proportion, gets the same law. Lengths are measured against its `reach`,
 """
 
 import functools
+import math
 from typing import Literal
 
 import numpy as np
@@ -18,8 +19,11 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
+    COULOMB,
+    COULOMB_SPEED,
     NUM_STATE,
     NUM_TORQUES,
+    PLANT_PARAMETERS,
     POSE,
     RATES,
 )
@@ -29,6 +33,8 @@ Array = NDArray[np.float64]
 
 PREDICTION_BUDGET = 2e-5
 """rad, and shares of the reach, by which integrating over the delay may move the predicted pose."""
+MOST_SUBSTEPS = 64
+"""Per torque."""
 ASTRAY = 0.3
 """rad, and crank lengths, from the reference on which a prediction is of no use."""
 STILL = 0.1
@@ -157,6 +163,27 @@ def choose_substeps(
         return True
 
     substeps = 1
-    while substeps < 64 and not within_budget(substeps):
+    while substeps < MOST_SUBSTEPS and not within_budget(substeps):
         substeps *= 2
     return substeps
+
+
+def turning_substeps(
+    dynamics: StewartDynamics, reference: Trajectory, period: float, duration: float
+) -> int:
+    """Runge-Kutta steps per period in each of which no crank's rate changes by more than its slip.
+
+    Coulomb friction changes sides while a crank that turns back passes the rates within
+    coulomb_speed, which coarser steps do not see. 1 where no friction is known or looked for.
+    """
+    values, name = dynamics.plant_parameters, PLANT_PARAMETERS[COULOMB]
+    if values[COULOMB] == 0 and name not in dynamics.free:
+        return 1
+
+    def crank_rates(t: float) -> Array:
+        x = evaluate(reference, t)
+        return dynamics.mechanism.jacobian(x[POSE]) @ x[RATES]
+
+    times, h = spread_instants(duration, INSTANTS), 1e-3
+    fastest = max(np.abs(crank_rates(t + h) - crank_rates(t)).max() / h for t in times)
+    return min(MOST_SUBSTEPS, math.ceil(period * fastest / values[COULOMB_SPEED]))

@@ -356,11 +356,14 @@ def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | Mult
             experiment.truth,
             plant.time_step,
             gravity=plant.gravity,
-            payload_mass=plant.payload_mass,
-            joint_damping=plant.joint_damping,
             meshcat=meshcat,
             start=experiment.start[POSE],
             wrench=wrench,
+            payload_mass=plant.payload_mass,
+            payload_position=plant.payload_position,
+            joint_damping=plant.joint_damping,
+            coulomb_friction=plant.coulomb_friction,
+            coulomb_speed=plant.coulomb_speed,
         )
     parameters = np.array(plant.parameters)
     parameters[BIAS] = 0.0  # added before, where the record of torques ends

@@ -50,6 +50,7 @@ from stewart_drake.law.startup import (
     initial_queue,
     machine_torque,
     reference_torque,
+    turning_substeps,
     weight_scales,
 )
 from stewart_drake.law.timeline import Timeline
@@ -69,6 +70,7 @@ from stewart_drake.scenario.known import DELAY, OFFSETS, Known, load_known
 from stewart_drake.scenario.link import in_time, times_under_way
 from stewart_drake.scenario.signals import (
     BIAS,
+    COULOMB,
     DAMPING,
     PARAMETERS,
     PAYLOAD,
@@ -248,10 +250,11 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
 
 
 def estimated(scenario: Scenario) -> tuple[str, ...]:
-    """Names of what the estimator finds, if there is one."""
+    """Names of what the estimator finds, if there is one; the eight of the record first."""
     c = scenario.controller
+    friction = (PLANT_PARAMETERS[COULOMB],) if c.estimate_coulomb else ()
     finds_offsets = c.estimate_offsets and c.estimator == "parameters"
-    return (*PARAMETERS, *OFFSETS) if finds_offsets else PARAMETERS
+    return (*PARAMETERS, *friction, *(OFFSETS if finds_offsets else ()))
 
 
 def simulated_machine(scenario: Scenario) -> Mechanism:
@@ -416,7 +419,10 @@ def compose_law(experiment: Experiment) -> PredictiveLqi:
     sc, nominal = experiment.scenario, experiment.nominal
     c, motion = sc.controller, motion_scale(experiment)
     timeline = Timeline(c.period, believed_delay(sc))
-    substeps = choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration)
+    substeps = max(
+        choose_substeps(nominal, experiment.reference, c.period, timeline.steps, sc.duration),
+        turning_substeps(nominal, experiment.reference, c.period, sc.duration),
+    )
     peak_torque = reference_torque(nominal, experiment.reference, sc.duration)
     torque_scale = max(machine_torque(nominal), peak_torque)
     plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)

@@ -1,5 +1,6 @@
 """The multibody plant: the generated SDFormat in Drake's engine, with ball constraints."""
 
+from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
@@ -47,18 +48,10 @@ def add_mechanism(
     mechanism: Mechanism,
     *,
     gravity: bool = True,
-    payload_mass: float = 0.0,
-    joint_damping: float = 0.0,
     collision: bool = False,
 ) -> ModelInstanceIndex:
     """`add_model` to a `plant` that holds nothing else, and finalize it."""
-    model = add_model(
-        plant,
-        mechanism,
-        payload_mass=payload_mass,
-        joint_damping=joint_damping,
-        collision=collision,
-    )
+    model = add_model(plant, mechanism, collision=collision)
     if not gravity:
         plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
     plant.Finalize()
@@ -70,6 +63,7 @@ def add_model(
     mechanism: Mechanism,
     *,
     payload_mass: float = 0.0,
+    payload_position: Sequence[float] = (0.0, 0.0, 0.0),
     joint_damping: float = 0.0,
     collision: bool = False,
     parent: Frame | None = None,
@@ -83,7 +77,8 @@ def add_model(
     Args:
         plant: where to.
         mechanism: the machine; a second one of its name gets a number.
-        payload_mass: kg, a point mass at the plate's COM.
+        payload_mass: kg, a point mass.
+        payload_position: m, in the plate's frame, from its COM.
         joint_damping: N m s/rad on the six crank shafts.
         collision: whether its shapes can touch other bodies of `plant`; alone it has nothing to
             touch, and looking for contacts would take a fifth of the time.
@@ -104,8 +99,9 @@ def add_model(
     joint = plant.AddJoint(RpyFloatingJoint("plate", under, plate.body_frame()))
     floating = cast(RpyFloatingJoint, joint)
     if payload_mass > 0:
+        place, point = np.array(payload_position), UnitInertia.PointMass
         payload = plant.AddRigidBody(
-            "payload", model, SpatialInertia(payload_mass, np.zeros(3), UnitInertia(0, 0, 0))
+            "payload", model, SpatialInertia(payload_mass, place, point(place))
         )
         plant.WeldFrames(plate.body_frame(), payload.body_frame())
     pose = mechanism.home if start is None else start
@@ -202,6 +198,46 @@ class PlateState(LeafSystem):
         if margin(self._mechanism, tree[self._pose], angles) > 0:
             return EventStatus.DidNothing()
         return EventStatus.ReachedTermination(self, "the plate left its workspace")
+
+
+class CoulombFriction(LeafSystem):
+    """What reaches the shafts: the torque less friction tanh(crank rate / speed).
+
+    A discrete plant reads it at its steps' beginnings, so that it stays stable as long as friction
+    / speed times the step is small beside the inertia that a motor feels.
+
+    | port | direction | size | unit |
+    | --- | --- | --- | --- |
+    | torque | input | 6 | N m |
+    | tree_state | input | positions and velocities of the tree | mixed |
+    | actuation | output | 6 | N m |
+
+    Args:
+        plant: finalized.
+        model: the machine in it, needed where there are several.
+        friction: N m.
+        speed: rad/s.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        model: ModelInstanceIndex | None,
+        friction: float,
+        speed: float,
+    ) -> None:
+        super().__init__()
+        self._friction, self._speed = friction, speed
+        motors = [plant.GetJointByName(f"motor_{leg}", model) for leg in LEGS]
+        self._rates = [plant.num_positions() + motor.velocity_start() for motor in motors]
+        self._torque = self.DeclareVectorInputPort("torque", NUM_TORQUES)
+        self._tree = self.DeclareVectorInputPort("tree_state", plant.num_multibody_states())
+        self.DeclareVectorOutputPort("actuation", NUM_TORQUES, weak(self._actuation))
+
+    def _actuation(self, context: Context, output: BasicVector) -> None:
+        rates = np.asarray(self._tree.Eval(context))[self._rates]
+        friction = self._friction * np.tanh(rates / self._speed)
+        output.SetFromVector(np.asarray(self._torque.Eval(context)) - friction)
 
 
 class PlateWrench(LeafSystem):

@@ -1,5 +1,7 @@
 """The multibody plant as a system with the ports of the exact one, and the model in a viewer."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Meshcat, MeshcatVisualizer
@@ -32,11 +34,10 @@ class MultibodyStewart(Diagram):
         mechanism: the machine.
         time_step: s.
         gravity: whether it acts.
-        payload_mass: kg, a point mass at the plate's COM.
-        joint_damping: N m s/rad on each crank shaft.
         meshcat: where to show it, or None.
         start: (6,) pose by default, home if None.
         wrench: whether there is an input for a wrench on the plate; unconnected it is zero.
+        **loads: what loads the machine: fields of `PlantConfig`.
     """
 
     def __init__(
@@ -45,21 +46,14 @@ class MultibodyStewart(Diagram):
         time_step: float = 1e-3,
         *,
         gravity: bool = True,
-        payload_mass: float = 0.0,
-        joint_damping: float = 0.0,
         meshcat: Meshcat | None = None,
         start: ArrayLike | None = None,
         wrench: bool = False,
+        **loads: Any,
     ) -> None:
         super().__init__()
         builder = DiagramBuilder()
-        config = PlantConfig(
-            kind="multibody",
-            gravity=gravity,
-            time_step=time_step,
-            payload_mass=payload_mass,
-            joint_damping=joint_damping,
-        )
+        config = PlantConfig(kind="multibody", gravity=gravity, time_step=time_step, **loads)
         platform = AddStewartPlatform(builder, mechanism, config, start=start)
         for name in ("torque", "wrench") if wrench else ("torque",):
             builder.ExportInput(platform.GetInputPort(name), name)

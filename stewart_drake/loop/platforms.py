@@ -23,6 +23,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.multibody import (
+    CoulombFriction,
     PlateState,
     PlateWrench,
     add_model,
@@ -72,11 +73,11 @@ class StewartPlatform:
         plant: Any,
         model: ModelInstanceIndex | None = None,
         scene_graph: SceneGraph | None = None,
-        torque_bias: ArrayLike = (0.0,) * NUM_TORQUES,
+        config: PlantConfig | None = None,
     ) -> None:
         self.mechanism, self.plant, self.model = mechanism, plant, model
         self.scene_graph = scene_graph
-        self._builder, self._bias = builder, np.array(torque_bias)
+        self._builder, self._config = builder, PlantConfig() if config is None else config
         self._added: dict[str, Any] = {}
 
     def __repr__(self) -> str:
@@ -93,15 +94,18 @@ class StewartPlatform:
             raise ConfigError(f"input port: got {name!r}; expected {' or '.join(_INPUTS)}")
         if self.model is None:
             return self.plant.GetInputPort(name)
+        self._check_finalized()
         if name == "wrench":
-            self._check_finalized()
             forces = self.plant.get_applied_spatial_force_input_port()
             return self._before(forces, name, lambda: PlateWrench(self.plant, self.model))
-        self._check_finalized()
-        actuation = self.plant.get_actuation_input_port(self.model)
-        if not self._bias.any():
-            return actuation
-        return self._before(actuation, "torque_bias", lambda: add_to_torque(self._bias))
+        port, c = self.plant.get_actuation_input_port(self.model), self._config
+        if c.coulomb_friction > 0:
+            shafts = (self.plant, self.model, c.coulomb_friction, c.coulomb_speed)
+            port = self._before(port, "coulomb_friction", lambda: CoulombFriction(*shafts))
+        if any(c.torque_bias):
+            bias = np.array(c.torque_bias)
+            port = self._before(port, "torque_bias", lambda: add_to_torque(bias))
+        return port
 
     def GetOutputPort(self, name: str) -> OutputPort:
         """`state`, or `crank_angles` of a multibody plant.
@@ -142,14 +146,16 @@ class StewartPlatform:
         self._check_finalized()
         system = self._builder.AddSystem(make())
         system.set_name(f"{self.plant.GetModelInstanceName(self.model)}_{name}")
+        if system.HasInputPort("tree_state"):
+            tree = self.plant.get_state_output_port()
+            self._builder.Connect(tree, system.GetInputPort("tree_state"))
         self._added[name] = system
         return system
 
     def _plate_state(self) -> Any:
         name = "plate_state"
         if name not in self._added:
-            system = self._add(name, lambda: PlateState(self.plant, self.mechanism, self.model))
-            self._builder.Connect(self.plant.get_state_output_port(), system.get_input_port())
+            self._add(name, lambda: PlateState(self.plant, self.mechanism, self.model))
         return self._added[name]
 
     def _before(self, port: InputPort, name: str, make: Callable[[], System]) -> InputPort:
@@ -162,7 +168,7 @@ class StewartPlatform:
                 )
             system = self._add(name, make)
             self._builder.Connect(system.get_output_port(), port)
-        return self._added[name].get_input_port()
+        return self._added[name].get_input_port(0)
 
 
 def add_to_torque(bias: Array) -> AffineSystem:
@@ -194,7 +200,8 @@ def AddStewartPlatform(
         mechanism: the machine, or what `load_mechanism` takes.
         config: kind, gravity, time step and what loads the machine, as a scenario's `plant`; of a
             plant of one's own `time_step` is that plant's, and gravity is switched off for the
-            machine alone. By default as `PlantConfig()`, which is without gravity.
+            machine alone; `mechanism` has no meaning. By default as `PlantConfig()`, which is
+            without gravity.
         plant: a MultibodyPlant that is not finalized, registered with a SceneGraph.
         parent: frame of `plant` that the base is welded to, the world's if None.
         X_PB: pose of the base in that frame, none if None.
@@ -238,6 +245,7 @@ def AddStewartPlatform(
         plant,
         dataclasses.replace(machine, effort_limit=None),
         payload_mass=config.payload_mass,
+        payload_position=config.payload_position,
         joint_damping=config.joint_damping,
         collision=collision and not own,
         parent=parent,
@@ -248,4 +256,4 @@ def AddStewartPlatform(
         plant.set_gravity_enabled(model, False)
     if own:
         plant.Finalize()
-    return StewartPlatform(builder, machine, plant, model, scene_graph, config.torque_bias)
+    return StewartPlatform(builder, machine, plant, model, scene_graph, config)

@@ -103,8 +103,9 @@ class SimulationResult:
             `log_period`): pose, rates, reference, reference_rates, error, integral,
             torque_commanded (what the law asked for), torque_applied (what acted of it: within the
             limit, late), weights, parameters and parameter_std (estimated), density (45),
-            measurement and state_estimate (12, as the controller has them). Held signals show the
-            value from that instant on. Units, long names, the scenario and versions are attributes.
+            measurement (12, or 6 crank angles per sample of encoders) and state_estimate (12) of
+            the controller. Held signals show the value from that instant on. Units, long names, the
+            scenario and versions are attributes.
         summary: what `summary.json` holds.
     """
 

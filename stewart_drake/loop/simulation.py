@@ -77,11 +77,13 @@ def simulate(
             and returns the one to be used, such as `dataclasses.replace(law, observer=Mine())`.
         sensor: a Drake system with the input `state` (12) and the output `measurement` (12; NaN is
             lost), read every `controller.period`; the scenario's noise and faults are its affair.
+            Neither this nor a controller goes with the scenario's encoders.
         link: a Drake system with the input `commanded` (6, N m, as it was limited) and the output
             `torque` (6, what arrives now); the law goes on believing what the scenario says.
         tuner: a Drake system with the output `weights` (2: w_Q, w_R), read every
             `controller.period`, and of the inputs `density` (18), `measurement` (12) and
-            `reference` (18) those that it wants.
+            `reference` (18) those that it wants. With encoders `measurement` is the estimate of the
+            sample before.
         progress: called every 20 ms of simulated time; what it raises reaches the caller.
         meshcat: where the machine, its reference and the torques are shown live, or None; the run
             then takes at least as long as its duration.

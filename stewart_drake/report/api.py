@@ -9,8 +9,8 @@ from tempfile import TemporaryDirectory
 from matplotlib.figure import Figure
 from pydrake.geometry import Meshcat
 
+from stewart_drake.loop.experiment import simulated_machine
 from stewart_drake.loop.results import SimulationResult
-from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.report import report_document
 from stewart_drake.report.analyses import analyze
@@ -107,7 +107,7 @@ def replay(
     Raises:
         OSError: the file cannot be written.
     """
-    machine = load_mechanism(result.scenario.mechanism) if mechanism is None else mechanism
+    machine = simulated_machine(result.scenario) if mechanism is None else mechanism
     if meshcat is not None:
         return animate(result.signals, machine, meshcat)
     if path is None:
@@ -130,7 +130,7 @@ def report(scenario: str | Path, settings: Iterable[str] = ()) -> Answer:
     found = collect(scenario, settings)
     film = ""
     if found.run is not None:
-        film = replay_html(found.run, load_mechanism(found.scenario.mechanism), Path(scenario).stem)
+        film = replay_html(found.run, simulated_machine(found.scenario), Path(scenario).stem)
     made = Provenance(f"sd.report({str(scenario)!r}, {list(settings)})")
     document = report_document.document(found, Path(scenario).stem, film)
     return Answer(found, report_document.report_summary(found), document, made)

@@ -19,7 +19,14 @@ from stewart_drake.report import style
 from stewart_drake.report.style import FACTORS, UNITS, figure_style, write_figures
 from stewart_drake.report.tuner_figures import shown_until, weights_figure
 from stewart_drake.scenario.config import FixedTunerConfig
-from stewart_drake.scenario.signals import ANGLES, COORDINATES, LEGS, PARAMETERS, POSITION
+from stewart_drake.scenario.signals import (
+    ANGLES,
+    COORDINATES,
+    LEGS,
+    NUM_PARAMETERS,
+    PARAMETERS,
+    POSITION,
+)
 from stewart_drake.studies.compare import ADAPTIVE, LABELS
 from stewart_drake.studies.compare import label as spoken
 
@@ -171,7 +178,7 @@ def _torques(
 def _parameters(run: SimulationResult) -> Figure:
     figure, axes = _grid([run], rows=4)
     plant, time = run.scenario.plant, run.signals.time.values
-    true = np.array([*plant.torque_bias, plant.payload_mass, plant.joint_damping])
+    true = np.array(plant.parameters[:NUM_PARAMETERS])
     true, values, widths = (
         _PARAMETER_FACTORS * data
         for data in (true, run.signals.parameters.values, 2 * run.signals.parameter_std.values)

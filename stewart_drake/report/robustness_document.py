@@ -28,11 +28,11 @@ from stewart_drake.report.robustness_figures import (
 )
 from stewart_drake.report.words import number
 from stewart_drake.studies.robustness_result import (
-    FACTORS,
     QUANTILES,
     Influence,
     RobustnessStudy,
     factor_values,
+    factors,
     unit_of,
 )
 from stewart_drake.studies.statistics import Correlation, Interval, wilson_interval
@@ -143,9 +143,9 @@ def _median(study: RobustnessStudy) -> str:
 
 def _spans(study: RobustnessStudy) -> dict[str, str]:
     """What was in fact drawn, from least to most; nothing for sizes."""
-    values = factor_values(study.draws)
+    values, told = factor_values(study.draws), factors(study.draws)
     return {
-        name: f"{_span(float(x.min()), float(x.max()))} {FACTORS[name]}" if name in FACTORS else ""
+        name: f"{_span(float(x.min()), float(x.max()))} {told[name]}" if name in told else ""
         for name, x in values.items()
     }
 
@@ -225,21 +225,22 @@ def _range_table(study: RobustnessStudy) -> Table:
         f"In fact drawn. Asked for with --vary: payload={r.payload:g}, "
         f"torque_bias={r.torque_bias:g}, noise={r.noise:g}, torque_limit={r.torque_limit}, "
         f"damping={r.damping:g}, delay={r.delay:g}, delay_steps={r.delay_steps}, "
-        f"lengths={r.lengths:g}, anchors={r.anchors:g}."
+        f"lengths={r.lengths:g}, anchors={r.anchors:g}, coulomb={r.coulomb:g}, "
+        f"payload_position={r.payload_position:g}."
     )
-    rows = [(TITLES[name], spans[name]) for name in FACTORS]
+    rows = [(TITLES[name], spans[name]) for name in factors(study.draws)]
     return Table(("quantity", "from, to"), rows, caption)
 
 
 def _worst_table(study: RobustnessStudy) -> Table:
-    values = factor_values(study.draws)
+    values, told = factor_values(study.draws), factors(study.draws)
     order = np.argsort(np.where(np.isnan(study.errors), np.inf, study.errors), kind="stable")[::-1]
     rows = []
     for i in order[:_WORST]:
         one = study.outcomes[i]
         how = number(one.error) if one.status == "completed" else f"ends at {one.time:.2f} s"
-        rows.append((str(i), how, *(f"{values[name][i]:.3g}" for name in FACTORS)))
-    columns = ("run", "E_ac, % s", *(f"{TITLES[n]}, {unit}" for n, unit in FACTORS.items()))
+        rows.append((str(i), how, *(f"{values[name][i]:.3g}" for name in told)))
+    columns = ("run", "E_ac, % s", *(f"{TITLES[n]}, {unit}" for n, unit in told.items()))
     return Table(columns, rows, "All runs are in runs.csv.")
 
 

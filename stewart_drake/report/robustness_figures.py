@@ -1,5 +1,6 @@
 """Figures of a robustness study: distribution of E_ac, what matters, every run, when it failed."""
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -22,10 +23,10 @@ from stewart_drake.report.style import (
     plain_log_ticks,
 )
 from stewart_drake.studies.robustness_result import (
-    FACTORS,
     Influence,
     RobustnessStudy,
     factor_values,
+    factors,
 )
 from stewart_drake.studies.statistics import Correlation, wilson_interval
 
@@ -40,6 +41,8 @@ TITLES: Final = {
     "delay": "delay error",
     "lengths": "lengths, rms",
     "anchors": "anchors, rms",
+    "coulomb": "Coulomb friction",
+    "payload_position": "payload's place, rms",
 }
 SIGNIFICANT: Final = 0.05
 """Adjusted p-value below which an influence counts as found."""
@@ -97,10 +100,14 @@ def influence_figure(influences: Sequence[Influence]) -> Figure:
 @figure_style()
 def runs_figure(study: RobustnessStudy) -> Figure:
     """E_ac of every run over every drawn quantity, failures in a strip of their own on top."""
-    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
-    axes = figure.subplots(2, 4, sharey=True)
+    told = factors(study.draws)
+    rows = math.ceil(len(told) / 4)
+    figure = Figure(figsize=(WIDTH, 2.6 * rows), layout="constrained")
+    axes = figure.subplots(rows, 4, sharey=True)
+    for ax in axes.ravel()[len(told) :]:
+        ax.remove()
     values, done = factor_values(study.draws), np.isfinite(study.errors)
-    for ax, (name, unit) in zip(axes.ravel(), FACTORS.items(), strict=True):
+    for ax, (name, unit) in zip(axes.ravel(), told.items(), strict=False):
         x = values[name]
         kept = done & ~study.failed
         _scatter(ax, x[kept], study.errors[kept], "o", _SUCCESS, "success")
@@ -113,7 +120,7 @@ def runs_figure(study: RobustnessStudy) -> Figure:
     low, high = _log_range(study.errors[done])
     strip = high * (high / low) ** 0.06
     top = high * (high / low) ** 0.18
-    for ax, name in zip(axes.ravel(), FACTORS, strict=True):
+    for ax, name in zip(axes.ravel(), told, strict=False):
         ax.set_ylim(low, top)
         ax.axhspan(strip, top, color="#F1EAE6", zorder=0)
         # Spread over the strip by the number of the run, so that marks do not hide each other.

@@ -154,7 +154,8 @@ class ControllerConfig:
         feedforward: `none`, `equilibrium` torque, or `inverse_dynamics` of the reference.
         model: behind gain and prediction, `paper` (massless legs) or `multibody`.
         torque_map: of the paper's model, from `virtual_work` or as `printed`.
-        estimator: `none`, or `parameters` (torque bias, payload and damping).
+        estimator: `none`, or `parameters` (torque bias, payload and damping, see also
+            `estimate_coulomb`).
         w_Q: weight of the errors.
         w_R: weight of the torques.
         integral_weight: of the integrals beside the errors, which share w_Q.
@@ -172,6 +173,8 @@ class ControllerConfig:
             have acted.
         rejoin: with a delay estimator: a plan back onto the reference takes so long, in s, where
             the prediction is off it, as when the delay was found or has jumped; 0 is none.
+        estimate_coulomb: whether the estimator also finds the Coulomb friction of the shafts; the
+            speed over which it builds up is 0.02 rad/s, or known.
         prior: standard deviations of what is estimated, a section of its own; null all of them.
         known: a file of what is known of the machine (`scenario.known`), as `identify` writes it;
             means and covariance of what is estimated, and the values of what is not. A delay in it
@@ -201,6 +204,7 @@ class ControllerConfig:
     delay_max: Annotated[float, Field(gt=0, le=10)] = 1.5
     quiet_start: bool = True
     rejoin: Annotated[float, Field(ge=0, le=10)] = 0.6
+    estimate_coulomb: bool = False
     prior: PriorConfig = field(default_factory=PriorConfig)
     known: Name | None = None
     estimate_offsets: bool = False

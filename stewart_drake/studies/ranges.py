@@ -33,6 +33,9 @@ class Ranges:
         lengths: error of crank and rod lengths, rms over the twelve, uniform from 0.
         anchors: error of the coordinates of motor shafts and plate joints, rms over the 36,
             uniform from 0.
+        coulomb: Coulomb friction of a crank, uniform from 0.
+        payload_position: error of the coordinates of the payload's place, rms over the three,
+            uniform from 0; it matters where there is a payload.
     """
 
     payload: Annotated[float, Field(ge=0, lt=1, description="+-share of the plate's mass")] = 0.1
@@ -60,6 +63,12 @@ class Ranges:
     anchors: Annotated[float, Field(ge=0, lt=1, description="share of the mean crank length")] = (
         2e-4
     )
+    coulomb: Annotated[
+        float, Field(ge=0, description="share of the reference's largest torque")
+    ] = 0.0
+    payload_position: Annotated[
+        float, Field(ge=0, description="share of the mean crank length")
+    ] = 0.0
 
 
 RANGE_UNITS: Final = units_of(Ranges)

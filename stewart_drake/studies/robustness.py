@@ -7,8 +7,7 @@ from typing import Any
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
-from stewart_drake.loop.experiment import assemble, prepare
-from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.loop.experiment import assemble, prepare, simulated_machine
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
@@ -89,7 +88,7 @@ def run_draw(scenario: Scenario, one: Draw) -> bytes:
 
 def _run(scenario: Scenario, one: Draw) -> Outcome:
     try:
-        changed = drawn(MACHINE, scenario, load_mechanism(scenario.mechanism), one)
+        changed = drawn(MACHINE, scenario, simulated_machine(scenario), one)
         variant = changed.as_scenario()
     except ConfigError as error:
         return Outcome("refused", str(error), time=0.0)

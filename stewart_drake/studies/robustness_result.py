@@ -30,9 +30,7 @@ from stewart_drake.studies.uncertainty import MACHINE, Draw, Scales
 Array = NDArray[np.float64]
 
 QUANTILES: Final = (0.5, 0.75, 0.9, 0.95, 0.99)
-FACTORS: Final = {name: one.unit for name, one in MACHINE.items() if one.unit}
-"""What is ranked, with its unit; what has six parts or more by its rms."""
-SIGNED: Final = tuple(name for name in FACTORS if MACHINE[name].signed)
+SIGNED: Final = tuple(name for name, one in MACHINE.items() if one.signed)
 """These are ranked by their size too, as |payload| and |delay|."""
 
 
@@ -146,14 +144,24 @@ class RobustnessStudy(NamedTuple):
 
 def unit_of(factor: str) -> str:
     """Unit of a factor, or of its size."""
-    return FACTORS[factor.strip("|")]
+    return MACHINE[factor.strip("|")].unit
+
+
+def factors(draws: list[Draw]) -> dict[str, str]:
+    """What is ranked, with its unit; what has several parts by its rms."""
+    return {
+        name: one.unit
+        for name, one in MACHINE.items()
+        if one.unit
+        and (not one.optional or any(name in d and one.told(d[name]) != 0 for d in draws))
+    }
 
 
 def factor_values(draws: list[Draw]) -> dict[str, Array]:
-    """(n,) of each factor in the units of FACTORS, and of the sizes of those with a sign."""
+    """(n,) of each factor in its unit, and of the sizes of those with a sign."""
     arrays = {
         name: np.array([MACHINE[name].told(one[name]) for one in draws], dtype=np.float64)
-        for name in FACTORS
+        for name in factors(draws)
     }
     return arrays | {f"|{name}|": np.abs(arrays[name]) for name in SIGNED}
 
@@ -162,13 +170,14 @@ def table(study: RobustnessStudy) -> str:
     """All runs as CSV, a row each, empty where there is no number."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    head = [f"{name} [{unit}]" for name, unit in FACTORS.items()]
+    told = factors(study.draws)
+    head = [f"{name} [{unit}]" for name, unit in told.items()]
     writer.writerow(
         ["run", "status", "reason", "leg", "time [s]", "E_ac [% s]", "peak_torque [N m]", *head]
     )
     values = factor_values(study.draws)
     for i, one in enumerate(study.outcomes):
-        numbers = [one.time, one.error, one.peak_torque, *(values[name][i] for name in FACTORS)]
+        numbers = [one.time, one.error, one.peak_torque, *(values[name][i] for name in told)]
         cells = [repr(float(v)) if math.isfinite(v) else "" for v in numbers]
         writer.writerow([i, one.status, study.reason_of(one), one.leg or "", *cells])
     return text.getvalue()

@@ -81,6 +81,8 @@ class Quantity(NamedTuple):
     """Either direction may hurt."""
     sometimes: bool = False
     """Absent, 0, in half of the draws."""
+    optional: bool = False
+    """Told only where it is drawn at all."""
 
     def told(self, value: Any) -> float:
         """What was drawn in its unit, of several numbers their rms, of None infinite."""
@@ -167,6 +169,16 @@ def _limit_torque(truth: Truth, limit: float | None) -> None:
 
 def _damp(truth: Truth, damping: float) -> None:
     truth.fields["plant"]["joint_damping"] += damping
+
+
+def _rub(truth: Truth, friction: float) -> None:
+    truth.fields["plant"]["coulomb_friction"] += friction
+
+
+def _move_payload(truth: Truth, errors: tuple[float, ...]) -> None:
+    plant = truth.fields["plant"]
+    place = plant["payload_position"]
+    plant["payload_position"] = [a + b for a, b in zip(place, errors, strict=True)]
 
 
 def _delay(truth: Truth, late: float) -> None:
@@ -308,5 +320,13 @@ MACHINE: Final[Model] = {
         _move_anchors, "mm", 1e3,
     ),
     "seed": Quantity(draw_seed, seed_noise),
+    "coulomb": Quantity(
+        lambda rng, a: float(a.ranges.coulomb * a.scales.torque * rng.uniform()),
+        _rub, "mN m", 1e3, optional=True,
+    ),
+    "payload_position": Quantity(
+        lambda rng, a: _of_random_size(rng, 3, a.ranges.payload_position * a.scales.crank),
+        _move_payload, "mm", 1e3, optional=True,
+    ),
 }  # fmt: skip
 """True less believed, of what `Ranges` says how far it may be off."""

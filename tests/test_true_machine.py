@@ -1,0 +1,134 @@
+"""A plant that is not what the controller knows: friction, an eccentric payload, other lengths."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+import stewart_drake as sd
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import data_root
+from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.experiment import compose_law, prepare, simulated_machine
+from stewart_drake.loop.simulation import make_simulator
+from stewart_drake.scenario.signals import COULOMB
+from tests.mechanisms import PAPER
+
+ON_REFERENCE = ("start=on_reference", "queue=reference")
+ROUGH = (
+    "plant.coulomb_friction=1e-3",
+    "plant.payload_mass=0.4",
+    "plant.payload_position=[0.03, -0.02, 0.05]",
+)
+
+
+def run(*settings: str, controller: str = "delay_lqi", **more: object) -> sd.SimulationResult:
+    scenario = sd.load_scenario("paper", controller, (*ON_REFERENCE, *settings))
+    return sd.simulate(scenario, margin=False, **more)
+
+
+def test_both_plants_go_the_same_way() -> None:
+    """Multibody is of first order in its step; without friction and payload it goes elsewhere."""
+    exact = run("plant.kind=exact", "duration=1.5", *ROUGH).signals.pose
+    errors = [
+        np.abs(run(f"plant.time_step={h}", "duration=1.5", *ROUGH).signals.pose - exact)
+        for h in (1e-3, 5e-4)
+    ]
+    coarse, fine = (float(error.max()) for error in errors)
+    plain = run("plant.kind=exact", "duration=1.5")
+    assert float(np.abs(plain.signals.pose - exact).max()) > 30 * coarse
+    assert coarse / fine == pytest.approx(2, rel=0.2)
+
+
+@pytest.mark.parametrize("controller", ["predictor_lqi", "adaptive_lqi"])
+def test_friction_is_found_where_it_is_asked_for(controller: str) -> None:
+    """Without it is taken for bias and damping, which it is not, and the run is lost or bad."""
+    settings = ("plant.kind=exact", "duration=6", "plant.coulomb_friction=1e-3", *ON_REFERENCE)
+    asked = "controller.estimate_coulomb=true"
+    loop = build_closed_loop(sd.load_scenario("paper", controller, (*settings, asked)))
+    simulator = make_simulator(loop)
+    simulator.AdvanceTo(6.0)
+    held = loop.GetSubsystemByName("controller")
+    context = held.GetMyContextFromRoot(simulator.get_context())
+    belief = held.memory(context).belief
+    assert belief.parameters[COULOMB] == pytest.approx(1e-3, rel=0.05)
+    found, without = (
+        run(*settings, *more, controller=controller).accumulated_error for more in ((asked,), ())
+    )
+    assert found < 4
+    assert not without < 5 * found  # or lost
+
+
+def test_the_law_sees_a_crank_turn_back() -> None:
+    """While its rate passes coulomb_speed; the paper's cranks accelerate by about 1 rad/s^2."""
+
+    def substeps(*settings: str) -> int:
+        return compose_law(prepare(sd.load_scenario("paper", settings=settings))).plant.substeps
+
+    plain = substeps("plant.coulomb_friction=1e-3")  # which nobody told
+    asked = substeps("controller.estimate_coulomb=true")
+    reference, state = prepare(sd.load_scenario("paper")).reference, []
+    for t in np.linspace(0, 10, 2001):
+        pose, rates = reference.value(t)[:, 0], reference.EvalDerivative(t, 1)[:, 0]
+        state.append(PAPER.jacobian(pose) @ rates)
+    fastest = np.abs(np.diff(state, axis=0)).max() / 5e-3
+    assert plain == 1
+    assert asked == np.ceil(0.1 * fastest / 0.02)
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    """The paper's with rods 0.3 mm longer."""
+    data = YAML(typ="safe").load((data_root() / "models" / "paper.yaml").read_text())
+    data["rod"]["length"] = float(PAPER.rod_lengths[0]) + 3e-4
+    path = tmp_path / "mine.yaml"
+    YAML(typ="safe").dump(data, path)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["exact", "multibody"])
+def test_the_plant_is_the_machine_that_the_scenario_says(machine: Path, kind: str) -> None:
+    """As with `truth`; the controller knows the other one."""
+    settings = (f"plant.kind={kind}", "duration=0.5")
+    found = run(*settings, f"plant.mechanism={machine}")
+    truth = dataclasses.replace(PAPER, rod_lengths=PAPER.rod_lengths + 3e-4)
+    expected = run(*settings, truth=truth)
+    assert np.abs(found.signals.pose - expected.signals.pose).max() < 1e-12
+    assert np.abs(found.signals.pose - run(*settings).signals.pose).max() > 1e-6
+    experiment = prepare(found.scenario)
+    assert experiment.mechanism == PAPER
+    assert experiment.truth == simulated_machine(found.scenario)
+    assert experiment.truth.rod_lengths == pytest.approx(truth.rod_lengths, rel=1e-12)
+
+
+def test_a_truth_that_is_given_comes_first(machine: Path) -> None:
+    scenario = sd.load_scenario("paper", settings=[f"plant.mechanism={machine}"])
+    assert prepare(scenario, PAPER).truth is PAPER
+
+
+def test_its_limit_is_that_of_its_motors(machine: Path) -> None:
+    data = YAML(typ="safe").load(machine.read_text())
+    data["motor"]["effort_limit"] = 0.25
+    YAML(typ="safe").dump(data, machine)
+    found = prepare(sd.load_scenario("paper", settings=[f"plant.mechanism={machine}"]))
+    assert found.torque_limit == 0.25
+
+
+def test_a_machine_that_does_not_reach_the_start_is_refused(machine: Path) -> None:
+    data = YAML(typ="safe").load(machine.read_text())
+    data["rod"]["length"], data["home"][5] = 0.8, 0.8
+    YAML(typ="safe").dump(data, machine)
+    scenario = sd.load_scenario("paper", settings=[f"plant.mechanism={machine}"])
+    with pytest.raises(ConfigError, match=r"^plant\.mechanism: got .* does not reach the first"):
+        prepare(scenario)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("nothing", r"^plant\.mechanism: got 'nothing'"), ("/no/file.yaml", r"^plant\.mechanism: no")],
+)
+def test_a_machine_that_is_not_there_names_the_field(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        prepare(sd.load_scenario("paper", settings=[f"plant.mechanism={name}"]))
