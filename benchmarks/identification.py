@@ -1,15 +1,15 @@
 """Machines found from their logs: `python benchmarks/identification.py [section ...]`.
 
 Writes benchmarks/results/identification.md; MACHINES of the environment is their number. Sections:
-ranges, drawing, loop, lost. All logs are of the exact plant with a delay that is believed to be 0.8 s and
-is 130 ms longer, logged while `adaptive_lqi` had the measured state: a multisine of 20 s around half the
-paper's amplitude, crank angles in 14 bit at 50 Hz, whose zero within a step is random. "With pose" is
-a pose beside them, off by 0.1 mrad and 20 um, and encoder offsets of 2 mrad nobody knows. Times are
-the CPU's.
+ranges, drawing. All logs are of the exact plant with a delay that is believed to be 0.8 s and is
+130 ms longer, logged while `adaptive_lqi` had the measured state: a multisine of 20 s around half
+the paper's amplitude, crank angles in 14 bit at 50 Hz, whose zero within a step is random. "With
+pose" is a pose beside them, off by 0.1 mrad and 20 um, and encoder offsets of 2 mrad nobody knows.
+Times are the CPU's.
 
 `ranges` draws machines as `analyze robustness` does; the tolerances of lengths and joints are the
-root mean square of what it draws. `drawing` draws lengths and joints with a standard deviation of 0.2 mm, the
-default tolerance.
+root mean square of what it draws. `drawing` draws lengths and joints with a standard deviation of
+0.2 mm, the default tolerance.
 """
 
 import dataclasses
@@ -161,9 +161,7 @@ def truth_of(machine: Mechanism, scenario: Scenario) -> Array:
     return values
 
 
-def log_of(
-    run: SimulationResult, machine: Mechanism, seed: int, poses: bool
-) -> tuple[Log, Array]:
+def log_of(run: SimulationResult, machine: Mechanism, seed: int, poses: bool) -> tuple[Log, Array]:
     """What encoders and, where asked for, a sensor of poses saw of a run; and the offsets."""
     rng, signals, period = np.random.default_rng(seed), run.signals, run.scenario.controller.period
     time = signals.time.values

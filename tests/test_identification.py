@@ -190,10 +190,14 @@ def test_sensitivities_are_differences_of_trajectories(delay):
         h = 1e-5 * np.eye(NUM_UNKNOWNS)[place]
         expected = (at(values + h).states - at(values - h).states)[:, 0] / 2e-5
         scale = np.abs(expected).max()
-        np.testing.assert_allclose(slopes[:, :, k], expected, atol=2e-4 * scale, err_msg=NAMES[place])
+        np.testing.assert_allclose(
+            slopes[:, :, k], expected, atol=2e-4 * scale, err_msg=NAMES[place]
+        )
     for k in range(12):
         h = 1e-5 * np.eye(12)[k]
-        expected = (at(values, states[0] + h).states - at(values, states[0] - h).states)[:, 0] / 2e-5
+        expected = (at(values, states[0] + h).states - at(values, states[0] - h).states)[
+            :, 0
+        ] / 2e-5
         np.testing.assert_allclose(slopes[:, :, k], expected, atol=1e-6)
 
 
@@ -254,8 +258,12 @@ def test_the_fit_is_that_of_a_general_solver():
     found = solve(problem, guess)
     spread = np.linalg.inv(other.jac.T @ other.jac)[: len(free), : len(free)]
     std = np.sqrt(np.diag(spread))
-    np.testing.assert_allclose(found.guess.values[free] / std, other.x[: len(free)] / std, atol=0.02)
-    np.testing.assert_allclose(found.covariance / np.outer(std, std), spread / np.outer(std, std), atol=2e-3)
+    np.testing.assert_allclose(
+        found.guess.values[free] / std, other.x[: len(free)] / std, atol=0.02
+    )
+    np.testing.assert_allclose(
+        found.covariance / np.outer(std, std), spread / np.outer(std, std), atol=2e-3
+    )
     assert found.residuals.chi2 == pytest.approx(2 * other.cost, abs=2 * ENOUGH)
     true = problem.unknowns.mean.copy()
     away = (found.guess.values - true)[free] / np.sqrt(np.diag(found.covariance))
@@ -338,13 +346,11 @@ def test_pose_uncertainty_is_that_of_drawn_machines():
 def sine_log(truth: Mechanism, parameters, delay: float, duration=6.0, seed=0) -> Log:
     """Open loop along a multisine: torques that would follow it, as far as they do; 14 bit.
 
-    Torques are those of the true machine with true parameters, sent early by the true delay, and the
-    plate is pulled back to the motion every second, as by hand: a log of several stretches.
+    Torques are those of the true machine with true parameters, sent early by the true delay, and
+    noise.
     """
     rng = np.random.default_rng(seed)
-    times, poses = multisine(
-        truth.home, np.array([0.1, 0.1, 0.1, 0.01, 0.01, 0.03]), duration
-    )
+    times, poses = multisine(truth.home, np.array([0.1, 0.1, 0.1, 0.01, 0.01, 0.03]), duration)
     rates = np.gradient(poses, times, axis=0, edge_order=2)
     accelerations = np.gradient(rates, times, axis=0, edge_order=2)
     dynamics = StewartDynamics(truth, 0.0, parameters)

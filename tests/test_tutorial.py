@@ -19,7 +19,7 @@ FENCE = re.compile(r"^```(\w+) ?(\S*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 def test_the_names_of_saved_files_are_told_in_the_text():
     text = TUTORIAL.read_text(encoding="utf-8")
     names = [name for _, name, _ in FENCE.findall(text) if name]
-    assert len(names) == 3 and all(f"*{name}*" in text for name in names)
+    assert len(names) == 4 and all(f"*{name}*" in text for name in names)
 
 
 def test_everything_in_it_works(tmp_path, monkeypatch, capsys):
@@ -50,6 +50,19 @@ def check_what_it_says(told: dict[str, str]) -> None:
         assert (Path("out/waves") / file).stat().st_size > 1000
     for file in ("out/bench/mechanism.png", "out/delay/report.html", "out/report/report.html"):
         assert Path(file).stat().st_size > 10_000
+    lost, half, full = (
+        json.loads(Path(f"out/{name}/summary.json").read_text())
+        for name in ("lost", "half", "full")
+    )
+    assert [run["status"] for run in (lost, half, full)] == [
+        "left_workspace",
+        "completed",
+        "completed",
+    ]
+    for name, error in {"first": 2e-4, "second": 5e-5}.items():
+        found = json.loads(Path(f"out/{name}/summary.json").read_text())
+        assert abs(found["delay_s"] - 0.93) < error and found["intervals"]
+    assert full["accumulated_error"] < 10
     with xr.open_dataset("out/desktop/signals.nc") as signals:
         assert signals.time.values[-1] == pytest.approx(2.0)
     assert "completed" in told["simulate waves.yaml --set plant.payload_mass=0.4"]

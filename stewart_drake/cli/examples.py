@@ -16,11 +16,11 @@ EXAMPLES: Final = {
     "export": ("stewart-drake export out/lqi/signals.nc --out lqi.csv",),
     "export-c": ("stewart-drake export-c paper --out out/board",),
     "report": ("stewart-drake report paper --set plant.kind=exact --out out/report",),
-    "new": ("stewart-drake new mine --torque-limit 6 --delay 0.08",),
     "identify": (
         "stewart-drake identify --plan paper --out out/plan",
         "stewart-drake identify out/lqi/signals.nc --mechanism paper --out out/machine",
     ),
+    "new": ("stewart-drake new mine --torque-limit 6 --delay 0.08",),
     "list": ("stewart-drake list",),
     "model check": ("stewart-drake model check paper --out out/paper",),
     "model sdf": ("stewart-drake model sdf paper --out paper.sdf",),

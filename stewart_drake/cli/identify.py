@@ -57,7 +57,7 @@ def identify(
         str | None,
         typer.Option(
             metavar="RAD,M",
-            help="Errors of measured poses; 1e-4,2e-5 for a CSV log. With --plan poses are measured.",
+            help="Errors of poses; 1e-4,2e-5 in a CSV log. With --plan: poses are measured too.",
         ),
     ] = None,
     gravity: Annotated[

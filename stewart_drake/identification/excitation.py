@@ -4,9 +4,9 @@ Coordinate i of six moves by
 
     q_i(t) = q_0i + w(t) a_i sum_j cos(2 pi f_ij t + phi_ij) / f_ij,
 
-with frequencies f_ij = low + (j + i/6) (high - low) / n of its own, and phases spread evenly over the
-turn by the golden sequence, so that no two coordinates move alike even for a short while. The window
-w rises from rest and falls to rest. a_i makes the peak what is asked for.
+with frequencies f_ij = low + (j + i/6) (high - low) / n of its own, and phases spread evenly over
+the turn by the golden sequence, so that no two coordinates move alike. The window w rises from rest
+and falls to rest. a_i makes the peak what is asked for.
 """
 
 from typing import Final
@@ -49,7 +49,8 @@ def multisine(middle: Array, peak: Array, duration: float) -> tuple[Array, Array
     y = np.clip(np.minimum(time, time[-1] - time) / rise, 0, 1)[:, None]
     window = y**4 * (35 - 84 * y + 70 * y**2 - 20 * y**3)  # three derivatives vanish at both ends
     moved = window * waves.sum(axis=1)
-    return time, middle + peak * moved / np.abs(moved).max(axis=0)
+    poses: Array = middle + peak * moved / np.abs(moved).max(axis=0)
+    return np.asarray(time, np.float64), poses
 
 
 def fitted_multisine(

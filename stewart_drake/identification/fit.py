@@ -4,8 +4,8 @@ Minimised over the unknowns p and the first state x_i of every segment is
 
     chi^2 = sum |(y - h(x(t); p)) / sigma|^2 + |(p - p_0) / sigma_0|^2,
 
-measurements and what was known before. A step solves J'J d = -J'r with J'J + lambda diag(J'J) in the
-place of J'J. A first state meets the measurements of its own segment only, so that J'J is an arrow,
+measurements and what was known before. A step solves J'J d = -J'r with J'J + lambda diag(J'J) in
+the place of J'J. A first state meets the measurements of its own segment only, J'J is an arrow,
 
     J'J = [N_pp, N_pi; N_ip, N_ii],   d_i = -N_ii^-1 (g_i + N_ip d_p),
     (N_pp - sum N_pi N_ii^-1 N_ip) d_p = -(g_p - sum N_pi N_ii^-1 g_i),

@@ -190,28 +190,33 @@ def identify(
     # The longest log has most to say.
     longest = max(range(len(logs)), key=lambda i: len(logs[i].times))
     unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
-    begun = [believed]
+    begun = [(believed, 1.0)]
     if tolerances.delay > 0:
         coarse = start.coarse_delay(
             logs[longest], poses[longest], mechanism, believed, tolerances.delay
         )
-        begun = [coarse, believed]
+        # Where the plate was lost, long trajectories lead nowhere; and the coarse delay may err.
+        begun = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5)]
     tried = list[Identification]()
-    for delay_at_first in begun:
-        tried.append(_from(delay_at_first, logs, poses, unknowns))
+    for delay_at_first, share in begun:
+        tried.append(_from(delay_at_first, share, logs, poses, unknowns))
         if tried[-1].right:
             break
     return min(tried, key=lambda one: one.chi2["all"])
 
 
 def _from(
-    delay: float, logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns
+    delay: float,
+    share: float,
+    logs: Sequence[Log],
+    poses: Sequence[Array],
+    unknowns: Unknowns,
 ) -> Identification:
-    """The fit that begins with a delay in s."""
+    """The fit that begins with a delay in s, of segments of a share of their usual length."""
     segments, mechanism = list[Segment](), unknowns.mechanism
     late = _COARSE if unknowns.std[DELAY] > 0 else 0.0
     for log, own in zip(logs, poses, strict=True):
-        length = start.segment_length(log, own, mechanism, delay)
+        length = share * start.segment_length(log, own, mechanism, delay)
         segments += start.segments_of(log, float(log.sent[0]) + delay + late, length)
     by_log = {log.name: own for log, own in zip(logs, poses, strict=True)}
     first, values = start.first_states(segments, by_log), unknowns.mean.copy()

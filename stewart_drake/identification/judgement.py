@@ -64,7 +64,7 @@ class PoseUncertainty(NamedTuple):
 
 
 def named_directions(mechanism: Mechanism) -> dict[str, Array]:
-    """Directions (NUM_UNKNOWNS,) in which machines differ as a whole, by what they are."""
+    """Directions (NUM_UNKNOWNS,) in which whole machines differ, by what they are."""
     joints, found = mechanism.p_PQ, {}
 
     def of_legs(columns: slice | int, values: Array) -> Array:
@@ -94,8 +94,8 @@ def unseen(unknowns: Unknowns, covariance: Array) -> tuple[int, list[str]]:
     """How many directions the log does not see, and what they are, in words.
 
     In units of what was known before, the covariance of the unknowns has eigenvalues from 0 (found
-    by the log) to 1 (as uncertain as before). Those above UNSEEN span what it does not see. Of that,
-    whole-machine directions are named; the rest by what it consists of.
+    by the log) to 1 (as uncertain as before). Those above UNSEEN span what it does not see. Of
+    that, whole-machine directions are named; the rest by what it consists of.
 
     Args:
         unknowns: before the log.

@@ -34,10 +34,9 @@ _TORQUES: Final = [f"torque_{leg}" for leg in LEGS]
 _CRANKS: Final = [f"angle_{leg}" for leg in LEGS]
 _UNITS: Final[dict[str, Mapping[str, float]]] = {
     "time": {"s": 1.0},
-    **dict.fromkeys(_TORQUES, {"N m": 1.0, "mN m": 1e-3}),
-    **dict.fromkeys(_CRANKS, _ANGLE),
-    **dict.fromkeys(COORDINATE_NAMES[:3], _ANGLE),
-    **dict.fromkeys(COORDINATE_NAMES[3:], _LENGTH),
+    **{name: {"N m": 1.0, "mN m": 1e-3} for name in _TORQUES},
+    **{name: _ANGLE for name in (*_CRANKS, *COORDINATE_NAMES[:3])},  # noqa: C420
+    **{name: _LENGTH for name in COORDINATE_NAMES[3:]},  # noqa: C420
 }
 _HEADER: Final = (
     "time[s], torque_1[N m] to torque_6, angle_1[rad] to angle_6 and, where it was measured, "
@@ -49,8 +48,9 @@ equations are integrated."""
 
 
 def angle_std(bits: int) -> float:
-    """Of a code of so many bits per turn, rad: it is off by up to half a step either way, evenly."""
+    """Of a code of so many bits per turn, rad: off by up to half a step either way, evenly."""
     return 2 * math.pi / 2**bits / math.sqrt(12)
+
 
 LEAST_ANGLE: Final = 1e-6
 """rad, alike of encoders without a code."""
@@ -101,7 +101,7 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
         raise ConfigError(f"{path}: {problem}; expected {EXPECTED}")
     period, time = scenario.controller.period, signals.time.values
     # Held signals show a sample's value from its instant on.
-    samples = period * np.arange(int(time[-1] / period + 1e-9) + 1)
+    samples: Array = period * np.arange(int(time[-1] / period + 1e-9) + 1, dtype=np.float64)
     rows = np.minimum(np.searchsorted(time, samples - 1e-9), len(time) - 1)
     seen = time[rows] < samples + period - 1e-9
     if not seen.all():
@@ -166,11 +166,12 @@ def _scenario_of(path: Path, signals: xr.Dataset) -> Scenario:
 
 def _run_problem(signals: xr.Dataset, scenario: Scenario) -> str | None:
     """Why a run cannot serve as a log, or None."""
-    sensor = scenario.sensor
-    states = isinstance(sensor, StateSensorConfig)
-    shapes = {
+    sensor, measured = scenario.sensor, {"state": NUM_STATE}
+    if not isinstance(sensor, StateSensorConfig):
+        measured = {"encoder": NUM_LEGS * sensor.samples}
+    shapes: dict[str, dict[str, int]] = {
         "torque_commanded": {"leg": NUM_TORQUES},
-        "measurement": {"state": NUM_STATE} if states else {"encoder": NUM_LEGS * sensor.samples},
+        "measurement": measured,
         "delay_estimate": {},
     }
     for name, others in shapes.items():

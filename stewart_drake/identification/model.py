@@ -149,7 +149,7 @@ class MachineModel:
         dF, MN = self._residual(states[:, :6], states[:, 6:], a, torques, *numbers)
         n = self.points
         dF, MN = dF.reshape(n, -1, NUM_COORDINATES), MN.reshape(n, 6, 6)
-        da = -np.linalg.solve(MN.transpose(0, 2, 1), dF.transpose(0, 2, 1))
+        da = np.negative(np.linalg.solve(MN.transpose(0, 2, 1), dF.transpose(0, 2, 1)), dtype=float)
         return Slopes(a, da[:, :, :NUM_STATE], da[:, :, NUM_STATE:])
 
     def crank_angles(self, poses: Array, numbers: Numbers) -> tuple[Array, Array, Array]:

@@ -163,7 +163,7 @@ def _foreseen(
     sc, mechanism = experiment.scenario, experiment.mechanism
     dynamics = StewartDynamics(mechanism, experiment.nominal.gravity)
     period, eta = sc.controller.period, sc.eta
-    sent = period * np.arange(int(end / period + 1e-9) + 1)
+    sent: Array = period * np.arange(int(end / period + 1e-9) + 1, dtype=np.float64)
     # The motion rests after its end.
     starts = np.minimum(sent + eta, end)
     torques = mean_torques(dynamics, motion, starts, np.minimum(starts + period, end))

@@ -35,15 +35,15 @@ _UNITS: Final = {
     "rad": ("mrad", 1e3),
     "s": ("ms", 1e3),
 }
-"""How a unknown's SI unit is told, and the factor."""
+"""How an unknown's SI unit is told, and the factor."""
 _FIT_TEXT: Final = (
-    "chi²/n is the mean square of what the fit leaves, in standard deviations of the measurement: 1 "
-    "where the model explains all but the measurements' own errors."
+    "chi²/n is the mean square of what the fit leaves, in standard deviations of the measurement: "
+    "1 where the model explains all but the measurements' own errors."
 )
 _POSES_TEXT: Final = (
     "Standard deviation of a pose that is computed from crank angles with the geometry found, "
-    "the largest of three coordinates. From the middle: of the change from the pose in the middle of "
-    "the motion, where it does not matter how base and plate stand in their frames."
+    "the largest of three coordinates. From the middle: of the change from the pose in the middle "
+    "of the motion, where it does not matter how base and plate stand in their frames."
 )
 
 

@@ -1,0 +1,223 @@
+"""`identify`: bad logs and options in one line each; from a lost run to one that is held."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from stewart_drake.cli import main
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.log_files import Precision, angle_std, read_log
+from stewart_drake.identification.logs import ANGLES, POSE
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.scenario.known import load_known
+from tests.mechanisms import PAPER
+
+HEADER = [
+    "time[s]",
+    *(f"torque_{leg}[N m]" for leg in range(1, 7)),
+    *(f"angle_{leg}[deg]" for leg in range(1, 7)),
+]
+HOME = np.rad2deg(PAPER.crank_angles(PAPER.home))
+ROWS = [
+    [f"{0.02 * k:.2f}", *(f"{0.1 * (k // 5 % 3)}" for _ in range(6)), *(f"{a:.6f}" for a in HOME)]
+    for k in range(60)
+]
+
+
+def csv_text(header=HEADER, rows=ROWS) -> str:
+    return "\n".join(",".join(cells) for cells in [header, *rows]) + "\n"
+
+
+def changed(row: int, column: int, text: str) -> str:
+    rows = [list(cells) for cells in ROWS]
+    rows[row][column] = text
+    return csv_text(rows=rows)
+
+
+def read(path: Path):
+    return read_log(path, PAPER, Precision())
+
+
+def test_a_csv_log_is_read(tmp_path):
+    path = tmp_path / "log.csv"
+    poses = ["roll[deg]", "pitch[rad]", "yaw[rad]", "x[mm]", "y[m]", "z[m]"]
+    rows = [[*row, "1.5", "0.1", "", "2", "0", "0.38"] for row in ROWS]
+    path.write_text(csv_text([*HEADER, *poses], rows))
+    log = read(path)
+    assert len(log.times) == 60 and log.gravity == 9.81 and log.delay is None
+    np.testing.assert_allclose(log.sent[:3], [0.0, 0.1, 0.2])  # only changes have a time
+    np.testing.assert_allclose(log.torques[:3, 0], [0.0, 0.1, 0.2])
+    np.testing.assert_allclose(log.values[5, ANGLES], np.deg2rad(HOME), atol=1e-8)
+    np.testing.assert_allclose(log.values[5, POSE], [np.deg2rad(1.5), 0.1, np.nan, 2e-3, 0, 0.38])
+    np.testing.assert_allclose(log.acting(np.array([0.0, 0.19, 0.21]), 0.1)[:, 0], [0, 0, 0.1])
+
+
+def test_measurements_come_at_100_hz_at_most(tmp_path):
+    path = tmp_path / "log.csv"
+    rows = [[f"{0.001 * k:.3f}", *ROWS[k % 60][1:]] for k in range(1000)]
+    path.write_text(csv_text(rows=rows))
+    times = read(path).times
+    assert len(times) == 100 and np.diff(times).min() > 0.0099
+
+
+def test_the_error_of_a_code_is_that_of_rounding():
+    angles, step = np.random.default_rng(0).uniform(-3, 3, 100_000), 2 * np.pi / 2**10
+    assert angle_std(10) == pytest.approx((step * np.round(angles / step) - angles).std(), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("", "is empty"),
+        (csv_text(["time", *HEADER[1:]]), "time"),
+        (csv_text(["time[ms]", *HEADER[1:]]), "time[ms]"),
+        (csv_text([*HEADER[:3], "torque_1[N m]", *HEADER[4:]]), "a second column"),
+        (csv_text(HEADER[:7], [row[:7] for row in ROWS]), "angle_1 is missing"),
+        (csv_text(HEADER[:-1], [row[:-1] for row in ROWS]), "angle_6 is missing"),
+        (csv_text([*HEADER[:1], *HEADER[2:]], [row[:1] + row[2:] for row in ROWS]), "torque_1"),
+        (csv_text(rows=[*ROWS[:9], ROWS[9][:-1], *ROWS[10:]]), "row 11: got 12 cells"),
+        (changed(3, 0, "0.01"), "row 5, column time"),
+        (changed(3, 0, ""), "row 5, column time"),
+        (changed(3, 4, "many"), "row 5, column torque_4"),
+        (changed(3, 9, "inf"), "row 5, column angle_3"),
+        (changed(3, 2, ""), "row 5: got some of the six torques"),
+        (csv_text(rows=ROWS[:15]), "at 15 instants"),
+        (csv_text(rows=[[row[0], *ROWS[0][1:]] for row in ROWS]), "one torque throughout"),
+    ],
+)  # fmt: skip
+def test_a_bad_csv_log_is_told_in_one_line(tmp_path, text, named):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        read(path)
+    assert named in str(caught.value) and str(path) in str(caught.value)
+    assert "expected" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def lost(tmp_path_factory) -> Path:
+    """The log of a run whose delay is believed to be 0.8 s and is 0.93 s."""
+    folder = tmp_path_factory.mktemp("lost")
+    settings = (
+        "plant.kind=exact", "start=on_reference", "queue=reference", "controller.delay_steps=8",
+        "delay.steps=9", "delay.fraction=0.3", "plant.payload_mass=0.4",
+        "sensor.noise_std=[1e-4,1e-4,1e-4,2e-5,2e-5,2e-5,1e-3,1e-3,1e-3,1e-4,1e-4,1e-4]",
+    )  # fmt: skip
+    words = [word for setting in settings for word in ("--set", setting)]
+    assert main(["simulate", "paper", *words, "--out", str(folder), "--quiet"]) == 0
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["status"] == "left_workspace" and summary["failure"]["time"] < 8
+    return folder / "signals.nc"
+
+
+def broken(signals: xr.Dataset, how: str) -> xr.Dataset:
+    if how == "scenario":
+        signals.attrs.pop("scenario")
+    elif how in ("network", "sensor.delay"):
+        old, new = {
+            "network": ("link:\n  kind: wire", "link:\n  kind: network"),
+            "sensor.delay": ("sensor:\n  kind: state", "sensor:\n  delay: 0.1\n  kind: state"),
+        }[how]
+        text = signals.attrs["scenario"]
+        if how == "sensor.delay":
+            text = text.replace("  delay: 0.0\n", "")
+        assert old in text
+        signals.attrs["scenario"] = text.replace(old, new, 1)
+    elif how == "log_period":
+        return signals.isel(time=slice(None, None, 9))
+    elif how == "at 5 instants":
+        return signals.isel(time=signals.time < 0.45)
+    else:
+        return signals.drop_vars(how)
+    return signals
+
+
+@pytest.mark.parametrize(
+    "how",
+    ["scenario", "network", "sensor.delay", "log_period", "at 5 instants", "measurement",
+     "torque_commanded"],
+)  # fmt: skip
+def test_a_run_that_is_no_log_is_told_in_one_line(lost, tmp_path, how):
+    with xr.open_dataset(lost, engine="h5netcdf") as signals:
+        broken(signals.load(), how).to_netcdf(tmp_path / "bad.nc", engine="h5netcdf")
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path / "bad.nc")
+    assert how in str(caught.value) and "bad.nc" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ([], "LOG, --plan"),
+        (["LOG", "--plan", "paper"], "LOG, --plan"),
+        (["LOG"], "--mechanism"),
+        (["LOG", "--mechanism", "nothing"], "nothing"),
+        (["LOG", "--mechanism", "desktop"], "do not suit the mechanism desktop"),
+        (["no.csv", "--mechanism", "paper"], "no.csv"),
+        (["LOG", "--mechanism", "paper", "--tolerance", "lengths"], "--tolerance"),
+        (["LOG", "--mechanism", "paper", "--tolerance", "lengths=-1"], "lengths"),
+        (["LOG", "--mechanism", "paper", "--tolerance", "width=1"], "width"),
+        (["LOG", "--mechanism", "paper", "--tolerance", "delay=null"], "delay"),
+        (["LOG", "--mechanism", "paper", "--delay", "-1"], "--delay"),
+        (["LOG", "--mechanism", "paper", "--delay", "nan"], "--delay"),
+        (["LOG", "--mechanism", "paper", "--bits", "0"], "--bits"),
+        (["LOG", "--mechanism", "paper", "--pose-std", "1e-4"], "--pose-std"),
+        (["LOG", "--mechanism", "paper", "--pose-std", "1e-4,0"], "--pose-std"),
+        (["LOG", "--mechanism", "paper", "--set", "duration=1"], "--set"),
+        (["--plan", "nothing"], "nothing"),
+        (["--plan", "paper", "--set", "plant.gravitas=true"], "gravitas"),
+    ],
+)
+def test_a_bad_command_is_told_in_one_line(tmp_path, capsys, arguments, named):
+    path = tmp_path / "log.csv"
+    path.write_text(csv_text())
+    words = [str(path) if word == "LOG" else word for word in arguments]
+    assert main(["identify", *words, "--out", str(tmp_path / "out")]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("error: ") and named in err and err.count("\n") == 1
+    assert not list((tmp_path / "out").glob("*.yaml"))
+
+
+def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
+    assert main(["identify", str(lost), "--mechanism", "paper", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "The delay is 9" in out and all(len(line) <= 80 for line in out.splitlines())
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert abs(summary["delay_s"] - 0.93) < 1e-3 and summary["intervals"]
+    assert abs(summary["delay_s"] - 0.93) < 4 * summary["delay_std_s"]
+    assert abs(summary["parameters"]["payload_mass"]["value"] - 0.4) < 0.1
+    assert summary["chi2"].keys() == {"pose", "rates", "prior", "all"}
+    assert 0.7 < summary["chi2"]["all"] < 1.4
+    assert summary["pose_uncertainty"].keys() >= {"angle_rad", "position_m"}
+    known = load_known(tmp_path / "known.yaml")
+    assert known.value("delay") == summary["delay_s"]
+    machine = load_mechanism(tmp_path / "mechanism.yaml")
+    assert np.abs(machine.rod_lengths - PAPER.rod_lengths).max() < 1e-3
+    page = (tmp_path / "report.html").read_text()
+    assert "What the log does not see" in page and "<svg" not in page.split("<body")[0]
+    settings = (
+        "plant.kind=exact", "plant.mechanism=paper", "delay.steps=9", "delay.fraction=0.3",
+        "plant.payload_mass=0.4", "reference.amplitude=[0.13,0.13,0.13,0.01,0.01,0.04]",
+        f"mechanism={tmp_path / 'mechanism.yaml'}", f"controller.known={tmp_path / 'known.yaml'}",
+    )  # fmt: skip
+    words = [word for setting in settings for word in ("--set", setting)]
+    assert main(["simulate", "paper", *words, "--out", str(tmp_path / "next"), "--quiet"]) == 0
+    run = json.loads((tmp_path / "next" / "summary.json").read_text())
+    assert run["status"] == "completed" and run["delay"]["estimated_s"] == summary["delay_s"]
+
+
+def test_a_plan_can_be_run(tmp_path):
+    assert main(["identify", "--plan", "paper", "--out", str(tmp_path), "--quiet"]) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert 1e-6 < summary["delay_std_s"] < 1e-4 and summary["share"] == 1
+    assert {f"where the base stands along {axis}" for axis in "xyz"} <= {
+        *summary["unseen"]["names"]
+    }
+    words = ["--set", "plant.kind=exact", "--set", "duration=3", "--out", str(tmp_path / "run")]
+    assert main(["simulate", str(tmp_path / "scenario.yaml"), *words, "--quiet"]) == 0
+    run = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert run["status"] == "completed"
