@@ -233,7 +233,11 @@ def main() -> None:
     for work, times in measure().items():
         numbers = " | ".join(f"{1e6 * times[name]:.4g}" for name in BACKENDS)
         lines.append(f"| {work} | {numbers} | {times['casadi'] / times['native']:.2f} |")
-    lines += ["", "Least times of repeats, both in turns; the law in Python on the compiled dynamics:", ""]
+    lines += [
+        "",
+        "Least times of repeats, both in turns; the law in Python on the compiled dynamics:",
+        "",
+    ]
     with ProcessPoolExecutor(1, get_context("spawn"), use, ("require",)) as pool:
         lines += pool.submit(controller_lines).result()
     text = "\n".join(lines) + "\n"

@@ -64,13 +64,17 @@ def uncovered(law: PredictiveLqi) -> str | None:
     observer: Any = law.observer.observer if isinstance(law.observer, LateObserver) else None
     observer = observer if late else law.observer
     timeline, dynamics, estimated = law.timeline, law.plant.dynamics, PARAMETERS
+    correlated = False
     if isinstance(observer, ParameterObserver):
-        estimated = observer.settings.parameters.names
+        prior = observer.settings.parameters
+        # A prior whose errors go together, which a set of parameters may have or not.
+        estimated, correlated = prior.names, getattr(prior, "correlation", None) is not None
     covered = {
         "law": type(law) is PredictiveLqi and type(law.plant) is NominalPlant,
         "controller.delay_estimator": not isinstance(observer, DelayObserver),
         "controller.estimator": type(observer) in _OBSERVERS and type(timeline) is Timeline,
         "controller.prior": estimated == PARAMETERS and dynamics.free == PARAMETERS,
+        "controller.known": not correlated,
         "controller.rejoin": type(law.planner) is NoPlanner,
         "controller.prediction": type(law.predictor) is NonlinearPredictor,
         "controller.feedforward": type(law.feedforward) is InverseDynamicsFeedforward,
