@@ -358,7 +358,9 @@ MACHINE: Final[Model] = {
         lambda rng, a: float(a.ranges.jitter * a.scales.period * rng.uniform()), _jitter, "ms", 1e3,
         optional=True,
     ),
-    "loss": Quantity(lambda rng, a: float(a.ranges.loss * rng.uniform()), _lose, "%", 100, optional=True),
+    "loss": Quantity(
+        lambda rng, a: float(a.ranges.loss * rng.uniform()), _lose, "%", 100, optional=True
+    ),
     "link_seed": Quantity(draw_seed, _seed_link),
 }  # fmt: skip
 """True less believed, of what `Ranges` says how far it may be off."""
