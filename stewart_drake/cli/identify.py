@@ -69,9 +69,9 @@ def identify(
 ) -> int:
     """Find delay, friction and geometry in a log.
 
-    Even in that of a lost run. Writes mechanism.yaml and known.yaml for simulate, and a page. A CSV log has the columns
-    time[s], torque_1[N m] to torque_6 as they were commanded, angle_1[rad] to angle_6, and
-    where they were measured roll[rad] to z[m].
+    Even in that of a lost run. Writes mechanism.yaml and known.yaml for simulate, and a page.
+    A CSV log has the columns time[s], torque_1[N m] to torque_6 as they were commanded,
+    angle_1[rad] to angle_6, and where they were measured roll[rad] to z[m].
     """
     tolerances = read_tolerances(tolerance or ())
     precision = _precision(bits, pose_std)
