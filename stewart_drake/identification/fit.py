@@ -37,7 +37,7 @@ MOST_DELAY: Final = 0.1
 """s by which one iteration may change the delay."""
 ENOUGH: Final = 0.01
 """Of chi^2; an iteration that gains less is the last."""
-_MOST_ITERATIONS: Final = 30
+_MOST_ITERATIONS: Final = 60
 _SLOPES_STEP: Final = 0.02
 """s, of the integration of slopes."""
 _STEP_ERROR: Final = 0.05
