@@ -18,7 +18,7 @@ EXAMPLES: Final = {
     "report": ("stewart-drake report paper --set plant.kind=exact --out out/report",),
     "identify": (
         "stewart-drake identify --plan paper --out out/plan",
-        "stewart-drake identify out/lqi/signals.nc --mechanism paper --out out/machine",
+        "stewart-drake identify out/lqi/signals.nc --mechanism paper --out out/m",
     ),
     "new": ("stewart-drake new mine --torque-limit 6 --delay 0.08",),
     "list": ("stewart-drake list",),

@@ -67,11 +67,11 @@ def identify(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Find delay, friction, payload and geometry in a log, even of a lost run.
+    """Find delay, friction and geometry in a log.
 
-    Writes mechanism.yaml and known.yaml for simulate, and a page. A CSV log has the columns
-    time[s], torque_1[N m] to torque_6 as they were commanded, angle_1[rad] to angle_6, and
-    where they were measured roll[rad] to z[m].
+    Even in that of a lost run. Writes mechanism.yaml and known.yaml for simulate, and a page.
+    A CSV log has the columns time[s], torque_1[N m] to torque_6 as they were commanded,
+    angle_1[rad] to angle_6, and where they were measured roll[rad] to z[m].
     """
     tolerances = read_tolerances(tolerance or ())
     precision = _precision(bits, pose_std)
@@ -80,13 +80,7 @@ def identify(
         raise ConfigError(f"LOG, --plan: got {given}; expected logs, or --plan SCENARIO")
     if delay is not None and not 0 <= delay <= 100:
         raise ConfigError(f"--delay: got {delay:g}; expected 0 to 100 s")
-    typed = {
-        "delay": delay,
-        "tolerance": tolerance,
-        "bits": None if bits == 14 else bits,
-        "pose-std": pose_std,
-        "out": out,
-    }
+    typed = {"delay": delay, "tolerance": tolerance, "bits": bits, "pose-std": pose_std, "out": out}
     delivery = Delivery(out, quiet, as_json)
     if plan is not None:
         measured = pose_std is not None

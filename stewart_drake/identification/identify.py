@@ -259,6 +259,8 @@ def _unknowns(
         turned = own[known] @ J.T
         spans = np.diff(log.times[known])
         speeds.append(np.abs(np.diff(turned, axis=0) / spans[:, None]).max())
+    if not max(speeds) > 0:
+        raise ConfigError("LOG: got a plate that does not move; expected one that does")
     torque = max(float(np.abs(log.torques).max()) for log in logs)
     unknowns = unknowns_of(mechanism, tolerances, believed, torque, float(max(speeds)))
     if not any(log.measures(ANGLES) for log in logs):
