@@ -12,6 +12,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.bulk import samples_of
 from stewart_drake.loop.encoders import Encoders
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import make_simulator, simulate
@@ -21,7 +22,6 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import LEGS, POSE
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import make_reference
-from stewart_drake.tuning.dataset import samples as rows_of
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]
@@ -270,7 +270,7 @@ def test_the_record_has_angles_with_labels(tmp_path: Any) -> None:
 
 def test_densities_and_data_sets_are_of_the_estimate() -> None:
     result = run(*ON_REFERENCE, "duration=4")
-    rows = rows_of(result)
+    rows = samples_of(result)
     kept = result.signals.sel(time=1.5)
     assert rows[15, :6] == pytest.approx(kept.state_estimate.values[POSE] - kept.reference.values)
     assert np.isfinite(result.signals.density.values[-1]).all()

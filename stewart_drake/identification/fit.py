@@ -213,13 +213,29 @@ def followed(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
     return replace(problem, segments=segments), Guess(start.values, start.first[kept])
 
 
-def solve(problem: Problem, start: Guess) -> Fit:
-    """The most probable guess, from a start whose trajectories are `followed`."""
+def nearest(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
+    """The half of the segments whose first trajectories are nearest to what was measured.
+
+    The others, such as the last one before a plate was lost, would pull all unknowns to wherever
+    their own trajectory gets shorter; with what these say they are near, too.
+    """
+    measured, (values, _) = Evaluator(problem).residuals(start).measured, problem.measured()
+    away = np.sum(measured**2, axis=(0, 2)) / np.isfinite(values).sum(axis=(0, 2))
+    kept = np.sort(np.argsort(away)[: (len(away) + 1) // 2])
+    segments = [problem.segments[k] for k in kept]
+    return replace(problem, segments=segments), Guess(start.values, start.first[kept])
+
+
+def solve(problem: Problem, start: Guess, most: int = _MOST_ITERATIONS) -> Fit:
+    """The most probable guess, from a start whose trajectories are `followed`.
+
+    `most`: iterations; the fit ends where they do, or where they gain nothing.
+    """
     evaluator = Evaluator(problem)
     guess, damping = start, _DAMPING[0]
     residuals, normal = evaluator.normal(guess)
     iterations = 0
-    while iterations < _MOST_ITERATIONS:
+    while iterations < most:
         iterations += 1
         before, gained = residuals.chi2, 0.0
         while damping < _DAMPING[2]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from stewart_drake.identification.fit import (
     chi2_per_value,
     finer,
     followed,
+    nearest,
     solve,
 )
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
@@ -42,6 +43,8 @@ WRONG: Final = 1.5
 """chi^2 per value from which on a fit is wrong and its intervals mean nothing."""
 USUAL_DELAY: Final = 0.1
 """s, believed where nobody says anything."""
+_FEW: Final = 15
+"""Iterations over the segments that are looked at first."""
 _COARSE: Final = 0.1
 """s by which the delay that is begun with may be off."""
 
@@ -190,29 +193,50 @@ def identify(
     # The longest log has most to say.
     longest = max(range(len(logs)), key=lambda i: len(logs[i].times))
     unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
-    begun = [(believed, 1.0)]
+    starts = [(believed, 1.0)]
     if tolerances.delay > 0:
         coarse = start.coarse_delay(
             logs[longest], poses[longest], mechanism, believed, tolerances.delay
         )
         # Where the plate was lost, long trajectories lead nowhere; and the coarse delay may err.
-        begun = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5)]
-    tried = list[Identification]()
-    for delay_at_first, share in begun:
-        tried.append(_from(delay_at_first, share, logs, poses, unknowns))
-        if tried[-1].right:
+        starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5)]
+    tried = list[_Begun]()
+    for delay_at_first, share in starts:
+        tried.append(_begin(delay_at_first, share, logs, poses, unknowns))
+        if tried[-1].chi2 <= WRONG:
             break
-    return min(tried, key=lambda one: one.chi2["all"])
+    whole, values, first = min(tried, key=lambda one: one.chi2)[1:]
+    problem, guess = followed(whole, Guess(values, first))
+    fit = _solved(problem, guess)
+    # With what was found, what ran away before may be followed.
+    again, retried = followed(whole, Guess(fit.guess.values, first))
+    if len(again.segments) > len(problem.segments):
+        problem, fit = again, _solved(again, retried)
+    while (halved := finer(problem, fit.guess)) is not None:
+        problem, fit = halved, _solved(halved, fit.guess)
+    middle = np.nanmedian(np.vstack(poses), axis=0)
+    left_out = len(whole.segments) - len(problem.segments)
+    return Identification(logs, unknowns, problem, fit, left_out, middle)
 
 
-def _from(
+class _Begun(NamedTuple):
+    """Where a start leads; chi^2 per value, of the segments that were looked at first."""
+
+    chi2: float
+    whole: Problem
+    values: Array
+    first: Array
+    """(n, 12) states of all n segments, as measured."""
+
+
+def _begin(
     delay: float,
     share: float,
     logs: Sequence[Log],
     poses: Sequence[Array],
     unknowns: Unknowns,
-) -> Identification:
-    """The fit that begins with a delay in s, of segments of a share of their usual length."""
+) -> _Begun:
+    """A delay in s and segments of a share of their usual length, and what the nearest say."""
     segments, mechanism = list[Segment](), unknowns.mechanism
     late = _COARSE if unknowns.std[DELAY] > 0 else 0.0
     for log, own in zip(logs, poses, strict=True):
@@ -223,16 +247,12 @@ def _from(
     values[DELAY] = delay
     whole = Problem(segments, unknowns)
     problem, guess = followed(whole, Guess(values, first))
-    fit = _solved(problem, guess)
-    # With what was found, what ran away before may be followed.
-    again, retried = followed(whole, Guess(fit.guess.values, first))
-    if len(again.segments) > len(problem.segments):
-        problem, fit = again, _solved(again, retried)
-    while (halved := finer(problem, fit.guess)) is not None:
-        problem, fit = halved, _solved(halved, fit.guess)
-    middle = np.nanmedian(np.vstack(poses), axis=0)
-    left_out = len(segments) - len(problem.segments)
-    return Identification(logs, unknowns, problem, fit, left_out, middle)
+    if not problem.segments:
+        return _Begun(np.inf, whole, values, first)
+    near, guess = nearest(problem, guess)
+    fit = solve(near, guess, _FEW)
+    chi2 = chi2_per_value(fit.residuals, near)["all"]
+    return _Begun(chi2, whole, fit.guess.values, first)
 
 
 def _solved(problem: Problem, guess: Guess) -> Fit:
