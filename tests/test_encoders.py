@@ -11,8 +11,8 @@ from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.bulk import samples_of
+from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.encoders import Encoders
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import make_simulator, simulate

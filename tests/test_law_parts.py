@@ -37,6 +37,7 @@ from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
+from tests.backends import stepped_in_python
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 from tests.test_control_law import HOME, WEIGHTS, Loop, law_of, nominal_queue, sine
@@ -533,7 +534,10 @@ class Cautious(LeafSystem):
         output.SetFromVector([1 / (1 + 1e3 * error), 1.0])
 
 
-def test_a_source_of_weights_needs_no_change_of_the_package() -> None:
+def test_a_source_of_weights_needs_no_change_of_the_package(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stepped_in_python(monkeypatch)  # compared to the last bit with the law itself
     law = law_of("delay.steps=2")
     builder = DiagramBuilder()
     controller = builder.AddSystem(DelayLqiController(law, np.zeros((2, 6))))
