@@ -208,9 +208,7 @@ def followed(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
     """Without the segments whose first trajectory runs out of the workspace."""
     measured = Evaluator(problem).residuals(start).measured
     with np.errstate(over="ignore"):
-        kept = np.flatnonzero(np.isfinite(np.sum(measured**2, axis=(0, 2))))
-    segments = [problem.segments[k] for k in kept]
-    return replace(problem, segments=segments), Guess(start.values, start.first[kept])
+        return _of(problem, start, np.flatnonzero(np.isfinite(np.sum(measured**2, axis=(0, 2)))))
 
 
 def nearest(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
@@ -219,9 +217,23 @@ def nearest(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
     The others, such as the last one before a plate was lost, would pull all unknowns to wherever
     their own trajectory gets shorter; with what these say they are near, too.
     """
-    measured, (values, _) = Evaluator(problem).residuals(start).measured, problem.measured()
-    away = np.sum(measured**2, axis=(0, 2)) / np.isfinite(values).sum(axis=(0, 2))
-    kept = np.sort(np.argsort(away)[: (len(away) + 1) // 2])
+    away = misfit(Evaluator(problem).residuals(start), problem)
+    return _of(problem, start, np.sort(np.argsort(away)[: (len(away) + 1) // 2]))
+
+
+def without(problem: Problem, start: Guess, segment: int) -> tuple[Problem, Guess]:
+    """The others."""
+    return _of(problem, start, np.delete(np.arange(len(problem.segments)), segment))
+
+
+def misfit(residuals: Residuals, problem: Problem) -> Array:
+    """chi^2 per value (n,) of each segment."""
+    values, _ = problem.measured()
+    squares = np.sum(residuals.measured**2, axis=(0, 2))
+    return np.asarray(squares / np.isfinite(values).sum(axis=(0, 2)))
+
+
+def _of(problem: Problem, start: Guess, kept: NDArray[np.intp]) -> tuple[Problem, Guess]:
     segments = [problem.segments[k] for k in kept]
     return replace(problem, segments=segments), Guess(start.values, start.first[kept])
 

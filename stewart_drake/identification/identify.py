@@ -17,8 +17,10 @@ from stewart_drake.identification.fit import (
     chi2_per_value,
     finer,
     followed,
+    misfit,
     nearest,
     solve,
+    without,
 )
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
 from stewart_drake.identification.logs import ANGLES, POSE, Log
@@ -45,6 +47,9 @@ USUAL_DELAY: Final = 0.1
 """s, believed where nobody says anything."""
 _FEW: Final = 15
 """Iterations over the segments that are looked at first."""
+_ASTRAY: Final = 1e3
+"""chi^2 per value of a segment that is not explained by any machine like this one; drawings that
+are off by a millimetre make some fifty."""
 _COARSE: Final = 0.1
 """s by which the delay that is begun with may be off."""
 
@@ -205,13 +210,9 @@ def identify(
         tried.append(_begin(delay_at_first, share, logs, poses, unknowns))
         if tried[-1].chi2 <= WRONG:
             break
-    whole, values, first = min(tried, key=lambda one: one.chi2)[1:]
-    problem, guess = followed(whole, Guess(values, first))
-    fit = _solved(problem, guess)
-    # With what was found, what ran away before may be followed.
-    again, retried = followed(whole, Guess(fit.guess.values, first))
-    if len(again.segments) > len(problem.segments):
-        problem, fit = again, _solved(again, retried)
+    best = min(tried, key=lambda one: one.chi2)
+    whole = best.whole
+    problem, fit = _grown(best)
     while (halved := finer(problem, fit.guess)) is not None:
         problem, fit = halved, _solved(halved, fit.guess)
     middle = np.nanmedian(np.vstack(poses), axis=0)
@@ -253,6 +254,27 @@ def _begin(
     fit = solve(near, guess, _FEW)
     chi2 = chi2_per_value(fit.residuals, near)["all"]
     return _Begun(chi2, whole, fit.guess.values, first)
+
+
+def _grown(begun: _Begun) -> tuple[Problem, Fit]:
+    """The fit of all segments, without those that nothing fits.
+
+    Where the nearest segments are explained, and all of them are not, a trajectory may have gone
+    astray, such as the last before a plate was lost. One that is off by more than a machine that
+    is not quite this one can make it is left out then, as long as more than the nearest are left.
+    """
+    problem, guess = followed(begun.whole, Guess(begun.values, begun.first))
+    if begun.chi2 > WRONG:
+        return problem, _solved(problem, guess)
+    fewest = len(problem.segments) // 2 + 1
+    fit = solve(problem, guess, _FEW)
+    while chi2_per_value(fit.residuals, problem)["all"] > WRONG and len(problem.segments) > fewest:
+        off = misfit(fit.residuals, problem)
+        if off.max() < _ASTRAY:
+            break
+        problem, guess = without(problem, guess, int(off.argmax()))
+        fit = solve(problem, guess, _FEW)
+    return problem, solve(problem, fit.guess)
 
 
 def _solved(problem: Problem, guess: Guess) -> Fit:

@@ -120,8 +120,8 @@ def _cautions(found: Identification) -> list[str]:
     if found.left_out:
         stretches = "stretch" if found.left_out == 1 else "stretches"
         told.append(
-            f"{found.left_out} {stretches} of the logs left out, where the plate runs out of the "
-            "workspace"
+            f"{found.left_out} {stretches} of the logs left out, where no trajectory could be "
+            "followed"
         )
     beyond = np.abs(found.fit.residuals.prior) > 4
     if beyond.any():
