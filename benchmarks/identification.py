@@ -18,6 +18,7 @@ import sys
 import time
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -241,17 +242,16 @@ GROUPS: dict[str, Any] = {
 
 def machines(kind: str) -> str:
     """The tables of so many machines."""
-    folder = RESULTS / "logs"
-    folder.mkdir(parents=True, exist_ok=True)
-    motion = excitation(folder)
     jobs = Parallel(n_jobs=int(os.environ.get("JOBS", "-1")))
-    return "\n".join(
-        table(
-            f"{kind}, {'with pose' if poses else 'encoders alone'}",
-            jobs(delayed(find)(kind, seed, motion, poses) for seed in range(MACHINES)),
+    with TemporaryDirectory() as folder:
+        motion = excitation(Path(folder))
+        return "\n".join(
+            table(
+                f"{kind}, {'with pose' if poses else 'encoders alone'}",
+                jobs(delayed(find)(kind, seed, motion, poses) for seed in range(MACHINES)),
+            )
+            for poses in (False, True)
         )
-        for poses in (False, True)
-    )
 
 
 def table(title: str, found: list[Found]) -> str:
