@@ -572,3 +572,15 @@ def build_closed_loop_with(experiment: Any, own: Any) -> None:
     from stewart_drake.loop.diagram import _add_servos
 
     _add_servos(None, experiment._replace(own=own))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["exact", "multibody"])
+def test_encoders_do_where_the_state_is_not_measured(kind: str) -> None:
+    """A payload that nobody told is found through the delay, from crank angles alone."""
+    encoders = ("sensor.kind=encoders", "sensor.bits=14", "sensor.samples=20")
+    given = (*ON, *encoders, "plant.payload_mass=0.4", "duration=3")
+    result = run(*given, controller="servo_feedforward", kind=kind)
+    assert result.status == "completed" and result.accumulated_error < 0.05
+    assert result.signals.measurement.shape[1] == 120
+    density = result.signals.density.values[-1]
+    assert np.all(np.isfinite(density))  # which reads the estimate

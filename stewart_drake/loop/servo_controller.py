@@ -14,7 +14,7 @@ from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
 from stewart_drake.loop.controller import HELD
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
-from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_TORQUES, ports_of
+from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, ports_of
 
 Array = NDArray[np.float64]
 
@@ -47,6 +47,7 @@ class ServoController(LeafSystem):
     | report | input | of `law.servos.ReportLayout` | N m | read every period; NaN is lost |
     | age | input | 1 | s, whole periods | of measurement and report; 0 where unconnected |
     | command | output | 18 | rad, rad/s, N m | direct feedthrough |
+    | estimate | output | 12 | rad, m, rad/s, m/s | direct feedthrough |
     | torque | output | 6 | N m, that servos asked for | held |
     | torque_commanded | output | 6 | the same | held |
     | integral, weights_used | output | 6, 2 | | NaN |
@@ -78,6 +79,9 @@ class ServoController(LeafSystem):
             "command", NUM_REFERENCE, weak(self._command), {self._step.ticket()}
         )
         self.DeclareVectorOutputPort(
+            "estimate", NUM_STATE, weak(self._estimate), {self._step.ticket()}
+        )
+        self.DeclareVectorOutputPort(
             "torque", NUM_TORQUES, weak(self._held, "torque_commanded"), {ticket}
         )
         for port, signal in ports_of("controller").items():
@@ -103,6 +107,10 @@ class ServoController(LeafSystem):
     def _command(self, context: Context, output: BasicVector) -> None:
         sample: Any = self._step.Eval(context)
         output.SetFromVector(sample.memory.command)
+
+    def _estimate(self, context: Context, output: BasicVector) -> None:
+        sample: Any = self._step.Eval(context)
+        output.SetFromVector(sample.memory.belief.state)
 
     def _held(self, name: str, context: Context, output: BasicVector) -> None:
         output.SetFromVector(HELD[name](self.sample(context).memory))
