@@ -274,7 +274,7 @@ def _grown(begun: _Begun) -> tuple[Problem, Fit]:
             break
         problem, guess = without(problem, guess, int(off.argmax()))
         fit = solve(problem, guess, _FEW)
-    return problem, solve(problem, fit.guess)
+    return problem, fit if fit.iterations < _FEW else solve(problem, fit.guess)
 
 
 def _solved(problem: Problem, guess: Guess) -> Fit:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.dynamics.equations import STANDARD_GRAVITY
 from stewart_drake.files.arrayio import load_netcdf
-from stewart_drake.files.csvio import csv_rows, read_lines
+from stewart_drake.files.csvio import csv_rows, read_columns, read_lines
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import brief, parse_yaml, validate
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
@@ -248,22 +248,7 @@ def _of_csv(path: Path, mechanism: Mechanism, precision: Precision, gravity: flo
 
 def _header(path: Path, header: list[str]) -> tuple[list[str], list[float]]:
     """Name of each column, and its factor to SI units."""
-    names, scales = list[str](), list[float]()
-    for cell in header:
-        match = re.fullmatch(r"\s*(\w+)\s*\[\s*([\w ]+?)\s*\]\s*", cell)
-        name, unit = (match[1].lower(), match[2]) if match else ("", "")
-        if name not in _UNITS or name in names:
-            problem = "a second" if name in names else "an unknown"
-            raise ConfigError(
-                f"{path}: row 1: got {problem} column {brief(cell)}; expected {_HEADER}"
-            )
-        if unit not in _UNITS[name]:
-            raise ConfigError(
-                f"{path}: row 1: got column {brief(cell)}; expected {name} in "
-                f"{' or '.join(_UNITS[name])}"
-            )
-        names.append(name)
-        scales.append(_UNITS[name][unit])
+    names, scales = read_columns(path, header, _UNITS, _name_and_unit, _HEADER)
     wanted = ["time", *_TORQUES]
     for group in (_CRANKS, COORDINATE_NAMES):
         wanted += group if set(group) & set(names) else ()
@@ -273,6 +258,11 @@ def _header(path: Path, header: list[str]) -> tuple[list[str], list[float]]:
         if name not in names:
             raise ConfigError(f"{path}: row 1: column {name} is missing; expected {_HEADER}")
     return names, scales
+
+
+def _name_and_unit(cell: str) -> tuple[str, str]:
+    match = re.fullmatch(r"\s*(\w+)\s*\[\s*([\w ]+?)\s*\]\s*", cell)
+    return (match[1].lower(), match[2]) if match else ("", "")
 
 
 def _number(path: Path, line: int, text: str, name: str, scale: float) -> float:

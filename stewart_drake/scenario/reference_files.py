@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from stewart_drake.files.csvio import csv_rows, read_lines
+from stewart_drake.files.csvio import csv_rows, read_columns, read_lines
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import brief, load_yaml, validate
 from stewart_drake.scenario.field_types import Row, Seconds
@@ -250,7 +250,6 @@ def _motion_columns(header: list[str]) -> list[int]:
 
 def _read_header(path: Path, header: list[str]) -> tuple[list[str], list[float]]:
     """Name and factor to SI units of each column."""
-    names, scales = [], []
     for separator in (";", "\t"):
         if separator in header[0]:
             raise ConfigError(
@@ -259,26 +258,17 @@ def _read_header(path: Path, header: list[str]) -> tuple[list[str], list[float]]
             )
     if header[0].strip()[:1].isdigit():
         raise ConfigError(f"{path}: row 1: got {brief(header[0])}; expected a header {_HEADER}")
-    for cell in header:
-        match = re.fullmatch(r"\s*(\w+)\s*\[\s*(\w+)\s*\]\s*", cell)
-        name, unit = (part.lower() for part in match.groups()) if match else ("", "")
-        name = name.removeprefix(_POSE)
-        if name not in _UNITS or name in names:
-            problem = "a second" if name in names else "an unknown"
-            raise ConfigError(
-                f"{path}: row 1: got {problem} column {brief(cell)}; expected {_HEADER}"
-            )
-        if unit not in _UNITS[name]:
-            raise ConfigError(
-                f"{path}: row 1: got column {brief(cell)}; expected {name} in "
-                f"{' or '.join(_UNITS[name])}"
-            )
-        names.append(name)
-        scales.append(_UNITS[name][unit])
+    names, scales = read_columns(path, header, _UNITS, _name_and_unit, _HEADER)
     missing = [name for name in _COLUMNS if name not in names]
     if missing:
         raise ConfigError(f"{path}: row 1: column {missing[0]} is missing; expected {_HEADER}")
     return names, scales
+
+
+def _name_and_unit(cell: str) -> tuple[str, str]:
+    match = re.fullmatch(r"\s*(\w+)\s*\[\s*(\w+)\s*\]\s*", cell)
+    name, unit = (part.lower() for part in match.groups()) if match else ("", "")
+    return name.removeprefix(_POSE), unit
 
 
 def _time_problem(value: float, before: float | None) -> str | None:
