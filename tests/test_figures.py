@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from stewart_drake.dynamics.workspace import Failure
@@ -199,3 +200,14 @@ def test_a_run_stopped_before_its_first_sample_can_be_drawn(run, drawn):
 def test_an_unwritable_directory_is_reported(run, tmp_path):
     with pytest.raises(OSError):
         run_figures(run, tmp_path / "missing")
+
+
+def test_names_take_as_many_lines_as_they_need() -> None:
+    for number, name in ((3, "short"), (7, "LQI, delay-aware"), (9, "a name that is longer still")):
+        figure = Figure(figsize=(9, 6))
+        ax = figure.subplots()
+        for _ in range(number):
+            ax.plot([0, 1], label=name)
+        figures._with_legend(figure, [ax])
+        box = figure.legends[0].get_window_extent()
+        assert len(figure.legends) == 1 and 0 <= box.x0 < box.x1 <= figure.bbox.x1

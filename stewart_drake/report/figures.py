@@ -293,8 +293,6 @@ def _grid(
     return figure, list(axes.T.ravel())
 
 
-_ABREAST: Final = 7
-"""Names in one line above a figure; more would be cut off at its sides."""
 _LEGEND_LINE: Final = 0.25
 """Inches."""
 
@@ -305,12 +303,14 @@ def _with_legend(figure: Figure, axes: list[Axes]) -> Figure:
     if any(line.get_marker() == _CROSS for ax in axes for line in ax.lines):
         handles.append(Line2D([], [], ls="", marker=_CROSS, color="#666666", ms=7, mew=2))
         labels.append("run ended")
-    lines = max(1, math.ceil(len(labels) / _ABREAST))
-    if lines > 1:
-        room = _LEGEND_LINE * (lines - 1) / figure.get_figheight()
-        figure.subplots_adjust(top=figure.subplotpars.top - room)
-    columns = max(1, math.ceil(len(labels) / lines))
-    figure.legend(handles, labels, loc="upper center", ncols=columns)
+    for lines in range(1, max(1, len(labels)) + 1):  # as few as keep the names on the figure
+        columns = max(1, math.ceil(len(labels) / lines))
+        legend = figure.legend(handles, labels, loc="upper center", ncols=columns)
+        if legend.get_window_extent().width <= figure.bbox.width or columns == 1:
+            break
+        legend.remove()
+    room = _LEGEND_LINE * (lines - 1) / figure.get_figheight()
+    figure.subplots_adjust(top=figure.subplotpars.top - room)
     return figure
 
 
