@@ -24,6 +24,8 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 
 EXACT = ("--set", "plant.kind=exact")
+MULTIBODY = ("--set", "plant.kind=multibody")
+"""Slow enough to be interrupted: 200 s of it take forty, of the exact plant one or two."""
 SHORT = (*EXACT, "--set", "duration=0.5")
 RUN_FILES = {
     *(f"{name}.{suffix}" for name in ("states", "errors", "torques") for suffix in ("png", "svg")),
@@ -223,8 +225,9 @@ def interrupted(arguments: list[str], wait: float, group: bool) -> tuple[int, st
 
 
 def test_ctrl_c_in_simulate_keeps_what_was_computed(tmp_path):
-    arguments = ["simulate", *EXACT, "--set", "duration=200", "--set", "controller.period=0.02"]
-    arguments += ["--set", "delay.steps=4", "--out", str(tmp_path)]
+    settings = ("--set", "controller.period=0.02", "--set", "delay.steps=4")
+    arguments = ["simulate", "paper", *MULTIBODY, "--set", "duration=200", *settings]
+    arguments += ["--out", str(tmp_path)]
     assert interrupted(arguments, wait=1.0, group=False) == (130, "")
     assert files(tmp_path) >= RUN_FILES
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -237,7 +240,7 @@ def test_ctrl_c_in_simulate_keeps_what_was_computed(tmp_path):
 
 def test_ctrl_c_in_compare_reaches_the_processes_in_an_orderly_way(tmp_path):
     # Early, when they are still importing: there a signal of their own would break them.
-    arguments = ["compare", *EXACT, "--set", "duration=40", "--out", str(tmp_path)]
+    arguments = ["compare", "paper", *MULTIBODY, "--set", "duration=40", "--out", str(tmp_path)]
     assert interrupted(arguments, wait=1.0, group=True) == (130, "")
     summary = json.loads((tmp_path / "summary.json").read_text())["controllers"]
     for name, run in summary.items():
