@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -121,6 +122,48 @@ def test_the_sizes_are_told_and_kept_to(tmp_path: Path) -> None:
     state = int(readme.split("state ")[1].split()[0])
     assert 50_000 < text <= 180_000 and 3000 < state <= 8000
     assert "@" not in readme
+
+
+PAINTED: Final = """
+#include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+enum { SIZE = 1 << 18 };
+int replay(void);
+static void *run(void *failed) { *(int *)failed = replay(); return NULL; }
+int main(void) {
+    unsigned char *stack;
+    pthread_attr_t attributes;
+    pthread_t thread;
+    int failed = 1, untouched = 0;
+    if (posix_memalign((void **)&stack, 4096, SIZE) != 0) return 1;
+    memset(stack, 0xA5, SIZE);
+    pthread_attr_init(&attributes);
+    pthread_attr_setstack(&attributes, stack, SIZE);
+    pthread_create(&thread, &attributes, run, &failed);
+    pthread_join(thread, NULL);
+    while (stack[untouched] == 0xA5) untouched++;
+    printf("stack %d\\n", SIZE - untouched);
+    return failed;
+}
+"""
+"""Runs the replay on a stack that was painted before, and says how much of it was used."""
+
+
+def test_the_stack_is_not_deeper_than_told(tmp_path: Path, compiler: list[str]) -> None:
+    folder = exported(tmp_path, "paper", ("duration=1.0",))
+    (folder / "painted.c").write_text(PAINTED)
+    sources = [p.name for p in folder.glob("*.c")]
+    command = [*compiler, "-O2", "-Dmain=replay", "-c", "stewart_test.c"]
+    subprocess.run(command, cwd=folder, check=True)
+    sources.remove("stewart_test.c")
+    command = [*compiler, "-O2", *sources, "stewart_test.o", "-lm", "-pthread", "-o", "painted"]
+    subprocess.run(command, cwd=folder, check=True)
+    said = subprocess.run(["./painted"], cwd=folder, capture_output=True, text=True, check=True)
+    told = int((folder / "README.md").read_text().split("less than ")[1].split(" kB")[0])
+    used = int(said.stdout.split("stack ")[1])
+    assert 5000 < used < 1000 * told
 
 
 @pytest.mark.parametrize(
