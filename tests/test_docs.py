@@ -346,6 +346,27 @@ def test_names_for_the_reference_exist(path: Path) -> None:
         assert not name or is_name(name), name
 
 
+def docstrings(path: Path) -> Iterator[str]:
+    """Of a module, and of what is in it."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            yield ast.get_docstring(node) or ""
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            yield str(node.value.value)
+
+
+def test_dotted_names_in_docstrings_exist() -> None:
+    """The reference is made of them. `plant` may be somebody's own there."""
+    problems = {
+        f"{document(path)}: {problem_with(code)}"
+        for path in PACKAGE.rglob("*.py")
+        for text in docstrings(path)
+        for code in re.findall(r"`([a-z_]+(?:\.\w+)+)`", text)
+        if not code.endswith(SUFFIXES) and not code.startswith("plant.") and problem_with(code)
+    }
+    assert not problems, "\n".join(sorted(problems))
+
+
 def anchors(path: Path) -> set[str]:
     """Of the headings of a document, as GitHub and the site make them."""
     titles = re.findall(r"^#+ (.*)$", FENCE.sub("", path.read_text("utf-8")), re.MULTILINE)
