@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 INSTALLED_BENCH := $(VENV)/.installed-bench
+DOCS_VENV := .venv-docs
 
 # The pins in constraints.txt are for Python 3.11; a newer one is taken where there is no 3.11.
 ifeq ($(origin PYTHON),undefined)
@@ -20,7 +21,7 @@ PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
 COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null || true
 
 .DEFAULT_GOAL := help
-.PHONY: generate demo test casadi lint format-check types wheel newest bench soak clean help
+.PHONY: generate demo docs test casadi lint format-check types wheel newest bench soak clean help
 
 demo: $(INSTALLED)  ## the paper's comparison, from rest, on the reference, and with a delay of 0.8 s believed to be 0.6 s
 	$(BIN)/stewart-drake compare paper --out out/demo/rest
@@ -28,6 +29,11 @@ demo: $(INSTALLED)  ## the paper's comparison, from rest, on the reference, and 
 		--out out/demo/on_reference
 	$(BIN)/stewart-drake compare paper --set controller.delay_steps=6 --out out/demo/wrong_delay
 	@echo "figures:"; find out/demo -name '*.png' -o -name '*.svg' -o -name '*.pdf' | sort | sed 's/^/  /'
+
+# The package is read, not imported: what builds the site is all that is needed.
+docs: $(DOCS_VENV)/.installed  ## the documentation as a site with search, in out/site; warnings are errors
+	@NO_MKDOCS_2_WARNING=1 $(DOCS_VENV)/bin/mkdocs build --strict
+	@echo "open out/site/index.html"
 
 # Workers of one thread each, so that they do not fight over the processor.
 # Each takes a stretch of the files, so that what their tests share is made once, and who is done
@@ -72,8 +78,8 @@ generate: $(INSTALLED)  ## writes the equations in C anew, after a change of the
 	$(BIN)/python -m stewart_drake.dynamics.generate
 	$(BIN)/python -m stewart_drake.native.build
 
-clean:  ## removes builds, caches and the demo's output, keeps .venv
-	rm -rf build dist out/demo .pytest_cache .hypothesis .mypy_cache .ruff_cache
+clean:  ## removes builds, caches and the demo's output, keeps .venv and .venv-docs
+	rm -rf build dist out/demo out/site .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find . -path ./$(VENV) -prune -o -type d -name __pycache__ -exec rm -rf {} +
 
 help:  ## this list
@@ -88,6 +94,14 @@ $(INSTALLED): pyproject.toml constraints.txt hatch_build.py $(wildcard stewart_d
 	@echo "installing stewart-drake and its dependencies into $(VENV) (a few minutes the first time)"
 	@$(PIP_INSTALL) -e '.[train,dev]'
 	@$(COMPILE)
+	@touch $@
+
+$(DOCS_VENV)/.installed: pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "no Python found: set PYTHON=/path/to/python3.11"; exit 1; }
+	@echo "installing what builds the documentation into $(DOCS_VENV)"
+	@$(PYTHON) -m venv $(DOCS_VENV)
+	@$(DOCS_VENV)/bin/python -m pip install -qq -c constraints.txt $$($(PYTHON) -c 'import tomllib; \
+		print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"])')
 	@touch $@
 
 $(INSTALLED_BENCH): $(INSTALLED)

@@ -1,10 +1,15 @@
 """What the documents say exists, runs, loads and is true.
 
-Conventions of `docs/*.md`, so that names can be checked:
+Conventions of README, CHANGELOG (without what is before 0.2), CONTRIBUTING, `docs/` and
+`benchmarks/results/`, so that names can be checked:
 
 * a dotted name in code type is relative to the package (`law.riccati.lqr`), a field of a
-  scenario (`plant.gravity`) or a port of the loop (`plant.torque`);
+  scenario (`plant.gravity`) or a port of the loop (`plant.torque`); `sd.NAME` is public;
 * a path in code type is relative to the repository or to the package; `file.py::name` is a test;
+  a path below `out/` is what a command of a block, or the Makefile, writes;
+* a file in *italics* is in the repository, or is named by the code or by a block of the document;
+* a command in code type (`analyze delay`, `make test`, `python FILE`) exists, with its options;
+* names of 0.1 that are gone stand in the first column of docs/upgrading.md, and nowhere exist;
 * a word in code type with an underscore or an inner capital occurs in the package's source, its
   tests or its data files;
 * ```python blocks run, ```yaml blocks load, `stewart-drake` lines of ```sh blocks parse; what is
@@ -16,9 +21,11 @@ import dataclasses
 import functools
 import importlib
 import importlib.util
+import itertools
 import os
 import re
 import shlex
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -51,14 +58,17 @@ Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "stewart_drake"
 DOCS = [
-    path for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))) if path.exists()
+    *(ROOT / f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted((ROOT / "benchmarks" / "results").glob("*.md")),
 ]
-CHECKED_NAMES = [path for path in DOCS if path.parent == ROOT / "docs"]
 
 FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```[ \t]*$", re.DOTALL | re.MULTILINE)
 CODE = re.compile(r"`([^`\n]+)`")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
-SUFFIXES = (".py", ".md", ".yaml", ".sdf", ".xml", ".toml", ".txt", ".json")
+SUFFIXES = (".py", ".md", ".yaml", ".sdf", ".xml", ".toml", ".txt", ".json", ".c", ".h", ".ipynb")
+WRITTEN = re.compile(r"(?<![\w*])\*([\w-]+\.[a-z]\w{0,4})\*(?![\w*])")
+"""A file's name in italics."""
 
 
 class Block(NamedTuple):
@@ -85,8 +95,13 @@ def blocks(*languages: str) -> list[Block]:
 
 
 def prose(path: Path) -> str:
-    """A document without its fenced blocks."""
-    return FENCE.sub("", path.read_text(encoding="utf-8"))
+    """A document without its fenced blocks; of the changelog what is not history."""
+    return FENCE.sub("", path.read_text(encoding="utf-8")).split("\n## [0.1.0]")[0]
+
+
+def document(path: Path) -> str:
+    """Its name in a test."""
+    return str(path.relative_to(ROOT))
 
 
 def each(found: list[Block]) -> Any:
@@ -114,6 +129,73 @@ def functions_in(path: Path) -> frozenset[str]:
     """Names of the test functions in a file."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     return frozenset(node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+
+
+@functools.cache
+def sources() -> str:
+    """The texts of the package, the Makefile and the data files."""
+    paths = (*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.j2"), ROOT / "Makefile", ROOT / "mkdocs.yml")
+    data = (*(ROOT / "models").rglob("*.yaml"), *(ROOT / "diagrams").rglob("*.yaml"))
+    return "\n".join(path.read_text(encoding="utf-8") for path in (*paths, *data))
+
+
+@functools.cache
+def files() -> frozenset[str]:
+    """Names of the repository's files."""
+    kept = subprocess.run(
+        ["git", "ls-files", "-co", "--exclude-standard"],
+        cwd=ROOT,
+        text=True,
+        capture_output=True,
+        check=False,
+    ).stdout.split("\n")
+    return frozenset(path.rpartition("/")[2] for path in kept)
+
+
+@functools.cache
+def gone() -> frozenset[str]:
+    """What 0.1 had and 0.2 has not, by docs/upgrading.md."""
+    table = prose(ROOT / "docs" / "upgrading.md").split("| before | now |")[1]
+    return frozenset(re.findall(r"^\| `(?:stewart_drake\.)?([\w.]+)`", table, re.MULTILINE))
+
+
+@functools.cache
+def commands() -> dict[str, frozenset[str]]:
+    """Options by command, such as `analyze delay`; of a family, those of its members."""
+    typer = pytest.importorskip("typer")
+    cli = pytest.importorskip("stewart_drake.cli")
+    found: dict[str, frozenset[str]] = {}
+
+    def gather(command: Any, name: str) -> frozenset[str]:
+        options = {option for p in command.params for option in (*p.opts, *p.secondary_opts)}
+        for word, below in getattr(command, "commands", {}).items():
+            options |= gather(below, f"{name} {word}".strip())
+        found[name] = frozenset(options) | {"--help"}
+        return found[name]
+
+    gather(typer.main.get_command(cli.app), "")
+    return found
+
+
+def problem_with_command(code: str) -> str | None:
+    """What is wrong with a command whose `stewart-drake` may be left out, or with its options."""
+    words, known = code.removeprefix("stewart-drake ").split(), commands()
+    name = ""
+    while words and f"{name} {words[0]}".strip() in known:
+        name = f"{name} {words.pop(0)}".strip()
+    if words and any(other.startswith(f"{name} ") for other in known) and name:
+        if not words[0].startswith("-"):
+            return f"stewart-drake {name} has no {words[0]}"
+    elif not name and words and not words[0].startswith("-"):
+        return f"stewart-drake has no {words[0]}"
+    for word, after in itertools.zip_longest(words, words[1:], fillvalue=""):
+        option, _, _ = word.partition("=")
+        if option.startswith("--") and option not in known[name]:
+            return f"stewart-drake {name} has no {option}"
+        field = after.partition("=")[0]
+        if option == "--set" and "." in field and field != "section.field" and not is_field(field):
+            return f"no field is called {field}"
+    return None
 
 
 def is_field(dotted: str) -> bool:
@@ -167,9 +249,43 @@ def modules() -> frozenset[str]:
     return frozenset(path.stem for path in PACKAGE.iterdir() if path.suffix in ("", ".py"))
 
 
+@functools.cache
+def shell() -> str:
+    """What the blocks for a shell, the Makefile and the site's settings say."""
+    told = "".join(block.text for block in blocks("sh", "bash", "shell", "console"))
+    return told + sources()
+
+
+def problem_at_a_shell(program: str, rest: str) -> str | None:
+    """What is wrong with `stewart-drake ...`, `make ...` or `python ...`."""
+    if program == "stewart-drake":
+        return problem_with_command(rest)
+    words = [word for word in rest.split() if "=" not in word and word != "..."]
+    if program == "make":
+        targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        missing = set(words) - set(targets)
+        return f"make has no {', '.join(sorted(missing))}" if missing and '"' not in rest else None
+    if words[:1] == ["-m"]:
+        name = words[1].removeprefix("stewart_drake.")
+        exists = is_name(name) or importlib.util.find_spec(words[1]) is not None
+        return None if exists else f"no module {words[1]}"
+    script = next((word for word in words if word.endswith(".py")), None)
+    return None if script is None or (ROOT / script).is_file() else f"{script} does not exist"
+
+
 def problem_with(code: str) -> str | None:
     """What is wrong with a piece of code type; None where nothing is, or nothing can be told."""
     code = code.strip()
+    if code in gone():
+        return None
+    first, _, rest = code.partition(" ")
+    if first in ("stewart-drake", "make", "python") and rest:
+        return problem_at_a_shell(first, rest)
+    if first.startswith("--") or (rest and first in commands()):
+        return problem_with_command(code)
+    if code.startswith("out/"):
+        written = code.rstrip("/") in shell() or code.rpartition("/")[0] in shell()
+        return None if written else f"no command writes {code}"
     if "::" in code:
         file, _, test = code.partition("::")
         if not (ROOT / file).is_file():
@@ -179,7 +295,11 @@ def problem_with(code: str) -> str | None:
         exists = any((base / code).exists() for base in (ROOT, PACKAGE))
         return None if exists else f"{code} does not exist"
     field = re.match(r"[\w.]+(?=: |=)", code)  # `plant.gravity: false`, `plant.gravity=true`
-    dotted = field[0] if field else code
+    dotted = (field[0] if field else code).partition("(")[0]
+    if dotted.startswith("sd."):
+        public, _, below = dotted.removeprefix("sd.").partition(".")
+        known = public in sd.__all__ and (not below or hasattr(getattr(sd, public), below))
+        return None if known or public in ("NAME", "...") else f"sd has no {public}"
     if re.fullmatch(r"[A-Za-z_]\w*(\.\w+)+", dotted):
         first = dotted.split(".")[0]
         if first not in modules() | {"controller", "sensor", "delay_chain"} and not is_field(first):
@@ -192,28 +312,96 @@ def problem_with(code: str) -> str | None:
 
 
 def test_the_documents_exist() -> None:
-    assert {path.name for path in CHECKED_NAMES} >= {"theory.md", "errata.md", "architecture.md"}
+    pages = {"docs/theory.md", "docs/errata.md", "docs/architecture.md", "docs/howto/results.md"}
+    assert {document(path) for path in DOCS} >= pages | {"README.md", "docs/upgrading.md"}
 
 
-@pytest.mark.parametrize("path", CHECKED_NAMES, ids=lambda path: path.name)
+@pytest.mark.parametrize("path", DOCS, ids=document)
 def test_what_is_named_exists(path: Path) -> None:
-    problems = {problem_with(code) for code in CODE.findall(prose(path))} - {None}
+    codes = set(CODE.findall(prose(path)))
+    if path.name == "CHANGELOG.md":  # which abbreviates, and names files that are written
+        codes = {code for code in codes if not code.startswith("_") and not code.endswith(SUFFIXES)}
+    problems = {problem_with(code) for code in codes} - {None}
     assert not problems, "\n".join(sorted(map(str, problems)))
 
 
-@pytest.mark.parametrize("path", DOCS, ids=lambda path: path.name)
-def test_links_lead_somewhere(path: Path) -> None:
-    text = prose(path)
-    anchors = {
-        re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
-        for title in re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+@pytest.mark.parametrize("path", DOCS, ids=document)
+def test_files_in_italics_exist_or_are_written(path: Path) -> None:
+    shown = "".join(match[0] for match in FENCE.finditer(path.read_text(encoding="utf-8")))
+    missing = [
+        name
+        for name in WRITTEN.findall(prose(path))
+        if name not in files()
+        and name not in sources()
+        and name not in shown
+        # A figure's file is its name in the code with a suffix that is chosen elsewhere.
+        and f'"{name.rpartition(".")[0]}"' not in sources()
+    ]
+    assert not missing
+
+
+@pytest.mark.parametrize("path", DOCS, ids=document)
+def test_names_for_the_reference_exist(path: Path) -> None:
+    for name in re.findall(r"^::: stewart_drake\.?(.*)$", prose(path), re.MULTILINE):
+        assert not name or is_name(name), name
+
+
+def docstrings(path: Path) -> Iterator[str]:
+    """Of a module, and of what is in it."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            yield ast.get_docstring(node) or ""
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            yield str(node.value.value)
+
+
+def test_dotted_names_in_docstrings_exist() -> None:
+    """The reference is made of them. `plant` may be somebody's own there."""
+    problems = {
+        f"{document(path)}: {problem_with(code)}"
+        for path in PACKAGE.rglob("*.py")
+        for text in docstrings(path)
+        for code in re.findall(r"`([a-z_]+(?:\.\w+)+)`", text)
+        if not code.endswith(SUFFIXES) and not code.startswith("plant.") and problem_with(code)
     }
-    for link in LINK.findall(text):
+    assert not problems, "\n".join(sorted(problems))
+
+
+def anchors(path: Path) -> set[str]:
+    """Of the headings of a document, as GitHub and the site make them."""
+    titles = re.findall(r"^#+ (.*)$", FENCE.sub("", path.read_text("utf-8")), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("path", DOCS, ids=document)
+def test_links_lead_somewhere(path: Path) -> None:
+    for link in LINK.findall(prose(path)):
         file, _, anchor = link.partition("#")
         if "://" in link or link.startswith("mailto:"):
             continue
-        assert not file or (path.parent / file).exists(), f"{path.name}: {link}"
-        assert file or anchor in anchors, f"{path.name}: {link}"
+        target = path.parent / file if file else path
+        assert target.exists(), f"{path.name}: {link}"
+        assert not anchor or anchor in anchors(target), f"{path.name}: {link}"
+
+
+def test_the_site_has_every_page_once() -> None:
+    def leaves(tree: Any) -> Iterator[str]:
+        for part in tree if isinstance(tree, list) else tree.values():
+            yield from [part] if isinstance(part, str) else leaves(part)
+
+    shown = list(leaves(load_yaml(ROOT / "mkdocs.yml")["nav"]))
+    pages = {"README.md" if path == "index.md" else path for path in shown}
+    assert len(pages) == len(shown)
+    assert pages == {document(path).removeprefix("docs/") for path in DOCS}
+
+
+def test_names_of_0_1_that_are_gone_are_gone() -> None:
+    assert len(gone()) > 10
+    for name in gone():
+        assert importlib.util.find_spec(f"stewart_drake.{name.partition('.')[0]}") is None or not (
+            is_name(name)
+        ), name
+        assert name.rpartition(".")[2] not in dir(ClosedLoop)
 
 
 @pytest.mark.parametrize(
@@ -238,6 +426,29 @@ def test_links_lead_somewhere(path: Path) -> None:
         ("no_such_name", True),
         ("scipy.linalg.nothing", False),
         ("legs", False),
+        ("sd.simulate", False),
+        ("sd.simulat", True),
+        ("sd.StewartDynamics.linearize", False),
+        ("sd.StewartDynamics.linearise", True),
+        ("stewart-drake analyze delay", False),
+        ("stewart-drake analyse delay", True),
+        ("analyze delays", True),
+        ("simulate --csv", False),
+        ("simulate --cvs", True),
+        ("--beside CONTROLLER", False),
+        ("--besides CONTROLLER", True),
+        ("--set tuner.kind=ann", False),
+        ("--set tuna.kind=ann", True),
+        ("make test", False),
+        ("make tests", True),
+        ("python benchmarks/tracking.py", False),
+        ("python benchmarks/trakcing.py", True),
+        ("python -m tests.recorded.runs", False),
+        ("python -m tests.recorded.walks", True),
+        ("out/demo/", False),
+        ("out/nowhere/page.html", True),
+        ("stewart_drake/native/law.c", False),
+        ("stewart_drake/native/lore.c", True),
     ],
 )
 def test_the_check_of_names_finds_what_is_wrong(code: str, wrong: bool) -> None:
@@ -368,8 +579,8 @@ def port_rows(text: str) -> dict[str, tuple[str, str]]:
     return rows
 
 
-def test_the_readme_has_the_ports_of_the_table_of_signals() -> None:
-    rows = port_rows((ROOT / "README.md").read_text())
+def test_the_page_of_results_has_the_ports_of_the_table_of_signals() -> None:
+    rows = port_rows((ROOT / "docs" / "howto" / "results.md").read_text())
     assert list(rows) != [] and set(rows) == set(exported_ports())
     for name, (size, unit) in rows.items():
         assert int(size) == loop().GetOutputPort(name).size()

@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import joblib
 import pytest
 import xarray as xr
 
@@ -26,6 +27,9 @@ def test_everything_in_it_works(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     # Its simulations over delay and amplitude have tests of their own, and take a while.
     monkeypatch.setattr(delay_limits, "delay_map", lambda *_: ([], False))
+    # The report's pieces in this process, which has loaded everything: tests/test_report_stopped.py
+    # has processes.
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
     told = {}
     for language, name, text in FENCE.findall(TUTORIAL.read_text(encoding="utf-8")):
         if name:

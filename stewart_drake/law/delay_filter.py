@@ -11,7 +11,7 @@ a torque change at a sample itself it is the mean of both sides. An arrival at a
 moves by a eta_dot with the rate: to first order dx/deta_dot = dt/2 dx/deta.
 
 The likelihood of a measurement, -1/2 (nu' S^-1 nu + ln |S|) with innovation nu and covariance S,
-is kept: the delay is found by comparing filters (`law.delay_search`).
+is kept: the delay is found by comparing filters (`law.delay_observer`).
 """
 
 from dataclasses import dataclass, replace

@@ -1,7 +1,7 @@
 """The scenario: one plain dataclass per section and kind, with units, defaults and ranges.
 
 A field is checked alone when it is set; `Scenario.check` checks what several fields share. Nothing
-here needs a mechanism. `scenario_loading` reads scenarios from files.
+here needs a mechanism. `scenario.loading` reads scenarios from files.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Names, sizes and slices of every vector that crosses a port (DESIGN: block order, SI units).
+"""Names, sizes and slices of every vector that crosses a port (block order, SI units).
 
 Nothing else in the package does index arithmetic on these vectors.
 """

@@ -83,7 +83,8 @@ def compare(
         settings: as `load_scenario` takes them.
         progress: called for each run that got on, ten times a second.
         controllers: of your own by name, with the ports that `simulate` tells.
-        reference, disturbance: for all runs, as of `simulate`.
+        reference: for all runs, as of `simulate`.
+        disturbance: likewise.
 
     Returns:
         Results by controller, in the order of `shown`, then your own.
