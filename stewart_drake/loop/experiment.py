@@ -227,7 +227,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     known = known_of(scenario)
     if known is not None:
         _check_known(known, scenario, drawn)
-    mechanism = _with_motors(drawn, scenario)
+    mechanism = with_motors(drawn, scenario)
     if own.reference is None:
         reference = make_reference(scenario.reference, scenario.duration)
         span = peak_to_peak(scenario.reference, reference, scenario.duration)
@@ -240,7 +240,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     return Experiment(
         scenario=scenario,
         mechanism=mechanism,
-        truth=_with_motors(simulated_machine(scenario) if truth is None else truth, scenario),
+        truth=with_motors(simulated_machine(scenario) if truth is None else truth, scenario),
         reference=reference,
         peak_to_peak=span,
         nominal=StewartDynamics(
@@ -263,7 +263,7 @@ def estimated(scenario: Scenario) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _with_motors(mechanism: Mechanism, scenario: Scenario) -> Mechanism:
+def with_motors(mechanism: Mechanism, scenario: Scenario) -> Mechanism:
     """The machine with the rotors of its servos."""
     actuator = scenario.actuator
     if not isinstance(actuator, ServoActuatorConfig):

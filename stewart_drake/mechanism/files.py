@@ -177,6 +177,16 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism:
     return _of_content(read_yaml(path), path)
 
 
+def mechanism_spec(name_or_path: str | Path) -> MechanismSpec:
+    """What a mechanism's file says, in its own words.
+
+    Raises:
+        ConfigError: as `load_mechanism` does of a file that is not well formed.
+    """
+    path = resolve("mechanism", name_or_path)
+    return validate(MechanismSpec, yaml_of(read_yaml(path), path), str(path))
+
+
 @lru_cache(maxsize=16)
 def _of_content(raw: bytes, path: Path) -> Mechanism:
     """Read once as long as the file stays as it is."""

@@ -107,7 +107,7 @@ def angle_rate_map(angles: Array) -> Array:
 
 @dataclass(frozen=True)
 class LegGeometry:
-    """The six legs at one pose; unit vectors in W, arrays (6, 3) or (6,).
+    """The six legs at one pose; unit vectors in W, arrays (6, 3) or (6,); or at n of them.
 
     `p_PQ_W`: plate joint from the plate's COM. `tangent`: direction in which the crank tip moves
     for growing crank angle. `rod`: from the crank tip to the plate joint. `transmission` =
@@ -132,7 +132,7 @@ def _shaft_to_joint(mechanism: Legs, pose: Array) -> tuple[Array, Array]:
 def _margins(mechanism: Legs, p_SQ_S: Array) -> Array:
     # The crank tip runs on a circle; Q lies at distance h from its plane and rho from its axis, so
     # that the tip's distance from Q covers [hypot(rho - u, h), hypot(rho + u, h)].
-    rho, h = np.hypot(p_SQ_S[:, 0], p_SQ_S[:, 1]), p_SQ_S[:, 2]
+    rho, h = np.hypot(p_SQ_S[..., 0], p_SQ_S[..., 1]), p_SQ_S[..., 2]
     u, rod = mechanism.crank_lengths, mechanism.rod_lengths
     return np.minimum(rod - np.hypot(rho - u, h), np.hypot(rho + u, h) - rod)
 
@@ -196,14 +196,19 @@ def leg_geometry(mechanism: Legs, pose: Array) -> LegGeometry:
     margins = _margins(mechanism, p_SQ_S)
     if not np.all(margins >= 0):
         raise UnreachablePoseError(margins)
-    u, rod = mechanism.crank_lengths, mechanism.rod_lengths
     direction, cosine = _closing(mechanism, p_SQ_S)
     # Rounding may lift |c| over hypot(a, b) by one ulp where the margin is exactly zero.
-    alpha = direction + mechanism.branches * np.arccos(np.clip(cosine, -1.0, 1.0))
-    cos, sin = np.cos(alpha)[:, None], np.sin(alpha)[:, None]
+    swing = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return _assembled(mechanism, pose[POSITION], p_PQ_W, direction + mechanism.branches * swing)
+
+
+def _assembled(mechanism: Legs, position: Array, p_PQ_W: Array, alpha: Array) -> LegGeometry:
+    """The legs whose cranks are at alpha (..., 6), with joints p_PQ_W (..., 6, 3)."""
+    u, rod = mechanism.crank_lengths, mechanism.rod_lengths
+    cos, sin = np.cos(alpha)[..., None], np.sin(alpha)[..., None]
     x, y = mechanism.R_WS[:, :, 0], mechanism.R_WS[:, :, 1]
     crank, tangent = cos * x + sin * y, -sin * x + cos * y
-    p_TQ_W = pose[POSITION] + p_PQ_W - mechanism.p_WS - u[:, None] * crank
+    p_TQ_W = position + p_PQ_W - mechanism.p_WS - u[:, None] * crank
     e_rod = p_TQ_W / rod[:, None]
     return LegGeometry(
         crank_angles=alpha,
@@ -211,7 +216,7 @@ def leg_geometry(mechanism: Legs, pose: Array) -> LegGeometry:
         crank=crank,
         tangent=tangent,
         rod=e_rod,
-        transmission=np.einsum("li,li->l", e_rod, tangent),
+        transmission=np.einsum("...li,...li->...l", e_rod, tangent),
     )
 
 
@@ -222,12 +227,30 @@ def crank_angles(mechanism: Legs, pose: Array) -> Array:
 
 def crank_angles_along(mechanism: Legs, poses: Array) -> Array:
     """Crank angles (n, 6) in rad at poses (n, 6); NaN where a leg does not reach."""
-    R_WP = np.moveaxis(rotation(poses[:, ANGLES].T), -1, 0)
-    p_SQ_W = poses[:, None, POSITION] + mechanism.p_PQ @ R_WP.swapaxes(1, 2) - mechanism.p_WS
-    p_SQ_S = np.einsum("lij,nli->nlj", mechanism.R_WS, p_SQ_W)
+    _, p_SQ_S = _shafts_to_joints(mechanism, poses)
     direction, cosine = _closing(mechanism, p_SQ_S)
     with np.errstate(invalid="ignore"):
         return direction + mechanism.branches * np.arccos(cosine)
+
+
+def reach_margins_along(mechanism: Legs, poses: Array) -> Array:
+    """`reach_margins` (n, 6) in m at poses (n, 6)."""
+    return _margins(mechanism, _shafts_to_joints(mechanism, poses)[1])
+
+
+def legs_along(mechanism: Legs, poses: Array) -> LegGeometry:
+    """The legs at poses (n, 6), arrays (n, 6, 3) or (n, 6); NaN where a leg does not reach."""
+    p_PQ_W, _ = _shafts_to_joints(mechanism, poses)
+    alpha = crank_angles_along(mechanism, poses)
+    return _assembled(mechanism, poses[:, None, POSITION], p_PQ_W, alpha)
+
+
+def _shafts_to_joints(mechanism: Legs, poses: Array) -> tuple[Array, Array]:
+    """`_shaft_to_joint` of poses (n, 6), both (n, 6, 3)."""
+    R_WP = np.moveaxis(rotation(poses[:, ANGLES].T), -1, 0)
+    p_PQ_W = mechanism.p_PQ @ R_WP.swapaxes(1, 2)
+    p_SQ_W = poses[:, None, POSITION] + p_PQ_W - mechanism.p_WS
+    return p_PQ_W, np.einsum("lij,nli->nlj", mechanism.R_WS, p_SQ_W)
 
 
 def jacobian(mechanism: Legs, pose: Array) -> Array:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.mechanism.assembly import Assembly, assemble
 from stewart_drake.mechanism.geometry import Body, Mechanism
+from stewart_drake.mechanism.proportions import proportions
 from stewart_drake.scenario.signals import LEGS
 
 Array = NDArray[np.float64]
@@ -61,22 +62,22 @@ def _base(model: ET.Element, mechanism: Mechanism, weld: bool) -> None:
     link = _add(model, "link", name="base")
     if mechanism.base.mass > 0:
         _inertial(link, mechanism.base, np.zeros(3))
-    size = _sizes(mechanism)
+    size = proportions(mechanism)
     radius = 1.2 * np.hypot(mechanism.p_WS[:, 0], mechanism.p_WS[:, 1]).max()
     axes = mechanism.R_WS[:, :, 2]
     # The motors sit behind the planes in which their cranks turn, sunk into the disc they stand on.
-    centres = mechanism.p_WS - axes * (size["motor_length"] / 2 + size["crank"])
+    centres = mechanism.p_WS - axes * (size.motor_length / 2 + size.crank_thickness)
     tilt = np.hypot(axes[:, 0], axes[:, 1])
-    reach = np.abs(axes[:, 2]) * size["motor_length"] / 2 + tilt * size["motor_radius"]
-    bottom = (centres[:, 2] - reach).min() - 0.2 * size["motor_radius"]
-    top = bottom + 0.6 * size["motor_radius"]
+    reach = np.abs(axes[:, 2]) * size.motor_length / 2 + tilt * size.motor_radius
+    bottom = (centres[:, 2] - reach).min() - 0.2 * size.motor_radius
+    top = bottom + 0.6 * size.motor_radius
     disc = _cylinder(radius, top - bottom)
     _solid(link, "disc", _pose([0, 0, (top + bottom) / 2]), disc, BASE_COLOR)
     for leg, p_WS, R_WS, centre in zip(LEGS, mechanism.p_WS, mechanism.R_WS, centres, strict=True):
-        motor = _cylinder(size["motor_radius"], size["motor_length"])
+        motor = _cylinder(size.motor_radius, size.motor_length)
         _solid(link, f"motor_{leg}", _pose(centre, R_WS), motor, MOTOR_COLOR)
         height = centre[2] - top
-        post = _cylinder(0.7 * size["motor_radius"], height)
+        post = _cylinder(0.7 * size.motor_radius, height)
         foot = [centre[0], centre[1], top + height / 2]
         _solid(link, f"post_{leg}", _pose(foot), post, BASE_COLOR)
         _frame(model, f"shaft_{leg}", "base", _pose(p_WS, R_WS))
@@ -90,41 +91,41 @@ def _plate(model: ET.Element, mechanism: Mechanism, home: Assembly) -> None:
     link = _add(model, "link", name="plate")
     _add(link, "pose", _pose(mechanism.home[3:], home.R_WP))
     _inertial(link, mechanism.plate, np.zeros(3))
-    size = _sizes(mechanism)
+    size = proportions(mechanism)
     radius = 1.08 * np.hypot(mechanism.p_PQ[:, 0], mechanism.p_PQ[:, 1]).max()
-    disc = _cylinder(radius, size["plate"])
+    disc = _cylinder(radius, size.plate_thickness)
     deck = float(mechanism.p_PQ[:, 2].mean())
-    _solid(link, "disc", _pose([0, 0, deck + size["plate"]]), disc, PLATE_COLOR)
+    _solid(link, "disc", _pose([0, 0, deck + size.plate_thickness]), disc, PLATE_COLOR)
     # A pointer along x shows the yaw that a disc would hide.
-    bar = _box([0.85 * radius, 0.06 * radius, 0.4 * size["plate"]])
-    above = deck + 1.6 * size["plate"]
+    bar = _box([0.85 * radius, 0.06 * radius, 0.4 * size.plate_thickness])
+    above = deck + 1.6 * size.plate_thickness
     _visual(link, "x_axis", _pose([0.425 * radius, 0, above]), bar, CRANK_COLOR)
-    tip = _cylinder(0.09 * radius, 0.4 * size["plate"])
+    tip = _cylinder(0.09 * radius, 0.4 * size.plate_thickness)
     _visual(link, "x_axis_tip", _pose([0.85 * radius, 0, above]), tip, CRANK_COLOR)
     for leg, p_PQ in zip(LEGS, mechanism.p_PQ, strict=True):
-        _visual(link, f"joint_{leg}", _pose(p_PQ), _sphere(1.6 * size["rod"]), JOINT_COLOR)
+        _visual(link, f"joint_{leg}", _pose(p_PQ), _sphere(1.6 * size.rod_radius), JOINT_COLOR)
         _frame(model, f"plate_joint_{leg}", "plate", _pose(p_PQ))
 
 
 def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> None:
     i = leg - 1
     u, length = mechanism.crank_lengths[i], mechanism.rod_lengths[i]
-    size = _sizes(mechanism)
+    size = proportions(mechanism)
     crank = _add(model, "link", name=f"crank_{leg}")
     _add(crank, "pose", _pose(mechanism.p_WS[i], home.R_WC[i]))
     _inertial(crank, mechanism.crank, np.array([mechanism.crank.center * u, 0, 0]))
-    arm = _box([u, 1.6 * size["crank"], size["crank"]])
+    arm = _box([u, size.crank_width, size.crank_thickness])
     _solid(crank, "arm", _pose([u / 2, 0, 0]), arm, CRANK_COLOR)
-    hub = _cylinder(1.2 * size["crank"], 1.5 * size["crank"])
+    hub = _cylinder(1.2 * size.crank_thickness, 1.5 * size.crank_thickness)
     _visual(crank, "hub", _pose([0, 0, 0]), hub, CRANK_COLOR)
-    _visual(crank, "tip", _pose([u, 0, 0]), _sphere(1.6 * size["rod"]), JOINT_COLOR)
+    _visual(crank, "tip", _pose([u, 0, 0]), _sphere(1.6 * size.rod_radius), JOINT_COLOR)
     _frame(model, f"tip_{leg}", f"crank_{leg}", _pose([u, 0, 0]))
 
     rod = _add(model, "link", name=f"rod_{leg}")
     _add(rod, "pose", _pose(home.p_WT[i], home.R_WD[i]))
     _inertial(rod, mechanism.rod, np.array([mechanism.rod.center * length, 0, 0]))
     along_x = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-    tube = _cylinder(size["rod"], length)
+    tube = _cylinder(size.rod_radius, length)
     _solid(rod, "tube", _pose([length / 2, 0, 0], along_x), tube, ROD_COLOR)
     _frame(model, f"rod_end_{leg}", f"rod_{leg}", _pose([length, 0, 0]))
 
@@ -153,18 +154,6 @@ def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> N
         ("p_BQ", _numbers(mechanism.p_PQ[i])),
     ):
         _add(ball, f"drake:ball_constraint_{name}", value)
-
-
-def _sizes(mechanism: Mechanism) -> dict[str, float]:
-    """Dimensions of what is only drawn, in m, proportioned to the machine."""
-    u, rod = float(mechanism.crank_lengths.min()), float(mechanism.rod_lengths.min())
-    return {
-        "crank": 0.10 * u,
-        "motor_radius": 0.22 * u,
-        "motor_length": 0.40 * u,
-        "rod": 0.012 * rod,
-        "plate": 0.03 * rod,
-    }
 
 
 def _add(parent: ET.Element, tag: str, text: str | None = None, **attributes: str) -> ET.Element:

@@ -15,21 +15,26 @@ from stewart_drake.report.document import (
     Picture,
     Section,
     Table,
+    Tone,
     Values,
 )
 from stewart_drake.report.style import FACTORS, UNITS
 from stewart_drake.report.words import number
 from stewart_drake.report.workspace_figures import (
+    clearance_figure,
     margins_figure,
     motors_figure,
     sections_figure,
 )
 from stewart_drake.scenario.signals import COORDINATE_NAMES
+from stewart_drake.studies.clearance import ClearTravel, Nearest
 from stewart_drake.studies.sizing import Sizing
 from stewart_drake.studies.workspace import WorkspaceStudy
 from stewart_drake.studies.workspace_map import Travel
 
 _COORDINATES: Final = tuple(zip(COORDINATE_NAMES, FACTORS, UNITS, strict=True))
+_NEAREST: Final = 8
+"""Pairs that are told of even where all of them are apart."""
 _MOTORS: Final = {
     "peak_torque": "torque peak [N\u00a0m]",
     "rms_torque": "torque rms [N\u00a0m]",
@@ -51,8 +56,9 @@ def document(study: WorkspaceStudy) -> Document:
         "mechanism": mechanism.name,
         "least reach margin": f"{number(1e3 * margin)} mm, leg {leg}, t = {time:.2f} s",
         "largest amplitude": "-" if np.isnan(factor.value) else largest,
+        "least clearance": _nearest_text(study.clearance.along.least(fixed=False)),
     }
-    sections = [_along(study, summary)]
+    sections = [_along(study, summary), _clearance(study)]
     if study.sizing is not None:
         sections.append(_motors(study.sizing, study.torque_limit, summary["motors"]))
     if study.travel:
@@ -61,9 +67,15 @@ def document(study: WorkspaceStudy) -> Document:
         f"Workspace of {mechanism.name}, {study.experiment.scenario.reference.kind} reference",
         study.verdict,
         sections,
-        "bad" if study.exit is not None else "fair" if study.home is not None else "good",
+        _tone(study),
         facts,
     )
+
+
+def _tone(study: WorkspaceStudy) -> Tone:
+    if study.exit is not None:
+        return "bad"
+    return "fair" if study.home is not None or study.clearance.along.touching else "good"
 
 
 def travel_text(travel: list[Travel]) -> str:
@@ -139,6 +151,71 @@ def _motors(sizing: Sizing, limit: float | None, motors: list[dict[str, Any]]) -
     return Section("Motors", *parts, Picture(figure, "Torque, speed and power per crank."))
 
 
+def _nearest_text(nearest: Nearest | None) -> str:
+    if nearest is None:
+        return "-"
+    crossing = ", they cross" if nearest.distance < 0 else ""
+    where = f"{nearest.pair}, t = {nearest.time:.2f} s"
+    return f"{number(1e3 * nearest.distance)} mm, {where}{crossing}"
+
+
+def _clearance(study: WorkspaceStudy) -> Section:
+    """Which parts come near each other, or are in each other."""
+    found = study.clearance
+    rows = [
+        (
+            str(one.pair),
+            number(1e3 * one.distance),
+            f"{one.time:.2f}",
+            "they cross" if one.distance < 0 else "",
+        )
+        for one in _told(found.along.nearest)
+    ]
+    columns = ("parts", "distance [mm]", "at [s]", "")
+    caption = "On the reference, the nearest first; negative: by how far they are in each other."
+    values = {
+        "links, reference": _nearest_text(found.along.least(fixed=False)),
+        "base, reference": _nearest_text(found.along.least(fixed=True)),
+    }
+    if found.along.touching:
+        told = (f"{one.pair} ({1e3 * one.distance:.1f} mm)" for one in found.along.touching)
+        values["links that cross"] = ", ".join(told)
+    parts: list[Block | str] = [
+        "Distances between the shapes of the model, without those that meet in a joint. Links are "
+        "cranks, rods and plate. How thick they are no machine's file says: they are drawn in "
+        "proportion to its lengths, and so is the base with its motors, whose disc may lie "
+        "elsewhere in a real machine. In a simulation nothing of a machine touches itself.",
+        Values(values),
+        Table(columns, rows, caption),
+        Picture(
+            partial(clearance_figure, found, study.sections, study.experiment.mechanism.home),
+            "Left: along the reference; below the dotted line parts are in each other. Right: over "
+            "the first section through home, distance of the nearest two links.",
+        ),
+    ]
+    if found.travel:
+        names = ("coordinate", "unit", "clear from home down", "ends at", "up", "ends at")
+        ways = [_clear_row(*one) for one in zip(_COORDINATES, found.travel, strict=True)]
+        caption = "One coordinate alone, until two links touch or the workspace ends."
+        parts.append(Table(names, ways, caption))
+    return Section("Clearance", *parts)
+
+
+def _told(nearest: list[Nearest]) -> list[Nearest]:
+    """Those that cross, and the nearest of the others."""
+    crossing = sum(one.distance < 0 for one in nearest)
+    return nearest[: max(crossing, _NEAREST)]
+
+
+def _clear_row(unit: tuple[str, float, str], way: ClearTravel) -> tuple[str, ...]:
+    name, factor, of = unit
+    low, high = (
+        "the workspace's end" if pair is None else str(pair)
+        for pair in (way.low_pair, way.high_pair)
+    )
+    return name, of, f"{factor * way.low:.4g}", low, f"+{factor * way.high:.4g}", high
+
+
 def _around(study: WorkspaceStudy) -> Section:
     rows = [
         (name, unit, f"{factor * t.low:.4g}", t.low_reason, f"+{factor * t.high:.4g}",
@@ -156,9 +233,6 @@ def _around(study: WorkspaceStudy) -> Section:
         "the part that is connected with home within the section is shown. The reference is "
         "projected: off the section it may be elsewhere in the workspace.",
     )
-    text = (
-        "No contact between parts is modelled: cables, covers and crossing rods may end a motion "
-        "earlier."
-    )
+    text = "Links that touch end no travel here, see Clearance; nor do cables and covers."
     travel = Values({"from home alone": travel_text(study.travel)})
     return Section("Around home", text, travel, Table(columns, rows, caption), picture)

@@ -18,6 +18,7 @@ from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, Failure
 from stewart_drake.report.style import FACTORS, UNITS, Line, figure_style
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
+from stewart_drake.studies.clearance import ClearanceStudy
 from stewart_drake.studies.reach import Margins
 from stewart_drake.studies.sizing import Sizing
 from stewart_drake.studies.workspace_map import Section
@@ -129,6 +130,37 @@ def motors_figure(sizing: Sizing, torque_limit: float | None) -> Figure:
     axes[0].set_xlim(0, sizing.time[-1])
     figure.align_ylabels(list(axes))
     _legend(figure, False, limited)
+    return figure
+
+
+@figure_style()
+def clearance_figure(clearance: ClearanceStudy, sections: list[Section], home: Array) -> Figure:
+    """Distances of the nearest parts: along the reference, and over a section through home."""
+    figure = Figure(figsize=(10, 4.2))
+    figure.subplots_adjust(left=0.08, right=0.97, bottom=0.13, top=0.88, wspace=0.26)
+    along, around = figure.subplots(1, 2)
+    lines = {"links": LEG_LINES[0], "base and motors": LEG_LINES[2]}
+    for (name, line), values in zip(
+        lines.items(), (clearance.along.links, clearance.along.base), strict=True
+    ):
+        along.plot(clearance.along.time, 1e3 * values, label=name, **line._asdict())
+    along.axhline(0.0, **LIMIT._asdict())
+    along.set_xlim(0, clearance.along.time[-1])
+    along.set_xlabel("time  [s]")
+    along.set_ylabel("distance of the nearest  [mm]")
+    along.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+    if not clearance.sections:
+        around.set_axis_off()
+        return figure
+    section, pair = clearance.sections[0], (sections[0].first, sections[0].second)
+    x, y = (FACTORS[k] * v for k, v in zip(pair, (section.x, section.y), strict=True))
+    shown = around.pcolormesh(x, y, 1e3 * section.distance, cmap=_CMAP, shading="nearest")
+    around.plot(*(FACTORS[k] * home[k] for k in pair), **_HOME)
+    around.grid(False)
+    around.set_facecolor(_OUTSIDE)
+    around.set_xlabel(f"{COORDINATE_NAMES[pair[0]]}  [{UNITS[pair[0]]}]")
+    around.set_ylabel(f"{COORDINATE_NAMES[pair[1]]}  [{UNITS[pair[1]]}]")
+    figure.colorbar(shown, ax=around).set_label("nearest links  [mm]")
     return figure
 
 

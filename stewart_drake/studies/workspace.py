@@ -17,6 +17,7 @@ from stewart_drake.loop.experiment import (
 )
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import COORDINATES, LEGS
+from stewart_drake.studies.clearance import ClearanceStudy, study_clearance
 from stewart_drake.studies.reach import (
     Factor,
     Margins,
@@ -44,6 +45,7 @@ class WorkspaceStudy:
         travel: per coordinate from home; empty with a bad home pose.
         sections: through home; empty with a bad home pose.
         sizing: of the motors, or None where the reference leaves the workspace.
+        clearance: whether links touch, along the reference and around home.
     """
 
     experiment: Experiment
@@ -54,6 +56,7 @@ class WorkspaceStudy:
     travel: list[Travel]
     sections: list[Section]
     sizing: Sizing | None
+    clearance: ClearanceStudy
 
     @property
     def torque_limit(self) -> float | None:
@@ -76,7 +79,7 @@ class WorkspaceStudy:
             return (
                 f"yes: {opening}the reference stays in the workspace, leg {leg} is nearest to the "
                 f"end of its reach with {1e3 * margin:.3g} mm left at t = {time:.2f} s; "
-                f"{self._amplitude}"
+                f"{self._amplitude}; {self.clearance.verdict}"
             )
         short = (
             f", at worst leg {leg} is short by {-1e3 * margin:.3g} mm at t = {time:.2f} s"
@@ -85,7 +88,7 @@ class WorkspaceStudy:
         )
         return (
             f"no: {opening}the reference leaves the workspace at t = {self.exit.time:.3f} s, "
-            f"{self.exit.reason}{short}; {self._amplitude}"
+            f"{self.exit.reason}{short}; {self._amplitude}; {self.clearance.verdict}"
         )
 
     @property
@@ -132,6 +135,7 @@ class WorkspaceStudy:
             "home": measure(self.experiment.mechanism, self.experiment.mechanism.home)._asdict(),
             "travel": [t._asdict() for t in self.travel],
             "sections": [_bounds(section) for section in self.sections],
+            "clearance": self.clearance.summary,
             "torque_limit": np.nan if self.torque_limit is None else self.torque_limit,
             "motors": [] if self.sizing is None else self.sizing.summary(self.torque_limit),
             "scenario": dataclasses.asdict(self.experiment.scenario),
@@ -148,15 +152,18 @@ def study_workspace(scenario: Scenario) -> WorkspaceStudy:
     mechanism, reference = experiment.mechanism, experiment.reference
     time = check_instants(scenario.duration)
     left = first_exit(mechanism, reference, time)
+    margins = margins_along(mechanism, reference, time)
+    ways, around = travel(mechanism), sections(mechanism)
     return WorkspaceStudy(
         experiment=experiment,
         home=diagnose(mechanism, 0.0, mechanism.home),
         exit=left,
-        margins=margins_along(mechanism, reference, time),
+        margins=margins,
         factor=largest_factor(mechanism, reference, time),
-        travel=travel(mechanism),
-        sections=sections(mechanism),
+        travel=ways,
+        sections=around,
         sizing=size_motors(experiment.nominal, reference, time) if left is None else None,
+        clearance=study_clearance(mechanism, time, margins.pose, ways, around),
     )
 
 

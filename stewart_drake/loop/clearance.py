@@ -1,0 +1,102 @@
+"""How far the parts of a machine are from each other: Drake's distances between its shapes.
+
+The shapes are those of the SDFormat model, which collide with nothing of their own machine in a
+simulation. Here the machine is alone in a scene, and pairs are asked for one by one, which no
+collision filter hides.
+"""
+
+import re
+from itertools import combinations
+from typing import Any, Final, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import GeometryId, QueryObject, Role, SceneGraph
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+from pydrake.systems.framework import DiagramBuilder
+
+from stewart_drake.loop.multibody import add_mechanism, set_pose
+from stewart_drake.mechanism.geometry import Mechanism
+
+Array = NDArray[np.float64]
+
+_AT_REST: Final = np.zeros(6)
+
+
+class Pair(NamedTuple):
+    """Two parts that no joint holds together, such as `crank 2` and `rod 1`."""
+
+    first: str
+    second: str
+
+    @property
+    def fixed(self) -> bool:
+        """Whether one of them is of the base, which stands where the drawing puts it."""
+        return any(name.split()[0] in ("base", "motor", "post") for name in self)
+
+    def __str__(self) -> str:
+        return f"{self.first} and {self.second}"
+
+
+class ClearanceScene:
+    """A machine alone, whose parts are looked at pair by pair.
+
+    Args:
+        mechanism: the machine.
+        base: whether its base, motors and posts are looked at too.
+
+    Attributes:
+        pairs: what `distances` tells of, in that order.
+    """
+
+    def __init__(self, mechanism: Mechanism, base: bool = True) -> None:
+        builder = DiagramBuilder()
+        config = MultibodyPlantConfig(time_step=1e-3, discrete_contact_approximation="sap")
+        plant, scene_graph = AddMultibodyPlant(config, builder)
+        add_mechanism(plant, mechanism, collision=True)
+        self._mechanism, self._plant = mechanism, plant
+        self._diagram = builder.Build()
+        self._context = self._diagram.CreateDefaultContext()
+        self._tree = plant.GetMyMutableContextFromRoot(self._context)
+        self._query: Any = scene_graph.get_query_output_port()
+        self._shapes = scene_graph.GetMyContextFromRoot(self._context)
+        parts = _parts(scene_graph)
+        pairs = [Pair(*names) for names in combinations(parts, 2) if not _joined(*names)]
+        self.pairs = tuple(pair for pair in pairs if base or not pair.fixed)
+        self._ids = [(parts[pair.first], parts[pair.second]) for pair in self.pairs]
+
+    def distances(self, pose: Array) -> Array:
+        """Of all pairs (p,), in m, at a pose (6,); negative by how far they are in each other.
+
+        Raises:
+            UnreachablePoseError: the pose is out of reach.
+        """
+        set_pose(self._plant, self._tree, self._mechanism, pose, _AT_REST)
+        query = cast(QueryObject, self._query.Eval(self._shapes))
+        found = (query.ComputeSignedDistancePairClosestPoints(*ids).distance for ids in self._ids)
+        return np.fromiter(found, dtype=np.float64, count=len(self._ids))
+
+
+def _parts(scene_graph: SceneGraph) -> dict[str, GeometryId]:
+    """The shapes by their names: `base`, `motor 1`, `post 1`, `plate`, `crank 1`, `rod 1`."""
+    inspector, found = scene_graph.model_inspector(), {}
+    for shape in inspector.GetAllGeometryIds(Role.kProximity):
+        body = inspector.GetName(inspector.GetFrameId(shape)).split("::")[-1]
+        name = inspector.GetName(shape).split("::")[-1]
+        on_base = body == "base" and name != "disc"
+        found[(name if on_base else body).replace("_", " ")] = shape
+    return {name: found[name] for name in sorted(found, key=_place)}
+
+
+def _place(name: str) -> tuple[int, str]:
+    kinds = ("base", "motor", "post", "plate", "crank", "rod")
+    return kinds.index(name.split()[0]), name
+
+
+def _joined(first: str, second: str) -> bool:
+    """Whether two parts are of one body, or meet in a joint."""
+    kinds = {name.split()[0] for name in (first, second)}
+    if kinds <= {"base", "motor", "post"} or kinds == {"plate", "rod"}:
+        return True
+    same_leg = len({re.sub("[^0-9]", "", name) for name in (first, second)}) == 1
+    return same_leg and kinds in ({"motor", "crank"}, {"post", "crank"}, {"crank", "rod"})

@@ -1,0 +1,82 @@
+"""How far cranks and rods are from each other at least, for many poses at once.
+
+Each link is held in a capsule, what is within a radius of its centre line: a rod of the SDFormat
+model with the rod's own radius, a crank, a bar of width w and thickness h, with hypot(w, h) / 2.
+Two capsules are apart by the distance of the lines less both radii, and the links inside them by
+that at least. `loop.clearance` measures the shapes themselves, and plate and base too.
+"""
+
+from itertools import combinations
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.mechanism.kinematics import LegGeometry, Legs
+from stewart_drake.mechanism.proportions import proportions
+from stewart_drake.scenario.signals import LEGS, NUM_LEGS, POSITION
+
+Array = NDArray[np.float64]
+
+LINKS: Final = tuple(f"{kind} {leg}" for kind in ("crank", "rod") for leg in LEGS)
+"""Names of the links, in the order of `center_lines`."""
+APART: Final = tuple((i, j) for i, j in combinations(range(2 * NUM_LEGS), 2) if j - i != NUM_LEGS)
+"""Pairs (60) of links that no joint holds together: all but a crank and its own rod."""
+
+
+class Lines(NamedTuple):
+    """Centre lines of the links at n poses."""
+
+    start: Array
+    """(n, 12, 3) in m, W."""
+    along: Array
+    """(n, 12, 3), from one end to the other."""
+
+
+def center_lines(mechanism: Legs, poses: Array, legs: LegGeometry) -> Lines:
+    """Of cranks, then rods; `legs` are those of `kinematics.legs_along` at the poses (n, 6)."""
+    cranks = mechanism.crank_lengths[:, None] * legs.crank
+    rods = mechanism.rod_lengths[:, None] * legs.rod
+    joints = poses[:, None, POSITION] + legs.p_PQ_W
+    shafts = np.broadcast_to(mechanism.p_WS, joints.shape)
+    return Lines(np.hstack([shafts, joints - rods]), np.hstack([cranks, rods]))
+
+
+def segment_distances(p: Array, u: Array, q: Array, v: Array) -> Array:
+    """Distances (...) of the segments p + s u and q + t v, 0 <= s, t <= 1; arrays (..., 3).
+
+    |r + s u - t v|^2, r = p - q, is convex in (s, t). Over all s and t it is least where
+    s (u.u v.v - (u.v)^2) = (u.v)(v.r) - (u.r)(v.v). That s is cut to the segment, then the best t
+    for it, and then the best s for that t: if one of the three was cut, the minimum over the
+    square lies on its border, and these steps end there. Parallel lines have many minima, of which
+    s = 0 leads to one. Lengths are not zero.
+    """
+    r = p - q
+    uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
+    ur, vr = _dot(u, r), _dot(v, r)
+    area = uu * vv - uv**2
+    skew = area > 1e-14 * uu * vv
+    s = np.clip(np.where(skew, (uv * vr - ur * vv) / np.where(skew, area, 1.0), 0.0), 0.0, 1.0)
+    t = np.clip((uv * s + vr) / vv, 0.0, 1.0)
+    s = np.clip((uv * t - ur) / uu, 0.0, 1.0)
+    return np.sqrt(_dot(d := r + s[..., None] * u - t[..., None] * v, d))
+
+
+def clearances(mechanism: Legs, poses: Array, legs: LegGeometry) -> Array:
+    """Distances (n, 60) in m that the pairs `APART` have at least; negative where none is known."""
+    first, second = np.array(APART).T
+    start, along = center_lines(mechanism, poses, legs)
+    lines = start[:, first], along[:, first], start[:, second], along[:, second]
+    radii = capsule_radii(mechanism)
+    return segment_distances(*lines) - radii[first] - radii[second]
+
+
+def capsule_radii(mechanism: Legs) -> Array:
+    """(12,) m, of the capsules that hold the links."""
+    size = proportions(mechanism)
+    crank = float(np.hypot(size.crank_width, size.crank_thickness)) / 2
+    return np.repeat([crank, size.rod_radius], NUM_LEGS)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.einsum("...i,...i->...", a, b)

@@ -1,0 +1,209 @@
+"""Whether the parts of a machine touch: along a motion, and around home.
+
+Distances are those of `loop.clearance`; a negative one is by how far two parts are in each other.
+Links are cranks, rods and plate. The base with its motors is told apart: where its disc lies is the
+drawing's choice, not the machine's.
+"""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.loop.clearance import ClearanceScene, Pair
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import reach_margins_along
+from stewart_drake.scenario.signals import NUM_COORDINATES
+from stewart_drake.studies.workspace_map import Section, Travel, last_inside
+
+Array = NDArray[np.float64]
+
+EVERY: Final = 3
+"""Each so manieth pose of a section, along both sides, is looked at."""
+_STEPS: Final = 60
+
+
+class Nearest(NamedTuple):
+    """Two parts where they come nearest to each other."""
+
+    pair: Pair
+    distance: float
+    """m, negative where they are in each other."""
+    time: float
+    """s"""
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Plain data, SI units."""
+        return {"parts": list(self.pair), "distance": self.distance, "time": self.time}
+
+
+class ClearanceAlong(NamedTuple):
+    """Along a motion, as far as the legs reach."""
+
+    time: Array
+    """(n,) s."""
+    links: Array
+    """(n,) m, of the nearest two links; NaN out of reach."""
+    base: Array
+    """(n,) m, of whatever is nearest to the base or its motors; NaN out of reach."""
+    nearest: list[Nearest]
+    """Of every pair, the nearest first; empty where no pose is in reach."""
+
+    def least(self, fixed: bool) -> Nearest | None:
+        """The nearest of all links, or (`fixed`) of what comes near the base."""
+        return next((one for one in self.nearest if one.pair.fixed == fixed), None)
+
+    @property
+    def touching(self) -> list[Nearest]:
+        """Links that cross somewhere, the deepest first."""
+        return [one for one in self.nearest if not one.pair.fixed and one.distance < 0]
+
+
+class ClearTravel(NamedTuple):
+    """How far one coordinate goes from home, the others staying, until links touch; rad or m.
+
+    A pair is None where the workspace ends before any two touch; `low` and `high` are then its end.
+    """
+
+    coordinate: str
+    low: float
+    high: float
+    low_pair: Pair | None
+    high_pair: Pair | None
+
+
+class ClearSection(NamedTuple):
+    """Of a section of the workspace; arrays (len(y), len(x))."""
+
+    x: Array
+    y: Array
+    distance: Array
+    """m, of the nearest two links; NaN outside the workspace."""
+    touching: float
+    """Share of the poses inside at which links touch; NaN without any."""
+
+
+class ClearanceStudy(NamedTuple):
+    """What is found of a machine and a motion."""
+
+    along: ClearanceAlong
+    home: Nearest | None
+    """The nearest two links at home, or None from a home pose outside the workspace."""
+    travel: list[ClearTravel]
+    sections: list[ClearSection]
+
+    @property
+    def verdict(self) -> str:
+        """In a clause."""
+        least = self.along.least(fixed=False)
+        if least is None:
+            return "no pose of it is in reach, so that nothing is known of links that touch"
+        where = f"{least.pair}, t = {least.time:.2f} s"
+        if least.distance >= 0:
+            return f"links stay {1e3 * least.distance:.3g} mm apart at least ({where})"
+        count = len(self.along.touching)
+        pairs = "one pair of links crosses" if count == 1 else f"{count} pairs of links cross"
+        return f"{pairs}, at worst {-1e3 * least.distance:.3g} mm deep ({where})"
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What `summary.json` holds; m and s."""
+        least, base = self.along.least(fixed=False), self.along.least(fixed=True)
+        return {
+            "verdict": self.verdict,
+            "least": None if least is None else least.summary,
+            "base": None if base is None else base.summary,
+            "home": None if self.home is None else self.home.summary,
+            "touching": [one.summary for one in self.along.touching],
+            "pairs": [one.summary for one in self.along.nearest],
+            "travel": [
+                t._asdict() | {"low_pair": _named(t.low_pair), "high_pair": _named(t.high_pair)}
+                for t in self.travel
+            ],
+            "touching_share_of_sections": [section.touching for section in self.sections],
+        }
+
+
+def study_clearance(
+    mechanism: Mechanism,
+    time: Array,
+    poses: Array,
+    travel: list[Travel],
+    sections: list[Section],
+) -> ClearanceStudy:
+    """Along a motion of `poses` (n, 6) at `time` (n,), and in the workspace as it was found."""
+    links = ClearanceScene(mechanism, base=False)
+    at_home = links.distances(mechanism.home) if travel else None
+    return ClearanceStudy(
+        along=clearance_along(ClearanceScene(mechanism), mechanism, time, poses),
+        home=None if at_home is None else _nearest(links, at_home),
+        travel=[_clear_travel(links, mechanism, k, one) for k, one in enumerate(travel)],
+        sections=[_clear_section(links, mechanism, one) for one in sections],
+    )
+
+
+def clearance_along(
+    scene: ClearanceScene, mechanism: Mechanism, time: Array, poses: Array
+) -> ClearanceAlong:
+    """At the poses (n, 6), those out of reach left out."""
+    distances = np.full((len(time), len(scene.pairs)), np.nan)
+    for k in np.flatnonzero((reach_margins_along(mechanism, poses) > 0).all(axis=1)):
+        distances[k] = scene.distances(poses[k])
+    seen = np.flatnonzero(np.isfinite(distances[:, 0]))
+    rows = seen[distances[seen].argmin(axis=0)] if len(seen) else []
+    nearest = [
+        Nearest(pair, float(distances[row, k]), float(time[row]))
+        for k, (pair, row) in enumerate(zip(scene.pairs, rows, strict=bool(len(seen))))
+    ]
+    fixed = np.array([pair.fixed for pair in scene.pairs])
+    return ClearanceAlong(
+        time,
+        distances[:, ~fixed].min(axis=1),
+        distances[:, fixed].min(axis=1, initial=np.inf),
+        sorted(nearest, key=lambda one: one.distance),
+    )
+
+
+def _nearest(scene: ClearanceScene, distances: Array) -> Nearest:
+    k = int(distances.argmin())
+    return Nearest(scene.pairs[k], float(distances[k]), 0.0)
+
+
+def _clear_travel(
+    scene: ClearanceScene, mechanism: Mechanism, number: int, whole: Travel
+) -> ClearTravel:
+    axis = np.eye(NUM_COORDINATES)[number]
+
+    def end(limit: float, direction: float) -> tuple[float, Pair | None]:
+        def clear(s: float) -> bool:
+            return bool(scene.distances(mechanism.home + s * direction * axis).min() >= 0)
+
+        if not clear(0.0):
+            return 0.0, _nearest(scene, scene.distances(mechanism.home)).pair
+        # A hair inside: at the very end rounding may put a leg out of reach.
+        limit *= 1 - 1e-6
+        s = last_inside(clear, limit, _STEPS, tolerance=1e-3 * limit)
+        if s == limit:
+            return s, None
+        beyond = mechanism.home + (s + 1e-3 * limit) * direction * axis
+        return s, _nearest(scene, scene.distances(beyond)).pair
+
+    (low, low_pair), (high, high_pair) = end(-whole.low, -1.0), end(whole.high, 1.0)
+    return ClearTravel(whole.coordinate, 0.0 - low, high, low_pair, high_pair)
+
+
+def _clear_section(scene: ClearanceScene, mechanism: Mechanism, section: Section) -> ClearSection:
+    x, y = section.x[::EVERY], section.y[::EVERY]
+    inside = np.isfinite(section.condition[::EVERY, ::EVERY])
+    distance = np.full(inside.shape, np.nan)
+    for j, i in zip(*np.nonzero(inside), strict=True):
+        pose = mechanism.home.copy()
+        pose[[section.first, section.second]] = x[i], y[j]
+        distance[j, i] = scene.distances(pose).min()
+    seen = distance[inside]
+    return ClearSection(x, y, distance, float(np.mean(seen < 0)) if len(seen) else np.nan)
+
+
+def _named(pair: Pair | None) -> list[str] | None:
+    return None if pair is None else list(pair)

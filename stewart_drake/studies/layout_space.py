@@ -1,0 +1,220 @@
+"""The machines that a search for a layout may choose from: numbers of a pattern, and two lengths.
+
+A point of the space is a value for each of `PARAMETERS`, together with an arrangement: which joint
+of the plate each leg takes, and which crank solution. Both have a pattern's threefold symmetry.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.mechanism.files import (
+    BodySpec,
+    LinkSpec,
+    MechanismSpec,
+    PatternSpec,
+    SixLegs,
+    pattern_legs,
+)
+
+Array = NDArray[np.float64]
+
+PARAMETERS: Final = (
+    "rotation_deg",
+    "base_radius",
+    "base_separation_deg",
+    "plate_radius",
+    "plate_separation_deg",
+    "plate_offset_deg",
+    "shaft_height",
+    "installation_deg",
+    "crank",
+    "rod",
+)
+"""What is varied: fields of `mechanism.files.PatternSpec`, and lengths of crank and rod in m."""
+CHOICES: Final = ("plate_order", "branches")
+"""What is chosen from a few."""
+_LENGTHS: Final = ("base_radius", "plate_radius", "crank", "rod")
+DIGITS: Final = 4
+"""Decimals that are enough: of lengths in m a tenth of a millimetre."""
+
+
+class Arrangement(NamedTuple):
+    """How the legs go, for all three pairs alike."""
+
+    order: tuple[int, ...]
+    """(6,): leg i takes joint order[i] of the plate."""
+    branches: tuple[int, ...]
+    """(6,) of -1 or 1."""
+    centre_deg: float
+    """The plate offset that puts a pair's joints as far to the left of it as to the right."""
+
+    @property
+    def key(self) -> str:
+        """For the name of a file."""
+        signs = "".join("+" if branch > 0 else "-" for branch in self.branches[:2])
+        return f"joints{''.join(map(str, self.order))}_cranks{signs}"
+
+
+@dataclass(frozen=True)
+class Space:
+    """What may be chosen.
+
+    Attributes:
+        spec: of the machine that the search begins from; what is not varied stays as it is there.
+        bounds: lowest and highest value by parameter; of the plate's offset, where it is not kept,
+            from the arrangement's centre.
+        kept: of `CHOICES`, what stays as in `spec`.
+        offset_from_centre: whether the plate's offset is counted from the arrangement's centre.
+    """
+
+    spec: MechanismSpec
+    bounds: dict[str, tuple[float, float]]
+    kept: tuple[str, ...]
+    offset_from_centre: bool
+
+    @property
+    def pattern(self) -> PatternSpec:
+        """That of the machine it begins from."""
+        assert self.spec.pattern is not None
+        return self.spec.pattern
+
+    def arrangements(self) -> list[Arrangement]:
+        """All of them, that of the machine itself first."""
+        own_order, own_branches = tuple(self.pattern.plate_order), tuple(self.pattern.branches)
+        neighbours, pairs = (5, 0, 1, 2, 3, 4), (0, 1, 2, 3, 4, 5)
+        orders, signs = [own_order, neighbours, pairs], [own_branches]
+        signs += [sign * 3 for sign in product((-1, 1), repeat=2)]
+        orders = orders[:1] if "plate_order" in self.kept else orders
+        signs = signs[:1] if "branches" in self.kept else signs
+        unique = dict.fromkeys(product(orders, signs))
+        return [Arrangement(order, branches, _centre(order)) for order, branches in unique]
+
+    def ranges(self, arrangement: Arrangement) -> list[tuple[float, float]]:
+        """Bounds of `PARAMETERS` for one arrangement."""
+        shift = arrangement.centre_deg if self.offset_from_centre else 0.0
+        return [
+            (low + shift, high + shift) if name == "plate_offset_deg" else (low, high)
+            for name, (low, high) in self.bounds.items()
+        ]
+
+    def legs(self, values: Sequence[float] | Array, arrangement: Arrangement) -> SixLegs:
+        """What kinematics needs of a machine."""
+        named = dict(zip(PARAMETERS, map(float, values), strict=True))
+        crank, rod = named.pop("crank"), named.pop("rod")
+        return pattern_legs(self._pattern(named, arrangement), crank, rod)
+
+    def machine(
+        self, values: Sequence[float] | Array, arrangement: Arrangement, name: str
+    ) -> MechanismSpec:
+        """A machine file's contents.
+
+        A longer link of the same section has a mass that grows with its length, and moments that
+        grow with the cube of it; the plate keeps its mass and is as wide as its joints. All three
+        moments of a body are scaled alike, so that there is still a body that has them: the small
+        one along a link is taken as more than it is.
+        """
+        named = dict(zip(PARAMETERS, map(float, values), strict=True))
+        crank, rod = named.pop("crank"), named.pop("rod")
+        wider = named["plate_radius"] / self.pattern.plate_radius
+        return replace(
+            self.spec,
+            name=name,
+            pattern=self._pattern(named, arrangement),
+            crank=_longer(self.spec.crank, crank),
+            rod=_longer(self.spec.rod, rod),
+            plate=BodySpec(self.spec.plate.mass, _times(self.spec.plate.inertia, wider**2)),
+        )
+
+    def _pattern(self, named: Mapping[str, float], arrangement: Arrangement) -> PatternSpec:
+        order, branches = list(arrangement.order), list(arrangement.branches)
+        return replace(self.pattern, plate_order=order, branches=branches, **named)
+
+    def rounded(self, values: Array, digits: int = DIGITS) -> Array:
+        """To so many decimals; what does not vary stays as it is."""
+        free = np.array([low < high for low, high in self.bounds.values()])
+        return np.where(free, np.round(values, digits), values)
+
+
+def space_around(
+    spec: MechanismSpec, vary: Mapping[str, tuple[float, float]], keep: Sequence[str]
+) -> Space:
+    """The space about a machine: half to twice its lengths, all angles, unless said otherwise.
+
+    Args:
+        spec: of a machine with a pattern.
+        vary: bounds, lowest and highest, by parameter; equal ones fix it.
+        keep: parameters and choices that stay as they are.
+
+    Raises:
+        ConfigError: a machine without a pattern, unknown names, bounds the wrong way round.
+    """
+    if spec.pattern is None:
+        raise ConfigError(
+            f"mechanism: got {spec.name}, described leg by leg; expected one with a pattern, whose "
+            "numbers can be varied"
+        )
+    for option, names in (("vary", vary), ("keep", keep)):
+        known = PARAMETERS if option == "vary" else PARAMETERS + CHOICES
+        for name in names:
+            if name not in known:
+                raise ConfigError(f"--{option}: got {name}; expected one of {', '.join(known)}")
+    own = _own(spec)
+    rod = own["rod"]
+    usual = {
+        "rotation_deg": (own["rotation_deg"] - 60, own["rotation_deg"] + 60),
+        "base_separation_deg": (5.0, 110.0),
+        "plate_separation_deg": (5.0, 110.0),
+        "plate_offset_deg": (-60.0, 60.0),
+        "shaft_height": (own["shaft_height"] - rod / 2, own["shaft_height"] + rod / 2),
+        "installation_deg": (0.0, 180.0),
+        **{name: (own[name] / 2, own[name] * 2) for name in _LENGTHS},
+    }
+    bounds = {}
+    for name in PARAMETERS:
+        low, high = (own[name],) * 2 if name in keep else vary.get(name, usual[name])
+        if not low <= high:
+            raise ConfigError(f"--vary {name}: got {low:g}:{high:g}; expected the lower one first")
+        if name in _LENGTHS and not low > 0:
+            raise ConfigError(f"--vary {name}: got {low:g} m; expected a length above 0")
+        bounds[name] = (float(low), float(high))
+    if all(low == high for low, high in bounds.values()):
+        raise ConfigError("--keep: got every number of the pattern; expected one to search for")
+    kept = tuple(name for name in CHOICES if name in keep)
+    centred = "plate_offset_deg" not in vary and "plate_offset_deg" not in keep
+    return Space(spec, bounds, kept, centred)
+
+
+def own_values(spec: MechanismSpec) -> Array:
+    """`PARAMETERS` of a machine with a pattern; of lengths leg by leg their mean."""
+    return np.array([_own(spec)[name] for name in PARAMETERS])
+
+
+def _own(spec: MechanismSpec) -> dict[str, float]:
+    lengths = {"crank": spec.crank.length, "rod": spec.rod.length}
+    return {
+        name: float(np.mean(lengths[name])) if name in lengths else getattr(spec.pattern, name)
+        for name in PARAMETERS
+    }
+
+
+def _centre(order: tuple[int, ...]) -> float:
+    """Minus the mean azimuth of the first two legs' joints as seen from their own pair, degrees."""
+    azimuths = [(120.0 * (joint // 2) + 180.0) % 360.0 - 180.0 for joint in order[:2]]
+    return -float(np.mean(azimuths))
+
+
+def _longer(spec: LinkSpec, length: float) -> LinkSpec:
+    ratio = length / float(np.mean(spec.length))
+    return replace(
+        spec, length=length, mass=spec.mass * ratio, inertia=_times(spec.inertia, ratio**3)
+    )
+
+
+def _times(moments: list[float] | None, factor: float) -> list[float] | None:
+    return None if moments is None else [factor * moment for moment in moments]
