@@ -18,8 +18,8 @@ from stewart_drake.law.limits import is_stable, spectral_radius
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
 from stewart_drake.loop.cautions import cautions_after, cautions_before, coarse_step
-from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin, true_dynamics
-from stewart_drake.loop.experiment import believed_queue, control_law, prepare
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.loop.experiment import believed_queue, control_law, prepare, true_dynamics
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE

@@ -36,12 +36,23 @@ def sampled_as_printed(model: DelayedModel) -> DelayedModel:
 
 
 @functools.cache
-def error(ratio: float, *, integral: bool, rest: bool = False, printed_z: bool = False) -> float:
-    """E_ac in % s of (46) over 10 s with w_Q/w_R = ratio, with the torques for it in flight."""
+def error(
+    ratio: float,
+    *,
+    integral: bool,
+    rest: bool = False,
+    printed_z: bool = False,
+    share: float = 1.0,
+) -> float:
+    """E_ac in % s of (46) over 10 s with w_Q/w_R = ratio, with the torques for it in flight.
+
+    The integral counts by `share` of what the error does.
+    """
     model = delayed_model(double_integrators(B), PERIOD, STEPS, integral=integral)
     if printed_z:
         model = sampled_as_printed(model)
-    K = augmented_gain(model, ratio * np.eye(12 if integral else 6), np.eye(6))
+    Q = ratio * np.diag([1.0] * 6 + [share] * 6 * integral)
+    K = augmented_gain(model, Q, np.eye(6))
     x, v, z = np.zeros(6), np.zeros(6) if rest else AMPLITUDE, np.zeros(6)
     # Mean of the torque that the reference takes, over each of the holds in flight.
     change = np.diff(np.cos(PERIOD * np.arange(STEPS + 1)))

@@ -21,8 +21,8 @@ class Call(Protocol):
         """Evaluate; several threads may."""
 
 
-class DynamicsFunctions(Protocol):
-    """Functions of pose, rates, torque, parameters (13,) and gravity (m/s^2) of one mechanism."""
+class MotionFunctions(Protocol):
+    """Functions of pose, rates, torque, parameters (13,) and gravity (m/s^2) of one plant."""
 
     @property
     def backend(self) -> str:
@@ -49,6 +49,19 @@ class DynamicsFunctions(Protocol):
         """(pose, rates, accelerations, torque, parameters, gravity) -> derivatives of
         F = M nu_dot + h - B torque; see `StewartDynamics.derivatives`."""
 
+    def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
+        """d[pose; rates]/dt (12,)."""
+
+    def many_steps(self, steps: int) -> Call:
+        """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12), one call.
+
+        Steps of the classical Runge-Kutta method.
+        """
+
+
+class DynamicsFunctions(MotionFunctions, Protocol):
+    """Those of a mechanism, and where it may be."""
+
     @property
     def measures(self) -> Call:
         """(pose) -> the measures of the workspace (8,), see `dynamics.measures`."""
@@ -57,17 +70,8 @@ class DynamicsFunctions(Protocol):
     def measures_of_tree(self) -> Call:
         """(pose, angles) -> the same with crank angles (6,) that are known."""
 
-    def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
-        """d[pose; rates]/dt (12,)."""
-
     def margin(self, pose: Array, sign: float, least: Array) -> float:
         """`margin_of` the measures of a pose."""
-
-    def many_steps(self, steps: int) -> Call:
-        """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12), one call.
-
-        Steps of the classical Runge-Kutta method.
-        """
 
 
 def margin_of(measures: Array, sign: float, least: Array) -> float:

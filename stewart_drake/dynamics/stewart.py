@@ -6,11 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stewart_drake.dynamics.equations import STANDARD_GRAVITY
-from stewart_drake.dynamics.functions import compiled_functions
+from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE, STANDARD_GRAVITY
+from stewart_drake.dynamics.functions import MotionFunctions, compiled_functions
+from stewart_drake.dynamics.workspace import standing
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, angle_rate_map
+from stewart_drake.mechanism.torque_map import TorqueMap, torque_map
 from stewart_drake.scenario.signals import (
     ANGLES,
     COULOMB_SPEED,
@@ -152,7 +154,7 @@ class StewartDynamics:
         place = [PLANT_PARAMETERS.index(free[i]) for i in own]
         self._own, self._place = _slice(own), _slice(place)
         self.parameters = self.free_of(self.plant_parameters)
-        self._functions = compiled_functions(mechanism)
+        self._functions: MotionFunctions = compiled_functions(mechanism)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Compiled functions cannot be copied, but made again, or found.
@@ -179,6 +181,16 @@ class StewartDynamics:
         spread = np.zeros((len(self.free), *of_plant.shape[1:]))
         spread[self._own] = of_plant[self._place]
         return spread
+
+    def require_reach(self, pose: Array) -> None:
+        """Raises UnreachablePoseError for a pose (6,) out of reach or at a dead centre."""
+        # Beyond a leg's reach its sine is below that, too; a sine of NaN is none above it.
+        if not standing(self.mechanism, pose).sines.min() >= DEAD_CENTRE_SINE:
+            raise UnreachablePoseError(self.mechanism.reach_margins(pose))
+
+    def massless_map(self, pose: Array, form: TorqueMap = "virtual_work") -> Array:
+        """(6, 6) the paper's accelerations per torque at a pose: see `mechanism.torque_map`."""
+        return torque_map(self.mechanism, pose, form)
 
     def accelerations(
         self,

@@ -1,7 +1,7 @@
 """Where a mechanism may be: off dead centres and parallel singularities, angles distinct."""
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,3 +98,29 @@ def diagnose(
     return Failure(
         time, None, sign * now.parallel, "parallel singularity: the cranks do not hold the plate"
     )
+
+
+class Limits(Protocol):
+    """Where a plant's plate may be, at which time."""
+
+    def margin(self, time: float, pose: Array) -> float:
+        """Positive where a pose (6,) is permitted at a time in s."""
+        ...
+
+    def diagnose(self, time: float, pose: Array) -> Failure | None:
+        """The failure at a pose that is not permitted, else None."""
+        ...
+
+
+class Workspace(NamedTuple):
+    """The limits of a machine, always the same: `margin` and `diagnose`."""
+
+    mechanism: Mechanism
+
+    def margin(self, time: float, pose: Array) -> float:
+        """Of the module's function."""
+        return margin(self.mechanism, pose)
+
+    def diagnose(self, time: float, pose: Array) -> Failure | None:
+        """Of the module's function."""
+        return diagnose(self.mechanism, time, pose)

@@ -6,13 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
-from stewart_drake.dynamics.workspace import standing
 from stewart_drake.law.error_model import ContinuousModel, double_integrators, linear_model
 from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.mechanism.torque_map import TorqueMap, torque_map
+from stewart_drake.mechanism.torque_map import TorqueMap
 from stewart_drake.scenario.signals import POSE, RATES
 
 Array = NDArray[np.float64]
@@ -29,7 +25,7 @@ class DesignModel(ABC):
         Raises:
             UnreachablePoseError: the plate cannot be there, or not be moved there.
         """
-        require_reach(plant.mechanism, state[POSE])
+        plant.dynamics.require_reach(state[POSE])
         return self.about(state, torque, parameters, plant)
 
     @abstractmethod
@@ -37,13 +33,6 @@ class DesignModel(ABC):
         self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
     ) -> ContinuousModel:
         """`at`, of a pose that is known to be within reach."""
-
-
-def require_reach(mechanism: Mechanism, pose: Array) -> None:
-    """Raises UnreachablePoseError for a pose (6,) out of reach or at a dead centre."""
-    # Beyond a leg's reach its sine is below that, too; a sine of NaN is none above it.
-    if not standing(mechanism, pose).sines.min() >= DEAD_CENTRE_SINE:
-        raise UnreachablePoseError(mechanism.reach_margins(pose))
 
 
 @dataclass(frozen=True)
@@ -60,7 +49,7 @@ class PaperModel(DesignModel):
         self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
     ) -> ContinuousModel:
         """By the pose alone."""
-        return double_integrators(torque_map(plant.mechanism, state[POSE], self.form))
+        return double_integrators(plant.dynamics.massless_map(state[POSE], self.form))
 
 
 @dataclass(frozen=True)

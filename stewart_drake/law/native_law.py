@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Belief, Estimate
 from stewart_drake.law.channel import Report, Sent, Wire
 from stewart_drake.law.cost import QuadraticCost
@@ -71,6 +72,7 @@ def uncovered(law: PredictiveLqi) -> str | None:
         estimated, correlated = prior.names, getattr(prior, "correlation", None) is not None
     covered = {
         "law": type(law) is PredictiveLqi and type(law.plant) is NominalPlant,
+        "plant.kind": type(dynamics) is StewartDynamics,
         "controller.delay_estimator": not isinstance(observer, DelayObserver),
         "controller.estimator": type(observer) in _OBSERVERS and type(timeline) is Timeline,
         "controller.prior": estimated == PARAMETERS and dynamics.free == PARAMETERS,

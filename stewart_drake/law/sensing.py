@@ -119,10 +119,12 @@ class StateSensing:
     Attributes:
         noise_std: (12,) rad, m and per s.
         motion: (6,) how far each coordinate is expected to move, rad and m.
+        anywhere: whether poses out of the machine's reach are believed.
     """
 
     noise_std: Array
     motion: Array
+    anywhere: bool = False
 
     @property
     def size(self) -> int:
@@ -152,6 +154,8 @@ class StateSensing:
         if np.any(repeats & noisy) or np.any(stuck):
             return "measurements_frozen"
         pose = values[POSE]
+        if self.anywhere:
+            return None
         if abs(pose[1]) >= _STEEPEST or not np.all(mechanism.reach_margins(pose) >= 0):
             return "measurements_rejected"
         return None

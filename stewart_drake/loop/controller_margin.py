@@ -30,7 +30,7 @@ from stewart_drake.law.linear_loop import LinearLoop, Margins, law_gain, worst_m
 from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError
-from stewart_drake.loop.experiment import Experiment, compose_law, longest_wait
+from stewart_drake.loop.experiment import Experiment, compose_law, longest_wait, true_dynamics
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.scenario.config import NetworkConfig
 from stewart_drake.scenario.signals import (
@@ -230,12 +230,6 @@ def _order(radii: list[float]) -> list[int]:
     """
     first, *between, last = (int(i) for i in np.argsort(radii)[::-1])
     return [first, last, *(int(i) for i in np.random.default_rng(0).permutation(between))]
-
-
-def true_dynamics(experiment: Experiment) -> StewartDynamics:
-    """The plant as it is simulated, closed exactly whatever engine moves it."""
-    plant = experiment.scenario.plant
-    return StewartDynamics(experiment.truth, plant.gravity, plant.parameters)
 
 
 def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> ContinuousModel:

@@ -30,8 +30,10 @@ from stewart_drake.loop.experiment import (
     control_law,
     first_queue,
     followed_motion,
+    limits_of,
     motion_scale,
     torques_in_flight,
+    true_dynamics,
 )
 from stewart_drake.loop.late_measurements import LateMeasurements
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
@@ -59,7 +61,6 @@ from stewart_drake.scenario.link import (
     torque_delays,
 )
 from stewart_drake.scenario.signals import (
-    BIAS,
     NUM_TORQUES,
     PACKETS,
     POSE,
@@ -432,7 +433,5 @@ def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | Mult
             coulomb_friction=plant.coulomb_friction,
             coulomb_speed=plant.coulomb_speed,
         )
-    parameters = np.array(plant.parameters)
-    parameters[BIAS] = 0.0  # added before, where the record of torques ends
-    truth = StewartDynamics(experiment.truth, plant.gravity, parameters)
-    return ExactPlant(truth, experiment.start, wrench)
+    truth = true_dynamics(experiment, biased=False)
+    return ExactPlant(truth, experiment.start, wrench, limits_of(experiment))

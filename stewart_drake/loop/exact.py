@@ -16,7 +16,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.scalar_conversion import TemplateSystem
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import margin
+from stewart_drake.dynamics.workspace import Failure, Limits, Workspace
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE, RATES
 from stewart_drake.scenario.timing import METRIC_PERIOD
@@ -33,9 +33,9 @@ def ExactPlant_(T):
 
         Dynamics:  d[pose; rates]/dt = [rates; accelerations(pose, rates, torque)], and what a
                    wrench adds to that, `StewartDynamics.wrench_accelerations`.
-        Witness:   the least of the margins of `dynamics.workspace.margin`; the simulation ends
-                   where it passes zero: a leg at a dead centre, a parallel singularity, a pitch
-                   of 85 degrees.
+        Witness:   the margin of its limits, of a machine the least of `dynamics.workspace.margin`;
+                   the simulation ends where it passes zero: a leg at a dead centre, a parallel
+                   singularity, a pitch of 85 degrees.
 
         | port | direction | size | unit | rate |
         | --- | --- | --- | --- | --- |
@@ -51,6 +51,7 @@ def ExactPlant_(T):
             dynamics: equations of motion, with gravity and the true parameters.
             initial_state: (12,) default of the continuous state; at home and at rest if None.
             wrench: whether there is an input for a wrench on the plate; unconnected it is zero.
+            limits: where the plate may be; its machine's workspace if None.
         """
 
         def _construct(
@@ -58,10 +59,12 @@ def ExactPlant_(T):
             dynamics: StewartDynamics,
             initial_state: ArrayLike | None = None,
             wrench: bool = False,
+            limits: Limits | None = None,
             converter=None,
         ) -> None:
             super().__init__(converter=converter)
             self.dynamics = dynamics
+            self.limits = Workspace(dynamics.mechanism) if limits is None else limits
             self._initial = np.concatenate([dynamics.mechanism.home, np.zeros(6)])
             if initial_state is not None:
                 self._initial[:] = initial_state
@@ -82,7 +85,9 @@ def ExactPlant_(T):
 
         def _construct_copy(self, other, converter=None) -> None:
             wrench = other._wrench is not None
-            Impl._construct(self, other.dynamics, other._initial, wrench, converter=converter)
+            Impl._construct(
+                self, other.dynamics, other._initial, wrench, other.limits, converter=converter
+            )
 
         def DoCalcTimeDerivatives(self, context, derivatives) -> None:
             x = context.get_continuous_state_vector().CopyToVector()
@@ -120,8 +125,14 @@ def ExactPlant_(T):
 
         def margin(self, context) -> float:
             """Positive inside the permitted region, see `dynamics.workspace.margin`."""
-            pose = context.get_continuous_state_vector().CopyToVector()[POSE]
-            return margin(self.dynamics.mechanism, pose)
+            return self.limits.margin(context.get_time(), self._pose(context))
+
+        def diagnose(self, context) -> Failure | None:
+            """Why the plate is not inside it, or None."""
+            return self.limits.diagnose(context.get_time(), self._pose(context))
+
+        def _pose(self, context):
+            return context.get_continuous_state_vector().CopyToVector()[POSE]
 
         def DoGetWitnessFunctions(self, context):
             return [self._witness] if T is float else []

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.dynamics.frozen_map import Band, FrozenDynamics
 from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
-from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.dynamics.workspace import Failure, Limits, Workspace, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
 from stewart_drake.law.catch_up import CatchUp
@@ -94,6 +95,8 @@ _PATIENCE = 10
 """Periods by which a measurement may be later than that, or lost, before the model goes on."""
 _REPORTS = 10
 """Reports in a row that may be lost without losing what they said."""
+LOST = 10.0
+"""Peak-to-peaks by which a plant without a workspace, the paper's, may be off its reference."""
 REACH_CHECK_PERIOD = 0.02
 """s between the instants at which a reference is checked against the workspace."""
 
@@ -127,7 +130,8 @@ class Experiment(NamedTuple):
     def torque_limit(self) -> float:
         """Of each motor, N m, infinite for none: the scenario's, else that of the true machine."""
         own = self.scenario.actuator.torque_limit
-        limit = self.truth.effort_limit if own is None else own
+        frozen = self.scenario.plant.kind == "paper"  # has none of its own
+        limit = (None if frozen else self.truth.effort_limit) if own is None else own
         return math.inf if limit is None or limit == "none" else limit
 
     @property
@@ -243,7 +247,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
         truth=with_motors(simulated_machine(scenario) if truth is None else truth, scenario),
         reference=reference,
         peak_to_peak=span,
-        nominal=StewartDynamics(
+        nominal=_equations(scenario)(
             mechanism, scenario.plant.gravity, known_values(known), estimated(scenario)
         ),
         start=start,
@@ -251,6 +255,30 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
         own=own,
         known=known,
     )
+
+
+def _equations(scenario: Scenario) -> type[StewartDynamics]:
+    """Whose the plant's are, in the controller and out of it."""
+    return FrozenDynamics if scenario.plant.kind == "paper" else StewartDynamics
+
+
+def true_dynamics(experiment: Experiment, *, biased: bool = True) -> StewartDynamics:
+    """The plant as it is simulated, closed exactly whatever engine moves it.
+
+    In a loop it is not `biased`: there the bias is added before, where the record of torques ends.
+    """
+    scenario, plant = experiment.scenario, experiment.scenario.plant
+    parameters = np.array(plant.parameters)
+    parameters[BIAS] *= biased
+    return _equations(scenario)(experiment.truth, plant.gravity, parameters)
+
+
+def limits_of(experiment: Experiment) -> Limits:
+    """Where its plate may be."""
+    if experiment.scenario.plant.kind != "paper":
+        return Workspace(experiment.truth)
+    reference = experiment.reference
+    return Band(lambda time: reference.value(time)[:, 0], LOST * experiment.scale)
 
 
 def estimated(scenario: Scenario) -> tuple[str, ...]:
@@ -565,7 +593,8 @@ def _sensing(experiment: Experiment, motion: Array) -> Sensing:
     """What is measured, as the controller knows it; `motion` is `motion_scale`."""
     sensor, rates = experiment.scenario.sensor, experiment.scenario.controller.prior.rates
     if not isinstance(sensor, EncoderSensorConfig):
-        return StateSensing(np.array(sensor.noise_std), motion)
+        anywhere = experiment.scenario.plant.kind == "paper"
+        return StateSensing(np.array(sensor.noise_std), motion, anywhere)
     finds_offsets = OFFSETS[0] in experiment.nominal.free
     return EncoderSensing(
         mechanism=experiment.mechanism,

@@ -8,6 +8,7 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
+from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.loop.multibody import add_mechanism, set_pose
 from stewart_drake.loop.platforms import AddStewartPlatform
 from stewart_drake.mechanism.geometry import Mechanism
@@ -74,6 +75,13 @@ class MultibodyStewart(Diagram):
         """
         tree_context = self.GetMutableSubsystemContext(self.tree, context)
         set_pose(self.tree, tree_context, self.mechanism, state[POSE], state[RATES])
+
+    def diagnose(self, context: Context) -> Failure | None:
+        """Why the plate, in its own context, is not inside its workspace, or None."""
+        state, cranks = (
+            np.asarray(self.GetOutputPort(name).Eval(context)) for name in ("state", "crank_angles")
+        )
+        return diagnose(self.mechanism, context.get_time(), state[POSE], cranks)
 
 
 def build_viewer(

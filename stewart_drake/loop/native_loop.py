@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.open_loop import IntegrationError
-from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.native_law import configuration
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.experiment import Experiment, torques_in_flight
+from stewart_drake.loop.experiment import Experiment, torques_in_flight, true_dynamics
 from stewart_drake.loop.sensor import white_noises
 from stewart_drake.native.law_layout import CAUSES, address
 from stewart_drake.native.library import backend
@@ -29,7 +28,7 @@ from stewart_drake.scenario.config import (
     TorqueActuatorConfig,
     WireConfig,
 )
-from stewart_drake.scenario.signals import BIAS, NUM_STATE, NUM_TORQUES, POSE
+from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
 from stewart_drake.scenario.timing import event_time, instants, look_time
 
 Array = NDArray[np.float64]
@@ -193,9 +192,7 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
     sc, sensor = experiment.scenario, experiment.scenario.sensor
     assert isinstance(sensor, StateSensorConfig)
     noise = np.array(sensor.noise_std)
-    parameters = np.array(sc.plant.parameters)
-    parameters[BIAS] = 0.0  # added where torques arrive, as in the diagram
-    truth = StewartDynamics(experiment.truth, sc.plant.gravity, parameters)
+    truth = true_dynamics(experiment, biased=False)
     accuracy = SHARE * sc.plant.accuracy
     plant = NativePlant(truth, experiment.start, when.looks, accuracy, LONGEST_STEP)
     delay, number = sc.true_delay, len(when.samples)

@@ -219,6 +219,10 @@ def AddStewartPlatform(
     if pose.shape != (6,):
         raise ConfigError(f"start: got shape {pose.shape}; expected (6,), a pose")
     machine.crank_angles(pose)  # or it is out of reach
+    if config.kind == "paper":
+        raise ConfigError(
+            "plant.kind: got 'paper', which is no machine; expected 'multibody' or 'exact'"
+        )
     if config.kind == "exact":
         for name, given in (("plant", plant), ("parent", parent), ("X_PB", X_PB)):
             if given is not None:

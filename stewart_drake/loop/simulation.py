@@ -13,7 +13,7 @@ from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
 from stewart_drake.dynamics.threads import one_blas_thread
-from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.loop.cautions import cautions_after, cautions_before
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
@@ -27,7 +27,6 @@ from stewart_drake.loop.scene import Live
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.timing import instants, look_time
 
 Array = NDArray[np.float64]
@@ -220,19 +219,14 @@ def make_simulator(loop: ClosedLoop) -> Simulator:
     plant = loop.experiment.scenario.plant
     context = loop.CreateDefaultContext()
     simulator = Simulator(loop, context)
-    if plant.kind == "exact":
+    if plant.kind != "multibody":
         set_accuracy(simulator, plant.accuracy)
     return simulator
 
 
 def _failure(loop: ClosedLoop, context: Context) -> Failure:
     plant: Any = loop.GetSubsystemByName("plant")
-    plant_context = plant.GetMyContextFromRoot(context)
-    cranks = None
-    if plant.HasOutputPort("crank_angles"):
-        cranks = plant.GetOutputPort("crank_angles").Eval(plant_context)
-    pose = plant.GetOutputPort("state").Eval(plant_context)[POSE]
-    failure = diagnose(loop.experiment.truth, context.get_time(), pose, cranks)
+    failure: Failure | None = plant.diagnose(plant.GetMyContextFromRoot(context))
     assert failure is not None, "the simulation ended inside the workspace"
     return failure
 

@@ -192,7 +192,7 @@ def analyze_robustness(
 
 
 def _on_exact_plant(scenario: Scenario) -> Scenario:
-    return dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, kind="exact"))
+    return dataclasses.replace(scenario, plant=scenario.plant.without_engine)
 
 
 def analyze_hautus(scenario: Scenario | str | Path) -> Answer:

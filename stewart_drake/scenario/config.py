@@ -45,8 +45,10 @@ class PlantConfig:
     """The simulated platform; from the payload on nobody tells the controller.
 
     Attributes:
-        kind: `multibody` (MultibodyPlant with constraints, fixed steps) or `exact` (closed-form
-            dynamics, error-controlled integration).
+        kind: `multibody` (MultibodyPlant with constraints, fixed steps), `exact` (closed-form
+            dynamics, error-controlled integration) or `paper` (the paper's torque map, frozen at
+            home, for the controller too; without limits: lost is an error above ten times the
+            motion's peak to peak).
         gravity: whether gravity acts, 9.81 m/s^2; false stands for a counterbalanced platform.
         time_step: of the multibody plant, s.
         accuracy: of the exact plant's integrator, relative, 1e-12 to 1e-2.
@@ -60,7 +62,7 @@ class PlantConfig:
         payload_position: of the payload in the plate's frame, from its centre of mass, m.
     """
 
-    kind: Literal["multibody", "exact"] = "multibody"
+    kind: Literal["multibody", "exact", "paper"] = "multibody"
     gravity: bool = False
     time_step: Annotated[float, Field(ge=1e-6, le=METRIC_PERIOD)] = 0.001
     accuracy: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-8
@@ -79,6 +81,13 @@ class PlantConfig:
         """All of the plant, in the order of `scenario.signals.PLANT_PARAMETERS`."""
         shafts = (self.joint_damping, self.coulomb_friction, self.coulomb_speed)
         return [*self.torque_bias, self.payload_mass, *shafts, *self.payload_position]
+
+    @property
+    def without_engine(self) -> "PlantConfig":
+        """The same, exact where it is the multibody one."""
+        if self.kind != "multibody":
+            return self
+        return dataclasses.replace(self, kind="exact")
 
 
 @dataclass(config=STRICT)
@@ -551,6 +560,7 @@ class Scenario:
             self.reference.problem(),
             _controller_problem(self.controller),
             self._command_problem(),
+            self._map_problem(),
             self.sensor.problem(),
             self.link.problem(),
             self._delay_problem(),
@@ -580,6 +590,24 @@ class Scenario:
             if got != expected:
                 return (
                     f"{name}: got {got!r} with controller.command 'cranks'; expected {expected!r}"
+                )
+        return None
+
+    def _map_problem(self) -> str | None:
+        """What has no place in a plant that is a torque map, without legs, or None."""
+        p = self.plant
+        if p.kind != "paper":
+            return None
+        nothing = ("gravity", "payload_mass", "joint_damping", "coulomb_friction")
+        usual = PlantConfig()
+        parts = [(f"plant.{name}", getattr(p, name), getattr(usual, name)) for name in nothing]
+        parts += [("sensor.kind", self.sensor.kind, "state")]
+        parts += [("actuator.kind", self.actuator.kind, "torque")]
+        for name, got, expected in parts:
+            if got != expected:
+                return (
+                    f"{name}: got {brief(got)} with plant.kind 'paper'; expected "
+                    f"{brief(expected)}, or another plant"
                 )
         return None
 

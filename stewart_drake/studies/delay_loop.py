@@ -19,8 +19,7 @@ from stewart_drake.law.limits import (
     spectral_radius,
 )
 from stewart_drake.law.linear_loop import LinearLoop, law_gain, worst_margins
-from stewart_drake.loop.controller_margin import true_dynamics
-from stewart_drake.loop.experiment import believed_delay, quadratic_cost
+from stewart_drake.loop.experiment import believed_delay, quadratic_cost, true_dynamics
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import POSE

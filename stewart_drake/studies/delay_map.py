@@ -82,7 +82,7 @@ def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[lis
             variant = replace(
                 scenario,
                 reference=motion,
-                plant=replace(scenario.plant, kind="exact"),
+                plant=scenario.plant.without_engine,
                 delay=replace(scenario.delay, steps=steps),
             )
             key = f"mu{steps}-x{factor}"

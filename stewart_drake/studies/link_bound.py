@@ -126,7 +126,7 @@ def study_link(scenario: Scenario, runs: int = 5, progress: Progress | None = No
     if runs < 1:
         raise ConfigError(f"runs: got {runs}; expected at least 1")
     period, repeats = scenario.controller.period, scenario.controller.packet_repeats
-    base = replace(scenario, plant=replace(scenario.plant, kind="exact"))
+    base = replace(scenario, plant=scenario.plant.without_engine)
     bounds = bounds_for(link, period)
     losses = sorted({*LOSSES, link.loss})
     total = runs * (len(bounds) + len(losses))

@@ -7,8 +7,8 @@ from typing import Final, Literal
 import numpy as np
 
 from stewart_drake.law.limits import amplification, fastest_pole
-from stewart_drake.loop.controller_margin import ControllerMargin, true_dynamics, true_model
-from stewart_drake.loop.experiment import Experiment
+from stewart_drake.loop.controller_margin import ControllerMargin, true_model
+from stewart_drake.loop.experiment import Experiment, true_dynamics
 from stewart_drake.loop.results import MarginSummary
 
 INSTANTS: Final = 30

@@ -1,0 +1,136 @@
+"""The paper's plant: its torque map (19) frozen at home, behind the interface of the exact one.
+
+    d2(pose)/dt2 = map (torque + bias),      map = `mechanism.torque_map.torque_map` at home,
+
+everywhere and without limits. It is the model that the paper's controller is designed with, taken
+for the machine. Legs have no mass, and nothing else of a plant's parameters has a place in it.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stewart_drake.dynamics.functions import Call
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import angle_rate_map, rotation
+from stewart_drake.mechanism.torque_map import TorqueMap, torque_map
+from stewart_drake.scenario.signals import (
+    ANGLES,
+    BIAS,
+    NUM_COORDINATES,
+    NUM_PLANT_PARAMETERS,
+    NUM_STATE,
+    POSE,
+    RATES,
+)
+
+Array = NDArray[np.float64]
+
+
+class FrozenMap:
+    """Functions of `dynamics.functions.MotionFunctions`, of a torque map (6, 6) that stays.
+
+    With M the plate's mass matrix at home, M accelerations = M map (torque + bias).
+    """
+
+    backend = "frozen map"
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        plate, angles = mechanism.plate, mechanism.home[ANGLES]
+        self.map = torque_map(mechanism, mechanism.home)
+        R_WP, E = rotation(angles), angle_rate_map(angles)
+        self._mass = np.diag(np.repeat([0.0, plate.mass], 3))
+        self._mass[ANGLES, ANGLES] = E.T @ R_WP @ np.diag(plate.inertia) @ R_WP.T @ E
+
+    def accelerations(self, *arguments: ArrayLike) -> Sequence[Array]:
+        """(pose, rates, torque, parameters, gravity) -> accelerations (6,)."""
+        _, _, torque, parameters, _ = arguments
+        return [self.map @ (np.asarray(torque) + np.asarray(parameters)[BIAS])]
+
+    def inverse_dynamics(self, *arguments: ArrayLike) -> Sequence[Array]:
+        """(pose, rates, accelerations, parameters, gravity) -> torque (6,)."""
+        _, _, accelerations, parameters, _ = arguments
+        return [np.linalg.solve(self.map, accelerations) - np.asarray(parameters)[BIAS]]
+
+    def energy(self, *arguments: ArrayLike) -> Sequence[Array]:
+        """(pose, rates, parameters, gravity) -> J."""
+        rates = np.asarray(arguments[1])
+        return [rates @ self._mass @ rates / 2]
+
+    def terms(self, *arguments: ArrayLike) -> Sequence[Array]:
+        """(pose, rates, parameters, gravity) -> M, bias and, transposed, the actuation map."""
+        return [self._mass.copy(), np.zeros(NUM_COORDINATES), (self._mass @ self.map).T]
+
+    def residual_derivatives(self, *arguments: ArrayLike) -> Sequence[Array]:
+        """Of F = accelerations - map (torque + bias), transposed, as of the exact dynamics."""
+        by_parameters = np.zeros((NUM_PLANT_PARAMETERS, NUM_COORDINATES))
+        by_parameters[BIAS] = -self.map.T
+        nothing = np.zeros((NUM_STATE, NUM_COORDINATES))
+        return [nothing, by_parameters, np.eye(NUM_COORDINATES), self.map]
+
+    def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
+        """d[pose; rates]/dt (12,)."""
+        return np.concatenate([state[RATES], self.map @ (torque + parameters[BIAS])])
+
+    def many_steps(self, steps: int) -> Call:
+        """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12): parabolas."""
+
+        def through(*arguments: ArrayLike) -> Sequence[Array]:
+            state, torques, parameters, _, h = map(np.asarray, arguments)
+            accelerations = (torques + parameters[BIAS]) @ self.map.T
+            states = np.empty((steps, NUM_STATE))
+            for k, (a, s) in enumerate(zip(accelerations, h, strict=True)):
+                pose, rates = state[POSE], state[RATES]
+                state = np.concatenate([pose + s * rates + s**2 / 2 * a, rates + s * a])
+                states[k] = state
+            return [states]
+
+        return through
+
+
+class FrozenDynamics(StewartDynamics):
+    """`StewartDynamics` of that plant: the map at home, at any pose, in or out of reach.
+
+    Gravity and all parameters but the torque bias change nothing.
+    """
+
+    def __init__(self, mechanism: Mechanism, *arguments: Any, **named: Any) -> None:
+        super().__init__(mechanism, *arguments, **named)
+        self._functions = FrozenMap(mechanism)
+
+    def __repr__(self) -> str:
+        return f"FrozenDynamics({self.mechanism})"
+
+    def require_reach(self, pose: Array) -> None:
+        """Any pose will do."""
+
+    def massless_map(self, pose: Array, form: TorqueMap = "virtual_work") -> Array:
+        """(6, 6) that of home."""
+        return torque_map(self.mechanism, self.mechanism.home, form)
+
+
+class Band(NamedTuple):
+    """Where the plate may be that has no workspace: next to its reference.
+
+    Attributes:
+        reference: the pose (6,) that it shall have at a time in s.
+        width: (6,) rad and m, by which it may be off either way.
+    """
+
+    reference: Callable[[float], Array]
+    width: Array
+
+    def margin(self, time: float, pose: Array) -> float:
+        """Positive inside, in widths."""
+        return float(1 - np.max(np.abs(pose - self.reference(time)) / self.width))
+
+    def diagnose(self, time: float, pose: Array) -> Failure | None:
+        """See `dynamics.workspace.diagnose`."""
+        left = self.margin(time, pose)
+        if left > 0:
+            return None
+        return Failure(time, None, left, "the error passed ten times the motion's peak to peak")
