@@ -567,6 +567,59 @@ def test_architecture_shows_the_loop_as_it_is() -> None:
     assert all(f"`{name}`" in text for name in exported)
 
 
+# ------------------------------------------------------------------ figures
+
+
+def rows_of(path: Path, heading: str) -> list[list[str]]:
+    """Cells of the first table whose head begins so, without its head."""
+    table = path.read_text(encoding="utf-8").split(f"\n| {heading}", 1)[1].split("\n\n")[0]
+    return [[cell.strip() for cell in row.strip("|").split(" | ")] for row in table.split("\n")[2:]]
+
+
+TRACKING = ROOT / "benchmarks" / "results" / "tracking.md"
+
+
+def test_the_readme_s_table_is_that_of_the_benchmark() -> None:
+    *others, ours = rows_of(ROOT / "README.md", "controller")
+    measured = {tuple(row[:2]): row[2] for row in rows_of(TRACKING, "condition")}
+    assert [row[0].split("`")[1] for row in others] == ["lqr", "lqi", "delay_lqr", "delay_lqi"]
+    for (controller, _, *shown), column in itertools.product(others, range(2)):
+        start = ("from rest", "on the reference")[column]
+        found = measured[f"0.8 s, {start}", controller.split("`")[1]]
+        assert shown[column] == found.replace("left", "leaves")
+    plants = {row[0]: row for row in rows_of(TRACKING, "plant")}
+    for cell, column in ((ours[2], 1), (ours[3], 3)):
+        multibody, exact = re.findall(r"\d[\d.]*", cell)
+        assert float(plants["multibody, 0.001 s"][column]) == pytest.approx(
+            float(multibody), rel=0.05
+        )
+        assert plants["exact"][column] == exact
+
+
+@pytest.mark.parametrize(
+    ("page", "heading", "results"),
+    [
+        ("figures.md", "`predictor_lqi`, exact plant", ("tracking.md",)),
+        ("howto/delay.md", "`adaptive_lqi`, exact plant", ("delay_estimator.md",)),
+    ],
+)
+def test_figures_of_a_table_are_in_the_results(
+    page: str, heading: str, results: tuple[str, ...]
+) -> None:
+    """Each is a figure that was measured, rounded to its digits."""
+    texts = [(ROOT / "benchmarks" / "results" / name).read_text("utf-8") for name in results]
+    measured = [
+        float(word)
+        for text in texts
+        for word in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?:e-\d+)?(?![\w.])", text)
+    ]
+    for _, *cells in rows_of(ROOT / "docs" / page, heading):
+        for word in re.findall(r"\d[\d.]*", " ".join(cells).replace("1.0 s", "")):
+            digits = len(word.partition(".")[2])
+            rounded = {f"{value:.{digits}f}" for value in measured}
+            assert word in rounded, f"{page}: {word}"
+
+
 def port_rows(text: str) -> dict[str, tuple[str, str]]:
     """Port -> size and unit, of the table of output ports in a text; a row may name several."""
     table = text.split("with output ports", 1)[1].split("\n\n", 2)[1]
