@@ -25,7 +25,7 @@ import itertools
 import os
 import re
 import shlex
-import subprocess
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -141,15 +141,11 @@ def sources() -> str:
 
 @functools.cache
 def files() -> frozenset[str]:
-    """Names of the repository's files."""
-    kept = subprocess.run(
-        ["git", "ls-files", "-co", "--exclude-standard"],
-        cwd=ROOT,
-        text=True,
-        capture_output=True,
-        check=False,
-    ).stdout.split("\n")
-    return frozenset(path.rpartition("/")[2] for path in kept)
+    """Names of the repository's files, but for what is made."""
+    folders = (path for path in ROOT.iterdir() if path.is_dir() and path.name != "out")
+    kept = [path for path in folders if not path.name.startswith(".")]
+    found = itertools.chain(ROOT.glob("*"), *(folder.rglob("*") for folder in kept))
+    return frozenset(path.name for path in found)
 
 
 @functools.cache
@@ -565,6 +561,14 @@ def test_architecture_shows_the_loop_as_it_is() -> None:
     assert preview % 18 == 0
     exported = {diagram.get_output_port(i).get_name() for i in range(diagram.num_output_ports())}
     assert all(f"`{name}`" in text for name in exported)
+
+
+def test_the_citation_is_of_this_version() -> None:
+    cited = load_yaml(ROOT / "CITATION.cff")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert cited["version"] == project["version"]
+    assert cited["license"] == project["license"]
+    assert cited["authors"] == project["authors"]
 
 
 # ------------------------------------------------------------------ figures
