@@ -380,6 +380,13 @@ def test_links_lead_somewhere(path: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{path.name}: {link}"
 
 
+def test_the_contents_of_theory_are_its_sections() -> None:
+    text = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
+    sections = re.findall(r"^## (\d+)\. (.*)$", text, re.MULTILINE)
+    assert re.findall(r"^(\d+)\. \[(.*)\]\(#", text, re.MULTILINE) == sections
+    assert [int(number) for number, _ in sections] == list(range(1, len(sections) + 1))
+
+
 def test_the_site_has_every_page_once() -> None:
     def leaves(tree: Any) -> Iterator[str]:
         for part in tree if isinstance(tree, list) else tree.values():
