@@ -1,4 +1,4 @@
-"""Every tracking figure of the README: `python benchmarks/tracking.py [section ...]`.
+"""Tracking figures of README and docs/figures.md: `python benchmarks/tracking.py [section ...]`.
 
 Writes benchmarks/results/tracking.md. Sections: faithful, starts, limit, unknown, coverage,
 gravity, integral, delay, noise. All runs use `predictor_lqi` unless the row says otherwise.
@@ -161,6 +161,7 @@ def gravity() -> str:
     """Full amplitude under gravity, 10 ms samples, 0.16 s delay."""
     variants = {
         "exact": (EXACT,),
+        "exact, no estimator": (EXACT, NONE),
         "multibody, 1 ms": (),
         "multibody, 1 ms, no estimator": (NONE,),
         "multibody, 0.1 ms": ("plant.time_step=1e-4",),

@@ -25,7 +25,7 @@ import itertools
 import os
 import re
 import shlex
-import subprocess
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -141,15 +141,11 @@ def sources() -> str:
 
 @functools.cache
 def files() -> frozenset[str]:
-    """Names of the repository's files."""
-    kept = subprocess.run(
-        ["git", "ls-files", "-co", "--exclude-standard"],
-        cwd=ROOT,
-        text=True,
-        capture_output=True,
-        check=False,
-    ).stdout.split("\n")
-    return frozenset(path.rpartition("/")[2] for path in kept)
+    """Names of the repository's files, but for what is made."""
+    folders = (path for path in ROOT.iterdir() if path.is_dir() and path.name != "out")
+    kept = [path for path in folders if not path.name.startswith(".")]
+    found = itertools.chain(ROOT.glob("*"), *(folder.rglob("*") for folder in kept))
+    return frozenset(path.name for path in found)
 
 
 @functools.cache
@@ -384,6 +380,13 @@ def test_links_lead_somewhere(path: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{path.name}: {link}"
 
 
+def test_the_contents_of_theory_are_its_sections() -> None:
+    text = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
+    sections = re.findall(r"^## (\d+)\. (.*)$", text, re.MULTILINE)
+    assert re.findall(r"^(\d+)\. \[(.*)\]\(#", text, re.MULTILINE) == sections
+    assert [int(number) for number, _ in sections] == list(range(1, len(sections) + 1))
+
+
 def test_the_site_has_every_page_once() -> None:
     def leaves(tree: Any) -> Iterator[str]:
         for part in tree if isinstance(tree, list) else tree.values():
@@ -565,6 +568,67 @@ def test_architecture_shows_the_loop_as_it_is() -> None:
     assert preview % 18 == 0
     exported = {diagram.get_output_port(i).get_name() for i in range(diagram.num_output_ports())}
     assert all(f"`{name}`" in text for name in exported)
+
+
+def test_the_citation_is_of_this_version() -> None:
+    cited = load_yaml(ROOT / "CITATION.cff")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert cited["version"] == project["version"]
+    assert cited["license"] == project["license"]
+    assert cited["authors"] == project["authors"]
+
+
+# ------------------------------------------------------------------ figures
+
+
+def rows_of(path: Path, heading: str) -> list[list[str]]:
+    """Cells of the first table whose head begins so, without its head."""
+    table = path.read_text(encoding="utf-8").split(f"\n| {heading}", 1)[1].split("\n\n")[0]
+    return [[cell.strip() for cell in row.strip("|").split(" | ")] for row in table.split("\n")[2:]]
+
+
+TRACKING = ROOT / "benchmarks" / "results" / "tracking.md"
+
+
+def test_the_readme_s_table_is_that_of_the_benchmark() -> None:
+    *others, ours = rows_of(ROOT / "README.md", "controller")
+    measured = {tuple(row[:2]): row[2] for row in rows_of(TRACKING, "condition")}
+    assert [row[0].split("`")[1] for row in others] == ["lqr", "lqi", "delay_lqr", "delay_lqi"]
+    for (controller, _, *shown), column in itertools.product(others, range(2)):
+        start = ("from rest", "on the reference")[column]
+        found = measured[f"0.8 s, {start}", controller.split("`")[1]]
+        assert shown[column] == found.replace("left", "leaves")
+    plants = {row[0]: row for row in rows_of(TRACKING, "plant")}
+    for cell, column in ((ours[2], 1), (ours[3], 3)):
+        multibody, exact = re.findall(r"\d[\d.]*", cell)
+        assert float(plants["multibody, 0.001 s"][column]) == pytest.approx(
+            float(multibody), rel=0.05
+        )
+        assert plants["exact"][column] == exact
+
+
+@pytest.mark.parametrize(
+    ("page", "heading", "results"),
+    [
+        ("figures.md", "`predictor_lqi`, exact plant", ("tracking.md",)),
+        ("howto/delay.md", "`adaptive_lqi`, exact plant", ("delay_estimator.md",)),
+    ],
+)
+def test_figures_of_a_table_are_in_the_results(
+    page: str, heading: str, results: tuple[str, ...]
+) -> None:
+    """Each is a figure that was measured, rounded to its digits."""
+    texts = [(ROOT / "benchmarks" / "results" / name).read_text("utf-8") for name in results]
+    measured = [
+        float(word)
+        for text in texts
+        for word in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?:e-\d+)?(?![\w.])", text)
+    ]
+    for _, *cells in rows_of(ROOT / "docs" / page, heading):
+        for word in re.findall(r"\d[\d.]*", " ".join(cells).replace("1.0 s", "")):
+            digits = len(word.partition(".")[2])
+            rounded = {f"{value:.{digits}f}" for value in measured}
+            assert word in rounded, f"{page}: {word}"
 
 
 def port_rows(text: str) -> dict[str, tuple[str, str]]:
