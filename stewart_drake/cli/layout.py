@@ -57,7 +57,7 @@ def layout(
         ),
     ] = None,
     best: Annotated[int, typer.Option(metavar="N", help="How many machines to write.")] = 3,
-    starts: Annotated[int, typer.Option(metavar="N", help="Searches per arrangement of legs.")] = 2,
+    starts: Annotated[int, typer.Option(metavar="N", help="Searches per arrangement of legs.")] = 1,
     generations: Annotated[int, typer.Option(metavar="N", help="Of each search, at most.")] = 100,
     seed: Seed = 0,
     workers: Workers = None,
