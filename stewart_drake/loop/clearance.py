@@ -5,7 +5,7 @@ simulation. Here the machine is alone in a scene, and pairs are asked for one by
 collision filter hides. Rods have round ends here, those of the joints at them: between the flat
 ends of two long cylinders Drake's iteration stops early, at distances of 1 mm that are 0.6 mm too
 large, and still 0.09 mm between round ones. So the distance of two rods is that of their centre
-lines in closed form less two radii, which is exact for capsules. Of a rod and a crank it is Drake's,
+lines in closed form less two radii, exact for capsules. Of a rod and a crank it is Drake's,
 which may be some tenths of a percent too large.
 """
 
