@@ -216,6 +216,26 @@ def test_a_motion_out_of_reach_is_judged_without_a_run() -> None:
     assert list(found["measures"]) == ["reach"]
 
 
+def test_errata_another_layout_is_conditioned_better() -> None:
+    """Published lengths and separations; numbers of the search that docs/errata.md tells of."""
+    asked = problem_of(
+        load_scenario("paper"), "condition", {"reach": 0.005, "clearance": -1.0}, {}, ()
+    )
+    other = own_values(SPEC)
+    for name, value in (
+        ("rotation_deg", 9.7451),
+        ("plate_offset_deg", 68.9924),
+        ("shaft_height", 0.0229),
+        ("installation_deg", 68.2484),
+    ):
+        other[PARAMETERS.index(name)] = value
+    ours, theirs = asked.trial(own_values(SPEC), OWN), asked.trial(other, OWN)
+    assert not asked.wish.missed(theirs)
+    assert ours["condition"] == pytest.approx(5.07, abs=0.01)
+    assert theirs["condition"] == pytest.approx(3.73, abs=0.01)
+    assert theirs["reach"] == pytest.approx(0.0103, abs=1e-4)
+
+
 # ------------------------------------------------------------------ the command
 
 SMALL = ["layout", "paper", "--set", "plant.kind=exact", "--set", "duration=1.5"]

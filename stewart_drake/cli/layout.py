@@ -22,7 +22,6 @@ from stewart_drake.cli.common import (
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.report.terminal import count_bar
 
-
 Goal = Annotated[
     str,
     typer.Option(
