@@ -340,7 +340,7 @@ def test_the_command_writes_a_table_a_page_and_a_summary(
     )
     rounded = float("".join(told[0]))
     assert rounded <= summary["largest_factor"] < rounded + 1e-3
-    assert "Workspace of desktop" in page and page.count("<img") == 3
+    assert "Workspace of desktop" in page and page.count("<img") == 4
     assert "stewart-drake analyze workspace desktop" in page
 
 
@@ -366,7 +366,7 @@ def test_a_reference_that_leaves_is_analysed_not_refused(
     assert "leg 4 is short by 15.2 mm" in out and "0.872 times this one" in out
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["fits"] is False and summary["exit"]["leg"] == 2 and summary["motors"] == []
-    assert (tmp_path / "report.html").read_text().count("<img") == 2
+    assert (tmp_path / "report.html").read_text().count("<img") == 3
 
 
 @pytest.mark.usefixtures("quick")

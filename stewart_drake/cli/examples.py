@@ -21,6 +21,10 @@ EXAMPLES: Final = {
         "stewart-drake identify out/lqi/signals.nc --mechanism paper --out out/m",
     ),
     "new": ("stewart-drake new mine --torque-limit 6 --delay 0.08",),
+    "layout": (
+        "stewart-drake layout paper --out out/layout",
+        "stewart-drake layout paper --keep crank --keep rod --limit clearance=0.002 --out out/layout",
+    ),
     "list": ("stewart-drake list",),
     "model check": ("stewart-drake model check paper --out out/paper",),
     "model sdf": ("stewart-drake model sdf paper --out paper.sdf",),

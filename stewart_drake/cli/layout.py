@@ -22,43 +22,52 @@ from stewart_drake.cli.common import (
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.report.terminal import count_bar
 
+Goal = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="What should be as good as can be: condition, torque, reach, clearance, "
+        "transmission, plate_joint_deg or crank_joint_deg.",
+    ),
+]
+Limits = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--limit",
+        metavar="NAME=VALUE",
+        help="Least (reach, clearance, transmission) or largest value, SI units. Repeatable.",
+    ),
+]
+Vary = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=LOW:HIGH",
+        help="Bounds of a number of the machine's pattern, or of crank or rod; one value fixes "
+        "it. Repeatable.",
+    ),
+]
+Keep = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME",
+        help="A number that stays as it is, or branches or plate_order. Repeatable.",
+    ),
+]
+Best = Annotated[int, typer.Option(metavar="N", help="How many machines to write.")]
+Starts = Annotated[int, typer.Option(metavar="N", help="Searches per arrangement of legs.")]
+Generations = Annotated[int, typer.Option(metavar="N", help="Of each search, at most.")]
+
 
 def layout(
     scenario: ScenarioName = "paper",
     settings: Settings = None,
-    goal: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="What should be as good as can be: condition, torque, reach, clearance, "
-            "transmission, plate_joint_deg or crank_joint_deg.",
-        ),
-    ] = "condition",
-    limit: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="Least (reach, clearance, transmission) or largest value, SI units. Repeatable.",
-        ),
-    ] = None,
-    vary: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=LOW:HIGH",
-            help="Bounds of a number of the machine's pattern, or of crank or rod; one value fixes "
-            "it. Repeatable.",
-        ),
-    ] = None,
-    keep: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="A number that stays as it is, or branches or plate_order. Repeatable.",
-        ),
-    ] = None,
-    best: Annotated[int, typer.Option(metavar="N", help="How many machines to write.")] = 3,
-    starts: Annotated[int, typer.Option(metavar="N", help="Searches per arrangement of legs.")] = 2,
-    generations: Annotated[int, typer.Option(metavar="N", help="Of each search, at most.")] = 100,
+    goal: Goal = "condition",
+    limit: Limits = None,
+    vary: Vary = None,
+    keep: Keep = None,
+    best: Best = 3,
+    starts: Starts = 1,
+    generations: Generations = 100,
     seed: Seed = 0,
     workers: Workers = None,
     scheduler: Scheduler = None,

@@ -294,7 +294,7 @@ def study_layout(
     vary: Mapping[str, tuple[float, float]] | None = None,
     keep: Sequence[str] = (),
     best: int = 3,
-    starts: int = 2,
+    starts: int = 1,
     generations: int = 100,
     seed: int = 0,
     workers: int | None = None,

@@ -217,4 +217,9 @@ def _longer(spec: LinkSpec, length: float) -> LinkSpec:
 
 
 def _times(moments: list[float] | None, factor: float) -> list[float] | None:
-    return None if moments is None else [factor * moment for moment in moments]
+    if moments is None or factor == 1:
+        return moments
+    larger = [factor * moment for moment in moments]
+    # Of a flat plate one is the sum of the other two, which it must not exceed by rounding.
+    sums = [larger[1] + larger[2], larger[2] + larger[0], larger[0] + larger[1]]
+    return [min(one, (1 - 1e-15) * most) for one, most in zip(larger, sums, strict=True)]

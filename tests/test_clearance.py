@@ -1,0 +1,322 @@
+"""Clearances against closed forms and second implementations: segments, boxes, cylinders."""
+
+import dataclasses
+import json
+from itertools import combinations, product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from stewart_drake.cli import main
+from stewart_drake.files.resources import shipped
+from stewart_drake.loop.clearance import ClearanceScene, Pair
+from stewart_drake.loop.experiment import assemble as made
+from stewart_drake.mechanism.assembly import assemble
+from stewart_drake.mechanism.clearance import (
+    APART,
+    LINKS,
+    clearances,
+    segment_distances,
+)
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import (
+    leg_geometry,
+    legs_along,
+    reach_margins,
+    reach_margins_along,
+)
+from stewart_drake.mechanism.proportions import proportions
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.studies.clearance import clearance_along, study_clearance
+from stewart_drake.studies.workspace_map import Section, Travel, sections, travel
+from tests.mechanisms import PAPER, random_mechanism, random_pose
+
+Array = NDArray[np.float64]
+seeds = st.integers(0, 2**32 - 1)
+seeded = settings(max_examples=25, deadline=None, derandomize=True)
+LEG = ("1", "2", "3", "4", "5", "6")
+
+
+def distance(p: Array, u: Array, q: Array, v: Array) -> float:
+    """Of two segments: least squares between bounds."""
+    found = lsq_linear(np.column_stack([u, -v]), q - p, (0.0, 1.0), tol=1e-14)
+    return float(np.linalg.norm(p + found.x[0] * u - q - found.x[1] * v))
+
+
+# ------------------------------------------------------------------ centre lines
+
+
+@given(seed=seeds)
+@seeded
+def test_segments_are_as_far_apart_as_least_squares_says(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    p, u, q, v = rng.normal(size=(4, 20, 3)) * rng.choice([0.1, 1.0, 3.0], (4, 20, 1))
+    found = segment_distances(p, u, q, v)
+    expected = [distance(*one) for one in zip(p, u, q, v, strict=True)]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("q", "v", "wanted"),
+    [
+        ([0.3, 0, 2], [0.4, 0, 0], 2),  # beside each other
+        ([4, 0, 4], [2, 0, 0], 5),  # one after the other, 3 and 4
+        ([4, 0, 3], [-8, 0, 0], 3),  # the other way round
+        ([0.5, -1, 0], [0, 2, 0], 0),  # crossing
+        ([-3, 4, 0], [0, 9, 0], 5),  # end to end
+    ],
+)
+def test_segments_in_the_plane(q: list[float], v: list[float], wanted: float) -> None:
+    axis = np.array([1.0, 0, 0])
+    found = segment_distances(np.zeros(3), axis, np.array(q, float), np.array(v, float))
+    assert found == pytest.approx(wanted, abs=1e-12)
+
+
+@given(seed=seeds)
+@seeded
+def test_legs_along_a_motion_are_those_of_each_pose(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    mechanism = random_mechanism(rng)
+    poses = np.array([random_pose(rng, mechanism) for _ in range(3)])
+    many = legs_along(mechanism, poses)
+    for k, pose in enumerate(poses):
+        one = leg_geometry(mechanism, pose)
+        for field in dataclasses.fields(one):
+            np.testing.assert_allclose(
+                getattr(many, field.name)[k], getattr(one, field.name), rtol=1e-12, atol=1e-12
+            )
+        margins = reach_margins_along(mechanism, poses)[k]
+        np.testing.assert_allclose(margins, reach_margins(mechanism, pose), atol=1e-15)
+
+
+def test_out_of_reach_there_are_no_legs() -> None:
+    far = PAPER.home + [0, 0, 0, 0, 0, 1.0]
+    legs = legs_along(PAPER, np.array([PAPER.home, far]))
+    assert np.isfinite(legs.rod[0]).all() and np.isnan(legs.rod[1]).all()
+
+
+# ------------------------------------------------------------------ shapes
+
+
+def test_every_pair_is_looked_at_but_those_that_meet_in_a_joint() -> None:
+    names = {frozenset(pair) for pair in ClearanceScene(PAPER).pairs}
+    links = {frozenset(pair) for pair in ClearanceScene(PAPER, base=False).pairs}
+    assert links == {p for p in names if not Pair(*sorted(p)).fixed}
+    assert links == {frozenset((LINKS[i], LINKS[j])) for i, j in APART} | {
+        frozenset(("plate", f"crank {leg}")) for leg in LEG
+    }
+    assert len(APART) == 60 and all(frozenset((f"crank {k}", f"rod {k}")) not in links for k in LEG)
+    for first, second in product(LEG, LEG):
+        # A crank turns about its own motor, a rod does not.
+        assert (frozenset((f"motor {first}", f"crank {second}")) in names) == (first != second)
+        assert frozenset((f"motor {first}", f"rod {second}")) in names
+    assert str(Pair("rod 1", "crank 2")) == "rod 1 and crank 2"
+
+
+@given(seed=seeds)
+@seeded
+def test_rods_are_as_far_apart_as_least_squares_says(seed: int) -> None:
+    """Capsules: their lines' distance less two radii, along the common normal."""
+    rng = np.random.default_rng(seed)
+    mechanism = random_mechanism(rng)
+    pose = random_pose(rng, mechanism)
+    scene, home = ClearanceScene(mechanism, base=False), assemble(mechanism, pose)
+    radius = proportions(mechanism).rod_radius
+    along = mechanism.rod_lengths[:, None] * home.R_WD[:, :, 0]
+    found = dict(zip(scene.pairs, scene.distances(pose), strict=True))
+    for i, j in combinations(range(6), 2):
+        ends = home.p_WT[i], along[i], home.p_WT[j], along[j]
+        apart = distance(*ends) - 2 * radius
+        assert found[Pair(f"rod {i + 1}", f"rod {j + 1}")] == pytest.approx(apart, abs=1e-6)
+
+
+def test_lines_that_cross_are_two_radii_deep() -> None:
+    """In the reference mechanism, at home, the legs of a pair are mirror images of each other."""
+    scene = ClearanceScene(PAPER, base=False)
+    found = dict(zip(scene.pairs, scene.distances(PAPER.home), strict=True))
+    for first, second in (("1", "2"), ("3", "4"), ("5", "6")):
+        crossing = found[Pair(f"rod {first}", f"rod {second}")]
+        assert crossing == pytest.approx(-2 * proportions(PAPER).rod_radius, abs=1e-6)
+
+
+def nearest_in_box(point: Array, half: Array) -> Array:
+    return np.clip(point, -half, half)
+
+
+def nearest_in_capsule(point: Array, radius: float, half: float) -> Array:
+    on_axis = np.array([np.clip(point[0], -half, half), 0, 0])
+    off = point - on_axis
+    return on_axis + off * min(1.0, radius / max(float(np.linalg.norm(off)), 1e-300))
+
+
+def by_projections(mechanism: Mechanism, pose: Array, first: str, second: str) -> float:
+    """Distance of two links: projected from one onto the other until nothing changes."""
+    size, home = proportions(mechanism), assemble(mechanism, pose)
+
+    def onto(name: str, point: Array) -> Array:
+        kind, leg = name.split()[0], int(name.split()[1]) - 1
+        if kind == "crank":
+            R, half = home.R_WC[leg], mechanism.crank_lengths[leg] / 2
+            middle = mechanism.p_WS[leg] + half * R[:, 0]
+            extent = np.array([half, size.crank_width / 2, size.crank_thickness / 2])
+            return middle + R @ nearest_in_box(R.T @ (point - middle), extent)
+        R, half = home.R_WD[leg], mechanism.rod_lengths[leg] / 2
+        middle = home.p_WT[leg] + half * R[:, 0]
+        return middle + R @ nearest_in_capsule(R.T @ (point - middle), size.rod_radius, half)
+
+    point, before = np.zeros(3), np.full(3, np.inf)
+    for _ in range(20000):
+        other = onto(second, point)
+        point = onto(first, other)
+        if np.abs(point - before).max() < 1e-12:
+            break
+        before = point
+    return float(np.linalg.norm(point - other))
+
+
+@pytest.mark.parametrize("name", ["paper_clear", "desktop"])
+def test_cranks_and_rods_are_as_far_apart_as_by_projections(name: str) -> None:
+    experiment = made(load_scenario("paper" if name == "paper_clear" else name))
+    mechanism = load_mechanism(name)
+    scene = ClearanceScene(mechanism, base=False)
+    for time in (0.0, 2.3, 4.7):
+        pose = experiment.reference.value(time)[:, 0]
+        found = dict(zip(scene.pairs, scene.distances(pose), strict=True))
+        links = [pair for pair in found if "plate" not in pair]
+        for pair in sorted(links, key=lambda pair: found[pair])[:12]:
+            wanted = by_projections(mechanism, pose, *pair)
+            # The projections are two points of the links, so that Drake's distance is too large
+            # where it is larger: its iteration has stopped before the end.
+            assert -1e-7 < found[pair] - wanted < 1e-7 + 0.01 * wanted, pair
+            if pair.first[:3] == pair.second[:3]:  # two cranks, or two rods
+                assert found[pair] == pytest.approx(wanted, abs=1e-7), pair
+
+
+@given(seed=seeds)
+@seeded
+def test_capsules_are_never_further_apart_than_the_links_in_them(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    mechanism = random_mechanism(rng)
+    pose = random_pose(rng, mechanism)
+    low = clearances(mechanism, pose[None], legs_along(mechanism, pose[None]))[0]
+    scene = ClearanceScene(mechanism, base=False)
+    found = {frozenset(p): d for p, d in zip(scene.pairs, scene.distances(pose), strict=True)}
+    for (i, j), least in zip(APART, low, strict=True):
+        if least > 0:
+            assert found[frozenset((LINKS[i], LINKS[j]))] >= least - 1e-6
+
+
+# ------------------------------------------------------------------ along a motion, around home
+
+
+def along(name: str, machine: str | None = None) -> tuple[Mechanism, Array, Array]:
+    experiment = made(load_scenario(name))
+    mechanism = load_mechanism(machine or name)
+    time = np.linspace(0, 10, 101)
+    return mechanism, time, np.array([experiment.reference.value(t)[:, 0] for t in time])
+
+
+def test_the_reference_mechanism_crosses_and_paper_clear_does_not() -> None:
+    mechanism, time, poses = along("paper")
+    crossing = clearance_along(ClearanceScene(mechanism), mechanism, time, poses).touching
+    names = {str(one.pair) for one in crossing}
+    assert {"crank 1 and crank 2", "rod 1 and rod 2", "crank 1 and rod 2"} <= names
+    assert len(crossing) == 9
+    mechanism, time, poses = along("paper", "paper_clear")
+    found = clearance_along(ClearanceScene(mechanism), mechanism, time, poses)
+    assert not found.touching
+    least = found.least(fixed=False)
+    assert least is not None and least.distance == pytest.approx(0.567e-3, abs=2e-6)
+    of_motors = [one for one in found.nearest if one.pair.fixed and "base" not in one.pair]
+    assert of_motors[0].distance > 0  # its motors and posts stand free too, the drawn disc does not
+
+
+def test_paper_clear_has_what_the_paper_publishes() -> None:
+    clear = load_mechanism("paper_clear")
+    for lengths in ("crank_lengths", "rod_lengths"):
+        np.testing.assert_array_equal(getattr(clear, lengths), getattr(PAPER, lengths))
+    for body in ("base", "plate", "crank", "rod"):
+        ours, theirs = getattr(clear, body), getattr(PAPER, body)
+        assert ours.mass == theirs.mass and list(ours.inertia) == list(theirs.inertia)
+    for points in ("p_WS", "p_PQ"):
+        for ours, theirs in zip(
+            *(sorted_gaps(getattr(m, points)) for m in (clear, PAPER)), strict=True
+        ):
+            assert ours == pytest.approx(theirs, abs=1e-12)
+
+
+def sorted_gaps(points: Array) -> list[float]:
+    """What does not change as a pattern is turned: radii, and distances of all pairs."""
+    radii = np.hypot(points[:, 0], points[:, 1])
+    gaps = np.linalg.norm(points[:, None] - points[None], axis=2)
+    return [*np.sort(radii), *np.sort(gaps.ravel())]
+
+
+@pytest.mark.parametrize("name", shipped("mechanism"))
+def test_travel_ends_where_two_links_touch(name: str) -> None:
+    mechanism = load_mechanism(name)
+    scene, ways = ClearanceScene(mechanism, base=False), travel(mechanism)
+    found = study_clearance(mechanism, np.zeros(1), mechanism.home[None], ways, [])
+    for k, (whole, one) in enumerate(zip(ways, found.travel, strict=True)):
+        for end, limit, pair in (
+            (one.low, whole.low, one.low_pair),
+            (one.high, whole.high, one.high_pair),
+        ):
+            pose = mechanism.home.copy()
+            pose[k] += end
+            if pair is None:
+                assert end == pytest.approx(limit, rel=1e-5)
+            else:
+                found_there = dict(zip(scene.pairs, scene.distances(pose), strict=True))
+                assert abs(end) < abs(limit)
+                assert end == 0 or found_there[pair] >= 0
+                pose[k] += 2e-3 * limit
+                beyond = dict(zip(scene.pairs, scene.distances(pose), strict=True))
+                assert min(beyond.values()) < 0
+
+
+def test_sections_tell_where_links_touch() -> None:
+    clear = load_mechanism("paper_clear")
+    parts: list[Section] = sections(clear, points=13)
+    ways: list[Travel] = travel(clear)
+    found = study_clearance(clear, np.zeros(1), clear.home[None], ways, parts)
+    scene = ClearanceScene(clear, base=False)
+    for section, part in zip(found.sections, parts, strict=True):
+        inside = np.isfinite(section.distance)
+        assert section.touching == pytest.approx(np.mean(section.distance[inside] < 0))
+        j, i = np.argwhere(inside)[len(np.argwhere(inside)) // 2]
+        pose = clear.home.copy()
+        pose[[part.first, part.second]] = section.x[i], section.y[j]
+        assert section.distance[j, i] == pytest.approx(scene.distances(pose).min())
+    assert 0 < found.sections[2].touching < 1  # tilted far enough, rods of two pairs meet
+
+
+def test_out_of_reach_nothing_is_said_to_be_clear() -> None:
+    far = np.array([PAPER.home + [0, 0, 0, 0, 0, 1.0]])
+    found = study_clearance(PAPER, np.zeros(1), far, [], [])
+    assert found.along.nearest == [] and found.summary["least"] is None
+    assert "nothing is known" in found.verdict
+
+
+def test_the_command_names_the_links_that_cross(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stewart_drake.studies.workspace_map.POINTS", 15)
+    monkeypatch.setattr("stewart_drake.studies.workspace_map._ROUGH", 15)
+    assert main(["analyze", "workspace", "paper", "--out", str(tmp_path)]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    found = json.loads((tmp_path / "summary.json").read_text())["clearance"]
+    page = (tmp_path / "report.html").read_text()
+    for one in found["touching"]:
+        name = " and ".join(one["parts"])
+        assert one["distance"] < 0 and name in told and name in page
+    assert "9 pairs of links cross" in told and len(found["touching"]) == 9
+    assert found["least"]["distance"] == min(one["distance"] for one in found["touching"])
+    assert len(found["pairs"]) == len(ClearanceScene(PAPER).pairs)
+    assert found["base"]["distance"] < 0
