@@ -40,6 +40,17 @@ def test_robustness_from_either_start(tmp_path, capsys):
     assert set(answers) == {"rest", "on_reference"}
 
 
+def test_table_two_on_three_plants_and_what_its_law_lacks(tmp_path, capsys):
+    tables, rows = script("table2").main("duration=0.3", out=str(tmp_path))
+    assert list(tables) == ["exact", "multibody", "paper"]
+    for table in tables.values():
+        assert "as printed" in table and "delay_lqi_200" in table
+    lines = rows.splitlines()
+    assert len(lines) == 5 and all(line.count("|") == 4 for line in lines)
+    written = (tmp_path / "table2.txt").read_text()
+    assert rows in written and capsys.readouterr().out == written
+
+
 def test_every_script_is_run_by_a_test():
     tests = "".join(path.read_text() for path in Path(__file__).parent.glob("test_*.py"))
     for path in [*FOLDER.glob("*.py"), *FOLDER.glob("*.ipynb")]:

@@ -112,6 +112,7 @@ def test_the_shell_completes_commands_names_and_settings(monkeypatch, capsys):
     assert offered("stewart-drake simulate --set plant.k") == [
         "plant.kind=multibody",
         "plant.kind=exact",
+        "plant.kind=paper",
     ]
     assert "--replay" in offered("stewart-drake simulate --r")
 

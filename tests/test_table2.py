@@ -1,12 +1,22 @@
 """The paper's Table II under the conditions in which it comes out, and rows of `compare`."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import stewart_drake as sd
-from stewart_drake.loop.experiment import compose_law, prepare
+from stewart_drake.loop.controller_margin import controller_margin
+from stewart_drake.loop.experiment import check_instants, compose_law, prepare
+from stewart_drake.mechanism.files import mechanism_yaml
+from stewart_drake.report.document import Paragraph, Table
+from stewart_drake.report.table_two import table_two_blocks
+from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.loading import load_comparison
-from stewart_drake.studies.compare import CONTROLLERS
+from stewart_drake.studies.compare import CONTROLLERS, comparison_summary, label
+from stewart_drake.studies.reach import largest_factor
+from tests.mechanisms import PAPER
 
 
 @pytest.fixture(scope="module")
@@ -82,12 +92,89 @@ def test_who_does_not_know_of_the_delay_loses_the_plate(
     assert sd.simulate(rows[row], margin=False).status == "left_workspace"
 
 
-def test_the_table_has_the_papers_numbers_beside_every_row() -> None:
-    results = sd.compare("table2", ["duration=0.3"])
-    assert list(results) == [*CONTROLLERS, "delay_lqi_sum", "delay_lqi_200"]
-    lines = {line[:17].strip(): line for line in sd.table(results).splitlines()}
-    for row, paper in (("LQR, delay-aware", "225"), ("LQI, delay-aware", "80")):
-        assert lines[row].split()[2] == paper
-    for row in ("delay_lqi_sum", "delay_lqi_200"):
-        assert lines[row].split()[1] == "80"
-    assert lines["LQI, predictor"].split()[2] == "-"
+def test_a_multibody_plant_gives_the_same(rows: dict[str, sd.Scenario]) -> None:
+    scenario = replace(rows["delay_lqi_200"], plant=PlantConfig(kind="multibody"))
+    result = sd.simulate(scenario, margin=False)
+    assert result.accumulated_error == pytest.approx(82, abs=1)
+
+
+@pytest.fixture(scope="module")
+def short() -> dict[str, sd.SimulationResult]:
+    return sd.compare("table2", ["duration=0.3"])
+
+
+def of_the_paper(results: dict[str, sd.SimulationResult]) -> tuple[Table, list[str]]:
+    """The table that has the paper's numbers, and the paragraphs below it."""
+    table, *told = table_two_blocks(results)
+    assert isinstance(table, Table)
+    return table, [block.text for block in told if isinstance(block, Paragraph)]
+
+
+def test_the_table_has_paper_printed_and_reproduced_beside_each_other(
+    rows: dict[str, sd.Scenario],
+) -> None:
+    names = ("lqr", "delay_lqr", "delay_lqi", "delay_lqi_200")
+    results = {name: sd.simulate(rows[name], margin=False) for name in names}
+    table, told = of_the_paper(results)
+    found = {row[0]: [str(cell) for cell in row[1:]] for row in table.rows}
+    blind = found["LQR, delay-blind"]
+    assert blind[0] == "NaN" and blind[1] == blind[2] and blind[2].startswith("left 2.")
+    assert found["LQR, delay-aware"] == ["225", "225", "225", "-"]
+    assert found["LQI, delay-aware"] == ["80", "199", "199", "12"]
+    assert found["delay_lqi_200: integral_weight 200"] == ["80", "199", "82.0", "63"]
+    assert "0.3 of (46)" in told[0] and "w_Q/w_R = 2.5" in told[0] and "exact plant" in told[0]
+    assert "= 1.28 of the motion" in told[1] and "room for 1.07 of (46)" in told[1]
+
+
+def test_it_is_shown_once_and_every_row_is_in_the_summary(
+    short: dict[str, sd.SimulationResult],
+) -> None:
+    assert list(short) == [*CONTROLLERS, "delay_lqi_sum", "delay_lqi_200"]
+    text = sd.table(short)
+    assert text.count("Table II") == 1 and max(map(len, text.splitlines())) <= 80
+    heads = [line for line in text.splitlines() if line.startswith("controller")]
+    assert len(heads) == 2 and "as printed" in text
+    assert list(comparison_summary(short)["controllers"]) == list(short)
+    table, _ = of_the_paper(short)
+    assert [row[0] for row in table.rows] == [
+        *(label(name) for name in CONTROLLERS[:4]),
+        "delay_lqi_sum: integral_weight 100",
+        "delay_lqi_200: integral_weight 200",
+    ]
+
+
+def test_other_comparisons_have_no_such_table(short: dict[str, sd.SimulationResult]) -> None:
+    assert not table_two_blocks({name: short[name] for name in CONTROLLERS})
+    settings = ["duration=0.3", "delay.steps=2"]
+    other = sd.simulate(load_comparison("table2", (), settings)["delay_lqi_sum"], margin=False)
+    assert not table_two_blocks({"delay_lqi_sum": other})
+
+
+def test_more_room_alone_is_not_enough(tmp_path: Path) -> None:
+    """Theory 33: cranks of 0.18 m have room for 1.7 of (46), and the printed law needs 1.28."""
+    path = tmp_path / "longer.yaml"
+    path.write_text(mechanism_yaml(replace(PAPER, crank_lengths=np.full(6, 0.18))))
+    amplitude = "reference.amplitude=[0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]"
+    rows = load_comparison("table2", CONTROLLERS, [amplitude, f"mechanism={path}"])
+    experiment = prepare(rows["lqr"])
+    room = largest_factor(experiment.mechanism, experiment.reference, check_instants(10.0))
+    assert room.value > 1.7
+    for row in ("lqr", "lqi", "delay_lqr", "delay_lqi", "delay_lqi_200"):
+        assert sd.simulate(rows[row], margin=False).status == "left_workspace", row
+
+
+def test_the_papers_model_makes_a_loop_that_grows_whatever_the_weights() -> None:
+    """Theory 33: on the exact plant, along 0.3 of (46)."""
+    for controller in ("delay_lqr", "delay_lqi"):
+        for ratio in 10.0 ** np.arange(-7, 1):
+            settings = ("controller.model=paper", f"controller.w_Q={ratio}")
+            scenario = sd.load_scenario("table2", controller, settings)
+            assert controller_margin(prepare(scenario)).radius > 1.004, (controller, ratio)
+
+
+def test_nobody_is_lost_before_the_first_torque_and_for_some_time_after() -> None:
+    """Theory 33: 0.8 s is when the first torque acts, and it takes time to move a plate."""
+    for weight in (1.0, 1e8):
+        settings = ("start=rest", f"controller.w_Q={weight}", "controller.model=multibody")
+        result = sd.simulate(sd.load_scenario("paper", "lqi", settings), margin=False)
+        assert result.stopped is not None and result.stopped.time > 1.05

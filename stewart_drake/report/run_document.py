@@ -14,10 +14,10 @@ from stewart_drake.report.document import (
     Table,
     Values,
 )
+from stewart_drake.report.table_two import paper_error, table_two_blocks
 from stewart_drake.report.words import number
-from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import COORDINATE_NAMES
-from stewart_drake.studies.compare import PAPER_ERRORS, is_papers, label
+from stewart_drake.studies.compare import is_papers, label
 from stewart_drake.studies.verdict import loop_word
 
 _COLUMNS: Final = {
@@ -81,7 +81,10 @@ def comparison_blocks(
     results: Mapping[str, SimulationResult], tuned: Mapping[str, SimulationResult] | None = None
 ) -> list[Block]:
     """What `comparison_document` holds; the tuner's runs come after those with fixed weights."""
-    papers = any(is_papers(result.scenario, any_size=True) for result in results.values())
+    table_two = table_two_blocks(results)
+    papers = not table_two and any(
+        is_papers(result.scenario, any_size=True) for result in results.values()
+    )
     runs = [(label(name), name, run) for name, run in results.items()]
     runs += [(f"{label(name)}, tuned", name, run) for name, run in (tuned or {}).items()]
     rows = [comparison_row(title, name, run) for title, name, run in runs]
@@ -92,6 +95,7 @@ def comparison_blocks(
         for name, result in results.items()
     )
     return [
+        *table_two,
         Table(
             [heads[k] for k in kept],
             [[row[k] for k in kept] for row in rows],
@@ -116,7 +120,7 @@ def comparison_row(title: str, name: str, run: SimulationResult) -> list[Cell]:
     torques = (s["peak_torque"], s["peak_torque_applied"], s["rms_torque"], s["torque_variation"])
     step = round(s["controller_step_ms"]["median"], 2)
     told = [*(number(value, 2) for value in torques), number(step, 2)]
-    return [title, _paper_error(name, run.scenario), *errors, *told]
+    return [title, paper_error(name, run.scenario), *errors, *told]
 
 
 def _shared_warnings(results: Mapping[str, SimulationResult]) -> list[str]:
@@ -129,12 +133,3 @@ def _shared_warnings(results: Mapping[str, SimulationResult]) -> list[str]:
         text if len(names) == len(results) else f"{', '.join(names)}: {text}"
         for text, names in about.items()
     ]
-
-
-def _paper_error(row: str, scenario: Scenario) -> str:
-    """What the paper reports of a row's controller, in % s; a dash where it reports none."""
-    name = scenario.compare.get(row, {}).get("controller", row)
-    if name not in PAPER_ERRORS:
-        return "-"
-    error = PAPER_ERRORS[name]
-    return "NaN" if error is None else f"{error:.0f}"
