@@ -1,0 +1,508 @@
+"""The law in real time: a step for each measurement of a machine at the other end of a link.
+
+Sample k is the instant t0 + k dt of the machine's clock. Its step begins when its measurement is
+there, or when that is later than any of the last ones was: then it counts as lost, and the model
+stands in. So the step is as periodic as what comes over the link, and never waits for what does not
+come. A step that is sent more than a period after its sample was due has missed its deadline; it is
+taken all the same, one after the other, until the loop has caught up.
+"""
+
+import math
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.law.channel import Packets, Report, Wire
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.native_law import AnyMemory, serving
+from stewart_drake.law.timeline import Acting
+from stewart_drake.live.contact import Contact
+from stewart_drake.live.design import Design
+from stewart_drake.live.endpoint import now
+from stewart_drake.live.log import LiveRecord
+from stewart_drake.live.protocol import (
+    NEVER,
+    SECOND,
+    ControllerFlags,
+    MachineFlags,
+    MachineMessage,
+    Refusal,
+)
+from stewart_drake.live.steering import Steering, Wish
+from stewart_drake.loop.controller import reported
+from stewart_drake.loop.experiment import motion_scale
+from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, PACKETS, POSE, RATES
+from stewart_drake.scenario.trajectories import evaluate
+
+Array = NDArray[np.float64]
+
+OFF: Final = 0.08
+"""Share of the motion by which a prediction is off the way, so that a new one is planned."""
+AT_START: Final = 0.02
+"""The same, by which a plate is where the scenario begins."""
+SILENT: Final = 1.0
+"""s, or ten periods, of silence that are told."""
+PATIENCE: Final = 10.0
+"""s of silence after which the controller gives up."""
+_LEAD: Final = 0.5
+"""s, beside a round trip, from asking for a begin until then."""
+_ANSWER: Final = 5.0
+"""s, beside that, in which the machine must have agreed to it."""
+_SPARE: Final = 0.002
+"""s for which a measurement is waited for beside the usual."""
+_GONE: Final = 64
+"""Samples after which what came is forgotten."""
+
+
+class Viewer(Protocol):
+    """Who watches, and may ask for something."""
+
+    def show(self, seen: "Seen") -> None:
+        """The loop as it is now; never waits."""
+        ...
+
+    def wish(self) -> Wish:
+        """What is asked for."""
+        ...
+
+    def stopped(self) -> bool:
+        """Whether the end is asked for."""
+        ...
+
+
+class Nobody:
+    """No viewer."""
+
+    def show(self, seen: "Seen") -> None:
+        """Nothing."""
+
+    def wish(self) -> Wish:
+        """The scenario's motion."""
+        return Wish()
+
+    def stopped(self) -> bool:
+        """Never."""
+        return False
+
+
+class Seen(NamedTuple):
+    """The loop at a sample.
+
+    Attributes:
+        time: s since the begin.
+        state: (12,) of the plate.
+        wanted: (18,) of the reference.
+        torque: (6,) N m, that acts.
+        error: mean pose error, % of peak to peak.
+        eta: s, from a measurement to its torque, as the law believes.
+        trip: s, median round trip of the link.
+        spread: s, between the shortest and the longest one.
+        lost: share of the datagrams that are lost, there and back.
+        missed: deadlines.
+        safe: whether the machine is at its safe torque.
+        by_hand: whether a hand leads.
+        limit: what keeps the plate from what is asked for, or None.
+    """
+
+    time: float
+    state: Array
+    wanted: Array
+    torque: Array
+    error: float
+    eta: float
+    trip: float
+    spread: float
+    lost: float
+    missed: int
+    safe: bool
+    by_hand: bool
+    limit: str | None
+
+
+@dataclass
+class Pace:
+    """How periodic the loop was.
+
+    Attributes:
+        late: s, from the soonest that a sample's measurement could have come until its torques went
+            out: what the link adds, the wait for what is lost, the step.
+        missed: how many of them took a period longer than measurements usually do.
+        overtaken: measurements that came after their step.
+    """
+
+    late: list[float] = field(default_factory=list)
+    missed: int = 0
+    overtaken: int = 0
+
+    def summary(self) -> dict[str, Any]:
+        """For summary.json."""
+        late = np.array(self.late or [math.nan])
+        median = float(np.median(late))
+        return {
+            "samples": len(self.late),
+            "deadlines_missed": self.missed,
+            "measurements_overtaken": self.overtaken,
+            "sent_after_due_ms": {
+                "median": 1e3 * median,
+                "p99": 1e3 * float(np.quantile(late, 0.99)),
+                "worst": 1e3 * float(late.max()),
+            },
+            "jitter_std_ms": 1e3 * float(np.std(np.clip(late, None, np.quantile(late, 0.99)))),
+        }
+
+
+class LiveLoop:
+    """Runs a law against a machine.
+
+    Args:
+        design: what to run.
+        steering: of the reference, from t = 0 on.
+        contact: a session that the machine has offered.
+        viewer: who watches.
+        say: is told in a line what happens.
+
+    Attributes:
+        record: of the run.
+        pace: see `Pace`.
+        memory: of the law, as of the last sample.
+        backend: what steps the law.
+        recoveries: how often a new way was planned.
+        taken_over: whether the plate was anywhere else than at the scenario's start.
+    """
+
+    def __init__(
+        self,
+        design: Design,
+        steering: Steering,
+        contact: Contact,
+        viewer: Viewer,
+        say: Callable[[str], None],
+    ) -> None:
+        self._design, self._steering, self._contact = design, steering, contact
+        self._viewer, self._say = viewer, say
+        self._law, self.backend = serving(design.law)
+        self.record, self.pace = LiveRecord(design.experiment, self.backend), Pace()
+        self.memory: AnyMemory = self._law.initial_memory(design.queue)
+        self.recoveries, self.taken_over = 0, False
+        c = design.experiment.scenario.controller
+        self._period, self._weights = c.period, np.array([c.w_Q, c.w_R])
+        self._size = 2 * motion_scale(design.experiment)
+        self._sends = isinstance(design.law.channel, Packets)
+        # The next torque alone: what a plan goes on with may still change.
+        self._horizon = float(replace(design.law, channel=Wire()).preview_times.max())
+        self._began, self._came = 0, dict[int, MachineMessage]()
+        self._sequences = dict[int, int]()
+        self._flags, self._silent_since = MachineFlags(0), 0
+        self._asked = ControllerFlags(0)
+
+    # -------------------------------------------------------------- the begin
+
+    def begin(self, flags: ControllerFlags) -> None:
+        """Agree with the machine on when the run begins, and wait until then.
+
+        Raises:
+            TimeoutError: it does not.
+        """
+        contact, last = self._contact, self._contact.last
+        assert last is not None
+        contact.join(last.head.nonce)
+        lead = _LEAD + contact.link.longest
+        here = (clock.monotonic() - contact.soonest) * last.rate  # of the machine, s, or earlier
+        asked = round((here + lead * last.rate) * SECOND)
+        until = now() + round((_ANSWER + lead) * SECOND)
+        step = round(min(self._period, 0.05) / last.rate * SECOND)
+        self._asked = flags
+        while True:
+            contact.send(begin=self._began or asked, flags=flags)
+            for message in contact.wait(now() + step):
+                self._take(message)
+                if message.begin != NEVER and message.head.nonce == contact.session.nonce:
+                    self._began = message.begin
+            if self._began and now() >= self._due(0):
+                return
+            if now() > until:
+                raise TimeoutError("the machine has not begun")
+
+    def _take(self, message: MachineMessage) -> None:
+        """Keep a measurement until its sample."""
+        if message.begin == NEVER or message.sampled < message.begin:
+            return
+        k = round((message.sampled - message.begin) / message.period)
+        if k < len(self.pace.late):
+            self.pace.overtaken += 1
+            self._contact.refuse(Refusal.LATE)
+        self._came.setdefault(k, message)
+
+    # -------------------------------------------------------------- the run
+
+    def run(self, duration: float) -> tuple[str, Failure | None]:
+        """Go on for so many s; how it ended, and what stopped it before."""
+        status, stopped, k = "completed", None, 0
+        try:
+            while k * self._period < duration - 1e-9:
+                if self._viewer.stopped():
+                    raise KeyboardInterrupt
+                message = self._await(k)
+                stopped = self._over(k, message)
+                if stopped is None:
+                    stopped = self._sample(k, message)
+                if stopped is not None:
+                    status = "left_workspace" if "machine" not in stopped.reason else "lost_machine"
+                    break
+                k += 1
+        except KeyboardInterrupt:
+            status = "interrupted"
+            stopped = Failure(k * self._period, None, math.nan, "stopped")
+        self.stop()
+        return status, stopped
+
+    def stop(self) -> None:
+        """The safe torque, said three times."""
+        for _ in range(3):
+            self._contact.send(flags=ControllerFlags.STOP | self._asked)
+            clock.sleep(0.01)
+        self.record.flush()
+
+    def _due(self, k: int) -> int:
+        """ns of the own clock at which the measurement of a sample may come at the soonest."""
+        last = self._contact.last
+        assert last is not None
+        sampled = self._began + round(k * self._period * SECOND)
+        return round(self._contact.due(sampled, last.rate) * SECOND)
+
+    def _await(self, k: int) -> MachineMessage | None:
+        """The message with a sample's measurement, or None once it is too late."""
+        for message in self._contact.receive():
+            self._take(message)
+        usual = self._contact.lateness(self._period) + _SPARE
+        while self._came.get(k) is None:
+            until = self._due(k) + round(usual * SECOND)
+            if now() >= until:
+                break
+            for message in self._contact.wait(until):
+                self._take(message)
+        for old in [n for n in self._came if n < k - _GONE]:
+            del self._came[old]
+        return self._came.get(k)
+
+    def _over(self, k: int, message: MachineMessage | None) -> Failure | None:
+        """Why it does not go on, or None; what changes about the machine is said."""
+        time = k * self._period
+        silent = (now() - self._contact.heard) / SECOND
+        if silent > max(SILENT, 10 * self._period):
+            if not self._silent_since:
+                self._silent_since = self._contact.heard
+                self._say(f"at {time:.1f} s: the machine is silent since {silent:.1f} s; waiting")
+            if silent > PATIENCE:
+                return Failure(
+                    time, None, math.nan, f"the machine was silent for {PATIENCE:g} s"
+                )
+        elif self._silent_since:
+            gone = (self._contact.heard - self._silent_since) / SECOND
+            self._silent_since = 0
+            self._say(f"at {time:.1f} s: the machine is heard again, after {gone:.1f} s")
+        if message is None:
+            return None
+        before, self._flags = self._flags, message.flags
+        if MachineFlags.LEFT in message.flags:
+            pose = self.memory.belief.state[POSE]
+            found = diagnose(self._design.experiment.mechanism, time, pose)
+            return found or Failure(time, None, math.nan, "the plate left its workspace")
+        if MachineFlags.SAFE in message.flags & ~before:
+            self._say(f"at {time:.1f} s: the machine is at its safe torque")
+        if MachineFlags.SAFE in before & ~message.flags:
+            self._say(f"at {time:.1f} s: torques act again")
+        return None
+
+    def _sample(self, k: int, message: MachineMessage | None) -> Failure | None:
+        design, t = self._design, k * self._period
+        size = design.law.sensing.size
+        values = np.full(size, np.nan)
+        if message is not None and (message.state is not None or message.codes is not None):
+            values = message.values
+        measurement, report = Measurement.of(values), None
+        if message is not None:
+            self.record.acted(self._acted(message))
+            report = self._report(k)
+        if k == 0:
+            failure = self._start(measurement, message)
+            if failure is not None:
+                return failure
+        self._steering = self._steering.on(t + self._horizon, self._viewer.wish())
+        way = self._steering.way
+        started = clock.perf_counter()
+        self.memory = self._law.step(
+            self.memory,
+            measurement,
+            lambda times: np.array([way.at(t + ahead) for ahead in times]),
+            self._weights,
+            report if self._sends else None,
+        )
+        seconds = clock.perf_counter() - started
+        self._send(k)
+        self._note_pace(k)
+        wanted = way.at(t)
+        self.record.sample(
+            k,
+            self.memory,
+            measurement,
+            wanted if self._by_hand else evaluate(self._steering.motion, t),
+            seconds,
+            self._packets(k, message),
+        )
+        self._recover(k)
+        self._viewer.show(self._seen(k, wanted))
+        return None
+
+    @property
+    def _by_hand(self) -> bool:
+        return self._steering.governed is not None
+
+    def _send(self, k: int) -> None:
+        packet = self.memory.in_flight[-1:]
+        first = k
+        if self._sends:
+            packet, first = self.memory.sent.packets[-1], k - self._design.repeats
+        P = round(self._period * SECOND)
+        eta = round(self.memory.belief.timeline.eta * SECOND)
+        self._sequences[k] = self._contact.send(
+            packet,
+            sampled=self._began + k * P,
+            playout=self._began + first * P + eta,
+            begin=self._began,
+            flags=self._asked,
+        )
+        self._sequences.pop(k - 2 * _GONE, None)
+
+    def _note_pace(self, k: int) -> None:
+        late = (now() - self._due(k)) / SECOND
+        self.pace.late.append(late)
+        self.pace.missed += late > self._period + self._contact.lateness(self._period)
+
+    # -------------------------------------------------------------- reports
+
+    def _acted(self, message: MachineMessage) -> dict[int, Array]:
+        """Torques (6,) that have acted, by the number of the period that they began."""
+        if message.acted_from == NEVER:
+            return {}
+        P = message.period
+        fraction = round(self._design.law.timeline.fraction * P)
+        newest = round((message.acted_from - message.begin - fraction) / P)
+        return {newest - i: torque for i, torque in enumerate(message.acted)}
+
+    def _report(self, k: int) -> Report:
+        """What the law is told of its packets and torques at a sample."""
+        number = reported(self._design.law.kept)
+        packets = [self._sequences.get(k - 1 - i) for i in range(number)]
+        arrived = np.array([n is not None and self._contact.has_arrived(n) for n in packets])
+        acted = list[Array]()
+        for i in range(number):
+            torque = self.record.applied.get(k - 1 - i)
+            if torque is None:
+                break
+            acted.append(torque)
+        return Report(arrived, np.array(acted).reshape(-1, NUM_TORQUES))
+
+    def _packets(self, k: int, message: MachineMessage | None) -> Array:
+        """Counts as of `scenario.signals.PACKETS`; which were late only the machine knows."""
+        if message is None or not self._sends:
+            return np.full(len(PACKETS), np.nan)
+        link = self._contact.link
+        return np.array([k + 1.0, link.lost, math.nan, message.played, message.dry])
+
+    # -------------------------------------------------------------- the way
+
+    def _start(self, measurement: Measurement, message: MachineMessage | None) -> Failure | None:
+        """Where the plate is not at the scenario's start, the way onto the motion from there."""
+        design, law = self._design, self._design.law
+        first = law.sensing.start(measurement)
+        if first is None:
+            return None  # it is where it should be, for all that is known
+        away = np.abs(first.state - design.experiment.start) / np.tile(self._size, 2)
+        if away.max() <= AT_START:
+            return None
+        self.taken_over = True
+        acts = np.zeros(NUM_TORQUES)
+        if message is not None and len(message.acted):
+            acts = message.acted[0]
+        queue = np.tile(acts, (len(design.queue), 1))
+        self._law, self.backend = serving(replace(law, silence=0))
+        self.memory = self._law.initial_memory(queue)
+        timeline = law.timeline
+        anew = self._anew(0.0, first.state, timeline.until_next(timeline.queue(queue)), None)
+        if isinstance(anew, str):
+            return Failure(0.0, None, math.nan, f"no way from where the plate is: {anew}")
+        self._steering = anew
+        self._say("the plate is not where the scenario begins: it is led there first")
+        return None
+
+    def _recover(self, k: int) -> None:
+        """Plan a new way where the prediction is off the old one."""
+        belief, law = self.memory.belief, self._design.law
+        if not (belief.has_state and belief.feeds_back and belief.settled and not self.memory.silence):
+            return
+        in_flight = self.memory.in_flight
+        queue = belief.timeline.queue(in_flight[:-1])
+        until = belief.timeline.until_next(queue)
+        acting = Acting(
+            np.vstack([until.torques, in_flight[-1:]]), np.append(until.durations, self._period)
+        )
+        t = k * self._period
+        ahead = law.plant.predict(belief.state, acting, belief.parameters)[-1]
+        wanted = self._steering.way.at(t + belief.timeline.eta + self._period)[:NUM_STATE]
+        away = np.abs(ahead - wanted) / np.tile(self._size, 2)
+        if not away.max() > OFF:  # or NaN
+            return
+        anew = self._anew(t, belief.state, acting, belief.parameters)
+        if isinstance(anew, str):
+            return  # the next sample may see another
+        self._steering, self.memory = anew, self.memory.without_error()
+        self.recoveries += 1
+
+    def _anew(
+        self, t: float, state: Array, acting: Acting, parameters: Array | None
+    ) -> Steering | str:
+        plant = self._design.law.plant
+        dynamics = plant.dynamics if parameters is None else plant.dynamics.assuming(parameters)
+        states = np.vstack([state, plant.predict(state, acting, parameters)])
+        if not np.all(np.isfinite(states)):
+            return "the plate leaves its workspace before a torque can act"
+        for x in states:
+            failure = diagnose(plant.mechanism, t, x[POSE])
+            if failure is not None:
+                return f"{failure.reason} before a torque can act"
+        torques = np.vstack([acting.torques[:1], acting.torques]) if len(acting.torques) else None
+        if torques is None:
+            torques = np.zeros((1, NUM_TORQUES))
+        full = np.array(
+            [
+                np.append(x, dynamics.accelerations(x[POSE], x[RATES], torque))
+                for x, torque in zip(states, torques, strict=True)
+            ]
+        )
+        times = t + np.append(0.0, np.cumsum(acting.durations))
+        return self._steering.anew(times, full)
+
+    def _seen(self, k: int, wanted: Array) -> Seen:
+        link, memory = self._contact.link, self.memory
+        error = memory.belief.state[POSE] - wanted[POSE]
+        return Seen(
+            time=k * self._period,
+            state=np.array(memory.belief.state),
+            wanted=wanted,
+            torque=self.record.latest,
+            error=float(100 * np.mean(np.abs(error) / self._design.experiment.scale)),
+            eta=float(memory.belief.delay[0]),
+            trip=link.typical,
+            spread=link.longest - link.shortest,
+            lost=1 - (1 - link.loss_there) * (1 - link.loss_back),
+            missed=self.pace.missed,
+            safe=MachineFlags.SAFE in self._flags,
+            by_hand=self._by_hand,
+            limit=self._steering.limit,
+        )
