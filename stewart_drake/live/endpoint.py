@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 from stewart_drake.files.errors import ConfigError
@@ -31,6 +32,8 @@ WINDOW: Final = 64
 AT_ONCE: Final = 256
 """Datagrams that are read before anything else is done."""
 SHORTEST_KEY: Final = 16
+"""Bytes."""
+LONGEST_KEY: Final = 4096
 """Bytes."""
 _TRUSTED: Final = 64
 """Round trips of which the shortest one tells the other's clock."""
@@ -130,6 +133,26 @@ class Endpoint:
                 yield message, address
             else:
                 self.refused[Refusal.MALFORMED] += 1
+
+
+def read_key(path: Path) -> bytes:
+    """The bytes of a key's file, but for line breaks at its end.
+
+    Raises:
+        ConfigError: it cannot be read, or is too short or too long to be a key.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(LONGEST_KEY + 1)
+    except OSError as error:
+        raise ConfigError(f"--key: got {str(path)!r} ({error.strerror}); expected a file") from None
+    key = data.rstrip(b"\r\n")
+    if not SHORTEST_KEY <= len(key) <= LONGEST_KEY:
+        raise ConfigError(
+            f"--key: got {str(path)!r} with {len(key)} bytes or more; expected {SHORTEST_KEY} to "
+            f"{LONGEST_KEY}"
+        )
+    return key
 
 
 def is_loopback(host: str) -> bool:

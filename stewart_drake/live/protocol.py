@@ -90,13 +90,15 @@ class MachineFlags(IntFlag):
     LEFT = 16
     """The plate has left its workspace; the machine has stopped."""
     HOLDS = 32
-    """The safe torque is the last one; without it zero."""
+    """A dry buffer holds the last torque; without it zero acts."""
     BUSY = 64
     """Another controller drives it: this offer of a session would be refused."""
     WIRE = 128
     """A simulated wire: a torque acts when it arrives there, whatever its play-out time."""
     RESETS = 256
     """A new session begins at rest at the scenario's start; without it where the machine is."""
+    SAFE_HOLDS = 512
+    """The safe torque is the last one; without it zero."""
 
 
 class ControllerFlags(IntFlag):
@@ -187,11 +189,13 @@ class MachineMessage:
         return (self.head.time - self.sampled) / SECOND
 
     @property
-    def values(self) -> Array:
-        """(12,) the state, or (6 N,) crank angles in rad, the oldest first; NaN what is lost."""
-        if self.state is not None:
+    def values(self) -> Array | None:
+        """(12,) the state, or (6 N,) crank angles in rad, the oldest first; NaN what is lost.
+
+        None where there is no measurement.
+        """
+        if self.state is not None or self.codes is None:
             return self.state
-        assert self.codes is not None and self.zeros is not None
         angles = self.zeros + 2 * np.pi / 2**self.bits * self.codes
         return np.where(self.codes == MISSING, np.nan, angles).ravel()
 
@@ -205,7 +209,8 @@ class ControllerMessage:
         flags: see `ControllerFlags`.
         sampled: ns, the instant for which the torques were computed.
         playout: ns, when the first row shall act; row i acts i periods later, each for a period.
-        begin: ns, when the run shall begin, in each datagram from when it is known; NEVER.
+        begin: ns, when the run shall begin, in each datagram from when it is known, all that have
+            torques among them; or NEVER.
         torques: (rows, 6) N m; without a row it only says that the controller is there.
     """
 
@@ -344,7 +349,7 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
     }
     sizes = {0: 0, 1: 8 * NUM_STATE, 2: 8 * NUM_LEGS + 4 * NUM_LEGS * samples}
     plausible = rate > 0 and math.isfinite(rate) and limit > 0 and period > 0 and zero == 0
-    if not (fits.get(kind) and history <= MOST_HISTORY and plausible and flags < 512):
+    if not (fits.get(kind) and history <= MOST_HISTORY and plausible and flags < 1024):
         raise RefusedError(Refusal.MALFORMED, "a number outside its range")
     if len(body) != _MACHINE.size + sizes[kind] + 8 * NUM_TORQUES * history:
         raise RefusedError(Refusal.MALFORMED, "a body of another length")
@@ -393,6 +398,8 @@ def _controller(head: Head, flags: int, body: bytes) -> ControllerMessage:
     torques = _rows(body[_CONTROLLER.size :])
     if not np.all(np.isfinite(torques)):
         raise RefusedError(Refusal.MALFORMED, "a torque that is no number")
+    if rows and begin == NEVER:
+        raise RefusedError(Refusal.MALFORMED, "torques for no run")
     return ControllerMessage(head, ControllerFlags(flags), sampled, playout, begin, torques)
 
 
