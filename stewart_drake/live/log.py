@@ -16,7 +16,7 @@ from stewart_drake.law.native_law import AnyMemory
 from stewart_drake.loop.controller import HELD
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.recording import Record
-from stewart_drake.scenario.config import StateSensorConfig
+from stewart_drake.scenario.config import Scenario, StateSensorConfig
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE, TUNER_INPUTS, ports_of
 
 Array = NDArray[np.float64]
@@ -101,6 +101,10 @@ class LiveRecord(Record):
         self._rows[number] = row
         while len(self._rows) > _WAITS:
             self._write(min(self._rows))
+
+    def ran(self, scenario: Scenario) -> None:
+        """What the record says that was run."""
+        self._scenario = scenario
 
     def flush(self) -> None:
         """Write the rows that still wait."""

@@ -59,6 +59,13 @@ _GONE: Final = 64
 """Samples after which what came is forgotten."""
 
 
+class End(NamedTuple):
+    """How a run ended: a status as of `loop.results.RunSummary`, and what stopped it."""
+
+    status: str
+    stopped: Failure | None
+
+
 class Viewer(Protocol):
     """Who watches, and may ask for something."""
 
@@ -240,26 +247,23 @@ class LiveLoop:
 
     # -------------------------------------------------------------- the run
 
-    def run(self, duration: float) -> tuple[str, Failure | None]:
-        """Go on for so many s; how it ended, and what stopped it before."""
-        status, stopped, k = "completed", None, 0
+    def run(self, duration: float) -> End:
+        """Go on for so many s, which may be infinite; how it ended."""
+        end, k = End("completed", None), 0
         try:
             while k * self._period < duration - 1e-9:
                 if self._viewer.stopped():
                     raise KeyboardInterrupt
                 message = self._await(k)
-                stopped = self._over(k, message)
-                if stopped is None:
-                    stopped = self._sample(k, message)
-                if stopped is not None:
-                    status = "left_workspace" if "machine" not in stopped.reason else "lost_machine"
+                over = self._over(k, message) or self._sample(k, message)
+                if over is not None:
+                    end = over
                     break
                 k += 1
         except KeyboardInterrupt:
-            status = "interrupted"
-            stopped = Failure(k * self._period, None, math.nan, "stopped")
+            end = End("interrupted", Failure(k * self._period, None, math.nan, "stopped"))
         self.stop()
-        return status, stopped
+        return end
 
     def stop(self) -> None:
         """The safe torque, said three times."""
@@ -290,7 +294,7 @@ class LiveLoop:
             del self._came[old]
         return self._came.get(k)
 
-    def _over(self, k: int, message: MachineMessage | None) -> Failure | None:
+    def _over(self, k: int, message: MachineMessage | None) -> End | None:
         """Why it does not go on, or None; what changes about the machine is said."""
         time = k * self._period
         silent = (now() - self._contact.heard) / SECOND
@@ -299,9 +303,8 @@ class LiveLoop:
                 self._silent_since = self._contact.heard
                 self._say(f"at {time:.1f} s: the machine is silent since {silent:.1f} s; waiting")
             if silent > PATIENCE:
-                return Failure(
-                    time, None, math.nan, f"the machine was silent for {PATIENCE:g} s"
-                )
+                reason = f"the machine was silent for {PATIENCE:g} s"
+                return End("lost_machine", Failure(time, None, math.nan, reason))
         elif self._silent_since:
             gone = (self._contact.heard - self._silent_since) / SECOND
             self._silent_since = 0
@@ -312,14 +315,15 @@ class LiveLoop:
         if MachineFlags.LEFT in message.flags:
             pose = self.memory.belief.state[POSE]
             found = diagnose(self._design.experiment.mechanism, time, pose)
-            return found or Failure(time, None, math.nan, "the plate left its workspace")
+            said = Failure(time, None, math.nan, "the machine says that the plate left its workspace")
+            return End("left_workspace", found or said)
         if MachineFlags.SAFE in message.flags & ~before:
             self._say(f"at {time:.1f} s: the machine is at its safe torque")
         if MachineFlags.SAFE in before & ~message.flags:
             self._say(f"at {time:.1f} s: torques act again")
         return None
 
-    def _sample(self, k: int, message: MachineMessage | None) -> Failure | None:
+    def _sample(self, k: int, message: MachineMessage | None) -> End | None:
         design, t = self._design, k * self._period
         size = design.law.sensing.size
         values = np.full(size, np.nan)
@@ -330,9 +334,9 @@ class LiveLoop:
             self.record.acted(self._acted(message))
             report = self._report(k)
         if k == 0:
-            failure = self._start(measurement, message)
-            if failure is not None:
-                return failure
+            refused = self._start(measurement, message)
+            if refused is not None:
+                return End("refused", Failure(0.0, None, math.nan, refused))
         self._steering = self._steering.on(t + self._horizon, self._viewer.wish())
         way = self._steering.way
         started = clock.perf_counter()
@@ -417,8 +421,8 @@ class LiveLoop:
 
     # -------------------------------------------------------------- the way
 
-    def _start(self, measurement: Measurement, message: MachineMessage | None) -> Failure | None:
-        """Where the plate is not at the scenario's start, the way onto the motion from there."""
+    def _start(self, measurement: Measurement, message: MachineMessage | None) -> str | None:
+        """Lead the plate from where it is, unless that is the scenario's start; why not, or None."""
         design, law = self._design, self._design.law
         first = law.sensing.start(measurement)
         if first is None:
@@ -436,7 +440,7 @@ class LiveLoop:
         timeline = law.timeline
         anew = self._anew(0.0, first.state, timeline.until_next(timeline.queue(queue)), None)
         if isinstance(anew, str):
-            return Failure(0.0, None, math.nan, f"no way from where the plate is: {anew}")
+            return f"there is no way from where the plate is: {anew}"
         self._steering = anew
         self._say("the plate is not where the scenario begins: it is led there first")
         return None
@@ -447,8 +451,8 @@ class LiveLoop:
         if not (belief.has_state and belief.feeds_back and belief.settled and not self.memory.silence):
             return
         in_flight = self.memory.in_flight
-        queue = belief.timeline.queue(in_flight[:-1])
-        until = belief.timeline.until_next(queue)
+        before = np.vstack([np.zeros(NUM_TORQUES), in_flight[:-1]])  # as long as it was
+        until = belief.timeline.until_next(belief.timeline.queue(before))
         acting = Acting(
             np.vstack([until.torques, in_flight[-1:]]), np.append(until.durations, self._period)
         )
