@@ -36,7 +36,7 @@ _ROOM: Final = 0.25
 _COMPUTING: Final = 0.01
 """s, for the law's step and for waking up."""
 _LEAST_LOSS: Final = 0.01
-"""Of packets and measurements; none was seen to be lost in a few seconds."""
+"""Of packets; none was seen to be lost in a few seconds."""
 
 
 class Design(NamedTuple):
@@ -103,7 +103,7 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
     Raises:
         ConfigError: the link takes longer than that.
     """
-    loss = max(link.loss_back, _LEAST_LOSS)
+    loss = max(scenario.sensor.loss, link.loss_back)
     sensor = replace(scenario.sensor, delay=0.0, loss=loss, faults=[])
     seen = replace(scenario, sensor=sensor, plant=replace(scenario.plant, kind="exact"))
     if MachineFlags.WIRE in machine.flags:  # it does as the scenario says

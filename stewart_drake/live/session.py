@@ -98,6 +98,20 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
     ]
 
 
+def check_armed(ready: Ready, armed: bool) -> None:
+    """Refuse a machine that is no simulation, unless that was asked for.
+
+    Raises:
+        ConfigError: one line.
+    """
+    if not ready.simulated and not armed:
+        ready.endpoint.close()
+        raise ConfigError(
+            "--arm: got none, for a machine that does not say that it is a simulation; expected "
+            "--arm, with nobody in its reach"
+        )
+
+
 def drive(
     ready: Ready,
     duration: float = math.inf,
@@ -118,11 +132,7 @@ def drive(
     Raises:
         ConfigError: not armed for a real machine, or one that does not begin.
     """
-    if not ready.simulated and not armed:
-        raise ConfigError(
-            "--arm: got none, for a machine that does not say that it is a simulation; expected "
-            "--arm, with nobody in its reach"
-        )
+    check_armed(ready, armed)
     made, contact = ready.design, ready.contact
     governor = Governor(made.law.plant.dynamics, made.torque_limit)
     steering = Steering(governor, made.experiment.reference, Way.along(made.planned))
