@@ -25,14 +25,16 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.report.terminal import echo
 
 if TYPE_CHECKING:
-    from stewart_drake.live.session import Ready
+    from stewart_drake.live.page import PageViewer
     from stewart_drake.loop.results import SimulationResult
+    from stewart_drake.scenario.config import Scenario
 
 _EACH_WAY: Final = (0.35, 0.4)
 """Of the scenario's delay, between which the link of the demo's machine takes: 0.28 to 0.32 s of
 the paper's 0.8 s."""
 _LOST: Final = 0.02
 """Of its packets, each way."""
+_REQUESTS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 def live(
@@ -63,11 +65,12 @@ def live(
 ) -> int:
     """Drive a machine over UDP in real time, with sliders in the browser.
 
-    The law is that of `simulate`. Ctrl-C, or Stop on the page, ends it with the safe torque.
+    The law is that of `simulate`. Ctrl-C brings the plate to rest and ends it; Ctrl-C again, or Stop
+    on the page, stops it at once.
     """
     from stewart_drake.live.connect import address_of
     from stewart_drake.live.endpoint import read_key
-    from stewart_drake.live.session import plans, prepare_session
+    from stewart_drake.live.session import check_armed, drive, plans, prepare_session
     from stewart_drake.scenario.loading import load_scenario
 
     if (machine is None) != demo:
@@ -75,43 +78,50 @@ def live(
     loaded = load_scenario(scenario, controller, settings or ())
     delivery = Delivery(out, quiet, as_json)
     span = math.inf if duration is None else duration
-    with contextlib.ExitStack() as running, _ended_by_request():
+    name = Path(scenario).stem
+    with contextlib.ExitStack() as running:
+        viewer = None if no_browser else running.enter_context(_page(loaded, name))
         where = machine or running.enter_context(
             _demo_machine(scenario, loaded.eta, controller, settings or ())
         )
         delivery.say(f"calling {where}")
         secret = None if key is None else read_key(key)
         ready = prepare_session(loaded, address_of(where), secret)
-        for line in plans(ready, span, Path(scenario).stem):
+        for line in plans(ready, span, name):
             delivery.say(line)
-        result = _driven(ready, span, arm, no_browser, delivery, Path(scenario).stem)
-    return _told(delivery, result, ready)
+        check_armed(ready, arm)
+        if viewer is not None:
+            _show(viewer.opened())
+        if not ready.simulated and sys.stdin.isatty():
+            input("Enter begins, Ctrl-C leaves it alone")
+        with _Ending() as ending:
+            result = drive(
+                ready, span, armed=arm, viewer=viewer, ending=ending, say=delivery.say
+            )
+    return _told(delivery, result)
 
 
-def _driven(
-    ready: "Ready", span: float, arm: bool, no_browser: bool, delivery: Delivery, name: str
-) -> "SimulationResult":
-    from stewart_drake.live.session import check_armed, drive
-
-    check_armed(ready, arm)
-    if not ready.simulated and sys.stdin.isatty():
-        input("Enter begins, Ctrl-C leaves it alone")
-    if no_browser:
-        return drive(ready, span, armed=arm, say=delivery.say)
+@contextlib.contextmanager
+def _page(scenario: "Scenario", name: str) -> Iterator["PageViewer"]:
+    """The page's process, which takes as long to start as the machine is called."""
     from stewart_drake.live.page import PageViewer
+    from stewart_drake.mechanism.files import load_mechanism
 
-    viewer = PageViewer(ready.design.experiment.mechanism, f"live: {name}")
+    viewer = PageViewer(load_mechanism(scenario.mechanism), f"live: {name}")
     try:
-        # A reader needs the address even when everything else is quiet.
-        echo(f"page: {viewer.url}", error=True)
-        if sys.stdout.isatty():
-            webbrowser.open(viewer.url)
-        return drive(ready, span, armed=arm, viewer=viewer, say=delivery.say)
+        yield viewer
     finally:
         viewer.close()
 
 
-def _told(delivery: Delivery, result: "SimulationResult", ready: "Ready") -> int:
+def _show(url: str) -> None:
+    # A reader needs the address even when everything else is quiet.
+    echo(f"page: {url}", error=True)
+    if sys.stdout.isatty():
+        webbrowser.open(url)
+
+
+def _told(delivery: Delivery, result: "SimulationResult") -> int:
     """Write and print what has come of it."""
     from stewart_drake.report.run_document import run_document
 
@@ -164,15 +174,25 @@ def _demo_machine(
         process.communicate()
 
 
-@contextlib.contextmanager
-def _ended_by_request() -> Iterator[None]:
-    """SIGTERM is as Ctrl-C: the machine is told to stop."""
+class _Ending:
+    """Ctrl-C, or a request to end, once: come to rest; twice: at once."""
 
-    def interrupt(*_: Any) -> None:
-        raise KeyboardInterrupt
+    def __init__(self) -> None:
+        self._asked = False
+        self._before: list[Any] = []
 
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    def __call__(self) -> bool:
+        return self._asked
+
+    def __enter__(self) -> "_Ending":
+        self._before = [signal.signal(number, self._ask) for number in _REQUESTS]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, before in zip(_REQUESTS, self._before, strict=True):
+            signal.signal(number, before)
+
+    def _ask(self, *_: Any) -> None:
+        if self._asked:
+            raise KeyboardInterrupt
+        self._asked = True

@@ -163,6 +163,11 @@ class Contact:
             self._note(message, time)
             yield message
 
+    def forget_waiting(self) -> None:
+        """Throw away what came while nobody looked: how late it came says nothing of the link."""
+        for _ in self._endpoint.receive():
+            pass
+
     def refuse(self, cause: Refusal) -> None:
         """Count a message that was taken but is of no use."""
         self._endpoint.refused[cause] += 1

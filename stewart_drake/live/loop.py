@@ -45,6 +45,10 @@ OFF: Final = 0.08
 """Share of the motion by which a prediction is off the way, so that a new one is planned."""
 AT_START: Final = 0.02
 """The same, by which a plate is where the scenario begins."""
+STANDS: Final = 0.005
+"""The same, per s, by which it moves that has come to rest."""
+RESTING: Final = 8.0
+"""s in which it must."""
 SILENT: Final = 1.0
 """s, or ten periods, of silence that are told."""
 PATIENCE: Final = 10.0
@@ -205,7 +209,7 @@ class LiveLoop:
         self._began, self._came = 0, dict[int, MachineMessage]()
         self._sequences = dict[int, int]()
         self._flags, self._silent_since = MachineFlags(0), 0
-        self._asked = ControllerFlags(0)
+        self._asked, self._recording = ControllerFlags(0), True
 
     # -------------------------------------------------------------- the begin
 
@@ -217,6 +221,7 @@ class LiveLoop:
         """
         contact, last = self._contact, self._contact.last
         assert last is not None
+        contact.forget_waiting()
         contact.join(last.head.nonce)
         lead = _LEAD + contact.link.longest
         here = (clock.monotonic() - contact.soonest) * last.rate  # of the machine, s, or earlier
@@ -247,23 +252,48 @@ class LiveLoop:
 
     # -------------------------------------------------------------- the run
 
-    def run(self, duration: float) -> End:
-        """Go on for so many s, which may be infinite; how it ended."""
+    def run(self, duration: float, ending: Callable[[], bool] = lambda: False) -> End:
+        """Go on for so many s, which may be infinite, then bring the plate to rest.
+
+        Args:
+            duration: s, that are recorded.
+            ending: whether to come to rest before that.
+
+        Returns:
+            How it ended. A viewer's stop, Ctrl-C, and whatever goes wrong end it at once.
+        """
         end, k = End("completed", None), 0
         try:
-            while k * self._period < duration - 1e-9:
-                if self._viewer.stopped():
-                    raise KeyboardInterrupt
-                message = self._await(k)
-                over = self._over(k, message) or self._sample(k, message)
-                if over is not None:
-                    end = over
+            while k * self._period < duration - 1e-9 and not ending():
+                end = self._step(k)
+                if end.status != "completed":
                     break
                 k += 1
+            if end.status == "completed":
+                if k * self._period < duration - 1e-9:
+                    end = End("interrupted", Failure(k * self._period, None, math.nan, "ended"))
+                self._come_to_rest(k)
         except KeyboardInterrupt:
             end = End("interrupted", Failure(k * self._period, None, math.nan, "stopped"))
         self.stop()
         return end
+
+    def _step(self, k: int) -> End:
+        if self._viewer.stopped():
+            raise KeyboardInterrupt
+        message = self._await(k)
+        return self._over(k, message) or self._sample(k, message) or End("completed", None)
+
+    def _come_to_rest(self, k: int) -> None:
+        """Go on until the plate stands, without a record."""
+        self._recording, last = False, k + math.ceil(RESTING / self._period)
+        while k < last and self._step(k).status == "completed":
+            way, t = self._steering.way, k * self._period
+            wanted = np.array([way.at(t)[RATES], way.at(t + self._horizon)[RATES]])
+            rates = np.vstack([wanted, self.memory.belief.state[RATES]])
+            if np.all(np.abs(rates) <= STANDS * self._size):
+                return
+            k += 1
 
     def stop(self) -> None:
         """The safe torque, said three times."""
@@ -337,7 +367,8 @@ class LiveLoop:
             refused = self._start(measurement, message)
             if refused is not None:
                 return End("refused", Failure(0.0, None, math.nan, refused))
-        self._steering = self._steering.on(t + self._horizon, self._viewer.wish())
+        wish = self._viewer.wish() if self._recording else Wish(rest=True)
+        self._steering = self._steering.on(t + self._horizon, wish)
         way = self._steering.way
         started = clock.perf_counter()
         self.memory = self._law.step(
@@ -351,14 +382,11 @@ class LiveLoop:
         self._send(k)
         self._note_pace(k)
         wanted = way.at(t)
-        self.record.sample(
-            k,
-            self.memory,
-            measurement,
-            wanted if self._by_hand else evaluate(self._steering.motion, t),
-            seconds,
-            self._packets(k, message),
-        )
+        if self._recording:
+            # A way onto the motion is judged by the motion, as in a simulation.
+            judged = wanted if self._by_hand else evaluate(self._steering.motion, t)
+            packets = self._packets(k, message)
+            self.record.sample(k, self.memory, measurement, judged, seconds, packets)
         self._recover(k)
         self._viewer.show(self._seen(k, wanted))
         return None

@@ -7,6 +7,7 @@ computer too, do not know it.
 """
 
 import json
+import logging
 import multiprocessing
 import secrets
 import threading
@@ -64,11 +65,6 @@ class PageViewer:
         mechanism: to be shown.
         title: of the page.
 
-    Attributes:
-        url: of the page, with its token.
-
-    Raises:
-        ConfigError: the page's process did not start.
     """
 
     def __init__(self, mechanism: Mechanism, title: str) -> None:
@@ -78,9 +74,17 @@ class PageViewer:
         self._process.start()
         other.close()
         self._wish, self._stop, self._there, self._credit = Wish(), False, True, True
-        if not self._connection.poll(_START):
-            raise ConfigError("--browser: the page did not start; expected --no-browser")
-        self.url = str(self._connection.recv().url)
+
+    def opened(self) -> str:
+        """The page's address, with its token; once, waits for it.
+
+        Raises:
+            ConfigError: the page's process did not start.
+        """
+        with suppress(EOFError):
+            if self._connection.poll(_START):
+                return str(self._connection.recv().url)
+        raise ConfigError("--no-browser: not given, and the page did not start; expected it")
 
     def show(self, seen: Seen) -> None:
         """See `Viewer`: what the page has no time for is left out."""
@@ -176,6 +180,7 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     from stewart_drake.loop.scene import Scene
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the loop, which then closes this
+    logging.getLogger("drake").setLevel(logging.WARNING)  # the address that counts is the page's
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     scene, board = Scene(mechanism, meshcat), _Board()
     token, lock = secrets.token_urlsafe(24), threading.Lock()

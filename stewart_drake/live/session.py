@@ -118,6 +118,7 @@ def drive(
     *,
     armed: bool = False,
     viewer: Viewer | None = None,
+    ending: Callable[[], bool] = lambda: False,
     say: Callable[[str], None] = print,
 ) -> SimulationResult:
     """Run the loop; the machine moves.
@@ -127,6 +128,7 @@ def drive(
         duration: s, or infinite.
         armed: whether a machine that is no simulation may be driven.
         viewer: who watches.
+        ending: whether to come to rest and end.
         say: is told in a line what happens.
 
     Raises:
@@ -141,12 +143,12 @@ def drive(
     try:
         with one_blas_thread:
             loop.begin(ControllerFlags.ARMED if armed and not ready.simulated else NOTHING)
-            status, stopped = loop.run(duration)
+            status, stopped = loop.run(duration, ending)
     except TimeoutError as error:
         raise ConfigError(f"--machine: {error}; expected one that does") from None
     finally:
         ready.endpoint.close()
-    wall, samples = clock.perf_counter() - started, len(loop.pace.late)
+    wall, samples = clock.perf_counter() - started, len(loop.record.samples)
     period = made.experiment.scenario.controller.period
     as_run = replace(made.experiment.scenario, duration=max(samples - 1, 1) * period)
     as_run = replace(as_run, log_period=period)

@@ -32,9 +32,11 @@ class Wish(NamedTuple):
 
     Attributes:
         target: (6,) pose in rad and m, or None for the scenario's motion.
+        rest: whether to come to rest instead, as soon as that is smooth.
     """
 
     target: Array | None = None
+    rest: bool = False
 
 
 class Stretch(NamedTuple):
@@ -98,7 +100,7 @@ class Steering:
         """With the way fixed up to `time` in s, and what is asked for from there on."""
         if time - self.until < _LEAST - 1e-9:
             return self
-        if wish.target is None:
+        if wish.target is None and not wish.rest:
             return self._let_go(time)
         governed = self.governed
         if governed is None:
@@ -108,8 +110,8 @@ class Steering:
             governed = begun
         else:
             governed = self.governor.after(governed, time - self.until)
-        governed = self.governor.follow(governed, wish.target)
-        return self._by_hand(governed, time)
+        target = governed.applied if wish.rest or wish.target is None else wish.target
+        return self._by_hand(self.governor.follow(governed, target), time)
 
     def _by_hand(self, governed: Governed, time: float) -> "Steering":
         way = self.way.then(time, _future(self.governor, governed, time))
