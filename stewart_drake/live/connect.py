@@ -59,34 +59,52 @@ def call(contact: Contact, stopped: Callable[[], bool] = lambda: False) -> Machi
         What the machine last said of itself.
 
     Raises:
-        ConfigError: nobody answers, or another controller drives it.
+        ConfigError: nobody answers.
     """
-    began, first = now(), None
+    began, first = now(), 0
     while not stopped():
-        contact.send()
-        until = now() + _CALLS
-        while now() < until:
-            for _ in contact.wait(until):
-                first = first or now()
-        if first is None and now() - began > _PATIENCE * SECOND:
+        came = _ask(contact)
+        first = first or (now() if came else 0)
+        if not first and now() - began > _PATIENCE * SECOND:
             host, port = contact.session.address
             raise ConfigError(
                 f"--machine: got {host}:{port}, where nothing answers{_why(contact)}; expected a "
                 "machine, such as stewart-drake machine SCENARIO --port PORT"
             )
-        if first is None or contact.last is None:
-            continue
-        waited = (now() - first) / SECOND
-        patience = max(_LONGEST, 2 * contact.last.watchdog / SECOND)
-        if MachineFlags.BUSY in contact.last.flags:
-            if waited > patience:
-                raise ConfigError(
-                    "--machine: got one that another controller drives; expected a free one: it "
-                    f"is {contact.last.watchdog / SECOND:g} s after the last word of that one"
-                )
-        elif len(contact.link.trips) >= _TRIPS or waited > _LONGEST:
+        enough = len(contact.link.trips) >= _TRIPS or now() - first > _LONGEST * SECOND
+        if first and enough and contact.last is not None:
             return contact.last
     raise KeyboardInterrupt
+
+
+def await_free(contact: Contact) -> None:
+    """Wait until nobody else drives the machine, and its offer is a new one.
+
+    Raises:
+        ConfigError: another controller goes on driving it.
+    """
+    contact.forget_waiting()
+    began, last = now(), contact.last
+    assert last is not None
+    patience = max(_PATIENCE * SECOND, 2 * last.watchdog)
+    while True:
+        if _ask(contact) and MachineFlags.BUSY not in contact.last.flags:
+            return
+        if now() - began > patience:
+            raise ConfigError(
+                "--machine: got one that another controller drives, or that is gone; expected a "
+                f"free one, as it is {last.watchdog / SECOND:g} s after the last word of that one"
+            )
+
+
+def _ask(contact: Contact) -> bool:
+    """Ask once; whether something came before it is time to ask again."""
+    contact.send()
+    until, came = now() + _CALLS, False
+    while now() < until:
+        for _ in contact.wait(until):
+            came = True
+    return came
 
 
 def _why(contact: Contact) -> str:

@@ -63,6 +63,11 @@ class Link:
         return float(np.median(self.trips)) if self.trips else math.nan
 
     @property
+    def spread(self) -> float:
+        """Standard deviation of the round trips, s; NaN before there is one."""
+        return float(np.std(self.trips)) if self.trips else math.nan
+
+    @property
     def longest(self) -> float:
         """Of the round trips that are remembered, s; NaN before there is one."""
         return max(self.trips, default=math.nan)

@@ -39,6 +39,8 @@ class LiveRecord(Record):
         super().__init__(experiment, backend)
         self._period = experiment.scenario.controller.period
         self._eta = experiment.scenario.eta
+        # What acts at a sample began then, or, with a part of a period, in the one before.
+        self._began_before = int(experiment.scenario.true_delay.fraction > 0)
         self._measures_state = isinstance(experiment.scenario.sensor, StateSensorConfig)
         self._rows: dict[int, dict[str, Array]] = {}
         self.applied: dict[int, Array] = {}
@@ -113,7 +115,7 @@ class LiveRecord(Record):
 
     def _write(self, number: int) -> None:
         row = self._rows.pop(number)
-        self._acts = self.applied.get(number, self._acts)
+        self._acts = self.applied.get(number - self._began_before, self._acts)
         self.log(number * self._period, row | {"torque_applied": self._acts})
 
 

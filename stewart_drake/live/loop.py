@@ -20,7 +20,8 @@ from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.channel import Packets, Report, Wire
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.native_law import AnyMemory, serving
-from stewart_drake.law.timeline import Acting
+from stewart_drake.law.timeline import Acting, Timeline
+from stewart_drake.live.connect import await_free
 from stewart_drake.live.contact import Contact
 from stewart_drake.live.design import Design
 from stewart_drake.live.endpoint import now
@@ -53,10 +54,12 @@ SILENT: Final = 1.0
 """s, or ten periods, of silence that are told."""
 PATIENCE: Final = 10.0
 """s of silence after which the controller gives up."""
-_LEAD: Final = 0.5
+_LEAD: Final = 0.05
 """s, beside a round trip, from asking for a begin until then."""
-_ANSWER: Final = 5.0
-"""s, beside that, in which the machine must have agreed to it."""
+_REPEATED: Final = 0.05
+"""s after which it is asked for again."""
+_ANSWER: Final = 10.0
+"""s in which the machine must have begun."""
 _SPARE: Final = 0.002
 """s for which a measurement is waited for beside the usual."""
 _GONE: Final = 64
@@ -112,7 +115,7 @@ class Seen(NamedTuple):
         error: mean pose error, % of peak to peak.
         eta: s, from a measurement to its torque, as the law believes.
         trip: s, median round trip of the link.
-        spread: s, between the shortest and the longest one.
+        spread: s, standard deviation of those.
         lost: share of the datagrams that are lost, there and back.
         missed: deadlines.
         safe: whether the machine is at its safe torque.
@@ -217,28 +220,30 @@ class LiveLoop:
         """Agree with the machine on when the run begins, and wait until then.
 
         Raises:
-            TimeoutError: it does not.
+            ConfigError: another controller drives it.
+            TimeoutError: it does not begin.
         """
-        contact, last = self._contact, self._contact.last
+        contact = self._contact
+        await_free(contact)
+        last = contact.last
         assert last is not None
-        contact.forget_waiting()
         contact.join(last.head.nonce)
+        # Of the machine's clock, or earlier by the way back.
+        here = (clock.monotonic() - contact.soonest) * last.rate
         lead = _LEAD + contact.link.longest
-        here = (clock.monotonic() - contact.soonest) * last.rate  # of the machine, s, or earlier
-        asked = round((here + lead * last.rate) * SECOND)
-        until = now() + round((_ANSWER + lead) * SECOND)
-        step = round(min(self._period, 0.05) / last.rate * SECOND)
+        asked, until = round((here + lead * last.rate) * SECOND), now() + round(_ANSWER * SECOND)
+        step = round(min(self._period / last.rate, _REPEATED) * SECOND)
         self._asked = flags
         while True:
             contact.send(begin=self._began or asked, flags=flags)
             for message in contact.wait(now() + step):
-                self._take(message)
                 if message.begin != NEVER and message.head.nonce == contact.session.nonce:
                     self._began = message.begin
+                self._take(message)
             if self._began and now() >= self._due(0):
                 return
             if now() > until:
-                raise TimeoutError("the machine has not begun")
+                raise TimeoutError("got one that has not begun when it was asked to")
 
     def _take(self, message: MachineMessage) -> None:
         """Keep a measurement until its sample."""
@@ -465,8 +470,7 @@ class LiveLoop:
         queue = np.tile(acts, (len(design.queue), 1))
         self._law, self.backend = serving(replace(law, silence=0))
         self.memory = self._law.initial_memory(queue)
-        timeline = law.timeline
-        anew = self._anew(0.0, first.state, timeline.until_next(timeline.queue(queue)), None)
+        anew = self._anew(0.0, first.state, _until_next(law.timeline, queue), None)
         if isinstance(anew, str):
             return f"there is no way from where the plate is: {anew}"
         self._steering = anew
@@ -479,8 +483,7 @@ class LiveLoop:
         if not (belief.has_state and belief.feeds_back and belief.settled and not self.memory.silence):
             return
         in_flight = self.memory.in_flight
-        before = np.vstack([np.zeros(NUM_TORQUES), in_flight[:-1]])  # as long as it was
-        until = belief.timeline.until_next(belief.timeline.queue(before))
+        until = _until_next(belief.timeline, in_flight[:-1])
         acting = Acting(
             np.vstack([until.torques, in_flight[-1:]]), np.append(until.durations, self._period)
         )
@@ -531,10 +534,15 @@ class LiveLoop:
             error=float(100 * np.mean(np.abs(error) / self._design.experiment.scale)),
             eta=float(memory.belief.delay[0]),
             trip=link.typical,
-            spread=link.longest - link.shortest,
+            spread=link.spread,
             lost=1 - (1 - link.loss_there) * (1 - link.loss_back),
             missed=self.pace.missed,
             safe=MachineFlags.SAFE in self._flags,
             by_hand=self._by_hand,
             limit=self._steering.limit,
         )
+
+
+def _until_next(timeline: Timeline, flying: Array) -> Acting:
+    """What acts from now until the next torque does, of torques (n >= L, 6) that are under way."""
+    return timeline.until_next(timeline.queue(np.vstack([np.zeros(NUM_TORQUES), flying])))
