@@ -507,7 +507,7 @@ class Machine:
             head=to.head(time),
             flags=self._flags() | more,
             sampled=sampled,
-            begin=self.begin,
+            begin=self.begin if to is self.session else NEVER,
             period=self.period,
             watchdog=self.watchdog,
             rate=self._settings.rate,

@@ -1,0 +1,184 @@
+"""The least controller that a machine can be tried with, and a clock that tests turn themselves."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stewart_drake.law.channel import Packets, Report
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.motion import KnownMotion
+from stewart_drake.law.native_law import serving
+from stewart_drake.live.endpoint import Address, Endpoint, Session
+from stewart_drake.live.machine import Machine, Settings
+from stewart_drake.live.protocol import (
+    NEVER,
+    NOTHING,
+    SECOND,
+    ControllerFlags,
+    ControllerMessage,
+    MachineMessage,
+)
+from stewart_drake.loop.experiment import control_law, first_queue, prepare
+from stewart_drake.scenario.config import Scenario
+
+
+@dataclass
+class Clock:
+    """ns, as they are set."""
+
+    time: int = 10 * SECOND
+
+    def __call__(self) -> int:
+        return self.time
+
+
+class Driver:
+    """A law behind a socket, which knows the machine's clock because it is the tests'."""
+
+    def __init__(self, scenario: Scenario, machine: Address, key: bytes | None = None) -> None:
+        self.experiment = prepare(scenario)
+        self.law, self.planned, _ = control_law(self.experiment)
+        self.served, _ = serving(self.law)
+        self.memory = self.served.initial_memory(first_queue(self.experiment, self.law))
+        self.endpoint = Endpoint(MachineMessage, key=key)
+        self.session = Session.drawn(machine)
+        self.begin, self.first = NEVER, 0
+        self.period = round(scenario.controller.period * SECOND)
+        self.got: list[MachineMessage] = []
+        self.newest = -1
+        self.torques: list[np.ndarray] = []
+
+    def receive(self, time: int) -> list[MachineMessage]:
+        """What has come; a first nonce is taken."""
+        found = []
+        for message, address in self.endpoint.receive():
+            assert isinstance(message, MachineMessage)
+            refusal = self.session.refusal(message.head, address, time)
+            if refusal is not None:
+                self.endpoint.refused[refusal] += 1
+                continue
+            self.session.nonce = message.head.nonce
+            found.append(message)
+        self.got += found
+        return found
+
+    def say(
+        self,
+        time: int,
+        flags: ControllerFlags = NOTHING,
+        sampled: int = 0,
+        playout: int = 0,
+        torques: np.ndarray | None = None,
+    ) -> ControllerMessage:
+        """Send a datagram."""
+        rows = np.empty((0, 6)) if torques is None else torques
+        head = self.session.head(time)
+        message = ControllerMessage(head, flags, sampled, playout, self.begin, rows)
+        self.endpoint.send(message, self.session.address)
+        return message
+
+    def step(self, time: int) -> ControllerMessage:
+        """The sample that is due at a time of the machine's clock."""
+        number = (time - self.begin) // self.period
+        new = [m for m in self.receive(time) if m.sampled >= self.begin and m.sampled > self.newest]
+        newest = max(new, key=lambda m: m.sampled, default=None)
+        values, age, report = np.full(self.law.sensing.size, np.nan), 0.0, None
+        if newest is not None and newest.values is not None:
+            self.newest, values = newest.sampled, newest.values
+            age = (time - newest.sampled) / SECOND
+            report = self.report(newest, round((time - newest.sampled) / self.period))
+        motion = KnownMotion(self.planned, self.experiment.reference, time_of(number, self.period))
+        c = self.experiment.scenario.controller
+        weights = np.array([c.w_Q, c.w_R])
+        measured = Measurement.of(values, age)
+        self.memory = self.served.step(self.memory, measured, motion, weights, report)
+        self.torques.append(np.array(self.memory.torque))
+        playout = time + round(self.law.timeline.eta * SECOND)
+        rows = np.array(self.memory.torque)[None]
+        if isinstance(self.law.channel, Packets):
+            rows = self.memory.sent.packets[-1]
+            playout -= self.law.channel.repeats * self.period
+        message = self.say(time, sampled=time, playout=playout, torques=rows)
+        if number == 0:
+            self.first = message.head.sequence
+        return message
+
+    def report(self, message: MachineMessage, age: int) -> Report | None:
+        """Of the packets that were sent before the sample of a measurement."""
+        if not isinstance(self.law.channel, Packets) or message.acted_from == NEVER:
+            return None
+        sample = (message.sampled - self.begin) // self.period
+        arrived = []
+        for i in range(64):
+            behind = message.head.acknowledged - (self.first + sample - 1 - i)
+            arrived.append(0 <= behind < 64 and bool(message.arrived[behind]))
+        return Report(np.array(arrived), message.acted, age)
+
+
+def time_of(number: int, period: int) -> float:
+    """s, as the scenario's own grid has it."""
+    return number * (period / SECOND)
+
+
+@dataclass
+class Together:
+    """A machine and a driver on one clock, in one process."""
+
+    scenario: Scenario
+    settings: Settings = field(default_factory=Settings)
+    key: bytes | None = None
+
+    def __post_init__(self) -> None:
+        self.clock = Clock()
+        self.said: list[str] = []
+        self.ear = Endpoint(ControllerMessage, key=self.key)
+        self.machine = Machine(
+            prepare(self.scenario), self.ear, self.settings, self.said.append, self.clock
+        )
+        self.zero = self.clock.time
+        self.driver = Driver(self.scenario, self.ear.address, self.key)
+
+    def at(self, time: int) -> None:
+        """Let the machine's clock come to a time."""
+        while True:
+            self.machine.poll(self.machine.time())
+            upcoming = self.machine.advance(self.machine.time())
+            if upcoming > time:
+                break
+            self.clock.time = self.zero + upcoming
+        self.clock.time = self.zero + time
+        self.machine.advance(time)
+
+    def greet(self, time: int, begin: int) -> None:
+        """From nothing to a session that will begin its run."""
+        self.at(time)
+        for _ in range(50):
+            if self.driver.session.nonce:
+                break
+            self.driver.say(time)
+            time += self.driver.period
+            self.at(time)
+            self.driver.receive(time)
+        assert self.driver.session.nonce
+        self.driver.begin = begin
+        while self.machine.begin == NEVER:
+            self.driver.say(time)
+            time += self.driver.period
+            self.at(time)
+        assert self.machine.begin == begin
+
+    def drive(self, samples: int) -> list[np.ndarray]:
+        """So many samples; the machine's state at each."""
+        states = []
+        begin, period = self.driver.begin, self.driver.period
+        now = self.machine.time()
+        for time in range(now - now % period + period, begin, period):
+            self.at(time)
+            self.driver.say(time)
+        for k in range(samples):
+            time = begin + k * period
+            self.at(time)
+            states.append(np.array(self.machine._body.state))
+            self.driver.step(time)
+        self.at(begin + samples * period)
+        return states
