@@ -426,7 +426,7 @@ class Machine:
             self.counts.update(played=self._motors.played, dry=self._motors.dry)
             self._at_rest()
             where = "at rest"
-        elif not self._safe:
+        else:
             self._go_safe(time)
         self.begin = NEVER
         self._say(f"session {self.counts['sessions']}, of {host}:{port}, begins {where}")

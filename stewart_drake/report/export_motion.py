@@ -4,6 +4,7 @@ The polynomial has pose, rates and accelerations of the motion at both knots. Be
 by O(h^6) where the motion is smooth; where it is not, or h is too long, knots come closer.
 """
 
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -38,7 +39,7 @@ def knots(motion: Trajectory, end: float) -> Array:
     size = np.abs(np.array(rows)[:, 1:]).max(axis=0)
     size = np.maximum(size, 1e-3 * size.reshape(3, 6).max(axis=1).repeat(6) + 1e-9)
     found = [rows[0]]
-    for before, after in zip(rows, rows[1:], strict=False):
+    for before, after in pairwise(rows):
         _refine(motion, before, after, size, found, _HALVES)
     return np.array(found)
 
