@@ -1,5 +1,6 @@
 """The least controller that a machine can be tried with, and a clock that tests turn themselves."""
 
+import select
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,7 +9,7 @@ from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.native_law import serving
-from stewart_drake.live.endpoint import Address, Endpoint, Session
+from stewart_drake.live.endpoint import Address, Endpoint, OtherClock, Session, now
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.protocol import (
     NEVER,
@@ -45,7 +46,7 @@ class Driver:
         self.begin, self.first = NEVER, 0
         self.period = round(scenario.controller.period * SECOND)
         self.got: list[MachineMessage] = []
-        self.newest = -1
+        self.newest, self.looked_at = -1, 0
         self.torques: list[np.ndarray] = []
 
     def receive(self, time: int) -> list[MachineMessage]:
@@ -77,10 +78,14 @@ class Driver:
         self.endpoint.send(message, self.session.address)
         return message
 
-    def step(self, time: int) -> ControllerMessage:
-        """The sample that is due at a time of the machine's clock."""
+    def step(self, time: int, own: int | None = None) -> ControllerMessage:
+        """The sample that is due at a time of the machine's clock; `own` is another one's."""
+        own = time if own is None else own
         number = (time - self.begin) // self.period
-        new = [m for m in self.receive(time) if m.sampled >= self.begin and m.sampled > self.newest]
+        self.receive(own)
+        least = max(self.begin, self.newest + 1)
+        new = [m for m in self.got[self.looked_at :] if m.sampled >= least]
+        self.looked_at = len(self.got)
         newest = max(new, key=lambda m: m.sampled, default=None)
         values, age, report = np.full(self.law.sensing.size, np.nan), 0.0, None
         if newest is not None and newest.values is not None:
@@ -98,7 +103,7 @@ class Driver:
         if isinstance(self.law.channel, Packets):
             rows = self.memory.sent.packets[-1]
             playout -= self.law.channel.repeats * self.period
-        message = self.say(time, sampled=time, playout=playout, torques=rows)
+        message = self.say(own, sampled=time, playout=playout, torques=rows)
         if number == 0:
             self.first = message.head.sequence
         return message
@@ -118,6 +123,43 @@ class Driver:
 def time_of(number: int, period: int) -> float:
     """s, as the scenario's own grid has it."""
     return number * (period / SECOND)
+
+
+def drive_in_real_time(driver: Driver, samples: int) -> np.ndarray:
+    """From a request for a session to a stop; (samples, 12) what was measured, NaN what was not."""
+    clock, period = OtherClock(), driver.period
+
+    def hear(until: int) -> None:
+        while (left := until - now()) > 0:
+            select.select([driver.endpoint], [], [], left / SECOND)
+            for message in driver.receive(now()):
+                clock.note(message.head, now())
+
+    def machine() -> int:
+        return round(clock.at(now()) * SECOND)
+
+    for _ in range(100):
+        driver.say(now())
+        hear(now() + period // 2)
+        trips = sum(m.head.acknowledged > 0 for m in driver.got)
+        if trips >= 10 and driver.begin == NEVER:
+            driver.begin = (machine() // period + 8) * period
+        if driver.got and driver.got[-1].begin == driver.begin != NEVER:
+            break
+    while machine() < driver.begin - period:
+        driver.say(now())
+        hear(now() + period // 2)
+    for k in range(samples):
+        time = driver.begin + k * period
+        while machine() < time + period // 3:
+            if driver.got[-1].sampled >= time:
+                break
+            hear(now() + period // 50)
+        driver.step(time, now())
+    driver.say(now(), ControllerFlags.STOP)
+    there = {(m.sampled - driver.begin) // period: m.state for m in driver.got}
+    nothing = np.full(12, np.nan)
+    return np.array([there.get(k, nothing) for k in range(samples)])
 
 
 @dataclass
