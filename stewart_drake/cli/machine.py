@@ -1,6 +1,7 @@
 """A simulated machine in real time, for a controller over a link: machine."""
 
 import signal
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -69,22 +70,26 @@ def machine(
     delivery = Delivery(None, quiet, as_json)
     endpoint = Endpoint(ControllerMessage, host, port, None if key is None else read_key(key))
     running = Machine(experiment, endpoint, chosen, delivery.say)
-    delivery.say(_first_line(running, scenario, endpoint.address))
-    interrupted = _run(running, duration or float("inf"))
+    interrupted = _run(
+        running,
+        duration or float("inf"),
+        lambda: delivery.say(_first_line(running, scenario, endpoint.address)),
+    )
     endpoint.close()
     summary = running.summary()
     delivery.say(_last_line(summary))
     return delivery.end(summary, interrupted)
 
 
-def _run(machine: "Machine", duration: float) -> bool:
-    """Whether Ctrl-C, or a request to end, came first."""
+def _run(machine: "Machine", duration: float, listens: Callable[[], None]) -> bool:
+    """Say that it listens and go on; whether Ctrl-C, or a request to end, came first."""
 
     def ask_to_end(*_: Any) -> None:
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGTERM, ask_to_end)
     try:
+        listens()
         machine.run(duration)
     except KeyboardInterrupt:
         return True

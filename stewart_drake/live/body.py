@@ -97,7 +97,8 @@ class DrakeBody:
         plant: Any = self._diagram.GetSubsystemByName("plant")
         plant.set_state(plant.GetMyMutableContextFromRoot(context), experiment.start)
         self._plant = plant
-        self._torque: Any = self._diagram.GetInputPort("torque").FixValue(context, self._bias)
+        self._torque = self._diagram.GetInputPort("torque")
+        self._torque.FixValue(context, self._bias)
         self._simulator = Simulator(self._diagram, context)
         if experiment.scenario.plant.kind == "exact":
             set_accuracy(self._simulator, experiment.scenario.plant.accuracy)
@@ -110,10 +111,10 @@ class DrakeBody:
 
     def advance(self, time: float, torque: Array) -> Failure | None:
         """See `Body`."""
-        context = self._simulator.get_context()
+        context = self._simulator.get_mutable_context()
         if time <= self.time:
             return None
-        self._torque.GetMutableVectorData().SetFromVector(torque + self._bias)
+        self._torque.FixValue(context, torque + self._bias)
         try:
             outcome = self._simulator.AdvanceTo(look_time(time))
         except RuntimeError as error:  # of Drake's solver, where constraints contradict dynamics

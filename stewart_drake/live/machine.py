@@ -426,7 +426,7 @@ class Machine:
             self.counts.update(played=self._motors.played, dry=self._motors.dry)
             self._at_rest()
             where = "at rest"
-        elif not self._safe:
+        else:
             self._go_safe(time)
         self.begin = NEVER
         self._say(f"session {self.counts['sessions']}, of {host}:{port}, begins {where}")
@@ -507,7 +507,7 @@ class Machine:
             head=to.head(time),
             flags=self._flags() | more,
             sampled=sampled,
-            begin=self.begin,
+            begin=self.begin if to is self.session else NEVER,
             period=self.period,
             watchdog=self.watchdog,
             rate=self._settings.rate,

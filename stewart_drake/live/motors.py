@@ -228,5 +228,5 @@ class WireMotors(_Shafts):
     def safe(self, time: int, holds: bool) -> None:
         """See `Motors`."""
         self._arriving.clear()
-        self.fed = False
+        self.fed, self._newest = False, -MOST_KEPT  # a new session counts anew
         self._act(self.torque if holds else _ZERO, time)
