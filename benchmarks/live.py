@@ -1,6 +1,6 @@
 """The loop in real time, in two processes: `python benchmarks/live.py [section ...]`.
 
-Writes benchmarks/results/live.md. Sections: minutes (ten of them, MINUTES of the environment), kills
+Writes benchmarks/results/live.md. Sections: minutes (ten, or MINUTES of the environment), kills
 (KILLS of them), page (needs chromium). The machine is that of `paper` on the exact plant, behind a
 link of 0.28 to 0.32 s each way that loses 2 % of the packets; every process shares this computer's
 cores with whatever else runs on it, so that the load is told beside the figures.
@@ -33,6 +33,7 @@ MINUTES = float(os.environ.get("MINUTES", "10"))
 KILLS = int(os.environ.get("KILLS", "20"))
 SEED = 29
 WAY = "low: 0.28, high: 0.32, loss: 0.02"
+"""Evenly 20 ms to either side of 0.3 s."""
 LINK = f"link={{kind: network, {WAY}, seed: {SEED}, return: {{{WAY}}}}}"
 WINDOW = 10.0
 """s"""
@@ -59,7 +60,9 @@ class Command:
         for line in self.process.stdout:
             self.lines.append((time.monotonic(), line.strip()))
 
-    def wait_for(self, pattern: str, patience: float = 120.0, after: float = 0.0) -> tuple[float, str]:
+    def wait_for(
+        self, pattern: str, patience: float = 120.0, after: float = 0.0
+    ) -> tuple[float, str]:
         """When a line came, not before `after`, that has the pattern, and what it has in brackets.
 
         Raises:
@@ -176,9 +179,7 @@ def minutes() -> list[str]:
     ]
     for name, each in rows.items():
         rest = each[1:]
-        lines.append(
-            f"| {name} | {each[0]:.2f} | {np.median(rest):.2g} | {rest.max():.2g} |"
-        )
+        lines.append(f"| {name} | {each[0]:.2f} | {np.median(rest):.2g} | {rest.max():.2g} |")
     return lines
 
 
@@ -195,7 +196,7 @@ def kills() -> list[str]:
         options = ("--restart", restart, "--set", LINK)
         began, where = machine(*options)
         first = live(where)
-        at, _ = began.wait_for("the run began")
+        began.wait_for("the run began")
         spare = live(where) if side == "controller" else None
         if spare is not None:
             spare.wait_for("^motion:")  # it waits for its turn, for five seconds
@@ -208,7 +209,9 @@ def kills() -> list[str]:
             _machine_killed(first, killed, found)
         for each in (first, began, *([] if spare is None else [spare])):
             each.end()
-        print(number, side, restart, {name: len(those) for name, those in found.items()}, flush=True)
+        print(
+            number, side, restart, {name: len(those) for name, those in found.items()}, flush=True
+        )
     safe, taken, refused = found["safe"], found["taken"], found["refused"]
     return [
         f"## {KILLS} kills",
@@ -220,7 +223,9 @@ def kills() -> list[str]:
         "promises 1 s after the last word, which is up to 0.32 s on its way.",
         f"- A controller that waited took over {len(taken)} times: "
         + ", ".join(f"{sum(t == kind for t in taken)} {kind}" for kind in ("at rest", "in motion"))
-        + f"; refused {len(refused)} times" + (f" ({'; '.join(refused)})" if refused else "") + ".",
+        + f"; refused {len(refused)} times"
+        + (f" ({'; '.join(refused)})" if refused else "")
+        + ".",
         f"- Without its machine a controller said so after {max(found['late']):.1f} s at the most, "
         f"and stopped after {min(found['lost']):.1f} to {max(found['lost']):.1f} s.",
     ]
@@ -273,19 +278,28 @@ def page() -> list[str]:
         "const was = window.live.wanted[5]; let hand = 0; "
         "source.addEventListener('message', e => { const now = JSON.parse(e.data); "
         "hand ||= now.byHand ? performance.now() - t0 : 0; "
-        "if (hand && Math.abs(now.wanted[5] - (+s.value)) < 1) done([hand, performance.now() - t0]); });"
-        "s.value = 390; s.dispatchEvent(new Event('input')); setTimeout(() => done([-1, -1]), 20000); })"
+        "const there = Math.abs(now.wanted[5] - (+s.value)) < 1; "
+        "if (hand && there) done([hand, performance.now() - t0]); }); "
+        "s.value = 390; s.dispatchEvent(new Event('input')); "
+        "setTimeout(() => done([-1, -1]), 20000); })"
     )
     run = Command("live", "--demo", "--duration", "300")
     _, url = run.wait_for(r"page: (\S+)", 180)
-    lines = ["## The page", "", "| width, px | frames per second | slider to loop, ms | to the ring at the target, ms |",
-             "| --- | --- | --- | --- |"]
+    lines = [
+        "## The page",
+        "",
+        "| width, px | frames per second | slider to loop, ms | to the ring at the target, ms |",
+        "| --- | --- | --- | --- |",
+    ]
     try:
         with browser() as b:
             for width in (1280, 400):
                 b.call(
                     "Emulation.setDeviceMetricsOverride",
-                    width=width, height=800, deviceScaleFactor=1, mobile=width < 600,
+                    width=width,
+                    height=800,
+                    deviceScaleFactor=1,
+                    mobile=width < 600,
                 )
                 b.call("Page.navigate", url=url)
                 b.wait("window.live !== undefined && window.live.time > 5 && !window.live.byHand")
@@ -299,7 +313,11 @@ def page() -> list[str]:
     finally:
         run.end()
     load = os.getloadavg()[0]
-    return [*lines, "", f"Errors in the browser: {len(errors)}. Drawn in software, load {load:.1f}."]
+    return [
+        *lines,
+        "",
+        f"Errors in the browser: {len(errors)}. Drawn in software, load {load:.1f}.",
+    ]
 
 
 SECTIONS = {"minutes": minutes, "kills": kills, "page": page}
@@ -318,7 +336,10 @@ def main() -> None:
         print("\n".join(lines))
         parts = {head: part for head, part in parts.items() if known[name] not in head}
         parts[lines[0]] = "\n".join(lines)
-    head = "# The loop in real time\n\nWritten by `python benchmarks/live.py`, with Drake " + versions()["drake"]
+    head = (
+        "# The loop in real time\n\nWritten by `python benchmarks/live.py`, with Drake "
+        + versions()["drake"]
+    )
     RESULTS.mkdir(exist_ok=True)
     path.write_text("\n\n".join([head + ".", *parts.values()]) + "\n")
 

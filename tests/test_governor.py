@@ -69,7 +69,9 @@ def test_whatever_is_asked_for_the_limits_hold(name, gravity, limit):
     torques = [dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in states]
     assert np.abs(torques).max() <= TORQUE_SHARE * limit
     # The motion is one: pose, rates and accelerations go on where the last period ended.
-    np.testing.assert_allclose(np.diff(states[:, POSE], axis=0) / 1e-3, states[:-1, RATES], atol=0.02)
+    np.testing.assert_allclose(
+        np.diff(states[:, POSE], axis=0) / 1e-3, states[:-1, RATES], atol=0.02
+    )
     assert np.ptp(states[:, 5]) > 0.2 * dynamics.mechanism.crank_lengths.min()
 
 

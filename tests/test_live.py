@@ -45,9 +45,7 @@ class Running:
         scenario = scenario_of(*settings)
         self.lines = []
         self.endpoint = Endpoint(ControllerMessage, "127.0.0.1", 0)
-        self.machine = Machine(
-            prepare(scenario), self.endpoint, Settings(**how), self.lines.append
-        )
+        self.machine = Machine(prepare(scenario), self.endpoint, Settings(**how), self.lines.append)
         self.address, self._stopping = self.endpoint.address, threading.Event()
         self._thread = threading.Thread(target=self._run)
 
@@ -159,8 +157,8 @@ def test_a_second_controller_takes_over_in_motion(quiet_machine):
         assert running.machine.failure is None or result.status in ("refused", "left_workspace")
     if result.status == "completed":
         assert result.summary["live"]["taken_over"]
-        error = np.abs(result.signals.error.values[-1]) / result.signals.reference.values.ptp()
-        assert error.max() < 0.5
+        error = np.abs(result.signals.error.values[-1])
+        assert (error / np.repeat([0.52, 0.04, 0.16], [3, 2, 1])).max() < 0.3
     else:  # the plate went too far meanwhile
         assert result.status in ("refused", "left_workspace") and result.stopped.reason
 
@@ -264,14 +262,14 @@ def test_a_real_machine_wants_to_be_armed(quiet_machine):
         ready = prepare_session(scenario_of(), running.address)
         ready.contact.last = replace(ready.contact.last, flags=MachineFlags.PARKED)
         assert "A REAL MACHINE" in plans(ready, math.inf, "paper")[0]
-        with pytest.raises(ConfigError, match="^--arm"):
+        with pytest.raises(ConfigError, match=r"^--arm"):
             check_armed(ready, False)
         check_armed(ready, True)
 
 
 @pytest.mark.parametrize("text", ["localhost", "127.0.0.1:", "127.0.0.1:0", ":7000", "a b:7000"])
 def test_an_address_that_is_none_is_refused(text):
-    with pytest.raises(ConfigError, match="^--machine: got"):
+    with pytest.raises(ConfigError, match=r"^--machine: got"):
         address_of(text)
 
 
@@ -302,8 +300,16 @@ def test_round_trips_and_losses_are_those_of_the_link(offer):
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"[]", b"{", b'{"target": [1, 2]}', b'{"target": [1, 2, 3, 4, 5, NaN]}',
-     b'{"target": [1, 2, 3, 4, 5, true]}', b'{"stop": 1}', b'{"target": "home"}'],
+    [
+        b"",
+        b"[]",
+        b"{",
+        b'{"target": [1, 2]}',
+        b'{"target": [1, 2, 3, 4, 5, NaN]}',
+        b'{"target": [1, 2, 3, 4, 5, true]}',
+        b'{"stop": 1}',
+        b'{"target": "home"}',
+    ],
 )
 def test_what_is_no_wish_is_refused(data):
     assert read_wish(data) is None

@@ -65,8 +65,8 @@ def live(
 ) -> int:
     """Drive a machine over UDP in real time, with sliders in the browser.
 
-    The law is that of `simulate`. Ctrl-C brings the plate to rest and ends it; Ctrl-C again, or Stop
-    on the page, stops it at once.
+    The law is that of `simulate`. Ctrl-C brings the plate to rest and ends it; Ctrl-C again, or
+    Stop on the page, stops it at once.
     """
     from stewart_drake.live.connect import address_of
     from stewart_drake.live.endpoint import read_key
@@ -95,9 +95,7 @@ def live(
         if not ready.simulated and sys.stdin.isatty():
             input("Enter begins, Ctrl-C leaves it alone")
         with _Ending() as ending:
-            result = drive(
-                ready, span, armed=arm, viewer=viewer, ending=ending, say=delivery.say
-            )
+            result = drive(ready, span, armed=arm, viewer=viewer, ending=ending, say=delivery.say)
     return _told(delivery, result)
 
 

@@ -88,7 +88,7 @@ def await_free(contact: Contact) -> None:
     assert last is not None
     patience = max(_PATIENCE * SECOND, 2 * last.watchdog)
     while True:
-        if _ask(contact) and MachineFlags.BUSY not in contact.last.flags:
+        if _ask(contact) and MachineFlags.BUSY not in (contact.last or last).flags:
             return
         if now() - began > patience:
             raise ConfigError(

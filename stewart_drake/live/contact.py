@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from stewart_drake.live.endpoint import Address, Endpoint, Session, now
 from stewart_drake.live.protocol import (
     NEVER,
+    NOTHING,
     SECOND,
     ControllerFlags,
     ControllerMessage,
@@ -133,7 +134,7 @@ class Contact:
         sampled: int = 0,
         playout: int = 0,
         begin: int = NEVER,
-        flags: ControllerFlags = ControllerFlags(0),
+        flags: ControllerFlags = NOTHING,
     ) -> int:
         """Send a datagram of these fields; its sequence."""
         rows = np.empty((0, NUM_TORQUES)) if torques is None else torques

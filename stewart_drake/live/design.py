@@ -76,13 +76,12 @@ def check_peer(scenario: Scenario, machine: MachineMessage) -> None:
     encoders = isinstance(sensor, EncoderSensorConfig)
     if encoders != (machine.codes is not None):
         says = "encoders" if machine.codes is not None else "state"
-        raise ConfigError(f"sensor.kind: got {sensor.kind!r}; expected {says!r}, as the machine has")
-    if isinstance(sensor, EncoderSensorConfig) and machine.codes is not None:
-        if len(machine.codes) != sensor.samples:
-            raise ConfigError(
-                f"sensor.samples: got {sensor.samples}; expected the machine's "
-                f"{len(machine.codes)}"
-            )
+        raise ConfigError(
+            f"sensor.kind: got {sensor.kind!r}; expected {says!r}, as the machine has"
+        )
+    read = 0 if machine.codes is None else len(machine.codes)
+    if isinstance(sensor, EncoderSensorConfig) and read != sensor.samples:
+        raise ConfigError(f"sensor.samples: got {sensor.samples}; expected the machine's {read}")
     if not isinstance(scenario.tuner, FixedTunerConfig):
         raise ConfigError(f"tuner.kind: got {scenario.tuner.kind!r}; expected 'fixed' for live")
     if not isinstance(scenario.actuator, TorqueActuatorConfig):

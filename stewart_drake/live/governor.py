@@ -6,7 +6,8 @@ Each coordinate follows an applied target g through three equal poles,
 
 so that pose, rates and accelerations are continuous. With e = q - g at the start, and g constant,
 
-    e(t) = (c0 + c1 t + c2 t^2) exp(-w t),   c0 = e,  c1 = q' + w e,  c2 = (q'' + 2 w q' + w^2 e) / 2.
+    e(t) = (c0 + c1 t + c2 t^2) exp(-w t),
+    c0 = e,   c1 = q' + w e,   c2 = (q'' + 2 w q' + w^2 e) / 2.
 
 The impulse response of three equal poles is positive: a target that moves one way moves the
 coordinate that way, without overshoot, and a pose at rest never turns back.
@@ -256,4 +257,3 @@ class Blend(NamedTuple):
     """The way, then the motion."""
     end: float
     """s, when the motion is reached."""
-

@@ -28,6 +28,7 @@ from stewart_drake.live.endpoint import now
 from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.protocol import (
     NEVER,
+    NOTHING,
     SECOND,
     ControllerFlags,
     MachineFlags,
@@ -199,6 +200,7 @@ class LiveLoop:
     ) -> None:
         self._design, self._steering, self._contact = design, steering, contact
         self._viewer, self._say = viewer, say
+        self._law: Any
         self._law, self.backend = serving(design.law)
         self.record, self.pace = LiveRecord(design.experiment, self.backend), Pace()
         self.memory: AnyMemory = self._law.initial_memory(design.queue)
@@ -212,7 +214,8 @@ class LiveLoop:
         self._began, self._came = 0, dict[int, MachineMessage]()
         self._sequences = dict[int, int]()
         self._flags, self._silent_since = MachineFlags(0), 0
-        self._asked, self._recording = ControllerFlags(0), True
+        self._asked, self._recording = NOTHING, True
+        self._parked = self._leads = False
 
     # -------------------------------------------------------------- the begin
 
@@ -228,6 +231,7 @@ class LiveLoop:
         last = contact.last
         assert last is not None
         contact.join(last.head.nonce)
+        self._parked = bool(last.flags & (MachineFlags.PARKED | MachineFlags.RESETS))
         # Of the machine's clock, or earlier by the way back.
         here = (clock.monotonic() - contact.soonest) * last.rate
         lead = _LEAD + contact.link.longest
@@ -350,7 +354,9 @@ class LiveLoop:
         if MachineFlags.LEFT in message.flags:
             pose = self.memory.belief.state[POSE]
             found = diagnose(self._design.experiment.mechanism, time, pose)
-            said = Failure(time, None, math.nan, "the machine says that the plate left its workspace")
+            said = Failure(
+                time, None, math.nan, "the machine says that the plate left its workspace"
+            )
             return End("left_workspace", found or said)
         if MachineFlags.SAFE in message.flags & ~before:
             self._say(f"at {time:.1f} s: the machine is at its safe torque")
@@ -360,18 +366,20 @@ class LiveLoop:
 
     def _sample(self, k: int, message: MachineMessage | None) -> End | None:
         design, t = self._design, k * self._period
-        size = design.law.sensing.size
-        values = np.full(size, np.nan)
-        if message is not None and (message.state is not None or message.codes is not None):
-            values = message.values
-        measurement, report = Measurement.of(values), None
+        measured = None if message is None else message.values
+        nothing = np.full(design.law.sensing.size, np.nan)
+        measurement, report = Measurement.of(nothing if measured is None else measured), None
         if message is not None:
             self.record.acted(self._acted(message))
             report = self._report(k)
-        if k == 0:
-            refused = self._start(measurement, message)
+        if not self._leads:
+            if not measurement.complete and not self._parked:  # who knows where it is
+                self._contact.send(begin=self._began, flags=self._asked)
+                return None
+            refused = self._start(t, measurement, message)
             if refused is not None:
-                return End("refused", Failure(0.0, None, math.nan, refused))
+                return End("refused", Failure(t, None, math.nan, refused))
+            self._leads = True
         wish = self._viewer.wish() if self._recording else Wish(rest=True)
         self._steering = self._steering.on(t + self._horizon, wish)
         way = self._steering.way
@@ -454,12 +462,14 @@ class LiveLoop:
 
     # -------------------------------------------------------------- the way
 
-    def _start(self, measurement: Measurement, message: MachineMessage | None) -> str | None:
-        """Lead the plate from where it is, unless that is the scenario's start; why not, or None."""
+    def _start(
+        self, t: float, measurement: Measurement, message: MachineMessage | None
+    ) -> str | None:
+        """Lead the plate from where it is, if not at the scenario's start; why not, or None."""
         design, law = self._design, self._design.law
-        first = law.sensing.start(measurement)
+        first = law.sensing.start(measurement) if measurement.complete else None
         if first is None:
-            return None  # it is where it should be, for all that is known
+            return None  # put there, as it says
         away = np.abs(first.state - design.experiment.start) / np.tile(self._size, 2)
         if away.max() <= AT_START:
             return None
@@ -470,7 +480,7 @@ class LiveLoop:
         queue = np.tile(acts, (len(design.queue), 1))
         self._law, self.backend = serving(replace(law, silence=0))
         self.memory = self._law.initial_memory(queue)
-        anew = self._anew(0.0, first.state, _until_next(law.timeline, queue), None)
+        anew = self._anew(t, first.state, _until_next(law.timeline, queue), None)
         if isinstance(anew, str):
             return f"there is no way from where the plate is: {anew}"
         self._steering = anew
@@ -480,7 +490,9 @@ class LiveLoop:
     def _recover(self, k: int) -> None:
         """Plan a new way where the prediction is off the old one."""
         belief, law = self.memory.belief, self._design.law
-        if not (belief.has_state and belief.feeds_back and belief.settled and not self.memory.silence):
+        if not (
+            belief.has_state and belief.feeds_back and belief.settled and not self.memory.silence
+        ):
             return
         in_flight = self.memory.in_flight
         until = _until_next(belief.timeline, in_flight[:-1])

@@ -1,6 +1,7 @@
 """The page of a live run: the machine in Meshcat, readouts, sliders, and the button that stops it.
 
-It is served by a process of its own, so that neither drawing nor a browser takes time from the loop.
+It is served by a process of its own, so that neither drawing nor a browser takes time from the
+loop.
 Both servers listen on this computer alone. What asks the machine to do something must bring the
 token that is in the page's address: other pages in the same browser, which can send to this
 computer too, do not know it.

@@ -1,8 +1,9 @@
 """What the law is to follow while somebody may take the reference over: the motion or a hand.
 
-A torque computed at t acts at t + eta, and is computed from the reference up to t + h, h >= eta. So
-what is asked for at t changes the reference from t + h on, and nothing before: no torque in flight is
-ever wrong by it, and no error arises from a target that moves. That is how long a hand waits.
+A torque computed at t acts at t + eta, and is computed from the reference up to t + h, h >= eta.
+So what is asked for at t changes the reference from t + h on, and nothing before: no torque in
+flight is ever wrong by it, and no error arises from a target that moves. That is how long a hand
+waits.
 """
 
 from collections.abc import Callable
@@ -69,7 +70,7 @@ class Way:
         return self.stretches[0].at(time)
 
     def then(self, begin: float, at: Callable[[float], Array]) -> "Way":
-        """The same up to `begin`, and something else from there on; what is long past is dropped."""
+        """The same up to `begin`, something else from there on; what is long past is dropped."""
         before = [s for s in self.stretches if s.begin < begin]
         while len(before) > 1 and before[1].begin < begin - _KEPT:
             del before[0]

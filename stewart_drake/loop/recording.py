@@ -244,6 +244,6 @@ def summarize(
 
 def _floor(experiment: Experiment, time: Array, reference: Array) -> float:
     sc = experiment.scenario
-    if not waits_at_rest(sc):
+    if not waits_at_rest(sc) or not len(time):
         return 0.0
     return metrics.delay_floor(time, reference, experiment.scale, sc.eta)
