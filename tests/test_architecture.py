@@ -33,6 +33,7 @@ ROOMS = (
     "studies",
     "tuning",
     "report",
+    "live",
     "cli",
 )
 RANK = {name: number for number, name in enumerate(ROOMS)}

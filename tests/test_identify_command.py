@@ -118,7 +118,11 @@ def broken(signals: xr.Dataset, how: str) -> xr.Dataset:
         signals.attrs.pop("scenario")
     elif how in ("network", "sensor.delay"):
         old, new = {
-            "network": ("link:\n  kind: wire", "link:\n  kind: network"),
+            "network": (
+                "link:\n  kind: wire",
+                "link:\n  kind: network\n  low: 0.1\n  high: 0.2\n"
+                "  return:\n    low: 0.1\n    high: 0.2",
+            ),
             "sensor.delay": ("sensor:\n  kind: state", "sensor:\n  delay: 0.1\n  kind: state"),
         }[how]
         text = signals.attrs["scenario"]

@@ -6,7 +6,18 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from stewart_drake.cli import analyze, identify, layout, model, new, report, run, tune
+from stewart_drake.cli import (
+    analyze,
+    identify,
+    layout,
+    live,
+    machine,
+    model,
+    new,
+    report,
+    run,
+    tune,
+)
 from stewart_drake.cli.common import INTERRUPTED, release
 from stewart_drake.cli.examples import add_examples
 from stewart_drake.files.errors import ConfigError
@@ -25,6 +36,8 @@ app.command()(report.report)
 app.command()(identify.identify)
 app.command()(new.new)
 app.command()(layout.layout)
+app.command()(machine.machine)
+app.command()(live.live)
 app.add_typer(model.app, name="model")
 app.add_typer(analyze.app, name="analyze")
 app.add_typer(tune.app, name="tune")

@@ -18,7 +18,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import brief, parse_yaml, validate
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.config import Scenario, StateSensorConfig
+from stewart_drake.scenario.config import NetworkConfig, Scenario, StateSensorConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE, NUM_TORQUES
 
 Array = NDArray[np.float64]
@@ -109,11 +109,10 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
             f"{path}: log_period: got a step of {np.diff(time).max():.4g} s, longer than the "
             f"controller's {period:g} s; expected each of its samples in the log"
         )
-    torques = signals.torque_commanded.transpose("time", "leg").values[rows]
+    torques, believed = _sent(signals, scenario, samples, rows)
     own = scenario.actuator.torque_limit
     limit = mechanism.effort_limit if own is None else own
     times, values, std = _measured(signals.measurement, scenario, samples, rows)
-    believed = float(signals.delay_estimate.values[-1])
     return _checked(
         Log(
             name=str(path),
@@ -127,6 +126,22 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
         ),
         path,
     )
+
+
+def _sent(
+    signals: xr.Dataset, scenario: Scenario, samples: Array, rows: NDArray[np.intp]
+) -> tuple[Array, float]:
+    """Torques (n, 6) that were sent at `samples`, as far as they arrived, and their delay, s.
+
+    Over a network other torques may act than were sent; but when they act is known, a bound later.
+    So what acted then stands for what was sent.
+    """
+    if not isinstance(scenario.link, NetworkConfig):
+        torques = signals.torque_commanded.transpose("time", "leg").values[rows]
+        return torques, float(signals.delay_estimate.values[-1])
+    eta, time = scenario.eta, signals.time.values
+    then = np.minimum(np.searchsorted(time, samples + eta - 1e-9), len(time) - 1)
+    return signals.torque_applied.transpose("time", "leg").values[then], eta
 
 
 def _measured(
@@ -171,6 +186,7 @@ def _run_problem(signals: xr.Dataset, scenario: Scenario) -> str | None:
         measured = {"encoder": NUM_LEGS * sensor.samples}
     shapes: dict[str, dict[str, int]] = {
         "torque_commanded": {"leg": NUM_TORQUES},
+        "torque_applied": {"leg": NUM_TORQUES},
         "measurement": measured,
         "delay_estimate": {},
     }
@@ -182,8 +198,8 @@ def _run_problem(signals: xr.Dataset, scenario: Scenario) -> str | None:
             return f"{name} is no signal over time of {others or 'one number'}"
     if "time" not in signals.coords or not np.all(np.diff(signals.time.values) > 0):
         return "time does not increase"
-    if scenario.link.kind != "wire":
-        return "its torques went over a network, each with a delay of its own"
+    if isinstance(scenario.link, NetworkConfig) and scenario.link.back is not None:
+        return "its measurements came over a network, each of an age of its own (link.return)"
     if scenario.actuator.kind != "torque":
         return f"its motors got no torques (actuator.kind {scenario.actuator.kind!r})"
     if scenario.sensor.delay > 0:

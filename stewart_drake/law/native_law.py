@@ -213,6 +213,12 @@ class NativeMemory:
         )
         return Belief(estimate, self.timeline, self._part("measured"))
 
+    def without_error(self) -> "NativeMemory":
+        """The same with nothing integrated."""
+        data = self.data.copy()
+        data["error"], data["integral"] = 0.0, 0.0
+        return NativeMemory(data, self.timeline, self.length)
+
     def _part(self, name: str) -> Array:
         part: Array = self.data[name]
         return part

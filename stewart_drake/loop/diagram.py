@@ -55,9 +55,9 @@ from stewart_drake.scenario.config import (
     ServoActuatorConfig,
 )
 from stewart_drake.scenario.link import (
+    forward_times,
     measurement_times,
     number_sent,
-    packet_times,
     torque_delays,
 )
 from stewart_drake.scenario.signals import (
@@ -142,6 +142,30 @@ def build_closed_loop(
     loop.set_name("closed_loop")
     loop.experiment, loop.catch_up = experiment, catch_up
     return loop
+
+
+def build_machine(experiment: Experiment) -> Diagram:
+    """Plant and sensor alone, for torques that come from elsewhere.
+
+    | port | direction | size | unit |
+    | --- | --- | --- | --- |
+    | torque | input | 6 | N m, at the shafts: what acts, and the bias |
+    | state | output | 12 | rad, m, rad/s, m/s |
+    | measurement | output | 12, or 6 N of encoders | the same; rad |
+
+    Args:
+        experiment: of a scenario whose motors take torques.
+    """
+    builder = DiagramBuilder()
+    plant = builder.AddNamedSystem("plant", _plant(experiment, None))
+    sensor = builder.AddNamedSystem("sensor", _sensor(experiment))
+    builder.Connect(plant.GetOutputPort("state"), sensor.GetInputPort("state"))
+    builder.ExportInput(plant.GetInputPort("torque"), "torque")
+    builder.ExportOutput(plant.GetOutputPort("state"), "state")
+    builder.ExportOutput(sensor.GetOutputPort("measurement"), "measurement")
+    machine = builder.Build()
+    machine.set_name("machine")
+    return machine
 
 
 def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
@@ -390,7 +414,7 @@ def _link(experiment: Experiment, channel: Channel, reports: int) -> System:
     period, queue = sc.controller.period, torques_in_flight(experiment, delay)
     if isinstance(sc.link, NetworkConfig):
         repeats = channel.repeats if isinstance(channel, Packets) else 0
-        times = packet_times(sc.link, number_sent(sc.duration, period), sc.link.seed)
+        times = forward_times(sc.link, number_sent(sc.duration, period))
         return PlayoutBuffer(
             period,
             times,

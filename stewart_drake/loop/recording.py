@@ -1,6 +1,7 @@
 """Collecting the signals of a running loop, and summing them up."""
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -65,8 +66,12 @@ class Table:
         return self.columns(slice(place, place + 1))[:, 0]
 
 
-class Recorder:
-    """Collects signals of the loop: `look` at the plant, then `keep` that and the held signals.
+class Record:
+    """What is kept of a run, wherever the signals come from.
+
+    Args:
+        experiment: that is run.
+        backend: what steps the law.
 
     Attributes:
         on_grid: time, pose error (6) and reference (6) on the metric's grid, and where a run ended.
@@ -79,28 +84,63 @@ class Recorder:
         delay: at the last sample, s: true, as it is believed in or estimated, standard deviation.
     """
 
-    def __init__(self, loop: ClosedLoop) -> None:
-        self._loop = loop
-        self._ports: dict[str, Any] = {}
-        controller: Any = loop.GetSubsystemByName("controller")
-        self._controller, self.controller_backend = controller, str(controller.backend)
-        tuner = loop.GetSubsystemByName("tuner") if loop.HasSubsystemNamed("tuner") else None
-        self._tuner = tuner if isinstance(tuner, AnnTuner) else None
-        self._scale = loop.experiment.scale
-        self._instant = 0.0
-        self._state, self._wanted, self._error = np.empty(0), np.empty(0), np.empty(0)
-        sensor = loop.experiment.scenario.sensor
+    def __init__(self, experiment: Experiment, backend: str) -> None:
+        self._scenario, self.controller_backend = experiment.scenario, backend
+        sensor = experiment.scenario.sensor
         samples = sensor.samples if isinstance(sensor, EncoderSensorConfig) else None
         self._signals, self._dimensions = run_signals(samples), run_dimensions(samples)
         self._recorded = [signal for signal in self._signals.values() if signal.source]
-        self._systems = {port: system for port, (system, _) in exported_ports().items()}
-        self._held: dict[str, Array] = {}
         self._log = Table(1 + sum(signal.size for signal in self._recorded))
         self.on_grid, self.samples = Table(13), Table(19)
         self.peak_applied = 0.0
         self.counts, self.tuner_fallbacks = Counts(), 0
         nan = float("nan")
         self.delay: DelaySummary = {"true_s": nan, "estimated_s": nan, "std_s": nan}
+
+    def log(self, time: float, seen: Mapping[str, Array]) -> None:
+        """Add a row to the log: at a time in s, by port what is exported there."""
+        row = [seen[signal.exported][signal.part] for signal in self._recorded]
+        self._log.append(time, *row)
+
+    def dataset(self) -> xr.Dataset:
+        """The log, see `SimulationResult.signals`."""
+        values, start = {}, 1
+        for signal in self._recorded:
+            stop = start + signal.size
+            values[signal.name], start = self._log.columns(slice(start, stop)), stop
+        values["error"] = values["pose"] - values["reference"]
+        variables = {
+            name: _variable(signal, values[name]) for name, signal in self._signals.items()
+        }
+        coordinates: dict[str, Any] = {
+            name: (name, list(dimension.labels), {"long_name": dimension.long_name})
+            for name, dimension in self._dimensions.items()
+        }
+        time = self._log.column(0)
+        coordinates["time"] = ("time", time, {"units": "s", "long_name": "time"})
+        attributes = {
+            "title": "closed loop of a rotary Stewart platform with delayed torques",
+            "scenario": scenario_yaml(self._scenario),
+            "versions": json.dumps(versions()),
+        }
+        return xr.Dataset(variables, coordinates, attributes)
+
+
+class Recorder(Record):
+    """Collects signals of the loop: `look` at the plant, then `keep` that and the held signals."""
+
+    def __init__(self, loop: ClosedLoop) -> None:
+        controller: Any = loop.GetSubsystemByName("controller")
+        super().__init__(loop.experiment, str(controller.backend))
+        self._loop, self._controller = loop, controller
+        self._ports: dict[str, Any] = {}
+        tuner = loop.GetSubsystemByName("tuner") if loop.HasSubsystemNamed("tuner") else None
+        self._tuner = tuner if isinstance(tuner, AnnTuner) else None
+        self._scale = loop.experiment.scale
+        self._instant = 0.0
+        self._state, self._wanted, self._error = np.empty(0), np.empty(0), np.empty(0)
+        self._systems = {port: system for port, (system, _) in exported_ports().items()}
+        self._held: dict[str, Array] = {}
 
     def _port(self, context: Context, name: str) -> Array:
         if name not in self._ports:
@@ -139,35 +179,11 @@ class Recorder:
             # Plant and reference as they were looked at: the plant may have gone on since.
             seen = self._held | {"state": self._state, "reference": self._wanted}
             seen |= {n: self._port(context, n) for n in self._systems if n not in seen}
-            row = [seen[signal.exported][signal.part] for signal in self._recorded]
-            self._log.append(self._instant, *row)
+            self.log(self._instant, seen)
 
     def current_error(self) -> float:
         """Mean pose error in % of peak to peak."""
         return float(100 * np.mean(np.abs(self._error) / self._scale))
-
-    def dataset(self) -> xr.Dataset:
-        """The log, see `SimulationResult.signals`."""
-        values, start = {}, 1
-        for signal in self._recorded:
-            stop = start + signal.size
-            values[signal.name], start = self._log.columns(slice(start, stop)), stop
-        values["error"] = values["pose"] - values["reference"]
-        variables = {
-            name: _variable(signal, values[name]) for name, signal in self._signals.items()
-        }
-        coordinates: dict[str, Any] = {
-            name: (name, list(dimension.labels), {"long_name": dimension.long_name})
-            for name, dimension in self._dimensions.items()
-        }
-        time = self._log.column(0)
-        coordinates["time"] = ("time", time, {"units": "s", "long_name": "time"})
-        attributes = {
-            "title": "closed loop of a rotary Stewart platform with delayed torques",
-            "scenario": scenario_yaml(self._loop.experiment.scenario),
-            "versions": json.dumps(versions()),
-        }
-        return xr.Dataset(variables, coordinates, attributes)
 
 
 def _variable(signal: Signal, values: Array) -> tuple[tuple[str, ...], Array, dict[str, str]]:
@@ -181,7 +197,7 @@ def _variable(signal: Signal, values: Array) -> tuple[tuple[str, ...], Array, di
 
 def summarize(
     experiment: Experiment,
-    recorder: Recorder,
+    recorder: Record,
     status: str,
     stopped: Failure | None,
     wall: float,
@@ -228,6 +244,6 @@ def summarize(
 
 def _floor(experiment: Experiment, time: Array, reference: Array) -> float:
     sc = experiment.scenario
-    if not waits_at_rest(sc):
+    if not waits_at_rest(sc) or not len(time):
         return 0.0
     return metrics.delay_floor(time, reference, experiment.scale, sc.eta)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import xarray as xr
 
@@ -52,7 +52,8 @@ class RunSummary(TypedDict):
     """
 
     status: str
-    """`completed`, `left_workspace`, `solver_failed` or `interrupted`."""
+    """`completed`, `left_workspace`, `solver_failed` or `interrupted`; in real time also
+    `lost_machine`, which fell silent, or `refused`, where there was no way to take it over."""
     accumulated_error: float
     """E_ac in % s, equation (47)."""
     failure: dict[str, Any] | None
@@ -91,6 +92,8 @@ class RunSummary(TypedDict):
     """None where it was not asked for."""
     warnings: list[str]
     """What the user should know of this run, a sentence each."""
+    live: NotRequired[dict[str, Any]]
+    """Of a run in real time: how periodic it was, and what the link did; theory.md, section 36."""
 
 
 @dataclass(frozen=True)

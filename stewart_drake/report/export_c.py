@@ -18,6 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stewart_drake.dynamics.workspace import LEAST, home_sign
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import replacing
 from stewart_drake.law.channel import Report
@@ -27,9 +28,11 @@ from stewart_drake.law.motion import Motion
 from stewart_drake.law.native_law import configuration, uncovered
 from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.loop.experiment import control_law, prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.native.build import FOLDER, compiler
 from stewart_drake.native.law_layout import CONFIG_FIELDS, CONFIG_FLAGS
+from stewart_drake.report.export_motion import TOLERANCE, knots
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_yaml
 
@@ -160,6 +163,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "ESTIMATES": "no" if isinstance(law.observer, NoObserver) else "yes",
     }
     values["CONFIGURATION"] = _configuration(law, suffix)
+    values |= _surroundings(scenario, law, suffix)
     values["QUEUE"] = _list(law.queue[0] if law.queue[0].size else [0.0], suffix)
     for name in ("measurement", "preview", "weights", "torque", "sent"):
         rows = [_list(getattr(step, name), suffix) for step in law.steps]
@@ -172,6 +176,24 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         files["README.md"], {"SIZES": _sizes(files) if measured else _UNMEASURED}
     )
     return files
+
+
+def _surroundings(scenario: Scenario, law: RecordedLqi, suffix: str) -> dict[str, str]:
+    """What the examples over UDP know of the scenario beside the controller."""
+    experiment = prepare(scenario)
+    motion, c = control_law(experiment)[1], scenario.controller
+    rows = knots(motion, scenario.duration + max(0.0, float(law.preview_times.max())))
+    return {
+        "DURATION": repr(float(scenario.duration)),
+        "OWN_WEIGHTS": _list([c.w_Q, c.w_R], suffix),
+        "START": _list(experiment.start, suffix),
+        "LEAST": _list(LEAST, suffix),
+        "HOME_SIGN": _list(home_sign(experiment.mechanism), suffix),
+        "QUEUE_ROWS": str(len(law.queue[0])),
+        "KNOTS": str(len(rows)),
+        "MOTION": ",\n    ".join(_list(row, "") for row in rows),
+        "MOTION_TOLERANCE": f"{TOLERANCE:g}",
+    }
 
 
 def write(files: Mapping[str, str], folder: Path) -> list[Path]:

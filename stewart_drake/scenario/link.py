@@ -100,15 +100,31 @@ def packet_times(config: PacketsConfig, number: int, seed: int, stream: int = _F
     return np.where(losses(number, config.loss, config.burst, rng), np.inf, times)
 
 
+def forward_times(link: NetworkConfig, number: int) -> Array:
+    """(number,) s that each packet of torques is under way; infinite for one that is lost."""
+    return packet_times(link, number, link.seed)
+
+
+def sensor_times(scenario: Scenario, number: int) -> Array:
+    """(number,) s from each sample until the machine has what was measured; infinite for never."""
+    sc = scenario.sensor
+    none_late = PacketsConfig(low=0.0, high=0.0, loss=sc.loss)
+    lost = packet_times(none_late, number, sc.seed, _SENSOR)
+    return sc.delay + np.where(np.isfinite(lost), 0.0, np.inf)
+
+
+def return_times(scenario: Scenario, number: int) -> Array:
+    """(number,) s that each measurement is under way to the controller; infinite for never."""
+    link = scenario.link
+    if not isinstance(link, NetworkConfig) or link.back is None:
+        return np.zeros(number)
+    return packet_times(link.back, number, link.seed, _BACK)
+
+
 def measurement_times(scenario: Scenario) -> Array:
     """(n,) s from each sample until the controller has what was measured; infinite for never."""
-    sc, link = scenario.sensor, scenario.link
     n = number_sent(scenario.duration, scenario.controller.period)
-    lost = packet_times(PacketsConfig(low=0.0, high=0.0, loss=sc.loss), n, sc.seed, _SENSOR)
-    times = sc.delay + np.where(np.isfinite(lost), 0.0, np.inf)
-    if isinstance(link, NetworkConfig) and link.back is not None:
-        times = times + packet_times(link.back, n, link.seed, _BACK)
-    return times
+    return sensor_times(scenario, n) + return_times(scenario, n)
 
 
 def newest_measurements(times: Array, period: float) -> NDArray[np.int64]:

@@ -1,0 +1,196 @@
+"""The loop in real time, against a machine over a link: live."""
+
+import contextlib
+import math
+import signal
+import subprocess
+import sys
+import webbrowser
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from stewart_drake.cli.common import (
+    AsJson,
+    Controller,
+    Delivery,
+    Out,
+    Quiet,
+    ScenarioName,
+    Settings,
+)
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.report.terminal import echo
+
+if TYPE_CHECKING:
+    from stewart_drake.live.page import PageViewer
+    from stewart_drake.loop.results import SimulationResult
+    from stewart_drake.scenario.config import Scenario
+
+_EACH_WAY: Final = (0.35, 0.4)
+"""Of the scenario's delay, between which the link of the demo's machine takes: 0.28 to 0.32 s of
+the paper's 0.8 s."""
+_LOST: Final = 0.02
+"""Of its packets, each way."""
+_REQUESTS: Final = (signal.SIGINT, signal.SIGTERM)
+
+
+def live(
+    scenario: ScenarioName = "paper",
+    machine: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Where the machine listens.")
+    ] = None,
+    demo: Annotated[
+        bool, typer.Option("--demo", help="Start a simulated machine too, 0.3 s away each way.")
+    ] = False,
+    duration: Annotated[
+        float | None, typer.Option(min=0.1, metavar="S", help="Until it is stopped by default.")
+    ] = None,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Without a page; only what is printed.")
+    ] = False,
+    arm: Annotated[
+        bool, typer.Option("--arm", help="Drive a machine that is no simulation.")
+    ] = False,
+    key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Whose bytes both sides share.")
+    ] = None,
+    controller: Controller = None,
+    settings: Settings = None,
+    out: Out = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> int:
+    """Drive a machine over UDP in real time, with sliders in the browser.
+
+    The law is that of `simulate`. Ctrl-C brings the plate to rest and ends it; Ctrl-C again, or
+    Stop on the page, stops it at once.
+    """
+    from stewart_drake.live.connect import address_of
+    from stewart_drake.live.endpoint import read_key
+    from stewart_drake.live.session import check_armed, drive, plans, prepare_session
+    from stewart_drake.scenario.loading import load_scenario
+
+    if (machine is None) != demo:
+        raise ConfigError("--machine: expected either --machine HOST:PORT or --demo")
+    loaded = load_scenario(scenario, controller, settings or ())
+    delivery = Delivery(out, quiet, as_json)
+    span = math.inf if duration is None else duration
+    name = Path(scenario).stem
+    with contextlib.ExitStack() as running:
+        viewer = None if no_browser else running.enter_context(_page(loaded, name))
+        where = machine or running.enter_context(
+            _demo_machine(scenario, loaded.eta, controller, settings or ())
+        )
+        delivery.say(f"calling {where}")
+        secret = None if key is None else read_key(key)
+        ready = prepare_session(loaded, address_of(where), secret)
+        for line in plans(ready, span, name):
+            delivery.say(line)
+        check_armed(ready, arm)
+        if viewer is not None:
+            _show(viewer.opened())
+        if not ready.simulated and sys.stdin.isatty():
+            input("Enter begins, Ctrl-C leaves it alone")
+        with _Ending() as ending:
+            result = drive(ready, span, armed=arm, viewer=viewer, ending=ending, say=delivery.say)
+    return _told(delivery, result)
+
+
+@contextlib.contextmanager
+def _page(scenario: "Scenario", name: str) -> Iterator["PageViewer"]:
+    """The page's process, which takes as long to start as the machine is called."""
+    from stewart_drake.live.page import PageViewer
+    from stewart_drake.mechanism.files import load_mechanism
+
+    viewer = PageViewer(load_mechanism(scenario.mechanism), f"live: {name}")
+    try:
+        yield viewer
+    finally:
+        viewer.close()
+
+
+def _show(url: str) -> None:
+    # A reader needs the address even when everything else is quiet.
+    echo(f"page: {url}", error=True)
+    if sys.stdout.isatty():
+        webbrowser.open(url)
+
+
+def _told(delivery: Delivery, result: "SimulationResult") -> int:
+    """Write and print what has come of it."""
+    from stewart_drake.report.run_document import run_document
+
+    s, stopped = result.summary["live"], result.stopped
+    if stopped is not None:
+        delivery.say(f"{result.status.replace('_', ' ')}: {stopped}")
+    if result.status == "completed":
+        delivery.say(run_document(result).plain())
+    late = s["sent_after_due_ms"]
+    delivery.say(
+        f"{s['samples']} samples, {s['deadlines_missed']} deadlines missed; torques went out "
+        f"{late['median']:.0f} ms after the soonest measurement (99 %: {late['p99']:.0f}, worst "
+        f"{late['worst']:.0f}); {s['periods_played']} periods played, {s['periods_dry']} dry"
+    )
+    if delivery.out is not None:
+        result.save(delivery.out)
+        delivery.wrote("summary.json", "signals.nc")
+    lost = result.status in ("lost_machine", "refused", "left_workspace")
+    return delivery.end(result.summary, result.status == "interrupted") or int(lost)
+
+
+@contextlib.contextmanager
+def _demo_machine(
+    scenario: str, eta: float, controller: str | None, settings: Sequence[str]
+) -> Iterator[str]:
+    """A simulated machine in a process of its own, on a free port, over a link of its own."""
+    low, high = (share * eta for share in _EACH_WAY)
+    way = f"low: {low:g}, high: {high:g}, loss: {_LOST}"
+    words = ["machine", scenario, "--port", "0"]
+    words += [] if controller is None else ["--controller", controller]
+    link = f"link={{kind: network, {way}, return: {{{way}}}}}"
+    for setting in (*settings, "plant.kind=exact", link):
+        words += ["--set", setting]
+    program = "import sys; from stewart_drake.cli import main; sys.exit(main(sys.argv[1:]))"
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-c", program, *words],
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # Ctrl-C is for the controller, which stops it
+    )
+    try:
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        _, _, rest = first.partition(" at ")
+        if not rest:
+            raise ConfigError("--demo: the simulated machine did not start")
+        yield rest.split(": ", 1)[0]
+    finally:
+        process.terminate()
+        process.communicate()
+
+
+class _Ending:
+    """Ctrl-C, or a request to end, once: come to rest; twice: at once."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._before: list[Any] = []
+
+    def __call__(self) -> bool:
+        return self._asked
+
+    def __enter__(self) -> "_Ending":
+        self._before = [signal.signal(number, self._ask) for number in _REQUESTS]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, before in zip(_REQUESTS, self._before, strict=True):
+            signal.signal(number, before)
+
+    def _ask(self, *_: Any) -> None:
+        if self._asked:
+            raise KeyboardInterrupt
+        self._asked = True

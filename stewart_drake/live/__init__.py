@@ -1,0 +1,1 @@
+"""The loop in real time: a machine and a controller that talk over a link."""

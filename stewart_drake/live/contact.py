@@ -1,0 +1,213 @@
+"""The controller's view of its machine: what has come from it, and how long the link takes.
+
+No clock is compared with another one. A measurement carries the instant at which it was taken, a
+plan the instants at which its torques shall act, both of the machine's clock; how long a plan may
+take is what is left of that. So the way there and the way back count together, as a round trip.
+"""
+
+import math
+import select
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.live.endpoint import Address, Endpoint, Session, now
+from stewart_drake.live.protocol import (
+    NEVER,
+    NOTHING,
+    SECOND,
+    ControllerFlags,
+    ControllerMessage,
+    MachineMessage,
+    Refusal,
+)
+from stewart_drake.scenario.signals import NUM_TORQUES
+
+Array = NDArray[np.float64]
+
+_TRIPS: Final = 256
+"""Round trips that are remembered."""
+_SENT: Final = 1024
+"""Datagrams of which it is remembered what became of them."""
+_SETTLED: Final = 48
+"""Datagrams after which one that has not arrived counts as lost."""
+_PHASES: Final = 128
+"""Measurements of which the one that came soonest tells when the next will come."""
+
+
+@dataclass
+class Link:
+    """What is known of the way there and back.
+
+    Attributes:
+        trips: last round trips, s: from sending a datagram to having its answer, without the time
+            that the machine held it.
+        sent: datagrams.
+        lost: of them, as the machine says.
+        missed: measurements that never came, by their numbers.
+        came: that did.
+    """
+
+    trips: deque[float] = field(default_factory=lambda: deque(maxlen=_TRIPS))
+    sent: int = 0
+    lost: int = 0
+    missed: int = 0
+    came: int = 0
+
+    @property
+    def typical(self) -> float:
+        """Median round trip, s; NaN before there is one."""
+        return float(np.median(self.trips)) if self.trips else math.nan
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the round trips, s; NaN before there is one."""
+        return float(np.std(self.trips)) if self.trips else math.nan
+
+    @property
+    def longest(self) -> float:
+        """Of the round trips that are remembered, s; NaN before there is one."""
+        return max(self.trips, default=math.nan)
+
+    @property
+    def shortest(self) -> float:
+        """The same."""
+        return min(self.trips, default=math.nan)
+
+    @property
+    def loss_there(self) -> float:
+        """Share of the datagrams that did not arrive."""
+        return self.lost / max(self.sent, 1)
+
+    @property
+    def loss_back(self) -> float:
+        """Share of the measurements that did not come."""
+        return self.missed / max(self.missed + self.came, 1)
+
+
+class Contact:
+    """A session with a machine.
+
+    Args:
+        endpoint: to be used; whoever made it closes it.
+        address: of the machine.
+
+    Attributes:
+        link: see `Link`.
+        last: newest message of the machine, by its sequence, or None.
+        session: see `live.endpoint.Session`.
+        heard: ns of the own clock, when something of the machine was last taken.
+    """
+
+    def __init__(self, endpoint: Endpoint, address: Address) -> None:
+        self._endpoint = endpoint
+        self.session = Session.drawn(address)
+        self.link = Link()
+        self.last: MachineMessage | None = None
+        self.heard = now()
+        self._pending: dict[int, bool] = {}
+        self._phases: deque[float] = deque(maxlen=_PHASES)
+        self._newest = 0
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Datagrams that were not acted upon, by cause."""
+        return {cause.value: n for cause, n in self._endpoint.refused.items()}
+
+    @property
+    def unsent(self) -> int:
+        """Datagrams that the system did not take."""
+        return self._endpoint.unsent
+
+    def join(self, nonce: int) -> None:
+        """From now on as in the session that the machine has offered."""
+        self.session.nonce = nonce
+
+    def send(
+        self,
+        torques: Array | None = None,
+        *,
+        sampled: int = 0,
+        playout: int = 0,
+        begin: int = NEVER,
+        flags: ControllerFlags = NOTHING,
+    ) -> int:
+        """Send a datagram of these fields; its sequence."""
+        rows = np.empty((0, NUM_TORQUES)) if torques is None else torques
+        head = self.session.head(now())
+        message = ControllerMessage(head, flags, sampled, playout, begin, rows)
+        self._endpoint.send(message, self.session.address)
+        self._pending[head.sequence] = False
+        for old in [n for n in self._pending if n <= head.sequence - _SENT]:
+            del self._pending[old]
+        return head.sequence
+
+    def has_arrived(self, sequence: int) -> bool:
+        """Whether the machine has said that a datagram was there."""
+        return self._pending.get(sequence, False)
+
+    def wait(self, until: int) -> Iterator[MachineMessage]:
+        """What comes until a time of the own clock, ns; at once if that is past."""
+        left = max(0, until - now()) / SECOND
+        if select.select([self._endpoint], [], [], left)[0]:
+            yield from self.receive()
+
+    def receive(self) -> Iterator[MachineMessage]:
+        """What has come, each once, whatever the order."""
+        for message, address in self._endpoint.receive():
+            assert isinstance(message, MachineMessage)
+            time = now()
+            refused = self.session.refusal(message.head, address, time)
+            if refused is not None:
+                self._endpoint.refused[refused] += 1
+                continue
+            self.heard = time
+            self._note(message, time)
+            yield message
+
+    def forget_waiting(self) -> None:
+        """Throw away what came while nobody looked: how late it came says nothing of the link."""
+        for _ in self._endpoint.receive():
+            pass
+
+    def refuse(self, cause: Refusal) -> None:
+        """Count a message that was taken but is of no use."""
+        self._endpoint.refused[cause] += 1
+
+    def _note(self, message: MachineMessage, time: int) -> None:
+        head, link = message.head, self.link
+        if self.last is None or head.sequence > self.last.head.sequence:
+            self.last = message
+        link.came += 1
+        link.missed = max(0, self.session.window.newest - link.came)
+        self._phases.append((time - message.sampled / message.rate) / SECOND)
+        if head.acknowledged > self._newest:  # else its answer was there before
+            self._newest = head.acknowledged
+            link.trips.append((time - head.echo - head.held / message.rate) / SECOND)
+        for i, there in enumerate(message.arrived):
+            if there and head.acknowledged - i in self._pending:
+                self._pending[head.acknowledged - i] = True
+        settled = [n for n in self._pending if n <= head.acknowledged - _SETTLED]
+        link.sent = len(settled)
+        link.lost = sum(not self._pending[n] for n in settled)
+
+    @property
+    def soonest(self) -> float:
+        """s of the own clock at which a measurement of the machine's time 0 would have come."""
+        return min(self._phases, default=math.nan)
+
+    def lateness(self, most: float) -> float:
+        """By how much the last measurements came later than the soonest, s.
+
+        Those that took longer than `most`, as where this process stood still, do not count.
+        """
+        late = (phase - self.soonest for phase in self._phases)
+        return max((each for each in late if each <= most), default=0.0)
+
+    def due(self, sampled: int, rate: float) -> float:
+        """s of the own clock at which a measurement taken at ns of the machine's may come."""
+        return self.soonest + sampled / rate / SECOND

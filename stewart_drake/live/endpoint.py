@@ -1,0 +1,278 @@
+"""A socket for datagrams of `live.protocol`, who is at its other end, and which clock is there.
+
+Without a key only the loopback interface is used. What is not acted upon is counted by its cause.
+"""
+
+import ipaddress
+import secrets
+import socket
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.live.protocol import (
+    LONGEST,
+    SECOND,
+    Head,
+    Message,
+    Refusal,
+    RefusedError,
+    decode,
+    encode,
+)
+
+Address = tuple[str, int]
+
+WINDOW: Final = 64
+"""Datagrams by which one may be overtaken and still be told from a replay."""
+AT_ONCE: Final = 256
+"""Datagrams that are read before anything else is done."""
+SHORTEST_KEY: Final = 16
+"""Bytes."""
+LONGEST_KEY: Final = 4096
+"""Bytes."""
+_TRUSTED: Final = 64
+"""Round trips of which the shortest one tells the other's clock."""
+
+
+def now() -> int:
+    """ns of this process's clock, which nobody sets."""
+    return time.monotonic_ns()
+
+
+class Endpoint:
+    """A UDP socket that never blocks.
+
+    Args:
+        takes: the class of message that comes in; the other side's own is malformed.
+        host: to listen at; a name or number of an interface.
+        port: 0 is any that is free.
+        key: shared with the other side; None takes loopback addresses only.
+
+    Attributes:
+        refused: datagrams that were not acted upon, by cause; who finds more of them adds them.
+        unsent: datagrams that the system did not take: a full buffer, no way there.
+
+    Raises:
+        ConfigError: no key beyond loopback, a key that is too short, an address that is not free.
+    """
+
+    def __init__(
+        self,
+        takes: type[Message],
+        host: str = "127.0.0.1",
+        port: int = 0,
+        key: bytes | None = None,
+    ) -> None:
+        self._takes, self._key, self.refused, self.unsent = takes, key, Counter[Refusal](), 0
+        if key is not None and len(key) < SHORTEST_KEY:
+            raise ConfigError(f"key: got {len(key)} bytes; expected at least {SHORTEST_KEY}")
+        self._check_reach(host, "host")
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind((host, port))
+        except (OSError, OverflowError) as error:
+            self._socket.close()
+            raise ConfigError(f"port: got {host}:{port} ({error}); expected a free one") from None
+
+    def _check_reach(self, host: str, name: str) -> None:
+        if self._key is None and not is_loopback(host):
+            raise ConfigError(
+                f"{name}: got {host} without a key; expected a loopback address, such as "
+                "127.0.0.1, or a key"
+            )
+
+    @property
+    def address(self) -> Address:
+        """Where it listens."""
+        host, port = self._socket.getsockname()
+        return host, port
+
+    def fileno(self) -> int:
+        """For `select`."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """Nothing is sent or got any more."""
+        self._socket.close()
+
+    def send(self, message: Message, to: Address) -> bool:
+        """Whether it went out; what did not is counted.
+
+        Raises:
+            ConfigError: no key, and not to loopback.
+        """
+        self._check_reach(to[0], "machine")
+        try:
+            self._socket.sendto(encode(message, self._key), to)
+        except OSError:
+            self.unsent += 1
+            return False
+        return True
+
+    def receive(self) -> Iterator[tuple[Message, Address]]:
+        """What has come, at most AT_ONCE of it; the rest next time."""
+        for _ in range(AT_ONCE):
+            try:
+                data, address = self._socket.recvfrom(LONGEST + 1)
+            except BlockingIOError:
+                return
+            except ConnectionError:  # what was sent before found nobody
+                continue
+            try:
+                message = decode(data, self._key)
+            except RefusedError as refused:
+                self.refused[refused.cause] += 1
+                continue
+            if isinstance(message, self._takes):
+                yield message, address
+            else:
+                self.refused[Refusal.MALFORMED] += 1
+
+
+def read_key(path: Path) -> bytes:
+    """The bytes of a key's file, but for line breaks at its end.
+
+    Raises:
+        ConfigError: it cannot be read, or is too short or too long to be a key.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(LONGEST_KEY + 1)
+    except OSError as error:
+        raise ConfigError(f"--key: got {str(path)!r} ({error.strerror}); expected a file") from None
+    key = data.rstrip(b"\r\n")
+    if not SHORTEST_KEY <= len(key) <= LONGEST_KEY:
+        raise ConfigError(
+            f"--key: got {str(path)!r} with {len(key)} bytes or more; expected {SHORTEST_KEY} to "
+            f"{LONGEST_KEY}"
+        )
+    return key
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address or a name is of this machine alone."""
+    try:
+        return ipaddress.ip_address(socket.gethostbyname(host)).is_loopback
+    except (OSError, UnicodeError, ValueError):
+        return False
+
+
+@dataclass
+class Window:
+    """Which sequence numbers were there already, of the last WINDOW.
+
+    Attributes:
+        newest: of them, 0 for none.
+        seen: bit i is for `newest` - i.
+    """
+
+    newest: int = 0
+    seen: int = 0
+
+    def take(self, sequence: int) -> Refusal | None:
+        """Note a number; why it is refused, or None."""
+        behind = self.newest - sequence
+        if behind < 0:
+            self.seen = (self.seen << -behind if -behind < WINDOW else 0) & (2**WINDOW - 1) | 1
+            self.newest = sequence
+            return None
+        if behind >= WINDOW:
+            return Refusal.LATE
+        if self.seen >> behind & 1:
+            return Refusal.REPLAYED
+        self.seen |= 1 << behind
+        return None
+
+
+@dataclass
+class Session:
+    """One side's view of a session: who is there, what was sent, what has come.
+
+    Attributes:
+        number: drawn by the controller.
+        address: of the other side.
+        nonce: drawn by the machine; 0 where it has not offered one.
+        window: of what has come.
+        heard: ns of the own clock when the last one was taken, 0 for none.
+    """
+
+    number: int
+    address: Address
+    nonce: int = 0
+    window: Window = field(default_factory=Window)
+    heard: int = 0
+    _sent: int = 0
+    _echo: int = 0
+    _got: int = 0
+
+    @classmethod
+    def drawn(cls, address: Address) -> "Session":
+        """A new one of a controller's."""
+        return cls(draw(), address)
+
+    def head(self, time: int) -> Head:
+        """Of the next datagram, which is sent now, in ns of the own clock."""
+        self._sent += 1
+        held = time - self._got if self.window.newest else 0
+        return Head(
+            *(self.number, self.nonce, self._sent, self.window.newest, time, self._echo, held)
+        )
+
+    def refusal(self, head: Head, address: Address, time: int) -> Refusal | None:
+        """Why a datagram is not taken, or None: then it is noted, with the time of now."""
+        if head.session != self.number or address != self.address:
+            return Refusal.FOREIGN
+        if self.nonce not in (0, head.nonce):
+            return Refusal.FOREIGN
+        before = self.window.newest
+        refused = self.window.take(head.sequence)
+        if refused is None:
+            self.heard = time
+            if head.sequence > before:
+                self._echo, self._got = head.time, time
+        return refused
+
+
+def draw() -> int:
+    """A number of 64 bits that nobody guesses, not 0."""
+    return secrets.randbits(64) or 1
+
+
+@dataclass
+class OtherClock:
+    """The other side's clock, from datagrams that went there and came back.
+
+    A datagram sent at t1 was got there at t2 and answered at t3, which came at t4. On its way back
+    it was half of r = (t4 - t1) - (t3 - t2) / rate, or up to r/2 more or less; the shortest r tells
+    most. What a controller makes of that error is harmless: a measurement that seems older by as
+    much has, it seems, torques on their way for as much less time.
+
+    Attributes:
+        rate: of the other clock, by the own one.
+        round_trip: s, the shortest of the last ones; infinite before there is one.
+    """
+
+    rate: float = 1.0
+    round_trip: float = float("inf")
+    _trips: list[tuple[float, float]] = field(default_factory=list)
+
+    def note(self, head: Head, time: int) -> None:
+        """Take a datagram that came at a time of the own clock, ns."""
+        if head.acknowledged == 0:
+            return
+        trip = (time - head.echo) / SECOND - head.held / SECOND / self.rate
+        there = head.time / SECOND + self.rate * max(trip, 0.0) / 2 - self.rate * time / SECOND
+        self._trips = [*self._trips[1 - _TRUSTED :], (trip, there)]
+        self.round_trip = min(self._trips)[0]
+
+    def at(self, time: int) -> float:
+        """s of the other clock at a time of the own one, ns; NaN before it is known."""
+        if not self._trips:
+            return float("nan")
+        return self.rate * time / SECOND + min(self._trips)[1]

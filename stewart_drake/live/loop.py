@@ -1,0 +1,560 @@
+"""The law in real time: a step for each measurement of a machine at the other end of a link.
+
+Sample k is the instant t0 + k dt of the machine's clock. Its step begins when its measurement is
+there, or when that is later than any of the last ones was: then it counts as lost, and the model
+stands in. So the step is as periodic as what comes over the link, and never waits for what does not
+come. A step that is sent more than a period after its sample was due has missed its deadline; it is
+taken all the same, one after the other, until the loop has caught up.
+"""
+
+import math
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.law.channel import Packets, Report, Wire
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.native_law import AnyMemory, serving
+from stewart_drake.law.timeline import Acting, Timeline
+from stewart_drake.live.connect import await_free
+from stewart_drake.live.contact import Contact
+from stewart_drake.live.design import Design
+from stewart_drake.live.endpoint import now
+from stewart_drake.live.log import LiveRecord
+from stewart_drake.live.protocol import (
+    NEVER,
+    NOTHING,
+    SECOND,
+    ControllerFlags,
+    MachineFlags,
+    MachineMessage,
+    Refusal,
+)
+from stewart_drake.live.steering import Steering, Wish
+from stewart_drake.loop.controller import reported
+from stewart_drake.loop.experiment import motion_scale
+from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, PACKETS, POSE, RATES
+from stewart_drake.scenario.trajectories import evaluate
+
+Array = NDArray[np.float64]
+
+OFF: Final = 0.08
+"""Share of the motion by which a prediction is off the way, so that a new one is planned."""
+AT_START: Final = 0.02
+"""The same, by which a plate is where the scenario begins."""
+STANDS: Final = 0.005
+"""The same, per s, by which it moves that has come to rest."""
+RESTING: Final = 8.0
+"""s in which it must."""
+SILENT: Final = 1.0
+"""s, or ten periods, of silence that are told."""
+PATIENCE: Final = 10.0
+"""s of silence after which the controller gives up."""
+_LEAD: Final = 0.05
+"""s, beside a round trip, from asking for a begin until then."""
+_REPEATED: Final = 0.05
+"""s after which it is asked for again."""
+_ANSWER: Final = 10.0
+"""s in which the machine must have begun."""
+_SPARE: Final = 0.002
+"""s for which a measurement is waited for beside the usual."""
+_GONE: Final = 64
+"""Samples after which what came is forgotten."""
+
+
+class End(NamedTuple):
+    """How a run ended: a status as of `loop.results.RunSummary`, and what stopped it."""
+
+    status: str
+    stopped: Failure | None
+
+
+class Viewer(Protocol):
+    """Who watches, and may ask for something."""
+
+    def show(self, seen: "Seen") -> None:
+        """The loop as it is now; never waits."""
+        ...
+
+    def wish(self) -> Wish:
+        """What is asked for."""
+        ...
+
+    def stopped(self) -> bool:
+        """Whether the end is asked for."""
+        ...
+
+
+class Nobody:
+    """No viewer."""
+
+    def show(self, seen: "Seen") -> None:
+        """Nothing."""
+
+    def wish(self) -> Wish:
+        """The scenario's motion."""
+        return Wish()
+
+    def stopped(self) -> bool:
+        """Never."""
+        return False
+
+
+class Seen(NamedTuple):
+    """The loop at a sample.
+
+    Attributes:
+        time: s since the begin.
+        state: (12,) of the plate.
+        wanted: (18,) of the reference.
+        torque: (6,) N m, that acts.
+        error: mean pose error, % of peak to peak.
+        eta: s, from a measurement to its torque, as the law believes.
+        trip: s, median round trip of the link.
+        spread: s, standard deviation of those.
+        lost: share of the datagrams that are lost, there and back.
+        missed: deadlines.
+        safe: whether the machine is at its safe torque.
+        by_hand: whether a hand leads.
+        limit: what keeps the plate from what is asked for, or None.
+    """
+
+    time: float
+    state: Array
+    wanted: Array
+    torque: Array
+    error: float
+    eta: float
+    trip: float
+    spread: float
+    lost: float
+    missed: int
+    safe: bool
+    by_hand: bool
+    limit: str | None
+
+
+@dataclass
+class Pace:
+    """How periodic the loop was.
+
+    Attributes:
+        late: s, from the soonest that a sample's measurement could have come until its torques went
+            out: what the link adds, the wait for what is lost, the step.
+        missed: how many of them took a period longer than measurements usually do.
+        overtaken: measurements that came after their step.
+    """
+
+    late: list[float] = field(default_factory=list)
+    missed: int = 0
+    overtaken: int = 0
+
+    def summary(self) -> dict[str, Any]:
+        """For summary.json."""
+        late = np.array(self.late or [math.nan])
+        median = float(np.median(late))
+        return {
+            "samples": len(self.late),
+            "deadlines_missed": self.missed,
+            "measurements_overtaken": self.overtaken,
+            "sent_after_due_ms": {
+                "median": 1e3 * median,
+                "p99": 1e3 * float(np.quantile(late, 0.99)),
+                "worst": 1e3 * float(late.max()),
+            },
+            "jitter_std_ms": 1e3 * float(np.std(np.clip(late, None, np.quantile(late, 0.99)))),
+        }
+
+
+class LiveLoop:
+    """Runs a law against a machine.
+
+    Args:
+        design: what to run.
+        steering: of the reference, from t = 0 on.
+        contact: a session that the machine has offered.
+        viewer: who watches.
+        say: is told in a line what happens.
+
+    Attributes:
+        record: of the run.
+        pace: see `Pace`.
+        memory: of the law, as of the last sample.
+        backend: what steps the law.
+        recoveries: how often a new way was planned.
+        taken_over: whether the plate was anywhere else than at the scenario's start.
+    """
+
+    def __init__(
+        self,
+        design: Design,
+        steering: Steering,
+        contact: Contact,
+        viewer: Viewer,
+        say: Callable[[str], None],
+    ) -> None:
+        self._design, self._steering, self._contact = design, steering, contact
+        self._viewer, self._say = viewer, say
+        self._law: Any
+        self._law, self.backend = serving(design.law)
+        self.record, self.pace = LiveRecord(design.experiment, self.backend), Pace()
+        self.memory: AnyMemory = self._law.initial_memory(design.queue)
+        self.recoveries, self.taken_over = 0, False
+        c = design.experiment.scenario.controller
+        self._period, self._weights = c.period, np.array([c.w_Q, c.w_R])
+        self._size = 2 * motion_scale(design.experiment)
+        self._sends = isinstance(design.law.channel, Packets)
+        # The next torque alone: what a plan goes on with may still change.
+        self._horizon = float(replace(design.law, channel=Wire()).preview_times.max())
+        self._began, self._came = 0, dict[int, MachineMessage]()
+        self._sequences = dict[int, int]()
+        self._flags, self._silent_since = MachineFlags(0), 0
+        self._asked, self._recording = NOTHING, True
+        self._parked = self._leads = False
+
+    # -------------------------------------------------------------- the begin
+
+    def begin(self, flags: ControllerFlags) -> None:
+        """Agree with the machine on when the run begins, and wait until then.
+
+        Raises:
+            ConfigError: another controller drives it.
+            TimeoutError: it does not begin.
+        """
+        contact = self._contact
+        await_free(contact)
+        last = contact.last
+        assert last is not None
+        contact.join(last.head.nonce)
+        self._parked = bool(last.flags & (MachineFlags.PARKED | MachineFlags.RESETS))
+        # Of the machine's clock, or earlier by the way back.
+        here = (clock.monotonic() - contact.soonest) * last.rate
+        lead = _LEAD + contact.link.longest
+        asked, until = round((here + lead * last.rate) * SECOND), now() + round(_ANSWER * SECOND)
+        step = round(min(self._period / last.rate, _REPEATED) * SECOND)
+        self._asked = flags
+        while True:
+            contact.send(begin=self._began or asked, flags=flags)
+            for message in contact.wait(now() + step):
+                if message.begin != NEVER and message.head.nonce == contact.session.nonce:
+                    self._began = message.begin
+                self._take(message)
+            if self._began and now() >= self._due(0):
+                return
+            if now() > until:
+                raise TimeoutError("got one that has not begun when it was asked to")
+
+    def _take(self, message: MachineMessage) -> None:
+        """Keep a measurement until its sample."""
+        if message.begin == NEVER or message.sampled < message.begin:
+            return
+        k = round((message.sampled - message.begin) / message.period)
+        if k < len(self.pace.late):
+            self.pace.overtaken += 1
+            self._contact.refuse(Refusal.LATE)
+        self._came.setdefault(k, message)
+
+    # -------------------------------------------------------------- the run
+
+    def run(self, duration: float, ending: Callable[[], bool] = lambda: False) -> End:
+        """Go on for so many s, which may be infinite, then bring the plate to rest.
+
+        Args:
+            duration: s, that are recorded.
+            ending: whether to come to rest before that.
+
+        Returns:
+            How it ended. A viewer's stop, Ctrl-C, and whatever goes wrong end it at once.
+        """
+        end, k = End("completed", None), 0
+        try:
+            while k * self._period < duration - 1e-9 and not ending():
+                end = self._step(k)
+                if end.status != "completed":
+                    break
+                k += 1
+            if end.status == "completed":
+                if k * self._period < duration - 1e-9:
+                    end = End("interrupted", Failure(k * self._period, None, math.nan, "ended"))
+                self._come_to_rest(k)
+        except KeyboardInterrupt:
+            end = End("interrupted", Failure(k * self._period, None, math.nan, "stopped"))
+        self.stop()
+        return end
+
+    def _step(self, k: int) -> End:
+        if self._viewer.stopped():
+            raise KeyboardInterrupt
+        message = self._await(k)
+        return self._over(k, message) or self._sample(k, message) or End("completed", None)
+
+    def _come_to_rest(self, k: int) -> None:
+        """Go on until the plate stands, without a record."""
+        self._recording, last = False, k + math.ceil(RESTING / self._period)
+        while k < last and self._step(k).status == "completed":
+            way, t = self._steering.way, k * self._period
+            wanted = np.array([way.at(t)[RATES], way.at(t + self._horizon)[RATES]])
+            rates = np.vstack([wanted, self.memory.belief.state[RATES]])
+            if np.all(np.abs(rates) <= STANDS * self._size):
+                return
+            k += 1
+
+    def stop(self) -> None:
+        """The safe torque, said three times."""
+        for _ in range(3):
+            self._contact.send(flags=ControllerFlags.STOP | self._asked)
+            clock.sleep(0.01)
+        self.record.flush()
+
+    def _due(self, k: int) -> int:
+        """ns of the own clock at which the measurement of a sample may come at the soonest."""
+        last = self._contact.last
+        assert last is not None
+        sampled = self._began + round(k * self._period * SECOND)
+        return round(self._contact.due(sampled, last.rate) * SECOND)
+
+    def _await(self, k: int) -> MachineMessage | None:
+        """The message with a sample's measurement, or None once it is too late."""
+        for message in self._contact.receive():
+            self._take(message)
+        usual = self._contact.lateness(self._period) + _SPARE
+        while self._came.get(k) is None:
+            until = self._due(k) + round(usual * SECOND)
+            if now() >= until:
+                break
+            for message in self._contact.wait(until):
+                self._take(message)
+        for old in [n for n in self._came if n < k - _GONE]:
+            del self._came[old]
+        return self._came.get(k)
+
+    def _over(self, k: int, message: MachineMessage | None) -> End | None:
+        """Why it does not go on, or None; what changes about the machine is said."""
+        time = k * self._period
+        silent = (now() - self._contact.heard) / SECOND
+        if silent > max(SILENT, 10 * self._period):
+            if not self._silent_since:
+                self._silent_since = self._contact.heard
+                self._say(f"at {time:.1f} s: the machine is silent since {silent:.1f} s; waiting")
+            if silent > PATIENCE:
+                reason = f"the machine was silent for {PATIENCE:g} s"
+                return End("lost_machine", Failure(time, None, math.nan, reason))
+        elif self._silent_since:
+            gone = (self._contact.heard - self._silent_since) / SECOND
+            self._silent_since = 0
+            self._say(f"at {time:.1f} s: the machine is heard again, after {gone:.1f} s")
+        if message is None:
+            return None
+        before, self._flags = self._flags, message.flags
+        if MachineFlags.LEFT in message.flags:
+            pose = self.memory.belief.state[POSE]
+            found = diagnose(self._design.experiment.mechanism, time, pose)
+            said = Failure(
+                time, None, math.nan, "the machine says that the plate left its workspace"
+            )
+            return End("left_workspace", found or said)
+        if MachineFlags.SAFE in message.flags & ~before:
+            self._say(f"at {time:.1f} s: the machine is at its safe torque")
+        if MachineFlags.SAFE in before & ~message.flags:
+            self._say(f"at {time:.1f} s: torques act again")
+        return None
+
+    def _sample(self, k: int, message: MachineMessage | None) -> End | None:
+        design, t = self._design, k * self._period
+        measured = None if message is None else message.values
+        nothing = np.full(design.law.sensing.size, np.nan)
+        measurement, report = Measurement.of(nothing if measured is None else measured), None
+        if message is not None:
+            self.record.acted(self._acted(message))
+            report = self._report(k)
+        if not self._leads:
+            if not measurement.complete and not self._parked:  # who knows where it is
+                self._contact.send(begin=self._began, flags=self._asked)
+                return None
+            refused = self._start(t, measurement, message)
+            if refused is not None:
+                return End("refused", Failure(t, None, math.nan, refused))
+            self._leads = True
+        wish = self._viewer.wish() if self._recording else Wish(rest=True)
+        self._steering = self._steering.on(t + self._horizon, wish)
+        way = self._steering.way
+        started = clock.perf_counter()
+        self.memory = self._law.step(
+            self.memory,
+            measurement,
+            lambda times: np.array([way.at(t + ahead) for ahead in times]),
+            self._weights,
+            report if self._sends else None,
+        )
+        seconds = clock.perf_counter() - started
+        self._send(k)
+        self._note_pace(k)
+        wanted = way.at(t)
+        if self._recording:
+            # A way onto the motion is judged by the motion, as in a simulation.
+            judged = wanted if self._by_hand else evaluate(self._steering.motion, t)
+            packets = self._packets(k, message)
+            self.record.sample(k, self.memory, measurement, judged, seconds, packets)
+        self._recover(k)
+        self._viewer.show(self._seen(k, wanted))
+        return None
+
+    @property
+    def _by_hand(self) -> bool:
+        return self._steering.governed is not None
+
+    def _send(self, k: int) -> None:
+        packet = self.memory.in_flight[-1:]
+        first = k
+        if self._sends:
+            packet, first = self.memory.sent.packets[-1], k - self._design.repeats
+        P = round(self._period * SECOND)
+        eta = round(self.memory.belief.timeline.eta * SECOND)
+        self._sequences[k] = self._contact.send(
+            packet,
+            sampled=self._began + k * P,
+            playout=self._began + first * P + eta,
+            begin=self._began,
+            flags=self._asked,
+        )
+        self._sequences.pop(k - 2 * _GONE, None)
+
+    def _note_pace(self, k: int) -> None:
+        late = (now() - self._due(k)) / SECOND
+        self.pace.late.append(late)
+        self.pace.missed += late > self._period + self._contact.lateness(self._period)
+
+    # -------------------------------------------------------------- reports
+
+    def _acted(self, message: MachineMessage) -> dict[int, Array]:
+        """Torques (6,) that have acted, by the number of the period that they began."""
+        if message.acted_from == NEVER:
+            return {}
+        P = message.period
+        fraction = round(self._design.law.timeline.fraction * P)
+        newest = round((message.acted_from - message.begin - fraction) / P)
+        return {newest - i: torque for i, torque in enumerate(message.acted)}
+
+    def _report(self, k: int) -> Report:
+        """What the law is told of its packets and torques at a sample."""
+        number = reported(self._design.law.kept)
+        packets = [self._sequences.get(k - 1 - i) for i in range(number)]
+        arrived = np.array([n is not None and self._contact.has_arrived(n) for n in packets])
+        acted = list[Array]()
+        for i in range(number):
+            torque = self.record.applied.get(k - 1 - i)
+            if torque is None:
+                break
+            acted.append(torque)
+        return Report(arrived, np.array(acted).reshape(-1, NUM_TORQUES))
+
+    def _packets(self, k: int, message: MachineMessage | None) -> Array:
+        """Counts as of `scenario.signals.PACKETS`; which were late only the machine knows."""
+        if message is None or not self._sends:
+            return np.full(len(PACKETS), np.nan)
+        link = self._contact.link
+        return np.array([k + 1.0, link.lost, math.nan, message.played, message.dry])
+
+    # -------------------------------------------------------------- the way
+
+    def _start(
+        self, t: float, measurement: Measurement, message: MachineMessage | None
+    ) -> str | None:
+        """Lead the plate from where it is, if not at the scenario's start; why not, or None."""
+        design, law = self._design, self._design.law
+        first = law.sensing.start(measurement) if measurement.complete else None
+        if first is None:
+            return None  # put there, as it says
+        away = np.abs(first.state - design.experiment.start) / np.tile(self._size, 2)
+        if away.max() <= AT_START:
+            return None
+        self.taken_over = True
+        acts = np.zeros(NUM_TORQUES)
+        if message is not None and len(message.acted):
+            acts = message.acted[0]
+        queue = np.tile(acts, (len(design.queue), 1))
+        self._law, self.backend = serving(replace(law, silence=0))
+        self.memory = self._law.initial_memory(queue)
+        anew = self._anew(t, first.state, _until_next(law.timeline, queue), None)
+        if isinstance(anew, str):
+            return f"there is no way from where the plate is: {anew}"
+        self._steering = anew
+        self._say("the plate is not where the scenario begins: it is led there first")
+        return None
+
+    def _recover(self, k: int) -> None:
+        """Plan a new way where the prediction is off the old one."""
+        belief, law = self.memory.belief, self._design.law
+        if not (
+            belief.has_state and belief.feeds_back and belief.settled and not self.memory.silence
+        ):
+            return
+        in_flight = self.memory.in_flight
+        until = _until_next(belief.timeline, in_flight[:-1])
+        acting = Acting(
+            np.vstack([until.torques, in_flight[-1:]]), np.append(until.durations, self._period)
+        )
+        t = k * self._period
+        ahead = law.plant.predict(belief.state, acting, belief.parameters)[-1]
+        wanted = self._steering.way.at(t + belief.timeline.eta + self._period)[:NUM_STATE]
+        away = np.abs(ahead - wanted) / np.tile(self._size, 2)
+        if not away.max() > OFF:  # or NaN
+            return
+        anew = self._anew(t, belief.state, acting, belief.parameters)
+        if isinstance(anew, str):
+            return  # the next sample may see another
+        self._steering, self.memory = anew, self.memory.without_error()
+        self.recoveries += 1
+
+    def _anew(
+        self, t: float, state: Array, acting: Acting, parameters: Array | None
+    ) -> Steering | str:
+        plant = self._design.law.plant
+        dynamics = plant.dynamics if parameters is None else plant.dynamics.assuming(parameters)
+        states = np.vstack([state, plant.predict(state, acting, parameters)])
+        if not np.all(np.isfinite(states)):
+            return "the plate leaves its workspace before a torque can act"
+        for x in states:
+            failure = diagnose(plant.mechanism, t, x[POSE])
+            if failure is not None:
+                return f"{failure.reason} before a torque can act"
+        torques = np.vstack([acting.torques[:1], acting.torques]) if len(acting.torques) else None
+        if torques is None:
+            torques = np.zeros((1, NUM_TORQUES))
+        full = np.array(
+            [
+                np.append(x, dynamics.accelerations(x[POSE], x[RATES], torque))
+                for x, torque in zip(states, torques, strict=True)
+            ]
+        )
+        times = t + np.append(0.0, np.cumsum(acting.durations))
+        return self._steering.anew(times, full)
+
+    def _seen(self, k: int, wanted: Array) -> Seen:
+        link, memory = self._contact.link, self.memory
+        error = memory.belief.state[POSE] - wanted[POSE]
+        return Seen(
+            time=k * self._period,
+            state=np.array(memory.belief.state),
+            wanted=wanted,
+            torque=self.record.latest,
+            error=float(100 * np.mean(np.abs(error) / self._design.experiment.scale)),
+            eta=float(memory.belief.delay[0]),
+            trip=link.typical,
+            spread=link.spread,
+            lost=1 - (1 - link.loss_there) * (1 - link.loss_back),
+            missed=self.pace.missed,
+            safe=MachineFlags.SAFE in self._flags,
+            by_hand=self._by_hand,
+            limit=self._steering.limit,
+        )
+
+
+def _until_next(timeline: Timeline, flying: Array) -> Acting:
+    """What acts from now until the next torque does, of torques (n >= L, 6) that are under way."""
+    return timeline.until_next(timeline.queue(np.vstack([np.zeros(NUM_TORQUES), flying])))

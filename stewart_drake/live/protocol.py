@@ -1,0 +1,407 @@
+"""The datagrams between a machine and its controller: what they hold, and how it is written.
+
+docs/protocol.md tells every byte; the C of `export-c` speaks the same. Numbers are little-endian.
+Times are whole nanoseconds of the *machine's* clock, which begins when the machine does, but for
+`time` and `echo`, which are of the clock of whoever sends, and of the other. Nothing here knows a
+socket.
+"""
+
+import hashlib
+import hmac
+import math
+import struct
+from dataclasses import dataclass, field
+from enum import Enum, IntFlag
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, NUM_TORQUES
+
+Array = NDArray[np.float64]
+
+VERSION: Final = 1
+MAGIC_MACHINE: Final = b"STWM"
+MAGIC_CONTROLLER: Final = b"STWC"
+TAG: Final = 16
+"""Bytes of HMAC-SHA256 that a datagram with a key ends with."""
+NEVER: Final = 2**64 - 1
+"""A time that is not known yet."""
+LONGEST: Final = 1452
+"""Bytes of a datagram: what passes Ethernet and IPv6 in one piece."""
+MOST_ROWS: Final = 24
+"""Torques of a plan."""
+MOST_HISTORY: Final = 16
+"""Torques that have acted, in a report."""
+MOST_SAMPLES: Final = 16
+"""Of each encoder in a measurement."""
+MOST_BITS: Final = 30
+"""Of an encoder's turn."""
+MISSING: Final = -(2**31)
+"""A code that was not read."""
+SECOND: Final = 10**9
+
+# magic, version, bytes of the tag, bytes in all, session, nonce, sequence, acknowledged, time,
+# echo, held, flags
+_HEAD: Final = struct.Struct("<4sBBHQQIIQQQI")
+# kind, samples, bits, history; sampled, begin, period, watchdog, rate, torque_limit, arrived,
+# acted_from; played, dry, refused, reserved
+_MACHINE: Final = struct.Struct("<BBBBQQQQddQQIIII")
+# rows, reserved (3); sampled, playout, begin
+_CONTROLLER: Final = struct.Struct("<B3xQQQ")
+
+
+class Refusal(Enum):
+    """Why a datagram is not acted upon."""
+
+    MALFORMED = "malformed"
+    """No datagram of this protocol: length, magic, a count or a number outside its range."""
+    VERSION = "version"
+    KEY = "key"
+    """Its tag is wrong, or there is none, or one that nobody asked for."""
+    FOREIGN = "foreign"
+    """Of another session, or from another address."""
+    REPLAYED = "replayed"
+    """It has been there before."""
+    LATE = "late"
+    """So old that it is of no use, or cannot be told from a replay."""
+
+
+class RefusedError(Exception):
+    """Bytes that are no datagram to act upon; `cause` says why."""
+
+    def __init__(self, cause: Refusal, detail: str = "") -> None:
+        super().__init__(f"{cause.value}: {detail}" if detail else cause.value)
+        self.cause = cause
+
+
+class MachineFlags(IntFlag):
+    """What a machine says of itself."""
+
+    SIMULATION = 1
+    """Nothing moves. Without it a controller must be armed."""
+    PARKED = 2
+    """Brakes are on, or the simulation waits: torques do nothing before `begin`."""
+    RUNNING = 4
+    """The run has begun and torques from the buffer act."""
+    SAFE = 8
+    """The safe torque acts: nothing was heard for `watchdog`, or the controller said stop."""
+    LEFT = 16
+    """The plate has left its workspace; the machine has stopped."""
+    HOLDS = 32
+    """A dry buffer holds the last torque; without it zero acts."""
+    BUSY = 64
+    """Another controller drives it: this offer of a session would be refused."""
+    WIRE = 128
+    """A simulated wire: a torque acts when it arrives there, whatever its play-out time."""
+    RESETS = 256
+    """A new session begins at rest at the scenario's start; without it where the machine is."""
+    SAFE_HOLDS = 512
+    """The safe torque is the last one; without it zero."""
+
+
+class ControllerFlags(IntFlag):
+    """What a controller asks for beside torques."""
+
+    STOP = 1
+    """The safe torque at once, and the end of the session."""
+    ARMED = 2
+    """It knows that this is no simulation. A real machine does not begin without it."""
+
+
+NOTHING: Final = ControllerFlags(0)
+
+
+@dataclass(frozen=True)
+class Head:
+    """What each datagram begins with.
+
+    Attributes:
+        session: drawn by the controller, not 0.
+        nonce: drawn by the machine for each session, that of its last offer; 0 asks for one.
+        sequence: of the datagrams that a side sends in a session, from 1 on; each is 1 more.
+        acknowledged: newest sequence that was got from the other side, 0 for none.
+        time: ns, of the sender's clock, when it was sent.
+        echo: `time` of the datagram that is acknowledged.
+        held: ns since that was got.
+    """
+
+    session: int
+    nonce: int
+    sequence: int
+    acknowledged: int
+    time: int
+    echo: int
+    held: int
+
+
+@dataclass(frozen=True, eq=False)
+class MachineMessage:
+    """A measurement and a report, machine to controller.
+
+    Attributes:
+        head: see `Head`.
+        flags: see `MachineFlags`.
+        sampled: ns, when the measurement was taken, the last of its samples.
+        begin: ns, when the run began or will begin; NEVER without one.
+        period: ns, of the samples and of torques.
+        watchdog: ns of silence after which the safe torque acts.
+        rate: seconds of the machine's clock in a second.
+        torque_limit: of each motor, N m, infinite for none; kept to at the machine.
+        arrived: (n,) whether the datagram `acknowledged` - i has arrived; n = 64.
+        acted_from: ns, when the first row of `acted` began to act; NEVER with no row.
+        acted: (h, 6) N m, what acted there and, i rows on, i periods before.
+        played: periods in which a torque of a plan acted.
+        dry: periods for which there was none.
+        refused: datagrams.
+        state: (12,) pose and rates in rad, m, rad/s, m/s, NaN what is lost; or None.
+        codes: (N, 6) of encoders, int32, the oldest first, MISSING what is lost; or None.
+        bits: of an encoder's turn, 0 without encoders.
+        zeros: (6,) rad at code 0; or None.
+    """
+
+    head: Head
+    flags: MachineFlags
+    sampled: int
+    begin: int
+    period: int
+    watchdog: int
+    rate: float
+    torque_limit: float
+    arrived: NDArray[np.bool_]
+    acted_from: int
+    acted: Array
+    played: int = 0
+    dry: int = 0
+    refused: int = 0
+    state: Array | None = None
+    codes: NDArray[np.int32] | None = None
+    bits: int = 0
+    zeros: Array | None = None
+
+    def __eq__(self, other: object) -> bool:
+        return _equal(self, other)
+
+    @property
+    def age(self) -> float:
+        """s since the measurement was taken, when it was sent."""
+        return (self.head.time - self.sampled) / SECOND
+
+    @property
+    def values(self) -> Array | None:
+        """(12,) the state, or (6 N,) crank angles in rad, the oldest first; NaN what is lost.
+
+        None where there is no measurement.
+        """
+        if self.state is not None or self.codes is None:
+            return self.state
+        angles = self.zeros + 2 * np.pi / 2**self.bits * self.codes
+        return np.where(self.codes == MISSING, np.nan, angles).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerMessage:
+    """Torques for coming periods, controller to machine.
+
+    Attributes:
+        head: see `Head`; with a nonce of 0 it asks for a session, and nothing in it is acted upon.
+        flags: see `ControllerFlags`.
+        sampled: ns, the instant for which the torques were computed.
+        playout: ns, when the first row shall act; row i acts i periods later, each for a period.
+        begin: ns, when the run shall begin, in each datagram from when it is known, all that have
+            torques among them; or NEVER.
+        torques: (rows, 6) N m; without a row it only says that the controller is there.
+    """
+
+    head: Head
+    flags: ControllerFlags = NOTHING
+    sampled: int = 0
+    playout: int = 0
+    begin: int = NEVER
+    torques: Array = field(default_factory=lambda: np.empty((0, NUM_TORQUES)))
+
+    def __eq__(self, other: object) -> bool:
+        return _equal(self, other)
+
+
+Message = MachineMessage | ControllerMessage
+
+
+def _equal(one: Any, other: object) -> bool:
+    if type(one) is not type(other):
+        return False
+    for name, a in vars(one).items():
+        b = getattr(other, name)
+        if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+            same = np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+        else:
+            same = a == b
+        if not same:
+            return False
+    return True
+
+
+# ---------------------------------------------------------------- writing
+
+
+def encode(message: Message, key: bytes | None = None) -> bytes:
+    """The datagram of a message, with a tag if there is a key.
+
+    Raises:
+        ValueError: a count outside its range, more than LONGEST bytes.
+        struct.error: a number that does not fit its field.
+    """
+    if isinstance(message, MachineMessage):
+        magic, body = MAGIC_MACHINE, _machine_body(message)
+    else:
+        magic, body = MAGIC_CONTROLLER, _controller_body(message)
+    tag = 0 if key is None else TAG
+    length = _HEAD.size + len(body) + tag
+    if length > LONGEST:
+        raise ValueError(f"datagram: got {length} bytes; expected at most {LONGEST}")
+    h = message.head
+    numbers = (h.session, h.nonce, h.sequence, h.acknowledged, h.time, h.echo, h.held)
+    data = _HEAD.pack(magic, VERSION, tag, length, *numbers, int(message.flags)) + body
+    return data if key is None else data + _tag(data, key)
+
+
+def _tag(data: bytes, key: bytes) -> bytes:
+    return hmac.new(key, data, hashlib.sha256).digest()[:TAG]
+
+
+def _machine_body(m: MachineMessage) -> bytes:
+    _check(m.acted, "acted", MOST_HISTORY)
+    kind, samples, measured = 0, 0, b""
+    if m.state is not None:
+        kind, samples, measured = 1, 1, np.asarray(m.state, "<f8").tobytes()
+    elif m.codes is not None and m.zeros is not None:
+        kind, samples = 2, len(m.codes)
+        _check(m.codes, "codes", MOST_SAMPLES)
+        zeros, codes = np.asarray(m.zeros, "<f8"), np.asarray(m.codes, "<i4")
+        measured = zeros.tobytes() + codes.tobytes()
+    arrived = sum(1 << i for i, there in enumerate(m.arrived[:64]) if there)
+    times = (m.sampled, m.begin, m.period, m.watchdog)
+    packed = _MACHINE.pack(
+        *(kind, samples, m.bits, len(m.acted), *times, m.rate, m.torque_limit),
+        *(arrived, m.acted_from, m.played, m.dry, m.refused, 0),
+    )
+    return packed + measured + np.asarray(m.acted, "<f8").tobytes()
+
+
+def _controller_body(m: ControllerMessage) -> bytes:
+    _check(m.torques, "torques", MOST_ROWS)
+    packed = _CONTROLLER.pack(len(m.torques), m.sampled, m.playout, m.begin)
+    return packed + np.asarray(m.torques, "<f8").tobytes()
+
+
+def _check(rows: NDArray[Any], name: str, most: int) -> None:
+    if rows.ndim != 2 or rows.shape[1] != NUM_TORQUES or len(rows) > most:
+        raise ValueError(f"{name}: got shape {rows.shape}; expected up to {most} rows of six")
+
+
+# ---------------------------------------------------------------- reading
+
+
+def decode(data: bytes, key: bytes | None = None) -> Message:
+    """The message of a datagram.
+
+    What is looked at comes in this order: length and magic, version, tag, and only then the rest.
+
+    Raises:
+        RefusedError: malformed, version or key.
+    """
+    if not _HEAD.size <= len(data) <= LONGEST:
+        raise RefusedError(Refusal.MALFORMED, f"{len(data)} bytes")
+    magic, version, tag, length, *numbers, flags = _HEAD.unpack_from(data)
+    if magic not in (MAGIC_MACHINE, MAGIC_CONTROLLER):
+        raise RefusedError(Refusal.MALFORMED, f"magic {magic!r}")
+    if version != VERSION:
+        raise RefusedError(Refusal.VERSION, str(version))
+    if length != len(data) or tag not in (0, TAG) or length < _HEAD.size + tag:
+        raise RefusedError(Refusal.MALFORMED, f"{len(data)} bytes that say {length}, tag {tag}")
+    _authenticate(data, tag, key)
+    head, body = Head(*numbers), data[_HEAD.size : length - tag]
+    if head.session == 0 or head.sequence == 0:
+        raise RefusedError(Refusal.MALFORMED, "a session or a sequence of 0")
+    if magic == MAGIC_MACHINE:
+        return _machine(head, flags, body)
+    return _controller(head, flags, body)
+
+
+def _authenticate(data: bytes, tag: int, key: bytes | None) -> None:
+    if (tag != 0) != (key is not None):
+        raise RefusedError(Refusal.KEY, "a tag" if tag else "no tag")
+    if key is not None and not hmac.compare_digest(_tag(data[:-TAG], key), data[-TAG:]):
+        raise RefusedError(Refusal.KEY, "a wrong tag")
+
+
+def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
+    if len(body) < _MACHINE.size:
+        raise RefusedError(Refusal.MALFORMED, "a short body")
+    kind, samples, bits, history, *rest = _MACHINE.unpack_from(body)
+    sampled, begin, period, watchdog, rate, limit, arrived, acted_from, *counts = rest
+    played, dry, refused, zero = counts
+    fits = {
+        0: samples == 0 and bits == 0,
+        1: samples == 1 and bits == 0,
+        2: 1 <= samples <= MOST_SAMPLES and 1 <= bits <= MOST_BITS,
+    }
+    sizes = {0: 0, 1: 8 * NUM_STATE, 2: 8 * NUM_LEGS + 4 * NUM_LEGS * samples}
+    plausible = rate > 0 and math.isfinite(rate) and limit > 0 and period > 0 and zero == 0
+    if not (fits.get(kind) and history <= MOST_HISTORY and plausible and flags < 1024):
+        raise RefusedError(Refusal.MALFORMED, "a number outside its range")
+    if len(body) != _MACHINE.size + sizes[kind] + 8 * NUM_TORQUES * history:
+        raise RefusedError(Refusal.MALFORMED, "a body of another length")
+    measured = body[_MACHINE.size :]
+    acted = _rows(body[_MACHINE.size + sizes[kind] :])
+    state = codes = zeros = None
+    if kind == 1:
+        state = np.frombuffer(measured, "<f8", NUM_STATE).astype(np.float64)
+    elif kind == 2:
+        zeros = np.frombuffer(measured, "<f8", NUM_LEGS).astype(np.float64)
+        read = np.frombuffer(measured, "<i4", NUM_LEGS * samples, 8 * NUM_LEGS)
+        codes = read.astype(np.int32).reshape(samples, NUM_LEGS)
+    if not np.all(np.isfinite(acted)) or (zeros is not None and not np.all(np.isfinite(zeros))):
+        raise RefusedError(Refusal.MALFORMED, "a torque or an angle that is no number")
+    there = np.array([bool(arrived >> i & 1) for i in range(64)])
+    return MachineMessage(
+        head=head,
+        flags=MachineFlags(flags),
+        sampled=sampled,
+        begin=begin,
+        period=period,
+        watchdog=watchdog,
+        rate=rate,
+        torque_limit=limit,
+        arrived=there,
+        acted_from=acted_from,
+        acted=acted,
+        played=played,
+        dry=dry,
+        refused=refused,
+        state=state,
+        codes=codes,
+        bits=bits,
+        zeros=zeros,
+    )
+
+
+def _controller(head: Head, flags: int, body: bytes) -> ControllerMessage:
+    if len(body) < _CONTROLLER.size:
+        raise RefusedError(Refusal.MALFORMED, "a short body")
+    rows, sampled, playout, begin = _CONTROLLER.unpack_from(body)
+    if rows > MOST_ROWS or flags > 3 or any(body[1:4]):
+        raise RefusedError(Refusal.MALFORMED, "a number outside its range")
+    if len(body) != _CONTROLLER.size + 8 * NUM_TORQUES * rows:
+        raise RefusedError(Refusal.MALFORMED, "a body of another length")
+    torques = _rows(body[_CONTROLLER.size :])
+    if not np.all(np.isfinite(torques)):
+        raise RefusedError(Refusal.MALFORMED, "a torque that is no number")
+    if rows and begin == NEVER:
+        raise RefusedError(Refusal.MALFORMED, "torques for no run")
+    return ControllerMessage(head, ControllerFlags(flags), sampled, playout, begin, torques)
+
+
+def _rows(data: bytes) -> Array:
+    return np.frombuffer(data, "<f8").astype(np.float64).reshape(-1, NUM_TORQUES)

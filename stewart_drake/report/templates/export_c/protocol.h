@@ -1,0 +1,115 @@
+/* The datagrams between a machine and its controller: docs/protocol.md of stewart_drake tells every
+   byte. No state, no allocation. Times are ns; torques N m; angles rad. */
+
+#ifndef STEWART_PROTOCOL_H
+#define STEWART_PROTOCOL_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#define STEWART_LONGEST 1452
+#define STEWART_HEAD 60
+#define STEWART_TAG 16
+#define STEWART_NEVER UINT64_MAX
+#define STEWART_ROWS 24
+#define STEWART_HISTORY 16
+#define STEWART_SAMPLES 16
+#define STEWART_BITS 30
+#define STEWART_MISSING INT32_MIN /* a code that was not read */
+
+/* Why a datagram is not acted upon. */
+enum {
+    STEWART_TAKEN,
+    STEWART_MALFORMED,
+    STEWART_VERSION,
+    STEWART_KEY,
+    STEWART_FOREIGN,
+    STEWART_REPLAYED,
+    STEWART_LATE,
+    STEWART_REFUSALS
+};
+
+/* Flags of a machine, then of a controller. */
+enum {
+    STEWART_SIMULATION = 1,
+    STEWART_PARKED = 2,
+    STEWART_RUNNING = 4,
+    STEWART_SAFE = 8,
+    STEWART_LEFT = 16,
+    STEWART_HOLDS = 32,
+    STEWART_BUSY = 64,
+    STEWART_WIRE = 128,
+    STEWART_RESETS = 256,
+    STEWART_SAFE_HOLDS = 512
+};
+enum { STEWART_STOP = 1, STEWART_ARMED = 2 };
+
+/* Kinds of measurement. */
+enum { STEWART_NOTHING, STEWART_STATE, STEWART_ENCODERS };
+
+typedef struct {
+    uint64_t session, nonce;
+    uint32_t sequence, acknowledged;
+    uint64_t time, echo, held;
+    uint32_t flags;
+} stewart_head;
+
+typedef struct {
+    stewart_head head;
+    uint8_t kind, samples, bits, history;
+    uint64_t sampled, begin, period, watchdog;
+    double rate, torque_limit;
+    uint64_t arrived, acted_from;
+    uint32_t played, dry, refused;
+    double state[12], zeros[6]; /* the one or the other, by kind */
+    int32_t codes[STEWART_SAMPLES][6];
+    double acted[STEWART_HISTORY][6];
+} stewart_measured;
+
+typedef struct {
+    stewart_head head;
+    uint8_t rows;
+    uint64_t sampled, playout, begin;
+    double torques[STEWART_ROWS][6];
+} stewart_plan;
+
+/* Shared by both sides, or of no bytes. */
+typedef struct {
+    const uint8_t *bytes;
+    size_t size;
+} stewart_key;
+
+/* The bytes of a datagram, up to STEWART_LONGEST; returns how many. */
+size_t stewart_write_measured(const stewart_measured *message, stewart_key key, uint8_t *data);
+size_t stewart_write_plan(const stewart_plan *message, stewart_key key, uint8_t *data);
+
+/* A datagram's message; returns STEWART_TAKEN, or why it is none: malformed, version or key. */
+int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key,
+                          stewart_measured *message);
+int stewart_read_plan(const uint8_t *data, size_t size, stewart_key key, stewart_plan *message);
+
+/* Which sequences were there already; starts as zeros. */
+typedef struct {
+    uint32_t newest;
+    uint64_t seen; /* bit i is for newest - i: what `arrived` says */
+} stewart_window;
+
+/* STEWART_TAKEN, STEWART_REPLAYED or STEWART_LATE. */
+int stewart_take(stewart_window *window, uint32_t sequence);
+
+/* One side's view of a session. */
+typedef struct {
+    uint64_t number, nonce;
+    stewart_window window;
+    uint32_t sent;
+    uint64_t echo, got; /* of the newest datagram: its time, and when it came by the own clock */
+    uint64_t heard;     /* when the last one was taken */
+} stewart_session;
+
+/* The head of the next datagram, which is sent now. */
+stewart_head stewart_next(stewart_session *session, uint64_t now, uint32_t flags);
+
+/* Why a datagram is not of this session, or STEWART_TAKEN: then it is noted. A nonce of 0 takes any. */
+int stewart_note(stewart_session *session, const stewart_head *head, uint64_t now);
+
+#endif

@@ -1,0 +1,18 @@
+/* What the examples know of the scenario beside the controller: its motion, its start, its limits. */
+
+#ifndef STEWART_MOTION_H
+#define STEWART_MOTION_H
+
+#include "stewart.h"
+
+extern const double stewart_duration;                /* s */
+extern const real stewart_weights[2];                /* of errors and of torques */
+extern const real stewart_start[STEWART_STATES];     /* of the plate */
+extern const real stewart_least[STEWART_MEASURES];   /* what the measures of the workspace must be above */
+extern const real stewart_home_sign;                 /* of the measure of parallel singularity */
+extern const int stewart_rows;                       /* torques in `stewart_queue` */
+
+/* What is followed, at t >= 0: pose, rates, accelerations. */
+void stewart_reference(double t, real *reference);
+
+#endif

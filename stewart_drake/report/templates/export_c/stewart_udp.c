@@ -1,0 +1,284 @@
+/* The controller behind a socket, as an example: it drives a machine that speaks docs/protocol.md.
+
+       ./stewart_udp ADDRESS PORT [seconds=S] [key=FILE] [log=FILE] [arm]
+
+   It asks for a session, finds the machine's clock, chooses when to begin, and then steps the
+   controller once a period of the machine. Without a key it talks to this computer only; a machine that
+   does not say that it is a simulation is driven with `arm` only. The log has a line per sample: time,
+   measured state (12), torques (6). */
+
+#define _POSIX_C_SOURCE 200809L
+
+#include <arpa/inet.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "stewart_config.h"
+#include "stewart_motion.h"
+#include "udp.h"
+
+#define TRIPS 64
+#define ENOUGH 10 /* round trips that tell the clock */
+
+/* Round trips, and the machine's clock less the own one by each: the shortest one counts. */
+typedef struct {
+    double trip[TRIPS], there[TRIPS], rate;
+    unsigned number;
+} other_clock;
+
+typedef struct {
+    int socket;
+    struct sockaddr_in machine;
+    stewart_key key;
+    stewart_session session;
+    other_clock clock;
+    stewart_measured last; /* the newest by `sampled` */
+    uint64_t begin, used;  /* of the machine's clock; that of the measurement used last, plus 1 */
+    uint32_t flags;
+    unsigned refused[STEWART_REFUSALS];
+    stewart_memory memory;
+    stewart_workspace work;
+    unsigned samples, missing, missed;
+    double seconds;
+    FILE *log;
+} controller;
+
+static void clock_note(other_clock *c, const stewart_head *h, double rate, uint64_t now)
+{
+    if (h->acknowledged == 0)
+        return;
+    unsigned i = c->number++ % TRIPS;
+    c->rate = rate;
+    c->trip[i] = (double)(now - h->echo) - (double)h->held / rate;
+    c->there[i] = (double)h->time + rate * (c->trip[i] > 0 ? c->trip[i] : 0) / 2 - rate * (double)now;
+}
+
+static unsigned shortest(const other_clock *c)
+{
+    unsigned best = 0;
+    for (unsigned i = 1; i < c->number && i < TRIPS; i++)
+        best = c->trip[i] < c->trip[best] ? i : best;
+    return best;
+}
+
+/* The own clock at an instant of the machine's. */
+static uint64_t own_time(const other_clock *c, uint64_t machine)
+{
+    return (uint64_t)(((double)machine - c->there[shortest(c)]) / c->rate);
+}
+
+static double machine_time(const other_clock *c, uint64_t own)
+{
+    return c->rate * (double)own + c->there[shortest(c)];
+}
+
+static void receive(controller *c)
+{
+    uint8_t data[STEWART_LONGEST + 1];
+    struct sockaddr_in from;
+    stewart_measured m;
+    size_t size;
+    while ((size = udp_get(c->socket, data, &from)) > 0) {
+        uint64_t now = udp_now();
+        int cause = stewart_read_measured(data, size, c->key, &m);
+        if (!cause && !udp_same(&from, &c->machine))
+            cause = STEWART_FOREIGN;
+        if (!cause)
+            cause = stewart_note(&c->session, &m.head, now);
+        c->refused[cause]++;
+        if (cause)
+            continue;
+        c->session.nonce = m.head.nonce;
+        clock_note(&c->clock, &m.head, m.rate, now);
+        if (m.sampled >= c->last.sampled)
+            c->last = m;
+    }
+}
+
+static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playout, const real *torque)
+{
+    uint8_t data[STEWART_LONGEST];
+    stewart_plan plan;
+    memset(&plan, 0, sizeof plan);
+    plan.head = stewart_next(&c->session, udp_now(), c->flags | flags);
+    plan.sampled = sampled;
+    plan.playout = playout;
+    plan.begin = c->begin;
+    plan.rows = torque != NULL;
+    for (int i = 0; torque && i < STEWART_MOTORS; i++)
+        plan.torques[0][i] = (double)torque[i];
+    udp_put(c->socket, data, stewart_write_plan(&plan, c->key, data), &c->machine);
+}
+
+/* The measurement of an instant, NaN where there is none; its age in periods. */
+static int take(controller *c, uint64_t sampled, real *measurement)
+{
+    int fresh = c->last.kind == STEWART_STATE && c->last.sampled >= c->used &&
+                c->last.sampled >= c->begin && c->last.sampled <= sampled;
+    uint64_t age = fresh ? (sampled - c->last.sampled + c->last.period / 2) / c->last.period : 0;
+    fresh &= age <= (uint64_t)stewart_configuration.longest_wait;
+    for (int i = 0; i < STEWART_STATES; i++)
+        measurement[i] = fresh ? (real)c->last.state[i] : (real)NAN;
+    c->used = fresh ? c->last.sampled + 1 : c->used;
+    c->missing += !fresh;
+    return fresh ? (int)age : 0;
+}
+
+static void note(const controller *c, double t, const real *measurement, const real *torque)
+{
+    fprintf(c->log, "%.9g", t);
+    for (int i = 0; i < STEWART_STATES; i++)
+        fprintf(c->log, ",%.17g", (double)measurement[i]);
+    for (int i = 0; i < STEWART_MOTORS; i++)
+        fprintf(c->log, i + 1 < STEWART_MOTORS ? ",%.17g" : ",%.17g\n", (double)torque[i]);
+}
+
+static void step(controller *c, unsigned k)
+{
+    const stewart_config *config = &stewart_configuration;
+    uint64_t sampled = c->begin + k * c->last.period;
+    real times[STEWART_PREVIEW], preview[STEWART_PREVIEW * STEWART_REFERENCE];
+    real measurement[STEWART_STATES], torque[STEWART_MOTORS];
+    int rows = stewart_preview_times(config, times), lower = 0;
+    for (int i = 0; i < rows; i++)
+        stewart_reference(fmax(0, k * (double)config->period + (double)times[i]),
+                          preview + i * STEWART_REFERENCE);
+    int age = take(c, sampled, measurement);
+    stewart_step(config, &c->memory, &c->work, measurement, age, preview, stewart_weights, torque);
+    real limit = (real)fmin(c->last.torque_limit, (double)config->torque_limit);
+    for (int i = 0; i < STEWART_MOTORS; i++) {
+        torque[i] = (real)fmax(-limit, fmin(limit, torque[i]));
+        lower |= limit < config->torque_limit;
+    }
+    if (lower)
+        stewart_sent(config, &c->memory, torque);
+    double eta = (config->steps + (double)config->fraction) * (double)c->last.period;
+    say(c, 0, sampled, sampled + (uint64_t)(eta + 0.5), torque);
+    if (c->log)
+        note(c, k * (double)config->period, measurement, torque);
+    c->samples++;
+    c->missed += udp_now() > own_time(&c->clock, sampled + c->last.period);
+}
+
+/* Why a machine is not driven, or NULL. */
+static const char *objection(const controller *c)
+{
+    double period = (double)stewart_configuration.period * SECOND;
+    if (!(c->last.head.flags & STEWART_SIMULATION) && !(c->flags & STEWART_ARMED))
+        return "this is a real machine: say `arm` to drive it";
+    if (fabs((double)c->last.period - period) > 1)
+        return "its period is another one";
+    return NULL;
+}
+
+/* A session and a run that will begin, or why not. */
+static const char *greet(controller *c)
+{
+    uint64_t patience = udp_now() + 10ull * SECOND;
+    int busy = 0;
+    while (c->last.begin == STEWART_NEVER || c->begin == STEWART_NEVER || c->last.period == 0) {
+        if (udp_interrupted() || udp_now() > patience)
+            return busy ? "another controller drives it" : "the machine does not answer";
+        say(c, 0, 0, 0, NULL);
+        uint64_t next = udp_now() + (c->last.period ? c->last.period : SECOND / 10);
+        while (udp_now() < next) {
+            udp_wait(c->socket, next);
+            receive(c);
+        }
+        busy = c->session.nonce && (c->last.head.flags & STEWART_BUSY);
+        if (busy) /* asks for another offer */
+            c->session.nonce = 0;
+        if (c->session.nonce == 0)
+            continue;
+        const char *problem = objection(c);
+        if (problem)
+            return problem;
+        if (c->begin == STEWART_NEVER && c->clock.number >= ENOUGH) {
+            double trip = c->clock.trip[shortest(&c->clock)], ahead = 5 * (double)c->last.period;
+            double wanted = machine_time(&c->clock, udp_now()) + ahead + 2 * c->clock.rate * trip;
+            c->begin = ((uint64_t)wanted / c->last.period + 1) * c->last.period;
+        }
+    }
+    c->begin = c->last.begin; /* as the machine says */
+    return NULL;
+}
+
+/* One sample after the other; why it ended before its time, or NULL. */
+static const char *drive(controller *c)
+{
+    unsigned number = (unsigned)(c->seconds / (double)stewart_configuration.period + 0.5);
+    int waits = stewart_configuration.longest_wait == 0;
+    for (uint64_t t = own_time(&c->clock, c->begin); udp_now() + SECOND / 20 < t;) {
+        say(c, 0, 0, 0, NULL); /* still here */
+        udp_wait(c->socket, udp_now() + SECOND / 20);
+        receive(c);
+    }
+    for (unsigned k = 0; k < number; k++) {
+        uint64_t sampled = c->begin + k * c->last.period;
+        uint64_t patience = own_time(&c->clock, sampled + (waits ? c->last.period / 4 : 0));
+        for (receive(c); udp_now() < patience && !(waits && c->last.sampled >= sampled); receive(c))
+            udp_wait(c->socket, patience);
+        if (udp_interrupted())
+            return "interrupted";
+        if (c->last.head.flags & STEWART_LEFT)
+            return "the plate has left its workspace";
+        if (udp_now() > c->session.heard + 2 * c->last.watchdog)
+            return "the machine has fallen silent";
+        step(c, k);
+    }
+    return NULL;
+}
+
+static int understood(controller *c, int argc, char **argv)
+{
+    c->machine.sin_family = AF_INET;
+    c->seconds = stewart_duration;
+    if (argc < 3 || inet_pton(AF_INET, argv[1], &c->machine.sin_addr) != 1)
+        return 0;
+    c->machine.sin_port = htons((uint16_t)atoi(argv[2]));
+    for (int i = 3; i < argc; i++) {
+        if (strncmp(argv[i], "seconds=", 8) == 0)
+            c->seconds = atof(argv[i] + 8);
+        else if (strncmp(argv[i], "key=", 4) == 0 && (c->key = udp_key(argv[i] + 4)).size)
+            continue;
+        else if (strncmp(argv[i], "log=", 4) == 0 && (c->log = fopen(argv[i] + 4, "w")))
+            continue;
+        else if (strcmp(argv[i], "arm") == 0)
+            c->flags = STEWART_ARMED;
+        else
+            return 0;
+    }
+    return c->key.size || ntohl(c->machine.sin_addr.s_addr) >> 24 == 127;
+}
+
+int main(int argc, char **argv)
+{
+    static controller c;
+    if (!understood(&c, argc, argv)) {
+        fprintf(stderr, "expected: stewart_udp ADDRESS PORT [seconds=S] [key=FILE] [log=FILE] [arm], "
+                        "the address in numbers, beyond 127.0.0.1 with a key\n");
+        return 2;
+    }
+    udp_interrupted();
+    c.socket = udp_open(0, c.key);
+    c.session.number = udp_draw();
+    c.begin = c.last.begin = STEWART_NEVER;
+    stewart_init(&stewart_configuration, &c.memory, stewart_queue);
+    const char *problem = c.socket < 0 ? "no socket" : greet(&c);
+    if (!problem) {
+        printf("begins at %.3f s of the machine, round trip %.2f ms\n", 1e-9 * (double)c.begin,
+               1e-6 * c.clock.trip[shortest(&c.clock)]);
+        fflush(stdout);
+        problem = drive(&c);
+    }
+    for (int i = 0; i < 3 && c.session.nonce; i++)
+        say(&c, STEWART_STOP, 0, 0, NULL);
+    printf("%s after %u samples, %u of them without a measurement, %u late\n",
+           problem ? problem : "completed", c.samples, c.missing, c.missed);
+    udp_tell(c.refused);
+    if (c.log)
+        fclose(c.log);
+    return problem != NULL;
+}

@@ -1,0 +1,124 @@
+#define _POSIX_C_SOURCE 200809L
+
+#include <arpa/inet.h>
+#include <fcntl.h>
+#include <poll.h>
+#include <signal.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "udp.h"
+
+uint64_t udp_now(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (uint64_t)t.tv_sec * SECOND + (uint64_t)t.tv_nsec;
+}
+
+uint64_t udp_draw(void)
+{
+    uint64_t number = 0;
+    FILE *file = fopen("/dev/urandom", "rb");
+    if (!file || fread(&number, sizeof number, 1, file) != 1)
+        number = udp_now();
+    if (file)
+        fclose(file);
+    return number ? number : 1;
+}
+
+int udp_open(uint16_t port, stewart_key key)
+{
+    struct sockaddr_in at = {.sin_family = AF_INET, .sin_port = htons(port)};
+    at.sin_addr.s_addr = htonl(key.size ? INADDR_ANY : INADDR_LOOPBACK);
+    int s = socket(AF_INET, SOCK_DGRAM, 0);
+    if (s >= 0 && (fcntl(s, F_SETFL, O_NONBLOCK) < 0 ||
+                   bind(s, (struct sockaddr *)&at, sizeof at) < 0)) {
+        close(s);
+        s = -1;
+    }
+    if (s < 0)
+        perror("port");
+    return s;
+}
+
+void udp_wait(int socket, uint64_t until)
+{
+    struct pollfd watched = {.fd = socket, .events = POLLIN};
+    uint64_t now = udp_now();
+    /* Whole ms, up: the last of them is waited for by the clock. */
+    uint64_t wait = until > now ? (until - now) / 1000000u : 0;
+    if (poll(&watched, 1, wait > 1000u ? 1000 : (int)wait) != 0 || wait > 0 || until <= now)
+        return;
+    struct timespec rest = {0, (long)(until - now)};
+    nanosleep(&rest, NULL);
+}
+
+size_t udp_get(int socket, uint8_t *data, struct sockaddr_in *from)
+{
+    socklen_t size = sizeof *from;
+    ssize_t got = recvfrom(socket, data, STEWART_LONGEST + 1, 0, (struct sockaddr *)from, &size);
+    return got > 0 ? (size_t)got : 0;
+}
+
+int udp_put(int socket, const uint8_t *data, size_t size, const struct sockaddr_in *to)
+{
+    return sendto(socket, data, size, 0, (const struct sockaddr *)to, sizeof *to) == (ssize_t)size;
+}
+
+int udp_same(const struct sockaddr_in *one, const struct sockaddr_in *other)
+{
+    return one->sin_port == other->sin_port && one->sin_addr.s_addr == other->sin_addr.s_addr;
+}
+
+stewart_key udp_key(const char *path)
+{
+    static uint8_t bytes[4096];
+    stewart_key key = {bytes, 0};
+    FILE *file = path ? fopen(path, "rb") : NULL;
+    if (file) {
+        key.size = fread(bytes, 1, sizeof bytes, file);
+        fclose(file);
+    }
+    while (key.size && (bytes[key.size - 1] == '\n' || bytes[key.size - 1] == '\r'))
+        key.size--;
+    if (path && key.size < 16) {
+        fprintf(stderr, "%s: expected a key of at least 16 bytes\n", path);
+        key.size = 0;
+    }
+    return key;
+}
+
+static volatile sig_atomic_t interrupted;
+
+static void interrupt(int number)
+{
+    (void)number;
+    interrupted = 1;
+}
+
+int udp_interrupted(void)
+{
+    static int asked;
+    if (!asked) {
+        struct sigaction action;
+        memset(&action, 0, sizeof action);
+        action.sa_handler = interrupt;
+        sigaction(SIGINT, &action, NULL);
+        sigaction(SIGTERM, &action, NULL);
+        asked = 1;
+    }
+    return interrupted;
+}
+
+void udp_tell(const unsigned *refused)
+{
+    static const char *const names[STEWART_REFUSALS] = {"",        "malformed", "version", "key",
+                                                        "foreign", "replayed",  "late"};
+    printf("refused:");
+    for (int i = 1; i < STEWART_REFUSALS; i++)
+        printf(" %u %s%s", refused[i], names[i], i + 1 < STEWART_REFUSALS ? "," : "\n");
+}

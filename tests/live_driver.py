@@ -1,0 +1,232 @@
+"""The least controller that a machine can be tried with, and a clock that tests turn themselves."""
+
+import select
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stewart_drake.law.channel import Packets, Report
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.motion import KnownMotion
+from stewart_drake.law.native_law import serving
+from stewart_drake.live.endpoint import Address, Endpoint, OtherClock, Session, now
+from stewart_drake.live.machine import Machine, Settings
+from stewart_drake.live.protocol import (
+    NEVER,
+    NOTHING,
+    SECOND,
+    ControllerFlags,
+    ControllerMessage,
+    MachineMessage,
+)
+from stewart_drake.loop.experiment import control_law, first_queue, prepare
+from stewart_drake.scenario.config import Scenario
+
+
+@dataclass
+class Clock:
+    """ns, as they are set."""
+
+    time: int = 10 * SECOND
+
+    def __call__(self) -> int:
+        return self.time
+
+
+class Driver:
+    """A law behind a socket, which knows the machine's clock because it is the tests'."""
+
+    def __init__(self, scenario: Scenario, machine: Address, key: bytes | None = None) -> None:
+        self.experiment = prepare(scenario)
+        self.law, self.planned, _ = control_law(self.experiment)
+        self.served, _ = serving(self.law)
+        self.memory = self.served.initial_memory(first_queue(self.experiment, self.law))
+        self.endpoint = Endpoint(MachineMessage, key=key)
+        self.session = Session.drawn(machine)
+        self.begin, self.first = NEVER, 0
+        self.period = round(scenario.controller.period * SECOND)
+        self.got: list[MachineMessage] = []
+        self.newest, self.looked_at = -1, 0
+        self.torques: list[np.ndarray] = []
+
+    def receive(self, time: int) -> list[MachineMessage]:
+        """What has come; a first nonce is taken."""
+        found = []
+        for message, address in self.endpoint.receive():
+            assert isinstance(message, MachineMessage)
+            refusal = self.session.refusal(message.head, address, time)
+            if refusal is not None:
+                self.endpoint.refused[refusal] += 1
+                continue
+            self.session.nonce = message.head.nonce
+            found.append(message)
+        self.got += found
+        return found
+
+    def say(
+        self,
+        time: int,
+        flags: ControllerFlags = NOTHING,
+        sampled: int = 0,
+        playout: int = 0,
+        torques: np.ndarray | None = None,
+    ) -> ControllerMessage:
+        """Send a datagram."""
+        rows = np.empty((0, 6)) if torques is None else torques
+        head = self.session.head(time)
+        message = ControllerMessage(head, flags, sampled, playout, self.begin, rows)
+        self.endpoint.send(message, self.session.address)
+        return message
+
+    def step(self, time: int, own: int | None = None) -> ControllerMessage:
+        """The sample that is due at a time of the machine's clock; `own` is another one's."""
+        own = time if own is None else own
+        number = (time - self.begin) // self.period
+        self.receive(own)
+        least = max(self.begin, self.newest + 1)
+        new = [m for m in self.got[self.looked_at :] if m.sampled >= least]
+        self.looked_at = len(self.got)
+        newest = max(new, key=lambda m: m.sampled, default=None)
+        values, age, report = np.full(self.law.sensing.size, np.nan), 0.0, None
+        if newest is not None and newest.values is not None:
+            self.newest, values = newest.sampled, newest.values
+            age = (time - newest.sampled) / SECOND
+            report = self.report(newest, round((time - newest.sampled) / self.period))
+        motion = KnownMotion(self.planned, self.experiment.reference, time_of(number, self.period))
+        c = self.experiment.scenario.controller
+        weights = np.array([c.w_Q, c.w_R])
+        measured = Measurement.of(values, age)
+        self.memory = self.served.step(self.memory, measured, motion, weights, report)
+        self.torques.append(np.array(self.memory.torque))
+        playout = time + round(self.law.timeline.eta * SECOND)
+        rows = np.array(self.memory.torque)[None]
+        if isinstance(self.law.channel, Packets):
+            rows = self.memory.sent.packets[-1]
+            playout -= self.law.channel.repeats * self.period
+        message = self.say(own, sampled=time, playout=playout, torques=rows)
+        if number == 0:
+            self.first = message.head.sequence
+        return message
+
+    def report(self, message: MachineMessage, age: int) -> Report | None:
+        """Of the packets that were sent before the sample of a measurement."""
+        if not isinstance(self.law.channel, Packets) or message.acted_from == NEVER:
+            return None
+        sample = (message.sampled - self.begin) // self.period
+        arrived = []
+        for i in range(64):
+            behind = message.head.acknowledged - (self.first + sample - 1 - i)
+            arrived.append(0 <= behind < 64 and bool(message.arrived[behind]))
+        return Report(np.array(arrived), message.acted, age)
+
+
+def time_of(number: int, period: int) -> float:
+    """s, as the scenario's own grid has it."""
+    return number * (period / SECOND)
+
+
+def drive_in_real_time(driver: Driver, samples: int) -> np.ndarray:
+    """From a request for a session to a stop; (samples, 12) what was measured, NaN what was not."""
+    clock, period = OtherClock(), driver.period
+
+    def hear(until: int) -> None:
+        while (left := until - now()) > 0:
+            select.select([driver.endpoint], [], [], left / SECOND)
+            for message in driver.receive(now()):
+                clock.note(message.head, now())
+
+    def machine() -> int:
+        return round(clock.at(now()) * SECOND)
+
+    for _ in range(100):
+        driver.say(now())
+        hear(now() + period // 2)
+        trips = sum(m.head.acknowledged > 0 for m in driver.got)
+        if trips >= 10 and driver.begin == NEVER:
+            driver.begin = (machine() // period + 8) * period
+        if driver.got and driver.got[-1].begin == driver.begin != NEVER:
+            break
+    while machine() < driver.begin - period:
+        driver.say(now())
+        hear(now() + period // 2)
+    for k in range(samples):
+        time = driver.begin + k * period
+        while machine() < time + period // 3:
+            if driver.got[-1].sampled >= time:
+                break
+            hear(now() + period // 50)
+        driver.step(time, now())
+    driver.say(now(), ControllerFlags.STOP)
+    there = {(m.sampled - driver.begin) // period: m.state for m in driver.got}
+    nothing = np.full(12, np.nan)
+    return np.array([there.get(k, nothing) for k in range(samples)])
+
+
+@dataclass
+class Together:
+    """A machine and a driver on one clock, in one process."""
+
+    scenario: Scenario
+    settings: Settings = field(default_factory=Settings)
+    key: bytes | None = None
+
+    def __post_init__(self) -> None:
+        self.clock = Clock()
+        self.said: list[str] = []
+        self.ear = Endpoint(ControllerMessage, key=self.key)
+        self.machine = Machine(
+            prepare(self.scenario), self.ear, self.settings, self.said.append, self.clock
+        )
+        self.zero = self.clock.time
+        self.driver = Driver(self.scenario, self.ear.address, self.key)
+
+    def at(self, time: int) -> None:
+        """Let the machine's clock come to a time."""
+        while True:
+            self.machine.poll(self.machine.time())
+            upcoming = self.machine.advance(self.machine.time())
+            if upcoming > time:
+                break
+            self.clock.time = self.zero + upcoming
+        self.clock.time = self.zero + time
+        self.machine.advance(time)
+
+    def greet(self, time: int, begin: int) -> None:
+        """From nothing to a session that will begin its run."""
+        self.at(time)
+        for _ in range(50):
+            if self.driver.session.nonce:
+                break
+            self.driver.say(time)
+            time += self.driver.period
+            self.at(time)
+            self.driver.receive(time)
+        assert self.driver.session.nonce
+        self.driver.begin = begin
+        while not self.expects(begin):
+            assert time < begin
+            self.driver.say(time)
+            time += self.driver.period
+            self.at(time)
+
+    def expects(self, begin: int) -> bool:
+        """Whether the driver's run is about to begin."""
+        session = self.machine.session
+        driving = session is not None and session.number == self.driver.session.number
+        return driving and self.machine.begin == begin
+
+    def drive(self, samples: int) -> list[np.ndarray]:
+        """So many samples; the machine's state at each."""
+        states = []
+        begin, period = self.driver.begin, self.driver.period
+        now = self.machine.time()
+        for time in range(now - now % period + period, begin, period):
+            self.at(time)
+            self.driver.say(time)
+        for k in range(samples):
+            time = begin + k * period
+            self.at(time)
+            states.append(np.array(self.machine._body.state))
+            self.driver.step(time)
+        self.at(begin + samples * period)
+        return states

@@ -1,0 +1,360 @@
+"""The controller's side of the loop in real time, against a simulated machine in a thread."""
+
+import json
+import math
+import threading
+import urllib.error
+import urllib.request
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import stewart_drake as sd
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.log_files import Precision, read_log
+from stewart_drake.live.connect import address_of, call, open_endpoint
+from stewart_drake.live.contact import Contact, Link
+from stewart_drake.live.design import as_seen, check_peer, design
+from stewart_drake.live.endpoint import Endpoint
+from stewart_drake.live.governor import Governor
+from stewart_drake.live.loop import LiveLoop, Nobody, Seen
+from stewart_drake.live.machine import Machine, Settings
+from stewart_drake.live.page import Asked, PageViewer, read_wish
+from stewart_drake.live.protocol import NOTHING, ControllerMessage, MachineFlags
+from stewart_drake.live.session import check_armed, drive, plans, prepare_session
+from stewart_drake.live.steering import Steering, Way, Wish
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.report.style import FACTORS
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.reference_config import SineConfig
+from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
+from stewart_drake.scenario.trajectories import make_reference
+
+WAY = "low: 0.1, high: 0.12, loss: 0.02"
+OVER_A_NETWORK = f"link={{kind: network, {WAY}, return: {{{WAY}}}}}"
+FROM_REST = ("start=rest", "queue=zero")
+SETTINGS = ("plant.kind=exact", "start=on_reference", "queue=reference")
+
+
+class Running:
+    """A machine in a thread."""
+
+    def __init__(self, *settings, **how):
+        scenario = scenario_of(*settings)
+        self.lines = []
+        self.endpoint = Endpoint(ControllerMessage, "127.0.0.1", 0)
+        self.machine = Machine(prepare(scenario), self.endpoint, Settings(**how), self.lines.append)
+        self.address, self._stopping = self.endpoint.address, threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self):
+        while not self._stopping.is_set():
+            self.machine.run(self.machine.time() / 1e9 + 0.05)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._stopping.set()
+        self._thread.join()
+        self.endpoint.close()
+
+
+@pytest.fixture
+def quiet_machine(monkeypatch):
+    """`Machine.run` in slices does not stop the machine between two of them."""
+    monkeypatch.setattr(Machine, "stop", lambda self: None)
+
+
+def scenario_of(*settings):
+    return load_scenario("paper", settings=(*SETTINGS, *settings))
+
+
+# ---------------------------------------------------------------- runs
+
+
+def test_on_a_wire_it_does_what_the_simulation_does(quiet_machine):
+    with Running() as running:
+        ready = prepare_session(scenario_of(), running.address)
+        told = "\n".join(plans(ready, 4.0, "paper"))
+        assert "a simulation" in told and "0.8 s after the measurement" in told
+        result = drive(ready, 4.0, say=lambda line: None)
+    simulated = sd.simulate(scenario_of("duration=3.9"))
+    assert result.status == "completed" and result.signals.sizes["time"] == 40
+    assert result.accumulated_error < simulated.accumulated_error + 0.05
+    assert result.summary["live"]["samples"] >= 40
+    assert result.summary["delay"]["estimated_s"] == pytest.approx(0.8)
+    assert set(result.signals.data_vars) == set(simulated.signals.data_vars)
+
+
+def test_over_a_network_packets_bridge_what_is_lost(quiet_machine, tmp_path):
+    with Running(OVER_A_NETWORK, *FROM_REST) as running:
+        ready = prepare_session(scenario_of(*FROM_REST), running.address)
+        link = ready.design.experiment.scenario.link
+        assert 0.19 < link.low <= 0.24 and link.playout == pytest.approx(0.7)
+        result = drive(ready, 5.0, say=lambda line: None)
+    simulated = sd.simulate(scenario_of("duration=4.9", *FROM_REST))
+    assert result.status == "completed"
+    assert result.accumulated_error < simulated.accumulated_error + 0.5
+    applied = result.signals.torque_applied.values
+    assert np.isfinite(applied).all() and result.summary["live"]["periods_played"] > 20
+    result.save(tmp_path)
+    assert json.loads((tmp_path / "summary.json").read_text())["live"]["deadlines_missed"] >= 0
+    log = read_log(tmp_path / "signals.nc", load_mechanism("paper"), Precision())
+    # What acted 0.8 s later is what was sent at a sample, as far as it was not lost.
+    sent = result.signals.torque_commanded.values[:-10]
+    same = np.isclose(log.torques[: len(sent)], sent, atol=1e-9).all(axis=1)
+    assert log.delay == pytest.approx(0.8) and same.mean() > 0.6
+
+
+class Hand(Nobody):
+    """Asks for a pose after some samples."""
+
+    def __init__(self, target, after=5):
+        self.seen, self._target, self._after = list[Seen](), np.array(target), after
+
+    def show(self, seen):
+        self.seen.append(seen)
+
+    def wish(self):
+        return Wish(self._target if len(self.seen) >= self._after else None)
+
+
+def test_a_hand_leads_and_a_target_beyond_reach_is_told(quiet_machine):
+    target = load_mechanism("paper").home + [0, 0, 0, 0, 0, 0.3]
+    hand = Hand(target)
+    with Running() as running:
+        result = drive(
+            prepare_session(scenario_of(), running.address),
+            7.0,
+            viewer=hand,
+            say=lambda line: None,
+        )
+    assert result.status == "completed"
+    last = hand.seen[69]  # then it comes to rest
+    assert last.by_hand and "leg" in last.limit
+    np.testing.assert_allclose(last.state[POSE], last.wanted[POSE], atol=2e-3)
+    # It rises until a leg is at the end of its reach.
+    assert last.state[5] > 0.45
+
+
+def test_a_second_controller_takes_over_in_motion(quiet_machine):
+    said = []
+    with Running(restart="motion", watchdog=0.3) as running:
+        first = prepare_session(scenario_of(), running.address)
+        steering = steering_of(first.design)
+        loop = LiveLoop(first.design, steering, first.contact, Nobody(), said.append)
+        loop.begin(NOTHING)
+        # Rates are smallest where the motion turns back.
+        for k in range(15):
+            loop._step(k)
+        second = prepare_session(scenario_of(), running.address)
+        first.endpoint.close()  # as a process that was killed
+        result = drive(second, 3.0, say=said.append)
+        assert running.machine.failure is None or result.status in ("refused", "left_workspace")
+    if result.status == "completed":
+        assert result.summary["live"]["taken_over"]
+        error = np.abs(result.signals.error.values[-1])
+        assert (error / np.repeat([0.52, 0.04, 0.16], [3, 2, 1])).max() < 0.3
+    else:  # the plate went too far meanwhile
+        assert result.status in ("refused", "left_workspace") and result.stopped.reason
+
+
+def steering_of(made):
+    governor = Governor(made.law.plant.dynamics, made.torque_limit)
+    return Steering(governor, made.experiment.reference, Way.along(made.planned))
+
+
+# ---------------------------------------------------------------- the way
+
+
+def test_the_way_has_no_jumps_whoever_leads():
+    experiment = prepare(scenario_of())
+    motion = make_reference(SineConfig(), 60.0)
+    governor = Governor(experiment.nominal, 10.0)
+    steering = Steering(governor, motion, Way.along(motion))
+    home = experiment.mechanism.home
+    times, states = [], []
+    for k in range(160):
+        t = 0.1 * k
+        target = home + [0.1, 0, 0, 0.01, 0, 0.02] if 40 <= k < 90 else None
+        steering = steering.on(t + 1.0, Wish(target))
+        fine = t + np.linspace(0, 0.1, 20, endpoint=False)
+        times.extend(fine)
+        states.extend(steering.way.at(one) for one in fine)
+    states = np.array(states)
+    steps = np.diff(states, axis=0)
+    h = times[1] - times[0]
+    assert np.abs(steps[:, POSE] - h * states[:-1, RATES]).max() < 1e-4
+    assert np.abs(steps[:, RATES] - h * states[:-1, ACCELERATIONS]).max() < 0.05
+    np.testing.assert_allclose(states[1900, POSE], home + [0.1, 0, 0, 0.01, 0, 0.02], atol=1e-3)
+    np.testing.assert_allclose(states[-1, POSE], motion.value(times[-1])[:, 0], atol=1e-9)
+
+
+def test_what_is_fixed_does_not_change_when_a_hand_moves():
+    experiment = prepare(scenario_of())
+    motion = make_reference(SineConfig(), 60.0)
+    steering = Steering(Governor(experiment.nominal, 10.0), motion, Way.along(motion))
+    home = experiment.mechanism.home
+    for k in range(30):
+        t = 0.1 * k
+        before = [steering.way.at(x) for x in np.linspace(t, t + 0.99, 12)]
+        steering = steering.on(t + 1.0, Wish(home + 0.01 * np.sin(k * np.arange(6.0))))
+        after = [steering.way.at(x) for x in np.linspace(t, t + 0.99, 12)]
+        np.testing.assert_array_equal(before, after)
+
+
+# ---------------------------------------------------------------- what is refused
+
+
+@pytest.fixture(scope="module")
+def offer():
+    """A machine's offer, with the link that it came over."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Machine, "stop", lambda self: None)
+        with Running(OVER_A_NETWORK) as running:
+            endpoint = open_endpoint(running.address, None)
+            contact = Contact(endpoint, running.address)
+            message = call(contact)
+            endpoint.close()
+            yield message, contact.link
+
+
+@pytest.mark.parametrize(
+    ("settings", "field"),
+    [
+        (("controller.period=0.05",), "controller.period"),
+        (("sensor.kind=encoders",), "sensor.kind"),
+        (("tuner.kind=ann",), "tuner.kind"),
+    ],
+)
+def test_a_scenario_of_another_machine_is_refused(offer, settings, field):
+    with pytest.raises(ConfigError, match=f"^{field}: got"):
+        check_peer(scenario_of(*settings), offer[0])
+
+
+def test_a_link_that_takes_longer_than_the_delay_is_refused(offer):
+    message, link = offer
+    with pytest.raises(ConfigError, match=r"^delay\.steps: got 0\.1 s .* delay\.steps=4$"):
+        as_seen(scenario_of("delay.steps=1"), link, message)
+
+
+def test_a_delay_estimator_needs_a_wire(offer):
+    message, link = offer
+    aware = scenario_of("controller.delay_estimator=constant")
+    with pytest.raises(ConfigError, match=r"^controller\.delay_estimator: got 'constant'"):
+        as_seen(aware, link, message)
+    assert as_seen(aware, link, replace(message, flags=message.flags | MachineFlags.WIRE))
+
+
+def test_the_tighter_torque_limit_counts(offer):
+    message, link = offer
+    seen = as_seen(scenario_of(), link, message)
+    made = design(seen, replace(message, torque_limit=0.5))
+    assert made.torque_limit == made.law.plant.motors.limit == 0.5
+
+
+def test_a_real_machine_wants_to_be_armed(quiet_machine):
+    with Running() as running:
+        ready = prepare_session(scenario_of(), running.address)
+        ready.contact.last = replace(ready.contact.last, flags=MachineFlags.PARKED)
+        assert "A REAL MACHINE" in plans(ready, math.inf, "paper")[0]
+        with pytest.raises(ConfigError, match=r"^--arm"):
+            check_armed(ready, False)
+        check_armed(ready, True)
+
+
+@pytest.mark.parametrize("text", ["localhost", "127.0.0.1:", "127.0.0.1:0", ":7000", "a b:7000"])
+def test_an_address_that_is_none_is_refused(text):
+    with pytest.raises(ConfigError, match=r"^--machine: got"):
+        address_of(text)
+
+
+def test_nobody_there_is_told():
+    endpoint = Endpoint(ControllerMessage, "127.0.0.1", 0)
+    try:
+        with pytest.raises(ConfigError, match="where nothing answers"):
+            prepare_session(scenario_of(), endpoint.address)
+    finally:
+        endpoint.close()
+
+
+def test_beyond_loopback_a_key_is_needed():
+    with pytest.raises(ConfigError, match="without a key"):
+        open_endpoint(("192.0.2.1", 7000), None)
+
+
+def test_round_trips_and_losses_are_those_of_the_link(offer):
+    link = offer[1]
+    assert isinstance(link, Link)
+    assert 0.2 <= link.shortest <= link.typical <= link.longest
+    assert link.typical == pytest.approx(0.22, abs=0.03)
+    assert 0 <= link.loss_there < 0.2 and 0 <= link.loss_back < 0.2
+
+
+# ---------------------------------------------------------------- the page
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"[]",
+        b"{",
+        b'{"target": [1, 2]}',
+        b'{"target": [1, 2, 3, 4, 5, NaN]}',
+        b'{"target": [1, 2, 3, 4, 5, true]}',
+        b'{"stop": 1}',
+        b'{"target": "home"}',
+    ],
+)
+def test_what_is_no_wish_is_refused(data):
+    assert read_wish(data) is None
+
+
+def test_wishes_are_in_degrees_and_mm():
+    asked = read_wish(b'{"target": [180, 0, 0, 0, 0, 380]}')
+    assert isinstance(asked, Asked) and not asked.stop
+    np.testing.assert_allclose(asked.target, np.array([180, 0, 0, 0, 0, 380]) / FACTORS)
+    assert read_wish(b'{"target": null, "stop": true}') == Asked(None, True)
+
+
+def test_the_page_does_what_its_own_buttons_ask_for_and_nobody_else():
+    viewer = PageViewer(load_mechanism("paper"), "live: a test")
+    try:
+        url = viewer.opened()
+        address, token = url.split("/?token=")
+        page = urllib.request.urlopen(url).read().decode()
+        assert "live: a test" in page and page.count('type="range"') == 6
+
+        def ask(headers, body=b'{"target": [0, 0, 0, 0, 0, 400]}'):
+            request = urllib.request.Request(f"{address}/wish", body, headers)
+            try:
+                return urllib.request.urlopen(request).status
+            except urllib.error.HTTPError as error:
+                return error.code
+
+        assert ask({}) == ask({"X-Token": "guess"}) == 403
+        assert ask({"X-Token": token, "Host": "elsewhere.example:80"}) == 403
+        assert ask({"X-Token": token}, b"nonsense") == 400
+        assert viewer.wish() == Wish() and not viewer.stopped()
+        assert ask({"X-Token": token}) == 200
+        np.testing.assert_allclose(viewer.wish().target, [0, 0, 0, 0, 0, 0.4])
+        assert ask({"X-Token": token}, b'{"stop": true}') == 200
+        viewer.wish()
+        assert viewer.stopped()
+    finally:
+        viewer.close()
+
+
+def test_the_loop_goes_on_where_the_page_is_gone():
+    viewer = PageViewer(load_mechanism("paper"), "live: a test")
+    viewer.opened()
+    viewer.close()
+    seen = Seen(0.0, np.zeros(12), np.zeros(18), np.zeros(6), *[0.0] * 5, 0, False, False, None)
+    for _ in range(3):
+        viewer.show(seen)
+    assert viewer.wish() == Wish()

@@ -1,0 +1,511 @@
+"""The simulated machine behind its socket, on a clock that the tests turn."""
+
+import random
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.live.endpoint import Endpoint
+from stewart_drake.live.machine import Settings, check_scenario
+from stewart_drake.live.motors import Plan, PlayoutMotors, WireMotors
+from stewart_drake.live.protocol import (
+    MISSING,
+    NEVER,
+    SECOND,
+    ControllerFlags,
+    ControllerMessage,
+    MachineFlags,
+    MachineMessage,
+    Refusal,
+    encode,
+)
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.loading import load_scenario
+from tests.live_driver import Driver, Together
+from tests.test_protocol import KEY, damaged
+
+EXACT = "plant.kind=exact"
+NETWORK = (
+    "link={kind: network, low: 0.3, high: 0.32, loss: 0.02, "
+    "return: {low: 0.3, high: 0.32, loss: 0.02}}"
+)
+NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
+BIAS = "plant.torque_bias=[1e-3,-1e-3,2e-3,0,0,0]"
+
+
+def together(
+    *settings: str, name: str = "paper", key: bytes | None = None, **own: object
+) -> Together:
+    scenario = load_scenario(name, settings=settings)
+    return Together(scenario, Settings(**own), key)  # type: ignore[arg-type]
+
+
+def begun(*settings: str, samples: int = 0, **own: object) -> Together:
+    """With a run that began at 2 s, on the exact plant."""
+    found = together(EXACT, *settings, **own)  # type: ignore[arg-type]
+    period = found.driver.period
+    found.greet(3 * period, -(-2 * SECOND // period) * period)
+    found.drive(samples)
+    return found
+
+
+# ---------------------------------------------------------------- the same as the simulation
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "samples"),
+    [
+        ("paper", (EXACT,), 60),
+        ("paper", (EXACT, NOISE, BIAS, "start=on_reference", "queue=reference"), 40),
+        ("paper", (EXACT, NETWORK, NOISE), 60),
+        ("paper", (EXACT, "link={kind: network, dry: zero, loss: 0.2}"), 60),
+        ("paper", (EXACT, "delay.fraction=0.37", "sensor={kind: encoders, samples: 4}"), 40),
+        ("paper", ("plant.kind=multibody",), 40),
+        ("motion_base", (EXACT, "sensor.delay=0.06", "sensor.loss=0.1"), 60),
+        ("paper", (EXACT, "delay.drift=0.002", "delay.jitter_std=0.0005"), 25),
+        ("gravity", (EXACT, "sensor.faults=[{kind: missing, from: 0.1, to: 0.14}]"), 50),
+    ],
+)
+def test_a_run_over_the_socket_is_the_simulated_one(
+    name: str, settings: tuple[str, ...], samples: int
+) -> None:
+    """The same seeds, delays, losses: the states of Drake's loop at every sample."""
+    scenario = load_scenario(name, settings=settings)
+    scenario = replace(scenario, duration=samples * scenario.controller.period)
+    run = Together(scenario)
+    period = run.driver.period
+    run.greet(3 * period, 60 * period)
+    states = np.array(run.drive(samples))
+    result = simulate(scenario, margin=False)
+    assert result.status == "completed"
+    at = scenario.controller.period * np.arange(samples)
+    kept = result.signals.sel(time=at, method="nearest")
+    expected = np.hstack([kept.pose.values, kept.rates.values])
+    scale = np.abs(expected).max(axis=0) + 1e-9
+    moved = np.abs(expected - expected[0]).max(axis=0) / scale
+    assert moved.max() > 0.5
+    np.testing.assert_allclose(states / scale, expected / scale, atol=2e-5)
+    said = kept.torque_commanded.values
+    np.testing.assert_allclose(run.driver.torques, said, atol=1e-4 * np.abs(said).max())
+
+
+def test_counts_are_those_of_the_simulation() -> None:
+    """Of torques that were played and periods that were dry."""
+    settings = (EXACT, "link={kind: network, loss: 0.6, burst: 6}", "controller.packet_torques=2")
+    scenario = load_scenario("paper", settings=("duration=3.1", *settings))
+    run = Together(scenario, Settings(watchdog=5))
+    run.greet(3 * run.driver.period, 60 * run.driver.period)
+    run.drive(31)
+    packets = simulate(scenario, margin=False).signals.packets.values[-1]
+    played, dry = packets[3:]
+    machine = run.machine.summary()
+    assert dry > 0
+    assert (machine["played"], machine["dry"]) == (played, dry)
+
+
+def test_encoders_are_told_as_codes() -> None:
+    run = begun(
+        "sensor={kind: encoders, bits: 12, samples: 3, offset: [0.01,0,0,0,0,0]}", samples=5
+    )
+    told = [m for m in run.driver.got if m.codes is not None]
+    assert told and all(m.codes.shape == (3, 6) and m.bits == 12 for m in told)  # type: ignore[union-attr]
+    run = begun(
+        "sensor={kind: encoders, faults: [{kind: missing, leg: 2, from: 0.3, to: 0.4}]}", samples=5
+    )
+    lost = [m for m in run.driver.got if m.codes is not None and MISSING in m.codes]
+    assert [m.sampled for m in lost] == [run.driver.begin + 3 * run.driver.period]
+    assert np.flatnonzero(lost[0].codes[0] == MISSING).tolist() == [1]  # type: ignore[index]
+
+
+# ---------------------------------------------------------------- safety
+
+
+def torque_of(run: Together) -> np.ndarray:
+    return run.machine._motors.torque
+
+
+@pytest.mark.parametrize("safe", ["zero", "hold"])
+@pytest.mark.parametrize("settings", [(), (NETWORK,)])
+def test_silence_ends_in_the_safe_torque_in_time(safe: str, settings: tuple[str, ...]) -> None:
+    """At `watchdog` after the last datagram, whatever is in the buffer."""
+    run = begun(*settings, samples=20, safe=safe, watchdog=0.35)
+    run.at(run.machine.time() + round(0.33 * SECOND) * bool(settings))  # what is under way is heard
+    heard = run.machine.session.heard  # type: ignore[union-attr]
+    run.at(heard + round(0.35 * SECOND))
+    before = torque_of(run)
+    assert np.any(before) and not run.machine._safe
+    run.at(heard + round(0.35 * SECOND) + 2)
+    assert run.machine._safe
+    expected = before if safe == "hold" else np.zeros(6)
+    np.testing.assert_array_equal(torque_of(run), expected)
+    run.at(heard + 2 * SECOND)
+    np.testing.assert_array_equal(torque_of(run), expected)
+    assert run.machine.counts["silences"] == 1
+    assert sum("nothing was heard for 0.35 s" in line for line in run.said) == 1
+    last = messages(run)[-1]
+    assert MachineFlags.SAFE in last.flags
+    assert (MachineFlags.SAFE_HOLDS in last.flags) == (safe == "hold")
+
+
+def messages(run: Together) -> list[MachineMessage]:
+    run.driver.receive(run.machine.time())
+    return run.driver.got
+
+
+def test_a_controller_that_was_suspended_goes_on_in_its_session() -> None:
+    run = begun(samples=20, watchdog=0.3)
+    time = run.driver.begin + 30 * run.driver.period
+    run.at(time)
+    assert run.machine._safe and not torque_of(run).any()
+    driver = run.driver
+    driver.say(time, sampled=time, playout=time + driver.period, torques=np.full((1, 6), 0.1))
+    run.at(time + 9 * driver.period)
+    assert "torques act again" in "".join(run.said)
+    assert run.machine.counts["silences"] == 2  # and silence again
+    assert any(np.all(m.acted == 0.1, axis=1).any() for m in messages(run))
+
+
+def test_stop_is_the_safe_torque_and_the_end_of_the_session() -> None:
+    run = begun(samples=20)
+    time, driver = run.machine.time(), run.driver
+    assert torque_of(run).any()
+    driver.say(time, ControllerFlags.STOP)
+    run.at(time + 1)
+    assert not torque_of(run).any()
+    driver.say(time, sampled=time, playout=time + driver.period, torques=np.ones((1, 6)))
+    run.at(time + 20 * driver.period)
+    assert not torque_of(run).any()
+    assert run.machine.summary()["sessions"] == 1
+
+
+def test_limits_are_kept_to_here() -> None:
+    run = begun("actuator.torque_limit=0.25", "link.kind=network", "link.loss=0", samples=1)
+    driver, period = run.driver, run.driver.period
+    time = driver.begin + period
+    rows = np.array([[100.0, -1e300, 0.2, 0, 0, 0]])
+    driver.say(time, sampled=time, playout=time + 10 * period, torques=rows)
+    run.at(time + 10 * period + 1)
+    np.testing.assert_array_equal(torque_of(run), [0.25, -0.25, 0.2, 0, 0, 0])
+    assert messages(run)[-1].torque_limit == 0.25
+
+
+def test_a_plate_that_leaves_stops_and_a_new_session_begins_at_rest() -> None:
+    run = begun("queue=equilibrium", "plant.gravity=true", samples=25)
+    machine = run.machine
+    assert machine.failure is not None
+    assert [line for line in run.said if "left its workspace" in line and "new session" in line]
+    left, state = machine.time(), np.array(machine._body.state)
+    run.at(left + 2 * SECOND)
+    np.testing.assert_array_equal(machine._body.state, state)
+    assert MachineFlags.LEFT in messages(run)[-1].flags
+    # The same session cannot move it; another one finds it back at its start.
+    run.driver = Driver(run.scenario, run.ear.address)
+    period = run.driver.period
+    now = -(-machine.time() // period) * period
+    run.greet(now + period, now + 30 * period)
+    assert machine.failure is None
+    np.testing.assert_array_equal(machine._body.state, run.driver.experiment.start)
+    run.drive(3)
+    assert machine.counts["runs"] == 2
+
+
+def test_a_run_does_not_begin_for_nobody() -> None:
+    run = together(EXACT, watchdog=0.5)
+    period = run.driver.period
+    run.greet(3 * period, 60 * period)
+    run.at(80 * period)
+    assert run.machine.counts["runs"] == 0
+    assert "still parked" in run.said[-1]
+    np.testing.assert_array_equal(run.machine._body.state, run.driver.experiment.start)
+
+
+def test_a_beginning_in_the_past_or_off_the_grid_is_the_next_one() -> None:
+    run = together(EXACT)
+    driver, period = run.driver, run.driver.period
+    run.at(0)
+    driver.say(0)
+    run.at(1)
+    driver.receive(1)
+    run.at(5 * period)
+    driver.begin = 2 * period + 17
+    driver.say(5 * period)
+    run.at(5 * period + 1)
+    assert run.machine.begin == 6 * period
+    run.at(7 * period)
+    assert messages(run)[-1].begin == 6 * period
+
+
+# ---------------------------------------------------------------- who drives
+
+
+def test_another_controller_has_to_wait() -> None:
+    run = begun(samples=10)
+    time, other = run.machine.time(), Driver(run.scenario, run.ear.address)
+    other.say(time)
+    run.at(time + 1)
+    (offer,) = other.receive(time)
+    assert MachineFlags.BUSY in offer.flags and offer.begin == NEVER
+    other.begin = 0
+    other.say(time, sampled=time, playout=time + other.period, torques=np.ones((1, 6)))
+    run.at(time + 2)
+    assert run.ear.refused == {Refusal.FOREIGN: 1}
+    # Once the first one is silent the same offer holds.
+    run.at(time + 2 * SECOND)
+    other.begin = NEVER
+    other.say(time)
+    run.at(time + 2 * SECOND + 1)
+    assert run.machine.session.number == other.session.number  # type: ignore[union-attr]
+    assert run.machine.counts["sessions"] == 2
+
+
+@pytest.mark.parametrize("restart", ["rest", "motion"])
+def test_a_new_session_begins_where_it_is_said(restart: str) -> None:
+    run = begun(samples=15, restart=restart)
+    period, machine = run.driver.period, run.machine
+    moving = np.array(machine._body.state)
+    assert np.abs(moving[6:]).max() > 0.01
+    run.driver.say(machine.time(), ControllerFlags.STOP)
+    old = run.driver.session
+    run.driver = Driver(run.scenario, run.ear.address)
+    now = -(-machine.time() // period) * period
+    run.at(now)
+    run.driver.say(now)
+    run.at(now + 1)
+    (offer,) = run.driver.receive(now)
+    assert (MachineFlags.RESETS in offer.flags) == (restart == "rest")
+    run.driver.begin = now + 3 * period
+    run.driver.say(now)
+    run.at(now + 2)
+    assert old.number != machine.session.number  # type: ignore[union-attr]
+    if restart == "rest":
+        np.testing.assert_array_equal(machine._body.state, run.driver.experiment.start)
+        assert "begins at rest" in run.said[-1]
+    else:
+        np.testing.assert_allclose(machine._body.state, moving, atol=0.05)
+        assert "begins in motion" in run.said[-1]
+        assert machine.begin == now + 3 * period
+        # Its torques act when they are due.
+        time = now + period
+        torques = np.full((1, 6), 0.05)
+        run.driver.say(time, sampled=time, playout=time + period, torques=torques)
+        run.at(time + 10 * period)
+        assert any(np.all(m.acted == 0.05, axis=1).any() for m in messages(run))
+
+
+def test_what_was_recorded_of_an_earlier_session_is_foreign() -> None:
+    """With a key and without: every datagram of a session, once it is over and another drives."""
+    run = together(EXACT, key=KEY)
+    period = run.driver.period
+    recorded: list[bytes] = []
+    say = run.driver.endpoint.send
+
+    def send(message: ControllerMessage, to: tuple[str, int]) -> bool:
+        recorded.append(encode(message, KEY))
+        return say(message, to)
+
+    run.driver.endpoint.send = send  # type: ignore[method-assign, assignment]
+    run.greet(3 * period, 20 * period)
+    run.drive(12)
+    run.driver.say(run.machine.time(), ControllerFlags.STOP)
+    replayer = run.driver.endpoint._socket
+    run.driver = Driver(run.scenario, run.ear.address, KEY)
+    now = -(-run.machine.time() // period) * period
+    run.greet(now + period, now + 20 * period)
+    run.drive(12)
+    before = Counter(run.ear.refused)
+    sessions, played = run.machine.counts["sessions"], run.machine.summary()["played"]
+    torque = np.array(torque_of(run))
+    for data in recorded:
+        replayer.sendto(data, run.ear.address)
+    run.at(run.machine.time() + 1)
+    refused = run.ear.refused - before
+    # The requests for a session, which have no nonce, are answered; nothing else is done.
+    asked = sum(data[16:24] == bytes(8) for data in recorded)
+    assert refused == {Refusal.FOREIGN: len(recorded) - asked} and 0 < asked < 5
+    assert run.machine.counts["sessions"] == sessions
+    assert run.machine.summary()["played"] == played
+    np.testing.assert_array_equal(torque_of(run), torque)
+
+
+# ---------------------------------------------------------------- what nobody should act upon
+
+
+def attack(rng: random.Random, run: Together, attacker: Endpoint, recorded: list[bytes]) -> None:
+    """A datagram that must not do anything."""
+    driver, time = run.driver, run.machine.time()
+    if recorded and rng.random() < 0.3:
+        data = rng.choice(recorded)  # from another address: foreign; from its own: replayed
+        mouth = attacker if rng.random() < 0.5 else driver.endpoint
+        mouth._socket.sendto(data, run.ear.address)
+        return
+    head = driver.session.head(time)
+    driver.session._sent -= 1
+    head = replace(head, sequence=head.sequence + rng.randrange(3))
+    rows = np.full((rng.randrange(1, 5), 6), rng.uniform(-9, 9))
+    plan = ControllerMessage(head, sampled=time, playout=time, begin=driver.begin, torques=rows)
+    kind = rng.randrange(4)
+    if kind == 0:
+        other = replace(head, session=rng.randrange(1, 2**64))
+        data = encode(replace(plan, head=other), KEY)
+    elif kind == 1:
+        data = encode(plan, rng.choice([None, b"another key, as long"]))
+    elif kind == 2:
+        data = bytearray(encode(plan, KEY))
+        data[4] = rng.randrange(2, 256)
+        data = bytes(data)
+    else:
+        data = damaged(rng, encode(plan, KEY))
+        while data == encode(plan, KEY):
+            data = damaged(rng, data)
+    mouth = attacker if rng.random() < 0.5 else driver.endpoint
+    mouth._socket.sendto(data[:1600], run.ear.address)
+
+
+def attacked(
+    seed: int, samples: int, most: int
+) -> tuple[Counter[Refusal], int, Together, list[np.ndarray]]:
+    """A run among such datagrams: what was refused, how many there were, the states."""
+    rng = random.Random(seed)
+    run = together(EXACT, NETWORK, key=KEY)
+    attacker = Endpoint(MachineMessage, key=KEY)
+    period, number, recorded, states = run.driver.period, 0, list[bytes](), list[np.ndarray]()
+    run.greet(3 * period, 60 * period)
+    while run.machine.time() < 60 * period - period:
+        time = run.machine.time() // period * period + period
+        run.at(time)
+        run.driver.say(time)
+    for k in range(samples):
+        time = run.driver.begin + k * period
+        run.at(time)
+        for _ in range(rng.randrange(most + 1)):
+            attack(rng, run, attacker, recorded)
+            number += 1
+        run.machine.poll(time)
+        states.append(np.array(run.machine._body.state))
+        recorded.append(encode(run.driver.step(time), KEY))
+    run.at(run.driver.begin + (samples + 20) * period)
+    attacker.close()
+    return Counter(run.ear.refused), number, run, states
+
+
+def check_attack(seed: int, samples: int = 25, most: int = 30) -> Counter[Refusal]:
+    """Nothing differs from the run without them, but what is counted."""
+    peace, nothing, calm, expected = attacked(seed, samples, 0)
+    assert nothing == 0 and not peace
+    refused, number, run, states = attacked(seed, samples, most)
+    np.testing.assert_array_equal(states, expected)
+    lost = run.machine.counts["lost"] - calm.machine.counts["lost"]
+    assert sum(refused.values()) + lost == number
+    for name in ("sessions", "runs", "silences"):
+        assert run.machine.counts[name] == calm.machine.counts[name]
+    for name in ("played", "dry"):
+        assert run.machine.summary()[name] == calm.machine.summary()[name]
+    return refused
+
+
+def test_nothing_that_is_refused_is_acted_upon() -> None:
+    refused = check_attack(20261122)
+    assert set(refused) == {
+        *(Refusal.MALFORMED, Refusal.VERSION, Refusal.KEY, Refusal.FOREIGN, Refusal.REPLAYED),
+    }
+
+
+@pytest.mark.soak
+def test_nothing_that_is_refused_is_acted_upon_for_five_minutes() -> None:
+    import time
+
+    end, total, seed = time.monotonic() + 300, Counter[Refusal](), random.randrange(10**9)
+    while time.monotonic() < end:
+        total += check_attack(seed, samples=60, most=200)
+        seed += 1
+    print(dict(total))
+
+
+def test_a_flooded_socket_is_survived() -> None:
+    """More than its buffer takes: what is lost is lost, and the rest goes on."""
+    run = begun(samples=10)
+    attacker = Endpoint(MachineMessage)
+    for _ in range(20_000):
+        attacker._socket.sendto(b"x" * 1000, run.ear.address)
+    time = run.machine.time()
+    run.at(time + 1)
+    run.driver.say(time)
+    while run.machine.session.heard < time:  # type: ignore[union-attr]
+        before = run.ear.refused[Refusal.MALFORMED]
+        run.machine.poll(time + 1)
+        run.machine.advance(time + 1)
+        if run.ear.refused[Refusal.MALFORMED] == before:
+            run.driver.say(time)
+    assert run.ear.refused[Refusal.MALFORMED] > 50
+
+
+# ---------------------------------------------------------------- motors, settings
+
+
+def test_the_newest_plan_of_a_period_acts_and_a_dry_buffer_holds_or_not() -> None:
+    for holds in (True, False):
+        motors = PlayoutMotors(1.0, 10, holds)
+        motors.begin(Plan(0, 0, 0, 100, np.full((2, 6), 0.5)))
+        assert motors.take(Plan(5, 0, 0, 110, np.full((2, 6), 0.2)), 50) is None
+        assert motors.take(Plan(4, 0, 0, 110, np.full((3, 6), 9.0)), 50) is None
+        seen = []
+        while motors.next_change < 160:
+            time = motors.next_change
+            motors.change(time)
+            seen.append((time, motors.torque[0]))
+        after = 1.0 if holds else 0.0
+        assert seen == [(100, 0.5), (110, 0.2), (120, 0.2), (130, 1.0), (140, after), (150, after)]
+        assert (motors.played, motors.dry) == (3, 2)
+        assert motors.take(Plan(6, 0, 0, 120, np.zeros((4, 6))), 155) == Refusal.LATE
+        assert motors.take(Plan(6, 0, 0, 120, np.zeros((5, 6))), 155) is None
+        assert motors.take(Plan(7, 0, 0, 120, np.zeros((1 << 16, 6))), 155) == Refusal.MALFORMED
+
+
+def test_over_a_wire_what_was_overtaken_never_acts() -> None:
+    delays = {0: 50, 1: 20, 2: 30}
+    motors = WireMotors(1.0, 10, delays.__getitem__)
+    motors.begin(Plan(0, 0, 0, 0, np.array([[0.1] * 6, [0.2] * 6])))
+    for k in range(3):
+        plan = Plan(k + 1, 10 * k, k, 0, np.full((1, 6), 0.5 + k))
+        assert motors.take(plan, 10 * k) is None
+    seen = []
+    while motors.next_change != NEVER:
+        time = motors.next_change
+        motors.change(time)
+        seen.append((time, motors.torque[0]))
+    assert seen == [(0, 0.1), (10, 0.2), (30, 1.0), (50, 1.0), (50, 1.0)]
+    assert motors.played == 2
+    assert motors.take(Plan(1, 0, 0, 0, np.ones((1, 6))), 60) == Refusal.LATE
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (("actuator.kind=servo", "controller.command=cranks"), "actuator.kind: got 'servo'"),
+        (
+            (EXACT, "sensor={kind: encoders, samples: 17}"),
+            "sensor.samples: got 17; expected at most 16",
+        ),
+    ],
+)
+def test_what_the_protocol_cannot_say_is_refused(settings: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        check_scenario(load_scenario("paper", settings=settings))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("rate", 0.0), ("rate", float("nan")), ("watchdog", -1)]
+)
+def test_settings_have_a_range(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=f"--{name}: got"):
+        Settings(**{name: value})  # type: ignore[arg-type]
+
+
+def test_half_the_rate_takes_twice_the_time() -> None:
+    run = together(EXACT, rate=0.5)
+    start = run.clock.time
+    run.clock.time = start + 2 * SECOND
+    assert run.machine.time() == SECOND

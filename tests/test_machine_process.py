@@ -1,0 +1,292 @@
+"""The machine as a process, in real time: signals, suspensions, kills; and both ends in C."""
+
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stewart_drake.live.protocol import SECOND
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.native import build
+from stewart_drake.report import export_c
+from stewart_drake.scenario.loading import load_scenario
+from tests.live_driver import Driver, drive_in_real_time
+
+SETTINGS = ("plant.kind=exact", "duration=4.0")
+COMMAND = [sys.executable, "-c", "import sys; from stewart_drake.cli import main; sys.exit(main())"]
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+class Process:
+    """A process whose lines are read one by one."""
+
+    def __init__(self, command: list[str]) -> None:
+        surroundings = os.environ | {"PYTHONUNBUFFERED": "1"}
+        self.popen = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=surroundings
+        )
+        self.lines: list[str] = []
+
+    def until(self, pattern: str) -> str:
+        """The line that has it, which must come before the process ends."""
+        assert self.popen.stdout is not None
+        for line in self.popen.stdout:
+            self.lines.append(line.rstrip("\n"))
+            if re.search(pattern, line):
+                return line
+        raise AssertionError(f"no {pattern!r} in {self.lines}")
+
+    def end(self, number: signal.Signals | None = None) -> int:
+        """Its exit status, after a signal."""
+        if number is not None:
+            self.popen.send_signal(number)
+        said, _ = self.popen.communicate(timeout=30)
+        self.lines += said.splitlines()
+        return self.popen.returncode
+
+
+@contextmanager
+def process(command: list[str]) -> Iterator[Process]:
+    made = Process(command)
+    try:
+        yield made
+    finally:
+        if made.popen.poll() is None:
+            made.popen.kill()
+            made.popen.communicate()
+
+
+@contextmanager
+def machine(*options: str, settings: tuple[str, ...] = SETTINGS) -> Iterator[tuple[Process, int]]:
+    """`stewart-drake machine`, once it listens, and its port."""
+    said = [word for setting in settings for word in ("--set", setting)]
+    with process([*COMMAND, "machine", "paper", "--port", "0", *said, *options]) as made:
+        first = made.until("waits for a controller")
+        yield made, int(first.split("127.0.0.1:")[1].split(":")[0])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What export-c writes, with the examples over UDP under the sanitizers."""
+    if build.compiler() is None or shutil.which("make") is None:
+        pytest.skip("there is no C compiler, or no make")
+    made = tmp_path_factory.mktemp("board")
+    scenario = load_scenario("paper", settings=SETTINGS)
+    export_c.write(export_c.exported(scenario, measured=False), made)
+    # What is long is tried under them by tests/test_export_c.py.
+    long, checked = ["dynamics.o", "riccati.o", "law.o"], "-fsanitize=address,undefined"
+    for targets, flags in ((long, "-O1"), (["udp"], f"-g {checked} -fno-sanitize-recover=all")):
+        command = ["make", "-s", *targets, f"CFLAGS={flags}"]
+        done = subprocess.run(command, cwd=made, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    return made
+
+
+def c_controller(folder: Path, port: int, *options: str) -> list[str]:
+    return [str(folder / "stewart_udp"), "127.0.0.1", str(port), *options]
+
+
+def states_of(log: Path) -> np.ndarray:
+    """(k, 12) that the C controller measured."""
+    return np.loadtxt(log, delimiter=",")[:, 1:13]
+
+
+def simulated(samples: int) -> np.ndarray:
+    result = simulate(load_scenario("paper", settings=SETTINGS), margin=False)
+    kept = result.signals.sel(time=0.1 * np.arange(samples), method="nearest")
+    return np.hstack([kept.pose.values, kept.rates.values])
+
+
+# ---------------------------------------------------------------- the three pairs with C
+
+
+def test_the_controller_in_c_drives_the_machine_in_python(folder: Path, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    with machine() as (running, port):
+        with process(c_controller(folder, port, f"log={log}")) as driving:
+            assert driving.end() == 0, driving.lines
+        assert running.end(signal.SIGINT) == 130
+    assert "completed after 40 samples, 0 of them without a measurement" in driving.lines[-2]
+    assert driving.lines[-1] == (
+        "refused: 0 malformed, 0 version, 0 key, 0 foreign, 0 replayed, 0 late"
+    )
+    assert "1 sessions, 1 runs" in running.lines[-1] and "none refused" in running.lines[-1]
+    np.testing.assert_allclose(states_of(log), simulated(40), atol=1e-6)
+
+
+def test_the_controller_in_python_drives_the_machine_in_c(folder: Path) -> None:
+    port = free_port()
+    with process([str(folder / "stewart_machine"), str(port)]) as running:
+        running.until("a simulated machine at port")
+        driver = Driver(load_scenario("paper", settings=SETTINGS), ("127.0.0.1", port))
+        states = drive_in_real_time(driver, 40)
+        running.until("the controller said stop")
+        assert running.end(signal.SIGINT) == 0
+    assert "32 torques played, 0 periods dry, 0 silences" in running.lines[-2]
+    np.testing.assert_allclose(states, simulated(40), atol=1e-6)
+
+
+def test_both_ends_in_c(folder: Path, tmp_path: Path) -> None:
+    log, port, key = tmp_path / "log", free_port(), tmp_path / "key"
+    key.write_bytes(b"a key of some length\n")
+    with process([str(folder / "stewart_machine"), str(port), "60", str(key)]) as running:
+        running.until("a simulated machine at port")
+        with process(c_controller(folder, port, f"log={log}", f"key={key}")) as driving:
+            assert driving.end() == 0, driving.lines
+        # Without the key, and with another one: refused, and nothing is done.
+        with process(c_controller(folder, port, "seconds=1")) as other:
+            time.sleep(0.5)
+            assert other.end(signal.SIGINT) == 1
+        assert running.end(signal.SIGINT) == 0
+    np.testing.assert_allclose(states_of(log), simulated(40), atol=1e-6)
+    assert sum("a session begins" in line for line in running.lines) == 1
+    assert re.search(r"refused: 0 malformed, 0 version, [1-9]\d* key", running.lines[-1])
+
+
+# ---------------------------------------------------------------- signals
+
+
+def test_ctrl_c_ends_it_with_one_summary() -> None:
+    with machine() as (running, _):
+        assert running.end(signal.SIGINT) == 130
+    assert len(running.lines) == 2 and running.lines[1].startswith("ended after")
+    said = [*COMMAND, "machine", "paper", "--set", "plant.kind=exact", "--port", "0"]
+    done = subprocess.run(
+        [*said, "--duration", "0.2", "--json"], capture_output=True, text=True, check=True
+    )
+    summary = json.loads(done.stdout)
+    assert summary["sessions"] == 0 and set(summary["refused"].values()) == {0}
+
+
+def test_a_suspended_machine_goes_on_and_says_so(folder: Path) -> None:
+    with machine() as (running, port):
+        with process(c_controller(folder, port)) as driving:
+            running.until("the run began")
+            time.sleep(0.5)
+            running.popen.send_signal(signal.SIGSTOP)
+            time.sleep(1.2)
+            running.popen.send_signal(signal.SIGCONT)
+            line = running.until("stood still")
+            assert driving.end() in (0, 1)
+        assert running.end(signal.SIGINT) == 130
+    assert 0.8 < float(line.split("stood still for ")[1].split()[0]) < 2.5
+    assert sum("stood still" in line for line in running.lines) == 1
+
+
+def test_a_suspended_controller_is_survived_or_stopped(folder: Path) -> None:
+    with machine("--watchdog", "0.5") as (running, port):
+        with process(c_controller(folder, port)) as driving:
+            running.until("the run began")
+            time.sleep(0.7)
+            driving.popen.send_signal(signal.SIGSTOP)
+            silent = running.until("nothing was heard for 0.5 s")
+            time.sleep(0.3)
+            driving.popen.send_signal(signal.SIGCONT)
+            assert driving.end() in (0, 1)
+        assert running.end(signal.SIGINT) == 130
+    assert "the safe torque (zero) acts" in silent
+
+
+def kills(folder: Path, number: int, rng: random.Random) -> None:
+    """Kill the controller at random times; the next one takes over from rest."""
+    with machine("--watchdog", "0.4") as (running, port):
+        for k in range(number):
+            with process(c_controller(folder, port)) as driving:
+                began = running.until("the run began")
+                wait = rng.uniform(0, 2)
+                time.sleep(wait)
+                driving.popen.kill()
+                killed = time.monotonic()
+                line = running.until("nothing was heard|left its workspace")
+                took = time.monotonic() - killed
+            assert "nothing was heard for 0.4 s" in line, line
+            # It is heard once a period; scheduling of two busy cores is in it, too.
+            assert took < 0.4 + 0.25, (k, wait, took)
+            assert began
+        assert running.end(signal.SIGINT) == 130
+    assert f"{number} sessions, {number} runs" in running.lines[-1]
+
+
+def test_a_killed_controller_ends_in_the_safe_torque_and_the_next_one_takes_over(
+    folder: Path,
+) -> None:
+    kills(folder, 2, random.Random(3))
+
+
+@pytest.mark.soak
+def test_killed_twenty_times(folder: Path) -> None:
+    kills(folder, 20, random.Random())
+
+
+def test_a_killed_machine_ends_the_controller_with_the_reason(folder: Path) -> None:
+    with (
+        machine("--watchdog", "0.3") as (running, port),
+        process(c_controller(folder, port)) as driving,
+    ):
+        running.until("the run began")
+        running.popen.kill()
+        assert driving.end() == 1
+    assert "the machine has fallen silent after" in driving.lines[-2]
+
+
+def test_wrong_commands_are_one_line(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    from stewart_drake.cli import main
+
+    busy = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    busy.bind(("127.0.0.1", 0))
+    exact = ("machine", "paper", "--set", "plant.kind=exact")
+    for options, expected in (
+        (("--host", "0.0.0.0"), "host: got 0.0.0.0 without a key"),
+        (("--port", str(busy.getsockname()[1])), "expected a free one"),
+        (("--port", "70000"), "65535"),
+        (("--rate", "0"), "--rate: got 0; expected"),
+        (("--watchdog", "nan"), "--watchdog: got nan; expected"),
+        (("--key", str(tmp_path / "none")), "--key: got"),
+        (("--safe", "brake"), "brake"),
+    ):
+        assert main([*exact, *options]) == 2
+        error = capfd.readouterr().err
+        assert error.count("\n") == 1 and expected in error, error
+    busy.close()
+
+
+def test_a_slower_clock_is_told(folder: Path) -> None:
+    """At half the rate 1 s of the machine takes two; its datagrams say so."""
+    with machine("--rate", "0.5") as (running, port):
+        started = time.monotonic()
+        with process(c_controller(folder, port, "seconds=1")) as driving:
+            running.until("the run began")
+            began = time.monotonic()
+            assert driving.end() == 0, driving.lines
+        assert 1.6 < time.monotonic() - began < 3.0
+        assert began - started < 10
+        assert running.end(signal.SIGINT) == 130
+    assert "completed after 10 samples, 0 of them without" in driving.lines[-2]
+
+
+def test_a_clock_that_is_set_is_not_looked_at() -> None:
+    """Every time is of the monotonic clock: nothing in the room asks for another."""
+    from stewart_drake import live
+
+    folder = Path(live.__file__).parent
+    for name in ("endpoint", "machine", "motors", "body", "protocol"):
+        text = (folder / f"{name}.py").read_text("utf-8")
+        assert not re.search(r"time\.time\(|datetime|time_ns\(", text.replace("monotonic_ns(", ""))
+    assert SECOND == 10**9

@@ -1,0 +1,507 @@
+"""Datagrams: the documented bytes, in Python and in C, and what is refused."""
+
+import hashlib
+import hmac
+import math
+import random
+import re
+import struct
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.live.endpoint import (
+    SHORTEST_KEY,
+    Endpoint,
+    OtherClock,
+    Session,
+    Window,
+    read_key,
+)
+from stewart_drake.live.protocol import (
+    LONGEST,
+    MISSING,
+    MOST_BITS,
+    MOST_HISTORY,
+    MOST_ROWS,
+    MOST_SAMPLES,
+    NEVER,
+    SECOND,
+    TAG,
+    ControllerFlags,
+    ControllerMessage,
+    Head,
+    MachineFlags,
+    MachineMessage,
+    Message,
+    Refusal,
+    RefusedError,
+    decode,
+    encode,
+)
+from stewart_drake.native import build
+from stewart_drake.report.export_c import TEMPLATES
+
+ROOT = Path(__file__).resolve().parents[1]
+KEY = b"0123456789abcdef"
+
+HEAD = Head(0x1122334455667788, 0x99AABBCCDDEEFF01, 7, 3, 2_500_000_000, 1_234_567_890, 1_000_000)
+ARRIVED = np.isin(np.arange(64), [0, 1, 3])
+ACTED = np.array([[0.5, -0.25, 0, 1, -1, 2]])
+PLAN = ControllerMessage(
+    HEAD,
+    ControllerFlags.ARMED,
+    2_400_000_000,
+    3_200_000_000,
+    1_000_000_000,
+    np.vstack([ACTED, [[0.125, 0, 0, 0, 0, -8]]]),
+)
+STATE = MachineMessage(
+    head=HEAD,
+    flags=MachineFlags.SIMULATION | MachineFlags.RUNNING | MachineFlags.HOLDS,
+    sampled=2_400_000_000,
+    begin=1_000_000_000,
+    period=100_000_000,
+    watchdog=SECOND,
+    rate=1.0,
+    torque_limit=math.inf,
+    arrived=ARRIVED,
+    acted_from=2_400_000_000,
+    acted=ACTED,
+    played=23,
+    dry=1,
+    refused=4,
+    state=np.array([0, 0.5, -0.5, 0.25, 0, 0.375, 0, 0, 0, 1, 0, np.nan]),
+)
+ENCODERS = MachineMessage(
+    head=HEAD,
+    flags=MachineFlags.PARKED,
+    sampled=2_400_000_000,
+    begin=NEVER,
+    period=100_000_000,
+    watchdog=SECOND,
+    rate=1.0,
+    torque_limit=0.5,
+    arrived=ARRIVED,
+    acted_from=NEVER,
+    acted=np.empty((0, 6)),
+    codes=np.array([[1, -1, 4096, -4096, 0, MISSING]], np.int32),
+    bits=14,
+    zeros=np.array([0, 0.5, 0, 0, 0, -0.5]),
+)
+VECTORS: list[tuple[Message, bytes | None]] = [
+    (PLAN, None),
+    (PLAN, KEY),
+    (STATE, None),
+    (ENCODERS, None),
+]
+
+
+def documented() -> list[bytes]:
+    """The vectors of docs/protocol.md."""
+    text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split("## Test vectors")[1]
+    return [bytes.fromhex(block) for block in re.findall(r"```text\n(.*?)```", text, re.DOTALL)]
+
+
+def in_c() -> list[bytes]:
+    """Those of protocol_test.c."""
+    text = (TEMPLATES / "protocol_test.c").read_text("utf-8")
+    found = re.findall(r"_bytes\[\] =\n(.*?);", text, re.DOTALL)
+    return [bytes.fromhex("".join(re.findall('"([0-9a-f]+)"', block))) for block in found]
+
+
+def cause(data: bytes, key: bytes | None = None) -> Refusal | None:
+    try:
+        decode(data, key)
+    except RefusedError as refused:
+        return refused.cause
+    return None
+
+
+@pytest.mark.parametrize("number", range(len(VECTORS)))
+def test_the_documented_bytes_are_written_and_read(number: int) -> None:
+    message, key = VECTORS[number]
+    assert len(documented()) == len(in_c()) == len(VECTORS)
+    data = documented()[number]
+    assert data == in_c()[number]
+    assert encode(message, key) == data
+    assert decode(data, key) == message
+
+
+def test_each_field_lies_where_the_tables_say() -> None:
+    """Every row of the tables of docs/protocol.md whose place is a number, read by itself."""
+    text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split("## A session")[0]
+    head, machine, controller = re.split(r"## (?:Machine|Controller) to ", text)
+    formats = {"u8": "<B", "u16": "<H", "u32": "<I", "u64": "<Q", "f64": "<d"}
+    wanted = {
+        "version": 1,
+        "tag": 0,
+        "kind": 1,
+        "samples": 1,
+        "bits": 0,
+        "history": 1,
+        "arrived": 0b1011,
+        "rows": 2,
+    }
+    seen = 0
+    for part, message in ((head, STATE), (machine, STATE), (head, PLAN), (controller, PLAN)):
+        data = encode(message)
+        for place, kind, name in re.findall(r"^\| (\d+) \| (\w+) \| (\w+) \|", part, re.MULTILINE):
+            (value,) = struct.unpack_from(formats[kind], data, int(place))
+            if name == "length":
+                expected = len(data)
+            else:
+                expected = wanted.get(name, getattr(message, name, None))
+                expected = getattr(message.head, name) if expected is None else expected
+            assert value == expected, name
+            seen += 1
+    assert seen == 2 * 11 + 15 + 4
+
+
+def test_the_tag_is_the_first_half_of_an_hmac() -> None:
+    data = encode(PLAN, KEY)
+    assert data[-TAG:] == hmac.new(KEY, data[:-TAG], hashlib.sha256).digest()[:16]
+
+
+def test_crank_angles_follow_from_codes() -> None:
+    values = ENCODERS.values
+    assert values is not None
+    turn = 2 * np.pi
+    expected = [turn / 2**14, 0.5 - turn / 2**14, turn / 4, -turn / 4, 0, np.nan]
+    np.testing.assert_allclose(values, expected, rtol=1e-15)
+    assert STATE.values is STATE.state
+    assert STATE.age == pytest.approx(0.1)
+
+
+# ---------------------------------------------------------------- random messages
+
+U32, U64 = st.integers(0, 2**32 - 1), st.integers(0, 2**64 - 1)
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+HEADS = st.builds(
+    Head, st.integers(1, 2**64 - 1), U64, st.integers(1, 2**32 - 1), U32, U64, U64, U64
+)
+
+
+def rows(most: int) -> st.SearchStrategy[np.ndarray]:
+    row = st.lists(FINITE, min_size=6, max_size=6)
+    return st.lists(row, max_size=most).map(lambda found: np.array(found).reshape(-1, 6))
+
+
+@st.composite
+def plans(draw: st.DrawFn) -> ControllerMessage:
+    torques = draw(rows(MOST_ROWS))
+    begin = draw(U64.filter(lambda t: t != NEVER)) if len(torques) else draw(U64)
+    flags = ControllerFlags(draw(st.integers(0, 3)))
+    return ControllerMessage(draw(HEADS), flags, draw(U64), draw(U64), begin, torques)
+
+
+@st.composite
+def reports(draw: st.DrawFn) -> MachineMessage:
+    kind = draw(st.integers(0, 2))
+    said: dict[str, object] = {}
+    if kind == 1:
+        said["state"] = np.array(draw(st.lists(st.floats(width=64), min_size=12, max_size=12)))
+    elif kind == 2:
+        samples, codes = draw(st.integers(1, MOST_SAMPLES)), st.integers(-(2**31), 2**31 - 1)
+        size = 6 * samples
+        found = draw(st.lists(codes, min_size=size, max_size=size))
+        said["codes"] = np.array(found, np.int32).reshape(-1, 6)
+        said["bits"] = draw(st.integers(1, MOST_BITS))
+        said["zeros"] = np.array(draw(st.lists(FINITE, min_size=6, max_size=6)))
+    return MachineMessage(
+        draw(HEADS),
+        MachineFlags(draw(st.integers(0, 1023))),
+        *(draw(U64), draw(U64), draw(st.integers(1, 2**64 - 1)), draw(U64)),
+        draw(st.floats(1e-300, 1e300)),
+        draw(st.one_of(st.just(math.inf), st.floats(1e-300, 1e300))),
+        np.array(draw(st.lists(st.booleans(), min_size=64, max_size=64))),
+        draw(U64),
+        draw(rows(MOST_HISTORY)),
+        *(draw(U32), draw(U32), draw(U32)),
+        **said,  # type: ignore[arg-type]
+    )
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.one_of(plans(), reports()), st.one_of(st.none(), st.binary(min_size=16, max_size=99)))
+def test_what_is_written_is_read(message: Message, key: bytes | None) -> None:
+    data = encode(message, key)
+    assert len(data) <= LONGEST
+    assert decode(data, key) == message
+    assert encode(decode(data, key), key) == data
+
+
+def test_messages_that_do_not_fit_are_not_written() -> None:
+    for torques in (np.zeros((MOST_ROWS + 1, 6)), np.zeros((2, 5)), np.zeros(6)):
+        with pytest.raises(ValueError, match="expected up to"):
+            encode(ControllerMessage(HEAD, begin=0, torques=torques))
+
+
+# ---------------------------------------------------------------- what is refused
+
+
+def changed(data: bytes, place: int, value: bytes) -> bytes:
+    return data[:place] + value + data[place + len(value) :]
+
+
+def test_every_shorter_datagram_is_malformed() -> None:
+    for message, key in VECTORS:
+        data = encode(message, key)
+        assert all(cause(data[:n], key) == Refusal.MALFORMED for n in range(len(data)))
+        assert cause(data + b"\0", key) == Refusal.MALFORMED
+        assert cause(data + bytes(LONGEST), key) == Refusal.MALFORMED
+
+
+def test_the_first_thing_that_is_wrong_is_the_cause() -> None:
+    plan, report, nan = encode(PLAN), encode(STATE), struct.pack("<d", math.nan)
+    wrong: list[tuple[bytes, bytes | None, Refusal]] = [
+        (changed(plan, 0, b"XTWC"), None, Refusal.MALFORMED),
+        (changed(plan, 4, b"\2"), None, Refusal.VERSION),
+        (changed(encode(PLAN, KEY), 4, b"\2"), None, Refusal.VERSION),
+        (changed(plan, 5, b"\7"), None, Refusal.MALFORMED),
+        (encode(PLAN, KEY), None, Refusal.KEY),
+        (plan, KEY, Refusal.KEY),
+        (encode(PLAN, KEY), b"x" + KEY, Refusal.KEY),
+        (changed(encode(PLAN, KEY), 100, b"\1"), KEY, Refusal.KEY),
+        (changed(plan, 8, bytes(8)), None, Refusal.MALFORMED),
+        (changed(plan, 24, bytes(4)), None, Refusal.MALFORMED),
+        (changed(plan, 56, b"\4"), None, Refusal.MALFORMED),
+        (changed(plan, 60, b"\3"), None, Refusal.MALFORMED),
+        (changed(plan, 60, b"\xff"), None, Refusal.MALFORMED),
+        (changed(plan, 61, b"\1"), None, Refusal.MALFORMED),
+        (changed(plan, 80, b"\xff" * 8), None, Refusal.MALFORMED),
+        (changed(plan, 88, nan), None, Refusal.MALFORMED),
+        (changed(report, 60, b"\3"), None, Refusal.MALFORMED),
+        (changed(report, 61, b"\2"), None, Refusal.MALFORMED),
+        (changed(report, 63, b"\x11"), None, Refusal.MALFORMED),
+        (changed(report, 80, bytes(8)), None, Refusal.MALFORMED),
+        (changed(report, 96, nan), None, Refusal.MALFORMED),
+        (changed(report, 104, bytes(8)), None, Refusal.MALFORMED),
+        (changed(report, 140, b"\1"), None, Refusal.MALFORMED),
+        (changed(report, len(report) - 8, nan), None, Refusal.MALFORMED),
+    ]
+    for data, key, expected in wrong:
+        assert cause(data, key) == expected
+    assert cause(changed(report, 144, nan)) is None  # a value that is lost
+
+
+def test_a_window_takes_each_number_once() -> None:
+    """Against a set of all that were seen, over numbers that overtake one another and repeat."""
+    rng = random.Random(20261122)
+    window, seen, newest = Window(), set[int](), 0
+    causes = set()
+    for _ in range(20_000):
+        number = max(1, newest + rng.choice([-100, -64, -63, -5, -1, 0, 1, 1, 1, 2, 7, 63, 64, 90]))
+        found = window.take(number)
+        if number <= newest - 64:
+            expected = Refusal.LATE
+        else:
+            expected = Refusal.REPLAYED if number in seen else None
+        assert found == expected
+        causes.add(found)
+        seen.add(number)
+        newest = max(newest, number)
+        assert [n for n in range(newest, newest - 64, -1) if window.seen >> (newest - n) & 1] == [
+            n for n in range(newest, newest - 64, -1) if n in seen and n > 0
+        ]
+    assert causes == {None, Refusal.LATE, Refusal.REPLAYED}
+
+
+def test_a_session_is_of_two_numbers_and_an_address() -> None:
+    here, other = ("127.0.0.1", 5), ("127.0.0.1", 6)
+    session = Session(9, here, nonce=4)
+
+    def refusal(number: int, nonce: int, sequence: int, address: tuple[str, int]) -> Refusal | None:
+        return session.refusal(Head(number, nonce, sequence, 0, 100, 0, 0), address, 1000)
+
+    assert refusal(8, 4, 1, here) == refusal(9, 5, 1, here) == refusal(9, 4, 1, other)
+    assert refusal(9, 4, 1, other) == Refusal.FOREIGN
+    assert session.heard == 0
+    assert refusal(9, 4, 1, here) is None
+    assert refusal(9, 4, 1, here) == Refusal.REPLAYED
+    head = session.head(1500)
+    assert (head.sequence, head.acknowledged, head.echo, head.held) == (1, 1, 100, 500)
+    assert session.head(1600).sequence == 2
+
+
+@pytest.mark.parametrize("rate", [1.0, 0.5])
+def test_the_other_clock_is_found_within_half_the_difference_of_the_ways(rate: float) -> None:
+    """There 0.3 s and up to 20 ms more, back 0.31 s and up to 20 ms: off by at most the spread."""
+    rng = np.random.default_rng(5)
+    clock, worst = OtherClock(rate), 0.0
+
+    def there(own: int) -> int:  # the other clock: another zero, another rate
+        return round(rate * (own + 123 * SECOND))
+
+    for k in range(200):
+        sent = 10 * SECOND + k * SECOND // 10
+        got = sent + round((0.3 + 0.02 * rng.random()) * SECOND)
+        answered = got + SECOND // 50
+        back = answered + round((0.31 + 0.02 * rng.random()) * SECOND)
+        held = there(answered) - there(got)
+        clock.note(Head(1, 1, k + 1, k + 1, there(answered), sent, held), back)
+        if k > 20:
+            worst = max(worst, abs(clock.at(back) - there(back) / SECOND))
+    assert 0.6 < clock.round_trip < 0.64
+    assert 1e-4 < worst < rate * (0.31 + 0.02 - 0.3) / 2 + 1e-3
+
+
+# ---------------------------------------------------------------- sockets
+
+
+def test_without_a_key_only_loopback(tmp_path: Path) -> None:
+    for host in ("0.0.0.0", "192.0.2.1"):
+        with pytest.raises(ConfigError, match="without a key; expected a loopback address"):
+            Endpoint(ControllerMessage, host)
+    with pytest.raises(ConfigError, match="key: got 3 bytes"):
+        Endpoint(ControllerMessage, key=b"abc")
+    endpoint = Endpoint(MachineMessage)
+    with pytest.raises(ConfigError, match="without a key"):
+        endpoint.send(PLAN, ("192.0.2.1", 9))
+    with pytest.raises(ConfigError, match="expected a free one"):
+        Endpoint(ControllerMessage, port=endpoint.address[1])
+    file = tmp_path / "key"
+    for text in (b"short\n", b"", bytes(5000)):
+        file.write_bytes(text)
+        with pytest.raises(ConfigError, match="--key: got"):
+            read_key(file)
+    with pytest.raises(ConfigError, match="No such file"):
+        read_key(tmp_path / "none")
+    file.write_bytes(b"x" * SHORTEST_KEY + b"\n")
+    assert read_key(file) == b"x" * SHORTEST_KEY
+    endpoint.close()
+
+
+def test_an_endpoint_counts_what_it_refuses() -> None:
+    ear, mouth = Endpoint(ControllerMessage, key=KEY), Endpoint(MachineMessage, key=KEY)
+    good = encode(PLAN, KEY)
+    for data in (
+        good,
+        b"",
+        b"x",
+        good[:-1],
+        encode(PLAN),
+        changed(good, 4, b"\3"),
+        encode(STATE, KEY),
+    ):
+        mouth._socket.sendto(data, ear.address)
+    assert [(message, address) for message, address in ear.receive()] == [(PLAN, mouth.address)]
+    assert list(ear.receive()) == []
+    # A report is the other side's own.
+    assert ear.refused == {Refusal.MALFORMED: 4, Refusal.KEY: 1, Refusal.VERSION: 1}
+    ear.close()
+    mouth.close()
+    assert not mouth.send(PLAN, ("127.0.0.1", 9))
+    assert mouth.unsent == 1
+
+
+# ---------------------------------------------------------------- the C
+
+
+@pytest.fixture(scope="module")
+def codec(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """protocol_test.c, compiled with the sanitizers."""
+    compiler = build.compiler()
+    if compiler is None:
+        pytest.skip("there is no C compiler")
+    made = tmp_path_factory.mktemp("codec") / "protocol_test"
+    sources = [str(TEMPLATES / name) for name in ("protocol.c", "protocol_test.c")]
+    flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-g"]
+    flags += ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    subprocess.run([*compiler, *flags, *sources, "-lm", "-o", str(made)], check=True)
+    return made
+
+
+def through_c(codec: Path, datagrams: list[bytes], key: bytes) -> Iterator[tuple[int, bytes]]:
+    """Of each why C refuses it, as a number, and what it writes of it."""
+    lines = "".join(data.hex() + "\n" for data in datagrams)
+    done = subprocess.run(
+        [codec, key.decode()], input=lines, capture_output=True, text=True, check=True
+    )
+    for line in done.stdout.splitlines():
+        number, _, text = line.partition(" ")
+        yield int(number), bytes.fromhex(text)
+
+
+def test_c_writes_and_reads_the_documented_bytes(codec: Path) -> None:
+    """Its messages are those of the table above, written in C."""
+    done = subprocess.run([codec], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout == "protocol: as documented\n"
+
+
+IN_C = {None: 0, Refusal.MALFORMED: 1, Refusal.VERSION: 2, Refusal.KEY: 3}
+
+
+def damaged(rng: random.Random, data: bytes) -> bytes:
+    """What a bad link, or somebody, makes of a datagram."""
+    kind = rng.randrange(6)
+    if kind == 0:
+        return data[: rng.randrange(len(data) + 1)]
+    if kind == 1:
+        return data + rng.randbytes(rng.randrange(1, 30))
+    if kind == 2:
+        return rng.randbytes(rng.randrange(200))
+    if kind == 3:  # with the right length
+        return data[:60] + rng.randbytes(len(data) - 60)
+    place = rng.randrange(len(data))
+    number = 1 if kind == 4 else rng.randrange(1, 9)
+    return changed(data, place, rng.randbytes(min(number, len(data) - place)))
+
+
+def any_message(rng: random.Random) -> Message:
+    """Of either side, with numbers of all sizes."""
+    head = Head(*(rng.randrange(1, 2**n) for n in (64, 64, 32, 32, 64, 64, 64)))
+    some = np.array([rng.uniform(-1, 1) * 10.0 ** rng.randrange(-300, 300) for _ in range(6)])
+    if rng.random() < 0.5:
+        torques = np.tile(some, (rng.randrange(MOST_ROWS + 1), 1))
+        return ControllerMessage(head, ControllerFlags.STOP, 3, 4, rng.randrange(2**63), torques)
+    acted = np.tile(some, (rng.randrange(MOST_HISTORY + 1), 1))
+    times = (rng.randrange(1, 2**64) for _ in range(4))
+    flags, there = MachineFlags(rng.randrange(1024)), np.array(rng.choices([True, False], k=64))
+    fixed = (1.0, math.inf, there, 5, acted, 1, 2, 3)
+    if rng.random() < 0.5:
+        return MachineMessage(head, flags, *times, *fixed, state=np.append(some, some))
+    codes = np.array([rng.randrange(-(2**31), 2**31) for _ in range(24)], np.int32).reshape(-1, 6)
+    return MachineMessage(head, flags, *times, *fixed, codes=codes, bits=9, zeros=some)
+
+
+def compare_codecs(codec: Path, rng: random.Random, number: int) -> set[Refusal | None]:
+    """Damaged and sound datagrams through both; the causes that were seen."""
+    key = KEY if rng.random() < 0.5 else b""
+    datagrams = []
+    for _ in range(number):
+        data = encode(any_message(rng), key or None)
+        datagrams.append(data if rng.random() < 0.2 else damaged(rng, data)[: LONGEST + 1])
+    seen = set()
+    answers = list(through_c(codec, datagrams, key))
+    assert len(answers) == len(datagrams)
+    for data, (number, again) in zip(datagrams, answers, strict=True):
+        expected = cause(data, key or None)
+        assert number == IN_C[expected], data.hex()
+        assert again == (data if expected is None else b"")
+        if expected is None:
+            assert encode(decode(data, key or None), key or None) == data
+        seen.add(expected)
+    return seen
+
+
+def test_both_codecs_take_and_refuse_the_same(codec: Path) -> None:
+    rng = random.Random(202611)
+    seen = set.union(*(compare_codecs(codec, rng, 300) for _ in range(6)))
+    assert seen == set(IN_C)
+
+
+@pytest.mark.soak
+def test_both_codecs_take_and_refuse_the_same_for_five_minutes(codec: Path) -> None:
+    rng, end, number = random.Random(), time.monotonic() + 300, 0
+    while time.monotonic() < end:
+        compare_codecs(codec, rng, 1000)
+        number += 1000
+    print(f"{number} datagrams")
