@@ -11,13 +11,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
+import pydantic.dataclasses
 from numpy.typing import NDArray
+from pydantic import ConfigDict
 
 from stewart_drake.files.arrayio import load_npz
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.jsonio import load_json
+from stewart_drake.files.versions import versions
+from stewart_drake.files.yamlio import validate
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.bulk import Ending, run_in_bulk
 from stewart_drake.loop.experiment import Experiment
@@ -26,7 +31,7 @@ from stewart_drake.loop.weights import health_of
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.families import base_of, condition, draw_family
-from stewart_drake.studies.jobs import Progress, run_jobs
+from stewart_drake.studies.jobs import MANIFEST, Progress, run_jobs
 from stewart_drake.studies.uncertainty import Draw
 from stewart_drake.tuner.density import NUM_INPUTS, WINDOW, densities
 from stewart_drake.tuner.health import HealthFeatures
@@ -42,6 +47,13 @@ Array = NDArray[np.float64]
 
 RATIOS: Final = np.linspace(-4.0, 2.0, 13)
 """log10(w_Q / w_R)."""
+
+
+def fixed_name(ratio: float) -> str:
+    """Of a run with fixed weights."""
+    return f"{ratio:+.1f}"
+
+
 LOST: Final = 50.0
 """% s per second."""
 EVERY: Final = 2
@@ -186,6 +198,7 @@ class Curves:
 
     Attributes:
         family: name of it.
+        base: the scenario that it varies.
         draws: n conditions.
         cost: (n, m) J in % s, of m = 13 fixed ratios, or 1 roll-out.
         completed: (n, m).
@@ -193,6 +206,7 @@ class Curves:
     """
 
     family: str
+    base: Scenario
     draws: list[Draw]
     cost: Array
     completed: NDArray[np.bool_]
@@ -247,32 +261,72 @@ def make_curves(
         scheduler=scheduler,
         progress=progress,
     )
-    return collected(family, draws, kept)
+    return collected(family, base, draws, kept)
+
+
+def load_curves(directory: str | Path) -> Curves:
+    """What `make_curves` has left, all of it.
+
+    Raises:
+        ConfigError: there is nothing of the kind, some of it is missing or damaged.
+    """
+    folder = Path(directory) / "curves"
+    manifest = folder / MANIFEST
+    settings = validate(_Manifest, load_json(manifest, _MAX_MANIFEST, EXPECTED), str(manifest))
+    said = settings.settings
+    base = validate(Scenario, said.scenario, str(manifest))
+    paths = sorted(folder.glob("[0-9]*.npz"))
+    if [path.stem for path in paths] != [f"{i:05d}" for i in range(len(paths))] or not paths:
+        raise ConfigError(f"{folder}: conditions are missing; go on with tune dataset --family")
+    draws = draw_family(said.family, len(paths), said.seed, "training")
+    read = partial(read_curve, runs=len(RATIOS), samples=samples_of(base))
+    return collected(said.family, base, draws, {path.stem: read(path) for path in paths})
+
+
+_STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+_MAX_MANIFEST: Final = 1_000_000
+
+
+@pydantic.dataclasses.dataclass(config=_STRICT)
+class _Settings:
+    family: Literal["T", "N2"]
+    seed: int
+    scenario: dict[str, Any]
+
+
+@pydantic.dataclasses.dataclass(config=_STRICT)
+class _Manifest:
+    hash: str
+    settings: _Settings
 
 
 def roll_outs(
-    family: str,
-    draws: list[Draw],
+    curves: Curves,
+    chosen: NDArray[np.intp],
     network: Network,
     directory: Path,
     *,
     key: str,
-    settings: tuple[str, ...] = (),
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Curves:
-    """Run conditions with a network, or go on with it.
+    """Run some of the conditions with a network, or go on with it.
 
     Args:
-        family, settings, workers, progress: as of `make_curves`.
-        draws: the conditions.
+        curves: of the conditions.
+        chosen: numbers of those that are run.
         network: what sets the weights.
         directory: where the runs are kept.
         key: by which the network differs from others.
+        workers, progress: as `run_jobs` takes them.
     """
-    base = base_of(family, settings)
+    family, base = curves.family, curves.base
+    draws = [curves.draws[i] for i in chosen]
     kept = run_jobs(
-        {f"{i:05d}": (condition(base, one), network) for i, one in enumerate(draws)},
+        {
+            f"{i:05d}": (condition(base, one), network)
+            for i, one in zip(chosen, draws, strict=True)
+        },
         roll_out,
         directory,
         settings={"family": family, "scenario": scenario_to_dict(base), "network": key},
@@ -281,14 +335,17 @@ def roll_outs(
         workers=workers,
         progress=progress,
     )
-    return collected(family, draws, kept)
+    return collected(family, base, draws, kept)
 
 
-def collected(family: str, draws: list[Draw], kept: Mapping[str, dict[str, Any]]) -> Curves:
+def collected(
+    family: str, base: Scenario, draws: list[Draw], kept: Mapping[str, dict[str, Any]]
+) -> Curves:
     """The files of all conditions, in their order."""
     read = list(kept.values())
     return Curves(
         family=family,
+        base=base,
         draws=draws,
         cost=np.array([one["cost"] for one in read]),
         completed=np.array([one["completed"] for one in read]),
@@ -320,3 +377,19 @@ def read_curve(path: Path, runs: int, samples: int) -> dict[str, Any]:
             f"{path}: cost: got one that is negative or not finite; expected J in % s"
         )
     return found
+
+
+def summarize(curves: Curves) -> dict[str, Any]:
+    """What `summary.json` of a family's data holds."""
+    g = np.exp(curves.log_cost.mean(axis=0))
+    return {
+        "family": curves.family,
+        "conditions": len(curves.draws),
+        "g": dict(zip(map(fixed_name, RATIOS), g.tolist(), strict=True)),
+        "completed": dict(
+            zip(map(fixed_name, RATIOS), curves.completed.sum(axis=0).tolist(), strict=True)
+        ),
+        "hindsight": float(np.exp(curves.log_cost.min(axis=1).mean())),
+        "scenario": scenario_to_dict(curves.base),
+        "versions": versions(),
+    }

@@ -35,6 +35,8 @@ FeatureName = Literal["densities", "health"]
 HIDDEN: Final = 10
 HELD_OUT: Final = 0.2
 """Of the conditions."""
+OWN: Final = 0.5
+"""Of the conditions trained on that are run with the first round's network."""
 BATCH: Final = 4000
 STEPS: Final = 1500
 PATIENCE: Final = 300
@@ -91,7 +93,6 @@ def train_by_regret(
     *,
     features: FeatureName = "health",
     seed: int = 0,
-    settings: tuple[str, ...] = (),
     workers: int | None = None,
     told: Told = lambda line: None,
     progress: Progress | None = None,
@@ -103,7 +104,7 @@ def train_by_regret(
         directory: its own runs are kept there, so that a second start goes on.
         features: what it decides by; the second round is for `health` alone.
         seed: of the split, the start and the batches.
-        settings, workers, progress: as of `tuning.curves.make_curves`.
+        workers, progress: as of `tuning.curves.make_curves`.
         told: how far it is.
 
     Raises:
@@ -115,19 +116,22 @@ def train_by_regret(
     first = trainer.network(theta)
     if features != "health":
         return RegretTraining(first, np.array(trainer.curve))
-    common: dict[str, Any] = {"settings": settings, "workers": workers, "progress": progress}
 
     def own_runs(network: Network, chosen: NDArray[np.intp], number: int) -> Curves:
-        key, draws = _key(network), [curves.draws[i] for i in chosen]
+        key = _key(network)
         folder = Path(directory) / f"round{number}-{key[:8]}"
-        return roll_outs(curves.family, draws, network, folder, key=key, **common)
+        return roll_outs(
+            curves, chosen, network, folder, key=key, workers=workers, progress=progress
+        )
 
-    everything = np.arange(len(curves.draws))
-    own = own_runs(first, everything, 1)
-    theta = trainer.fit(theta, [trainer.rows, rows_of(own, features)], 2)
-    second, held = trainer.network(theta), np.flatnonzero(trainer.held)
+    held, some = np.flatnonzero(trainer.held), np.flatnonzero(~trainer.held)[:: round(1 / OWN)]
+    chosen = np.sort(np.concatenate([held, some]))
+    own = own_runs(first, chosen, 1)
+    rows = rows_of(own, features)
+    theta = trainer.fit(theta, [trainer.rows, Rows(rows.inputs, chosen[rows.condition])], 2)
+    second = trainer.network(theta)
     scores = [
-        float(own.log_cost[held].mean()),
+        float(own.log_cost[np.isin(chosen, held)].mean()),
         float(own_runs(second, held, 2).log_cost.mean()),
     ]
     told("held out, in the loop: J of round 1 {:.3g}, of round 2 {:.3g}".format(*np.exp(scores)))
@@ -185,10 +189,9 @@ class _Trainer:
                 with torch.no_grad():
                     # The last source is what the network itself leads to, where there is one.
                     held = float(self._loss(x, *parts[-1][1]))
-                self.curve.append((float(number), step + 1.0, float(loss), held))
-                self._told(
-                    f"round {number}, step {step + 1}: {float(loss):.3f}, held out {held:.3f}"
-                )
+                self.curve.append((float(number), step + 1.0, float(loss.detach()), held))
+                line = f"{float(loss.detach()):.3f}, held out {held:.3f}"
+                self._told(f"round {number}, step {step + 1}: {line}")
                 since += LOOK
                 if held < best:
                     best, kept, since = held, x.detach().numpy().astype(np.float64), 0
