@@ -26,6 +26,7 @@ from stewart_drake.scenario.config import (
     DelayConfig,
     FixedTunerConfig,
     PlantConfig,
+    RuleTunerConfig,
     Scenario,
     ServoActuatorConfig,
 )
@@ -656,7 +657,13 @@ scenarios = st.builds(
         catch_up=st.none() | st.just(0.0) | st.floats(1e-3, 10),
         model=st.sampled_from(["paper", "multibody"]),
     ),
-    tuner=st.sampled_from([FixedTunerConfig(), AnnTunerConfig(weights="paper")]),
+    tuner=st.sampled_from(
+        [
+            FixedTunerConfig(),
+            AnnTunerConfig(weights="paper"),
+            RuleTunerConfig(ratio=-1.0, slope=2.0, knee=0.5),
+        ]
+    ),
 )
 
 

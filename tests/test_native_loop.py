@@ -16,7 +16,7 @@ from pydrake.systems.framework import Context, LeafSystem
 import stewart_drake as sd
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.loop import bulk
-from stewart_drake.loop.bulk import Ending, PythonLaw, ending_of, run_in_bulk
+from stewart_drake.loop.bulk import Ending, SampledLaw, ending_of, run_in_bulk
 from stewart_drake.loop.experiment import control_law, prepare
 from stewart_drake.loop.native_loop import InPython, instants_of, run_loop, uncovered
 from stewart_drake.loop.preparation import preparation_of
@@ -78,6 +78,19 @@ LOOPS = {
         "paper", "duration=2", "controller.delay_estimator=constant", "controller.delay_steps=6",
         "start=on_reference", "queue=reference",
     ),
+    "jitter": scenario(
+        "paper", "duration=2", "delay.jitter_std=0.06", "delay.seed=4", "delay.fraction=0.2",
+        "controller.delay_steps=8", "plant.coulomb_friction=0.0003", *FOLLOWS, *DIRTY,
+    ),
+    "shorter and shorter": scenario(
+        "paper", "duration=1.5", "delay.drift=-0.3", "delay.steps=3", "controller.delay_steps=3",
+        *FOLLOWS,
+    ),
+    "rule": scenario(
+        "paper", "duration=2", "tuner.kind=rule", "tuner.ratio=1", "tuner.knee=-0.5",
+        "delay.fraction=0.3", "controller.delay_steps=8", *FOLLOWS, *DIRTY,
+    ),
+    "network": scenario("paper", "duration=2", "tuner.kind=ann", *FOLLOWS, *DIRTY),
 }  # fmt: skip
 
 
@@ -86,6 +99,8 @@ IN_PYTHON = {
     "linear": "native, law in Python (controller.prediction)",
     "printed": "native, law in Python (controller.model)",
     "adaptive": "native, law in Python (controller.delay_estimator)",
+    "rule": "native, weights in Python (tuner.kind)",
+    "network": "native, weights in Python (tuner.kind)",
 }
 """What the law in C has not."""
 
@@ -154,7 +169,8 @@ def test_states_torques_and_measurements_are_drakes() -> None:
     one = LOOPS["late"]
     preparation = preparation_of(one)
     prepared = preparation.prepared(preparation.experiment(one))
-    law = InPython(PythonLaw(prepared, preparation.when).torque)
+    wanted = preparation.references[preparation.when.sampled]
+    law = InPython(SampledLaw(prepared, preparation.when, wanted).torque)
     course = run_loop(prepared.experiment, preparation.when, law)
     signals = simulate(one, margin=False).signals
     assert np.array_equal(signals.time.values, preparation.when.nominal)
@@ -243,12 +259,10 @@ def test_what_a_law_raises_comes_through() -> None:
     ("field", "settings"),
     [
         ("plant.kind", ["plant.kind=multibody"]),
-        ("delay", ["delay.drift=0.01"]),
         ("link.kind", ["link.kind=network"]),
         ("sensor.faults", ["sensor.faults=[{kind: missing, from: 0.05, to: 0.15}]"]),
         ("sensor.delay", ["sensor.delay=0.1"]),
         ("sensor.loss", ["sensor.loss=0.1"]),
-        ("tuner.kind", ["tuner.kind=ann", "controller.delay_steps=8"]),
     ],
 )
 def test_what_it_has_not_runs_in_drake_and_says_so(field: str, settings: list[str]) -> None:

@@ -1,9 +1,9 @@
-"""The neural tuner: tune dataset, tune train, tune evaluate."""
+"""Tuners: tune dataset, tune train, tune evaluate; with --family the ones trained by regret."""
 
 import time
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -26,6 +26,7 @@ from stewart_drake.scenario.config import Scenario
 
 app = typer.Typer(rich_markup_mode=None, help="Data for the neural tuner, its training, its worth.")
 
+DRAWS: Final = 384
 Out = Annotated[Path, typer.Option(metavar="DIR", help="Where runs, results and summary go.")]
 
 
@@ -52,6 +53,19 @@ class DensityKind(StrEnum):
     signed = "signed"
 
 
+class FamilyName(StrEnum):
+    """Choices of --family, those of `studies.families.FAMILIES`."""
+
+    T = "T"
+    N2 = "N2"
+
+
+Family = Annotated[
+    FamilyName | None,
+    typer.Option(help="Conditions where weights matter: T with the estimator, N2 without."),
+]
+
+
 @app.command()
 def dataset(
     scenario: ScenarioName = "paper",
@@ -61,13 +75,22 @@ def dataset(
     disturbed: Annotated[
         int, typer.Option(metavar="N", help="N drawn conditions instead of the paper's grid.")
     ] = 0,
+    family: Family = None,
+    draws: Annotated[
+        int, typer.Option(metavar="N", help="With --family: how many, each with 13 ratios.")
+    ] = DRAWS,
     seed: Seed = 0,
     workers: Workers = None,
     scheduler: Scheduler = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Run the grid of delays, frequencies and weights, 180 runs."""
+    """Run the grid of delays, frequencies and weights, 180 runs, or a family's conditions."""
+    if family is not None:
+        refuse_with_family(scenario, controller)
+        return _curves(
+            family.value, draws, seed, settings, workers, scheduler, Delivery(out, quiet, as_json)
+        )
     from stewart_drake.report.tuner_document import dataset_document
     from stewart_drake.tuning.dataset import make_dataset, summarize
 
@@ -93,6 +116,9 @@ def dataset(
 @app.command()
 def train(
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder or file of tune dataset.")],
+    regret: Annotated[
+        bool, typer.Option("--regret", help="By regret, on data of a --family; else as the paper.")
+    ] = False,
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="For the network; figures go beside it.")
     ] = Path("out/tuner/tuner.json"),
@@ -102,10 +128,11 @@ def train(
     split: Annotated[SplitKind, typer.Option(help="What 70 % of are trained on.")] = SplitKind.run,
     density: Annotated[DensityKind, typer.Option(help="Of (45).")] = DensityKind.magnitude,
     seed: Seed = 0,
+    workers: Workers = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Train the network on a data set by Levenberg-Marquardt."""
+    """Train the network on a data set: by Levenberg-Marquardt, or by regret and its own runs."""
     from stewart_drake.report.tuner_document import training_document
     from stewart_drake.tuner.network import save_network
     from stewart_drake.tuning.dataset import load_dataset
@@ -115,6 +142,8 @@ def train(
     if out.suffix != ".json":
         raise ConfigError(f"--out: got {str(out)!r}; expected a file ending in .json")
     delivery = Delivery(out.parent, quiet, as_json)
+    if regret:
+        return _train_by_regret(data, out, seed, workers, delivery)
     read = load_dataset(data)
     with stopping("nothing written"), working("training", quiet):
         result = run(read, kind=labels.value, split=split.value, density=density.value, seed=seed)
@@ -137,7 +166,8 @@ def train(
 @app.command()
 def evaluate(
     weights: Annotated[
-        str | None, typer.Argument(metavar="[WEIGHTS]", help="Shipped name or file.")
+        list[str] | None,
+        typer.Argument(metavar="[WEIGHTS]...", help="Shipped name or file; several with --family."),
     ] = None,
     out: Out = Path("out/tuner/evaluation"),
     scenario: Annotated[
@@ -146,13 +176,22 @@ def evaluate(
     controller: Controller = None,
     settings: Settings = None,
     scenarios: Annotated[int, typer.Option(metavar="N", help="How many to draw.")] = 40,
+    family: Family = None,
     seed: Seed = 0,
     workers: Workers = None,
     scheduler: Scheduler = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Compare the tuner with every fixed gain on unseen scenarios."""
+    """Compare the tuner with every fixed gain on unseen scenarios, or a family's conditions."""
+    if family is not None:
+        refuse_with_family(scenario, controller)
+        delivery = Delivery(out, quiet, as_json)
+        return _worth(
+            family.value, weights, scenarios, seed, settings, workers, scheduler, delivery
+        )
+    if weights and len(weights) > 1:
+        raise ConfigError(f"WEIGHTS: got {len(weights)} without --family; expected one")
     from stewart_drake.report.tuner_document import evaluation_document
     from stewart_drake.tuning.evaluation import evaluate as run
 
@@ -161,7 +200,7 @@ def evaluate(
     with stopping(GO_ON), count_bar("runs", quiet) as progress:
         result = run(
             base,
-            weights,
+            weights[0] if weights else None,
             out,
             scenarios=scenarios,
             seed=seed,
@@ -173,6 +212,109 @@ def evaluate(
     delivery.write(summary)
     delivery.say(evaluation_document(result).plain())
     delivery.wrote("runs in fixed/ and tuner-*/")
+    return delivery.end(summary)
+
+
+def refuse_with_family(scenario: str, controller: str | None) -> None:
+    """A family says both.
+
+    Raises:
+        ConfigError: another scenario, or a controller.
+    """
+    for name, got, usual in (("SCENARIO", scenario, "paper"), ("--controller", controller, None)):
+        if got != usual:
+            raise ConfigError(f"{name}: got {got!r} with --family, which says it; expected none")
+
+
+def _curves(
+    family: str,
+    draws: int,
+    seed: int,
+    settings: list[str] | None,
+    workers: int | None,
+    scheduler: str | None,
+    delivery: Delivery,
+) -> int:
+    from stewart_drake.report.worth_document import curves_document
+    from stewart_drake.tuning.curves import make_curves, summarize
+
+    assert delivery.out is not None
+    started = time.perf_counter()
+    with stopping(GO_ON), count_bar("conditions", delivery.silent) as progress:
+        curves = make_curves(
+            family,
+            delivery.out,
+            number=draws,
+            seed=seed,
+            settings=tuple(settings or ()),
+            workers=workers,
+            scheduler=scheduler,
+            progress=progress,
+        )
+    summary = summarize(curves) | {"seed": seed, "wall_s": time.perf_counter() - started}
+    delivery.write(summary)
+    delivery.say(curves_document(summary).plain())
+    delivery.wrote("curves/")
+    return delivery.end(summary)
+
+
+def _train_by_regret(
+    data: Path, out: Path, seed: int, workers: int | None, delivery: Delivery
+) -> int:
+    from stewart_drake.report.worth_document import regret_document
+    from stewart_drake.tuner.network import save_network
+    from stewart_drake.tuning.curves import load_curves
+    from stewart_drake.tuning.regret import train_by_regret
+
+    curves, runs = load_curves(data), out.with_name(f"{out.stem}-runs")
+    with stopping(GO_ON), count_bar("own runs", delivery.silent, "training") as progress:
+        result = train_by_regret(curves, runs, seed=seed, workers=workers, progress=progress)
+    summary = dict(result.network.card) | {"curve": result.curve.tolist()}
+    save_network(result.network, out)
+    delivery.wrote(out.name, f"{runs.name}/")
+    delivery.write(summary)
+    delivery.say(regret_document(summary).plain())
+    return delivery.end(summary)
+
+
+def _worth(
+    family: str,
+    weights: list[str] | None,
+    conditions: int,
+    seed: int,
+    settings: list[str] | None,
+    workers: int | None,
+    scheduler: str | None,
+    delivery: Delivery,
+) -> int:
+    from stewart_drake.report.page import Provenance, command_line, write_page
+    from stewart_drake.report.worth_document import worth_document
+    from stewart_drake.tuning.worth import weigh
+
+    assert delivery.out is not None
+    started = time.perf_counter()
+    networks = weights or [f"health_{family}"]
+    with stopping(GO_ON), count_bar("conditions", delivery.silent) as progress:
+        worth = weigh(
+            family,
+            networks,
+            delivery.out,
+            conditions=conditions,
+            seed=seed,
+            settings=tuple(settings or ()),
+            workers=workers,
+            scheduler=scheduler,
+            progress=progress,
+        )
+    seconds = time.perf_counter() - started
+    summary = worth.summary | {"wall_s": seconds}
+    delivery.write(summary)
+    document = worth_document(worth)
+    delivery.say(document.plain())
+    options = {"family": family, "scenarios": conditions, "seed": seed}
+    command = command_line("tune", "evaluate", *networks, settings=settings or (), options=options)
+    made = Provenance(command, seconds=seconds)
+    delivery.draw("worth.html", lambda folder: [write_page(document, made, folder / "worth.html")])
     return delivery.end(summary)
 
 

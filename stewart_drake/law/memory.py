@@ -1,6 +1,6 @@
 """What the control law carries from one sample to the next."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +9,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Sent
+from stewart_drake.scenario.signals import NUM_TORQUES
 
 Array = NDArray[np.float64]
 
@@ -71,6 +72,7 @@ class Memory:
         sent: what the channel remembers.
         path: that was planned in flight, or None.
         silence: samples that are still to go on without feedback.
+        feedforward: (6,) how much of `torque` rests on no measurement; NaN before the first sample.
     """
 
     in_flight: Array
@@ -86,6 +88,7 @@ class Memory:
     sent: Sent
     path: Trajectory | None = None
     silence: int = 0
+    feedforward: Array = field(default_factory=lambda: np.full(NUM_TORQUES, np.nan))
 
     def without_error(self) -> "Memory":
         """The same with nothing integrated."""

@@ -167,6 +167,11 @@ class NativeMemory:
         return self._part("torque")
 
     @property
+    def feedforward(self) -> Array:
+        """(6,)."""
+        return self._part("feedforward")
+
+    @property
     def weights(self) -> Array:
         """(2,)."""
         return self._part("weights")

@@ -61,6 +61,8 @@ class Response(NamedTuple):
     """(6, g), NaN for none."""
     trouble: str | None
     """What went wrong, as the name of a count."""
+    feedforward: Array
+    """(6,) N m, of the torque."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +195,7 @@ class PredictiveLqi:
             belief = belief.at(wanted[0])
         queue = belief.timeline.queue(memory.in_flight)
         guide, response = self._respond(memory, belief, queue, wanted, nodes, weights)
-        torque, error, integral, ahead, gain, trouble = response
+        torque, error, integral, ahead, gain, trouble, feedforward = response
         nonfinite = not np.all(np.isfinite(torque))
         if nonfinite:
             torque = memory.torque
@@ -218,6 +220,7 @@ class PredictiveLqi:
             ),
             path=followed.path,
             silence=max(memory.silence - 1, 0),
+            feedforward=feedforward,
             plan=plan,
             sent=self.channel.send(sent, plan, memory.in_flight),
         )
@@ -259,7 +262,7 @@ class PredictiveLqi:
             pending = (queue[len(queue) - len(held) + 1 :] - held[:-1]).ravel()
             seen = self.cost.sees(ahead.integral)
             torque = torque - gain @ np.concatenate([error_ahead, seen, pending])
-        return Response(torque, error, integral, ahead, gain, trouble)
+        return Response(torque, error, integral, ahead, gain, trouble, held[-1])
 
     def _go_on_alone(self, memory: Memory, belief: Belief, wanted: Array, nodes: Array) -> Response:
         """The feedforward of what is known beforehand; errors do not count."""
@@ -269,7 +272,7 @@ class PredictiveLqi:
             self._no_gain(belief.timeline),
             Ahead(wanted[-1], np.zeros(NUM_STATE), nothing),
         )
-        return Response(held[-1], nothing, memory.integral, ahead, none, None)
+        return Response(held[-1], nothing, memory.integral, ahead, none, None, held[-1])
 
     def _plan(
         self, first: Array, belief: Belief, ahead: Ahead, queue: Array, gain: Array, preview: Array

@@ -17,8 +17,9 @@ from stewart_drake.law import native_law
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
+from stewart_drake.law.native_law import AnyMemory
 from stewart_drake.loop.experiment import Experiment, assemble, first_queue, followed_motion
-from stewart_drake.loop.metrics import Figures, figures
+from stewart_drake.loop.metrics import Figures, accumulated_error, figures
 from stewart_drake.loop.native_loop import (
     Course,
     InC,
@@ -27,12 +28,13 @@ from stewart_drake.loop.native_loop import (
     run_loop,
     uncovered,
 )
-from stewart_drake.loop.preparation import Preparation, Prepared, preparation_of
+from stewart_drake.loop.preparation import MakeTuner, Preparation, Prepared, preparation_of
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario, StateSensorConfig
-from stewart_drake.scenario.signals import POSE, TUNER_INPUTS
+from stewart_drake.scenario.signals import POSE, TUNER_INPUTS, WEIGHTS
+from stewart_drake.tuner.source import Decision
 
 Array = NDArray[np.float64]
 
@@ -47,6 +49,10 @@ class Ending(NamedTuple):
         counts: what went wrong and was survived, by name, as in the summary.
         samples: (k, 18) at the controller's samples [measurement - reference (12); torque that the
             law asked for (6)], in rad, m, rad/s, m/s and N m.
+        error_so_far: E_ac in % s up to the end, wherever that was; NaN where nothing ran.
+        weights: (k, 2) w_Q and w_R at the samples.
+        rows: (k, n) what a tuner's features keep of each sample (`tuner.features`); n = 0 where
+            there is no tuner, or Drake ran it.
         loop: what ran it: `native`, or what else, and what of the scenario made it necessary;
             nothing where the true machine cannot stand where the run begins.
     """
@@ -56,29 +62,40 @@ class Ending(NamedTuple):
     figures: Figures
     counts: dict[str, int]
     samples: Array
+    error_so_far: float
+    weights: Array
+    rows: Array
     loop: str
 
 
-def run_in_bulk(scenario: Scenario, truth: Mechanism | None = None) -> Ending:
+def run_in_bulk(
+    scenario: Scenario, truth: Mechanism | None = None, tuner: MakeTuner | None = None
+) -> Ending:
     """Run a scenario, without a judgement beforehand.
 
     Args:
         scenario: what to run.
         truth: the machine to simulate where it is not the one that the controller knows.
+        tuner: what sets the weights, in the place of the scenario's; not for Drake's loop.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
         KeyboardInterrupt: Ctrl-C.
+        ValueError: a tuner of one's own where only Drake's loop can run the scenario.
     """
     only_drake = uncovered(scenario)
+    if only_drake is not None and tuner is not None:
+        raise ValueError(f"tuner: got one for Drake's loop ({only_drake}); expected None")
     if only_drake is not None:
         outside = _outside(assemble(scenario, truth))
         return outside or _in_drake(scenario, truth, only_drake)
     preparation = preparation_of(scenario)
     experiment = preparation.experiment(scenario, truth)
     try:
-        return _outside(experiment) or _in_c(preparation, preparation.prepared(experiment))
+        return _outside(experiment) or _in_c(preparation, preparation.prepared(experiment, tuner))
     except IntegrationError:
+        if tuner is not None:
+            raise
         return _in_drake(scenario, truth, "plant.accuracy")
 
 
@@ -89,52 +106,83 @@ def _outside(experiment: Experiment) -> Ending | None:
         return None
     counts = Counts().summary() | {"tuner_fallbacks": 0}
     nothing = Figures(*[np.nan] * len(Figures._fields))
-    return Ending("left_workspace", failure, nothing, counts, np.empty((0, len(TUNER_INPUTS))), "")
+    samples, weights, rows = (np.empty((0, n)) for n in (len(TUNER_INPUTS), len(WEIGHTS), 0))
+    return Ending("left_workspace", failure, nothing, counts, samples, np.nan, weights, rows, "")
 
 
-class PythonLaw:
-    """The law of a prepared run, sample by sample.
+class SampledLaw:
+    """The law of a prepared run, sample by sample, and the tuner that sets its weights, if any.
 
     Attributes:
         memory: as of the last sample.
+        tuner: what the tuner remembers, None where weights are fixed.
+        weights: (2,) of each sample.
+        rows: what the tuner's features keep of each, see `Ending`.
+        backend: what steps the law, see `law.native_law.serving`.
     """
 
-    def __init__(self, prepared: Prepared, when: Instants) -> None:
+    def __init__(self, prepared: Prepared, when: Instants, wanted: Array) -> None:
         experiment, law = prepared.experiment, prepared.law
         c = experiment.scenario.controller
         self._law, self._previews, self._when = law, prepared.previews, when
-        self._weights = np.array([c.w_Q, c.w_R])
+        self._wanted, self._fixed = wanted, Decision(np.array([c.w_Q, c.w_R]), False)
         self._followed = followed_motion(experiment, law, prepared.planned)
-        self.memory = law.initial_memory(first_queue(experiment, law))
+        self._served, self.backend = native_law.serving(law)
+        self.memory: AnyMemory = self._served.initial_memory(first_queue(experiment, law))
+        self._source = prepared.tuner
+        self.tuner = None if self._source is None else self._source.start(self.memory)
+        self.weights: list[Array] = []
+        self.rows: list[Array] = []
 
     def torque(self, sample: int, measurement: Array) -> Array:
         """The torque (6,) of a sample."""
         motion: Motion = Preview(self._law.preview_times, self._previews[sample])
         if self._followed is not None:
             motion = KnownMotion(*self._followed, self._when.samples[sample])
-        measured = Measurement.of(measurement)
-        self.memory = self._law.step(self.memory, measured, motion, self._weights)
-        return self.memory.torque
+        measured, decision = Measurement.of(measurement), self._fixed
+        if self._source is not None and self.tuner is not None:
+            decision = self._source.decide(self.tuner)
+        after = self._served.step(self.memory, measured, motion, decision.weights)
+        if self._source is not None and self.tuner is not None:
+            wanted = self._wanted[sample]
+            self.tuner = self._source.observe(self.tuner, decision, after, wanted)
+            self.rows.append(self.tuner.window[-1])
+        self.weights.append(decision.weights)
+        self.memory = after
+        return after.torque
 
 
 def _in_c(preparation: Preparation, prepared: Prepared) -> Ending:
     experiment, law, when = prepared.experiment, prepared.law, preparation.when
     only_python = native_law.uncovered(law)
-    if only_python is None:
+    if only_python is None and prepared.tuner is None:
         c = experiment.scenario.controller
         queue = first_queue(experiment, law)
         in_c = InC(law, queue, prepared.previews, np.array([c.w_Q, c.w_R]))
         course = run_loop(experiment, when, in_c)
         return _ending(preparation, prepared, course, in_c.counts, "native")
-    in_python = PythonLaw(prepared, when)
+    sampled = SampledLaw(prepared, when, preparation.references[when.sampled])
     with one_blas_thread:
-        course = run_loop(experiment, when, InPython(in_python.torque))
-    loop = f"native, law in Python ({only_python})"
-    return _ending(preparation, prepared, course, in_python.memory.counts, loop)
+        course = run_loop(experiment, when, InPython(sampled.torque))
+    loop = "native, weights in Python (tuner.kind)"
+    if only_python is not None:
+        loop = f"native, law in Python ({only_python})"
+    ending = _ending(preparation, prepared, course, sampled.memory.counts, loop)
+    if sampled.tuner is None:
+        return ending
+    return ending._replace(
+        counts=ending.counts | {"tuner_fallbacks": sampled.tuner.fallbacks},
+        weights=np.array(sampled.weights),
+        rows=np.array(sampled.rows),
+    )
 
 
 def _ending(
-    preparation: Preparation, prepared: Prepared, course: Course, counts: Counts, loop: str
+    preparation: Preparation,
+    prepared: Prepared,
+    course: Course,
+    counts: Counts,
+    loop: str,
 ) -> Ending:
     when, looked = preparation.when, len(course.states)
     error = course.states[:, POSE] - preparation.references[:looked, POSE]
@@ -155,7 +203,11 @@ def _ending(
     wanted = preparation.references[:looked][sampled]
     samples = np.hstack([course.measured[:taken] - wanted, course.asked[:taken]])
     told = counts.summary() | {"tuner_fallbacks": 0}
-    return Ending(status, course.stopped, found, told, samples, loop)
+    so_far = accumulated_error(when.nominal[:looked][grid], error[grid], experiment.scale)
+    c = experiment.scenario.controller
+    weights = np.tile([c.w_Q, c.w_R], (taken, 1))
+    rows = np.empty((taken, 0))
+    return Ending(status, course.stopped, found, told, samples, so_far, weights, rows, loop)
 
 
 def _in_drake(scenario: Scenario, truth: Mechanism | None, field: str) -> Ending:
@@ -176,8 +228,17 @@ def ending_of(result: SimulationResult, loop: str = "drake") -> Ending:
         rms_torque=summary["rms_torque"],
         torque_variation=summary["torque_variation"],
     )
-    samples = samples_of(result)
-    return Ending(result.status, result.stopped, found, summary["counts"], samples, loop)
+    samples, signals = samples_of(result), result.signals
+    so_far, weights = np.nan, np.empty((0, len(WEIGHTS)))
+    if signals.sizes["time"]:
+        scale = assemble(result.scenario).scale
+        so_far = accumulated_error(signals.time.values, signals.error.values, scale)
+        at = result.scenario.controller.period * np.arange(len(samples))
+        weights = signals.weights.sel(time=at, method="nearest").values
+    rows, counts = np.empty((len(samples), 0)), summary["counts"]
+    return Ending(
+        result.status, result.stopped, found, counts, samples, so_far, weights, rows, loop
+    )
 
 
 def samples_of(result: SimulationResult) -> Array:

@@ -88,6 +88,7 @@ class DelayLqiController(LeafSystem):
     | plan | output | 6 (r + N) | N m, the packet to be sent | the same; direct feedthrough |
     | torque | output | 6 | N m | direct feedthrough |
     | estimate | output | 12 | rad, m, rad/s, m/s | direct feedthrough; what T_k rests on |
+    | memory | output | abstract, `Sample` | - | direct feedthrough; what this sample leaves |
     | torque_commanded | output | 6 | N m | held |
     | integral | output | 6 | rad s, m s | held |
     | weights_used | output | 2 | - | held, NaN before the first sample |
@@ -140,6 +141,9 @@ class DelayLqiController(LeafSystem):
         )
         self.DeclareVectorOutputPort(
             "estimate", NUM_STATE, weak(self._estimate), {self._step.ticket()}
+        )
+        self.DeclareAbstractOutputPort(
+            "memory", lambda: Value(first), weak(self._left), {self._step.ticket()}
         )
         if sends:
             size = first.memory.sent.packets[0].size
@@ -203,6 +207,9 @@ class DelayLqiController(LeafSystem):
     def _estimate(self, context: Context, output: BasicVector) -> None:
         sample: Any = self._step.Eval(context)
         output.SetFromVector(sample.memory.belief.state)
+
+    def _left(self, context: Context, output: AbstractValue) -> None:
+        output.set_value(self._step.Eval(context))
 
     def _update(self, context: Context, state: State) -> None:
         state.get_mutable_abstract_state(int(self._memory)).set_value(self._step.Eval(context))

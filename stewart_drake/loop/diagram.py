@@ -46,8 +46,9 @@ from stewart_drake.loop.servo_controller import ServoController
 from stewart_drake.loop.servo_design import commands_in_flight, servo_law, servo_loop
 from stewart_drake.loop.servos import Servos
 from stewart_drake.loop.start_check import StartCheck
-from stewart_drake.loop.tuner import AnnTuner
+from stewart_drake.loop.tuner import AnnTuner, LawTuner
 from stewart_drake.loop.varying_delay import VaryingDelay, declare_constant
+from stewart_drake.loop.weights import weights_source
 from stewart_drake.scenario.config import (
     EncoderSensorConfig,
     NetworkConfig,
@@ -69,6 +70,8 @@ from stewart_drake.scenario.signals import (
     Carried,
     exported_ports,
 )
+from stewart_drake.tuner.features import DensityFeatures
+from stewart_drake.tuner.source import PaperPolicy
 
 Array = NDArray[np.float64]
 
@@ -339,13 +342,9 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[Predictiv
     reference = builder.AddNamedSystem(
         "reference", Reference(experiment.reference, planned, law.preview_times)
     )
-    weights = _weights(builder, experiment)
-    controller = builder.AddNamedSystem(
-        "controller",
-        DelayLqiController(
-            law, first_queue(experiment, law), followed_motion(experiment, law, planned)
-        ),
-    )
+    queue, motion = first_queue(experiment, law), followed_motion(experiment, law, planned)
+    controller = builder.AddNamedSystem("controller", DelayLqiController(law, queue, motion))
+    weights = _weights(builder, experiment, law)
     builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
     builder.Connect(weights, controller.GetInputPort("weights"))
     return law, catch_up
@@ -354,7 +353,7 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[Predictiv
 def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None:
     """The user's controller behind its reference, and what samples it."""
     sc, system = experiment.scenario, experiment.own.systems["controller"]
-    if experiment.network is not None:
+    if experiment.tuned:
         raise ConfigError(
             f"tuner.kind: got {sc.tuner.kind!r} with a controller of your own; expected 'fixed'"
         )
@@ -385,19 +384,33 @@ def _disturb(builder: DiagramBuilder, experiment: Experiment, torque: OutputPort
     builder.Connect(torque, plant.GetInputPort("torque"))
 
 
-def _weights(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
+def _weights(builder: DiagramBuilder, experiment: Experiment, law: PredictiveLqi) -> OutputPort:
     """What the controller's weights come from: a `tuner`, or constant `weights`."""
     c, own = experiment.scenario.controller, experiment.own.systems.get("tuner")
     fixed = np.array([c.w_Q, c.w_R])
-    if own is None and experiment.network is None:
+    if own is None and not experiment.tuned:
         return builder.AddNamedSystem("weights", ConstantVectorSource(fixed)).get_output_port()
-    tuner = AnnTuner(experiment.network, fixed, c.period) if own is None else own
+    tuner = _tuner(builder, experiment, law) if own is None else own
     return builder.AddNamedSystem("tuner", tuner).GetOutputPort("weights")
+
+
+def _tuner(builder: DiagramBuilder, experiment: Experiment, law: PredictiveLqi) -> System:
+    """The scenario's, that of a network of the paper's kind by the densities in the diagram."""
+    c, source = experiment.scenario.controller, weights_source(experiment, law)
+    assert source is not None
+    if isinstance(source.policy, PaperPolicy) and isinstance(source.features, DensityFeatures):
+        return AnnTuner(source.policy.network, source.policy.first, c.period)
+    controller: Any = builder.GetSubsystemByName("controller")
+    first = controller.sample(controller.CreateDefaultContext())
+    return LawTuner(source, first, c.period)
 
 
 def _connect_tuner(builder: DiagramBuilder, tuner: System, state: OutputPort) -> None:
     """Give it of what the loop can tell, the state among it, those that it has ports for."""
     told = {name: builder.GetSubsystemByName(name).GetOutputPort(name) for name in _TOLD}
+    controller = builder.GetSubsystemByName("controller")
+    if controller.HasOutputPort("memory"):
+        told["memory"] = controller.GetOutputPort("memory")
     for name, port in (told | {"measurement": state}).items():
         if tuner.HasInputPort(name):
             builder.Connect(port, tuner.GetInputPort(name))

@@ -65,6 +65,7 @@ from stewart_drake.native.layout import plate_radius
 from stewart_drake.scenario.config import (
     AnnTunerConfig,
     EncoderSensorConfig,
+    FixedTunerConfig,
     NetworkConfig,
     Scenario,
     ServoActuatorConfig,
@@ -133,6 +134,11 @@ class Experiment(NamedTuple):
         frozen = self.scenario.plant.kind == "paper"  # has none of its own
         limit = (None if frozen else self.truth.effort_limit) if own is None else own
         return math.inf if limit is None or limit == "none" else limit
+
+    @property
+    def tuned(self) -> bool:
+        """Whether a tuner of the scenario sets the weights."""
+        return not isinstance(self.scenario.tuner, FixedTunerConfig)
 
     @property
     def scale(self) -> Array:
@@ -226,7 +232,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
         ConfigError: one line.
     """
     scenario.check()
-    network = _network(scenario)
+    network = network_of(scenario)
     drawn = load_mechanism(scenario.mechanism)
     known = known_of(scenario)
     if known is not None:
@@ -360,7 +366,12 @@ def offsets_of(known: Known | None) -> Array:
     return np.array([0.0 if value is None else value for value in found])
 
 
-def _network(scenario: Scenario) -> Network | None:
+def network_of(scenario: Scenario) -> Network | None:
+    """What the scenario's tuner decides with, where that is a network.
+
+    Raises:
+        ConfigError: there is no such file, or it holds none; one line.
+    """
     tuner = scenario.tuner
     if not isinstance(tuner, AnnTunerConfig):
         return None

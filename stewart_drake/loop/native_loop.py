@@ -22,12 +22,12 @@ from stewart_drake.native.law_layout import CAUSES, address
 from stewart_drake.native.library import backend
 from stewart_drake.native.plant import Controller, Ended, LoopStruct
 from stewart_drake.scenario.config import (
-    FixedTunerConfig,
     Scenario,
     StateSensorConfig,
     TorqueActuatorConfig,
     WireConfig,
 )
+from stewart_drake.scenario.link import releases, torque_delays
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
 from stewart_drake.scenario.timing import event_time, instants, look_time
 
@@ -165,16 +165,53 @@ def uncovered(scenario: Scenario) -> str | None:
     only_drake = {
         str(backend()): backend().library is None,
         "plant.kind": sc.plant.kind != "exact",
-        "delay": not sc.delay.constant,
         "link.kind": not isinstance(sc.link, WireConfig),
         "actuator.kind": not isinstance(sc.actuator, TorqueActuatorConfig),
         "sensor.kind": not isinstance(sc.sensor, StateSensorConfig),
         "sensor.faults": bool(sc.sensor.faults),
         "sensor.delay": sc.sensor.delay != 0,
         "sensor.loss": sc.sensor.loss != 0,
-        "tuner.kind": not isinstance(sc.tuner, FixedTunerConfig),
     }
     return next((name for name, there in only_drake.items() if there), None)
+
+
+class Wire(NamedTuple):
+    """What a run's torques wait for.
+
+    Attributes:
+        applied: (6,) N m, what acts at first.
+        waiting: (b, 6) N m, sent before the start and still to act.
+        released: (n,) s, ascending, when another torque begins to act.
+        which: (n,) its place among those that wait and, after them, the run's own.
+    """
+
+    applied: Array
+    waiting: Array
+    released: Array
+    which: NDArray[np.int_]
+
+
+def wire_of(experiment: Experiment, when: Instants) -> Wire:
+    """The delay chain of an experiment, as `loop.delay_chain` and `loop.varying_delay` are."""
+    sc, delay, number = experiment.scenario, experiment.scenario.true_delay, len(when.samples)
+    period, queue = sc.controller.period, torques_in_flight(experiment, delay)
+    nothing = np.zeros(NUM_TORQUES)
+    if sc.delay.constant:
+        released: Array = when.samples
+        if delay.fraction > 0:
+            first = event_time(delay.fraction * period)
+            released = first + event_time(period) * np.arange(number)
+        waiting, applied = queue[len(queue) - delay.steps :], queue[0] if len(queue) else nothing
+        return Wire(applied, waiting, released, np.arange(number))
+    numbers, arrivals = releases(period, torque_delays(sc), delay)
+    ours = numbers < number
+    numbers, arrivals = numbers[ours], arrivals[ours]
+    begun = (arrivals <= 0) & (numbers < 0)
+    which = numbers + len(queue)
+    applied = queue[which[begun][-1]] if begun.any() else nothing
+    at_once = arrivals == period * numbers
+    released = np.where(at_once, when.samples[np.maximum(numbers, 0)], event_time(1.0) * arrivals)
+    return Wire(applied, queue, released[~begun], which[~begun])
 
 
 def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
@@ -195,26 +232,24 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
     truth = true_dynamics(experiment, biased=False)
     accuracy = SHARE * sc.plant.accuracy
     plant = NativePlant(truth, experiment.start, when.looks, accuracy, LONGEST_STEP)
-    delay, number = sc.true_delay, len(when.samples)
-    queue = torques_in_flight(experiment, delay)
-    waiting = np.zeros((number + delay.steps, NUM_TORQUES))
-    waiting[: delay.steps] = queue[len(queue) - delay.steps :]
+    number = len(when.samples)
+    wire = wire_of(experiment, when)
+    before = len(wire.waiting)
+    waiting = np.vstack([wire.waiting, np.zeros((number, NUM_TORQUES))])
     measured, asked = np.empty((number, NUM_STATE)), np.empty((number, NUM_TORQUES))
     drawn = None
     if noise.any():
         drawn = noise * white_noises(sensor.seed, number)
-    released = None
-    if delay.fraction > 0:
-        period = sc.controller.period
-        released = event_time(delay.fraction * period) + event_time(period) * np.arange(number)
     loop = LoopStruct(
         samples=number,
-        delay=delay.steps,
+        before=before,
         sampled=when.samples.ctypes.data,
-        released=None if released is None else released.ctypes.data,
+        releases=len(wire.released),
+        released=wire.released.ctypes.data,
+        which=wire.which.ctypes.data,
         noise=None if drawn is None else drawn.ctypes.data,
         waiting=waiting.ctypes.data,
-        applied=tuple(queue[0]) if len(queue) else (0.0,) * NUM_TORQUES,
+        applied=tuple(wire.applied),
         bias=tuple(sc.plant.torque_bias),
         limit=experiment.torque_limit,
         measured=measured.ctypes.data,
@@ -227,7 +262,7 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
     if ended == Ended.LEFT:
         stopped = diagnose(experiment.truth, plant.time, plant.final[POSE])
     taken = loop.taken
-    sent = waiting[delay.steps : delay.steps + taken]
+    sent = waiting[before : before + taken]
     return Course(
         plant.states[: plant.seen], measured[:taken], asked[:taken], sent, plant.time, stopped
     )

@@ -6,6 +6,7 @@ previews stay.
 """
 
 import json
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -24,24 +25,31 @@ from stewart_drake.loop.experiment import (
     believed_delay,
     believed_queue,
     compose_law,
+    network_of,
     planned_limit,
     prepare,
     sizing_of,
     way_onto,
 )
 from stewart_drake.loop.native_loop import Instants, instants_of
+from stewart_drake.loop.weights import weights_source
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.tuner.source import WeightsSource
 
 Array = NDArray[np.float64]
+
+MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
+"""What sets the weights of an experiment with such a law, None where they are fixed."""
 
 _DRAWN: Final = (
     ("plant", "payload_mass"),
     ("plant", "torque_bias"),
     ("plant", "joint_damping"),
+    ("plant", "coulomb_friction"),
     ("sensor", "noise_std"),
     ("sensor", "seed"),
     ("actuator", "torque_limit"),
@@ -59,12 +67,14 @@ class Prepared(NamedTuple):
         law: of its torques.
         planned: the motion that it follows.
         previews: (k, p, 18) of it, for each sample.
+        tuner: what sets its weights, None where they are fixed.
     """
 
     experiment: Experiment
     law: PredictiveLqi
     planned: Trajectory
     previews: Array
+    tuner: WeightsSource | None
 
 
 class Preparation:
@@ -98,10 +108,13 @@ class Preparation:
         """
         scenario.check()
         own = self._base.mechanism if truth is None else truth
-        return self._base._replace(scenario=scenario, truth=own)
+        return self._base._replace(scenario=scenario, truth=own, network=network_of(scenario))
 
-    def prepared(self, experiment: Experiment) -> Prepared:
-        """Law and previews as of `control_law`, which says what may go wrong."""
+    def prepared(self, experiment: Experiment, tuner: MakeTuner | None = None) -> Prepared:
+        """Law and previews as of `control_law`, which says what may go wrong.
+
+        A tuner takes the place of the scenario's.
+        """
         law = compose_law(experiment, self._sizing)
         queue = believed_queue(experiment, law.timeline).tobytes()
         if queue not in self._ways:
@@ -110,7 +123,8 @@ class Preparation:
         if way is not None:
             sc = experiment.scenario
             motion, _ = way.plan(sc.controller.catch_up, planned_limit(sc))
-        return Prepared(experiment, law, motion, self._preview(motion, law))
+        source = (tuner or weights_source)(experiment, law)
+        return Prepared(experiment, law, motion, self._preview(motion, law), source)
 
     def _preview(self, motion: Trajectory, law: PredictiveLqi) -> Array:
         """(k, p, 18), as of `loop.reference.Reference`."""
@@ -138,6 +152,7 @@ class _Key:
         fields, believed = scenario_to_dict(scenario), believed_delay(scenario)
         for section, name in _DRAWN:
             del fields[section][name]
+        del fields["tuner"]
         fields["delay"] = believed.steps, believed.fraction
         fields["controller"] |= {"delay_steps": None, "delay_fraction": None}
         files = [resolve("mechanism", scenario.mechanism)]

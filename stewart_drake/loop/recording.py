@@ -17,7 +17,7 @@ from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.experiment import Experiment, waits_at_rest
 from stewart_drake.loop.results import DelaySummary, RunSummary
-from stewart_drake.loop.tuner import AnnTuner
+from stewart_drake.loop.tuner import AnnTuner, LawTuner
 from stewart_drake.native.library import backend
 from stewart_drake.scenario.config import EncoderSensorConfig
 from stewart_drake.scenario.loading import scenario_to_dict, scenario_yaml
@@ -135,7 +135,7 @@ class Recorder(Record):
         self._loop, self._controller = loop, controller
         self._ports: dict[str, Any] = {}
         tuner = loop.GetSubsystemByName("tuner") if loop.HasSubsystemNamed("tuner") else None
-        self._tuner = tuner if isinstance(tuner, AnnTuner) else None
+        self._tuner = tuner if isinstance(tuner, AnnTuner | LawTuner) else None
         self._scale = loop.experiment.scale
         self._instant = 0.0
         self._state, self._wanted, self._error = np.empty(0), np.empty(0), np.empty(0)

@@ -1,6 +1,6 @@
-"""The neural tuner of the weights as a Drake system."""
+"""The tuner of the weights as a Drake system: of densities, or of what the law remembers."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,14 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from stewart_drake.loop.controller import Sample
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
-from stewart_drake.scenario.signals import WEIGHTS
+from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, WEIGHTS
 from stewart_drake.tuner.density import NUM_INPUTS
 from stewart_drake.tuner.law import MAX_FACTOR, tune
 from stewart_drake.tuner.network import Network
+from stewart_drake.tuner.source import TunerMemory, WeightsSource
 
 Array = NDArray[np.float64]
 
@@ -88,3 +90,69 @@ class AnnTuner(LeafSystem):
         state.get_mutable_discrete_state(self._last).SetFromVector(weights)
         count = self.fallbacks(context) + fell_back
         state.get_mutable_discrete_state(self._count).SetFromVector([count])
+
+
+class Remembered(NamedTuple):
+    """A tuner's memory in a Context."""
+
+    memory: TunerMemory
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Remembered":
+        """Drake copies what it keeps; nobody changes a memory, so that itself will do."""
+        return self
+
+
+class LawTuner(LeafSystem):
+    """Sets w_Q and w_R at every sample by what the law remembers.
+
+    With m the tuner's memory and `decide` and `observe` those of a tuner (`tuner.source`):
+
+    Initialise: m of a law before its first sample, then the update of k = 0.
+    Update:     at k dt   m <- observe(m, decide(m), what the law remembers since k, reference).
+    Output:     weights = decide(m), hence of samples up to k - 1 until k dt.
+
+    The law's memory since sample k rests on the weights of sample k, and these on m alone: there is
+    no algebraic loop.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | memory | input | abstract, `loop.controller.Sample` | - | read every period |
+    | reference | input | 18 | rad, m and time derivatives | read every period |
+    | weights | output | 2 | w_Q, w_R | held |
+
+    Args:
+        source: the tuner.
+        first: what the law remembers before its first sample.
+        period: dt in s.
+    """
+
+    def __init__(self, source: WeightsSource, first: Sample, period: float) -> None:
+        super().__init__()
+        self._source = source
+        start = Remembered(source.start(first.memory))
+        self._kept = self.DeclareAbstractState(Value(start))
+        self._memory = self.DeclareAbstractInputPort("memory", Value(first))
+        self._reference = self.DeclareVectorInputPort("reference", NUM_REFERENCE)
+        ticket = self.abstract_state_ticket(self._kept)
+        self.DeclareVectorOutputPort("weights", len(WEIGHTS), weak(self._weights), {ticket})
+        update_every(self, period, self._update)
+
+    def memory(self, context: Context) -> TunerMemory:
+        """What the tuner remembers in a context of this system."""
+        value: Any = context.get_abstract_state(int(self._kept))
+        return value.get_value().memory
+
+    def fallbacks(self, context: Context) -> int:
+        """Samples so far at which who decides had to be passed over."""
+        return self.memory(context).fallbacks
+
+    def _weights(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._source.decide(self.memory(context)).weights)
+
+    def _update(self, context: Context, state: State) -> None:
+        memory = self.memory(context)
+        sample: Any = self._memory.Eval(context)
+        wanted = np.asarray(self._reference.Eval(context))[:NUM_STATE]
+        decision = self._source.decide(memory)
+        after = self._source.observe(memory, decision, sample.memory, wanted)
+        state.get_mutable_abstract_state(int(self._kept)).set_value(Remembered(after))

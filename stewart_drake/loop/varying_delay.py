@@ -9,7 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, 
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.link import acting
+from stewart_drake.scenario.link import TOGETHER, releases
 from stewart_drake.scenario.signals import CARRIED, PACKETS, Carried
 from stewart_drake.scenario.timing import event_time
 
@@ -17,8 +17,6 @@ Array = NDArray[np.float64]
 
 _ONCE: Final = 1e9
 """s, the period of an event that comes once: longer than any run."""
-_TOGETHER: Final = 1e-9
-"""Of a period; what is so close to each other has no order."""
 
 
 class VaryingDelay(LeafSystem):
@@ -69,15 +67,11 @@ class VaryingDelay(LeafSystem):
             raise ValueError(f"queue: got shape {queue.shape}; expected {(length, size)}")
         if delays.ndim != 1 or not len(delays) or not np.all(delays >= 0):
             raise ValueError("delays: got an empty or negative one; expected (n,) of at least 0 s")
-        self._delays = np.where(delays > _TOGETHER * period, delays, 0.0)
-        numbers = np.arange(-length, len(delays))
-        earlier = (numbers[:length] + delay.periods) * period
-        arrivals = np.concatenate([earlier, period * numbers[length:] + self._delays])
-        acts = acting(arrivals, _TOGETHER * period)
-        self._numbers, times = numbers[acts], arrivals[acts]
+        self._delays = np.where(delays > TOGETHER * period, delays, 0.0)
+        self._numbers, times = releases(period, delays, delay)
         self._at_once = set(self._numbers[times == period * self._numbers].tolist())
         # Sent by the time each of them acts, and one more where both fall on a sample.
-        sent_by_then = np.floor(times / period + _TOGETHER) + 1
+        sent_by_then = np.floor(times / period + TOGETHER) + 1
         kept = int(np.max(sent_by_then - self._numbers, initial=1)) + 1
         sent = np.zeros((max(kept, length + 1), size))
         sent[len(sent) - length :] = queue

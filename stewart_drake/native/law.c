@@ -1033,6 +1033,7 @@ static int feed_back(const stewart_config *c, stewart_memory *m, const real *pre
     feed_forward(c, m->mean + X, nodes, &h);
     int trouble = find_gain(c, m, &h, &a, weights, w, &use);
     copy(U, h.torque[pending], torque);
+    copy(U, torque, m->feedforward);
     if (!use)
         return trouble;
     copy(X, a.error, seen);
@@ -1062,6 +1063,7 @@ void stewart_init(const stewart_config *c, stewart_memory *m, const real *queue)
     fill(X, (real)NAN, m->measured);
     fill(X, (real)NAN, m->outlier);
     fill(2, (real)NAN, m->weights);
+    fill(U, (real)NAN, m->feedforward);
     fill(U * STEWART_MAX_ORDER, (real)NAN, m->gain);
     m->silence = c->silence;
 }
@@ -1082,6 +1084,7 @@ int stewart_step(const stewart_config *c, stewart_memory *m, stewart_workspace *
         held h;
         feed_forward(c, c->parameters, nodes, &h);
         copy(U, h.torque[c->fraction > 0], torque);
+        copy(U, torque, m->feedforward);
         fill(6, 0, m->error);
     } else {
         status |= feed_back(c, m, preview, nodes, weights, w, torque);

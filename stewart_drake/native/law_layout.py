@@ -72,6 +72,7 @@ MEMORY_FIELDS: Final[Fields] = {
     "integral": NUM_COORDINATES,
     "gain": NUM_TORQUES * MAX_ORDER,
     "torque": NUM_TORQUES,
+    "feedforward": NUM_TORQUES,
     "weights": 2,
 }
 MEMORY_FLAGS: Final = (
@@ -101,5 +102,5 @@ def check_sizes(library: ctypes.CDLL) -> None:
 
 
 def address(array: NDArray[Any]) -> int:
-    """Where the numbers of an array are."""
-    return int(array.__array_interface__["data"][0])
+    """Where the numbers of an array are; `__array_interface__` would describe every field first."""
+    return int(array.ctypes.data)

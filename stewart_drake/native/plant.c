@@ -147,12 +147,13 @@ typedef int (*controller)(void *about, long sample, const double *measurement, d
 /* What stands between a controller and the plant. */
 typedef struct {
     long samples;             /* that are taken in the run */
-    long delay;               /* whole periods */
+    long before;              /* torques that were sent before the start and are still to act */
     const double *sampled;    /* when, s */
-    const double *released;   /* when the torque of `delay` samples ago begins to act, s; NULL at once */
+    long releases;            /* torques that ever begin to act, at the most */
+    const double *released;   /* when each of them does, ascending, s; at a sample's instant after it */
+    const long *which;        /* and its place in `waiting` */
     const double *noise;      /* (samples, 12), or NULL */
-    double *waiting;          /* (samples + delay, 6) torques in the order in which they act; the first
-                                 `delay` of them are those of before the start */
+    double *waiting;          /* (before + samples, 6) torques in the order in which they are sent */
     double applied[MOTORS];   /* what acts at first */
     double bias[MOTORS];      /* added to what acts */
     double limit;             /* of each motor */
@@ -169,32 +170,37 @@ static int sample(dop853 *s, loop *o, long k, controller law, void *about)
     if (law(about, k, y, torque))
         return CONTROLLER_FAILED;
     for (int i = 0; i < MOTORS; i++)
-        o->waiting[MOTORS * (o->delay + k) + i] = fmax(-o->limit, fmin(o->limit, torque[i]));
+        o->waiting[MOTORS * (o->before + k) + i] = fmax(-o->limit, fmin(o->limit, torque[i]));
     o->taken = k + 1;
     return INSIDE;
 }
 
-/* Sample, wait, release, until the run's end: the delay chain of `loop.delay_chain.DelayChain`. */
+static void apply(machine *m, const loop *o, const double *torque)
+{
+    for (int i = 0; i < MOTORS; i++)
+        m->torque[i] = torque[i] + o->bias[i];
+}
+
+/* Sample, wait, release, until the run's end: the delay chain of `loop.delay_chain.DelayChain`, or
+   `loop.varying_delay.VaryingDelay`. */
 EXPORT int closed_loop(run *r, machine *m, looks *l, loop *o, controller law, void *about)
 {
     dop853 s = integrator(r, m);
-    int how = INSIDE;
     m->sine = NULL;
-    for (long k = 0; k <= o->samples && how == INSIDE; k++) {
-        if (k == 0)
-            for (int i = 0; i < MOTORS; i++)
-                m->torque[i] = o->applied[i] + o->bias[i];
-        how = advance(&s, m, k < o->samples ? o->sampled[k] : r->end, l);
-        if (how != INSIDE || k == o->samples)
-            break;
-        how = sample(&s, o, k, law, about);
-        if (how == INSIDE && o->released)
-            how = advance(&s, m, fmin(o->released[k], r->end), l);
-        if (how == INSIDE && !(o->released && o->released[k] >= r->end))
-            for (int i = 0; i < MOTORS; i++)
-                m->torque[i] = o->waiting[MOTORS * k + i] + o->bias[i];
+    apply(m, o, o->applied);
+    for (long k = 0, i = 0;;) {
+        double sampled = k < o->samples ? o->sampled[k] : HUGE_VAL;
+        double released = i < o->releases ? o->released[i] : HUGE_VAL;
+        int how = advance(&s, m, fmin(fmin(sampled, released), r->end), l);
+        if (how == INSIDE && sampled <= released && sampled <= r->end)
+            how = sample(&s, o, k++, law, about);
+        else if (how == INSIDE && released < r->end)
+            apply(m, o, o->waiting + MOTORS * o->which[i++]);
+        else
+            return ended(r, &s, how);
+        if (how != INSIDE)
+            return ended(r, &s, how);
     }
-    return ended(r, &s, how);
 }
 
 /* law.c as a controller. */

@@ -69,9 +69,11 @@ class LoopStruct(Structure):
 
     _fields_ = (
         ("samples", c_long),
-        ("delay", c_long),
+        ("before", c_long),
         ("sampled", c_void_p),
+        ("releases", c_long),
         ("released", c_void_p),
+        ("which", c_void_p),
         ("noise", c_void_p),
         ("waiting", c_void_p),
         ("applied", _Six),

@@ -75,6 +75,7 @@ typedef struct {
     real integral[6];
     real gain[STEWART_MOTORS * STEWART_MAX_ORDER]; /* the last good one, (6, n) */
     real torque[STEWART_MOTORS];                   /* the last, as asked for */
+    real feedforward[STEWART_MOTORS];              /* and how much of it takes no measurement */
     real weights[2];
     int has_covariance, has_gain, has_started;
     int outliers; /* in a row that bear each other out */

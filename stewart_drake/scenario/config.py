@@ -447,7 +447,26 @@ class AnnTunerConfig:
     weights: Name | None = None
 
 
-TunerConfig = Annotated[FixedTunerConfig | AnnTunerConfig, ByKind()]
+@dataclass(config=STRICT)
+class RuleTunerConfig:
+    """Two lines set w_Q / w_R: a constant while predictions hold, less where they do not.
+
+    log10(w_Q / w_R) = ratio - slope max(0, x - knee), x the logarithm of the last three seconds'
+    largest innovation; see `tuner.source.Rule`.
+
+    Attributes:
+        kind: `rule`.
+        ratio, slope, knee: see above; null is what was found for controllers with an estimator,
+            or without one.
+    """
+
+    kind: Literal["rule"] = "rule"
+    ratio: Annotated[float, Field(ge=-4, le=2)] | None = None
+    slope: Annotated[float, Field(ge=0, le=100)] | None = None
+    knee: Annotated[float, Field(ge=-6, le=4)] | None = None
+
+
+TunerConfig = Annotated[FixedTunerConfig | AnnTunerConfig | RuleTunerConfig, ByKind()]
 
 
 @dataclass(config=STRICT)

@@ -23,6 +23,8 @@ _FORWARD, _BACK, _SENSOR = range(3)
 """Streams of random numbers of one seed."""
 RARE: Final = 1.5
 """Torques that are missing, by those that would be with no packet late."""
+TOGETHER: Final = 1e-9
+"""Of a period; what is so close to each other has no order."""
 ALMOST_NONE: Final = 1e-3
 """Share of torques that may be late where no packet is lost."""
 
@@ -71,6 +73,26 @@ def acting(arrivals: Array, together: float = 0.0) -> NDArray[np.bool_]:
     """
     earliest_newer = np.minimum.accumulate(np.append(arrivals, np.inf)[::-1])[::-1][1:]
     return np.isfinite(arrivals) & (arrivals + together < earliest_newer)
+
+
+def releases(period: float, delays: Array, delay: Delay) -> tuple[NDArray[np.int64], Array]:
+    """Which torques ever act over a wire, and when they begin to, s, in the order in which they do.
+
+    Torque k >= 0 is sent at k dt and waits for `delays[k]`; torques -L to -1 were sent before, each
+    a period after the other, and wait for `delay`, of which L is the length of the queue.
+
+    Args:
+        period: dt in s.
+        delays: (n,) s; what is less than 1e-9 of a period is 0.
+        delay: of those sent before t = 0.
+    """
+    length = delay.queue_length
+    waits = np.where(delays > TOGETHER * period, delays, 0.0)
+    numbers = np.arange(-length, len(delays))
+    earlier = (numbers[:length] + delay.periods) * period
+    arrivals = np.concatenate([earlier, period * numbers[length:] + waits])
+    acts = acting(arrivals, TOGETHER * period)
+    return numbers[acts], arrivals[acts]
 
 
 def times_under_way(config: PacketsConfig) -> Any:

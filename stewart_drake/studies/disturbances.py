@@ -50,11 +50,13 @@ def _delay(truth: Truth, steps: int) -> None:
     truth.fields["delay"]["steps"] = steps
 
 
-def _frequency(truth: Truth, frequency: float) -> None:
+def set_frequency(truth: Truth, frequency: float) -> None:
+    """Of a sine, rad/s."""
     truth.fields["reference"] |= {"frequency": frequency, "frequency_unit": "rad/s"}
 
 
-def _amplitude(truth: Truth, share: float) -> None:
+def set_amplitude(truth: Truth, share: float) -> None:
+    """A share of what the reference's amplitudes are."""
     reference = truth.fields["reference"]
     reference["amplitude"] = [share * a for a in reference["amplitude"]]
 
@@ -63,9 +65,9 @@ CONDITIONS: Final[Model] = {
     # Whole periods, 0 and 15 included, which the controller knows.
     "delay_steps": Quantity(lambda rng, _: int(rng.integers(0, 16)), _delay),
     # rad/s of the sine.
-    "frequency": Quantity(_logarithmic(0.5, 3.0), _frequency),
+    "frequency": Quantity(_logarithmic(0.5, 3.0), set_frequency),
     # Share of the scenario's own amplitudes.
-    "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.3, 1.0)), _amplitude),
+    "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.3, 1.0)), set_amplitude),
     # Of each motor; its standard deviation is a share of the standard torque.
     "torque_bias": Quantity(_biases, add_bias, sometimes=True),
     # kg, up to a tenth of the plate's.
@@ -108,12 +110,21 @@ def draw(
     Raises:
         ConfigError: the scenario cannot be prepared, or its reference is not a sine.
     """
+    standard = standard_of(scenario)
+    streams = (np.random.default_rng([seed, _STREAMS[purpose], i]) for i in range(number))
+    return [draw_from(CONDITIONS, rng, standard) for rng in streams]
+
+
+def standard_of(scenario: Scenario) -> Standard:
+    """What shares are taken of.
+
+    Raises:
+        ConfigError: the scenario cannot be prepared, or its reference is not a sine.
+    """
     slow = replace(sine_of(scenario), frequency=1.0, frequency_unit="rad/s")
     experiment = prepare(replace(scenario, reference=slow))
     torque = reference_torque(experiment.nominal, experiment.reference, scenario.duration)
-    standard = Standard(torque, experiment.mechanism.plate.mass)
-    streams = (np.random.default_rng([seed, _STREAMS[purpose], i]) for i in range(number))
-    return [draw_from(CONDITIONS, rng, standard) for rng in streams]
+    return Standard(torque, experiment.mechanism.plate.mass)
 
 
 def disturbed(scenario: Scenario, one: Draw) -> Scenario:

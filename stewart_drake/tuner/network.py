@@ -1,6 +1,8 @@
 """The network behind the tuner: densities in, (w_Q, w_R) out, in plain numpy.
 
-    y = W2 sigmoid(W1 (rho - input_mean) / input_scale + b1) + b2
+    y = W2 sigmoid(W1 (rho - input_mean) / input_scale + b1) + b2,
+
+with rho the densities, or other features of the same number by the name in its file.
 
 A network lives in one JSON file, read as strictly as a scenario.
 """
@@ -53,6 +55,9 @@ class Network:
         output: what the output layer gives: `weights` (w_Q, w_R) or `log_weights`, their natural
             logarithms.
         density: the kind of density it was trained on, `magnitude` or `signed`.
+        features: what its inputs are, `densities` (`tuner.density`) or `health` (`tuner.health`).
+        start: (2,) w_Q and w_R at the first sample, and to go back to; null is what the controller
+            has. A network with a start moves along w_Q / w_R, see `tuner.source`.
         card: where it comes from: data, seed, versions, errors; plain JSON values.
 
     Raises:
@@ -70,6 +75,8 @@ class Network:
     output: Literal["weights", "log_weights"] = "weights"
     density: Literal["magnitude", "signed"] = "magnitude"
     card: Mapping[str, Any] = field(default_factory=dict)
+    features: Literal["densities", "health"] = "densities"
+    start: Array | None = None
 
     def __post_init__(self) -> None:
         hidden = np.shape(self.b1)[0] if np.ndim(self.b1) == 1 else 0
@@ -93,9 +100,16 @@ class Network:
                 f"bounds: got {brief(self.bounds.tolist())}; expected [lower, upper] of (w_Q, w_R) "
                 "with 0 < lower < upper"
             )
+        if self.start is not None:
+            object.__setattr__(self, "start", _frozen("start", self.start, (NUM_OUTPUTS,)))
+            if not np.all((self.start >= self.bounds[0]) & (self.start <= self.bounds[1])):
+                raise ConfigError(
+                    f"start: got {brief(self.start.tolist())}; expected (w_Q, w_R) within bounds"
+                )
         for name, known in (
             ("output", ("weights", "log_weights")),
             ("density", ("magnitude", "signed")),
+            ("features", ("densities", "health")),
         ):
             if getattr(self, name) not in known:
                 raise ConfigError(
@@ -138,7 +152,7 @@ def _frozen(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 @pydantic.dataclasses.dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
 class _File:
-    """The file's keys, all of which must be there."""
+    """The file's keys; `features` and `start` may be missing."""
 
     input_mean: list[float]
     input_scale: list[float]
@@ -150,6 +164,8 @@ class _File:
     output: Literal["weights", "log_weights"]
     density: Literal["magnitude", "signed"]
     card: dict[str, Any]
+    features: Literal["densities", "health"] = "densities"
+    start: list[float] | None = None
 
 
 def save_network(network: Network, path: str | Path) -> None:
@@ -162,6 +178,7 @@ def save_network(network: Network, path: str | Path) -> None:
     path = Path(path)
     data = {f.name: getattr(network, f.name) for f in dataclasses.fields(network)}
     data |= {name: data[name].tolist() for name in _ARRAYS}
+    data["start"] = None if network.start is None else network.start.tolist()
     try:
         text = json.dumps(data | {"card": dict(network.card)}, indent=2, allow_nan=False)
     except (TypeError, ValueError) as error:
