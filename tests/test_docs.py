@@ -33,6 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 import stewart_drake as sd
 from stewart_drake.files import resources
@@ -572,6 +573,14 @@ def test_architecture_shows_the_loop_as_it_is() -> None:
     assert preview % 18 == 0
     exported = {diagram.get_output_port(i).get_name() for i in range(diagram.num_output_ports())}
     assert all(f"`{name}`" in text for name in exported)
+
+
+def test_the_readme_s_animation_moves_and_is_small() -> None:
+    path = ROOT / "docs" / "images" / "delay.gif"
+    assert path.stat().st_size < 1e6
+    with Image.open(path) as picture:
+        assert picture.n_frames == 70 and picture.info["duration"] == 100
+        assert picture.info["loop"] == 0  # for ever
 
 
 def test_the_citation_is_of_this_version() -> None:
