@@ -466,9 +466,12 @@ def test_the_check_of_names_finds_what_is_wrong(code: str, wrong: bool) -> None:
 # ------------------------------------------------------------------ code blocks
 
 
-@each([block for block in blocks("python", "py") if block.path.name != "extending.md"])
+ELSEWHERE = ("extending.md", "tutorial.md")
+
+
+@each([block for block in blocks("python", "py") if block.path.name not in ELSEWHERE])
 def test_python_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All but those of docs/extending.md, which `tests/test_extending.py` runs and looks into."""
+    """All but those that tests/test_extending.py and tests/test_tutorial.py run and look into."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
     source = "\n" * block.line + block.text  # so that a traceback shows the document's line
