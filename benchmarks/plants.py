@@ -206,7 +206,7 @@ def measure(motion: Motion) -> dict[str, Curve]:
 
 
 def claims(curves: Sequence[dict[str, Curve]]) -> list[list[str]]:
-    """What the README says about the plants."""
+    """What docs/figures.md says about the plants."""
     rows = []
     for motion, families in zip(motions(), curves, strict=True):
         exact, sap = families["exact, runge_kutta5"], families["SAP"]

@@ -72,7 +72,7 @@ def test_torques_arrive_after_the_delay_and_not_before(plant: str) -> None:
 def test_the_tuner_does_not_save_the_faithful_controllers(
     controller: str, start: tuple[str, ...], seconds: float
 ) -> None:
-    """As the README says beside the paper's figures, which were reached with a tuner."""
+    """As docs/figures.md says beside the paper's figures, which were reached with a tuner."""
     result = run(*start, "tuner.kind=ann", "duration=2.0", controller=controller)
     assert result.status == "left_workspace" and result.stopped is not None
     assert result.stopped.time == pytest.approx(seconds, abs=0.0051)

@@ -33,6 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 import stewart_drake as sd
 from stewart_drake.files import resources
@@ -119,7 +120,7 @@ def words() -> frozenset[str]:
         path.read_text(encoding="utf-8")
         for folder in folders
         for path in folder.rglob("*")
-        if path.suffix in (".py", ".yaml") and path != Path(__file__)
+        if path.suffix in (".py", ".yaml", ".c", ".h") and path != Path(__file__)
     )
     return frozenset(word for text in texts for word in re.findall(r"[A-Za-z_]\w*", text))
 
@@ -134,7 +135,8 @@ def functions_in(path: Path) -> frozenset[str]:
 @functools.cache
 def sources() -> str:
     """The texts of the package, the Makefile and the data files."""
-    paths = (*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.j2"), ROOT / "Makefile", ROOT / "mkdocs.yml")
+    package = (path for kind in ("py", "j2", "c", "h") for path in PACKAGE.rglob(f"*.{kind}"))
+    paths = (*package, ROOT / "Makefile", ROOT / "mkdocs.yml")
     data = (*(ROOT / "models").rglob("*.yaml"), *(ROOT / "diagrams").rglob("*.yaml"))
     return "\n".join(path.read_text(encoding="utf-8") for path in (*paths, *data))
 
@@ -258,7 +260,9 @@ def problem_at_a_shell(program: str, rest: str) -> str | None:
         return problem_with_command(rest)
     words = [word for word in rest.split() if "=" not in word and word != "..."]
     if program == "make":
-        targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        makefiles = (ROOT / "Makefile", *PACKAGE.rglob("Makefile"))  # that of a board, too
+        told = "\n".join(path.read_text(encoding="utf-8") for path in makefiles)
+        targets = re.findall(r"^([\w-]+):", told, re.MULTILINE)
         missing = set(words) - set(targets)
         return f"make has no {', '.join(sorted(missing))}" if missing and '"' not in rest else None
     if words[:1] == ["-m"]:
@@ -384,7 +388,8 @@ def test_the_contents_of_theory_are_its_sections() -> None:
     text = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
     sections = re.findall(r"^## (\d+)\. (.*)$", text, re.MULTILINE)
     assert re.findall(r"^(\d+)\. \[(.*)\]\(#", text, re.MULTILINE) == sections
-    assert [int(number) for number, _ in sections] == list(range(1, len(sections) + 1))
+    numbers = [int(number) for number, _ in sections]
+    assert numbers == sorted(set(numbers))
 
 
 def test_the_site_has_every_page_once() -> None:
@@ -461,9 +466,12 @@ def test_the_check_of_names_finds_what_is_wrong(code: str, wrong: bool) -> None:
 # ------------------------------------------------------------------ code blocks
 
 
-@each([block for block in blocks("python", "py") if block.path.name != "extending.md"])
+ELSEWHERE = ("extending.md", "tutorial.md")
+
+
+@each([block for block in blocks("python", "py") if block.path.name not in ELSEWHERE])
 def test_python_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All but those of docs/extending.md, which `tests/test_extending.py` runs and looks into."""
+    """All but those that tests/test_extending.py and tests/test_tutorial.py run and look into."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
     source = "\n" * block.line + block.text  # so that a traceback shows the document's line
@@ -568,6 +576,14 @@ def test_architecture_shows_the_loop_as_it_is() -> None:
     assert preview % 18 == 0
     exported = {diagram.get_output_port(i).get_name() for i in range(diagram.num_output_ports())}
     assert all(f"`{name}`" in text for name in exported)
+
+
+def test_the_readme_s_animation_moves_and_is_small() -> None:
+    path = ROOT / "docs" / "images" / "delay.gif"
+    assert path.stat().st_size < 1e6
+    with Image.open(path) as picture:
+        assert picture.n_frames == 70 and picture.info["duration"] == 100
+        assert picture.info["loop"] == 0  # for ever
 
 
 def test_the_citation_is_of_this_version() -> None:

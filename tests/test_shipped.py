@@ -18,7 +18,7 @@ OWN = ("desktop", "motion_base")
 SHORT = 1.5
 """s; whole runs take their time and are soak tests."""
 DIVERGES = {("gravity", "multibody")}
-"""At 1 ms the engine's discretisation error grows faster than the delay allows, see README."""
+"""At 1 ms the engine's error grows faster than the delay allows, see docs/figures.md."""
 
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])

@@ -1,4 +1,8 @@
-"""The tutorial, done from its first line to its last in an empty folder, as its reader does it."""
+"""The tutorial, done from its first line to its last in an empty folder, as its reader does it.
+
+The section on the machine that is not its drawing needs nothing of the others, and is a test of its
+own, which another worker can take.
+"""
 
 import json
 import re
@@ -13,64 +17,71 @@ from stewart_drake.studies import delay_limits
 from tests import test_docs
 
 TUTORIAL = test_docs.ROOT / "docs" / "tutorial.md"
+TEXT = TUTORIAL.read_text(encoding="utf-8")
 FENCE = re.compile(r"^```(\w+) ?(\S*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 """Language, name under which the reader is told to save it, text."""
+BEFORE, _, _REST = TEXT.partition("\n## 6. ")
+IDENTIFICATION, _, _AFTER = _REST.partition("\n## ")
+OTHERS = f"{BEFORE}\n## {_AFTER}"
 
 
 def test_the_names_of_saved_files_are_told_in_the_text():
-    text = TUTORIAL.read_text(encoding="utf-8")
-    names = [name for _, name, _ in FENCE.findall(text) if name]
-    assert len(names) == 4 and all(f"*{name}*" in text for name in names)
+    names = [name for _, name, _ in FENCE.findall(TEXT) if name]
+    assert len(names) == 4 and all(f"*{name}*" in TEXT for name in names)
 
 
-def test_everything_in_it_works(tmp_path, monkeypatch, capsys):
+def test_the_two_parts_are_all_of_it():
+    assert FENCE.findall(IDENTIFICATION)
+    assert sorted(FENCE.findall(IDENTIFICATION) + FENCE.findall(OTHERS)) == sorted(
+        FENCE.findall(TEXT)
+    )
+
+
+@pytest.fixture
+def do(tmp_path, monkeypatch, capsys):
+    """Does what a part of it says, in an empty folder; returns what each command printed."""
     monkeypatch.chdir(tmp_path)
     # Its simulations over delay and amplitude have tests of their own, and take a while.
     monkeypatch.setattr(delay_limits, "delay_map", lambda *_: ([], False))
     # The report's pieces in this process, which has loaded everything: tests/test_report_stopped.py
     # has processes.
     monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
-    told = {}
-    for language, name, text in FENCE.findall(TUTORIAL.read_text(encoding="utf-8")):
-        if name:
-            Path(name).write_text(text, encoding="utf-8")
-        elif language == "python":
-            exec(compile(text, str(TUTORIAL), "exec"), {"__name__": "__main__"})
-            capsys.readouterr()
-        elif language == "sh":
-            for arguments in test_docs.command_lines(test_docs.Block(TUTORIAL, 0, "sh", text)):
-                assert main(arguments) == 0, arguments
-                out, err = capsys.readouterr()
-                assert err == "" and all(len(line) <= 80 for line in out.splitlines()), arguments
-                told[" ".join(arguments)] = out
-    check_what_it_says(told)
+
+    def done(part: str) -> dict[str, str]:
+        told = {}
+        for language, name, text in FENCE.findall(part):
+            if name:
+                Path(name).write_text(text, encoding="utf-8")
+            elif language == "python":
+                exec(compile(text, str(TUTORIAL), "exec"), {"__name__": "__main__"})
+                capsys.readouterr()
+            elif language == "sh":
+                for arguments in test_docs.command_lines(test_docs.Block(TUTORIAL, 0, "sh", text)):
+                    assert main(arguments) == 0, arguments
+                    out, err = capsys.readouterr()
+                    assert err == "", arguments
+                    assert all(len(line) <= 80 for line in out.splitlines()), arguments
+                    told[" ".join(arguments)] = out
+        return told
+
+    return done
 
 
-def check_what_it_says(told: dict[str, str]) -> None:
-    """What the text promises of the results."""
-    run = json.loads(Path("out/waves/summary.json").read_text())
+def summary(name: str) -> dict:
+    return json.loads(Path(f"out/{name}/summary.json").read_text())
+
+
+def test_a_machine_and_a_motion_of_one_s_own(do):
+    told = do(OTHERS)
+    run = summary("waves")
     assert run["status"] == "completed" and run["accumulated_error"] < 0.01
     for file in ("signals.csv", "signals.nc", "replay.html", "states.png"):
         assert (Path("out/waves") / file).stat().st_size > 1000
-    own = [json.loads(Path(f"out/own_{steps}/summary.json").read_text()) for steps in (0, 4)]
-    assert own[0]["status"] == "completed" and own[0]["accumulated_error"] < 1
-    assert own[1]["status"] == "left_workspace"
-    assert (Path("out/board") / "Makefile").is_file()
     for file in ("out/bench/mechanism.png", "out/delay/report.html", "out/report/report.html"):
         assert Path(file).stat().st_size > 10_000
-    lost, half, full = (
-        json.loads(Path(f"out/{name}/summary.json").read_text())
-        for name in ("lost", "half", "full")
-    )
-    assert [run["status"] for run in (lost, half, full)] == [
-        "left_workspace",
-        "completed",
-        "completed",
-    ]
-    for name, error in {"first": 2e-4, "second": 5e-5}.items():
-        found = json.loads(Path(f"out/{name}/summary.json").read_text())
-        assert abs(found["delay_s"] - 0.93) < error and found["intervals"]
-    assert full["accumulated_error"] < 10
+    own = [summary(f"own_{steps}") for steps in (0, 4)]
+    assert own[0]["status"] == "completed" and own[0]["accumulated_error"] < 1
+    assert own[1]["status"] == "left_workspace"
     with xr.open_dataset("out/desktop/signals.nc") as signals:
         assert signals.time.values[-1] == pytest.approx(2.0)
     assert "completed" in told["simulate waves.yaml --set plant.payload_mass=0.4"]
@@ -84,8 +95,21 @@ def check_what_it_says(told: dict[str, str]) -> None:
     assert "completed" in told[slow]
     usual = slow.split()[:-2]
     assert main([*usual, "--out", "out/usual", "--quiet"]) == 0
-    assert json.loads(Path("out/usual/summary.json").read_text())["status"] == "left_workspace"
-    shown = FENCE.findall(TUTORIAL.read_text(encoding="utf-8"))
-    (sample,) = (text for language, _, text in shown if language == "text")
+    assert summary("usual")["status"] == "left_workspace"
+    sample = next(text for language, _, text in FENCE.findall(TEXT) if language == "text")
     real = told["simulate waves.yaml --out out/waves --csv --replay"]
     assert real.startswith(sample), "the output that the text shows"
+
+
+def test_from_a_lost_run_to_full_amplitude(do):
+    do(IDENTIFICATION)
+    lost, half, full = (summary(name) for name in ("lost", "half", "full"))
+    assert [run["status"] for run in (lost, half, full)] == [
+        "left_workspace",
+        "completed",
+        "completed",
+    ]
+    for name, error in {"first": 2e-4, "second": 5e-5}.items():
+        found = summary(name)
+        assert abs(found["delay_s"] - 0.93) < error and found["intervals"]
+    assert full["accumulated_error"] < 10
