@@ -62,7 +62,7 @@ def test_figures_of_a_run(run, tmp_path):
     assert {"states", "errors", "torques"} <= set(figures)
     assert {path.stem for path in (tmp_path / "new").iterdir()} == set(figures)
     assert isinstance(figures, Figures) and "states" in repr(figures)
-    assert figures._repr_html_().count('<img src="data:image/svg+xml;base64,') == len(figures)
+    assert figures._repr_html_().count('<img src="data:image/svg+xml,') == len(figures)
 
 
 def test_replay_as_a_file_in_a_notebook_or_in_meshcat(run, tmp_path):

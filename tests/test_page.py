@@ -4,6 +4,8 @@ import pickle
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
+from xml.etree import ElementTree
 
 import pytest
 from matplotlib.figure import Figure
@@ -20,7 +22,7 @@ from stewart_drake.report.document import (
     Values,
 )
 from stewart_drake.report.page import Provenance, command_line, html, write_page
-from stewart_drake.report.style import figure_style
+from stewart_drake.report.style import figure_style, rounded
 
 
 class Outline(HTMLParser):
@@ -58,6 +60,14 @@ def picture() -> Picture:
     return Picture(figure, "a line that goes down")
 
 
+def embedded(text: str) -> list[ElementTree.Element]:
+    """The figures in a page, as a browser finds them in its attributes."""
+    head = "data:image/svg+xml,"
+    sources = [str(image["src"]) for image in Outline(text).all("img")]
+    assert all(one.startswith(head) for one in sources)
+    return [ElementTree.fromstring(unquote(one.removeprefix(head))) for one in sources]
+
+
 MADE = Provenance("stewart-drake analyze hautus 'a b'", {"drake": "1.51"}, 12.3)
 
 
@@ -84,11 +94,14 @@ def test_a_page_holds_everything_and_fetches_nothing() -> None:
     text = page()
     outline = Outline(text)
     sources = [image["src"] or "" for image in outline.all("img")]
-    assert [source.partition(";")[0] for source in sources] == ["data:image/svg+xml"] * 2
+    assert [source.partition(",")[0] for source in sources] == ["data:image/svg+xml"] * 2
+    for figure in embedded(text):  # which refers to its own parts
+        inside = ElementTree.tostring(figure, "unicode")
+        assert set(re.findall(r"""(?:url\(|href=["'])(.)""", inside)) == {"#"}
     assert not outline.all("script")
     assert not outline.all("link")
     assert not re.search(r"(src|href)=\"(?!data:|#)", text)
-    assert "url(" not in text
+    assert "url(" not in re.sub(r'src="[^"]*"', "", text)
     words = " ".join(outline.words)
     for part in ("All is well.", "First.", "a line that goes down", "drake 1.51", "12 s", "mu"):
         assert part in words
@@ -219,3 +232,23 @@ def test_command_lines_are_quoted_for_a_shell() -> None:
         "stewart-drake analyze delay 'my file.yaml' --set delay.steps=4 "
         "--set 'reference.amplitude=[1, 2]' --out out"
     )
+
+
+def test_figures_are_whole_and_nothing_is_painted_behind_them() -> None:
+    one, other = embedded(html(document(), MADE))
+    assert ElementTree.tostring(one) == ElementTree.tostring(other)
+    space = "{http://www.w3.org/2000/svg}"
+    assert one.tag == f"{space}svg" and one.findall(f".//{space}path")
+    backs = [
+        group.find(f"{space}path")
+        for group in one.iter(f"{space}g")
+        if group.get("id") in ("patch_1", "patch_2")
+    ]
+    assert len(backs) == 2
+    assert all(back is not None and "fill: none" in str(back.get("style")) for back in backs)
+
+
+def test_paths_are_cut_to_a_hundredth_and_nothing_else() -> None:
+    svg = b'<path d="M 1.23456 7 L 100.5 -0.98765" style="stroke-width: 0.123456"/>'
+    expected = b'<path d="M 1.23 7 L 100.5 -0.98" style="stroke-width: 0.123456"/>'
+    assert rounded(svg) == expected

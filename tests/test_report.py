@@ -22,6 +22,7 @@ from stewart_drake.report.page import Provenance
 from stewart_drake.report.page import html as html_of
 from stewart_drake.report.report_document import mean_error
 from stewart_drake.report.run_document import comparison_document
+from stewart_drake.report.words import number
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from stewart_drake.tuner.network import save_network
@@ -73,6 +74,12 @@ def text_of(html: str) -> str:
 
 def test_there_are_three_files_and_no_half_ones(report):
     assert sorted(os.listdir(report)) == ["replay.html", "report.html", "summary.json"]
+
+
+def test_without_its_replay_the_page_is_small(report, html):
+    """Of ten seconds, whose figures have five times the points: see the docs of the release."""
+    inside = re.search(r'srcdoc="([^"]*)"', html)
+    assert inside and len(html) - len(inside[1]) < 2.2e6
 
 
 def test_the_summary_agrees_with_the_commands_of_their_own(summary, tmp_path, capsys):
@@ -165,7 +172,8 @@ def test_the_scenario_in_it_runs_again(html, tmp_path):
 def test_nothing_in_it_comes_from_elsewhere(html):
     page = re.sub(r'srcdoc="[^"]*"', "", html)  # the replay has a test of its own
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page)
-    assert "@import" not in page and "url(" not in page
+    bare = re.sub(r' src="data:[^"]*"', "", page)  # figures, which refer to their own parts
+    assert "@import" not in bare and "url(" not in bare
     assert "sandbox=" in html and "<script" not in page
 
 
@@ -197,6 +205,24 @@ def test_a_run_that_ends_early_is_told_at_once():
     assert page.tone == "bad"
     assert re.match(r"The run ended after 1\.\d\d of 10 s: .*leg 2", page.verdict)
     assert "mine" in page.title and "<h1>" in html_of(page, Provenance("command"))
+
+
+def test_who_completes_is_told_and_how_the_delay_was_found():
+    settings = ("plant.kind=exact", "duration=2.5", "controller.delay_steps=6")
+    lost, found = (
+        simulate(load_scenario("paper", name, settings)) for name in ("delay_lqi", "adaptive_lqi")
+    )
+    compared = {"delay_lqi": lost, "adaptive_lqi": found}
+    one = collect_of(lost.scenario, run=lost, comparison=compared)
+    page = report_document.document(one, "mine")
+    error = number(found.accumulated_error)
+    assert page.verdict.endswith(f"LQI, delay found completes it, with an E_ac of {error} % s.")
+    captions = [picture.caption for section in page.sections for picture in section.all(Picture)]
+    assert "How LQI, delay found came to know the delay: with its band, and its error." in captions
+    assert "Applied torques of LQI, delay found." in captions
+    assert not any("packets" in caption for caption in captions)
+    alone = collect_of(lost.scenario, run=lost, comparison={"delay_lqi": lost})
+    assert "completes" not in report_document.document(alone, "mine").verdict
 
 
 def test_a_motion_out_of_reach_gets_a_report_without_runs(tmp_path, capsys, monkeypatch):

@@ -19,7 +19,7 @@ from stewart_drake.report import (
     replay,
     report_document,
 )
-from stewart_drake.studies.compare import CONTROLLERS
+from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, SERVOS
 
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.3", "--set", "delay.steps=1")
 COMMAND = (sys.executable, "-c", "import sys; from stewart_drake.cli import main; sys.exit(main())")
@@ -84,7 +84,9 @@ def test_figures_of_an_earlier_run_do_not_stay_beside_new_results(tmp_path, monk
 
 def test_all_figures_of_a_comparison_are_known_to_be_removed() -> None:
     controllers = {name for name in run_command.COMPARISON_FIGURES if name.startswith("torques_")}
-    assert controllers == {f"torques_{name}" for name in figures.TORQUE_CONTROLLERS}
+    shown = (*figures.TORQUE_CONTROLLERS, ADAPTIVE, *SERVOS)
+    assert controllers == {f"torques_{name}" for name in shown}
+    assert f"delay_{ADAPTIVE}" in run_command.COMPARISON_FIGURES
 
 
 def start(folder: Path, redirection: str = "", **environment: str) -> subprocess.CompletedProcess:

@@ -37,7 +37,14 @@ COMPARISON_FIGURES: Final = (
     "states",
     "errors",
     "weights",
-    *(f"torques_{name}" for name in ("delay_lqr", "delay_lqi", "predictor_lqi")),
+    *(
+        f"torques_{name}"
+        for name in (
+            *("delay_lqr", "delay_lqi", "predictor_lqi"),
+            *("adaptive_lqi", "servo_preview", "servo_feedforward"),
+        )
+    ),
+    "delay_adaptive_lqi",
 )
 _POLL: Final = 0.1
 """s between two looks whether somebody watches."""

@@ -64,7 +64,7 @@ def comparison_figures(
 ) -> list[Path]:
     """Write states, errors, and torques of each delay-aware controller, as PNG and SVG.
 
-    With the neural tuner, also the weights that it set for these controllers.
+    Of those that find the delay, also how; with the neural tuner, the weights that it set.
 
     Args:
         results: by controller, as `compare` returns them.
@@ -97,6 +97,9 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
         for name, result in aware.items():
             line = style.controller_line(name)
             figures[f"torques_{name}"] = _torques(result, spoken(name), line)
+        for name, result in aware.items():
+            if _finds_delay(result):
+                figures[f"delay_{name}"] = _delay(result)
         tuned = {spoken(n): run for n, run in aware.items() if _is_tuned(run)}
         if tuned:
             figures["weights"] = weights_figure(tuned)
@@ -132,7 +135,7 @@ def draw_run(result: SimulationResult) -> dict[str, Figure]:
         }
         if np.isfinite(result.signals.parameter_std.values).any():
             figures["parameters"] = _parameters(result)
-        if np.isfinite(result.signals.delay_std.values).any():
+        if _finds_delay(result):
             figures["delay"] = _delay(result)
         if _is_tuned(result):
             figures["weights"] = weights_figure({"weights that the tuner set": result})
@@ -141,6 +144,10 @@ def draw_run(result: SimulationResult) -> dict[str, Figure]:
 
 def _is_tuned(run: SimulationResult) -> bool:
     return not isinstance(run.scenario.tuner, FixedTunerConfig)
+
+
+def _finds_delay(run: SimulationResult) -> bool:
+    return bool(np.isfinite(run.signals.delay_std.values).any())
 
 
 def _states(runs: Mapping[str, SimulationResult], lines: Mapping[str, style.Line]) -> Figure:
@@ -174,7 +181,7 @@ def _errors(runs: Mapping[str, SimulationResult], lines: Mapping[str, style.Line
 def _torques(
     run: SimulationResult, label: str, line: style.Line, commanded: bool = False
 ) -> Figure:
-    figure, axes = _grid([run], sharey=True, strip=_STRIP if _has_packets(run) else 0.0)
+    figure, axes = _grid([run], sharey=True, strip=_STRIP if has_packets(run) else 0.0)
     steps: dict[str, Any] = {"drawstyle": "steps-post"}
     for k, ax in enumerate(axes):
         time = run.signals.time.values
@@ -184,12 +191,13 @@ def _torques(
         values = run.signals.torque_applied.values[:, k]
         _plot(ax, {label: run}, {label: line}, {label: values}, **steps)
         ax.set_ylabel(f"motor {LEGS[k]}{'' if commanded else ' applied'}  [N m]")
-    if _has_packets(run):
+    if has_packets(run):
         _packet_strip(figure, run, axes[0].get_xlim())
     return _with_legend(figure, axes)
 
 
-def _has_packets(run: SimulationResult) -> bool:
+def has_packets(run: SimulationResult) -> bool:
+    """Whether its torques went over a network."""
     return bool(np.isfinite(run.signals.packets.values).any())
 
 

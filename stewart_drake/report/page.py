@@ -4,14 +4,15 @@ The page needs no other file and no network: figures are embedded. It is readabl
 in dark mode, and printed in grey.
 """
 
-import base64
 import io
+import re
 import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
+from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
@@ -20,9 +21,11 @@ from stewart_drake.files.fileio import replacing
 from stewart_drake.files.versions import versions
 from stewart_drake.native.library import backend
 from stewart_drake.report.document import Document
-from stewart_drake.report.style import figure_style, for_dark_too
+from stewart_drake.report.style import figure_style, for_dark_too, rounded
 
 _TEMPLATE: Final = "page.html.j2"
+_LINE_END: Final = re.compile(r"\s*\n\s*")
+_AS_IT_IS: Final = " <>'=/:;,.()[]{}!*?@+-_"
 
 
 @dataclass(frozen=True)
@@ -60,12 +63,17 @@ def write_page(document: Document, made: Provenance, path: Path) -> Path:
 
 
 def source(figure: Figure) -> str:
-    """A figure as a data URI: vectors, sharp when enlarged, readable on light and dark."""
+    """A figure as a data URI for an attribute: vectors, sharp when enlarged, on what is behind it.
+
+    Characters that mean something in a URI or end the attribute are encoded, the rest is as it is:
+    a quarter less than in base 64.
+    """
     data = io.BytesIO()
     with figure_style():
-        figure.savefig(data, format="svg", metadata={"Date": None})
-    content = for_dark_too(data.getvalue())
-    return f"data:image/svg+xml;base64,{base64.b64encode(content).decode()}"
+        figure.savefig(data, format="svg", metadata={"Date": None}, facecolor="none")
+    content = for_dark_too(rounded(data.getvalue())).decode()
+    line = _LINE_END.sub(" ", content).replace("'", "&apos;").replace('"', "'")
+    return "data:image/svg+xml," + quote(line, safe=_AS_IT_IS)
 
 
 def size(figure: Figure) -> tuple[int, int]:

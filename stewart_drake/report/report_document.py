@@ -23,13 +23,13 @@ from stewart_drake.report.document import (
     Section,
     Tone,
 )
-from stewart_drake.report.figures import draw_comparison, draw_run
+from stewart_drake.report.figures import draw_comparison, draw_run, has_packets
 from stewart_drake.report.run_document import comparison_blocks, run_blocks
 from stewart_drake.report.tuner_figures import weights_figure
 from stewart_drake.report.words import number, sentence
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_yaml
-from stewart_drake.studies.compare import LABELS, is_papers
+from stewart_drake.studies.compare import LABELS, is_papers, label
 
 GOOD: Final = 5.0
 """% of peak to peak: a mean error up to here, once torques can act, is called good."""
@@ -58,13 +58,15 @@ _PAPER_FIGURES: Final = {
 _RUN_CAPTIONS: Final = {
     "states": "Where the plate was, and where it should have been.",
     "errors": "The difference.",
-    "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay. "
-    "Over a network, below: packets that were sent, lost, or late, and periods in which one was "
-    "played, or the buffer was dry.",
+    "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay.",
     "delay": "The delay as it was found, with its band, and its error.",
     "parameters": "What the controller found out about the plant, which nobody told it.",
     "weights": "The weights that the tuner set.",
 }
+_PACKETS_BELOW: Final = (
+    " Below: packets that were sent, lost, or late, and periods in which one was played, or the "
+    "buffer was dry."
+)
 _ERROR_IS: Final = (
     "E_ac is the error in percent of the motion's peak to peak, averaged over the six coordinates "
     "and accumulated over time."
@@ -122,7 +124,7 @@ def verdict(found: Collected) -> tuple[str, Tone]:
     if run.stopped is not None:
         return (
             f"The run ended after {run.stopped.time:.2f} of {run.scenario.duration:g} s: "
-            f"{run.stopped.reason}.",
+            f"{run.stopped.reason}.{_who_completes(found)}",
             "bad",
         )
     error, floor, mean = s["accumulated_error"], s["delay_floor"], mean_error(run)
@@ -136,6 +138,19 @@ def verdict(found: Collected) -> tuple[str, Tone]:
     else:
         text += f"{number(error)} % s, {average}."
     return text, "good" if mean <= GOOD else "fair"
+
+
+def _who_completes(found: Collected) -> str:
+    """The best of the other controllers that do, in a sentence, or nothing."""
+    done = {
+        name: run.accumulated_error
+        for name, run in found.comparison.items()
+        if run.status == "completed"
+    }
+    if not done:
+        return ""
+    best = min(done, key=lambda name: done[name])
+    return f" {label(best)} completes it, with an E_ac of {number(done[best])} % s."
 
 
 def mean_error(run: SimulationResult) -> float:
@@ -154,7 +169,9 @@ def _run_sections(found: Collected, replay: str) -> Iterator[Section]:
     if replay:
         text = "Drag to look around. The ring is where the plate should be."
         yield Section("Replay", text, Frame(replay))
-    pictures = _pictures(draw_run(found.run), _RUN_CAPTIONS)
+    captions = dict(_RUN_CAPTIONS)
+    captions["torques"] += _PACKETS_BELOW if has_packets(found.run) else ""
+    pictures = _pictures(draw_run(found.run), captions)
     yield Section("The run", _ERROR_IS, *run_blocks(found.run), *pictures)
 
 
@@ -175,8 +192,16 @@ def _comparison(found: Collected) -> Section:
         figures["weights"] = weights_figure({LABELS[n]: run for n, run in found.tuned.items()})
     elif "weights" not in figures:
         parts.append(_NO_NETWORK)
-    shown = {name: figures[name] for name in _CAPTIONS if name in figures}
-    return Section("The controllers compared", *parts, *_pictures(shown, captions))
+    captions = {name: captions.get(name) or _caption_of(name) for name in figures}
+    return Section("The controllers compared", *parts, *_pictures(figures, captions))
+
+
+def _caption_of(figure: str) -> str:
+    """Of a figure about a controller that is not always among those compared."""
+    what, _, controller = figure.partition("_")
+    if what == "delay":
+        return f"How {label(controller)} came to know the delay: with its band, and its error."
+    return f"Applied torques of {label(controller)}."
 
 
 def _answer(question: str, answer: Answer) -> Section:

@@ -1,5 +1,6 @@
 """How every figure looks: one line per controller, also told apart in grey print, light or dark."""
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -71,7 +72,11 @@ DARK: Final = {
 """What our lines and letters become on a dark page. Any other colour is data and stays."""
 
 FORMATS: Final = ("png", "svg")
+_PATH: Final = re.compile(rb' d="[^"]*"')
+_DIGITS: Final = re.compile(rb"(\.\d\d)\d+")
+"""Beyond the second, which are cut off."""
 _RC: Final[dict[Any, Any]] = {
+    "axes.facecolor": "none",  # the figure's is behind it, or the page
     "axes.grid": True,
     "axes.labelsize": 9,
     "axes.spines.right": False,
@@ -185,6 +190,11 @@ def write_figure(figure: Figure, directory: Path, name: str) -> list[Path]:
             figure.savefig(partial, format=suffix, metadata=metadata)
         paths.append(path)
     return paths
+
+
+def rounded(svg: bytes) -> bytes:
+    """A figure with its paths to a hundredth of a point, which nobody sees: a fifth is saved."""
+    return _PATH.sub(lambda path: _DIGITS.sub(rb"\1", path[0]), svg)
 
 
 def for_dark_too(svg: bytes) -> bytes:

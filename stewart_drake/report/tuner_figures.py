@@ -30,7 +30,7 @@ def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
         The figure; the ratio, on which alone the gain depends, in the lower row.
     """
     count = len(runs)
-    figure = Figure(figsize=(max(5.0, 10 / 3 * count), 4.6))
+    figure = Figure(figsize=(max(10.0, 10 / 3 * count), 4.6))
     width = figure.get_figwidth()
     figure.subplots_adjust(
         left=0.62 / width,
