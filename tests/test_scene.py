@@ -85,7 +85,7 @@ def test_a_live_run_keeps_to_real_time(meshcat):
     np.testing.assert_array_equal(unpaced.signals.pose, run.signals.pose)
 
 
-@pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
+@pytest.mark.parametrize("name", ["paper", "paper_clear", "desktop", "motion_base"])
 def test_the_camera_sees_a_machine_of_any_size(name):
     aimed = []
 

@@ -23,7 +23,7 @@ EXAMPLES: Final = {
     "new": ("stewart-drake new mine --torque-limit 6 --delay 0.08",),
     "layout": (
         "stewart-drake layout paper --out out/layout",
-        "stewart-drake layout paper --keep crank --keep rod --limit clearance=0.002",
+        "stewart-drake layout paper --keep crank --keep rod --out out/layout",
     ),
     "live": (
         "stewart-drake live --demo --duration 5 --no-browser",

@@ -22,7 +22,7 @@ def document(study: LayoutStudy) -> Document:
     sections += [_drawn(one) for one in machines]
     scenario = study.problem.scenario
     return Document(
-        f"Layouts for the motion of {scenario.reference.kind} kind, from {study.before.name}",
+        f"Layouts for a {scenario.reference.kind} motion, from {study.before.name}",
         study.verdict,
         sections,
         _tone(study),
@@ -97,6 +97,7 @@ def _numbers(study: LayoutStudy, machines: list[Layout]) -> Section:
         rows.append((name, between, *(f"{one.values[k]:.4g}" for one in machines)))
     signs = (["".join("+" if b > 0 else "-" for b in one.mechanism.branches)] for one in machines)
     rows.append(("branches", "", *(sign for (sign,) in signs)))
+    rows.append(("plate_order", "", *("".join(map(str, one.order)) for one in machines)))
     columns = ("", "between", *(one.name for one in machines))
     caption = "Lengths in m; of crank and rod the mean."
     text = (

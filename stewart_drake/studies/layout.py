@@ -125,6 +125,8 @@ class Layout(NamedTuple):
     name: str
     """Of its file, without the suffix; of the scenario's own machine its name."""
     mechanism: Mechanism
+    order: tuple[int, ...]
+    """(6,): the plate's joint that each leg takes."""
     values: Array
     """Of `layout_space.PARAMETERS`."""
     measures: dict[str, float]
@@ -142,6 +144,7 @@ class Layout(NamedTuple):
         return {
             "name": self.name,
             "parameters": pattern,
+            "plate_order": list(self.order),
             "branches": self.mechanism.branches.tolist(),
             "measures": self.measures,
             "missed": self.missed,
@@ -356,10 +359,11 @@ def study_layout(
         progress=_part(progress, len(jobs), len(jobs) + len(places)),
     )
     layouts = [
-        _layout(problem, key, places[key], np.array(one.values), judged[key])
+        _layout(problem, key, places[key], one.order, one.values, judged[key])
         for key, one in zip(texts, chosen, strict=True)
     ]
-    before = _layout(problem, "before", own, own_values(problem.space.spec), judged["before"])
+    spec, order = problem.space.spec, problem.space.pattern.plate_order
+    before = _layout(problem, "before", own, order, own_values(spec), judged["before"])
     before = before._replace(name=before.mechanism.name)
     return LayoutStudy(problem, seed, starts, generations, searches, before, layouts)
 
@@ -508,11 +512,27 @@ def _remove_more(folder: Path, number: int) -> None:
         number += 1
 
 
-def _layout(problem: Problem, name: str, machine: str, values: Array, judged: _Judged) -> Layout:
+def _layout(
+    problem: Problem,
+    name: str,
+    machine: str,
+    order: Sequence[int],
+    values: Sequence[float] | Array,
+    judged: _Judged,
+) -> Layout:
     near, mechanism = judged.nearest, load_mechanism(machine)
     nearest = None if near is None else Nearest(Pair(*near.parts), near.distance, near.time)
     missed = _missed(problem, judged.measures)
-    return Layout(name, mechanism, values, judged.measures, missed, nearest, judged.outcome)
+    return Layout(
+        name=name,
+        mechanism=mechanism,
+        order=tuple(order),
+        values=np.array(values),
+        measures=judged.measures,
+        missed=missed,
+        nearest=nearest,
+        outcome=judged.outcome,
+    )
 
 
 def _missed(problem: Problem, measures: Mapping[str, float]) -> dict[str, float]:
