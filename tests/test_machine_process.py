@@ -172,9 +172,8 @@ def test_both_ends_in_c(folder: Path, tmp_path: Path) -> None:
 def test_ctrl_c_ends_it_with_one_summary() -> None:
     with machine() as (running, _):
         assert running.end(signal.SIGINT) == 130
-    assert [line.split()[0] for line in running.lines] == [
-        *("machine", "waits", "ended", "datagrams:", "link;", "torques:"),
-    ]
+    begun = [line.split()[0] for line in running.lines if not line.startswith(" ")]
+    assert begun == ["machine", "waits", "ended", "datagrams:", "torques:"]
     said = [*COMMAND, "machine", "paper", "--set", "plant.kind=exact", "--port", "0"]
     done = subprocess.run(
         [*said, "--duration", "0.2", "--json"], capture_output=True, text=True, check=True
