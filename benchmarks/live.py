@@ -190,7 +190,8 @@ def kills() -> list[str]:
     """Either side is killed at random; what the other one does, and who takes over."""
     draw = random.Random(SEED)
     found: dict[str, list[Any]] = {"safe": [], "taken": [], "refused": [], "lost": [], "late": []}
-    for number in range(KILLS):
+    number = void = 0
+    while number < KILLS:
         side = draw.choice(("controller", "machine"))
         wait, restart = draw.uniform(1.0, 6.0), draw.choice(("rest", "motion"))
         options = ("--restart", restart, "--set", LINK)
@@ -202,6 +203,12 @@ def kills() -> list[str]:
             spare.wait_for("^motion:")  # it waits for its turn, for five seconds
             wait = min(wait, 3.0)
         time.sleep(wait)
+        if first.process.poll() is not None:  # the load was too much before anybody was killed
+            void += 1
+            for each in (first, began, *([] if spare is None else [spare])):
+                each.end()
+            continue
+        number += 1
         killed = first.kill() if side == "controller" else began.kill()
         if spare is not None:
             _controller_killed(began, spare, killed, restart, found)
@@ -217,7 +224,8 @@ def kills() -> list[str]:
         f"## {KILLS} kills",
         "",
         f"The controller was killed {len(safe)} times, the machine {len(found['lost'])} times, at "
-        "random.",
+        f"random; {void} runs had ended before that. Load {os.getloadavg()[0]:.1f} on "
+        f"{os.cpu_count()} cores.",
         "",
         f"- The machine was at its safe torque after {min(safe):.2f} to {max(safe):.2f} s; it "
         "promises 1 s after the last word, which is up to 0.32 s on its way.",
@@ -326,22 +334,19 @@ SECTIONS = {"minutes": minutes, "kills": kills, "page": page}
 def main() -> None:
     """Run the sections that are asked for, and write those anew."""
     path = RESULTS / "live.md"
-    text = path.read_text() if path.exists() else ""
-    parts = {
-        part.splitlines()[0]: part.strip() for part in re.split(r"(?m)^(?=## )", text)[1:] if part
-    }
     known = {"minutes": "minutes", "kills": "kills", "page": "The page"}
     for name in sys.argv[1:] or list(SECTIONS):
         lines = SECTIONS[name]()
         print("\n".join(lines))
+        text = path.read_text() if path.exists() else ""
+        found = re.split(r"(?m)^(?=## )", text)[1:]
+        parts = {part.splitlines()[0]: part.strip() for part in found}
         parts = {head: part for head, part in parts.items() if known[name] not in head}
         parts[lines[0]] = "\n".join(lines)
-    head = (
-        "# The loop in real time\n\nWritten by `python benchmarks/live.py`, with Drake "
-        + versions()["drake"]
-    )
-    RESULTS.mkdir(exist_ok=True)
-    path.write_text("\n\n".join([head + ".", *parts.values()]) + "\n")
+        head = f"Written by `python benchmarks/live.py`, with Drake {versions()['drake']}."
+        RESULTS.mkdir(exist_ok=True)
+        told = "\n\n".join(["# The loop in real time", head, *parts.values()])
+        path.write_text(told + "\n")
 
 
 if __name__ == "__main__":

@@ -21,10 +21,7 @@ EXAMPLES: Final = {
         "stewart-drake identify out/lqi/signals.nc --mechanism paper --out out/m",
     ),
     "new": ("stewart-drake new mine --torque-limit 6 --delay 0.08",),
-    "live": (
-        "stewart-drake live --demo --duration 5 --no-browser",
-        "stewart-drake live --demo --duration 5 --set controller.w_R=2 --out out/live",
-    ),
+    "live": ("stewart-drake live --demo --duration 5 --no-browser --out out/live",),
     "machine": ("stewart-drake machine paper --set plant.kind=exact --port 0 --duration 1",),
     "list": ("stewart-drake list",),
     "model check": ("stewart-drake model check paper --out out/paper",),
