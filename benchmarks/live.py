@@ -6,6 +6,7 @@ link of 0.28 to 0.32 s each way that loses 2 % of the packets; every process sha
 cores with whatever else runs on it, so that the load is told beside the figures.
 """
 
+import contextlib
 import json
 import os
 import random
@@ -30,6 +31,8 @@ from stewart_drake.files.versions import versions
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results"
 MINUTES = float(os.environ.get("MINUTES", "10"))
+SIMULATED = float(os.environ.get("SIMULATED", "1"))
+"""Of them, min; one ten seconds is as another after the first."""
 KILLS = int(os.environ.get("KILLS", "20"))
 SEED = 29
 WAY = "low: 0.28, high: 0.32, loss: 0.02"
@@ -133,16 +136,21 @@ def minutes() -> list[str]:
     duration = 60 * MINUTES
     with tempfile.TemporaryDirectory() as folder:
         began, where = machine("--set", LINK)
+        with contextlib.suppress(OSError, AttributeError):  # a machine's end has nothing else to do
+            os.sched_setscheduler(began.process.pid, os.SCHED_RR, os.sched_param(1))
         run = live(where, "--duration", f"{duration:g}", "--out", folder)
         loads = []
         while run.process.poll() is None:
             loads.append(os.getloadavg()[0])
             time.sleep(5.0)
         began.end()
+        for each in (run, began):
+            print("\n".join(line for _, line in each.lines[-4:]))
         summary = json.loads((Path(folder) / "summary.json").read_text())
         with xr.open_dataset(Path(folder) / "signals.nc") as opened:
             signals = opened.load()
-    settings = ("plant.kind=exact", LINK, f"duration={duration:g}")
+    shorter = f"duration={min(duration, 60 * SIMULATED):g}"
+    settings = ("plant.kind=exact", LINK, shorter)
     simulated = sd.simulate(sd.load_scenario("paper", settings=settings))
     seen = summary["scenario"]["link"]
     one_way = {name: seen[name] for name in ("low", "high", "loss", "playout")}
@@ -151,7 +159,7 @@ def minutes() -> list[str]:
         "plant.kind=exact",
         f"link={{kind: network, {text}, seed: {SEED}}}",
         f"sensor.loss={summary['scenario']['sensor']['loss']:.6g}",
-        f"duration={duration:g}",
+        shorter,
     )
     round_trip = sd.simulate(sd.load_scenario("paper", settings=as_seen))
     scale = 2 * np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
@@ -165,7 +173,8 @@ def minutes() -> list[str]:
     lines = [
         f"## {MINUTES:g} minutes",
         "",
-        f"Ended: {summary['status']}; simulated: {simulated.status}, {round_trip.status}. "
+        f"Ended: {summary['status']}; simulated for {SIMULATED:g} min: {simulated.status}, "
+        f"{round_trip.status}. Both processes ran in {told['scheduled']}. "
         f"{told['samples']} samples, {told['deadlines_missed']} deadlines missed, "
         f"{summary['counts']['measurements_missing']} measurements missing, {told['periods_dry']} "
         f"periods dry, {told['recoveries']} ways planned anew. Torques went out "
@@ -174,12 +183,13 @@ def minutes() -> list[str]:
         f"Load of the computer {np.mean(loads):.1f} (up to {max(loads):.1f}) on "
         f"{os.cpu_count()} cores.",
         "",
-        "| E_ac of 10 s, % s | first | median of the others | worst of the others |",
-        "| --- | --- | --- | --- |",
+        "| E_ac of 10 s, % s | first | median of the others | second worst | worst |",
+        "| --- | --- | --- | --- | --- |",
     ]
     for name, each in rows.items():
-        rest = each[1:]
-        lines.append(f"| {name} | {each[0]:.2f} | {np.median(rest):.2g} | {rest.max():.2g} |")
+        rest = np.sort(each[1:])
+        cells = (each[0], np.median(rest), rest[-2], rest[-1])
+        lines.append(f"| {name} | " + " | ".join(f"{cell:.4g}" for cell in cells) + " |")
     return lines
 
 

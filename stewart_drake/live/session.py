@@ -19,7 +19,7 @@ from stewart_drake.live.loop import LiveLoop, Nobody, Viewer
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
 from stewart_drake.live.steering import Steering, Way
 from stewart_drake.loop.recording import summarize
-from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.results import LiveSummary, SimulationResult
 from stewart_drake.scenario.config import NetworkConfig, Scenario
 
 
@@ -176,13 +176,13 @@ def drive(
     loop.record.ran(as_run)
     experiment = made.experiment._replace(scenario=as_run)
     summary = summarize(experiment, loop.record, status, stopped, wall, None)
-    summary["live"] = _told(loop, contact) | {"scheduled": scheduled}
+    told = _told(loop, contact) | {"scheduled": scheduled}
     return SimulationResult(
         scenario=as_run,
         status=status,
         stopped=stopped,
         signals=loop.record.dataset(),
-        summary=summary,
+        summary=LiveSummary(**summary, live=told),
     )
 
 
