@@ -25,10 +25,7 @@ EXAMPLES: Final = {
         "stewart-drake layout paper --out out/layout",
         "stewart-drake layout paper --keep crank --keep rod --out out/layout",
     ),
-    "live": (
-        "stewart-drake live --demo --duration 5 --no-browser",
-        "stewart-drake live --demo --duration 5 --set controller.w_R=2 --out out/live",
-    ),
+    "live": ("stewart-drake live --demo --duration 5 --no-browser --out out/live",),
     "machine": ("stewart-drake machine paper --set plant.kind=exact --port 0 --duration 1",),
     "list": ("stewart-drake list",),
     "model check": ("stewart-drake model check paper --out out/paper",),

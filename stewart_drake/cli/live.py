@@ -63,10 +63,10 @@ def live(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Drive a machine over UDP in real time, with sliders in the browser.
+    """Drive a machine over UDP in real time.
 
-    The law is that of `simulate`. Ctrl-C brings the plate to rest and ends it; Ctrl-C again, or
-    Stop on the page, stops it at once.
+    The law is that of `simulate`; a page in the browser has sliders for the pose. Ctrl-C brings the
+    plate to rest and ends it; Ctrl-C again, or Stop on the page, stops it at once.
     """
     from stewart_drake.live.connect import address_of
     from stewart_drake.live.endpoint import read_key
@@ -123,7 +123,9 @@ def _told(delivery: Delivery, result: "SimulationResult") -> int:
     """Write and print what has come of it."""
     from stewart_drake.report.run_document import run_document
 
-    s, stopped = result.summary["live"], result.stopped
+    stopped = result.stopped
+    told: Any = result.summary
+    s = told["live"]
     if stopped is not None:
         delivery.say(f"{result.status.replace('_', ' ')}: {stopped}")
     if result.status == "completed":

@@ -31,10 +31,8 @@ Array = NDArray[np.float64]
 
 _TRIPS: Final = 256
 """Round trips that are remembered."""
-_SENT: Final = 1024
-"""Datagrams of which it is remembered what became of them."""
 _SETTLED: Final = 48
-"""Datagrams after which one that has not arrived counts as lost."""
+"""Datagrams after which one that has not arrived counts as lost, and is forgotten."""
 _PHASES: Final = 128
 """Measurements of which the one that came soonest tells when the next will come."""
 
@@ -142,8 +140,6 @@ class Contact:
         message = ControllerMessage(head, flags, sampled, playout, begin, rows)
         self._endpoint.send(message, self.session.address)
         self._pending[head.sequence] = False
-        for old in [n for n in self._pending if n <= head.sequence - _SENT]:
-            del self._pending[old]
         return head.sequence
 
     def has_arrived(self, sequence: int) -> bool:
@@ -191,9 +187,9 @@ class Contact:
         for i, there in enumerate(message.arrived):
             if there and head.acknowledged - i in self._pending:
                 self._pending[head.acknowledged - i] = True
-        settled = [n for n in self._pending if n <= head.acknowledged - _SETTLED]
-        link.sent = len(settled)
-        link.lost = sum(not self._pending[n] for n in settled)
+        for settled in [n for n in self._pending if n <= head.acknowledged - _SETTLED]:
+            link.sent += 1
+            link.lost += not self._pending.pop(settled)
 
     @property
     def soonest(self) -> float:

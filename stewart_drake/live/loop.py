@@ -455,10 +455,10 @@ class LiveLoop:
 
     def _packets(self, k: int, message: MachineMessage | None) -> Array:
         """Counts as of `scenario.signals.PACKETS`; which were late only the machine knows."""
-        if message is None or not self._sends:
+        last = message or self._contact.last
+        if last is None or not self._sends:
             return np.full(len(PACKETS), np.nan)
-        link = self._contact.link
-        return np.array([k + 1.0, link.lost, math.nan, message.played, message.dry])
+        return np.array([k + 1.0, self._contact.link.lost, math.nan, last.played, last.dry])
 
     # -------------------------------------------------------------- the way
 

@@ -1,8 +1,10 @@
 """A controller's session with a machine, from the first call to what it leaves behind."""
 
+import contextlib
 import math
+import os
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -17,7 +19,7 @@ from stewart_drake.live.loop import LiveLoop, Nobody, Viewer
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
 from stewart_drake.live.steering import Steering, Way
 from stewart_drake.loop.recording import summarize
-from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.results import LiveSummary, SimulationResult
 from stewart_drake.scenario.config import NetworkConfig, Scenario
 
 
@@ -112,6 +114,25 @@ def check_armed(ready: Ready, armed: bool) -> None:
         )
 
 
+@contextlib.contextmanager
+def before_others() -> Iterator[str]:
+    """Let this process run before all that are not in real time, where the system permits it.
+
+    Yields:
+        `real time`, or `usual`.
+    """
+    try:
+        policy, given = os.sched_getscheduler(0), os.sched_getparam(0)
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except (AttributeError, OSError):  # another system, or no right to
+        yield "usual"
+        return
+    try:
+        yield "real time"
+    finally:
+        os.sched_setscheduler(0, policy, given)
+
+
 def drive(
     ready: Ready,
     duration: float = math.inf,
@@ -141,7 +162,7 @@ def drive(
     loop = LiveLoop(made, steering, contact, viewer or Nobody(), say)
     started = clock.perf_counter()
     try:
-        with one_blas_thread:
+        with one_blas_thread, before_others() as scheduled:
             loop.begin(ControllerFlags.ARMED if armed and not ready.simulated else NOTHING)
             status, stopped = loop.run(duration, ending)
     except TimeoutError as error:
@@ -155,13 +176,13 @@ def drive(
     loop.record.ran(as_run)
     experiment = made.experiment._replace(scenario=as_run)
     summary = summarize(experiment, loop.record, status, stopped, wall, None)
-    summary["live"] = _told(loop, contact)
+    told = _told(loop, contact) | {"scheduled": scheduled}
     return SimulationResult(
         scenario=as_run,
         status=status,
         stopped=stopped,
         signals=loop.record.dataset(),
-        summary=summary,
+        summary=LiveSummary(**summary, live=told),
     )
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any, TypedDict
 
 import xarray as xr
 
@@ -92,8 +92,13 @@ class RunSummary(TypedDict):
     """None where it was not asked for."""
     warnings: list[str]
     """What the user should know of this run, a sentence each."""
-    live: NotRequired[dict[str, Any]]
-    """Of a run in real time: how periodic it was, and what the link did; theory.md, section 36."""
+
+
+class LiveSummary(RunSummary):
+    """The same of a run in real time."""
+
+    live: dict[str, Any]
+    """How periodic it was, what the link did, and what was done about it."""
 
 
 @dataclass(frozen=True)

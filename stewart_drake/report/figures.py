@@ -212,8 +212,10 @@ def _packet_strip(figure: Figure, run: SimulationResult, span: tuple[float, floa
     for row, (name, rose) in enumerate(zip(PACKETS, rises.T, strict=True)):
         color = style.LIMIT.color if name in ("lost", "late", "dry") else style.RUN.color
         ax.vlines(time[rose], row - 0.35, row + 0.35, color=color, linewidth=1.0)
-    last = counts[-1].astype(int)
-    labels = [f"{name}  {n}" for name, n in zip(PACKETS, last, strict=True)]
+    labels = [
+        f"{name}  {n:.0f}" if np.isfinite(n) else f"{name}  not known"
+        for name, n in zip(PACKETS, counts[-1], strict=True)
+    ]
     ax.set(xlim=span, ylim=(len(PACKETS) - 0.5, -0.5), xlabel="time  [s]")
     ax.set_yticks(range(len(PACKETS)), labels, fontsize=8)
     ax.grid(visible=False)
