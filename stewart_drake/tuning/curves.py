@@ -323,10 +323,7 @@ def roll_outs(
     family, base = curves.family, curves.base
     draws = [curves.draws[i] for i in chosen]
     kept = run_jobs(
-        {
-            f"{i:05d}": (condition(base, one), network)
-            for i, one in zip(chosen, draws, strict=True)
-        },
+        {f"{i:05d}": (condition(base, one), network) for i, one in zip(chosen, draws, strict=True)},
         roll_out,
         directory,
         settings={"family": family, "scenario": scenario_to_dict(base), "network": key},

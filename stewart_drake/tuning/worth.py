@@ -291,7 +291,7 @@ def compared(
         for name, (J_one, log_J_one, _) in with_hindsight.items()
         if name not in FIXED
     }
-    by_fault = {}
+    by_fault: dict[str, dict[str, list[float]]] = {}
     for fault in FAULTS:
         here = np.flatnonzero(faults == fault)
         if not len(here):
