@@ -302,11 +302,11 @@ def _worth(
 ) -> int:
     from stewart_drake.report.page import Provenance, command_line, write_page
     from stewart_drake.report.worth_document import worth_document
-    from stewart_drake.tuning.worth import weigh
+    from stewart_drake.tuning.worth import SHIPPED, weigh
 
     assert delivery.out is not None
     started = time.perf_counter()
-    networks = weights or [f"health_{family}"]
+    networks = weights or [SHIPPED[family]]
     with stopping(GO_ON), count_bar("conditions", delivery.silent) as progress:
         worth = weigh(
             family,

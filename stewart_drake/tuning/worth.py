@@ -42,6 +42,8 @@ from stewart_drake.tuning.curves import LEAST, RATIOS, at_ratio, cost, fixed_nam
 
 Array = NDArray[np.float64]
 
+SHIPPED: Final = {"T": "health_T", "N2": "health_N2"}
+"""Networks by family."""
 RULE: Final = "rule"
 HINDSIGHT: Final = "hindsight"
 RESAMPLES: Final = 10_000
