@@ -17,6 +17,7 @@ from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.loop.weights import health_of, weights_source
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.studies.families import FAMILIES
 from stewart_drake.tuner.density import WINDOW
 from stewart_drake.tuner.features import HIGHEST, LOWEST, DensityFeatures
 from stewart_drake.tuner.health import NAMES, HealthFeatures, Row
@@ -272,3 +273,26 @@ def test_what_the_rule_is_depends_on_the_estimator() -> None:
                        "duration=0.2")  # fmt: skip
         run_in_bulk(one, tuner=make)
     assert [one.policy for one in made] == [weights.RULES[e] for e in weights.RULES]
+
+
+@pytest.mark.parametrize(("family", "bound"), [("T", 0.05), ("N2", 0.04)])
+def test_shipped_networks_cost_little_where_nothing_is_wrong(family: str, bound: float) -> None:
+    found = load_network(f"health_{family}")
+    assert found.features == "health"
+    assert found.card["family"] == family
+    kind = ("tuner.kind=ann", f"tuner.weights=health_{family}", *FAMILIES[family].settings)
+    assert run_in_bulk(scenario(*kind)).figures.accumulated_error < bound
+    rest = run_in_bulk(scenario(*kind, "start=rest", "queue=zero"))
+    assert rest.figures.accumulated_error < 21.2
+    assert rest.counts["tuner_fallbacks"] == 0
+    ratios = [ratio_of(w) for w in rest.weights]
+    assert min(ratios) >= LEAST - 1e-9
+    assert max(ratios) <= MOST + 1e-9
+
+
+def test_a_tuner_saves_a_plate_that_fixed_weights_lose() -> None:
+    late = scenario("delay.fraction=0.2", "controller.delay_steps=8", *BLIND)
+    assert run_in_bulk(late).status == "left_workspace"
+    for kind in (("tuner.kind=rule",), ("tuner.kind=ann", "tuner.weights=health_N2")):
+        one = scenario("delay.fraction=0.2", "controller.delay_steps=8", *BLIND, *kind)
+        assert run_in_bulk(one).status == "completed"

@@ -122,6 +122,12 @@ def train(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="For the network; figures go beside it.")
     ] = Path("out/tuner/tuner.json"),
+    start: Annotated[
+        float | None,
+        typer.Option(
+            metavar="RATIO", help="With --regret: log10 w_Q / w_R at first; else the best."
+        ),
+    ] = None,
     labels: Annotated[
         LabelKind, typer.Option(help="What the network learns to answer.")
     ] = LabelKind.best_in_cell,
@@ -143,7 +149,7 @@ def train(
         raise ConfigError(f"--out: got {str(out)!r}; expected a file ending in .json")
     delivery = Delivery(out.parent, quiet, as_json)
     if regret:
-        return _train_by_regret(data, out, seed, workers, delivery)
+        return _train_by_regret(data, out, seed, start, workers, delivery)
     read = load_dataset(data)
     with stopping("nothing written"), working("training", quiet):
         result = run(read, kind=labels.value, split=split.value, density=density.value, seed=seed)
@@ -259,7 +265,12 @@ def _curves(
 
 
 def _train_by_regret(
-    data: Path, out: Path, seed: int, workers: int | None, delivery: Delivery
+    data: Path,
+    out: Path,
+    seed: int,
+    start: float | None,
+    workers: int | None,
+    delivery: Delivery,
 ) -> int:
     from stewart_drake.report.worth_document import regret_document
     from stewart_drake.tuner.network import save_network
@@ -268,7 +279,9 @@ def _train_by_regret(
 
     curves, runs = load_curves(data), out.with_name(f"{out.stem}-runs")
     with stopping(GO_ON), count_bar("own runs", delivery.silent, "training") as progress:
-        result = train_by_regret(curves, runs, seed=seed, workers=workers, progress=progress)
+        result = train_by_regret(
+            curves, runs, seed=seed, start=start, workers=workers, progress=progress
+        )
     summary = dict(result.network.card) | {"curve": result.curve.tolist()}
     save_network(result.network, out)
     delivery.wrote(out.name, f"{runs.name}/")
@@ -289,11 +302,11 @@ def _worth(
 ) -> int:
     from stewart_drake.report.page import Provenance, command_line, write_page
     from stewart_drake.report.worth_document import worth_document
-    from stewart_drake.tuning.worth import weigh
+    from stewart_drake.tuning.worth import SHIPPED, weigh
 
     assert delivery.out is not None
     started = time.perf_counter()
-    networks = weights or [f"health_{family}"]
+    networks = weights or [SHIPPED[family]]
     with stopping(GO_ON), count_bar("conditions", delivery.silent) as progress:
         worth = weigh(
             family,

@@ -197,10 +197,10 @@ def wire_of(experiment: Experiment, when: Instants) -> Wire:
     period, queue = sc.controller.period, torques_in_flight(experiment, delay)
     nothing = np.zeros(NUM_TORQUES)
     if sc.delay.constant:
-        released: Array = when.samples
+        released = when.samples
         if delay.fraction > 0:
             first = event_time(delay.fraction * period)
-            released = first + event_time(period) * np.arange(number)
+            released = first + event_time(period) * np.arange(number, dtype=np.float64)
         waiting, applied = queue[len(queue) - delay.steps :], queue[0] if len(queue) else nothing
         return Wire(applied, waiting, released, np.arange(number))
     numbers, arrivals = releases(period, torque_delays(sc), delay)
@@ -210,8 +210,9 @@ def wire_of(experiment: Experiment, when: Instants) -> Wire:
     which = numbers + len(queue)
     applied = queue[which[begun][-1]] if begun.any() else nothing
     at_once = arrivals == period * numbers
-    released = np.where(at_once, when.samples[np.maximum(numbers, 0)], event_time(1.0) * arrivals)
-    return Wire(applied, queue, released[~begun], which[~begun])
+    at_samples = when.samples[np.maximum(numbers, 0)]
+    acts = np.where(at_once, at_samples, event_time(1.0) * arrivals)
+    return Wire(applied, queue, acts[~begun], which[~begun])
 
 
 def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:

@@ -21,6 +21,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.versions import versions
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.tuner.density import NUM_INPUTS
@@ -93,6 +94,7 @@ def train_by_regret(
     *,
     features: FeatureName = "health",
     seed: int = 0,
+    start: float | None = None,
     workers: int | None = None,
     told: Told = lambda line: None,
     progress: Progress | None = None,
@@ -103,14 +105,17 @@ def train_by_regret(
         curves: of the conditions to train on.
         directory: its own runs are kept there, so that a second start goes on.
         features: what it decides by; the second round is for `health` alone.
-        seed: of the split, the start and the batches.
+        seed: of the split, the first theta and the batches.
+        start: log10(w_Q / w_R) at which the network begins in the end, the best fixed one if None.
         workers, progress: as of `tuning.curves.make_curves`.
         told: how far it is.
 
     Raises:
-        ConfigError: torch is missing.
+        ConfigError: torch is missing, or a start that is no ratio.
         As `run_jobs`.
     """
+    if start is not None and not RATIOS[0] <= start <= RATIOS[-1]:
+        raise ConfigError(f"--start: got {start:g}; expected {RATIOS[0]:g} to {RATIOS[-1]:g}")
     trainer = _Trainer(curves, features, seed, told)
     theta = trainer.fit(trainer.start, [trainer.rows], 1)
     first = trainer.network(theta)
@@ -137,7 +142,9 @@ def train_by_regret(
     told("held out, in the loop: J of round 1 {:.3g}, of round 2 {:.3g}".format(*np.exp(scores)))
     best = (first, second)[int(np.argmin(scores))]
     fixed = curves.log_cost[held].mean(axis=0)
+    begin = trainer.first if start is None else start
     card = dict(best.card) | {
+        "start": begin,
         "round": 1 + int(np.argmin(scores)),
         "held_out_J": {
             "rounds": np.exp(scores).tolist(),
@@ -145,7 +152,8 @@ def train_by_regret(
             "hindsight": float(np.exp(curves.log_cost[held].min(axis=1).mean())),
         },
     }
-    return RegretTraining(replace(best, card=card), np.array(trainer.curve))
+    network = replace(best, start=weights_of(begin), card=card)
+    return RegretTraining(network, np.array(trainer.curve))
 
 
 class _Trainer:

@@ -42,6 +42,8 @@ from stewart_drake.tuning.curves import LEAST, RATIOS, at_ratio, cost, fixed_nam
 
 Array = NDArray[np.float64]
 
+SHIPPED: Final = {"T": "health_T", "N2": "health_N2"}
+"""Networks by family."""
 RULE: Final = "rule"
 HINDSIGHT: Final = "hindsight"
 RESAMPLES: Final = 10_000
@@ -291,7 +293,7 @@ def compared(
         for name, (J_one, log_J_one, _) in with_hindsight.items()
         if name not in FIXED
     }
-    by_fault = {}
+    by_fault: dict[str, dict[str, list[float]]] = {}
     for fault in FAULTS:
         here = np.flatnonzero(faults == fault)
         if not len(here):
