@@ -1,8 +1,9 @@
 """Runs of `analyze robustness` in C and in Drake, one after the other, machine by machine.
 
-Drake's ends are those at an accuracy of 1e-12; its time is that of the scenario as it stands. Times
-are of the processor, all that belongs to a run included: what is drawn, the law's parts, the file's
-text.
+Drake's ends are those at an accuracy of 1e-12; its times are those of the scenario as it stands:
+with the law and the dynamics in C, and, in another process and in turns with the others, with
+Python's law on CasADi's virtual machine. Times are of the processor, all that belongs to a run
+included: what is drawn, the law's parts, the file's text.
 """
 
 import argparse
@@ -10,7 +11,9 @@ import json
 import os
 import time
 from collections.abc import Callable
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +26,7 @@ from stewart_drake.files.versions import versions
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
+from stewart_drake.native.library import SWITCH, backend
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.robustness import run_draw
@@ -46,12 +50,24 @@ def in_drake(scenario: Scenario, one: Draw) -> sd.SimulationResult:
     return simulate(changed.as_scenario(), truth=changed.machine(), margin=False)
 
 
-def measure(scenario: Scenario, runs: int, seed: int) -> dict[str, str]:
-    """What is claimed, by name."""
+def without_c(value: str = "0") -> None:
+    """Of a process that has not made any function yet."""
+    os.environ[SWITCH] = value
+    backend.cache_clear()
+
+
+def seconds_in_drake(scenario: Scenario, one: Draw) -> float:
+    """Processor time of a run as a simulation."""
+    return timed(lambda: in_drake(scenario, one))[0]
+
+
+def measure(scenario: Scenario, runs: int, seed: int, other: Executor) -> dict[str, str]:
+    """What is claimed, by name; in the process of `other` nothing is compiled."""
     exact = replace(scenario, plant=replace(scenario.plant, accuracy=1e-12))
     peak = run_in_bulk(scenario).figures.peak_torque
     scales = scales_of(prepare(scenario), peak)
-    same, errors, stops, native, drake, loops = 0, [0.0], [0.0], [], [], set()
+    same, errors, stops, native, loops = 0, [0.0], [0.0], [], set()
+    drake: dict[str, list[float]] = {"C": [], "Python": []}
     for index in range(runs):
         one = draw(Ranges(), scales, scenario, seed, index)
         seconds, file = timed(lambda one=one: json.loads(run_draw(scenario, one)))
@@ -59,7 +75,9 @@ def measure(scenario: Scenario, runs: int, seed: int) -> dict[str, str]:
         native.append(seconds)
         loops.add(found["loop"])
         if index % TIMED == 0:
-            drake.append(timed(lambda one=one: in_drake(scenario, one))[0] / seconds)
+            drake["C"].append(seconds_in_drake(scenario, one) / seconds)
+            python = other.submit(seconds_in_drake, scenario, one).result()
+            drake["Python"].append(python / seconds)
         same += found["status"] == expected.status
         if expected.stopped is None and found["error"] is not None:
             errors.append(abs(found["error"] / expected.accumulated_error - 1))
@@ -72,7 +90,12 @@ def measure(scenario: Scenario, runs: int, seed: int) -> dict[str, str]:
         "E_ac, largest relative difference": f"{max(errors):.1e}",
         "instant of leaving, largest difference": f"{max(stops):.1e} s",
         "ms of a run in C": f"{1e3 * np.mean(native):.1f}",
-        "Drake's time over that, median": f"{np.median(drake):.1f}",
+        **{
+            f"Drake's time over that with law, dynamics in {language}, median (quartiles)": (
+                "{1:.1f} ({0:.1f} to {2:.1f})".format(*np.percentile(ratios, [25, 50, 75]))
+            )
+            for language, ratios in drake.items()
+        },
         "100 000 runs on two cores": f"{1e5 * np.mean(native) / 7200:.2f} h",
     }
 
@@ -84,7 +107,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=20261)
     given = parser.parse_args()
     scenario = sd.load_scenario("paper", settings=["plant.kind=exact"])
-    rows = measure(scenario, given.runs, given.seed)
+    with ProcessPoolExecutor(1, get_context("spawn"), without_c) as other:
+        rows = measure(scenario, given.runs, given.seed, other)
     told = ", ".join(f"{name} {number}" for name, number in versions().items())
     lines = [
         "# Monte Carlo in C",

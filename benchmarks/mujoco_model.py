@@ -163,9 +163,9 @@ class MujocoStewart:
             mujoco.set_mjcb_control(drive)
         else:
             ctrl[:] = torque
-        started = time.perf_counter()
+        started = time.process_time()
         mujoco.mj_step(self.model, self.data, nstep=round(duration / time_step))
-        seconds = time.perf_counter() - started
+        seconds = time.process_time() - started
         mujoco.set_mjcb_control(None)
         return seconds, self.state()
 

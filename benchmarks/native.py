@@ -24,6 +24,7 @@ from pydrake.systems.primitives import Sine
 
 import stewart_drake as sd
 from stewart_drake.dynamics.compiled import Buffered
+from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.files.versions import versions
 from stewart_drake.law.delay_model import delayed_model
 from stewart_drake.law.doubling import Doubling
@@ -36,7 +37,6 @@ from stewart_drake.law.riccati import lqr, reduced_gain
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.native.library import SWITCH, backend
 from stewart_drake.report.export_c import recorded_law
-from stewart_drake.scenario.signals import NUM_PARAMETERS
 
 RESULTS = Path(__file__).parent / "results"
 ROUNDS = 12
@@ -44,7 +44,7 @@ BACKENDS = {"casadi": "0", "native": "require"}
 MECHANISM = sd.load_mechanism("paper")
 RNG = np.random.default_rng(0)
 POSE, (RATES, ACCELERATIONS, TORQUE) = MECHANISM.home, RNG.normal(0, 0.3, (3, 6))
-THETA, GRAVITY = np.zeros(NUM_PARAMETERS), 9.81
+THETA, GRAVITY = plant_parameters(), 9.81
 FUNCTIONS = (
     "accelerations",
     "inverse dynamics",

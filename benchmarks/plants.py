@@ -5,7 +5,8 @@ The exact plant is integrated in Drake, and by the compiled DOP853 of
 
 All start at home, at rest, under torques amplitude * sin(frequency t + phase). The error is that of
 the pose at the end, its worst coordinate in rad or m, against an integration to 1e-13. The time is
-that of the stepping alone, per simulated second, the least of several interleaved repeats.
+that of the processor for the stepping alone, per simulated second, the least of several
+interleaved repeats.
 """
 
 import os
@@ -109,9 +110,9 @@ def drake_run(motion: Motion, plant: Any, scheme: str | None, accuracy: float) -
         context.SetTime(0.0)
         plant.set_state(own, START)
         simulator.Initialize()
-        started = time.perf_counter()
+        started = time.process_time()
         simulator.AdvanceTo(motion.duration)
-        return time.perf_counter() - started, np.array(plant.GetOutputPort("state").Eval(own))
+        return time.process_time() - started, np.array(plant.GetOutputPort("state").Eval(own))
 
     return run
 
@@ -125,9 +126,9 @@ def dop853_run(motion: Motion, accuracy: float) -> Run:
     def run() -> tuple[float, Array]:
         plant = NativePlant(dynamics, START, end, accuracy, np.inf)
         drives = in_c([drive])
-        started = time.perf_counter()
+        started = time.process_time()
         plant.call("open_loop", *drives)
-        return time.perf_counter() - started, plant.final
+        return time.process_time() - started, plant.final
 
     return run
 

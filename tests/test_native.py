@@ -30,6 +30,7 @@ from stewart_drake.native import build, library
 from stewart_drake.native.layout import SIGNATURES
 from stewart_drake.report.document import Document
 from stewart_drake.report.page import Provenance, html
+from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, PAYLOAD
 from tests.backends import switched
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
@@ -61,12 +62,19 @@ def arguments(rng: np.random.Generator, mechanism: Mechanism) -> dict[str, Array
         "state": np.concatenate([pose, rates]),
         "accelerations": accelerations,
         "torque": torque,
-        "parameters": rng.normal(0, 0.1, 13),
+        "parameters": parameters(rng),
         "gravity": rng.uniform(0, 10),
         "angles": angles,
         "sign": rng.choice([-1.0, 1.0]),
         "least": rng.normal(0, 0.1, 8),
     }
+
+
+def parameters(rng: np.random.Generator) -> Array:
+    """Of the plant, any: but of a payload that leaves the plate its mass, so that it can move."""
+    found = rng.normal(0, 0.1, NUM_PLANT_PARAMETERS)
+    found[PAYLOAD] = abs(found[PAYLOAD])
+    return found
 
 
 def difference(found: object, expected: object) -> float:
