@@ -9,7 +9,7 @@ from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.native_law import serving
-from stewart_drake.live.endpoint import Address, Endpoint, OtherClock, Session, now
+from stewart_drake.live.endpoint import Address, Endpoint, Session, now
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.protocol import (
     NEVER,
@@ -17,6 +17,7 @@ from stewart_drake.live.protocol import (
     SECOND,
     ControllerFlags,
     ControllerMessage,
+    Head,
     MachineMessage,
 )
 from stewart_drake.loop.experiment import control_law, first_queue, prepare
@@ -123,6 +124,40 @@ class Driver:
 def time_of(number: int, period: int) -> float:
     """s, as the scenario's own grid has it."""
     return number * (period / SECOND)
+
+
+@dataclass
+class OtherClock:
+    """The other side's clock, from datagrams that went there and came back.
+
+    A datagram sent at t1 was got there at t2 and answered at t3, which came at t4. On its way back
+    it was half of r = (t4 - t1) - (t3 - t2) / rate, or up to r/2 more or less; the shortest r tells
+    most. What a controller makes of that error is harmless: a measurement that seems older by as
+    much has, it seems, torques on their way for as much less time.
+
+    Attributes:
+        rate: of the other clock, by the own one.
+        round_trip: s, the shortest of the last ones; infinite before there is one.
+    """
+
+    rate: float = 1.0
+    round_trip: float = float("inf")
+    _trips: list[tuple[float, float]] = field(default_factory=list)
+
+    def note(self, head: Head, time: int) -> None:
+        """Take a datagram that came at a time of the own clock, ns."""
+        if head.acknowledged == 0:
+            return
+        trip = (time - head.echo) / SECOND - head.held / SECOND / self.rate
+        there = head.time / SECOND + self.rate * max(trip, 0.0) / 2 - self.rate * time / SECOND
+        self._trips = [*self._trips[-63:], (trip, there)]
+        self.round_trip = min(self._trips)[0]
+
+    def at(self, time: int) -> float:
+        """s of the other clock at a time of the own one, ns; NaN before it is known."""
+        if not self._trips:
+            return float("nan")
+        return self.rate * time / SECOND + min(self._trips)[1]
 
 
 def drive_in_real_time(driver: Driver, samples: int) -> np.ndarray:

@@ -104,7 +104,7 @@ def words() -> frozenset[str]:
         path.read_text(encoding="utf-8")
         for folder in folders
         for path in folder.rglob("*")
-        if path.suffix in (".py", ".yaml") and path != Path(__file__)
+        if path.suffix in (".py", ".yaml", ".c", ".h") and path != Path(__file__)
     )
     return frozenset(word for text in texts for word in re.findall(r"[A-Za-z_]\w*", text))
 

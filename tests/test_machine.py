@@ -282,10 +282,10 @@ def test_a_new_session_begins_where_it_is_said(restart: str) -> None:
     assert old.number != machine.session.number  # type: ignore[union-attr]
     if restart == "rest":
         np.testing.assert_array_equal(machine._body.state, run.driver.experiment.start)
-        assert "begins at rest" in run.said[-1]
+        assert run.said[-1].endswith("at rest")
     else:
         np.testing.assert_allclose(machine._body.state, moving, atol=0.05)
-        assert "begins in motion" in run.said[-1]
+        assert run.said[-1].endswith("in motion")
         assert machine.begin == now + 3 * period
         # Its torques act when they are due.
         time = now + period
@@ -380,9 +380,11 @@ def attacked(
     for k in range(samples):
         time = run.driver.begin + k * period
         run.at(time)
-        for _ in range(rng.randrange(most + 1)):
+        for i in range(rng.randrange(most + 1)):
             attack(rng, run, attacker, recorded)
             number += 1
+            if i % 20 == 0:  # before the socket's buffer is full
+                run.machine.poll(time)
         run.machine.poll(time)
         states.append(np.array(run.machine._body.state))
         recorded.append(encode(run.driver.step(time), KEY))

@@ -44,6 +44,11 @@ class Process:
         )
         self.lines: list[str] = []
 
+    @property
+    def said(self) -> str:
+        """All of it, in one line."""
+        return " ".join(" ".join(self.lines).split())
+
     def until(self, pattern: str) -> str:
         """The line that has it, which must come before the process ends."""
         assert self.popen.stdout is not None
@@ -78,7 +83,8 @@ def machine(*options: str, settings: tuple[str, ...] = SETTINGS) -> Iterator[tup
     """`stewart-drake machine`, once it listens, and its port."""
     said = [word for setting in settings for word in ("--set", setting)]
     with process([*COMMAND, "machine", "paper", "--port", "0", *said, *options]) as made:
-        first = made.until("waits for a controller")
+        first = made.until("^machine paper at")
+        made.until("waits for a controller")
         yield made, int(first.split("127.0.0.1:")[1].split(":")[0])
 
 
@@ -127,7 +133,7 @@ def test_the_controller_in_c_drives_the_machine_in_python(folder: Path, tmp_path
     assert driving.lines[-1] == (
         "refused: 0 malformed, 0 version, 0 key, 0 foreign, 0 replayed, 0 late"
     )
-    assert "1 sessions, 1 runs" in running.lines[-1] and "none refused" in running.lines[-1]
+    assert "1 sessions, 1 runs" in running.said and "refused: none" in running.said
     np.testing.assert_allclose(states_of(log), simulated(40), atol=1e-6)
 
 
@@ -166,7 +172,8 @@ def test_both_ends_in_c(folder: Path, tmp_path: Path) -> None:
 def test_ctrl_c_ends_it_with_one_summary() -> None:
     with machine() as (running, _):
         assert running.end(signal.SIGINT) == 130
-    assert len(running.lines) == 2 and running.lines[1].startswith("ended after")
+    begun = [line.split()[0] for line in running.lines if not line.startswith(" ")]
+    assert begun == ["machine", "waits", "ended", "datagrams:", "torques:"]
     said = [*COMMAND, "machine", "paper", "--set", "plant.kind=exact", "--port", "0"]
     done = subprocess.run(
         [*said, "--duration", "0.2", "--json"], capture_output=True, text=True, check=True
@@ -221,7 +228,7 @@ def kills(folder: Path, number: int, rng: random.Random) -> None:
             assert took < 0.4 + 0.25, (k, wait, took)
             assert began
         assert running.end(signal.SIGINT) == 130
-    assert f"{number} sessions, {number} runs" in running.lines[-1]
+    assert f"{number} sessions, {number} runs" in running.said
 
 
 def test_a_killed_controller_ends_in_the_safe_torque_and_the_next_one_takes_over(

@@ -20,7 +20,6 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.endpoint import (
     SHORTEST_KEY,
     Endpoint,
-    OtherClock,
     Session,
     Window,
     read_key,
@@ -48,6 +47,7 @@ from stewart_drake.live.protocol import (
 )
 from stewart_drake.native import build
 from stewart_drake.report.export_c import TEMPLATES
+from tests.live_driver import OtherClock
 
 ROOT = Path(__file__).resolve().parents[1]
 KEY = b"0123456789abcdef"

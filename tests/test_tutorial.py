@@ -78,6 +78,6 @@ def check_what_it_says(told: dict[str, str]) -> None:
     assert main([*usual, "--out", "out/usual", "--quiet"]) == 0
     assert json.loads(Path("out/usual/summary.json").read_text())["status"] == "left_workspace"
     shown = FENCE.findall(TUTORIAL.read_text(encoding="utf-8"))
-    (sample,) = (text for language, _, text in shown if language == "text")
+    sample = next(text for language, _, text in shown if language == "text")
     real = told["simulate waves.yaml --out out/waves --csv --replay"]
     assert real.startswith(sample), "the output that the text shows"

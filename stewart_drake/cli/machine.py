@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stewart_drake.cli.common import AsJson, Controller, Delivery, Quiet, ScenarioName, Settings
+from stewart_drake.report.words import wrap
 
 if TYPE_CHECKING:
     from stewart_drake.live.machine import Machine
@@ -69,15 +70,15 @@ def machine(
     experiment = prepare(loaded)
     delivery = Delivery(None, quiet, as_json)
     endpoint = Endpoint(ControllerMessage, host, port, None if key is None else read_key(key))
-    running = Machine(experiment, endpoint, chosen, delivery.say)
+    running = Machine(experiment, endpoint, chosen, lambda text: delivery.say(wrap(text)))
     interrupted = _run(
         running,
         duration or float("inf"),
-        lambda: delivery.say(_first_line(running, scenario, endpoint.address)),
+        lambda: delivery.say(_first_lines(running, scenario, endpoint.address)),
     )
     endpoint.close()
     summary = running.summary()
-    delivery.say(_last_line(summary))
+    delivery.say(_last_lines(summary))
     return delivery.end(summary, interrupted)
 
 
@@ -98,20 +99,22 @@ def _run(machine: "Machine", duration: float, listens: Callable[[], None]) -> bo
     return False
 
 
-def _first_line(machine: "Machine", scenario: str, address: tuple[str, int]) -> str:
+def _first_lines(machine: "Machine", scenario: str, address: tuple[str, int]) -> str:
     return (
-        f"machine {scenario} at {address[0]}:{address[1]}: a simulation ({machine.goes_by}), "
-        f"every {1e-6 * machine.period:g} ms; waits for a controller, Ctrl-C ends it"
+        f"machine {scenario} at {address[0]}:{address[1]}: simulated by {machine.goes_by}, every "
+        f"{1e-6 * machine.period:g} ms\nwaits for a controller; Ctrl-C ends it"
     )
 
 
-def _last_line(summary: dict[str, Any]) -> str:
-    refused = ", ".join(f"{n} {cause}" for cause, n in summary["refused"].items() if n)
-    return (
-        f"ended after {summary['time_s']:.1f} s: {summary['sessions']} sessions, "
-        f"{summary['runs']} runs, {summary['received']} datagrams received, {summary['sent']} "
-        f"sent, {summary['lost'] + summary['measurements_lost']} lost by the simulated link, "
-        f"{refused or 'none'} refused, {summary['unsent']} not sent; {summary['played']} torques "
-        f"played, {summary['dry']} periods dry, {summary['silences']} silences; at the most "
-        f"{1e3 * summary['longest_lag_s']:.0f} ms behind"
+def _last_lines(summary: dict[str, Any]) -> str:
+    s = summary
+    refused = ", ".join(f"{number} {cause}" for cause, number in s["refused"].items() if number)
+    lines = (
+        f"ended after {s['time_s']:.1f} s: {s['sessions']} sessions, {s['runs']} runs, "
+        f"{s['silences']} silences, at most {1e3 * s['longest_lag_s']:.0f} ms behind",
+        f"datagrams: {s['received']} received, {s['sent']} sent, {s['unsent']} not sent, "
+        f"{s['lost'] + s['measurements_lost']} lost by the simulated link; refused: "
+        f"{refused or 'none'}",
+        f"torques: {s['played']} played, {s['dry']} periods dry",
     )
+    return "\n".join(wrap(line) for line in lines)

@@ -1,4 +1,4 @@
-"""A socket for datagrams of `live.protocol`, who is at its other end, and which clock is there.
+"""A socket for datagrams of `live.protocol`, and who is at its other end.
 
 Without a key only the loopback interface is used. What is not acted upon is counted by its cause.
 """
@@ -16,7 +16,6 @@ from typing import Final
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.protocol import (
     LONGEST,
-    SECOND,
     Head,
     Message,
     Refusal,
@@ -35,8 +34,6 @@ SHORTEST_KEY: Final = 16
 """Bytes."""
 LONGEST_KEY: Final = 4096
 """Bytes."""
-_TRUSTED: Final = 64
-"""Round trips of which the shortest one tells the other's clock."""
 
 
 def now() -> int:
@@ -242,37 +239,3 @@ class Session:
 def draw() -> int:
     """A number of 64 bits that nobody guesses, not 0."""
     return secrets.randbits(64) or 1
-
-
-@dataclass
-class OtherClock:
-    """The other side's clock, from datagrams that went there and came back.
-
-    A datagram sent at t1 was got there at t2 and answered at t3, which came at t4. On its way back
-    it was half of r = (t4 - t1) - (t3 - t2) / rate, or up to r/2 more or less; the shortest r tells
-    most. What a controller makes of that error is harmless: a measurement that seems older by as
-    much has, it seems, torques on their way for as much less time.
-
-    Attributes:
-        rate: of the other clock, by the own one.
-        round_trip: s, the shortest of the last ones; infinite before there is one.
-    """
-
-    rate: float = 1.0
-    round_trip: float = float("inf")
-    _trips: list[tuple[float, float]] = field(default_factory=list)
-
-    def note(self, head: Head, time: int) -> None:
-        """Take a datagram that came at a time of the own clock, ns."""
-        if head.acknowledged == 0:
-            return
-        trip = (time - head.echo) / SECOND - head.held / SECOND / self.rate
-        there = head.time / SECOND + self.rate * max(trip, 0.0) / 2 - self.rate * time / SECOND
-        self._trips = [*self._trips[1 - _TRUSTED :], (trip, there)]
-        self.round_trip = min(self._trips)[0]
-
-    def at(self, time: int) -> float:
-        """s of the other clock at a time of the own one, ns; NaN before it is known."""
-        if not self._trips:
-            return float("nan")
-        return self.rate * time / SECOND + min(self._trips)[1]

@@ -188,6 +188,8 @@ class Machine:
         begin: ns, when the run began or will begin, or NEVER.
         failure: how the plate left its workspace, or None.
         counts: what happened, by name.
+        goes_by: what computes the plate, see `live.body.body_of`.
+        longest_lag: ns by which something was done late while the plate moved.
     """
 
     def __init__(
@@ -275,10 +277,10 @@ class Machine:
             if when > time:
                 return when
             lag = time - when
-            if lag > self.longest_lag:
-                self.longest_lag = lag
-            if lag > STOOD and self._running and do != self._silence:
-                self._tell_lag(lag, when)
+            if self._running:
+                self.longest_lag = max(lag, self.longest_lag)
+                if lag > STOOD and do != self._silence:
+                    self._tell_lag(lag, when)
             do(when)
 
     def _next(self) -> tuple[int, Callable[[int], None]]:
@@ -297,8 +299,8 @@ class Machine:
         if when > self._told_until:
             self.counts["stood still"] += 1
             self._say(
-                f"at {when / SECOND:.3f} s the process stood still for {lag / SECOND:.2f} s; the "
-                "plate went on by what was in the buffer"
+                f"{when / SECOND:.3f} s: stood still for {lag / SECOND:.2f} s; the plate went on "
+                "by its buffer"
             )
         self._told_until = when + lag
 
@@ -310,19 +312,23 @@ class Machine:
             return
         failure = self._body.advance((time - self._origin) / SECOND, self._motors.torque)
         if failure is not None:
-            self._leave(failure, time)
+            self._leave(failure)
 
-    def _leave(self, failure: Failure, time: int) -> None:
+    def _leave(self, failure: Failure) -> None:
         self.failure = failure
         self.counts["left workspace"] += 1
-        self._say(f"the plate left its workspace: {failure}; stopped, a new session begins at rest")
+        left = self._origin / SECOND + failure.time
+        self._say(
+            f"{left:.3f} s: the plate left its workspace ({failure.reason}): stopped; a new "
+            "session begins at rest"
+        )
 
     def _begin(self, time: int) -> None:
         if time != self.begin or self._running:
             return
         if not self._alive(time):
             self.begin = NEVER
-            self._say("nobody was heard when the run should have begun; still parked")
+            self._say("nobody was heard when the run should have begun: still parked")
             return
         sc, delay = self._experiment.scenario, self._experiment.scenario.true_delay
         queue = torques_in_flight(self._experiment, delay)
@@ -331,14 +337,14 @@ class Machine:
         self._running, self._origin, self._safe = True, time, False
         self._motors.begin(Plan(0, time, 0, playout, queue))
         self.counts["runs"] += 1
-        self._say(f"the run began at {time / SECOND:.3f} s")
+        self._say(f"{time / SECOND:.3f} s: the run began")
 
     def _change(self, time: int) -> None:
         self._follow(time)
         self._motors.change(time)
         if self._safe and self._motors.fed:
             self._safe = False
-            self._say(f"torques act again at {time / SECOND:.3f} s")
+            self._say(f"{time / SECOND:.3f} s: torques act again")
 
     def _take_sample(self, time: int) -> None:
         self._follow(time)
@@ -370,8 +376,8 @@ class Machine:
         self.counts["silences"] += 1
         self._go_safe(time)
         self._say(
-            f"nothing was heard for {self._settings.watchdog:g} s at {time / SECOND:.3f} s: the "
-            f"safe torque ({self._settings.safe}) acts"
+            f"{time / SECOND:.3f} s: nothing was heard for {self._settings.watchdog:g} s: the safe "
+            f"torque ({self._settings.safe}) acts"
         )
 
     def _go_safe(self, time: int) -> None:
@@ -429,14 +435,16 @@ class Machine:
         else:
             self._go_safe(time)
         self.begin = NEVER
-        self._say(f"session {self.counts['sessions']}, of {host}:{port}, begins {where}")
+        self._say(
+            f"{time / SECOND:.3f} s: session {self.counts['sessions']}, of {host}:{port}, {where}"
+        )
 
     def _obey(self, message: ControllerMessage, time: int) -> None:
         if ControllerFlags.STOP in message.flags:
             self._stopped = True
             if self._running:
                 self._go_safe(time)
-            self._say(f"the controller said stop at {time / SECOND:.3f} s")
+            self._say(f"{time / SECOND:.3f} s: the controller said stop")
             return
         if max(message.begin % NEVER, message.playout) > time + FURTHEST:
             self._refuse(Refusal.MALFORMED)

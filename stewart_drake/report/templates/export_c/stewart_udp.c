@@ -21,6 +21,7 @@
 
 #define TRIPS 64
 #define ENOUGH 10 /* round trips that tell the clock */
+#define REPEATS 7 /* earlier torques that a datagram says again, for those that get lost */
 
 /* Round trips, and the machine's clock less the own one by each: the shortest one counts. */
 typedef struct {
@@ -40,6 +41,7 @@ typedef struct {
     unsigned refused[STEWART_REFUSALS];
     stewart_memory memory;
     stewart_workspace work;
+    real sent[1 + REPEATS][STEWART_MOTORS]; /* the newest last */
     unsigned samples, missing, missed;
     double seconds;
     FILE *log;
@@ -97,7 +99,8 @@ static void receive(controller *c)
     }
 }
 
-static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playout, const real *torque)
+/* A datagram with the last `rows` torques, the first of which is for `playout`. */
+static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playout, unsigned rows)
 {
     uint8_t data[STEWART_LONGEST];
     stewart_plan plan;
@@ -106,9 +109,10 @@ static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playou
     plan.sampled = sampled;
     plan.playout = playout;
     plan.begin = c->begin;
-    plan.rows = torque != NULL;
-    for (int i = 0; torque && i < STEWART_MOTORS; i++)
-        plan.torques[0][i] = (double)torque[i];
+    plan.rows = (uint8_t)rows;
+    for (unsigned row = 0; row < rows; row++)
+        for (int i = 0; i < STEWART_MOTORS; i++)
+            plan.torques[row][i] = (double)c->sent[1 + REPEATS - rows + row][i];
     udp_put(c->socket, data, stewart_write_plan(&plan, c->key, data), &c->machine);
 }
 
@@ -154,8 +158,15 @@ static void step(controller *c, unsigned k)
     }
     if (lower)
         stewart_sent(config, &c->memory, torque);
+    memmove(c->sent[0], c->sent[1], REPEATS * sizeof c->sent[0]);
+    memcpy(c->sent[REPEATS], torque, sizeof torque);
+    /* Repetitions are of use where a buffer waits, for periods that are still to come. */
+    unsigned repeats = c->last.head.flags & STEWART_WIRE ? 0 : (unsigned)config->steps;
+    repeats = repeats < REPEATS ? repeats : REPEATS;
+    repeats = repeats < k ? repeats : k;
     double eta = (config->steps + (double)config->fraction) * (double)c->last.period;
-    say(c, 0, sampled, sampled + (uint64_t)(eta + 0.5), torque);
+    uint64_t playout = sampled + (uint64_t)(eta + 0.5);
+    say(c, 0, sampled, playout - repeats * c->last.period, 1 + repeats);
     if (c->log)
         note(c, k * (double)config->period, measurement, torque);
     c->samples++;
@@ -181,7 +192,7 @@ static const char *greet(controller *c)
     while (c->last.begin == STEWART_NEVER || c->begin == STEWART_NEVER || c->last.period == 0) {
         if (udp_interrupted() || udp_now() > patience)
             return busy ? "another controller drives it" : "the machine does not answer";
-        say(c, 0, 0, 0, NULL);
+        say(c, 0, 0, 0, 0);
         uint64_t next = udp_now() + (c->last.period ? c->last.period : SECOND / 10);
         while (udp_now() < next) {
             udp_wait(c->socket, next);
@@ -211,7 +222,7 @@ static const char *drive(controller *c)
     unsigned number = (unsigned)(c->seconds / (double)stewart_configuration.period + 0.5);
     int waits = stewart_configuration.longest_wait == 0;
     for (uint64_t t = own_time(&c->clock, c->begin); udp_now() + SECOND / 20 < t;) {
-        say(c, 0, 0, 0, NULL); /* still here */
+        say(c, 0, 0, 0, 0); /* still here */
         udp_wait(c->socket, udp_now() + SECOND / 20);
         receive(c);
     }
@@ -274,7 +285,7 @@ int main(int argc, char **argv)
         problem = drive(&c);
     }
     for (int i = 0; i < 3 && c.session.nonce; i++)
-        say(&c, STEWART_STOP, 0, 0, NULL);
+        say(&c, STEWART_STOP, 0, 0, 0);
     printf("%s after %u samples, %u of them without a measurement, %u late\n",
            problem ? problem : "completed", c.samples, c.missing, c.missed);
     udp_tell(c.refused);
