@@ -137,6 +137,19 @@ def test_the_controller_in_c_drives_the_machine_in_python(folder: Path, tmp_path
     np.testing.assert_allclose(states_of(log), simulated(40), atol=1e-6)
 
 
+def test_a_lost_datagram_of_the_controller_in_c_costs_nothing(folder: Path, tmp_path: Path) -> None:
+    """Where a buffer waits, those that follow say its torque again: the run without a loss."""
+    lossy = "link={kind: network, low: 0.0, high: 0.02, loss: 0.3, playout: 0.8}"
+    log, settings = tmp_path / "log", (*SETTINGS, lossy, "controller.packet_repeats=0")
+    with machine(settings=settings) as (running, port):
+        with process(c_controller(folder, port, f"log={log}")) as driving:
+            assert driving.end() == 0, driving.lines
+        assert running.end(signal.SIGINT) == 130
+    lost = int(re.search(r"(\d+) lost by", running.said)[1])  # type: ignore[index]
+    assert lost >= 5 and "32 played, 0 periods dry" in running.said
+    np.testing.assert_allclose(states_of(log), simulated(40), atol=1e-6)
+
+
 def test_the_controller_in_python_drives_the_machine_in_c(folder: Path) -> None:
     port = free_port()
     with process([str(folder / "stewart_machine"), str(port)]) as running:
