@@ -85,7 +85,10 @@ def dataset(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Run the grid of delays, frequencies and weights, 180 runs, or a family's conditions."""
+    """Run a grid of 180 scenarios, or a family's conditions.
+
+    The grid has delays, frequencies and weights; a family has faults of the timing, friction, noise.
+    """
     if family is not None:
         refuse_with_family(scenario, controller)
         return _curves(
@@ -138,7 +141,10 @@ def train(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Train the network on a data set: by Levenberg-Marquardt, or by regret and its own runs."""
+    """Train the network on a data set.
+
+    By Levenberg-Marquardt on labels, or, of a family, by regret and by its own runs.
+    """
     from stewart_drake.report.tuner_document import training_document
     from stewart_drake.tuner.network import save_network
     from stewart_drake.tuning.dataset import load_dataset
@@ -189,7 +195,10 @@ def evaluate(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Compare the tuner with every fixed gain on unseen scenarios, or a family's conditions."""
+    """Compare a tuner with fixed gains on unseen scenarios.
+
+    With --family on fresh conditions of a family, where lost plates count.
+    """
     if family is not None:
         refuse_with_family(scenario, controller)
         delivery = Delivery(out, quiet, as_json)
