@@ -315,13 +315,14 @@ def test_controller_topology_and_initial_state() -> None:
         "parameter_std": 8,
         "delay_estimate": 1,
         "delay_std": 1,
+        "memory": 0,  # an object
     }
     for name in outputs:
         port = controller.GetOutputPort(name).get_index()
         through = any(
             controller.HasDirectFeedthrough(i, port) for i in range(controller.num_input_ports())
         )
-        assert through == (name in ("torque", "estimate"))
+        assert through == (name in ("torque", "estimate", "memory"))
     context = controller.CreateDefaultContext()
     memory = controller.memory(context)
     assert np.array_equal(memory.in_flight[1:], in_flight)
