@@ -87,7 +87,7 @@ def dataset(
 ) -> int:
     """Run a grid of 180 scenarios, or a family's conditions.
 
-    The grid has delays, frequencies and weights; a family has faults of the timing, friction, noise.
+    The grid has delays, frequencies and weights; a family has faults of timing, friction, noise.
     """
     if family is not None:
         refuse_with_family(scenario, controller)
