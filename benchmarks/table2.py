@@ -32,7 +32,6 @@ LOW = 10.0 ** np.arange(-7, 0.1, 0.25)
 HIGH = 10.0 ** np.arange(0, 8.1, 0.5)
 SHARES = np.arange(0.3, 1.01, 0.01)
 CRANKS = (0.11, 0.15, 0.18, 0.22)
-INERTIA = "controller.model=multibody"
 
 
 def size(share: float) -> str:

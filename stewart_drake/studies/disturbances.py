@@ -38,7 +38,8 @@ class Standard(NamedTuple):
     plate_mass: float
 
 
-def _logarithmic(low: float, high: float) -> Callable[[Generator, Any], float]:
+def logarithmic(low: float, high: float) -> Callable[[Generator, Any], float]:
+    """Draws a number whose logarithm is uniform."""
     return lambda rng, _: float(np.exp(rng.uniform(*np.log((low, high)))))
 
 
@@ -65,7 +66,7 @@ CONDITIONS: Final[Model] = {
     # Whole periods, 0 and 15 included, which the controller knows.
     "delay_steps": Quantity(lambda rng, _: int(rng.integers(0, 16)), _delay),
     # rad/s of the sine.
-    "frequency": Quantity(_logarithmic(0.5, 3.0), set_frequency),
+    "frequency": Quantity(logarithmic(0.5, 3.0), set_frequency),
     # Share of the scenario's own amplitudes.
     "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.3, 1.0)), set_amplitude),
     # Of each motor; its standard deviation is a share of the standard torque.
@@ -76,7 +77,7 @@ CONDITIONS: Final[Model] = {
         add_payload, sometimes=True,
     ),
     # Standard deviation of pose (rates: per second), share of the amplitudes.
-    "noise": Quantity(_logarithmic(1e-4, 3e-3), add_noise, sometimes=True),
+    "noise": Quantity(logarithmic(1e-4, 3e-3), add_noise, sometimes=True),
     "seed": Quantity(draw_seed, seed_noise),
 }  # fmt: skip
 """What is unlike; uniform, what covers decades in the logarithm."""

@@ -16,7 +16,13 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import SineConfig
-from stewart_drake.studies.disturbances import Standard, set_amplitude, set_frequency, standard_of
+from stewart_drake.studies.disturbances import (
+    Standard,
+    logarithmic,
+    set_amplitude,
+    set_frequency,
+    standard_of,
+)
 from stewart_drake.studies.uncertainty import (
     Draw,
     Model,
@@ -84,10 +90,6 @@ def _uniform(low: float, high: float, share: float) -> float:
     return float(low + (high - low) * share)
 
 
-def _logarithmic(rng: Generator, low: float, high: float) -> float:
-    return float(np.exp(rng.uniform(*np.log((low, high)))))
-
-
 def _draw_bias(rng: Generator, about: About) -> tuple[float, ...]:
     """Of random size, for the standard motion."""
     size, direction = BIAS * about.standard.torque * rng.uniform(), rng.standard_normal(6)
@@ -141,7 +143,7 @@ def _seed_jitter(truth: Truth, seed: int) -> None:
 CONDITIONS: Final[Model] = {
     "delay_steps": Quantity(lambda rng, _: int(rng.integers(4, 13)), _steps),
     # rad/s of the sine.
-    "frequency": Quantity(lambda rng, _: _logarithmic(rng, 0.5, 2.0), set_frequency),
+    "frequency": Quantity(logarithmic(0.5, 2.0), set_frequency),
     # Share of the scenario's own amplitudes.
     "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.5, 1.0)), set_amplitude),
     "torque_bias": Quantity(_draw_bias, _bias),
@@ -149,7 +151,7 @@ CONDITIONS: Final[Model] = {
     "payload": Quantity(
         lambda rng, a: float(PAYLOAD * a.standard.plate_mass * rng.uniform(-1, 1)), add_payload
     ),
-    "noise": Quantity(lambda rng, _: _logarithmic(rng, *NOISE), add_noise),
+    "noise": Quantity(logarithmic(*NOISE), add_noise),
     "fault": Quantity(_draw_fault, _fault),
     "seed": Quantity(draw_seed, seed_noise),
     "jitter_seed": Quantity(draw_seed, _seed_jitter),

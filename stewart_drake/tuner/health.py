@@ -39,7 +39,6 @@ NAMES: Final = (
 )  # fmt: skip
 """Of the 18; numbers say over how many samples a root mean square is taken."""
 PEAK: Final = NAMES.index("surprise_peak")
-RATIO: Final = NAMES.index("ratio")
 HUGE: Final = 1e6
 """Where what is being lost has no limit, in units of what is usual."""
 LONGEST_DETECTABLE: Final = 0.1

@@ -8,10 +8,10 @@ regret is log J above the least of its curve: what another ratio would have been
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import pydantic.dataclasses
@@ -30,7 +30,8 @@ from stewart_drake.loop.preparation import MakeTuner
 from stewart_drake.loop.weights import health_of
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.studies.families import base_of, condition, draw_family
+from stewart_drake.studies.disturbances import with_gain
+from stewart_drake.studies.families import FamilyName, base_of, condition, draw_family
 from stewart_drake.studies.jobs import MANIFEST, Progress, run_jobs
 from stewart_drake.studies.uncertainty import Draw
 from stewart_drake.tuner.density import NUM_INPUTS, WINDOW, densities
@@ -119,8 +120,7 @@ def cost(ending: Ending, duration: float) -> float:
 
 def at_ratio(scenario: Scenario, ratio: float) -> Scenario:
     """With fixed weights of a ratio."""
-    w_Q, w_R = weights_of(ratio).tolist()
-    return replace(scenario, controller=replace(scenario.controller, w_Q=w_Q, w_R=w_R))
+    return with_gain(scenario, *weights_of(ratio).tolist())
 
 
 def samples_of(scenario: Scenario) -> int:
@@ -289,7 +289,7 @@ _MAX_MANIFEST: Final = 1_000_000
 
 @pydantic.dataclasses.dataclass(config=_STRICT)
 class _Settings:
-    family: Literal["T", "N2"]
+    family: FamilyName
     seed: int
     scenario: dict[str, Any]
 
