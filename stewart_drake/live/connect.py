@@ -2,7 +2,6 @@
 
 import contextlib
 import socket
-from collections.abc import Callable
 from typing import Final
 
 from stewart_drake.files.errors import ConfigError
@@ -48,12 +47,11 @@ def open_endpoint(address: Address, key: bytes | None) -> Endpoint:
     return Endpoint(MachineMessage, host, 0, key)
 
 
-def call(contact: Contact, stopped: Callable[[], bool] = lambda: False) -> MachineMessage:
+def call(contact: Contact) -> MachineMessage:
     """Ask for a session until the machine offers one and the link is known.
 
     Args:
         contact: without a session.
-        stopped: whether to give up.
 
     Returns:
         What the machine last said of itself.
@@ -62,7 +60,7 @@ def call(contact: Contact, stopped: Callable[[], bool] = lambda: False) -> Machi
         ConfigError: nobody answers.
     """
     began, first = now(), 0
-    while not stopped():
+    while True:
         came = _ask(contact)
         first = first or (now() if came else 0)
         if not first and now() - began > _PATIENCE * SECOND:
@@ -74,7 +72,6 @@ def call(contact: Contact, stopped: Callable[[], bool] = lambda: False) -> Machi
         enough = len(contact.link.trips) >= _TRIPS or now() - first > _LONGEST * SECOND
         if first and enough and contact.last is not None:
             return contact.last
-    raise KeyboardInterrupt
 
 
 def await_free(contact: Contact) -> None:

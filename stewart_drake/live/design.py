@@ -18,7 +18,13 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.live.contact import Link
-from stewart_drake.live.protocol import MOST_HISTORY, MOST_ROWS, MachineFlags, MachineMessage
+from stewart_drake.live.protocol import (
+    MOST_HISTORY,
+    MOST_ROWS,
+    SECOND,
+    MachineFlags,
+    MachineMessage,
+)
 from stewart_drake.loop.experiment import Experiment, control_law, first_queue, prepare
 from stewart_drake.scenario.config import (
     EncoderSensorConfig,
@@ -46,7 +52,6 @@ class Design(NamedTuple):
         experiment: of the scenario as it is seen.
         law: that is stepped.
         planned: the motion that it follows from a start at rest at the scenario's first pose.
-        catch_up: s, of the way onto the motion in it.
         queue: (L, 6) torques in flight at a begin, as the scenario says.
         repeats: torques that a packet says again.
         torque_limit: of each motor, N m: the tighter one of the scenario's and of the machine's.
@@ -55,7 +60,6 @@ class Design(NamedTuple):
     experiment: Experiment
     law: PredictiveLqi
     planned: Trajectory
-    catch_up: float
     queue: Array
     repeats: int
     torque_limit: float
@@ -68,10 +72,10 @@ def check_peer(scenario: Scenario, machine: MachineMessage) -> None:
         ConfigError: one line.
     """
     sensor, period = scenario.sensor, scenario.controller.period
-    if round(period * 1e9) != machine.period:
+    if round(period * SECOND) != machine.period:
         raise ConfigError(
             f"controller.period: got {period:g} s; expected the machine's, "
-            f"{machine.period / 1e9:g} s"
+            f"{machine.period / SECOND:g} s"
         )
     encoders = isinstance(sensor, EncoderSensorConfig)
     if encoders != (machine.codes is not None):
@@ -154,7 +158,7 @@ def design(scenario: Scenario, machine: MachineMessage) -> Design:
         ConfigError: as `loop.experiment.prepare` and `control_law`.
     """
     experiment = prepare(scenario)
-    law, planned, catch_up = control_law(experiment)
+    law, planned, _ = control_law(experiment)
     limit = min(law.plant.motors.limit, machine.torque_limit)
     law = replace(law, plant=replace(law.plant, motors=TorqueLimit(limit)))
     repeats = scenario.controller.packet_repeats
@@ -162,4 +166,4 @@ def design(scenario: Scenario, machine: MachineMessage) -> Design:
         repeats = 0
     queue = first_queue(experiment, law)
     assert law.kept < MOST_HISTORY
-    return Design(experiment, law, planned, catch_up, queue, repeats, limit)
+    return Design(experiment, law, planned, queue, repeats, limit)

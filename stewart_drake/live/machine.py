@@ -486,8 +486,8 @@ class Machine:
             MachineFlags.RUNNING: self._running,
             MachineFlags.SAFE: self._safe,
             MachineFlags.LEFT: self.failure is not None,
-            MachineFlags.HOLDS: getattr(self._motors, "holds", True),
-            MachineFlags.WIRE: isinstance(self._motors, WireMotors),
+            MachineFlags.HOLDS: self._motors.holds,
+            MachineFlags.WIRE: self._motors.is_wire,
             MachineFlags.RESETS: self._settings.restart == "rest",
             MachineFlags.SAFE_HOLDS: self._settings.safe == "hold",
         }

@@ -4,7 +4,7 @@ import heapq
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import ClassVar, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,16 @@ class Motors(Protocol):
     """Whether what acts now is of a plan."""
     acted: "deque[tuple[int, Array]]"
     """When the last torques began to act, the newest first."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether the last torque goes on where there is no next one."""
+        ...
+
+    @property
+    def is_wire(self) -> bool:
+        """Whether torques act when they arrive, whatever their play-out times."""
+        ...
 
     def begin(self, queue: Plan) -> None:
         """From now on torques act, first those that are in flight."""
@@ -108,6 +118,7 @@ class PlayoutMotors(_Shafts):
 
     period: int
     holds: bool = True
+    is_wire: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -185,6 +196,8 @@ class WireMotors(_Shafts):
 
     period: int
     delay_of: Callable[[int], int]
+    holds: ClassVar[bool] = True
+    is_wire: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -46,7 +46,6 @@ def prepare_session(
     scenario: Scenario,
     address: Address,
     key: bytes | None = None,
-    stopped: Callable[[], bool] = lambda: False,
 ) -> Ready:
     """Find a machine, find out about the link, and make the law for it.
 
@@ -54,7 +53,6 @@ def prepare_session(
         scenario: whose law and motion it shall be.
         address: of the machine.
         key: shared with it; None for loopback.
-        stopped: whether to give up.
 
     Raises:
         ConfigError: one line, whatever does not fit.
@@ -62,7 +60,7 @@ def prepare_session(
     endpoint = open_endpoint(address, key)
     try:
         contact = Contact(endpoint, address)
-        machine = call(contact, stopped)
+        machine = call(contact)
         check_peer(scenario, machine)
         with one_blas_thread:
             made = design(as_seen(scenario, contact.link, machine), machine)
