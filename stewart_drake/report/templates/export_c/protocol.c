@@ -228,6 +228,16 @@ static int get_head(const uint8_t *data, size_t size, stewart_key key, stewart_h
     return h->session == 0 || h->sequence == 0 ? STEWART_MALFORMED : STEWART_TAKEN;
 }
 
+/* The head of a datagram of a kind, whose body has at least so many bytes. */
+static int get_head_of(const char *magic, size_t least, const uint8_t *data, size_t size,
+                       stewart_key key, stewart_head *h, const uint8_t **at, size_t *body)
+{
+    int refused = get_head(data, size, key, h, at, body);
+    if (refused)
+        return refused;
+    return same_kind(data, magic) && *body >= least ? STEWART_TAKEN : STEWART_MALFORMED;
+}
+
 /* ---------------------------------------------------------------- machine to controller */
 
 #define MACHINE_BODY 84
@@ -279,11 +289,9 @@ int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, ste
     const uint8_t *at;
     size_t body;
     memset(m, 0, sizeof *m);
-    int refused = get_head(data, size, key, &m->head, &at, &body);
+    int refused = get_head_of("STWM", MACHINE_BODY, data, size, key, &m->head, &at, &body);
     if (refused)
         return refused;
-    if (!same_kind(data, "STWM") || body < MACHINE_BODY)
-        return STEWART_MALFORMED;
     m->kind = (uint8_t)get(&at, 1);
     m->samples = (uint8_t)get(&at, 1);
     m->bits = (uint8_t)get(&at, 1);
@@ -343,11 +351,9 @@ int stewart_read_plan(const uint8_t *data, size_t size, stewart_key key, stewart
     const uint8_t *at;
     size_t body;
     memset(m, 0, sizeof *m);
-    int refused = get_head(data, size, key, &m->head, &at, &body);
+    int refused = get_head_of("STWC", CONTROLLER_BODY, data, size, key, &m->head, &at, &body);
     if (refused)
         return refused;
-    if (!same_kind(data, "STWC") || body < CONTROLLER_BODY)
-        return STEWART_MALFORMED;
     m->rows = (uint8_t)get(&at, 1);
     uint64_t zero = get(&at, 3);
     m->sampled = get(&at, 8);
