@@ -108,12 +108,11 @@ def assert_equal(
             assert difference(found, expected) < CLOSE, (seed, name)
 
 
-@pytest.mark.parametrize("part", range(4))
-def test_native_equals_the_virtual_machine(native, part: int) -> None:
-    """100 random machines."""
-    for seed in range(25 * part, 25 * (part + 1)):
+def test_native_equals_the_virtual_machine(native) -> None:
+    """Random machines; `make soak` has a thousand."""
+    for seed in range(20):
         assert_equal(native, seed, QUICK)
-    for seed in range(25 * part, 25 * part + 3):
+    for seed in range(4):
         assert_equal(native, seed)
 
 

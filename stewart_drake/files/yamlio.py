@@ -4,8 +4,10 @@
 these into a pydantic dataclass. Both report the first problem as a one-line `ConfigError`.
 """
 
+import copy
 import dataclasses
 import difflib
+import functools
 import io
 import json
 import re
@@ -118,12 +120,8 @@ def parse_yaml(text: str, where: str) -> Any:
     Raises:
         ConfigError: the text breaks one of the rules.
     """
-    yaml = YAML(typ="safe", pure=True)
-    yaml.max_depth = _MAX_DEPTH
-    yaml.Composer = _StrictComposer
-    yaml.Constructor = _PlainConstructor
     try:
-        return yaml.load(text)
+        return copy.deepcopy(_parsed(text))
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f"line {mark.line + 1}: " if mark else ""
@@ -135,6 +133,16 @@ def parse_yaml(text: str, where: str) -> Any:
     except (YAMLError, ValueError, RecursionError, AssertionError, LookupError) as error:
         problem = _cut((str(error).strip() or type(error).__name__).splitlines()[0], 160)
         raise ConfigError(f"{where}: is not YAML ({problem}); expected plain YAML") from None
+
+
+@functools.lru_cache(maxsize=64)
+def _parsed(text: str) -> Any:
+    """What it says; kept, since a study reads the same few files for each of its runs."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = _MAX_DEPTH
+    yaml.Composer = _StrictComposer
+    yaml.Constructor = _PlainConstructor
+    return yaml.load(text)
 
 
 class _Representer(RoundTripRepresenter):

@@ -18,6 +18,8 @@ from stewart_drake.report.style import (
     legend_above,
     limit,
     panels,
+    plain_log_ticks,
+    powers_of_ten,
 )
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.studies.delay_limits import DelayStudy
@@ -82,6 +84,7 @@ def _margins(
         tolerance = study.systems[0].reach.tolerance
         limit(ax, tolerance, f"tolerance {tolerance:g}")
         ax.set(xlabel=over, ylabel=f"margin of {title}", yscale="log")
+        powers_of_ten(ax.yaxis)
     return figure, axes
 
 
@@ -104,6 +107,7 @@ def growth_figure(study: DelayStudy) -> Figure:
         limit(right, level, f"{word} {level:g}")
     right.axvline(study.eta, color="#666666", lw=1, ls=":")
     right.set(xlabel="delay η  [s]", ylabel="growth $e^{pη}$ at the worst instant", yscale="log")
+    powers_of_ten(right.yaxis)
     right.set(xlim=(0, longest), ylim=(0.7, max(1e4, 3 * 10 ** decades.max())))
     x = study.eta + 0.02 * longest
     right.text(x, 1.0, f"this delay, {study.eta:.3g} s", color="#444444", fontsize=8)
@@ -134,6 +138,7 @@ def loop_figure(study: DelayStudy) -> Figure:
             ax.plot(steps, values, marker=marker, ms=3.5, label=name, **line._asdict())
         ax.axvline(own, color="#666666", lw=1, ls=":")
         ax.set(xlabel="delay μ  [periods]", ylabel=label, yscale="log")
+        plain_log_ticks(ax.yaxis)
         ax.legend(loc="best")
     return figure
 

@@ -11,7 +11,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import (
+    FormatStrFormatter,
+    FuncFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+)
 
 from stewart_drake.files.fileio import replacing
 
@@ -72,6 +78,7 @@ DARK: Final = {
 """What our lines and letters become on a dark page. Any other colour is data and stays."""
 
 FORMATS: Final = ("png", "svg")
+_RAISED: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _PATH: Final = re.compile(rb' d="[^"]*"')
 _DIGITS: Final = re.compile(rb"(\.\d\d)\d+")
 """Beyond the second, which are cut off."""
@@ -128,6 +135,14 @@ def plain_log_ticks(axis: Axis) -> None:
     """Ticks such as 20 and 50 on a logarithmic axis, not powers of ten with a factor."""
     axis.set_major_locator(_RoundTicks(subs=(1, 2, 5)))
     axis.set_major_formatter(FormatStrFormatter("%g"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def powers_of_ten(axis: Axis) -> None:
+    """Ticks such as 10⁻³ on a logarithmic axis, as text: formulas take ten times as long."""
+    axis.set_major_formatter(
+        FuncFormatter(lambda value, _: "10" + f"{round(np.log10(value))}".translate(_RAISED))
+    )
     axis.set_minor_formatter(NullFormatter())
 
 

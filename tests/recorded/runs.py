@@ -10,6 +10,7 @@ has what they report of the last period at its end, and the answers are commands
 
 import hashlib
 import sys
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from scipy.linalg import expm
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.loop.simulation import make_simulator
-from stewart_drake.scenario.loading import load_controller, load_understood
+from stewart_drake.scenario.loading import load_understood
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES
 from stewart_drake.scenario.timing import event_time, look_time
 from tests.backends import switched
@@ -43,11 +44,6 @@ ROWS = tuple(
 )
 
 
-def is_servo(row: str) -> bool:
-    """Whether it is of a controller for servos."""
-    return load_controller(row.split("/")[1]).get("command") == "cranks"
-
-
 def closed_loop(row: str) -> ClosedLoop:
     """The loop of a row."""
     scenario, controller, kind = row.split("/")
@@ -55,9 +51,8 @@ def closed_loop(row: str) -> ClosedLoop:
     return build_closed_loop(load_understood(scenario, controller, settings))
 
 
-def run_servos(row: str) -> tuple[Array, Array]:
+def _run_servos(loop: ClosedLoop) -> tuple[Array, Array]:
     """As `run`, for controllers that send commands to servos."""
-    loop = closed_loop(row)
     simulator = make_simulator(loop)
     context = simulator.get_context()
     period = loop.experiment.scenario.controller.period
@@ -80,11 +75,10 @@ def run_servos(row: str) -> tuple[Array, Array]:
     return np.array(measurements), np.array(commands)
 
 
-def run(row: str) -> tuple[Array, Array]:
+def run(loop: ClosedLoop) -> tuple[Array, Array]:
     """Measurements (n, 12) and torques (n, 6) at the controller's first samples."""
-    if is_servo(row):
-        return run_servos(row)
-    loop = closed_loop(row)
+    if loop.experiment.scenario.controller.command != "torque":
+        return _run_servos(loop)
     simulator = make_simulator(loop)
     context = simulator.get_context()
     period = loop.experiment.scenario.controller.period
@@ -100,9 +94,8 @@ def run(row: str) -> tuple[Array, Array]:
     return np.array(measurements), np.array(torques)
 
 
-def answers(row: str, measurements: Array) -> Array:
-    """Torques (n, 6) that the controller of a row, alone, answers to measurements (n, 12)."""
-    loop = closed_loop(row)
+def answers(loop: ClosedLoop, measurements: Array) -> Array:
+    """Torques (n, 6) that the controller of a loop, alone, answers to measurements (n, 12)."""
     whole = loop.CreateDefaultContext()
     period = loop.experiment.scenario.controller.period
     controller = loop.GetSubsystemByName("controller")
@@ -161,6 +154,7 @@ def made_with() -> str:
     return ", ".join([*releases, digest.hexdigest()[:16]])
 
 
+@cache
 def same_rounding() -> bool:
     """Whether the record was made with what is here."""
     with np.load(FILE) as arrays:
@@ -183,7 +177,7 @@ def main(rows: list[str]) -> None:
     """Record rows anew; without any, those that are missing."""
     kept = load()
     for row in rows or [row for row in ROWS if row not in kept]:
-        kept[row] = run(row)
+        kept[row] = run(closed_loop(row))
         print(row, len(kept[row][1]), "samples")
     arrays = {}
     for row, (measurements, torques) in kept.items():
