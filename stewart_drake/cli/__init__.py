@@ -1,5 +1,6 @@
 """The stewart-drake command. Drake is imported by the commands that need it, not for --help."""
 
+import functools
 import os
 import sys
 from typing import Annotated, Any, Final
@@ -56,10 +57,8 @@ def main(arguments: list[str] | None = None) -> int:
     for argument in sys.argv[1:] if arguments is None else arguments:
         if any("\ud800" <= letter <= "\udfff" for letter in argument):  # an undecodable byte
             return _complain(f"{argument!r}: is not UTF-8 text; expected names in UTF-8")
-    add_examples(app)
-    command = typer.main.get_command(app)
     try:
-        return command.main(arguments, "stewart-drake", standalone_mode=False) or 0
+        return _command().main(arguments, "stewart-drake", standalone_mode=False) or 0
     except _UsageError as error:
         return _complain(_usage_message(error))
     except typer.Abort:  # Ctrl-C in a command that has nothing to keep
@@ -75,6 +74,13 @@ def main(arguments: list[str] | None = None) -> int:
         return _complain(str(error))
     finally:
         release()
+
+
+@functools.cache
+def _command() -> Any:
+    """All of it, as typer hands it to click; made once, also where a process runs many commands."""
+    add_examples(app)
+    return typer.main.get_command(app)
 
 
 def _prepare_surroundings() -> None:
