@@ -7,7 +7,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import lognorm, uniform
 
 from stewart_drake.scenario.config import (
     ControllerConfig,
@@ -97,6 +96,8 @@ def releases(period: float, delays: Array, delay: Delay) -> tuple[NDArray[np.int
 
 def times_under_way(config: PacketsConfig) -> Any:
     """The distribution of the time in s that a packet takes, as scipy has it."""
+    from scipy.stats import lognorm, uniform  # a fifth of a second, which others need not wait
+
     if config.distribution == "uniform":
         return uniform(config.low, max(config.high - config.low, 1e-12))
     assert config.sigma is not None and config.median is not None  # or it is refused
