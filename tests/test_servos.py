@@ -31,6 +31,7 @@ from stewart_drake.loop.servo_design import compose_servo_law, servo_loop
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.mechanism.rotors import with_rotors
 from stewart_drake.scenario.config import ServoActuatorConfig, TorqueActuatorConfig
+from stewart_drake.scenario.link import measurement_times
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.scenario.timing import look_time, servo_ticks
@@ -396,6 +397,16 @@ def test_lost_and_late_measurements_cost_little() -> None:
     assert result.summary["counts"]["measurements_missing"] > 10
     clean = run(*more, controller="servo_feedforward")
     assert result.accumulated_error < 4 * clean.accumulated_error < 0.05
+
+
+def test_more_lost_reports_than_there_are_periods_in_one_are_borne() -> None:
+    """What acted is not known then: the observer begins anew with what it had found."""
+    lossy = scenario(
+        *ON, "sensor.loss=0.85", "sensor.seed=4", "duration=4", controller="servo_feedforward"
+    )
+    there = np.flatnonzero(np.isfinite(measurement_times(lossy)))
+    assert np.diff(there).max() == 18 > compose_servo_law(prepare(lossy)).reports.periods
+    assert sd.simulate(lossy).status == "completed"
 
 
 def law_and_memory(**fields: Any) -> tuple[Any, Any]:
