@@ -20,7 +20,7 @@ from stewart_drake.law.servos import (
     ReportLayout,
     Segment,
     ServoLoop,
-    crank_inertia,
+    crank_mobility,
     mean_inertia,
     still,
     turned,
@@ -76,7 +76,7 @@ def test_the_energy_of_the_cranks_is_that_of_the_pose(seed: int) -> None:
     pose = HOME + 0.02 * rng.standard_normal(6)
     rates = rng.standard_normal(6)
     turning = crank_rates(pose, rates)
-    energy = turning @ crank_inertia(DYNAMICS, pose) @ turning / 2
+    energy = turning @ np.linalg.inv(crank_mobility(DYNAMICS, pose)) @ turning / 2
     assert energy == pytest.approx(DYNAMICS.energy(pose, rates), rel=1e-7)
 
 
@@ -302,7 +302,7 @@ def test_a_constant_bias_leaves_itself_over_the_stiffness(kind: str) -> None:
 @pytest.mark.parametrize("mode", range(6))
 def test_each_mode_follows_as_a_second_order_system(mode: int) -> None:
     """Plate over setpoint (w^2 + 2 d w s) / (s^2 m/J + 2 d w s + w^2), for small motions."""
-    inertias, shapes = np.linalg.eigh(crank_inertia(DYNAMICS, HOME))
+    inertias, shapes = np.linalg.eigh(np.linalg.inv(crank_mobility(DYNAMICS, HOME)))
     to_cranks = np.column_stack([crank_rates(HOME, unit) for unit in np.eye(6)])
     shape = np.linalg.solve(to_cranks, shapes[:, mode])
     omega, size = 12.0, 2e-4

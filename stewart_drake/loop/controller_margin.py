@@ -51,6 +51,7 @@ _COSTLY: Final = 150
 _LARGEST: Final = 330
 """Rows of a loop above which it is not judged: fifty periods of delay, seconds."""
 _FEWEST: Final = 6
+_UNJUDGED: Final = Margins(*[math.nan] * 4)
 
 
 @dataclass(frozen=True)
@@ -76,14 +77,14 @@ class ControllerMargin:
 
     period: float
     eta: float
-    radius: float
-    time: float
-    margins: Margins
-    pole: float
-    pole_time: float
-    estimated: bool
-    delay_found: bool
-    tuned: bool
+    radius: float = math.nan
+    time: float = math.nan
+    margins: Margins = _UNJUDGED
+    pole: float = 0.0
+    pole_time: float = 0.0
+    estimated: bool = False
+    delay_found: bool = False
+    tuned: bool = False
     problem: str = ""
     loops: tuple[LinearLoop, ...] = field(default=(), repr=False)
     span: float = 0.0
@@ -159,7 +160,7 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
     fastest = int(np.argmax(poles))
     queue = max(sc.true_delay.steps + 1, law.timeline.queue_length)
     rows = 12 + 6 * law.cost.integrates + 6 * queue
-    radius, time, margins = math.nan, math.nan, Margins(*[math.nan] * 4)
+    radius, time, margins = math.nan, math.nan, _UNJUDGED
     problem, loops = "", list[LinearLoop]()
     if not all(inside):
         problem = "the true machine does not reach all of the reference"
@@ -206,14 +207,6 @@ def _at_the_machine(experiment: Experiment, end: float) -> ControllerMargin:
     return ControllerMargin(
         period=experiment.scenario.controller.period,
         eta=experiment.scenario.eta,
-        radius=math.nan,
-        time=math.nan,
-        margins=Margins(*[math.nan] * 4),
-        pole=0.0,
-        pole_time=0.0,
-        estimated=False,
-        delay_found=False,
-        tuned=False,
         problem="servos close theirs at the machine, and nothing is fed back across the delay",
         span=end,
     )
