@@ -125,6 +125,9 @@ def configuration(law: PredictiveLqi) -> NDArray[np.void]:
     return config
 
 
+_PARTS: Final = ("measurement", "error", "integral", "torque", "feedforward", "weights")
+
+
 @dataclass(frozen=True)
 class NativeMemory:
     """A memory of the law in C, which reads as a `law.memory.Memory`.
@@ -144,35 +147,11 @@ class NativeMemory:
         """(length, 6)."""
         return self._part("in_flight")[: self.length]
 
-    @property
-    def measurement(self) -> Array:
-        """(12,)."""
-        return self._part("measurement")
-
-    @property
-    def error(self) -> Array:
-        """(6,)."""
-        return self._part("error")
-
-    @property
-    def integral(self) -> Array:
-        """(6,)."""
-        return self._part("integral")
-
-    @property
-    def torque(self) -> Array:
-        """(6,)."""
-        return self._part("torque")
-
-    @property
-    def feedforward(self) -> Array:
-        """(6,)."""
-        return self._part("feedforward")
-
-    @property
-    def weights(self) -> Array:
-        """(2,)."""
-        return self._part("weights")
+    def __getattr__(self, name: str) -> Array:
+        """What is called, and is, as in `Memory`."""
+        if name not in _PARTS:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return self._part(name)
 
     @property
     def gain(self) -> Array:

@@ -34,10 +34,10 @@ from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
 from stewart_drake.scenario.signals import USUAL_COULOMB_SPEED
 from stewart_drake.scenario.timing import (
     METRIC_PERIOD,
-    bound_problem,
     log_problem,
     samples_problem,
     step_problem,
+    whole_problem,
 )
 
 
@@ -664,7 +664,7 @@ class Scenario:
         fraction, bound, samples = self.delay.fraction, None, None
         if isinstance(link, NetworkConfig):
             fraction = 0.0
-            bound = None if link.playout is None else bound_problem(link.playout, step)
+            bound = link.playout and whole_problem("link.playout", link.playout, step)
         if isinstance(sensor, EncoderSensorConfig):
             samples = samples_problem(sensor.samples, period, step)
         logged = log_problem(self.log_period, self.duration, step)
