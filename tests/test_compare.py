@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import joblib
 import numpy as np
@@ -12,7 +13,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.loading import load_comparison, load_scenario
 from stewart_drake.studies.compare import (
     ADAPTIVE,
     CONTROLLERS,
@@ -132,3 +133,36 @@ def test_the_true_delay_counts_with_its_fraction():
 def test_a_delay_beyond_all_numbers_still_has_a_verdict():
     text = str(Verdict(eta=1000.0, pole=5.0, time=2.0))
     assert "beatable: no" in text and "3.0e2171 fold" in text
+
+
+# ---------------------------------------------------------------- rows of a file's `compare`
+
+
+def test_a_rows_own_controller_starts_from_the_files_folder(tmp_path, monkeypatch):
+    (tmp_path / "mine.yaml").write_text("w_Q: 7.0\n")
+    (tmp_path / "other").mkdir()
+    file = tmp_path / "scenario.yaml"
+    file.write_text("compare: {own: {controller: ./mine.yaml}}\n")
+    monkeypatch.chdir(tmp_path / "other")
+    assert load_comparison(file, ["lqi"])["own"].controller.w_Q == 7
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("{actuator: 5}", "actuator: got 5; expected a mapping"),
+        ("{actuator: {foo: 1}}", "actuator.foo: unknown key"),
+        ("{actuator: {torque_limit: -1}}", "actuator.torque_limit: got -1; expected a number"),
+        ("{actuator: {bandwidth: -3}}", "actuator.bandwidth: got -3"),
+        ("{known: 5}", "known: got 5; expected text"),
+        ("{controller: [./a.yaml]}", "controller: got ['./a.yaml']; expected text"),
+    ],
+)
+def test_a_bad_row_is_refused_in_one_line(row, message, tmp_path):
+    file = tmp_path / "scenario.yaml"
+    file.write_text(f"compare: {{lqi: {row}}}\n")
+    with pytest.raises(ConfigError, match=re.escape(message)) as caught:
+        load_comparison(file, ["lqi"])
+    assert len(str(caught.value).splitlines()) == 1
+    with pytest.raises(ConfigError, match=re.escape("compare.lqi: " + message)):
+        load_scenario(file)

@@ -1,6 +1,7 @@
 """The loop of a controller and its plant: stable or not, its margins, and what is said of it."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,18 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.resources import resolve
 from stewart_drake.law.delay_model import sample, sample_in_steps
-from stewart_drake.law.limits import is_stable, spectral_radius
+from stewart_drake.law.limits import fastest_pole, is_stable, spectral_radius
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
 from stewart_drake.loop.cautions import cautions_after, cautions_before, coarse_step
-from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.loop.controller_margin import (
+    ControllerMargin,
+    controller_margin,
+    true_model,
+)
 from stewart_drake.loop.experiment import believed_queue, control_law, prepare, true_dynamics
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE
 from stewart_drake.scenario.trajectories import evaluate
@@ -293,6 +299,25 @@ def test_a_controller_slower_than_its_period_is_told(median: float, said: bool) 
     assert [f"took {median} ms at the median" in line for line in found] == [True] * said
 
 
+def test_the_fastest_pole_is_told_where_it_is(tmp_path: Path) -> None:
+    """On the way to a side that the true machine does not reach, and then up, where it falls."""
+    path = tmp_path / "short.yaml"
+    path.write_text(mechanism_yaml(replace(PAPER, crank_lengths=0.6 * PAPER.crank_lengths)))
+    way = ((0.0, 0.38), (0.12, 0.38), (0.0, 0.38), (0.0, 0.43), (0.0, 0.38))
+    poses = [[0.0, 0.0, 0.0, x, 0.0, z] for x, z in way]
+    motion = ("reference.times=[0, 1, 2, 3, 4]", f"reference.poses={poses}", "duration=4")
+    sc = scenario(
+        f"plant.mechanism={path}", "reference.kind=waypoints", *motion, "start=on_reference",
+        name="gravity",
+    )  # fmt: skip
+    experiment = prepare(sc)
+    found = controller_margin(experiment)
+    truth = true_dynamics(experiment)
+    assert "does not reach" in found.problem and found.pole > 0
+    again = fastest_pole(true_model(experiment, truth, found.pole_time).A)
+    assert found.pole == pytest.approx(again, rel=1e-12)
+
+
 # ---------------------------------------------------------------- the engine's step
 
 
@@ -345,6 +370,13 @@ def test_shipped_scenarios_are_warned_only_where_the_step_is_too_coarse() -> Non
     assert said is not None and "plant.time_step=0.0002 would do" in said
     finer = scenario("plant.time_step=0.0002", name="gravity")
     assert coarse_step(prepare(finer), judged(finer)) is None
+    # With a log of 0.75 ms, of which 0.2 ms are no part, nor 0.1.
+    logged = scenario("plant.time_step=0.00025", "log_period=0.00075", name="gravity")
+    margin = replace(judged(logged), _growths={0.00025: 1e9, 0.0002: 1.0, 0.0001: 1.0, 5e-5: 1.0})
+    said = coarse_step(prepare(logged), margin)
+    assert said is not None and "plant.time_step=5e-05 would do" in said
+    logged.plant.time_step = 5e-5
+    logged.check()
 
 
 def test_one_engine_step_is_semi_implicit_euler() -> None:

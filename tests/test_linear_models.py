@@ -64,6 +64,15 @@ def test_they_are_the_loop_that_the_margins_judge(controller, settings):
     assert radius == pytest.approx(spectral_radius(loop.matrix()), rel=1e-6)
 
 
+def test_a_delay_that_is_estimated_has_been_found():
+    """The loop that the margins judge, whatever the controller believed at first."""
+    wrong = ("controller.delay_steps=4",)
+    experiment = prepare(sd.load_scenario("paper", "adaptive_lqi", wrong))
+    judged = controller_margin(experiment)
+    radius = spectral_radius(loop_at(experiment, judged.time).matrix())
+    assert radius == pytest.approx(judged.radius, rel=1e-9)
+
+
 def test_gain_margin_of_the_models_is_that_of_the_summary():
     experiment = prepare(sd.load_scenario("paper"))
     margin = controller_margin(experiment)

@@ -13,8 +13,10 @@ from pydrake.systems.framework import Context
 from scipy.integrate import quad_vec
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop import metrics
 from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.multibody import add_mechanism, set_pose
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import make_simulator, simulate
@@ -441,3 +443,14 @@ def test_joints_of_an_exact_run_fit_the_sdformat_model() -> None:
     assert run.status == "completed"
     assert len(run.signals.time) == 501
     assert worst < 1e-12
+
+
+def test_only_a_leg_is_short_by_millimetres() -> None:
+    """A parallel singularity has no unit."""
+    turned = "reference.offset=[-1.2112, 0.7651, 0.8994, -0.0246, -0.0499, 0.326]"
+    with pytest.raises(ConfigError, match="parallel singularity") as caught:
+        prepare(load_scenario("paper", settings=["reference.kind=hold", turned]))
+    assert " mm, home" in str(caught.value) and "short by" not in str(caught.value)
+    high = "reference.offset=[0, 0, 0, 0, 0, 0.6]"
+    with pytest.raises(ConfigError, match=r"reached the end of its reach .*, short by [\d.]+ mm"):
+        prepare(load_scenario("paper", settings=["reference.kind=hold", high]))

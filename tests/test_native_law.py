@@ -325,6 +325,10 @@ def test_a_part_of_ones_own_is_stepped_in_python(library) -> None:
     assert uncovered(Mine(**{name: getattr(law, name) for name in law.__dataclass_fields__})) == (
         "law"
     )
+    settings = law.observer.settings
+    wary = replace(settings.parameters, usual=2 * settings.parameters.std)
+    observer = replace(law.observer, settings=replace(settings, parameters=wary))
+    assert uncovered(replace(law, observer=observer)) == "controller.known"  # C knows one std
     with switched(None):
         assert serving(law).backend == "native"
         assert serving(mine) == (mine, "python (controller.rejoin)")

@@ -23,6 +23,8 @@ from stewart_drake.loop.preparation import preparation_of
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.loop.sensor import Sensor, white_noise, white_noises
 from stewart_drake.loop.simulation import simulate
+from stewart_drake.mechanism.files import mechanism_yaml
+from stewart_drake.mechanism.geometry import Body
 from stewart_drake.native import library
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.timing import look_time
@@ -317,6 +319,20 @@ def test_a_late_truth_that_is_not_believed_has_the_same_preparation() -> None:
     assert preparation_of(scenario("paper", "duration=2", "delay.fraction=0.1")) is not first
     assert preparation_of(scenario("paper", "duration=2", "controller.delay_steps=7")) is not first
     assert preparation_of(scenario("paper", "duration=2", "controller.catch_up=1")) is not first
+
+
+def test_the_machine_of_the_scenarios_plant_is_run(tmp_path: Path) -> None:
+    """Twice as heavy as the controller knows it; and a file that changes is read again."""
+    path, plate = tmp_path / "true.yaml", PAPER.plate
+    heavy = Body(2 * plate.mass, 2 * plate.inertia)
+    path.write_text(mechanism_yaml(dataclasses.replace(PAPER, plate=heavy)))
+    one = scenario("paper", f"plant.mechanism={path}", "duration=1", *FOLLOWS)
+    found = run_in_bulk(one)
+    assert found.loop == "native"
+    assert_same(found, drake(one))
+    path.write_text(mechanism_yaml(PAPER))
+    os.utime(path, ns=(1, 1))
+    assert_same(run_in_bulk(one), run_in_bulk(scenario("paper", "duration=1", *FOLLOWS)))
 
 
 def test_another_mechanism_file_is_another_preparation(tmp_path: Path) -> None:

@@ -11,11 +11,13 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from stewart_drake.dynamics import open_loop
-from stewart_drake.dynamics.open_loop import Course, Drive, IntegrationError, integrate
+from stewart_drake.dynamics.native_plant import NativePlant
+from stewart_drake.dynamics.open_loop import Course, Drive, IntegrationError, in_c, integrate
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.native import build
+from stewart_drake.native.plant import Ended
 from stewart_drake.scenario.signals import POSE, RATES
 from tests.backends import switched
 from tests.mechanisms import PAPER, random_mechanism
@@ -189,11 +191,22 @@ def test_several_looks_at_one_instant_and_at_the_start() -> None:
     assert np.array_equal(found.states[2], found.states[3])
     alone = integrate(HEAVY, AT_HOME, [SWING], [0.0], 1e-9)
     assert alone.end == 0 and alone.steps == 0 and np.array_equal(alone.final, AT_HOME)
+    assert np.array_equal(alone.times, [0.0]) and np.array_equal(alone.states, [AT_HOME])
 
 
 def test_torques_beyond_all_bounds_end_in_an_error() -> None:
     with pytest.raises(IntegrationError, match="no step is short enough at t = 0 s"):
         integrate(HEAVY, AT_HOME, [Drive(np.full(6, 1e300))], [0.1])
+
+
+def test_where_there_is_no_number_steps_are_cut_to_a_fifth(backend: str) -> None:
+    """As scipy does: ln(0.1 / 16 eps) / ln 5 steps of eleven evaluations at the most."""
+    if backend == "0":
+        pytest.skip("those are scipy's own")
+    plant = NativePlant(HEAVY, AT_HOME, np.array([0.1]), 1e-9, math.inf)
+    ended = plant.call("open_loop", *in_c([Drive(np.full(6, np.nan))]))
+    assert ended == Ended.TOO_SHORT_STEPS
+    assert plant.run.evaluations < 30 * 11
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,9 @@ import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Packets, Report, Wire
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.loop.controller import reported
 from stewart_drake.loop.diagram import build_closed_loop
+from stewart_drake.loop.experiment import compose_law, prepare
 from stewart_drake.loop.late_measurements import LateMeasurements
 from stewart_drake.loop.playout import PlayoutBuffer
 from stewart_drake.loop.simulation import make_simulator
@@ -343,6 +345,24 @@ def test_the_most_probable_content_is_believed() -> None:
     assert believed[-5:, 0].tolist() == [7, 7, 12, 13, 14]
 
 
+def test_packets_that_come_later_than_reports_tell_of_are_borne() -> None:
+    """Of a packet that was not there when it was last told of, nobody knows whether it is."""
+    channel = Packets(1, 0, (0.5,), (0.0, 0.2, 0.4, 1.0, 1.0, 1.0), told=2)
+    sent = channel.start()
+    for k in range(6):
+        sent = channel.send(sent, np.full((1, 6), 10.0 + k), np.zeros((6, 6)))
+    none = np.zeros(6, dtype=bool)
+    late = dataclasses.replace(channel, in_time=(1.0,))
+    # (1 - 0.4) / (1 - 0.4): it takes four periods, and is there by then.
+    assert late._expected(sent.packets, none, 3, 0)[0] == 12
+    # All were told of after four periods, by when every packet is there: this one is lost.
+    assert dataclasses.replace(late, told=4)._expected(sent.packets, none, 3, 0) is None
+    law = compose_law(prepare(scenario("link.kind=network")))
+    assert isinstance(law.channel, Packets) and law.channel.told == reported(law.kept)
+    slow = run("link.kind=network", "link.loss=0", "link.high=2.5", "link.playout=2.3", *LONG)
+    assert slow.status == "completed"
+
+
 def test_a_channel_refuses_chances_of_other_rows() -> None:
     with pytest.raises(ValueError, match="in_time: got 1 values; expected 3"):
         Packets(2, 1, in_time=(1.0,), arrived_by=(0.0,))
@@ -391,6 +411,15 @@ def test_the_bound_is_a_whole_number_of_a_multibody_plants_steps() -> None:
         scenario(*multibody, "link.playout=0.6535")
     with pytest.raises(ConfigError, match=r"link\.median: got null"):
         scenario(*multibody, "link.distribution=lognormal")
+
+
+def test_a_network_on_which_nothing_ever_comes_is_refused_at_once() -> None:
+    for times in ("link.low=0", "link.high=1e4"), ("link.playout=101",):
+        with pytest.raises(ConfigError, match="torques wait for more than 1000 periods"):
+            scenario("link.kind=network", *times)
+    slow = "link.return={distribution: lognormal, median: 1.0e6, sigma: 10}"
+    with pytest.raises(ConfigError, match=r"link\.return: got measurements"):
+        compose_law(prepare(scenario("link.kind=network", slow)))
 
 
 def test_without_reports_the_law_goes_on_what_is_probable() -> None:

@@ -20,7 +20,7 @@ from stewart_drake.law.servos import (
     ReportLayout,
     Segment,
     ServoLoop,
-    crank_inertia,
+    crank_mobility,
     mean_inertia,
     still,
     turned,
@@ -31,6 +31,7 @@ from stewart_drake.loop.servo_design import compose_servo_law, servo_loop
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.mechanism.rotors import with_rotors
 from stewart_drake.scenario.config import ServoActuatorConfig, TorqueActuatorConfig
+from stewart_drake.scenario.link import measurement_times
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.scenario.timing import look_time, servo_ticks
@@ -75,7 +76,7 @@ def test_the_energy_of_the_cranks_is_that_of_the_pose(seed: int) -> None:
     pose = HOME + 0.02 * rng.standard_normal(6)
     rates = rng.standard_normal(6)
     turning = crank_rates(pose, rates)
-    energy = turning @ crank_inertia(DYNAMICS, pose) @ turning / 2
+    energy = turning @ np.linalg.inv(crank_mobility(DYNAMICS, pose)) @ turning / 2
     assert energy == pytest.approx(DYNAMICS.energy(pose, rates), rel=1e-7)
 
 
@@ -301,7 +302,7 @@ def test_a_constant_bias_leaves_itself_over_the_stiffness(kind: str) -> None:
 @pytest.mark.parametrize("mode", range(6))
 def test_each_mode_follows_as_a_second_order_system(mode: int) -> None:
     """Plate over setpoint (w^2 + 2 d w s) / (s^2 m/J + 2 d w s + w^2), for small motions."""
-    inertias, shapes = np.linalg.eigh(crank_inertia(DYNAMICS, HOME))
+    inertias, shapes = np.linalg.eigh(np.linalg.inv(crank_mobility(DYNAMICS, HOME)))
     to_cranks = np.column_stack([crank_rates(HOME, unit) for unit in np.eye(6)])
     shape = np.linalg.solve(to_cranks, shapes[:, mode])
     omega, size = 12.0, 2e-4
@@ -396,6 +397,16 @@ def test_lost_and_late_measurements_cost_little() -> None:
     assert result.summary["counts"]["measurements_missing"] > 10
     clean = run(*more, controller="servo_feedforward")
     assert result.accumulated_error < 4 * clean.accumulated_error < 0.05
+
+
+def test_more_lost_reports_than_there_are_periods_in_one_are_borne() -> None:
+    """What acted is not known then: the observer begins anew with what it had found."""
+    lossy = scenario(
+        *ON, "sensor.loss=0.85", "sensor.seed=4", "duration=4", controller="servo_feedforward"
+    )
+    there = np.flatnonzero(np.isfinite(measurement_times(lossy)))
+    assert np.diff(there).max() == 18 > compose_servo_law(prepare(lossy)).reports.periods
+    assert sd.simulate(lossy).status == "completed"
 
 
 def law_and_memory(**fields: Any) -> tuple[Any, Any]:

@@ -101,5 +101,4 @@ def _factor(operand: str) -> str:
 
 
 def _literal(value: float) -> str:
-    text = repr(value)
-    return f"(real){text}"
+    return f"(real){value!r}"

@@ -17,7 +17,7 @@ Shape = tuple[int, ...]
 
 
 class NativeFunction(Buffered):
-    """A function of native/dynamics.c: one buffer with arguments, geometry and results.
+    """A function of native/packed.c: one buffer with arguments, geometry and results.
 
     Args:
         library: what holds it.

@@ -6,6 +6,7 @@ advance, and of those before only as of the last report. The law goes on what th
 probably* play: averaging over what it might play is worse, as it will never play the average.
 """
 
+import sys
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
@@ -117,6 +118,8 @@ class Packets:
         arrived_by: the same by so many periods after it was sent, 0 among them; as many packets are
             remembered.
         holds: whether a dry buffer holds the last torque, or puts out zero.
+        told: periods that a report looks back: of older packets that had not arrived by then it
+            does not tell whether they have since.
     """
 
     torques: int
@@ -124,6 +127,7 @@ class Packets:
     in_time: tuple[float, ...]
     arrived_by: tuple[float, ...]
     holds: bool = True
+    told: int = sys.maxsize
 
     def __post_init__(self) -> None:
         if len(self.in_time) != self.repeats + self.torques:
@@ -182,8 +186,8 @@ class Packets:
             here = 1.0 if arrived[-i] else self.in_time[row]
             if since < kept and i > since and not arrived[-i]:
                 # Bayes: it had not arrived when the report was made.
-                before = self.arrived_by[i - since]
-                here = max(0.0, (here - before) / (1 - before))
+                before = self.arrived_by[min(i - since, self.told)]
+                here = max(0.0, here - before) / (1 - before) if before < 1 else 0.0
             if row <= self.repeats:
                 decided += left * here
                 chances = [(SURE * decided, packets[-i, row])]

@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from stewart_drake.dynamics.native_functions import NativeFunction
 from stewart_drake.law.riccati import RiccatiError
+from stewart_drake.native.law_layout import MAX_ORDER
 from stewart_drake.scenario.signals import NUM_TORQUES
 
 Array = NDArray[np.float64]
-
-MAX_ORDER = 24
-"""States, at the most."""
 
 
 class Doubling:

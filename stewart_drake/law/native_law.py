@@ -61,22 +61,20 @@ def uncovered(law: PredictiveLqi) -> str | None:
 
     Parts of one's own count as other kinds of that field.
     """
-    late = type(law.observer) is LateObserver
-    observer: Any = law.observer.observer if isinstance(law.observer, LateObserver) else None
-    observer = observer if late else law.observer
-    timeline, dynamics, estimated = law.timeline, law.plant.dynamics, PARAMETERS
-    correlated = False
+    observer: Any = law.observer
+    if type(observer) is LateObserver:
+        observer = observer.observer
+    timeline, dynamics, estimated, known = law.timeline, law.plant.dynamics, PARAMETERS, False
     if isinstance(observer, ParameterObserver):
         prior = observer.settings.parameters
-        # A prior whose errors go together, which a set of parameters may have or not.
-        estimated, correlated = prior.names, getattr(prior, "correlation", None) is not None
+        estimated, known = prior.names, prior.correlation is not None or prior.usual is not None
     covered = {
         "law": type(law) is PredictiveLqi and type(law.plant) is NominalPlant,
         "plant.kind": type(dynamics) is StewartDynamics,
         "controller.delay_estimator": not isinstance(observer, DelayObserver),
         "controller.estimator": type(observer) in _OBSERVERS and type(timeline) is Timeline,
         "controller.prior": estimated == PARAMETERS and dynamics.free == PARAMETERS,
-        "controller.known": not correlated,
+        "controller.known": not known,
         "controller.rejoin": type(law.planner) is NoPlanner,
         "controller.prediction": type(law.predictor) is NonlinearPredictor,
         "controller.feedforward": type(law.feedforward) is InverseDynamicsFeedforward,
@@ -127,6 +125,9 @@ def configuration(law: PredictiveLqi) -> NDArray[np.void]:
     return config
 
 
+_PARTS: Final = ("measurement", "error", "integral", "torque", "feedforward", "weights")
+
+
 @dataclass(frozen=True)
 class NativeMemory:
     """A memory of the law in C, which reads as a `law.memory.Memory`.
@@ -146,35 +147,11 @@ class NativeMemory:
         """(length, 6)."""
         return self._part("in_flight")[: self.length]
 
-    @property
-    def measurement(self) -> Array:
-        """(12,)."""
-        return self._part("measurement")
-
-    @property
-    def error(self) -> Array:
-        """(6,)."""
-        return self._part("error")
-
-    @property
-    def integral(self) -> Array:
-        """(6,)."""
-        return self._part("integral")
-
-    @property
-    def torque(self) -> Array:
-        """(6,)."""
-        return self._part("torque")
-
-    @property
-    def feedforward(self) -> Array:
-        """(6,)."""
-        return self._part("feedforward")
-
-    @property
-    def weights(self) -> Array:
-        """(2,)."""
-        return self._part("weights")
+    def __getattr__(self, name: str) -> Array:
+        """What is called, and is, as in `Memory`."""
+        if name not in _PARTS:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return self._part(name)
 
     @property
     def gain(self) -> Array:

@@ -191,9 +191,8 @@ class ServoPreview:
         if said is not None:
             torques = said.torques
         elif belief.has_state:
-            measured, fresh = belief.measured, Belief.nothing
-            belief = fresh(self.timeline, self.sensing.size, belief.parameters)
-            belief = replace(belief, measured=measured)
+            fresh = self.observer.start(self.timeline, self.sensing, self.plant)
+            belief = replace(fresh.assuming(belief.parameters), measured=belief.measured)
         return self.observer.observe(belief, measurement, torques, self.sensing, self.plant)
 
     def _ahead(self, last: Array, wanted: Array, belief: Belief) -> tuple[Array, str | None]:

@@ -46,11 +46,6 @@ def crank_mobility(dynamics: StewartDynamics, pose: Array) -> Array:
     return np.asarray(map_.T @ np.linalg.solve(dynamics.mass_matrix(pose), map_))
 
 
-def crank_inertia(dynamics: StewartDynamics, pose: Array) -> Array:
-    """H (6, 6) in kg m^2, of which Jac' H Jac is the mass matrix in pose coordinates."""
-    return np.linalg.inv(crank_mobility(dynamics, pose))
-
-
 def mean_inertia(dynamics: StewartDynamics) -> float:
     """J in kg m^2."""
     mobility = crank_mobility(dynamics, dynamics.mechanism.home)

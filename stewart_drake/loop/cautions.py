@@ -12,7 +12,6 @@ from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.results import RunSummary
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.timing import step_problem
 
 TOLERABLE: Final = 1e5
 """Growth of an error along the motion, by a step of the plant, up to which nothing is said.
@@ -61,12 +60,9 @@ def coarse_step(experiment: Experiment, margin: ControllerMargin) -> str | None:
 
 def _finer(scenario: Scenario) -> Iterator[float]:
     """Smaller steps of one digit that suit the scenario's periods, s, the largest first."""
-    sc = scenario
     for exponent, digit in product(range(-2, -7, -1), (5, 2, 1)):
         step = float(f"{digit}e{exponent}")
-        if step < sc.plant.time_step and not step_problem(
-            step, sc.controller.period, sc.true_delay.fraction
-        ):
+        if step < scenario.plant.time_step and not scenario.step_problem(step):
             yield step
 
 

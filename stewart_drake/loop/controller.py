@@ -1,19 +1,12 @@
 """The control law as a Drake system."""
 
-import time
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue, Value
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    LeafSystem,
-    State,
-    ValueProducer,
-)
+from pydrake.systems.framework import Context
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.law.channel import Packets, Report
@@ -23,7 +16,7 @@ from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.native_law import AnyMemory, serving
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.lifetime import weak
-from stewart_drake.loop.sampling import update_every
+from stewart_drake.loop.sampling import Sample, SteppedLaw
 from stewart_drake.scenario.signals import (
     NUM_PARAMETERS,
     NUM_REFERENCE,
@@ -55,19 +48,7 @@ def reported(kept: int) -> int:
     return kept + 1
 
 
-class Sample(NamedTuple):
-    """What one step of the law left behind."""
-
-    memory: AnyMemory
-    seconds: float
-    """Time that it took to compute; 0 before the first."""
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Sample":
-        """Drake copies what it keeps; nobody changes a memory, so that itself will do."""
-        return self
-
-
-class DelayLqiController(LeafSystem):
+class DelayLqiController(SteppedLaw):
     """Predictive LQI, whatever parts its law is made of; in C where that is the same (`backend`).
 
     With m the memory (`law.memory.Memory`) and `step` the law (`law.predictive_lqi.PredictiveLqi`):
@@ -118,8 +99,7 @@ class DelayLqiController(LeafSystem):
         super().__init__()
         self._law, self._motion = law, motion
         self._served, self.backend = serving(law)
-        first = Sample(self._served.initial_memory(queue), 0.0)
-        self._memory = self.DeclareAbstractState(Value(first))
+        first = self._served.initial_memory(queue)
         self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
         self._times = law.preview_times
         preview_size = NUM_REFERENCE * len(self._times)
@@ -130,45 +110,24 @@ class DelayLqiController(LeafSystem):
         sends = isinstance(law.channel, Packets)
         size = reported(law.kept) * (1 + NUM_TORQUES)
         self._report = self.DeclareVectorInputPort("report", size) if sends else None
-        memory_ticket = self.abstract_state_ticket(self._memory)
-        self._step = self.DeclareCacheEntry(
-            "step",
-            ValueProducer(allocate=lambda: Value(first), calc=weak(self._calc_step)),
-            {self.all_input_ports_ticket(), memory_ticket},
-        )
-        self.DeclareVectorOutputPort(
-            "torque", NUM_TORQUES, weak(self._torque), {self._step.ticket()}
-        )
-        self.DeclareVectorOutputPort(
-            "estimate", NUM_STATE, weak(self._estimate), {self._step.ticket()}
-        )
+        self._begin(first, law.timeline.period)
+        self._put_out("torque", NUM_TORQUES, lambda m: m.torque, now=True)
+        self._put_out("estimate", NUM_STATE, lambda m: m.belief.state, now=True)
         self.DeclareAbstractOutputPort(
-            "memory", lambda: Value(first), weak(self._left), {self._step.ticket()}
+            "memory", lambda: Value(Sample(first, 0.0)), weak(self._left), {self._step.ticket()}
         )
         if sends:
-            size = first.memory.sent.packets[0].size
-            self.DeclareVectorOutputPort("plan", size, weak(self._plan), {self._step.ticket()})
+            size = first.sent.packets[0].size
+            self._put_out("plan", size, lambda m: m.sent.packets[-1].ravel(), now=True)
         for port, signal in ports_of("controller").items():
             part = HELD[signal.name]  # whose size is the law's: its parameters, what it senses
-            size = len(part(first.memory))
-            self.DeclareVectorOutputPort(port, size, weak(self._held, part), {memory_ticket})
-        update_every(self, law.timeline.period, self._update)
-
-    def sample(self, context: Context) -> Sample:
-        """What the last step left in a context of this system."""
-        value: Any = context.get_abstract_state(int(self._memory))
-        return value.get_value()
+            self._put_out(port, len(part(first)), part)
 
     def memory(self, context: Context) -> AnyMemory:
         """The memory in a context of this system."""
         return self.sample(context).memory
 
-    def _held(
-        self, part: Callable[[AnyMemory], Array], context: Context, output: BasicVector
-    ) -> None:
-        output.SetFromVector(part(self.memory(context)))
-
-    def _calc_step(self, context: Context, result: AbstractValue) -> None:
+    def _prepared(self, context: Context) -> Callable[[], AnyMemory]:
         age = 0.0
         if self._age is not None:
             age = float(np.asarray(self._age.Eval(context))[0])
@@ -176,9 +135,7 @@ class DelayLqiController(LeafSystem):
         weights = np.asarray(self._weights.Eval(context))
         memory, motion = self.memory(context), self._followed(context)
         report = self._reported(context, age)
-        started = time.perf_counter()
-        after = self._served.step(memory, measurement, motion, weights, report)
-        result.set_value(Sample(after, time.perf_counter() - started))
+        return lambda: self._served.step(memory, measurement, motion, weights, report)
 
     def _reported(self, context: Context, age: float) -> Report | None:
         if self._report is None or not self._report.HasValue(context):
@@ -190,26 +147,11 @@ class DelayLqiController(LeafSystem):
         acted = values[number:].reshape(number, NUM_TORQUES)
         return Report(values[:number] > 0, acted, round(age / self._law.timeline.period))
 
-    def _plan(self, context: Context, output: BasicVector) -> None:
-        sample: Any = self._step.Eval(context)
-        output.SetFromVector(sample.memory.sent.packets[-1].ravel())
-
     def _followed(self, context: Context) -> Motion:
         if self._motion is not None:
             return KnownMotion(*self._motion, context.get_time())
         reference = np.reshape(np.asarray(self._preview.Eval(context)), (-1, NUM_REFERENCE))
         return Preview(self._times, reference)
 
-    def _torque(self, context: Context, output: BasicVector) -> None:
-        sample: Any = self._step.Eval(context)
-        output.SetFromVector(sample.memory.torque)
-
-    def _estimate(self, context: Context, output: BasicVector) -> None:
-        sample: Any = self._step.Eval(context)
-        output.SetFromVector(sample.memory.belief.state)
-
     def _left(self, context: Context, output: AbstractValue) -> None:
         output.set_value(self._step.Eval(context))
-
-    def _update(self, context: Context, state: State) -> None:
-        state.get_mutable_abstract_state(int(self._memory)).set_value(self._step.Eval(context))

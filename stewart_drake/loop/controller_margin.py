@@ -51,6 +51,7 @@ _COSTLY: Final = 150
 _LARGEST: Final = 330
 """Rows of a loop above which it is not judged: fifty periods of delay, seconds."""
 _FEWEST: Final = 6
+_UNJUDGED: Final = Margins(*[math.nan] * 4)
 
 
 @dataclass(frozen=True)
@@ -76,14 +77,14 @@ class ControllerMargin:
 
     period: float
     eta: float
-    radius: float
-    time: float
-    margins: Margins
-    pole: float
-    pole_time: float
-    estimated: bool
-    delay_found: bool
-    tuned: bool
+    radius: float = math.nan
+    time: float = math.nan
+    margins: Margins = _UNJUDGED
+    pole: float = 0.0
+    pole_time: float = 0.0
+    estimated: bool = False
+    delay_found: bool = False
+    tuned: bool = False
     problem: str = ""
     loops: tuple[LinearLoop, ...] = field(default=(), repr=False)
     span: float = 0.0
@@ -148,21 +149,18 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
     end = sc.duration if until is None else until
     if sc.controller.command != "torque":
         return _at_the_machine(experiment, end)
-    truth, law = true_dynamics(experiment), compose_law(experiment)
-    finds_delay = isinstance(law.observer, DelayObserver)
-    if finds_delay:
-        law = replace(law, timeline=replace(law.timeline, delay=sc.true_delay))
+    truth, law = true_dynamics(experiment), _law_at_last(experiment)
     times = np.linspace(0.0, end, INSTANTS)
     poses = [evaluate(experiment.reference, t)[POSE] for t in times]
     inside = [margin(truth.mechanism, pose) > 0 for pose in poses]
-    models = [
-        true_model(experiment, truth, t) for t, within in zip(times, inside, strict=True) if within
+    poles = [
+        fastest_pole(true_model(experiment, truth, t).A) if within else 0.0
+        for t, within in zip(times, inside, strict=True)
     ]
-    poles = [fastest_pole(model.A) for model in models]
-    fastest = int(np.argmax(poles)) if poles else 0
+    fastest = int(np.argmax(poles))
     queue = max(sc.true_delay.steps + 1, law.timeline.queue_length)
     rows = 12 + 6 * law.cost.integrates + 6 * queue
-    radius, time, margins = math.nan, math.nan, Margins(*[math.nan] * 4)
+    radius, time, margins = math.nan, math.nan, _UNJUDGED
     problem, loops = "", list[LinearLoop]()
     if not all(inside):
         problem = "the true machine does not reach all of the reference"
@@ -190,10 +188,10 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
         radius=radius,
         time=time,
         margins=margins,
-        pole=poles[fastest] if poles else 0.0,
+        pole=poles[fastest],
         pole_time=float(times[fastest]),
         estimated=_estimates(law),
-        delay_found=finds_delay,
+        delay_found=isinstance(law.observer, DelayObserver),
         tuned=experiment.tuned,
         problem=problem,
         loops=tuple(loops),
@@ -209,14 +207,6 @@ def _at_the_machine(experiment: Experiment, end: float) -> ControllerMargin:
     return ControllerMargin(
         period=experiment.scenario.controller.period,
         eta=experiment.scenario.eta,
-        radius=math.nan,
-        time=math.nan,
-        margins=Margins(*[math.nan] * 4),
-        pole=0.0,
-        pole_time=0.0,
-        estimated=False,
-        delay_found=False,
-        tuned=False,
         problem="servos close theirs at the machine, and nothing is fed back across the delay",
         span=end,
     )
@@ -241,8 +231,16 @@ def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> C
 
 def loop_at(experiment: Experiment, time: float) -> LinearLoop:
     """The loop of a scenario about its reference at `time` in s."""
-    truth, law = true_dynamics(experiment), compose_law(experiment)
+    truth, law = true_dynamics(experiment), _law_at_last(experiment)
     return _loops(experiment, truth, law, np.array([time]))[0]
+
+
+def _law_at_last(experiment: Experiment) -> PredictiveLqi:
+    """The law, with the true delay where it estimates that."""
+    law = compose_law(experiment)
+    if not isinstance(law.observer, DelayObserver):
+        return law
+    return replace(law, timeline=replace(law.timeline, delay=experiment.scenario.true_delay))
 
 
 def _loops(

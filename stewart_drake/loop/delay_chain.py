@@ -13,7 +13,32 @@ from stewart_drake.scenario.timing import event_time
 Array = NDArray[np.float64]
 
 
-class DelayChain(LeafSystem):
+class Arrived(LeafSystem):
+    """What has come over a wire, and when, as outputs; for what decides when that is."""
+
+    def _begin(self, carries: Carried, applied: Array, arrived: float) -> None:
+        """Declare the input, and the outputs with what acts at first and when that arrived, s."""
+        self._size = CARRIED[carries]
+        self._commanded = self.DeclareVectorInputPort("commanded", self._size)
+        self._applied = self.DeclareDiscreteState(applied)
+        self._arrived = self.DeclareDiscreteState([arrived])
+        self._put_out(carries, self._size, self._applied)
+        if carries == "command":
+            self._put_out("arrived", 1, self._arrived)
+
+    def _apply(self, torque: Array, context: Context, state: State) -> None:
+        state.get_mutable_discrete_state(self._applied).SetFromVector(torque)
+        state.get_mutable_discrete_state(self._arrived).SetFromVector([context.get_time()])
+
+    def _put_out(self, name: str, size: int, index: DiscreteStateIndex) -> None:
+        ticket = self.discrete_state_ticket(index)
+        self.DeclareVectorOutputPort(name, size, weak(self._output, index), {ticket})
+
+    def _output(self, index: DiscreteStateIndex, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(index).value())
+
+
+class DelayChain(Arrived):
     """Holds torques back for eta = mu dt + eta0.
 
     With T_k the input at t = k dt:
@@ -56,17 +81,14 @@ class DelayChain(LeafSystem):
             raise ValueError(f"queue: got shape {queue.shape}; expected {(length, size)}")
         # `line` is [applied; waiting ...]: T_{k-mu} ... T_k after the update at k dt, with the
         # applied torque kept apart because it changes eta0 later than the rest.
-        self._fraction, self._size = fraction, size
-        applied = queue[0] if length > 0 else np.zeros(size)
+        self._fraction = fraction
         waiting = queue[1:] if fraction > 0 else queue
-        self._applied = self.DeclareDiscreteState(applied)
-        self._waiting = self.DeclareDiscreteState(np.vstack([np.zeros(size), waiting]).ravel())
         began = (fraction - 1) * period if fraction > 0 else 0.0
-        self._arrived = self.DeclareDiscreteState([began if length > 0 else np.nan])
-        self._commanded = self.DeclareVectorInputPort("commanded", size)
-        self._put_out(carries, size, self._applied)
-        if carries == "command":
-            self._put_out("arrived", 1, self._arrived)
+        if length > 0:
+            self._begin(carries, queue[0], began)
+        else:
+            self._begin(carries, np.zeros(size), np.nan)
+        self._waiting = self.DeclareDiscreteState(np.vstack([np.zeros(size), waiting]).ravel())
         update_every(self, period, self._take)
         if fraction > 0:
             self.DeclarePeriodicUnrestrictedUpdateEvent(
@@ -78,18 +100,8 @@ class DelayChain(LeafSystem):
         moved = np.concatenate([waiting[self._size :], self._commanded.Eval(context)])
         state.get_mutable_discrete_state(self._waiting).SetFromVector(moved)
         if self._fraction == 0:
-            self._apply(moved, context, state)
+            self._apply(moved[: self._size], context, state)
 
     def _release(self, context: Context, state: State) -> None:
-        self._apply(context.get_discrete_state(self._waiting).value(), context, state)
-
-    def _apply(self, waiting: Array, context: Context, state: State) -> None:
-        state.get_mutable_discrete_state(self._applied).SetFromVector(waiting[: self._size])
-        state.get_mutable_discrete_state(self._arrived).SetFromVector([context.get_time()])
-
-    def _put_out(self, name: str, size: int, index: DiscreteStateIndex) -> None:
-        ticket = self.discrete_state_ticket(index)
-        self.DeclareVectorOutputPort(name, size, weak(self._output, index), {ticket})
-
-    def _output(self, index: DiscreteStateIndex, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(index).value())
+        waiting = context.get_discrete_state(self._waiting).value()
+        self._apply(waiting[: self._size], context, state)

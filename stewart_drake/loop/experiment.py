@@ -56,6 +56,7 @@ from stewart_drake.law.startup import (
     weight_scales,
 )
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.loop.controller import reported
 from stewart_drake.loop.own import NOTHING, Own, take
 from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.mechanism.files import load_mechanism
@@ -71,6 +72,7 @@ from stewart_drake.scenario.config import (
     ServoActuatorConfig,
 )
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.known import DELAY, OFFSETS, Known, load_known
 from stewart_drake.scenario.link import in_time, times_under_way
 from stewart_drake.scenario.signals import (
@@ -161,9 +163,10 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
     failure = reference_failure(experiment)
     if failure is not None:
         first = experiment.reference.value(0.0)[:, 0]
+        short = failure.leg is not None and failure.margin < 0
         raise ConfigError(
             f"reference: {failure.reason} at t = {failure.time:.2f} s"
-            + (f", short by {-1e3 * failure.margin:.3g} mm" if failure.margin < 0 else "")
+            + (f", short by {-1e3 * failure.margin:.3g} mm" if short else "")
             + "; expected a motion within reach"
             + (
                 ", such as one of smaller amplitude"
@@ -234,9 +237,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     scenario.check()
     network = network_of(scenario)
     drawn = load_mechanism(scenario.mechanism)
-    known = known_of(scenario)
-    if known is not None:
-        _check_known(known, scenario, drawn)
+    known = known_of_machine(scenario, drawn)
     mechanism = with_motors(drawn, scenario)
     if own.reference is None:
         reference = make_reference(scenario.reference, scenario.duration)
@@ -336,8 +337,15 @@ def known_of(scenario: Scenario) -> Known | None:
         raise ConfigError(f"controller.known: {error}") from None
 
 
-def _check_known(known: Known, scenario: Scenario, mechanism: Mechanism) -> None:
-    c, own = scenario.controller, fingerprint(mechanism)
+def known_of_machine(scenario: Scenario, mechanism: Mechanism) -> Known | None:
+    """`known_of`, of this machine.
+
+    Raises:
+        ConfigError: one line.
+    """
+    c, own, known = scenario.controller, fingerprint(mechanism), known_of(scenario)
+    if known is None:
+        return None
     if known.mechanism != own:
         raise ConfigError(
             f"controller.known: got {c.known}, of another machine ({known.mechanism}); expected "
@@ -349,6 +357,7 @@ def _check_known(known: Known, scenario: Scenario, mechanism: Mechanism) -> None
             f"controller.delay_max: got {c.delay_max:g} s, less than the {believed:g} s that are "
             "believed in; expected as much or more"
         )
+    return known
 
 
 def known_values(known: Known | None) -> Array:
@@ -629,12 +638,22 @@ def _until_seen(delay: Delay, waits: int) -> int:
 
 
 def longest_wait(scenario: Scenario) -> int:
-    """Periods for which the law waits for a late measurement; 0 where none comes late."""
+    """Periods for which the law waits for a late measurement; 0 where none comes late.
+
+    Raises:
+        ConfigError: they are more than any delay may have.
+    """
     sc, period = scenario, scenario.controller.period
     back = sc.link.back if isinstance(sc.link, NetworkConfig) else None
     if sc.sensor.delay == 0 and back is None:
         return 0
     longest = sc.sensor.delay + (0.0 if back is None else times_under_way(back).ppf(_MOST))
+    if longest > MOST_PERIODS * period:
+        field = "sensor.delay" if back is None else "link.return"
+        raise ConfigError(
+            f"{field}: got measurements that take {longest:.4g} s; expected at most "
+            f"{MOST_PERIODS} periods"
+        )
     return math.ceil(longest / period - 1e-9) + _PATIENCE
 
 
@@ -651,6 +670,7 @@ def _channel(scenario: Scenario, timeline: Timeline, waits: int) -> Channel:
         in_time=tuple(in_time(link, time) for time in due),
         arrived_by=tuple(in_time(link, i * c.period) for i in range(kept)),
         holds=link.dry == "hold",
+        told=reported(waits + _REPORTS),
     )
 
 

@@ -16,7 +16,12 @@ from stewart_drake.files.yamlio import validate
 from stewart_drake.law.delay_observer import DelayObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController
-from stewart_drake.loop.experiment import Experiment, control_law, first_queue
+from stewart_drake.loop.experiment import (
+    Experiment,
+    control_law,
+    first_queue,
+    known_of_machine,
+)
 from stewart_drake.loop.own import Own
 from stewart_drake.loop.own_motion import own_motion
 from stewart_drake.loop.reference import Reference
@@ -124,13 +129,15 @@ def design_law(
     chosen = dataclasses.asdict(ControllerConfig() if options is None else options)
     if horizon is None:
         horizon = reference.end_time() if math.isfinite(reference.end_time()) else _HORIZON
+    believed = Delay.of(delay, period)
     sections = {
         "duration": horizon,
         "start": "on_reference" if start is None else "rest",
         "queue": queue,
         "plant": {"kind": "exact", "gravity": dynamics.gravity != 0},
-        "delay": dataclasses.asdict(Delay.of(delay, period)),
-        "controller": chosen | {"period": period, "delay_steps": None, "delay_fraction": None},
+        "delay": dataclasses.asdict(believed),
+        "controller": chosen
+        | {"period": period, "delay_steps": believed.steps, "delay_fraction": believed.fraction},
         "actuator": {"torque_limit": torque_limit},
         "sensor": {"noise_std": np.asarray(noise_std, dtype=float).tolist()},
     }
@@ -152,6 +159,7 @@ def design_law(
         start=at,
         network=None,
         own=Own(reference=reference),
+        known=known_of_machine(scenario, dynamics.mechanism),
     )
     law, planned, _ = control_law(experiment)
     c = scenario.controller

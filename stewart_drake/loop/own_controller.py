@@ -1,43 +1,38 @@
 """A controller of the user's own, sampled and on record like the shipped one."""
 
-import time
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue, Value
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    LeafSystem,
-    State,
-    ValueProducer,
-)
+from pydrake.systems.framework import Context
 
 from stewart_drake.law.memory import Counts
-from stewart_drake.loop.lifetime import weak
-from stewart_drake.loop.sampling import update_every
+from stewart_drake.loop.controller import HELD
+from stewart_drake.loop.sampling import SteppedLaw
+from stewart_drake.loop.varying_delay import declare_constant
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, ports_of
 
 Array = NDArray[np.float64]
 
+_KNOWN: Final = ("torque_commanded", "measurement")
+"""Signals that a controller has whose inside is not known."""
 
-class Sample(NamedTuple):
+
+class OwnMemory(NamedTuple):
     """The last sample, in the words of the shipped controller's memory.
 
     `torque` (6,) as asked for, `in_flight` (1, 6) what the limit let through of it, `measurement`
-    (12,) that was read, NaN before the first, `counts` of what is seen from outside, `seconds` that
-    the torque took to compute.
+    (12,) that was read, NaN before the first, `counts` of what is seen from outside.
     """
 
     torque: Array
     in_flight: Array
     measurement: Array
     counts: Counts
-    seconds: float
 
 
-class SampledController(LeafSystem):
+class SampledController(SteppedLaw):
     """Reads a controller's torque every period, in the place of `DelayLqiController`.
 
     Attributes:
@@ -67,66 +62,30 @@ class SampledController(LeafSystem):
         super().__init__()
         self._limit = torque_limit
         nothing = np.zeros(NUM_TORQUES)
-        first = Sample(nothing, nothing[None], np.full(NUM_STATE, np.nan), Counts(), 0.0)
-        self._last = self.DeclareAbstractState(Value(first))
+        first = OwnMemory(nothing, nothing[None], np.full(NUM_STATE, np.nan), Counts())
         self._measurement = self.DeclareVectorInputPort("measurement", NUM_STATE)
         self._own = self.DeclareVectorInputPort("own_torque", NUM_TORQUES)
-        ticket = self.abstract_state_ticket(self._last)
-        self._step = self.DeclareCacheEntry(
-            "step",
-            ValueProducer(allocate=lambda: Value(first), calc=weak(self._calc_step)),
-            {self.all_input_ports_ticket(), ticket},
-        )
-        self.DeclareVectorOutputPort(
-            "torque", NUM_TORQUES, weak(self._torque), {self._step.ticket()}
-        )
-        known = {"torque_commanded": weak(self._commanded), "measurement_used": weak(self._used)}
+        self._begin(first, period)
+        self._put_out("torque", NUM_TORQUES, HELD["torque_commanded"], now=True)
         for port, signal in ports_of("controller").items():
-            calc, of = known.get(port, _nothing), ticket if port in known else self.nothing_ticket()
-            self.DeclareVectorOutputPort(port, signal.size, calc, {of})
-        update_every(self, period, self._update)
+            if signal.name in _KNOWN:
+                self._put_out(port, signal.size, HELD[signal.name])
+            else:
+                declare_constant(self, port, np.full(signal.size, np.nan))
 
-    def sample(self, context: Context) -> tuple[Sample, float]:
-        """The last sample in a context of this system, and the time that it took, s."""
-        last = self._sample(context)
-        return last, last.seconds
+    def _prepared(self, context: Context) -> Callable[[], OwnMemory]:
+        last, measurement = self.sample(context).memory, np.array(self._measurement.Eval(context))
 
-    def _sample(self, context: Context) -> Sample:
-        value: Any = context.get_abstract_state(int(self._last))
-        return value.get_value()
+        def step() -> OwnMemory:
+            torque, causes = np.array(self._own.Eval(context)), []
+            if not np.all(np.isfinite(measurement)):
+                causes.append("measurements_missing")
+            if not np.all(np.isfinite(torque)):
+                causes.append("nonfinite_torque")
+                torque = last.torque
+            if np.any(np.abs(torque) >= self._limit):
+                causes.append("saturated_steps")
+            sent = np.clip(torque, -self._limit, self._limit)[None]
+            return OwnMemory(torque, sent, measurement, last.counts.plus(*causes))
 
-    def _calc_step(self, context: Context, result: AbstractValue) -> None:
-        last = self._sample(context)
-        # First, so that the time below is the controller's alone.
-        measurement = np.array(self._measurement.Eval(context))
-        started = time.perf_counter()
-        torque = np.array(self._own.Eval(context))
-        seconds = time.perf_counter() - started
-        causes = []
-        if not np.all(np.isfinite(measurement)):
-            causes.append("measurements_missing")
-        if not np.all(np.isfinite(torque)):
-            causes.append("nonfinite_torque")
-            torque = last.torque
-        if np.any(np.abs(torque) >= self._limit):
-            causes.append("saturated_steps")
-        sent = np.clip(torque, -self._limit, self._limit)[None]
-        counts = last.counts.plus(*causes)
-        result.set_value(Sample(torque, sent, measurement, counts, seconds))
-
-    def _torque(self, context: Context, output: BasicVector) -> None:
-        step: Any = self._step.Eval(context)
-        output.SetFromVector(step.torque)
-
-    def _commanded(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._sample(context).torque)
-
-    def _used(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._sample(context).measurement)
-
-    def _update(self, context: Context, state: State) -> None:
-        state.get_mutable_abstract_state(int(self._last)).set_value(self._step.Eval(context))
-
-
-def _nothing(context: Context, output: BasicVector) -> None:
-    output.SetFromVector(np.full(output.size(), np.nan))
+        return step

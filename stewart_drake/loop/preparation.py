@@ -107,8 +107,8 @@ class Preparation:
             ConfigError: the scenario's fields do not go together.
         """
         scenario.check()
-        own = self._base.mechanism if truth is None else truth
-        return self._base._replace(scenario=scenario, truth=own, network=network_of(scenario))
+        true = self._base.truth if truth is None else truth
+        return self._base._replace(scenario=scenario, truth=true, network=network_of(scenario))
 
     def prepared(self, experiment: Experiment, tuner: MakeTuner | None = None) -> Prepared:
         """Law and previews as of `control_law`, which says what may go wrong.
@@ -155,9 +155,10 @@ class _Key:
         del fields["tuner"]
         fields["delay"] = believed.steps, believed.fraction
         fields["controller"] |= {"delay_steps": None, "delay_fraction": None}
-        files = [resolve("mechanism", scenario.mechanism)]
-        named = getattr(scenario.reference, "file", None)
-        files += [Path(named)] if named else []
+        machines = scenario.mechanism, scenario.plant.mechanism
+        files = [resolve("mechanism", name) for name in machines if name is not None]
+        named = getattr(scenario.reference, "file", None), scenario.controller.known
+        files += [Path(name) for name in named if name is not None]
         self._key = json.dumps(fields, default=str), *(_stamp(file) for file in files)
 
     def __eq__(self, other: object) -> bool:

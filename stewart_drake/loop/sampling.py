@@ -1,12 +1,26 @@
-"""Updates of a sampled system, in the order that a discrete plant needs."""
+"""Updates of a sampled system, in the order that a discrete plant needs; and laws as systems."""
 
+import time
+from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue, Value
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    EventStatus,
+    LeafSystem,
+    State,
+    ValueProducer,
+)
 
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.scenario.timing import event_time
+
+Array = NDArray[np.float64]
 
 
 def update_every(
@@ -35,3 +49,68 @@ def update_every(
 
     system.DeclareInitializationUnrestrictedUpdateEvent(first)
     system.DeclarePeriodicUnrestrictedUpdateEvent(early, early, call)
+
+
+class Sample(NamedTuple):
+    """What one step of a law left behind."""
+
+    memory: Any
+    seconds: float
+    """Time that it took to compute; 0 before the first."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Sample":
+        """Drake copies what it keeps; nobody changes a memory, so that itself will do."""
+        return self
+
+
+class SteppedLaw(LeafSystem):
+    """A law that a system takes from sample to sample.
+
+    Initialise: s = [m, 0], m what the law remembers before the first sample.
+    Update:     every period s <- [step(m, inputs), the time it took].
+    Output:     of s, held; or of what the step of now leaves, to be taken at the samples, where the
+                update happens too: one step serves both.
+    """
+
+    def _begin(self, memory: Any, period: float) -> None:
+        """Declare the state and its update, after the input ports."""
+        first = Sample(memory, 0.0)
+        self._last = self.DeclareAbstractState(Value(first))
+        self._held = {self.abstract_state_ticket(self._last)}
+        self._step = self.DeclareCacheEntry(
+            "step",
+            ValueProducer(allocate=lambda: Value(first), calc=weak(self._calc_step)),
+            {self.all_input_ports_ticket(), *self._held},
+        )
+        update_every(self, period, self._update)
+
+    @abstractmethod
+    def _prepared(self, context: Context) -> Callable[[], Any]:
+        """The step to the next memory, its inputs read: the time that it takes is the law's."""
+
+    def sample(self, context: Context) -> Sample:
+        """What the last step left in a context of this system."""
+        value: Any = context.get_abstract_state(int(self._last))
+        return value.get_value()
+
+    def _put_out(
+        self, port: str, size: int, part: Callable[[Any], Array], *, now: bool = False
+    ) -> None:
+        """Declare an output (size,) of the memory: that of the last sample, or of `now`."""
+        ticket = {self._step.ticket()} if now else self._held
+        self.DeclareVectorOutputPort(port, size, weak(self._show, part, now), ticket)
+
+    def _show(
+        self, part: Callable[[Any], Array], now: bool, context: Context, output: BasicVector
+    ) -> None:
+        sample: Any = self._step.Eval(context) if now else self.sample(context)
+        output.SetFromVector(part(sample.memory))
+
+    def _calc_step(self, context: Context, result: AbstractValue) -> None:
+        step = self._prepared(context)
+        started = time.perf_counter()
+        memory = step()
+        result.set_value(Sample(memory, time.perf_counter() - started))
+
+    def _update(self, context: Context, state: State) -> None:
+        state.get_mutable_abstract_state(int(self._last)).set_value(self._step.Eval(context))

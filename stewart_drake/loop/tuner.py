@@ -13,9 +13,8 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from stewart_drake.loop.controller import Sample
 from stewart_drake.loop.lifetime import weak
-from stewart_drake.loop.sampling import update_every
+from stewart_drake.loop.sampling import Sample, update_every
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, WEIGHTS
 from stewart_drake.tuner.density import NUM_INPUTS
 from stewart_drake.tuner.law import MAX_FACTOR, tune
@@ -116,7 +115,7 @@ class LawTuner(LeafSystem):
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
-    | memory | input | abstract, `loop.controller.Sample` | - | read every period |
+    | memory | input | abstract, `loop.sampling.Sample` | - | read every period |
     | reference | input | 18 | rad, m and time derivatives | read every period |
     | weights | output | 2 | w_Q, w_R | held |
 

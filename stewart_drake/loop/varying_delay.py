@@ -4,8 +4,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
+from stewart_drake.loop.delay_chain import Arrived
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.delay import Delay
@@ -19,7 +20,7 @@ _ONCE: Final = 1e9
 """s, the period of an event that comes once: longer than any run."""
 
 
-class VaryingDelay(LeafSystem):
+class VaryingDelay(Arrived):
     """Holds torque k back for eta_k, each for a time of its own.
 
     With T_k the input at t = k dt, which arrives at a_k = k dt + eta_k:
@@ -77,16 +78,12 @@ class VaryingDelay(LeafSystem):
         sent[len(sent) - length :] = queue
         at_first = (times <= 0) & (self._numbers < 0)
         first = self._numbers[at_first]
-        applied = queue[first[-1] + length] if len(first) else np.zeros(size)
-        self._applied = self.DeclareDiscreteState(applied)
-        self._size, self._sent = size, self.DeclareDiscreteState(sent.ravel())
-        began = times[at_first][-1] if len(first) else np.nan
-        self._arrived = self.DeclareDiscreteState([began])
+        if len(first):
+            self._begin(carries, queue[first[-1] + length], times[at_first][-1])
+        else:
+            self._begin(carries, np.zeros(size), np.nan)
+        self._sent = self.DeclareDiscreteState(sent.ravel())
         self._taken = self.DeclareDiscreteState(1)
-        self._commanded = self.DeclareVectorInputPort("commanded", size)
-        self._put_out(carries, size, self._applied)
-        if carries == "command":
-            self._put_out("arrived", 1, self._arrived)
         taken_ticket = self.discrete_state_ticket(self._taken)
         self.DeclareVectorOutputPort("delay", 1, weak(self._delay), {taken_ticket})
         declare_constant(self, "packets", np.full(len(PACKETS), np.nan))
@@ -110,17 +107,6 @@ class VaryingDelay(LeafSystem):
         taken = int(context.get_discrete_state(self._taken).value()[0])
         sent = context.get_discrete_state(self._sent).value().reshape(-1, self._size)
         self._apply(sent[number - taken], context, state)
-
-    def _apply(self, torque: Array, context: Context, state: State) -> None:
-        state.get_mutable_discrete_state(self._applied).SetFromVector(torque)
-        state.get_mutable_discrete_state(self._arrived).SetFromVector([context.get_time()])
-
-    def _put_out(self, name: str, size: int, index: DiscreteStateIndex) -> None:
-        ticket = self.discrete_state_ticket(index)
-        self.DeclareVectorOutputPort(name, size, weak(self._output, index), {ticket})
-
-    def _output(self, index: DiscreteStateIndex, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(index).value())
 
     def _delay(self, context: Context, output: BasicVector) -> None:
         taken = int(context.get_discrete_state(self._taken).value()[0])

@@ -107,7 +107,7 @@ int dop853_step(dop853 *s, double end)
             stage(s, number, h, x);
         combine(s, A[LAST], LAST, h, x);
         double wrong = error(s, h, x);
-        double factor = wrong > 0. ? 0.9 * pow(wrong, -1. / 8.) : grows;
+        double factor = wrong == 0. ? grows : 0.9 * pow(wrong, -1. / 8.);
         if (wrong <= 1.) {
             s->time = parts > 1. ? s->before + h : end;
             memcpy(s->x, x, sizeof x);

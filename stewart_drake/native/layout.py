@@ -68,7 +68,7 @@ SIGNATURES: Final = {
     "change": _signature("state torque parameters gravity", (NUM_STATE,)),
     "margin": _signature("pose sign least", ()),
 }
-"""What dynamics.c holds, and `predict`; the geometry stands between arguments and results."""
+"""What packed.c holds, and `predict`; the geometry stands between arguments and results."""
 
 
 def plate_radius(mechanism: Mechanism) -> float:

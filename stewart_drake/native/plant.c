@@ -13,7 +13,7 @@
 #define EXPORT __attribute__((visibility("default")))
 #define MOTORS 6
 
-/* Of dynamics.c. */
+/* Of packed.c. */
 void change(double *buffer);
 void margin(double *buffer);
 
@@ -127,7 +127,7 @@ static int ended(run *r, const dop853 *s, int how)
 EXPORT int open_loop(run *r, machine *m, looks *l, const drive *drives, const double *from, long number)
 {
     dop853 s = integrator(r, m);
-    for (long i = 0; i < number && s.time < r->end; i++) {
+    for (long i = 0; i < number; i++) {
         double until = i + 1 < number ? fmin(from[i + 1], r->end) : r->end;
         int constant = 1;
         for (int j = 0; j < MOTORS; j++)

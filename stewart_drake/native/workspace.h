@@ -26,7 +26,7 @@ struct stewart_workspace {
         stewart_riccati_work riccati;
     } part;
     real power[5][144];                        /* of the matrix exponential */
-    real A[144], B[72], G[96];                 /* the model's */
+    real A[144], B[72];                        /* the model's */
     real phi[2][144], input[2][72];            /* sampled, before and after eta0 */
     real M[36], right[6 * 26];                 /* equations to be solved for derivatives */
     real dF_dx[72], dF_dp[6 * STEWART_PARAMETERS], arm[36];

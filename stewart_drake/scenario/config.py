@@ -17,6 +17,7 @@ from stewart_drake.files.yamlio import brief, differences, validate
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.fault_config import SensorFault, fault_problem
 from stewart_drake.scenario.field_types import (
+    MOST_PERIODS,
     STRICT,
     Deviation,
     Fraction,
@@ -33,10 +34,10 @@ from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
 from stewart_drake.scenario.signals import USUAL_COULOMB_SPEED
 from stewart_drake.scenario.timing import (
     METRIC_PERIOD,
-    bound_problem,
     log_problem,
     samples_problem,
     step_problem,
+    whole_problem,
 )
 
 
@@ -270,15 +271,24 @@ class ServoActuatorConfig:
         return self.gear_ratio**2 * self.rotor_inertia
 
 
-ActuatorConfig = Annotated[TorqueActuatorConfig | ServoActuatorConfig, ByKind()]
+AnyActuator = TorqueActuatorConfig | ServoActuatorConfig
+ActuatorConfig = Annotated[AnyActuator, ByKind()]
 
 
-def understanding(
-    command: str, actuator: TorqueActuatorConfig | ServoActuatorConfig
-) -> TorqueActuatorConfig | ServoActuatorConfig:
+def understanding(command: str, actuator: AnyActuator) -> AnyActuator:
     """Motors of the kind that a controller's command is for: these, or others of their limit."""
     wanted = TorqueActuatorConfig if command == "torque" else ServoActuatorConfig
     return actuator if isinstance(actuator, wanted) else wanted(torque_limit=actuator.torque_limit)
+
+
+def with_actuator(given: dict[str, Any], change: Any, where: str) -> AnyActuator:
+    """The motors of a section of a file, and of a row of `compare` that is laid over it.
+
+    Raises:
+        ConfigError: in one line, opened by `where`.
+    """
+    laid = given | change if isinstance(change, dict) else change
+    return validate(Scenario, {"actuator": laid}, where).actuator
 
 
 @dataclass(config=STRICT)
@@ -546,6 +556,16 @@ class Scenario:
             "believed in; expected as much or more"
         )
 
+    def _wait_problem(self) -> str | None:
+        """Whether torques over a network wait longer than they may over a wire."""
+        if not isinstance(self.link, NetworkConfig) or self.true_delay.steps <= MOST_PERIODS:
+            return None
+        bound = "null" if self.link.playout is None else f"{self.link.playout:g} s"
+        return (
+            f"link.playout: got {bound}, with which torques wait for more than {MOST_PERIODS} "
+            "periods; expected a shorter one, or a quicker network"
+        )
+
     def _offsets_problem(self) -> str | None:
         if not self.controller.estimate_offsets:
             return None
@@ -568,12 +588,7 @@ class Scenario:
         """
         # Assignment is validated, but a list can also be changed in place.
         validate(Scenario, dataclasses.asdict(self), where)
-        for row, change in self.compare.items():
-            place, fields = f"{where}: compare.{row}", dict(change)
-            fields.pop("controller", None)
-            actuator = {"kind": "servo", **fields.pop("actuator", {})}  # which knows every field
-            validate(Scenario, {"actuator": actuator}, place)
-            validate(ControllerConfig, fields, place)
+        self.check_rows(where)
         step = self.plant.time_step if self.plant.kind == "multibody" else None
         for problem in (
             self.reference.problem(),
@@ -581,14 +596,27 @@ class Scenario:
             self._command_problem(),
             self._map_problem(),
             self.sensor.problem(),
-            self.link.problem(),
+            self.link.problem() or self._wait_problem(),
             self._delay_problem(),
             self._offsets_problem(),
-            step and self._step_problem(step),
-            log_problem(self.log_period, self.duration, step),
+            self.step_problem(step) if step else log_problem(self.log_period, self.duration, None),
         ):
             if problem:
                 raise ConfigError(f"{where}: {problem}")
+
+    def check_rows(self, where: str) -> None:
+        """Checks what `compare` says, each row by itself.
+
+        Raises:
+            ConfigError: the first problem, in one line, opened by `where`.
+        """
+        for row, change in self.compare.items():
+            place, fields = f"{where}: compare.{row}", dict(change)
+            controller = fields.pop("controller", row)
+            if not isinstance(controller, str):
+                raise ConfigError(f"{place}: controller: got {brief(controller)}; expected text")
+            with_actuator({"kind": "servo"}, fields.pop("actuator", {}), place)  # has every field
+            validate(ControllerConfig, fields, place)
 
     def _command_problem(self) -> str | None:
         """Whether the motors understand what they are sent, and who else would have a say."""
@@ -630,17 +658,17 @@ class Scenario:
                 )
         return None
 
-    def _step_problem(self, step: float) -> str | None:
+    def step_problem(self, step: float) -> str | None:
         """What does not suit the steps in s of a discrete plant, or None."""
-        period, link = self.controller.period, self.link
-        if isinstance(self.sensor, EncoderSensorConfig):
-            problem = samples_problem(self.sensor.samples, period, step)
-            if problem:
-                return problem
+        period, link, sensor = self.controller.period, self.link, self.sensor
+        fraction, bound, samples = self.delay.fraction, None, None
         if isinstance(link, NetworkConfig):
-            bound = None if link.playout is None else bound_problem(link.playout, step)
-            return step_problem(step, period, 0.0) or bound
-        return step_problem(step, period, self.delay.fraction)
+            fraction = 0.0
+            bound = link.playout and whole_problem("link.playout", link.playout, step)
+        if isinstance(sensor, EncoderSensorConfig):
+            samples = samples_problem(sensor.samples, period, step)
+        logged = log_problem(self.log_period, self.duration, step)
+        return samples or step_problem(step, period, fraction) or bound or logged
 
 
 def _controller_problem(controller: ControllerConfig) -> str | None:

@@ -3,6 +3,7 @@
 Everything is drawn beforehand from a seed, so that the same scenario gives the same run.
 """
 
+from bisect import bisect_left
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from stewart_drake.scenario.config import (
     Scenario,
 )
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.field_types import MOST_PERIODS
 
 Array = NDArray[np.float64]
 _FORWARD, _BACK, _SENSOR = range(3)
@@ -182,13 +184,15 @@ def usual_bound(config: PacketsConfig, repeats: int, period: float) -> float:
 
     A longer one cannot bring back what is lost, and costs delay. With the bound B and r repetitions
     a torque is missing with q(B) = prod_i [1 - (1 - loss) F(B + i dt)], i = 0 to r, which falls to
-    loss^(r+1); wanted is the least B with q(B) <= RARE loss^(r+1), or ALMOST_NONE.
+    loss^(r+1); wanted is the least B with q(B) <= RARE loss^(r+1), or ALMOST_NONE. Beyond
+    MOST_PERIODS, which no delay may have, it is not looked for.
     """
     enough = max(RARE * config.loss ** (repeats + 1), ALMOST_NONE)
-    steps = 0
-    while torque_missing(config, steps * period, repeats, period) > enough:
-        steps += 1
-    return steps * period
+
+    def there(steps: int) -> bool:
+        return torque_missing(config, steps * period, repeats, period) <= enough
+
+    return bisect_left(range(MOST_PERIODS + 1), True, key=there) * period
 
 
 def network_delay(link: NetworkConfig, controller: ControllerConfig) -> Delay:

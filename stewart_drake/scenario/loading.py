@@ -14,7 +14,12 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import absolute_path, is_path, resolve, shipped
 from stewart_drake.files.schema import field_names, plain, sections, spelling
 from stewart_drake.files.yamlio import brief, load_yaml, parse_yaml, validate, yaml_text
-from stewart_drake.scenario.config import ControllerConfig, Scenario, understanding
+from stewart_drake.scenario.config import (
+    ControllerConfig,
+    Scenario,
+    understanding,
+    with_actuator,
+)
 
 _SETTINGS = "settings"
 _FILES = ("file", "known")
@@ -127,8 +132,9 @@ def load_comparison(
     """
     settings = tuple(settings)
     others = tuple(s for s in settings if not s.strip().startswith("controller.delay_"))
-    changes = read_scenario(name_or_path, settings=settings)[0].compare
-    rows = {}
+    unchecked, place = read_scenario(name_or_path, settings=settings)
+    unchecked.check_rows(place)
+    changes, rows = unchecked.compare, {}
     for row in dict.fromkeys([*controllers, *changes]):
         where, change = f"{name_or_path}: compare.{row}", dict(changes.get(row, {}))
         controller, actuator = change.pop("controller", row), change.pop("actuator", {})
@@ -137,7 +143,7 @@ def load_comparison(
         changed = dataclasses.asdict(scenario.controller) | change
         scenario.controller = validate(ControllerConfig, changed, where)
         motors = understanding(scenario.controller.command, scenario.actuator)
-        scenario.actuator = dataclasses.replace(motors, **actuator)
+        scenario.actuator = with_actuator(plain(motors), actuator, where)
         scenario.check(where)
         rows[row] = scenario
     return rows
@@ -243,12 +249,13 @@ def _make_paths_absolute(data: dict[str, Any], folder: Path) -> None:
 
     def tie(fields: dict[str, Any], name: str) -> None:
         value = fields.get(name)
-        if value is not None and (name in _FILES or is_path(value)):
+        if isinstance(value, str) and (name in _FILES or is_path(value)):
             fields[name] = str(absolute_path(value, folder))
 
     tie(data, "mechanism")
     tie(data.get("plant", {}), "mechanism")
     for fields in (data.get("controller", {}), *data.get("compare", {}).values()):
         tie(fields, "known")
+        tie(fields, "controller")  # of a row of `compare`
     tie(data.get("reference", {}), "file")
     tie(data.get("tuner", {}), "weights")

@@ -105,17 +105,15 @@ def step_problem(time_step: float, period: float, fraction: float) -> str | None
             f"plant.time_step: got {time_step!r}; expected {METRIC_PERIOD} s divided by a whole "
             f"number, nearest {nearest!r}"
         )
-    rule = f"a whole number of plant.time_step ({time_step!r} s)"
-    steps = period / time_step
-    if not _is_whole(steps):
-        nearest = _tidy(max(1, round(steps)) * time_step)
-        return f"controller.period: got {period!r}; expected {rule}, nearest {nearest!r}"
+    problem, steps = whole_problem("controller.period", period, time_step), period / time_step
+    if problem:
+        return problem
     delayed = fraction * steps
     if not _is_whole(delayed):
         nearest = min(round(delayed), round(steps) - 1) / round(steps)
         return (
-            f"delay.fraction: got {fraction!r}, {delayed:.6g} steps; expected {rule} within the "
-            f"period, nearest {nearest!r}"
+            f"delay.fraction: got {fraction!r}, {delayed:.6g} steps; expected a whole number of "
+            f"plant.time_step ({time_step!r} s) within the period, nearest {nearest!r}"
         )
     return None
 
@@ -133,14 +131,14 @@ def samples_problem(samples: int, period: float, time_step: float) -> str | None
     )
 
 
-def bound_problem(bound: float, time_step: float) -> str | None:
-    """What is wrong with a network's bound in s for a discrete plant, or None."""
-    if _is_whole(bound / time_step):
+def whole_problem(field: str, value: float, time_step: float) -> str | None:
+    """What is wrong with a field of the scenario in s that has to fit a discrete plant, or None."""
+    if _is_whole(value / time_step):
         return None
-    nearest = _tidy(max(1, round(bound / time_step)) * time_step)
+    nearest = _tidy(max(1, round(value / time_step)) * time_step)
     return (
-        f"link.playout: got {bound!r}; expected a whole number of plant.time_step "
-        f"({time_step!r} s), nearest {nearest!r}"
+        f"{field}: got {value!r}; expected a whole number of plant.time_step ({time_step!r} s), "
+        f"nearest {nearest!r}"
     )
 
 
@@ -163,13 +161,8 @@ def log_problem(log_period: float | None, duration: float, time_step: float | No
             f"log_period: got {log_period!r}; expected at least {least:.4g} s, {MOST_INSTANTS} "
             f"instants in duration {duration!r}, or null"
         )
-    if time_step is None or _is_whole(log_period / time_step):
-        return None
-    nearest = _tidy(max(1, round(log_period / time_step)) * time_step)
-    return (
-        f"log_period: got {log_period!r}; expected a whole number of plant.time_step "
-        f"({time_step!r} s), nearest {nearest!r}, or null"
-    )
+    problem = time_step and whole_problem("log_period", log_period, time_step)
+    return f"{problem}, or null" if problem else None
 
 
 def _nearest_step(time_step: float, period: float) -> float:
