@@ -177,7 +177,9 @@ def test_a_space_that_is_none_is_one_line(vary: Any, keep: Any, word: str) -> No
 
 def test_usual_bounds_are_numbers_that_a_file_may_hold() -> None:
     assert SPEC.pattern is not None
-    turned = dataclasses.replace(SPEC, pattern=dataclasses.replace(SPEC.pattern, rotation_deg=330.0))
+    turned = dataclasses.replace(
+        SPEC, pattern=dataclasses.replace(SPEC.pattern, rotation_deg=330.0)
+    )
     assert space_around(turned, {}, ()).bounds["rotation_deg"] == (270.0, 360.0)
 
 
