@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.experiment import assemble, check_instants, prepare
@@ -323,6 +324,24 @@ def test_the_command_writes_machines_that_run_and_goes_on(
 
 
 @pytest.mark.usefixtures("in_process")
+def test_a_search_from_python_is_that_of_the_command(tmp_path: Path, in_process: list[int]) -> None:
+    keep = [name for name in PARAMETERS if name not in ("crank", "rod")] + ["branches"]
+    found = sd.layout(
+        load_scenario("paper", None, QUICK),
+        tmp_path,
+        limits={"clearance": -1.0},
+        keep=[*keep, "plate_order"],
+        best=1,
+        generations=1,
+    )
+    assert (
+        found.verdict.startswith("yes: of ") and found.summary["layouts"][0]["name"] == "layout_1"
+    )
+    assert (tmp_path / "layout_1.yaml").exists() and len(in_process) == 2
+    found.save(tmp_path / "page")
+    assert "layout_1" in (tmp_path / "page" / "report.html").read_text()
+
+
 def test_limits_that_nothing_keeps_are_told_and_no_machine_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
