@@ -28,6 +28,14 @@ Tolerance = Annotated[
         + ".",
     ),
 ]
+Bits = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="Of the encoders of a CSV log, per turn; 14 by default."),
+]
+Gravity = Annotated[
+    bool | None,
+    typer.Option(help="Whether gravity acted in a CSV log, as by default, or was balanced."),
+]
 
 
 def identify(
@@ -50,10 +58,7 @@ def identify(
         typer.Option(metavar="S", help="Believed; that of the log by default, or 0.1 s."),
     ] = None,
     tolerance: Tolerance = None,
-    bits: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Of the encoders of a CSV log, per turn; 14 by default."),
-    ] = None,
+    bits: Bits = None,
     pose_std: Annotated[
         str | None,
         typer.Option(
@@ -61,10 +66,7 @@ def identify(
             help="Errors of poses; 1e-4,2e-5 in a CSV log. With --plan: poses are measured too.",
         ),
     ] = None,
-    gravity: Annotated[
-        bool | None,
-        typer.Option(help="Whether gravity acted in a CSV log, as by default, or was balanced."),
-    ] = None,
+    gravity: Gravity = None,
     out: Out = None,
     quiet: Quiet = False,
     as_json: AsJson = False,

@@ -67,6 +67,13 @@ Family = Annotated[
 ]
 
 
+Labels = Annotated[
+    LabelKind | None,
+    typer.Option(help="What the network learns to answer; best_in_cell by default."),
+]
+Density = Annotated[DensityKind | None, typer.Option(help="Of (45); magnitude by default.")]
+
+
 @app.command()
 def dataset(
     scenario: ScenarioName = "paper",
@@ -137,16 +144,11 @@ def train(
             metavar="RATIO", help="With --regret: log10 w_Q / w_R at first; else the best."
         ),
     ] = None,
-    labels: Annotated[
-        LabelKind | None,
-        typer.Option(help="What the network learns to answer; best_in_cell by default."),
-    ] = None,
+    labels: Labels = None,
     split: Annotated[
         SplitKind | None, typer.Option(help="What 70 % of are trained on; run by default.")
     ] = None,
-    density: Annotated[
-        DensityKind | None, typer.Option(help="Of (45); magnitude by default.")
-    ] = None,
+    density: Density = None,
     seed: Seed = 0,
     workers: Workers = None,
     quiet: Quiet = False,
@@ -166,13 +168,13 @@ def train(
         raise ConfigError(f"--out: got {str(out)!r}; expected a file ending in .json")
     chosen = {"kind": labels, "split": split, "density": density}
     given: dict[str, Any] = {name: one.value for name, one in chosen.items() if one is not None}
+    delivery = Delivery(out.parent, quiet, as_json)
     if regret:
         of_labels = {"--labels": labels, "--split": split, "--density": density}
         refuse(of_labels, "with --regret; expected it without")
-        delivery = Delivery(out.parent, quiet, as_json)
         return _train_by_regret(data, out, seed, start, workers, delivery)
     refuse({"--start": start, "--workers": workers}, "without --regret; expected it with --regret")
-    delivery, read = Delivery(out.parent, quiet, as_json), load_dataset(data)
+    read = load_dataset(data)
     with stopping("nothing written"), working("training", quiet):
         result = run(read, seed=seed, **given)
     summary = summarize(result)
