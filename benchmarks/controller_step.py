@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from timeit import timeit
@@ -18,9 +18,9 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import table, write
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
@@ -28,7 +28,6 @@ from stewart_drake.law.observers import NoObserver, ParameterObserver
 from stewart_drake.law.predictors import NonlinearPredictor
 from stewart_drake.native.library import backend
 
-RESULTS = Path(__file__).parent / "results"
 RUNS = 6
 SCENARIOS = {"paper": ["duration=10.0"], "gravity": ["duration=2.0"]}
 ESTIMATORS = ("parameters", "none")
@@ -154,19 +153,13 @@ print(time.perf_counter() - started)
     return [*rows, ["first one in a process", f"{in_fresh_processes(code)[0]:.3f} s"]]
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [" | ".join(header), " | ".join("---" for _ in header), *map(" | ".join, rows)]
-    return "\n".join(f"| {line} |" for line in lines) + "\n"
-
-
 def main() -> None:
     """Measure, print and write."""
-    packages = ", ".join(f"{package} {number}" for package, number in versions().items())
     totals, parts = steps()
-    text = "\n".join(
+    write(
+        __file__,
+        "Time",
         [
-            f"# Time\n\nMade by `python benchmarks/controller_step.py` with {packages}.\n",
             "## One step of `predictor_lqi` in the running loop, exact plant, ms\n",
             table(["scenario", "estimator", "median", "worst"], totals),
             "## Medians of its parts, ms\n",
@@ -175,11 +168,8 @@ def main() -> None:
             table(["what", "s"], walls()),
             "## One evaluation of the accelerations\n",
             table(["what", "time"], evaluations()),
-        ]
+        ],
     )
-    print(text)
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "controller_step.md").write_text(text)
 
 
 if __name__ == "__main__":

@@ -14,15 +14,14 @@ from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any, Final
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import table, write
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
@@ -32,7 +31,6 @@ from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.robustness import run_draw
 from stewart_drake.studies.uncertainty import MACHINE, Draw, draw, drawn, scales_of
 
-RESULTS: Final = Path(__file__).parent / "results"
 TIMED: Final = 5
 """Every so many runs, one is timed in Drake."""
 
@@ -109,17 +107,7 @@ def main() -> None:
     scenario = sd.load_scenario("paper", settings=["plant.kind=exact"])
     with ProcessPoolExecutor(1, get_context("spawn"), without_c) as other:
         rows = measure(scenario, given.runs, given.seed, other)
-    told = ", ".join(f"{name} {number}" for name, number in versions().items())
-    lines = [
-        "# Monte Carlo in C",
-        "",
-        f"Made by `python benchmarks/monte_carlo.py` with {told}.",
-        "",
-    ]
-    lines += ["| what | value |", "| --- | --- |", *(f"| {a} | {b} |" for a, b in rows.items())]
-    print("\n".join(lines))
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "monte_carlo.md").write_text("\n".join(lines) + "\n")
+    write(__file__, "Monte Carlo in C", [table(["what", "value"], list(rows.items()))])
 
 
 if __name__ == "__main__":

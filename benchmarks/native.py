@@ -11,12 +11,12 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import write
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -25,7 +25,6 @@ from pydrake.systems.primitives import Sine
 import stewart_drake as sd
 from stewart_drake.dynamics.compiled import Buffered
 from stewart_drake.dynamics.stewart import plant_parameters
-from stewart_drake.files.versions import versions
 from stewart_drake.law.delay_model import delayed_model
 from stewart_drake.law.doubling import Doubling
 from stewart_drake.law.error_model import linear_model
@@ -38,7 +37,6 @@ from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.native.library import SWITCH, backend
 from stewart_drake.report.export_c import recorded_law
 
-RESULTS = Path(__file__).parent / "results"
 ROUNDS = 12
 BACKENDS = {"casadi": "0", "native": "require"}
 MECHANISM = sd.load_mechanism("paper")
@@ -225,11 +223,7 @@ def measure() -> dict[str, dict[str, float]]:
 
 def main() -> None:
     """Measure, print and write."""
-    packages = ", ".join(f"{package} {number}" for package, number in versions().items())
-    lines = [
-        f"# The dynamics in C\n\nMade by `python benchmarks/native.py` with {packages}.\n",
-        "| what | casadi, us | native, us | ratio |\n| --- | --- | --- | --- |",
-    ]
+    lines = ["| what | casadi, us | native, us | ratio |\n| --- | --- | --- | --- |"]
     for work, times in measure().items():
         numbers = " | ".join(f"{1e6 * times[name]:.4g}" for name in BACKENDS)
         lines.append(f"| {work} | {numbers} | {times['casadi'] / times['native']:.2f} |")
@@ -240,10 +234,7 @@ def main() -> None:
     ]
     with ProcessPoolExecutor(1, get_context("spawn"), use, ("require",)) as pool:
         lines += pool.submit(controller_lines).result()
-    text = "\n".join(lines) + "\n"
-    print(text)
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "native.md").write_text(text)
+    write(__file__, "The dynamics in C", lines)
 
 
 if __name__ == "__main__":

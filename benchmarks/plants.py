@@ -12,7 +12,6 @@ interleaved repeats.
 import os
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -20,6 +19,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
+from _page import RESULTS, table, write
 from matplotlib.figure import Figure
 from mujoco_model import Closure, MujocoStewart
 from numpy.typing import NDArray
@@ -31,7 +31,6 @@ from scipy.integrate import solve_ivp
 import stewart_drake as sd
 from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.open_loop import Drive, in_c
-from stewart_drake.files.versions import versions
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
 from stewart_drake.report.style import figure_style, write_figure
@@ -39,7 +38,6 @@ from stewart_drake.scenario.signals import POSE, RATES
 
 Array = NDArray[np.float64]
 
-RESULTS = Path(__file__).parent / "results"
 ROUNDS, BUDGET = 25, 2.0
 """Repeats of each candidate, and the seconds after which it gets no more (but two at least)."""
 SAP_STEPS = (2e-3, 1e-3, 5e-4, 2e-4, 1e-4)
@@ -243,19 +241,10 @@ def figure(curves: Sequence[dict[str, Curve]]) -> Figure:
     return drawn
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [" | ".join(header), " | ".join("---" for _ in header), *map(" | ".join, rows)]
-    return "\n".join(f"| {line} |" for line in lines) + "\n"
-
-
 def main() -> None:
     """Measure, print, and write table and figure."""
-    packages = versions() | {"mujoco": mujoco.__version__}
-    text = "# Error against computing time\n\nMade by `python benchmarks/plants.py` with "
-    parts = [text + ", ".join(f"{name} {number}" for name, number in packages.items()) + ".\n"]
     curves = [measure(motion) for motion in motions()]
-    parts.append("## Claims\n\n" + table(["what", "motion", "value"], claims(curves)))
+    parts = ["## Claims\n\n" + table(["what", "motion", "value"], claims(curves))]
     for motion, families in zip(motions(), curves, strict=True):
         rows = [
             [family, setting, f"{error:.1e}", f"{t:.3g}"]
@@ -264,9 +253,8 @@ def main() -> None:
         ]
         header = ["family", "setting", "error, rad or m", "ms per simulated s"]
         parts.append(f"## {motion.title.capitalize()}\n\n" + table(header, rows))
-    print("\n".join(parts))
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "plants.md").write_text("\n".join(parts))
+    more = f", mujoco {mujoco.__version__}"
+    write(__file__, "Error against computing time", parts, more)
     with figure_style():
         write_figure(figure(curves), RESULTS, "plants")
 

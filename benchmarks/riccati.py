@@ -8,17 +8,16 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import table, write
 from numpy.typing import NDArray
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from scipy.linalg import solve_discrete_are
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
 from stewart_drake.law.delay_model import ChainModel, DelayedModel, chain, delayed_model
 from stewart_drake.law.error_model import double_integrators
 from stewart_drake.law.riccati import augmented_gain, full_gain, reduced_gain
@@ -26,7 +25,6 @@ from stewart_drake.mechanism.torque_map import torque_map
 
 Array = NDArray[np.float64]
 
-RESULTS = Path(__file__).parent / "results"
 PERIOD = 0.1
 STEPS = (0, 1, 5, 8, 10, 20, 30)
 FRACTIONS = (0.0, 0.5)
@@ -110,24 +108,15 @@ def checks(fraction: float) -> list[str]:
     return [f"{fraction:g}", f"{bare:.3g}", f"{checked:.3g}", f"{checked / bare:.3g}"]
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [" | ".join(header), " | ".join("---:" for _ in header), *map(" | ".join, rows)]
-    return "\n".join(f"| {line} |" for line in lines) + "\n"
-
-
 def main() -> None:
     """Print the tables and write them."""
-    packages = ", ".join(f"{package} {number}" for package, number in versions().items())
-    parts = [f"# The delay reduction\n\nMade by `python benchmarks/riccati.py` with {packages}.\n"]
-    for fraction in FRACTIONS:
-        parts.append(f"## eta0 = {fraction:g} dt\n\n{table(*comparison(fraction))}")
-        print(parts[-1], flush=True)
+    parts = [
+        f"## eta0 = {fraction:g} dt\n\n{table(*comparison(fraction), '---:')}"
+        for fraction in FRACTIONS
+    ]
     header = ["eta0 / dt", "Drake's solver, ms", "reduced_gain, ms", "ratio"]
-    parts.append(f"## Cost of the checks\n\n{table(header, [checks(f) for f in FRACTIONS])}")
-    print(parts[-1])
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "riccati.md").write_text("\n".join(parts))
+    cost = table(header, [checks(f) for f in FRACTIONS], "---:")
+    write(__file__, "The delay reduction", [*parts, f"## Cost of the checks\n\n{cost}"])
 
 
 if __name__ == "__main__":

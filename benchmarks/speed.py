@@ -13,13 +13,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import joblib
 import numpy as np
-from controller_step import RESULTS, evaluations, table, walls
+from _page import table, write
+from controller_step import evaluations, walls
 from plants import SAP_STEPS, drake_run, motions
 from plants import reference as plant_reference
 from riccati import comparison
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
 from stewart_drake.mechanism.files import load_mechanism
@@ -129,13 +129,11 @@ def studies() -> Rows:
 
 def main() -> None:
     """Measure, print and write."""
-    packages = ", ".join(f"{package} {number}" for package, number in versions().items())
     again = [[what, f"{value} s", ""] for what, value in walls()]
     one = [[f"accelerations, {what}", value, ""] for what, value in evaluations()]
     cores = joblib.cpu_count()
     over = ["wall, s", "step, ms", "wall, ratio", "step, ratio"]
     parts = [
-        f"# Speed\n\nMade by `python benchmarks/speed.py` with {packages}, on {cores} cores.\n",
         table(["what", "ratio or time", ""], [*plants(), *gains(), *steps(), *again, *one]),
         "## Growth with the delay\n\nFive seconds of `paper` on the exact plant.\n",
         table(["mu", *over], growth("delay.steps", DELAYS)),
@@ -144,10 +142,7 @@ def main() -> None:
         "## Growth with the number of runs\n\nTen seconds of `paper` each.\n",
         table(["runs", "1 worker, s", f"{cores} workers, s", "efficiency"], studies()),
     ]
-    text = "\n".join(parts)
-    print(text)
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "speed.md").write_text(text)
+    write(__file__, "Speed", parts, f", on {cores} cores")
 
 
 if __name__ == "__main__":

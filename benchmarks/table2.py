@@ -13,17 +13,17 @@ from tempfile import TemporaryDirectory
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import table as plain_table
+from _page import write
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
 from stewart_drake.loop.controller_margin import controller_margin
 from stewart_drake.loop.experiment import check_instants, prepare
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.studies.reach import largest_factor
 
-RESULTS = Path(__file__).parent / "results"
 AMPLITUDE = np.array([np.pi / 12] * 3 + [0.02, 0.02, 0.08])
 ROWS = ("delay_lqr", "delay_lqi", "delay_lqi_sum", "delay_lqi_200")
 BLIND = ("lqr", "lqi")
@@ -53,9 +53,7 @@ def told(result: sd.SimulationResult) -> str:
 
 def table(title: str, heads: tuple[str, ...], rows: list[list[str]]) -> str:
     """As Markdown."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    body = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    return f"## {title}\n\n{body}\n"
+    return f"## {title}\n\n{plain_table(heads, rows)}"
 
 
 def shares() -> str:
@@ -175,11 +173,7 @@ def exits() -> str:
 def main() -> None:
     """Write all tables."""
     parts = [make() for make in (shares, weights, longer_cranks, inertia, exits)]
-    used = ", ".join(f"{name} {version}" for name, version in versions().items())
-    title = "# Why the paper's Table II needs its conditions"
-    head = f"{title}\n\nMade by `python benchmarks/table2.py` with {used}.\n"
-    (RESULTS / "table2.md").write_text("\n".join([head, *parts]))
-    print("\n".join(parts))
+    write(__file__, "Why the paper's Table II needs its conditions", parts)
 
 
 if __name__ == "__main__":

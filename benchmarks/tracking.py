@@ -7,20 +7,19 @@ gravity, integral, delay, noise. All runs use `predictor_lqi` unless the row say
 import os
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import table as plain_table
+from _page import write
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.scenario.signals import PARAMETERS
 
-RESULTS = Path(__file__).parent / "results"
 EXACT = "plant.kind=exact"
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 BIAS = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
@@ -56,8 +55,7 @@ def outcome(result: SimulationResult) -> str:
 
 def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table under a heading."""
-    lines = [" | ".join(header), " | ".join("---" for _ in header), *(" | ".join(r) for r in rows)]
-    return f"## {title}\n\n" + "\n".join(f"| {line} |" for line in lines) + "\n"
+    return f"## {title}\n\n{plain_table(header, rows)}"
 
 
 def faithful() -> str:
@@ -239,11 +237,7 @@ def main(names: Sequence[str]) -> None:
         parts.append(SECTIONS[name]())
         print(parts[-1], flush=True)
     if not names:
-        head = "# Tracking\n\nMade by `python benchmarks/tracking.py` with " + ", ".join(
-            f"{package} {number}" for package, number in versions().items()
-        )
-        RESULTS.mkdir(exist_ok=True)
-        (RESULTS / "tracking.md").write_text("\n\n".join([head + ".", *parts]))
+        write(__file__, "Tracking", parts)
 
 
 if __name__ == "__main__":

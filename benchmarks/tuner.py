@@ -15,9 +15,9 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import table, write
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
 from stewart_drake.report.terminal import count_bar
 from stewart_drake.report.words import number
 from stewart_drake.scenario.loading import scenario_to_dict
@@ -29,7 +29,6 @@ from stewart_drake.tuning.dataset import make_dataset
 from stewart_drake.tuning.evaluation import TUNER, Evaluation, evaluate
 from stewart_drake.tuning.training import Training, train
 
-RESULTS = Path(__file__).parent / "results"
 WORKERS = 2
 CELLS = 16
 SCENARIOS = 20
@@ -135,7 +134,6 @@ def beyond(folder: Path, condition: str, grid: Evaluation) -> list[str]:
     header = ["beyond the grid", "failures", "mean E_ac, same scenarios"]
     return [
         table(header, lines),
-        "",
         f"With these four as well, the best gain of each scenario, picked in hindsight, is "
         f"{100 * hindsight:.1f} % below the best fixed gain of the grid.",
     ]
@@ -144,11 +142,6 @@ def beyond(folder: Path, condition: str, grid: Evaluation) -> list[str]:
 def slug(name: str) -> str:
     """A name as part of a file name."""
     return name.replace(", ", "-").replace(" ", "_")
-
-
-def table(header: list[str], lines: list[list[str]]) -> str:
-    """A Markdown table."""
-    return "\n".join(f"| {' | '.join(row)} |" for row in [header, ["---"] * len(header), *lines])
 
 
 def training_section(trained: dict[str, Training]) -> str:
@@ -190,7 +183,7 @@ def evaluation_section(condition: str, found: dict[str, Evaluation], extra: list
     header = ["w_Q / w_R", "failures", "mean E_ac", "95 %", "worst"]
     lines = [row(name, one) for name, one in first["candidates"].items() if name != TUNER]
     text = [f"## {condition}", "", f"{SCENARIOS} scenarios, {first['common']} in common.", ""]
-    text += [table(header, lines), ""]
+    text += [table(header, lines)]
     lines = []
     for name, evaluation in found.items():
         s = evaluation.summary
@@ -215,7 +208,7 @@ def evaluation_section(condition: str, found: dict[str, Evaluation], extra: list
         "hindsight",
         "fallbacks",
     ]
-    return "\n".join([*text, table(header, lines), "", *extra])
+    return "\n".join([*text, table(header, lines), *extra]) + "\n"
 
 
 EXPLANATION = (
@@ -236,11 +229,7 @@ def main(arguments: list[str]) -> None:
         grid = next(iter(found.values()))
         parts.append(evaluation_section(condition, found, beyond(folder, condition, grid)))
         print(f"\n{parts[-1]}", flush=True)
-    head = "# The tuner\n\nMade by `python benchmarks/tuner.py` with " + ", ".join(
-        f"{package} {release}" for package, release in versions().items()
-    )
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "tuner.md").write_text("\n\n".join([head + ".", EXPLANATION, *parts]) + "\n")
+    write(__file__, "The tuner", [f"{EXPLANATION}\n", *parts])
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import joblib
 import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
@@ -91,6 +92,15 @@ def test_analyses_are_answers_that_can_be_printed_shown_and_saved(tmp_path):
     assert saved == jsonable(found.summary)
 
 
+def test_a_network_is_analysed(monkeypatch):
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
+    settings = (*SHORT, "link.kind=network")
+    found = sd.analyze_link(sd.load_scenario("paper", settings=settings), runs=1)
+    assert "A bound of" in found.verdict and found.study.runs == 1
+    with pytest.raises(sd.ConfigError, match=r"link.kind: got 'wire'; expected 'network'"):
+        sd.analyze_link("paper")
+
+
 def test_compare_takes_own_controllers_and_disturbances(tmp_path):
     results = sd.compare("paper", SHORT, controllers={"nothing": Still}, disturbance=Push)
     assert list(results)[-1] == "nothing" and len(results) == 6
@@ -110,6 +120,7 @@ def test_compare_takes_own_controllers_and_disturbances(tmp_path):
     ("given", "message"),
     [
         ({"controllers": {"lqr": Still}}, "got 'lqr', a shipped one"),
+        ({"controllers": {"adaptive_lqi": Still}}, "got 'adaptive_lqi', a shipped one"),
         ({"disturbance": "made"}, "got an instance, which serves one run"),
         ({"reference": "handle"}, "cannot be sent to other processes"),
     ],

@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.excitation import fitted_multisine, multisine
 from stewart_drake.identification.fit import (
     ENOUGH,
@@ -436,9 +437,9 @@ def test_two_logs_tell_more_than_one(log_and_truth):
     log, true = log_and_truth
     half = len(log.times) // 2
     parts = [
-        dataclasses.replace(log, name=name, times=log.times[rows], values=log.values[rows])
-        for name, rows in (("first", slice(None, half)), ("second", slice(half, None)))
-    ]
+        dataclasses.replace(log, times=log.times[rows], values=log.values[rows])
+        for rows in (slice(None, half), slice(half, None))
+    ]  # of one name
     both = identify(parts, PAPER, Tolerances(offsets=0.0))
     one = identify(parts[1:], PAPER, Tolerances(offsets=0.0))
     assert both.std[DELAY] < one.std[DELAY]
@@ -465,6 +466,8 @@ def test_a_multisine_rests_at_both_ends_and_stays_inside():
     assert min(PAPER.reach_margins(pose).min() for pose in poses) > 0
     moved = (poses - PAPER.home)[100:-100]
     assert np.linalg.cond(moved / moved.std(axis=0)) < 10  # no two coordinates move alike
+    with pytest.raises(ConfigError, match="not even 5 % fits the workspace"):
+        fitted_multisine(PAPER, PAPER.home, np.full(6, 100.0), 2.0)
 
 
 def test_a_mechanism_s_file_is_read_back(tmp_path: Path):

@@ -132,6 +132,12 @@ def broken(signals: xr.Dataset, how: str) -> xr.Dataset:
         signals.attrs["scenario"] = text.replace(old, new, 1)
     elif how == "log_period":
         return signals.isel(time=slice(None, None, 9))
+    elif how == "time is missing":
+        return signals.isel(time=slice(0))
+    elif how == "a step of":
+        return signals.isel(time=[-1])
+    elif how == "longer than":
+        return signals.assign_coords(time=1e300 * (1 + signals.time))
     elif how == "at 5 instants":
         return signals.isel(time=signals.time < 0.45)
     else:
@@ -142,7 +148,7 @@ def broken(signals: xr.Dataset, how: str) -> xr.Dataset:
 @pytest.mark.parametrize(
     "how",
     ["scenario", "network", "sensor.delay", "log_period", "at 5 instants", "measurement",
-     "torque_commanded"],
+     "torque_commanded", "time is missing", "a step of", "longer than"],
 )  # fmt: skip
 def test_a_run_that_is_no_log_is_told_in_one_line(lost, tmp_path, how):
     with xr.open_dataset(lost, engine="h5netcdf") as signals:
@@ -172,6 +178,7 @@ def test_a_run_that_is_no_log_is_told_in_one_line(lost, tmp_path, how):
         (["LOG", "--mechanism", "paper", "--pose-std", "1e-4"], "--pose-std"),
         (["LOG", "--mechanism", "paper", "--pose-std", "1e-4,0"], "--pose-std"),
         (["LOG", "--mechanism", "paper", "--set", "duration=1"], "--set"),
+        (["LEGLESS", "--mechanism", "paper"], "at 0 instants; expected at least 8"),
         (["--plan", "nothing"], "nothing"),
         (["--plan", "paper", "--set", "plant.gravitas=true"], "gravitas"),
     ],
@@ -179,7 +186,10 @@ def test_a_run_that_is_no_log_is_told_in_one_line(lost, tmp_path, how):
 def test_a_bad_command_is_told_in_one_line(tmp_path, capsys, arguments, named):
     path = tmp_path / "log.csv"
     path.write_text(csv_text())
-    words = [str(path) if word == "LOG" else word for word in arguments]
+    legless = tmp_path / "legless.csv"  # one encoder says nothing
+    legless.write_text(csv_text(rows=[[*row[:9], "", *row[10:]] for row in ROWS]))
+    places = {"LOG": str(path), "LEGLESS": str(legless)}
+    words = [places.get(word, word) for word in arguments]
     assert main(["identify", *words, "--out", str(tmp_path / "out")]) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.startswith("error: ") and named in err and err.count("\n") == 1

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.experiment import assemble, check_instants, prepare
@@ -19,7 +20,15 @@ from stewart_drake.mechanism.files import build_mechanism, load_mechanism, mecha
 from stewart_drake.mechanism.inertias import bar_inertia
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.layout import Problem, judge, problem_of, search
+from stewart_drake.studies.layout import (
+    Found,
+    Layout,
+    LayoutStudy,
+    Problem,
+    judge,
+    problem_of,
+    search,
+)
 from stewart_drake.studies.layout_measures import (
     MEASURES,
     Wish,
@@ -35,6 +44,7 @@ from stewart_drake.studies.layout_space import (
     space_around,
 )
 from stewart_drake.studies.reach import margins_along
+from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.sizing import size_motors
 from tests.mechanisms import PAPER
 
@@ -152,13 +162,26 @@ def test_links_of_the_same_section_keep_a_uniform_bar_s_inertia() -> None:
         ({"size": (1, 2)}, (), "--vary: got size"),
         ({}, ("size",), "--keep: got size"),
         ({"crank": (0.2, 0.1)}, (), "--vary crank: got 0.2:0.1"),
-        ({"crank": (0.0, 0.1)}, (), "--vary crank: got 0 m"),
+        ({"crank": (0.0, 0.1)}, (), "--vary crank: length: got 0.0"),
+        ({"rod": (0.1, np.inf)}, (), "--vary rod: length: got inf"),
+        ({"base_radius": (0.0, 0.1)}, (), "--vary: base_radius: got 0.0"),
+        ({"plate_separation_deg": (5.0, 500.0)}, (), "--vary: plate_separation_deg: got 500.0"),
+        ({"shaft_height": (0.0, 1e9)}, (), "--vary: shaft_height: got 1000000000.0"),
+        ({"crank": (0.05, 0.06)}, ("crank",), "--keep: got crank, which --vary varies"),
         ({}, PARAMETERS, "--keep: got every number"),
     ],
 )
 def test_a_space_that_is_none_is_one_line(vary: Any, keep: Any, word: str) -> None:
     with pytest.raises(ConfigError, match=word):
         space_around(SPEC, vary, keep)
+
+
+def test_usual_bounds_are_numbers_that_a_file_may_hold() -> None:
+    assert SPEC.pattern is not None
+    turned = dataclasses.replace(
+        SPEC, pattern=dataclasses.replace(SPEC.pattern, rotation_deg=330.0)
+    )
+    assert space_around(turned, {}, ()).bounds["rotation_deg"] == (270.0, 360.0)
 
 
 def test_a_machine_told_leg_by_leg_has_no_numbers_to_vary() -> None:
@@ -214,6 +237,18 @@ def test_a_motion_out_of_reach_is_judged_without_a_run() -> None:
     found = json.loads(judge(problem_of(far, "condition", {}, {}, ()), "paper"))
     assert found["outcome"]["status"] == "refused" and found["measures"]["reach"] < 0
     assert list(found["measures"]) == ["reach"]
+
+
+def test_a_layout_that_loses_its_goal_between_the_instants_looked_at_is_told() -> None:
+    own = own_values(SPEC)
+    lost = Layout("layout_1", PAPER, OWN.order, own, {"reach": -0.01}, {"reach": 1.02}, None,
+                  Outcome("refused", "out of reach", time=0.0))  # fmt: skip
+    found = Found(list(OWN.order), list(OWN.branches), own.tolist(), {"condition": 3.0}, {}, 7)
+    study = LayoutStudy(problem(), 0, 1, 1, {"a": found}, lost, [lost])
+    assert study.verdict == (
+        "partly: of 7 layouts in 1 searches the best has no condition at every instant; "
+        "0 of 1 complete the scenario"
+    )
 
 
 def test_errata_another_layout_is_conditioned_better() -> None:
@@ -289,6 +324,24 @@ def test_the_command_writes_machines_that_run_and_goes_on(
 
 
 @pytest.mark.usefixtures("in_process")
+def test_a_search_from_python_is_that_of_the_command(tmp_path: Path, in_process: list[int]) -> None:
+    keep = [name for name in PARAMETERS if name not in ("crank", "rod")] + ["branches"]
+    found = sd.layout(
+        load_scenario("paper", None, QUICK),
+        tmp_path,
+        limits={"clearance": -1.0},
+        keep=[*keep, "plate_order"],
+        best=1,
+        generations=1,
+    )
+    assert (
+        found.verdict.startswith("yes: of ") and found.summary["layouts"][0]["name"] == "layout_1"
+    )
+    assert (tmp_path / "layout_1.yaml").exists() and len(in_process) == 2
+    found.save(tmp_path / "page")
+    assert "layout_1" in (tmp_path / "page" / "report.html").read_text()
+
+
 def test_limits_that_nothing_keeps_are_told_and_no_machine_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

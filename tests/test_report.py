@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import re
 import time
 from html.parser import HTMLParser
@@ -29,6 +30,7 @@ from stewart_drake.tuner.network import save_network
 from tests.browser import needs_chromium
 from tests.test_network import small_network
 
+EXACT = ("plant.kind=exact",)
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
 
 
@@ -228,7 +230,7 @@ def test_who_completes_is_told_and_how_the_delay_was_found():
 def test_a_motion_out_of_reach_gets_a_report_without_runs(tmp_path, capsys, monkeypatch):
     def only_workspace(scenario, scenarios, progress):
         assert not scenarios
-        return dict.fromkeys(ANALYSES, collect_module._analyse("workspace", scenario))
+        return {}, dict.fromkeys(ANALYSES, collect_module._analyse("workspace", scenario))
 
     monkeypatch.setattr(collect_module, "_work", only_workspace)
     amplitude = "reference.amplitude=[0.3, 0.3, 0.3, 0.2, 0.2, 0.3]"
@@ -247,7 +249,7 @@ def test_the_tuners_runs_are_there_where_there_is_a_network(monkeypatch, tmp_pat
 
     def kept(scenario, scenarios, progress):
         jobs.update(scenarios)
-        return dict.fromkeys((*scenarios, *ANALYSES))
+        return dict.fromkeys(scenarios), dict.fromkeys(ANALYSES)
 
     monkeypatch.setattr(collect_module, "_work", kept)
     for there in (False, True):
@@ -262,7 +264,29 @@ def test_the_tuners_runs_are_there_where_there_is_a_network(monkeypatch, tmp_pat
     mine = tmp_path / "mine.yaml"
     mine.write_text("controller: {feedforward: none}")
     collect(mine)
-    assert jobs["run"].controller.feedforward == "none"
+    assert jobs[collect_module._OWN].controller.feedforward == "none"
+    own = tmp_path / "own.yaml"
+    own.write_text("w_R: 2.0")
+    found = collect("paper", EXACT, controller=own)
+    assert found.scenario == jobs[collect_module._OWN] == load_scenario("paper", own, EXACT)
+    assert collect("paper", EXACT, controller="lqi").scenario == jobs["lqi"]
+
+
+def test_a_row_of_the_comparison_may_have_any_name(monkeypatch, tmp_path):
+    def done(jobs, function, folder, **options):
+        paths = {key: tmp_path / key for key in jobs}
+        for path in paths.values():
+            assert path.name.isalnum()
+            path.write_bytes(pickle.dumps(path.name))
+        return paths
+
+    monkeypatch.setattr(collect_module, "run_jobs", done)
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("compare: {delay: {controller: lqi, w_R: 2.0}, run it: {controller: lqi}}")
+    found = collect(mine, EXACT)
+    assert found.analyses == {name: name for name in ANALYSES}
+    assert {*CONTROLLERS, "delay", "run it"} <= set(found.comparison)
+    assert found.run is not None and len(set(found.comparison.values())) == len(found.comparison)
 
 
 def test_figure_6_and_the_tuned_rows_are_of_the_tuners_runs(tmp_path):

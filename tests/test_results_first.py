@@ -19,7 +19,7 @@ from stewart_drake.report import (
     replay,
     report_document,
 )
-from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, SERVOS
+from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, LABELS, SERVOS
 
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.3", "--set", "delay.steps=1")
 COMMAND = (sys.executable, "-c", "import sys; from stewart_drake.cli import main; sys.exit(main())")
@@ -82,11 +82,15 @@ def test_figures_of_an_earlier_run_do_not_stay_beside_new_results(tmp_path, monk
     assert names(tmp_path) == {"summary.json", "signals.nc"}
 
 
-def test_all_figures_of_a_comparison_are_known_to_be_removed() -> None:
-    controllers = {name for name in run_command.COMPARISON_FIGURES if name.startswith("torques_")}
-    shown = (*figures.TORQUE_CONTROLLERS, ADAPTIVE, *SERVOS)
-    assert controllers == {f"torques_{name}" for name in shown}
-    assert f"delay_{ADAPTIVE}" in run_command.COMPARISON_FIGURES
+def test_nothing_of_an_earlier_comparison_stays_beside_new_results(tmp_path, monkeypatch) -> None:
+    assert {*figures.TORQUE_CONTROLLERS, ADAPTIVE, *SERVOS} <= set(LABELS)
+    for name in LABELS:
+        for old in (f"{name}.nc", f"torques_{name}.png", f"delay_{name}.svg", "weights.png"):
+            (tmp_path / old).write_text("of an earlier comparison")
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
+    monkeypatch.setattr(figures, "draw_comparison", broken(tmp_path))
+    assert main(["compare", *EXACT, "--quiet", "--out", str(tmp_path)]) == 0
+    assert names(tmp_path) == {"summary.json", *(f"{name}.nc" for name in CONTROLLERS)}
 
 
 def start(folder: Path, redirection: str = "", **environment: str) -> subprocess.CompletedProcess:

@@ -240,6 +240,11 @@ def test_without_survivors_there_is_nothing_to_train_on(data):
         train(dead)
 
 
+def test_fewer_rows_than_numbers_to_find_are_refused(data):
+    with pytest.raises(ConfigError, match="100 rows to train on cannot tell the 212 numbers"):
+        train(data, max_rows=100)
+
+
 def test_without_torch_the_message_tells_the_fix(data, monkeypatch):
     monkeypatch.setitem(levenberg.__builtins__, "__import__", _no_torch)
     with pytest.raises(ConfigError, match=r"pip install 'stewart-drake\[train\]'"):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import resolve
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.families import (
@@ -34,8 +35,16 @@ from stewart_drake.tuning.curves import (
     watched_run,
 )
 from stewart_drake.tuning.levenberg import initial_theta
-from stewart_drake.tuning.regret import _Trainer, best_ratio, rows_of
-from stewart_drake.tuning.worth import FIXED, HINDSIGHT, RULE, compared
+from stewart_drake.tuning.regret import _Trainer, best_ratio, rows_of, train_by_regret
+from stewart_drake.tuning.worth import (
+    FIXED,
+    HINDSIGHT,
+    RULE,
+    compared,
+    read_told,
+    tuned_run,
+    tuners_of,
+)
 
 Array = NDArray[np.float64]
 
@@ -187,7 +196,35 @@ def test_the_same_seed_gives_the_same_network() -> None:
     assert not np.array_equal(found[0], found[2])
 
 
+@pytest.mark.parametrize("start", [None, -1.5])
+def test_a_network_begins_where_it_is_asked_to(start: float | None, tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    curves = synthetic(30)
+    named = dataclasses.replace(curves, features={"densities": curves.features["health"]})
+    found = train_by_regret(named, tmp_path, features="densities", start=start)
+    assert found.network.start is not None
+    assert ratio_of(found.network.start) == pytest.approx(
+        best_ratio(curves) if start is None else start
+    )
+
+
 # ------------------------------------------------------------------------- worth
+
+
+@pytest.mark.parametrize("name", ["fixed", "hindsight", "rule", "-1.0"])
+def test_a_network_is_not_called_as_another_candidate(name: str, tmp_path: Path) -> None:
+    path = tmp_path / f"{name}.json"
+    path.write_bytes(resolve("weights", "health_T").read_bytes())
+    with pytest.raises(ConfigError, match=f"got '{name}', which another candidate is called"):
+        tuners_of([str(path)])
+
+
+def test_a_file_of_too_few_runs_is_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "0000.json"
+    path.write_bytes(tuned_run(base_of("T", ("duration=0.5",))))
+    assert len(read_told(path).cost) == 1
+    with pytest.raises(ConfigError, match="cost: got 1 runs; expected 13"):
+        read_told(path, runs=len(RATIOS))
 
 
 def judged(tuner: Array, fixed: Array) -> dict:  # type: ignore[type-arg]

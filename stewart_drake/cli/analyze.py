@@ -21,6 +21,7 @@ from stewart_drake.cli.common import (
     Workers,
     stopping,
 )
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.report.terminal import count_bar, working
 from stewart_drake.studies.ranges import RANGE_UNITS
 
@@ -43,7 +44,7 @@ def hautus(
     delivery = Delivery(out, quiet, as_json)
     with working("hautus", quiet):
         answer = _answer("hautus", delivery, scenario, None, settings)
-    return _deliver(answer, delivery)
+    return delivery.answer(answer)
 
 
 @app.command()
@@ -59,7 +60,7 @@ def delay(
     delivery = Delivery(out, quiet, as_json)
     with count_bar("simulations", quiet) as progress:
         answer = _answer("delay", delivery, scenario, controller, settings, progress=progress)
-    return _deliver(answer, delivery, interrupted=answer.study.interrupted)
+    return delivery.answer(answer, interrupted=answer.study.interrupted)
 
 
 @app.command()
@@ -88,7 +89,7 @@ def link(
             runs=runs,
             progress=progress,
         )
-    return _deliver(answer, delivery, interrupted=answer.study.interrupted)
+    return delivery.answer(answer, interrupted=answer.study.interrupted)
 
 
 @app.command()
@@ -107,7 +108,7 @@ def workspace(
     delivery = Delivery(out, quiet, as_json)
     with working("workspace", quiet):
         answer = _answer("workspace", delivery, scenario, None, settings)
-    return _deliver(answer, delivery)
+    return delivery.answer(answer)
 
 
 Vary = Annotated[
@@ -152,7 +153,12 @@ def robustness(
     """
     from stewart_drake.studies.ranges import read_ranges
 
-    ranges, delivery = read_ranges(vary or ()), Delivery(out, quiet, as_json)
+    ranges, others = read_ranges(vary or ()), {Path(name).stem: name for name in beside or ()}
+    if len(others) < len(beside or ()):
+        raise ConfigError(
+            f"--beside: got two of one name, {', '.join(beside or ())}; expected each but once"
+        )
+    delivery = Delivery(out, quiet, as_json)
     with TemporaryDirectory() as scratch:
         kept = GO_ON if out else "nothing is kept without --out"
         given = {"runs": runs, "seed": seed, "limit": limit}
@@ -165,7 +171,7 @@ def robustness(
                 settings,
                 fixed=("plant.kind=exact",),
                 typed={"vary": vary or (), **given, "beside": beside or ()},
-                beside={Path(name).stem: _load(scenario, name, settings) for name in beside or ()},
+                beside={key: _load(scenario, name, settings) for key, name in others.items()},
                 directory=out or scratch,
                 ranges=ranges,
                 workers=workers,
@@ -173,7 +179,7 @@ def robustness(
                 progress=progress,
                 **given,
             )
-    return _deliver(answer, delivery, "runs.csv", "runs/")
+    return delivery.answer(answer, "runs.csv", "runs/")
 
 
 def _load(scenario: str, controller: str, settings: list[str] | None) -> "Scenario":
@@ -206,16 +212,3 @@ def _answer(
     command = command_line("analyze", name, scenario, settings=given, options=words)
     loaded = load_scenario(scenario, controller, (*fixed, *given))
     return analyze(name, loaded, command=command, **options)
-
-
-def _deliver(answer: "Answer", delivery: Delivery, *beside: str, interrupted: bool = False) -> int:
-    """Print an answer; write summary.json and the page `beside` what the study has written."""
-    from stewart_drake.report.answer import PAGE
-
-    delivery.say(str(answer))
-    # No page of an earlier run beside this one's numbers, which come first.
-    delivery.discard(PAGE)
-    delivery.write(answer.summary)
-    delivery.draw(PAGE, answer.save_page)
-    delivery.wrote(*beside)
-    return delivery.end(answer.summary, interrupted)

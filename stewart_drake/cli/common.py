@@ -17,6 +17,7 @@ from stewart_drake.report.terminal import echo
 
 if TYPE_CHECKING:
     from stewart_drake.files.resources import Kind
+    from stewart_drake.report.answer import Answer
 
 INTERRUPTED: Final = 130
 """Exit status after Ctrl-C."""
@@ -137,6 +138,21 @@ def _remove_empty(directories: list[Path]) -> None:
             path.rmdir()
 
 
+def refuse(options: Mapping[str, object], why: str) -> None:
+    """Refuse what would be ignored; None and an empty list were not given.
+
+    Args:
+        options: by what the command calls them.
+        why: what follows the value, with what is expected.
+
+    Raises:
+        ConfigError: one line, about the first that was given.
+    """
+    for name, value in options.items():
+        if value is not None and value != []:
+            raise ConfigError(f"{name}: got {value} {why}")
+
+
 @contextlib.contextmanager
 def stopping(text: str) -> Iterator[None]:
     """On Ctrl-C in here the command ends at once, with these words."""
@@ -200,6 +216,18 @@ class Delivery:
     def wrote(self, *names: str) -> None:
         """To be told at the end."""
         self._written += names
+
+    def answer(self, answer: "Answer", *beside: str, interrupted: bool = False) -> int:
+        """Print an answer, write summary.json and the page `beside` what there is; the status."""
+        from stewart_drake.report.answer import PAGE
+
+        self.say(str(answer))
+        # No page of an earlier run beside this one's numbers, which come first.
+        self.discard(PAGE)
+        self.write(answer.summary)
+        self.draw(PAGE, answer.save_page)
+        self.wrote(*beside)
+        return self.end(answer.summary, interrupted)
 
     def end(self, summary: Mapping[str, Any], interrupted: bool = False) -> int:
         """Tell what was written, print the summary if it is wanted; the exit status."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stewart_drake.cli.common import AsJson, Delivery, Out, Quiet, Settings
+from stewart_drake.cli.common import AsJson, Delivery, Out, Quiet, Settings, refuse
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.tolerances import TOLERANCE_UNITS, Tolerances, read_tolerances
 from stewart_drake.report.terminal import working
@@ -27,6 +27,14 @@ Tolerance = Annotated[
         + "; ".join(f"{name}: {unit}" for name, unit in TOLERANCE_UNITS.items())
         + ".",
     ),
+]
+Bits = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="Of the encoders of a CSV log, per turn; 14 by default."),
+]
+Gravity = Annotated[
+    bool | None,
+    typer.Option(help="Whether gravity acted in a CSV log, as by default, or was balanced."),
 ]
 
 
@@ -50,9 +58,7 @@ def identify(
         typer.Option(metavar="S", help="Believed; that of the log by default, or 0.1 s."),
     ] = None,
     tolerance: Tolerance = None,
-    bits: Annotated[
-        int, typer.Option(metavar="N", help="Of the encoders of a CSV log, per turn.")
-    ] = 14,
+    bits: Bits = None,
     pose_std: Annotated[
         str | None,
         typer.Option(
@@ -60,9 +66,7 @@ def identify(
             help="Errors of poses; 1e-4,2e-5 in a CSV log. With --plan: poses are measured too.",
         ),
     ] = None,
-    gravity: Annotated[
-        bool, typer.Option(help="Whether gravity acted in a CSV log, or was balanced.")
-    ] = True,
+    gravity: Gravity = None,
     out: Out = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -81,26 +85,31 @@ def identify(
     if delay is not None and not 0 <= delay <= 100:
         raise ConfigError(f"--delay: got {delay:g}; expected 0 to 100 s")
     typed = {"delay": delay, "tolerance": tolerance, "bits": bits, "pose-std": pose_std, "out": out}
-    delivery = Delivery(out, quiet, as_json)
+    of_csv = {"--bits": bits, "--pose-std": pose_std, "--gravity": gravity}
     if plan is not None:
-        measured = pose_std is not None
+        said = {"--mechanism": mechanism, "--delay": delay, "--gravity": gravity}
+        refuse(said, "with --plan, whose scenario says it (--set); expected none")
+        delivery, measured = Delivery(out, quiet, as_json), pose_std is not None
         answer = _planned(plan, settings or [], tolerances, precision, measured, typed, quiet)
         names = _write_plan(answer, delivery)
     else:
-        if settings:
-            raise ConfigError(f"--set: got {settings[0]!r} without --plan; expected it with --plan")
-        answer = _found(logs or [], mechanism, tolerances, precision, delay, gravity, typed, quiet)
+        refuse({"--set": settings}, "without --plan; expected it with --plan")
+        if all(path.suffix == ".nc" for path in logs or ()):
+            refuse(of_csv, "with logs that say it themselves (.nc); expected it of a CSV log")
+        acted, delivery = gravity is not False, Delivery(out, quiet, as_json)
+        answer = _found(logs or [], mechanism, tolerances, precision, delay, acted, typed, quiet)
         names = _write_found(answer, delivery)
-    return _deliver(answer, delivery, names)
+    return delivery.answer(answer, *names)
 
 
-def _precision(bits: int, pose_std: str | None) -> "Precision":
+def _precision(bits: int | None, pose_std: str | None) -> "Precision":
     from stewart_drake.identification.log_files import Precision, angle_std
 
-    if not 1 <= bits <= 52:
+    if bits is not None and not 1 <= bits <= 52:
         raise ConfigError(f"--bits: got {bits}; expected 1 to 52")
+    precision = Precision() if bits is None else Precision(angle_std(bits))
     if pose_std is None:
-        return Precision(angle_std(bits))
+        return precision
     try:
         angle, position = (float(part) for part in re.split(r"\s*,\s*", pose_std.strip()))
     except ValueError:
@@ -109,7 +118,7 @@ def _precision(bits: int, pose_std: str | None) -> "Precision":
         raise ConfigError(
             f"--pose-std: got {pose_std!r}; expected two positive numbers, rad and m, as 1e-4,2e-5"
         )
-    return Precision(angle_std(bits), angle, position)
+    return precision._replace(pose_angle=angle, pose_position=position)
 
 
 def _found(
@@ -134,8 +143,8 @@ def _found(
     machine = load_mechanism(mechanism)
     with working("identify", quiet):
         read = [read_log(path, machine, precision, gravity) for path in logs]
-        words = {"mechanism": mechanism, **typed}
-        command = command_line("identify", *map(str, logs), options=words)
+        words = [*map(str, logs), *(() if gravity else ("--no-gravity",))]
+        command = command_line("identify", *words, options={"mechanism": mechanism, **typed})
         return answer_of(lambda: find(read, machine, tolerances, delay), document, command)
 
 
@@ -198,14 +207,3 @@ def _write_plan(answer: "Answer", delivery: Delivery) -> list[str]:
         with replacing(delivery.out / name) as partial:
             partial.write_text(text)
     return list(texts)
-
-
-def _deliver(answer: "Answer", delivery: Delivery, names: list[str]) -> int:
-    from stewart_drake.report.answer import PAGE
-
-    delivery.say(str(answer))
-    delivery.discard(PAGE)
-    delivery.write(answer.summary)
-    delivery.wrote(*names)
-    delivery.draw(PAGE, answer.save_page)
-    return delivery.end(answer.summary)

@@ -80,7 +80,7 @@ def layout(
     The best few become machine files, beside a page that compares them. With --out the same
     command goes on where it was stopped.
     """
-    from stewart_drake.report.answer import PAGE, answer_of
+    from stewart_drake.report.answer import answer_of
     from stewart_drake.report.layout_document import document
     from stewart_drake.report.page import command_line
     from stewart_drake.scenario.loading import load_scenario
@@ -114,12 +114,8 @@ def layout(
             document,
             command,
         )
-    delivery.say(str(answer))
-    delivery.discard(PAGE)
-    delivery.write(answer.summary)
-    delivery.draw(PAGE, answer.save_page)
-    delivery.wrote(*(f"{one.name}.yaml" for one in answer.study.layouts), "searches/", "judged/")
-    return delivery.end(answer.summary)
+    machines = [f"{one.name}.yaml" for one in answer.study.layouts]
+    return delivery.answer(answer, *machines, "searches/", "judged/")
 
 
 def _limits(texts: Sequence[str]) -> dict[str, float]:

@@ -32,20 +32,10 @@ if TYPE_CHECKING:
 CSV: Final = "signals.csv"
 REPLAY: Final = "replay.html"
 RUN_FIGURES: Final = ("states", "errors", "torques", "parameters", "delay", "weights")
-"""All that `run_figures` may write, and below `comparison_figures`; what is older is removed."""
-COMPARISON_FIGURES: Final = (
-    "states",
-    "errors",
-    "weights",
-    *(
-        f"torques_{name}"
-        for name in (
-            *("delay_lqr", "delay_lqi", "predictor_lqi"),
-            *("adaptive_lqi", "servo_preview", "servo_feedforward"),
-        )
-    ),
-    "delay_adaptive_lqi",
-)
+"""All that `run_figures` may write; what is older is removed."""
+COMPARED_FIGURES: Final = ("states", "errors", "weights")
+OF_CONTROLLERS: Final = ("torques", "delay")
+"""Those that `comparison_figures` may write, of all and of each controller."""
 _POLL: Final = 0.1
 """s between two looks whether somebody watches."""
 
@@ -228,9 +218,9 @@ def compare(
             scenario, settings or (), lambda name, time, error: progress[name](time, error)
         )
     delivery.say(comparison_document(results).plain())
-    delivery.discard(
-        *(f"{name}.nc" for name in (*names, study.ADAPTIVE)), *_pictures(COMPARISON_FIGURES)
-    )
+    known = dict.fromkeys((*names, *study.LABELS))
+    drawn = [f"{what}_{name}" for what in OF_CONTROLLERS for name in known]
+    delivery.discard(*(f"{name}.nc" for name in known), *_pictures((*COMPARED_FIGURES, *drawn)))
     if out is not None:
         study.save_comparison(results, out)
         delivery.wrote("summary.json", f"{len(results)} signal files")

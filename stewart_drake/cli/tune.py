@@ -3,7 +3,7 @@
 import time
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -18,6 +18,7 @@ from stewart_drake.cli.common import (
     Seed,
     Settings,
     Workers,
+    refuse,
     stopping,
 )
 from stewart_drake.files.errors import ConfigError
@@ -66,6 +67,13 @@ Family = Annotated[
 ]
 
 
+Labels = Annotated[
+    LabelKind | None,
+    typer.Option(help="What the network learns to answer; best_in_cell by default."),
+]
+Density = Annotated[DensityKind | None, typer.Option(help="Of (45); magnitude by default.")]
+
+
 @app.command()
 def dataset(
     scenario: ScenarioName = "paper",
@@ -73,12 +81,16 @@ def dataset(
     controller: Controller = None,
     settings: Settings = None,
     disturbed: Annotated[
-        int, typer.Option(metavar="N", help="N drawn conditions instead of the paper's grid.")
-    ] = 0,
+        int | None,
+        typer.Option(metavar="N", help="N drawn conditions instead of the paper's grid."),
+    ] = None,
     family: Family = None,
     draws: Annotated[
-        int, typer.Option(metavar="N", help="With --family: how many, each with 13 ratios.")
-    ] = DRAWS,
+        int | None,
+        typer.Option(
+            metavar="N", help=f"With --family: how many, each with 13 ratios; {DRAWS} by default."
+        ),
+    ] = None,
     seed: Seed = 0,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -91,9 +103,10 @@ def dataset(
     """
     if family is not None:
         refuse_with_family(scenario, controller)
-        return _curves(
-            family.value, draws, seed, settings, workers, scheduler, Delivery(out, quiet, as_json)
-        )
+        refuse({"--disturbed": disturbed}, "with --family, which has --draws; expected one of them")
+        number, delivery = DRAWS if draws is None else draws, Delivery(out, quiet, as_json)
+        return _curves(family.value, number, seed, settings, workers, scheduler, delivery)
+    refuse({"--draws": draws}, "without --family; expected both or neither")
     from stewart_drake.report.tuner_document import dataset_document
     from stewart_drake.tuning.dataset import make_dataset, summarize
 
@@ -103,7 +116,7 @@ def dataset(
         data = make_dataset(
             base,
             out,
-            disturbances=disturbed,
+            disturbances=disturbed or 0,
             seed=seed,
             workers=workers,
             scheduler=scheduler,
@@ -131,11 +144,11 @@ def train(
             metavar="RATIO", help="With --regret: log10 w_Q / w_R at first; else the best."
         ),
     ] = None,
-    labels: Annotated[
-        LabelKind, typer.Option(help="What the network learns to answer.")
-    ] = LabelKind.best_in_cell,
-    split: Annotated[SplitKind, typer.Option(help="What 70 % of are trained on.")] = SplitKind.run,
-    density: Annotated[DensityKind, typer.Option(help="Of (45).")] = DensityKind.magnitude,
+    labels: Labels = None,
+    split: Annotated[
+        SplitKind | None, typer.Option(help="What 70 % of are trained on; run by default.")
+    ] = None,
+    density: Density = None,
     seed: Seed = 0,
     workers: Workers = None,
     quiet: Quiet = False,
@@ -153,12 +166,17 @@ def train(
 
     if out.suffix != ".json":
         raise ConfigError(f"--out: got {str(out)!r}; expected a file ending in .json")
+    chosen = {"kind": labels, "split": split, "density": density}
+    given: dict[str, Any] = {name: one.value for name, one in chosen.items() if one is not None}
     delivery = Delivery(out.parent, quiet, as_json)
     if regret:
+        of_labels = {"--labels": labels, "--split": split, "--density": density}
+        refuse(of_labels, "with --regret; expected it without")
         return _train_by_regret(data, out, seed, start, workers, delivery)
+    refuse({"--start": start, "--workers": workers}, "without --regret; expected it with --regret")
     read = load_dataset(data)
     with stopping("nothing written"), working("training", quiet):
-        result = run(read, kind=labels.value, split=split.value, density=density.value, seed=seed)
+        result = run(read, seed=seed, **given)
     summary = summarize(result)
     delivery.discard()
     save_network(result.network, out)
@@ -236,9 +254,8 @@ def refuse_with_family(scenario: str, controller: str | None) -> None:
     Raises:
         ConfigError: another scenario, or a controller.
     """
-    for name, got, usual in (("SCENARIO", scenario, "paper"), ("--controller", controller, None)):
-        if got != usual:
-            raise ConfigError(f"{name}: got {got!r} with --family, which says it; expected none")
+    said = {"SCENARIO": None if scenario == "paper" else scenario, "--controller": controller}
+    refuse(said, "with --family, which says it; expected none")
 
 
 def _curves(

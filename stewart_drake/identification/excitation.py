@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.dynamics.workspace import margin
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.geometry import Mechanism
 
 Array = NDArray[np.float64]
@@ -30,6 +31,7 @@ _RISE: Final = 2.0
 """s."""
 _ROOM: Final = 0.5
 """Of the workspace's margin at the middle of the motion, what is left at least."""
+_LEAST_SHARE: Final = 0.05
 
 
 def multisine(middle: Array, peak: Array, duration: float) -> tuple[Array, Array]:
@@ -56,11 +58,18 @@ def multisine(middle: Array, peak: Array, duration: float) -> tuple[Array, Array
 def fitted_multisine(
     mechanism: Mechanism, middle: Array, peak: Array, duration: float
 ) -> tuple[Array, Array, float]:
-    """The same, made smaller until it stays well inside the workspace; and the share of `peak`."""
+    """The same, made smaller until it stays well inside the workspace; and the share of `peak`.
+
+    Raises:
+        ConfigError: there is no room for a twentieth of it.
+    """
     least, share = _ROOM * margin(mechanism, middle), 1.0
-    while share > 0.05:
+    while share > _LEAST_SHARE:
         time, poses = multisine(middle, share * peak, duration)
         if min(margin(mechanism, pose) for pose in poses) > least:
-            break
+            return time, poses, share
         share *= 0.9
-    return time, poses, share
+    raise ConfigError(
+        f"--plan: got a motion of which not even {100 * _LEAST_SHARE:g} % fits the workspace; "
+        "expected a smaller one, around a pose with room on all sides"
+    )

@@ -23,7 +23,7 @@ from stewart_drake.identification.fit import (
     without,
 )
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
-from stewart_drake.identification.logs import ANGLES, POSE, Log
+from stewart_drake.identification.logs import ANGLES, Log
 from stewart_drake.identification.shooting import Segment
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import (
@@ -195,6 +195,8 @@ def identify(
     told = [log.delay for log in logs if log.delay is not None]
     believed = delay if delay is not None else told[0] if told else USUAL_DELAY
     poses = [start.measured_poses(log, mechanism) for log in logs]
+    for log, own in zip(logs, poses, strict=True):
+        start.check_poses(log, own)
     # The longest log has most to say.
     longest = max(range(len(logs)), key=lambda i: len(logs[i].times))
     unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
@@ -238,14 +240,14 @@ def _begin(
     unknowns: Unknowns,
 ) -> _Begun:
     """A delay in s and segments of a share of their usual length, and what the nearest say."""
-    segments, mechanism = list[Segment](), unknowns.mechanism
+    segments, states, values = list[Segment](), list[Array](), unknowns.mean.copy()
     late = _COARSE if unknowns.std[DELAY] > 0 else 0.0
     for log, own in zip(logs, poses, strict=True):
-        length = share * start.segment_length(log, own, mechanism, delay)
-        segments += start.segments_of(log, float(log.sent[0]) + delay + late, length)
-    by_log = {log.name: own for log, own in zip(logs, poses, strict=True)}
-    first, values = start.first_states(segments, by_log), unknowns.mean.copy()
-    values[DELAY] = delay
+        length = share * start.segment_length(log, own, unknowns.mechanism, delay)
+        parts = start.segments_of(log, float(log.sent[0]) + delay + late, length)
+        segments += parts
+        states += [start.first_state(log, own, int(part.rows[0])) for part in parts]
+    first, values[DELAY] = np.array(states), delay
     whole = Problem(segments, unknowns)
     problem, guess = followed(whole, Guess(values, first))
     if not problem.segments:
@@ -307,6 +309,4 @@ def _unknowns(
     unknowns = unknowns_of(mechanism, tolerances, believed, torque, float(max(speeds)))
     if not any(log.measures(ANGLES) for log in logs):
         unknowns = unknowns.without_encoders()
-    if not any(log.measures(ANGLES) or log.measures(POSE) for log in logs):
-        raise ConfigError("LOG: got neither crank angles nor poses; expected one of the two")
     return unknowns

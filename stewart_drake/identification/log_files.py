@@ -100,14 +100,15 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
     if problem:
         raise ConfigError(f"{path}: {problem}; expected {EXPECTED}")
     period, time = scenario.controller.period, signals.time.values
-    # Held signals show a sample's value from its instant on.
-    samples: Array = period * np.arange(int(time[-1] / period + 1e-9) + 1, dtype=np.float64)
+    # Held signals show a sample's value from its instant on; each has a row of its own.
+    count = int(min(time[-1] / period + 1e-9, len(time))) + 1
+    samples: Array = period * np.arange(count, dtype=np.float64)
     rows = np.minimum(np.searchsorted(time, samples - 1e-9), len(time) - 1)
     seen = time[rows] < samples + period - 1e-9
     if not seen.all():
         raise ConfigError(
-            f"{path}: log_period: got a step of {np.diff(time).max():.4g} s, longer than the "
-            f"controller's {period:g} s; expected each of its samples in the log"
+            f"{path}: log_period: got a step of {np.diff(time, prepend=0.0).max():.4g} s, longer "
+            f"than the controller's {period:g} s; expected each of its samples in the log"
         )
     torques, believed = _sent(signals, scenario, samples, rows)
     own = scenario.actuator.torque_limit
@@ -196,7 +197,10 @@ def _run_problem(signals: xr.Dataset, scenario: Scenario) -> str | None:
         found = {str(d): n for d, n in signals[name].sizes.items() if d != "time"}
         if found != others or signals[name].dtype.kind != "f" or "time" not in signals[name].dims:
             return f"{name} is no signal over time of {others or 'one number'}"
-    if "time" not in signals.coords or not np.all(np.diff(signals.time.values) > 0):
+    time = signals.time.values if "time" in signals.coords else np.empty(0)
+    if time.dtype.kind != "f" or not len(time) or not np.isfinite(time).all():
+        return "time is missing, or no number"
+    if not np.all(np.diff(time) > 0):
         return "time does not increase"
     if isinstance(scenario.link, NetworkConfig) and scenario.link.back is not None:
         return "its measurements came over a network, each of an age of its own (link.return)"

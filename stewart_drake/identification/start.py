@@ -28,6 +28,8 @@ _LOOKS: Final = 40
 _CUBIC: Final = 0.3
 """s over which a cubic is laid through the poses to find rates."""
 _LEAST_ROWS: Final = 4
+_FEWEST: Final = 8
+"""Poses that rates are taken from, at least."""
 _WINDOW: Final = 0.3
 """s of the motion, at least, from which an acceleration is taken,"""
 _DEGREE: Final = 4
@@ -58,6 +60,20 @@ def measured_poses(log: Log, mechanism: Mechanism) -> Array:
         if np.isfinite(poses[row]).all():
             last = poses[row]
     return poses
+
+
+def check_poses(log: Log, poses: Array) -> None:
+    """Refuse a log that tells too few whole poses (n, 6) to begin with.
+
+    Raises:
+        ConfigError: one line.
+    """
+    count = int(np.isfinite(poses).all(axis=1).sum())
+    if count < _FEWEST:
+        raise ConfigError(
+            f"{log.name}: got all six crank angles, or a whole pose, at {count} instants; expected "
+            f"at least {_FEWEST}"
+        )
 
 
 def coarse_delay(
@@ -113,7 +129,7 @@ def segment_length(log: Log, poses: Array, mechanism: Mechanism, delay: float) -
     known = np.flatnonzero(np.isfinite(poses).all(axis=1))
     fastest = 1e-9
     for row in known[:: max(1, len(known) // _LOOKS)]:
-        rates = _first_state(log, poses, row)[STATE_RATES]
+        rates = first_state(log, poses, row)[STATE_RATES]
         torque = log.acting(log.times[row : row + 1], delay)[0]
         A = dynamics.derivatives(poses[row], rates, torque).A
         fastest = max(fastest, float(np.linalg.eigvals(A).real.max()))
@@ -127,7 +143,8 @@ def segments_of(log: Log, start: float, length: float) -> list[Segment]:
         ConfigError: nothing is left of the log.
     """
     rows = np.flatnonzero(log.times >= start - 1e-9)
-    if len(rows) < 2 * _LEAST_ROWS or log.times[-1] - log.times[rows[0]] < SHORTEST:
+    few = np.isfinite(log.values[rows]).sum() < 2 * NUM_STATE
+    if few or len(rows) < 2 * _LEAST_ROWS or log.times[-1] - log.times[rows[0]] < SHORTEST:
         raise ConfigError(
             f"{log.name}: got measurements up to t = {log.times[-1]:.4g} s, of which those from "
             f"{start:.4g} s on count, when torques act that are in the log; expected a longer log"
@@ -148,20 +165,14 @@ def segments_of(log: Log, start: float, length: float) -> list[Segment]:
     return segments
 
 
-def first_states(segments: list[Segment], poses: dict[str, Array]) -> Array:
-    """(n, 12) of the segments, from the poses of each log by its name."""
-    return np.array([_first_state(s.log, poses[s.log.name], s.rows[0]) for s in segments])
-
-
-def _first_state(log: Log, poses: Array, row: int) -> Array:
-    """State (12,) at a row: as measured, or of a cubic through the poses from there on."""
+def first_state(log: Log, poses: Array, row: int) -> Array:
+    """State (12,) at a row: as measured, or of a cubic through the poses (n, 6) from there on."""
     rates = log.values[row, MEASURED_RATES]
     if np.isfinite(rates).all() and np.isfinite(poses[row]).all():
         return np.concatenate([poses[row], rates])
     known = np.flatnonzero(np.isfinite(poses).all(axis=1))
-    place = min(np.searchsorted(known, row), len(known) - 8)
-    near = known[max(0, place) :]
-    near = near[: max(8, int(np.searchsorted(log.times[near], log.times[row] + _CUBIC)))]
+    near = known[min(int(np.searchsorted(known, row)), len(known) - _FEWEST) :]
+    near = near[: max(_FEWEST, int(np.searchsorted(log.times[near], log.times[row] + _CUBIC)))]
     cubic = np.polynomial.polynomial.polyfit(log.times[near] - log.times[row], poses[near], 3)
     state = np.empty(NUM_STATE)
     state[STATE_POSE], state[STATE_RATES] = cubic[0], cubic[1]

@@ -2,9 +2,10 @@
 
 import dataclasses
 import html
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from matplotlib.figure import Figure
 from pydrake.geometry import Meshcat
@@ -12,9 +13,9 @@ from pydrake.geometry import Meshcat
 from stewart_drake.loop.experiment import simulated_machine
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.report import report_document
+from stewart_drake.report import layout_document, report_document
 from stewart_drake.report.analyses import analyze
-from stewart_drake.report.answer import Answer, framed
+from stewart_drake.report.answer import Answer, answer_of, framed
 from stewart_drake.report.collect import collect
 from stewart_drake.report.figures import comparison_figures, draw_comparison, draw_run, run_figures
 from stewart_drake.report.page import Provenance, source
@@ -23,6 +24,7 @@ from stewart_drake.report.replay import replay_html, write_replay
 from stewart_drake.report.run_document import comparison_document, run_document
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.studies.layout import study_layout
 from stewart_drake.studies.ranges import Ranges
 
 Results = SimulationResult | Mapping[str, SimulationResult]
@@ -116,22 +118,26 @@ def replay(
     return write_replay(result, machine, Path(path), title)
 
 
-def report(scenario: str | Path, settings: Iterable[str] = ()) -> Answer:
+def report(
+    scenario: str | Path, settings: Iterable[str] = (), controller: str | Path | None = None
+) -> Answer:
     """Run, compare and analyse a scenario, as one page.
 
     Args:
         scenario: a shipped name or a path.
         settings: as `load_scenario` takes them.
+        controller: laid over the scenario's own, see `report.collect.collect`.
 
     Raises:
         ConfigError: bad input.
     """
     settings = tuple(settings)
-    found = collect(scenario, settings)
+    found = collect(scenario, settings, controller=controller)
     film = ""
     if found.run is not None:
         film = replay_html(found.run, simulated_machine(found.scenario), Path(scenario).stem)
-    made = Provenance(f"sd.report({str(scenario)!r}, {list(settings)})")
+    own = "" if controller is None else f", {str(controller)!r}"
+    made = Provenance(f"sd.report({str(scenario)!r}, {list(settings)}{own})")
     document = report_document.document(found, Path(scenario).stem, film)
     return Answer(found, report_document.report_summary(found), document, made)
 
@@ -147,6 +153,19 @@ def analyze_delay(scenario: Scenario | str | Path, simulations: bool = True) -> 
         ConfigError: bad input.
     """
     return _analyze("delay", scenario, simulations=simulations)
+
+
+def analyze_link(scenario: Scenario | str | Path, runs: int = 5) -> Answer:
+    """Which play-out bound suits a scenario's network, and what loss it bears.
+
+    Args:
+        scenario: with `link.kind: network`, or a shipped name or a path.
+        runs: seeds for each bound and each loss.
+
+    Raises:
+        ConfigError: bad input.
+    """
+    return _analyze("link", scenario, runs=runs)
 
 
 def analyze_robustness(
@@ -175,14 +194,12 @@ def analyze_robustness(
         ConfigError: bad input.
         ChildProcessError: a worker process died.
     """
-    loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-    command = f"sd.analyze_robustness({loaded!r}, {runs})"
     with TemporaryDirectory() as scratch:
         return analyze(
             "robustness",
-            _on_exact_plant(loaded),
+            _on_exact_plant(_loaded(scenario)),
             directory or scratch,
-            command=command,
+            command=f"sd.analyze_robustness({scenario!r}, {runs})",
             ranges=ranges,
             runs=runs,
             seed=seed,
@@ -213,6 +230,55 @@ def analyze_workspace(scenario: Scenario | str | Path) -> Answer:
     return _analyze("workspace", scenario)
 
 
-def _analyze(name: str, scenario: Scenario | str | Path, **options: bool) -> Answer:
-    loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-    return analyze(name, loaded, command=f"sd.analyze_{name}({scenario!r})", **options)
+def layout(
+    scenario: Scenario | str | Path,
+    directory: str | Path | None = None,
+    *,
+    goal: str = "condition",
+    limits: Mapping[str, float] | None = None,
+    vary: Mapping[str, tuple[float, float]] | None = None,
+    keep: Sequence[str] = (),
+    best: int = 3,
+    starts: int = 1,
+    generations: int = 100,
+    seed: int = 0,
+) -> Answer:
+    """Search layouts and lengths of a machine that suit a scenario's motion, on all cores.
+
+    Args:
+        scenario: or a shipped name or a path; its machine, which has a pattern, is begun from.
+        directory: where the machines found and finished searches are kept, so that a second call
+            goes on with them; None is nowhere.
+        goal, limits, vary, keep, best, starts, generations, seed: as of
+            `studies.layout.study_layout`.
+
+    Raises:
+        ConfigError: bad input.
+        ChildProcessError: a worker process died.
+    """
+    with TemporaryDirectory() as scratch:
+        return answer_of(
+            lambda: study_layout(
+                _loaded(scenario),
+                directory or scratch,
+                goal=goal,
+                limits=limits,
+                vary=vary,
+                keep=keep,
+                best=best,
+                starts=starts,
+                generations=generations,
+                seed=seed,
+            ),
+            layout_document.document,
+            f"sd.layout({scenario!r}, goal={goal!r}, seed={seed})",
+        )
+
+
+def _analyze(name: str, scenario: Scenario | str | Path, **options: Any) -> Answer:
+    command = f"sd.analyze_{name}({scenario!r})"
+    return analyze(name, _loaded(scenario), command=command, **options)
+
+
+def _loaded(scenario: Scenario | str | Path) -> Scenario:
+    return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)

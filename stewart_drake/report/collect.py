@@ -1,7 +1,7 @@
 """What a report is made of: the scenario's run, the comparison, the tuner's runs, the analyses."""
 
 import pickle
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,16 +19,14 @@ from stewart_drake.report.figures import TORQUE_CONTROLLERS
 from stewart_drake.scenario.config import AnnTunerConfig, Scenario
 from stewart_drake.scenario.loading import load_understood
 from stewart_drake.studies.compare import shown
-from stewart_drake.studies.jobs import Job, run_jobs
+from stewart_drake.studies.jobs import Job, Progress, run_jobs
 from stewart_drake.tuner.network import DEFAULT
 
 ANALYSES: Final = ("delay", "hautus", "workspace")
 """In the order in which they are read."""
-_OWN: Final = "run"
+_OWN: Final = ""
+"""The scenario's own run, which no row of a comparison is called."""
 _TUNED: Final = "tuned-"
-
-Progress = Callable[[int, int], None]
-"""Called with the number of finished pieces and of all pieces."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,10 @@ class Collected:
 
 
 def collect(
-    scenario_name: str | Path, settings: Iterable[str] = (), progress: Progress | None = None
+    scenario_name: str | Path,
+    settings: Iterable[str] = (),
+    progress: Progress | None = None,
+    controller: str | Path | None = None,
 ) -> Collected:
     """Run and analyse a scenario, on all cores. A reference out of reach is analysed only.
 
@@ -61,6 +62,8 @@ def collect(
         scenario_name: a shipped name or a path.
         settings: as `load_scenario` takes them.
         progress: called for every finished run or analysis.
+        controller: laid over the scenario's own, a shipped name or a path; the shipped ones are
+            compared on the scenario without it.
 
     Raises:
         ConfigError: bad input.
@@ -68,7 +71,7 @@ def collect(
         KeyboardInterrupt: Ctrl-C.
     """
     settings = tuple(settings)
-    scenario = load_understood(scenario_name, settings=settings)
+    scenario = load_understood(scenario_name, controller, settings)
     failure = reference_failure(assemble(scenario))
     scenarios: dict[str, Scenario] = {}
     rows: set[str] = set()
@@ -81,14 +84,14 @@ def collect(
             tuned = (*settings, "tuner.kind=ann")
             for name in TORQUE_CONTROLLERS:
                 scenarios[_TUNED + name] = load_understood(scenario_name, name, tuned)
-    done = _work(scenario, scenarios, progress)
+    done, analyses = _work(scenario, scenarios, progress)
     return Collected(
         scenario=scenario,
         failure=failure,
         run=next((done[key] for key, sc in scenarios.items() if sc == scenario), None),
         comparison={name: done[name] for name in scenarios if name in rows},
         tuned={name: done[_TUNED + name] for name in TORQUE_CONTROLLERS if _TUNED + name in done},
-        analyses={name: done[name] for name in ANALYSES},
+        analyses=analyses,
     )
 
 
@@ -105,14 +108,17 @@ def has_network(scenario: Scenario) -> bool:
 
 def _work(
     scenario: Scenario, scenarios: dict[str, Scenario], progress: Progress | None
-) -> dict[str, Any]:
+) -> tuple[dict[str, SimulationResult], dict[str, Answer]]:
+    """Results by the names of the scenarios, and the analyses by theirs."""
     # The analyses first: they take longest.
     jobs: dict[str, Job] = {name: (name, scenario) for name in ANALYSES}
-    jobs |= {name: ("simulate", sc) for name, sc in scenarios.items()}
+    jobs |= {f"run{i}": ("simulate", sc) for i, sc in enumerate(scenarios.values())}
     with TemporaryDirectory() as folder:
         paths = run_jobs(jobs, _piece, folder, settings={}, suffix=".pickle", progress=progress)
         # Written by our own workers a moment ago, into a folder that nobody else can write to.
-        return {key: pickle.loads(path.read_bytes()) for key, path in paths.items()}
+        found: list[Any] = [pickle.loads(path.read_bytes()) for path in paths.values()]
+    answers, runs = found[: len(ANALYSES)], found[len(ANALYSES) :]
+    return dict(zip(scenarios, runs, strict=True)), dict(zip(ANALYSES, answers, strict=True))
 
 
 def _piece(what: str, scenario: Scenario) -> bytes:

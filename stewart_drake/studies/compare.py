@@ -93,8 +93,8 @@ def compare(
         ConfigError: bad input, an unreachable reference.
     """
     settings, controllers = tuple(settings), dict(controllers or {})
-    _check_makers(controllers, reference, disturbance)
     scenarios = shown(scenario_name, settings)
+    _check_makers(controllers, reference, disturbance, taken={*LABELS, *scenarios})
     scenarios |= {name: load_understood(scenario_name, settings=settings) for name in controllers}
     given = {
         name: {
@@ -159,10 +159,15 @@ def label(name: str) -> str:
     return LABELS.get(name, name)
 
 
-def _check_makers(controllers: Mapping[str, Any], reference: Any, disturbance: Any) -> None:
+def _check_makers(
+    controllers: Mapping[str, Any], reference: Any, disturbance: Any, taken: set[str]
+) -> None:
     for name in controllers:
-        if name in CONTROLLERS:
-            raise ConfigError(f"controllers: got {name!r}, a shipped one; expected another name")
+        if name in taken:
+            raise ConfigError(
+                f"controllers: got {name!r}, a shipped one or one of the scenario's; expected "
+                "another name"
+            )
     systems = {f"controllers[{name!r}]": maker for name, maker in controllers.items()}
     for what, maker in (systems | {"disturbance": disturbance}).items():
         if isinstance(maker, System):

@@ -53,7 +53,9 @@ _log: Final = logging.getLogger("stewart_drake")
 
 
 @dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
-class _Manifest:
+class Manifest:
+    """The file MANIFEST."""
+
     hash: str
     settings: dict[str, Any]
 
@@ -192,12 +194,22 @@ def _check_manifest(folder: Path, settings: Mapping[str, Any], suffix: str) -> N
         write_atomically(path, (text + "\n").encode())
         return
     expected = "the manifest of the runs beside it (choose another folder, or delete this one)"
-    manifest = validate(_Manifest, load_json(path, _MAX_MANIFEST, expected), str(path))
+    manifest = read_manifest(folder, expected)
     if manifest.hash != settings_hash(settings):
         raise ConfigError(
             f"{folder}: belongs to other settings ({_difference(manifest.settings, mine)}); "
             "expected the same settings as before, or another folder"
         )
+
+
+def read_manifest(folder: Path, expected: str) -> Manifest:
+    """What the runs in a folder depend on.
+
+    Raises:
+        ConfigError: there is none, or it is damaged; one line with what is `expected`.
+    """
+    path = folder / MANIFEST
+    return validate(Manifest, load_json(path, _MAX_MANIFEST, expected), str(path))
 
 
 def _canonical(settings: Mapping[str, Any]) -> str:

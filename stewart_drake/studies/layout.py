@@ -249,9 +249,10 @@ class LayoutStudy:
             missing = ", ".join(f"{name} by {100 * s:.3g} %" for name, s in least.missed.items())
             return f"no: {tried} none keeps the limits; the nearest misses {missing}"
         best, goal = self.layouts[0], self.problem.wish.goal
-        told = f"{MEASURES[goal].factor * best.measures[goal]:.3g} {MEASURES[goal].shown}".rstrip(
-            " -"
-        )
+        told = f"no {goal} at every instant"
+        if goal in best.measures:
+            value = f"{MEASURES[goal].factor * best.measures[goal]:.3g} {MEASURES[goal].shown}"
+            told = f"a {goal} of {value.rstrip(' -')}"
         done = sum(one.outcome.status == "completed" for one in self.layouts)
         count = len(self.layouts)
         run = (
@@ -264,7 +265,7 @@ class LayoutStudy:
         opening = (
             "yes" if done == count and not any(one.missed for one in self.layouts) else "partly"
         )
-        return f"{opening}: {tried} the best has a {goal} of {told}; {run} the scenario"
+        return f"{opening}: {tried} the best has {told}; {run} the scenario"
 
     def _distance(self, found: Found) -> float:
         return self.problem.cost(found.measures)

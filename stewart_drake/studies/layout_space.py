@@ -5,7 +5,7 @@ of the plate each leg takes, and which crank solution. Both have a pattern's thr
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Final, NamedTuple
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.yamlio import validate
 from stewart_drake.mechanism.files import (
     BodySpec,
     LinkSpec,
@@ -152,7 +153,8 @@ def space_around(
         keep: parameters and choices that stay as they are.
 
     Raises:
-        ConfigError: a machine without a pattern, unknown names, bounds the wrong way round.
+        ConfigError: a machine without a pattern, names that are unknown or both varied and kept,
+            bounds the wrong way round, or beyond what a machine's file may hold.
     """
     if spec.pattern is None:
         raise ConfigError(
@@ -164,10 +166,13 @@ def space_around(
         for name in names:
             if name not in known:
                 raise ConfigError(f"--{option}: got {name}; expected one of {', '.join(known)}")
+    for name in vary:
+        if name in keep:
+            raise ConfigError(f"--keep: got {name}, which --vary varies; expected one of the two")
     own = _own(spec)
-    rod = own["rod"]
+    rod, turned = own["rod"], own["rotation_deg"]
     usual = {
-        "rotation_deg": (own["rotation_deg"] - 60, own["rotation_deg"] + 60),
+        "rotation_deg": (max(-360.0, turned - 60), min(360.0, turned + 60)),
         "base_separation_deg": (5.0, 110.0),
         "plate_separation_deg": (5.0, 110.0),
         "plate_offset_deg": (-60.0, 60.0),
@@ -180,9 +185,12 @@ def space_around(
         low, high = (own[name],) * 2 if name in keep else vary.get(name, usual[name])
         if not low <= high:
             raise ConfigError(f"--vary {name}: got {low:g}:{high:g}; expected the lower one first")
-        if name in _LENGTHS and not low > 0:
-            raise ConfigError(f"--vary {name}: got {low:g} m; expected a length above 0")
         bounds[name] = (float(low), float(high))
+        for bound in bounds[name]:
+            if name in ("crank", "rod"):
+                validate(LinkSpec, asdict(spec.crank) | {"length": bound}, f"--vary {name}")
+            else:
+                validate(PatternSpec, asdict(spec.pattern) | {name: bound}, "--vary")
     if all(low == high for low, high in bounds.values()):
         raise ConfigError("--keep: got every number of the pattern; expected one to search for")
     kept = tuple(name for name in CHOICES if name in keep)

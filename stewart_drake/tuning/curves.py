@@ -20,7 +20,6 @@ from pydantic import ConfigDict
 
 from stewart_drake.files.arrayio import load_npz
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.jsonio import load_json
 from stewart_drake.files.versions import versions
 from stewart_drake.files.yamlio import validate
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -32,7 +31,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.disturbances import with_gain
 from stewart_drake.studies.families import FamilyName, base_of, condition, draw_family
-from stewart_drake.studies.jobs import MANIFEST, Progress, run_jobs
+from stewart_drake.studies.jobs import MANIFEST, Progress, read_manifest, run_jobs
 from stewart_drake.studies.uncertainty import Draw
 from stewart_drake.tuner.density import NUM_INPUTS, WINDOW, densities
 from stewart_drake.tuner.health import HealthFeatures
@@ -271,10 +270,9 @@ def load_curves(directory: str | Path) -> Curves:
         ConfigError: there is nothing of the kind, some of it is missing or damaged.
     """
     folder = Path(directory) / "curves"
-    manifest = folder / MANIFEST
-    settings = validate(_Manifest, load_json(manifest, _MAX_MANIFEST, EXPECTED), str(manifest))
-    said = settings.settings
-    base = validate(Scenario, said.scenario, str(manifest))
+    manifest = str(folder / MANIFEST)
+    said = validate(_Settings, read_manifest(folder, EXPECTED).settings, manifest)
+    base = validate(Scenario, said.scenario, manifest)
     paths = sorted(folder.glob("[0-9]*.npz"))
     if [path.stem for path in paths] != [f"{i:05d}" for i in range(len(paths))] or not paths:
         raise ConfigError(f"{folder}: conditions are missing; go on with tune dataset --family")
@@ -283,21 +281,11 @@ def load_curves(directory: str | Path) -> Curves:
     return collected(said.family, base, draws, {path.stem: read(path) for path in paths})
 
 
-_STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-_MAX_MANIFEST: Final = 1_000_000
-
-
-@pydantic.dataclasses.dataclass(config=_STRICT)
+@pydantic.dataclasses.dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
 class _Settings:
     family: FamilyName
     seed: int
     scenario: dict[str, Any]
-
-
-@pydantic.dataclasses.dataclass(config=_STRICT)
-class _Manifest:
-    hash: str
-    settings: _Settings
 
 
 def roll_outs(

@@ -18,7 +18,6 @@ FREQUENCIES: Final = (0.5, 2.0, 4.0, 6.0)
 """rad/s."""
 SAMPLES: Final = 100
 """Of each run, k = 0 ... 99."""
-PAPER_ROWS: Final = 18_000
 
 
 class Run(NamedTuple):

@@ -118,9 +118,10 @@ def train_by_regret(
         raise ConfigError(f"--start: got {start:g}; expected {RATIOS[0]:g} to {RATIOS[-1]:g}")
     trainer = _Trainer(curves, features, seed, told)
     theta = trainer.fit(trainer.start, [trainer.rows], 1)
-    first = trainer.network(theta)
+    first, begin = trainer.network(theta), trainer.first if start is None else start
     if features != "health":
-        return RegretTraining(first, np.array(trainer.curve))
+        network = replace(first, start=weights_of(begin))
+        return RegretTraining(network, np.array(trainer.curve))
 
     def own_runs(network: Network, chosen: NDArray[np.intp], number: int) -> Curves:
         key = _key(network)
@@ -142,7 +143,6 @@ def train_by_regret(
     told("held out, in the loop: J of round 1 {:.3g}, of round 2 {:.3g}".format(*np.exp(scores)))
     best = (first, second)[int(np.argmin(scores))]
     fixed = curves.log_cost[held].mean(axis=0)
-    begin = trainer.first if start is None else start
     card = dict(best.card) | {
         "start": begin,
         "round": 1 + int(np.argmin(scores)),

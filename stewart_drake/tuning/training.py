@@ -83,7 +83,7 @@ def train(
         evaluations: of the residuals at most.
 
     Raises:
-        ConfigError: torch is missing, or no rows are left to train on or to test with.
+        ConfigError: torch is missing, or too few rows are left to train on or to test with.
     """
     rows = training_rows(dataset, kind, density)
     rng = np.random.default_rng(seed)
@@ -94,13 +94,19 @@ def train(
             f"data: {len(rows.densities)} labelled rows give nothing to "
             f"{'test with' if len(chosen) else 'train on'}; expected more runs that complete"
         )
+    theta = initial_theta(NUM_INPUTS, hidden, rows.targets[chosen], seed)
+    if rows.targets[chosen].size < len(theta):
+        raise ConfigError(
+            f"data: {len(chosen)} rows to train on cannot tell the {len(theta)} numbers of a "
+            f"network with {hidden} hidden neurons; expected more runs that complete"
+        )
     mean, scale = _standard(rows.densities[chosen])
     u = (rows.densities - mean) / scale
     model = TorchModel(NUM_INPUTS, hidden)
     test = (u[~in_train], rows.targets[~in_train])
     found = fit(
         model,
-        initial_theta(NUM_INPUTS, hidden, rows.targets[chosen], seed),
+        theta,
         (u[chosen], rows.targets[chosen]),
         test,
         evaluations,

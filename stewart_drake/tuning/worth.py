@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
@@ -96,6 +97,8 @@ class Worth(NamedTuple):
 
 
 FIXED: Final = tuple(fixed_name(ratio) for ratio in RATIOS)
+_FIXED: Final = "fixed"
+"""All of these together."""
 
 
 def fixed_runs(scenario: Scenario) -> bytes:
@@ -120,14 +123,20 @@ def _file(endings: list[Ending], scenario: Scenario, tuned: bool) -> bytes:
     return json.dumps(jsonable(told)).encode()
 
 
-def read_told(path: Path) -> Told:
-    """The file of a condition.
+def read_told(path: Path, runs: int = 1) -> Told:
+    """The file of a condition, of so many runs.
 
     Raises:
         ConfigError: it is damaged; one line.
     """
     expected = "the file of one condition of `tune evaluate --family`"
-    return validate(Told, load_json(path, _MAX_BYTES, expected), str(path))
+    told = validate(Told, load_json(path, _MAX_BYTES, expected), str(path))
+    for name in ("cost", "completed"):
+        if len(getattr(told, name)) != runs:
+            raise ConfigError(
+                f"{path}: {name}: got {len(getattr(told, name))} runs; expected {runs}"
+            )
+    return told
 
 
 def weigh(
@@ -178,14 +187,14 @@ def weigh(
             function,
             directory / (f"{name}-{content[:8]}" if content else name),
             settings=common | extra,
-            read=read_told,
+            read=partial(read_told, runs=len(RATIOS) if function is fixed_runs else 1),
             workers=workers,
             scheduler=scheduler,
             progress=counted,
         )
         table[name], done = list(found.values()), done + len(jobs)
 
-    run("fixed", fixed_runs, {f"{i:04d}": (cell,) for i, cell in enumerate(cells)}, {})
+    run(_FIXED, fixed_runs, {f"{i:04d}": (cell,) for i, cell in enumerate(cells)}, {})
     for name, tuner in tuners.items():
         jobs = {f"{i:04d}": (replace(cell, tuner=tuner),) for i, cell in enumerate(cells)}
         run(name, tuned_run, jobs, {"network": contents[name]} if name in contents else {})
@@ -200,15 +209,18 @@ def tuners_of(
     """Sections by the name of the candidate, the rule's first, and SHA-256 of the networks' files.
 
     Raises:
-        ConfigError: no such network, or two of one name.
+        ConfigError: no such network, two of one name, or one of another candidate's.
     """
     tuners: dict[str, AnnTunerConfig | RuleTunerConfig] = {RULE: RuleTunerConfig()}
     contents = {}
     for one in networks:
         path = resolve("weights", one)
         load_network(path)
-        if path.stem in tuners:
-            raise ConfigError(f"weights: got two of the name {path.stem!r}; expected one of each")
+        if path.stem in (*tuners, *FIXED, _FIXED, HINDSIGHT):
+            raise ConfigError(
+                f"weights: got {path.stem!r}, which another candidate is called; expected a file "
+                "of a name of its own"
+            )
         tuners[path.stem] = AnnTunerConfig(weights=str(path))
         contents[path.stem] = hashlib.sha256(read_bytes(path, MAX_BYTES, EXPECTED)).hexdigest()
     return tuners, contents
@@ -239,10 +251,10 @@ def judged(
     family: str, draws: list[Draw], table: dict[str, list[Told]], about: dict[str, Any]
 ) -> Worth:
     """What runs say together: `fixed`, then each tuner's."""
-    tuners = [name for name in table if name != "fixed"]
-    rows = [*np.array([one.cost for one in table["fixed"]]).T]
+    tuners = [name for name in table if name != _FIXED]
+    rows = [*np.array([one.cost for one in table[_FIXED]]).T]
     rows += [np.array([one.cost[0] for one in table[name]]) for name in tuners]
-    done = [*np.array([one.completed for one in table["fixed"]]).T]
+    done = [*np.array([one.completed for one in table[_FIXED]]).T]
     done += [np.array([one.completed[0] for one in table[name]]) for name in tuners]
     J, completed, names = np.array(rows), np.array(done), (*FIXED, *tuners)
     faults = np.array([fault_of(one) for one in draws])
