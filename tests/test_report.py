@@ -263,6 +263,9 @@ def test_the_tuners_runs_are_there_where_there_is_a_network(monkeypatch, tmp_pat
     mine.write_text("controller: {feedforward: none}")
     collect(mine)
     assert jobs["run"].controller.feedforward == "none"
+    # One that is asked for is run, beside the comparison, which stays.
+    collect(mine, controller="servo_preview")
+    assert jobs["run"].controller.command == "cranks"
 
 
 def test_figure_6_and_the_tuned_rows_are_of_the_tuners_runs(tmp_path):

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stewart_drake.cli.common import AsJson, Delivery, Quiet, ScenarioName, Settings
+from stewart_drake.cli.common import AsJson, Controller, Delivery, Quiet, ScenarioName, Settings
 from stewart_drake.report.terminal import count_bar
 
 REPLAY = "replay.html"
@@ -14,6 +14,7 @@ REPLAY = "replay.html"
 
 def report(
     scenario: ScenarioName = "paper",
+    controller: Controller = None,
     settings: Settings = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where it goes.")] = Path("out/report"),
     quiet: Quiet = False,
@@ -32,7 +33,7 @@ def report(
     delivery = Delivery(out, quiet, as_json)
     started, name = time.perf_counter(), Path(scenario).stem
     with count_bar("runs, analyses", delivery.silent) as progress:
-        found = collect(scenario, settings or (), progress)
+        found = collect(scenario, settings or (), progress, controller)
     # Nothing of an earlier scenario beside this one's numbers, which come first.
     delivery.discard(REPLAY, PAGE)
     summary = report_document.report_summary(found)
@@ -54,7 +55,8 @@ def report(
 
     if found.run is not None:
         delivery.draw(REPLAY, film)
-    command = command_line("report", scenario, settings=settings or (), options={"out": out})
+    options = {"controller": controller, "out": out}
+    command = command_line("report", scenario, settings=settings or (), options=options)
     made = Provenance(command, seconds=time.perf_counter() - started)
     delivery.draw(PAGE, page)
     return delivery.end(summary)

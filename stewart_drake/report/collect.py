@@ -53,7 +53,10 @@ class Collected:
 
 
 def collect(
-    scenario_name: str | Path, settings: Iterable[str] = (), progress: Progress | None = None
+    scenario_name: str | Path,
+    settings: Iterable[str] = (),
+    progress: Progress | None = None,
+    controller: str | Path | None = None,
 ) -> Collected:
     """Run and analyse a scenario, on all cores. A reference out of reach is analysed only.
 
@@ -61,6 +64,8 @@ def collect(
         scenario_name: a shipped name or a path.
         settings: as `load_scenario` takes them.
         progress: called for every finished run or analysis.
+        controller: a shipped name or a path, of the run and what is analysed; the scenario's own
+            by default. The comparison has its controllers in any case.
 
     Raises:
         ConfigError: bad input.
@@ -68,7 +73,7 @@ def collect(
         KeyboardInterrupt: Ctrl-C.
     """
     settings = tuple(settings)
-    scenario = load_understood(scenario_name, settings=settings)
+    scenario = load_understood(scenario_name, controller, settings)
     failure = reference_failure(assemble(scenario))
     scenarios: dict[str, Scenario] = {}
     rows: set[str] = set()

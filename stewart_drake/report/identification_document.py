@@ -49,15 +49,17 @@ _POSES_TEXT: Final = (
 
 def document(found: Identification) -> Document:
     """The fit, what was found, what was not."""
-    delay = f"{1e3 * found.values[DELAY]:.6g} ms"
+    delay = f"{1e3 * found.values[DELAY]:.6g}"
     chi2 = number(found.chi2["all"])
     if found.right:
-        delay += f" ± {number(1e3 * found.std[DELAY], 2)} ms"
-        text = f"The delay is {delay}; the machine that was found explains the log (chi²/n {chi2})."
+        interval = number(1e3 * found.std[DELAY], 2)
+        if "e" not in interval:  # as many decimals as the interval has
+            delay = f"{1e3 * found.values[DELAY]:.{len(interval.partition('.')[2])}f}"
+        text = f"The delay is {delay} ± {interval} ms; the machine that was found explains the log (chi²/n {chi2})."
     else:
         text = (
             f"No machine within these tolerances explains the log (chi²/n {chi2}, above {WRONG}): "
-            f"the values are guesses, among them a delay of {delay}, and have no intervals."
+            f"the values are guesses, among them a delay of {delay} ms, and have no intervals."
         )
     cautions = [Caution(one) for one in _cautions(found)]
     sections = [
@@ -68,12 +70,22 @@ def document(found: Identification) -> Document:
         Section("Geometry and offsets", _table(found, geometry=True), folded=True),
     ]
     facts = {
-        "logs": ", ".join(Path(log.name).name for log in found.logs),
+        "logs": ", ".join(_log_names(found)),
         "mechanism": found.unknowns.mechanism.name,
         "segments": str(len(found.problem.segments)),
     }
     shown = [section for section in sections if section.blocks]
     return Document("A machine from its log", text, shown, "good" if found.right else "bad", facts)
+
+
+def _log_names(found: Identification) -> list[str]:
+    """The logs' files, with as many of their folders as tell them from each other."""
+    paths = [Path(log.name).resolve().parts for log in found.logs]
+    for depth in range(1, max(map(len, paths)) + 1):
+        names = ["/".join(parts[-depth:]) for parts in paths]
+        if len(set(names)) == len(set(paths)):
+            break
+    return names
 
 
 def plan_document(plan: Plan) -> Document:
@@ -161,9 +173,9 @@ def _pictures(found: Identification) -> list[Block]:
     return [
         Picture(
             partial(residual_figure, found, i),
-            f"{Path(log.name).name}: what the fit leaves, in standard deviations of a measurement.",
+            f"{name}: what the fit leaves, in standard deviations of a measurement.",
         )
-        for i, log in enumerate(found.logs)
+        for i, name in enumerate(_log_names(found))
     ]
 
 
