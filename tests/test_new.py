@@ -84,7 +84,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(
         ({"rod": 0.06}, "reach the plate"),
         ({"crank": 0.3}, "--rod: got 0.26 m with cranks of 0.3 m; expected a rod longer"),
         ({"rod": float("nan")}, "--rod: got nan m; expected a positive length"),
-        ({"crank_mass": -1}, "--crank-mass: got -1; expected a mass in kg"),
+        ({"crank_mass": -1}, "--crank-mass: got -1; expected a mass in kg, above 0"),
         ({"shaft_distance": 0.35}, "--shaft-distance: got 0.35 m on a circle of radius 0.2 m"),
         ({"delay": -1}, "--delay: got -1; expected 0 to 5 s"),
         ({"torque_limit": 0}, "--torque-limit: got 0; expected N m above 0"),

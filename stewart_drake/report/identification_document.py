@@ -55,7 +55,10 @@ def document(found: Identification) -> Document:
         interval = number(1e3 * found.std[DELAY], 2)
         if "e" not in interval:  # as many decimals as the interval has
             delay = f"{1e3 * found.values[DELAY]:.{len(interval.partition('.')[2])}f}"
-        text = f"The delay is {delay} ± {interval} ms; the machine that was found explains the log (chi²/n {chi2})."
+        text = (
+            f"The delay is {delay} ± {interval} ms; the machine that was found explains the log "
+            f"(chi²/n {chi2})."
+        )
     else:
         text = (
             f"No machine within these tolerances explains the log (chi²/n {chi2}, above {WRONG}): "
