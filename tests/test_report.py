@@ -225,6 +225,27 @@ def test_who_completes_is_told_and_how_the_delay_was_found():
     assert "completes" not in report_document.document(alone, "mine").verdict
 
 
+def test_what_is_not_plain_is_told_at_the_top():
+    plain = {"mechanism", "reference", "delay", "plant", "controller", "start"}
+    for controller, settings, told in (
+        (None, [], {}),
+        (None, ["link.kind=network"], {"link": "a network that loses 5 % of the packets"}),
+        (
+            "adaptive_lqi",
+            ["sensor.kind=encoders", "sensor.samples=5"],
+            {"sensor": "encoders, of 14 bit, 5 in a period"},
+        ),
+        ("servo_preview", ["actuator.kind=servo"], {"motors": "position servos, 10 Hz"}),
+        (None, ["tuner.kind=rule"], {"weights": "set by a rule"}),
+    ):
+        short = ["plant.kind=exact", "duration=0.3", *settings]
+        scenario = load_scenario("paper", controller, short)
+        facts = report_document.document(collect_of(scenario), "paper").facts
+        assert {name: facts[name] for name in facts.keys() - plain} == told
+        assert ("delay estimator constant" in facts["controller"]) == (controller == "adaptive_lqi")
+        assert ("sent ahead" in facts["controller"]) == (controller == "servo_preview")
+
+
 def test_a_motion_out_of_reach_gets_a_report_without_runs(tmp_path, capsys, monkeypatch):
     def only_workspace(scenario, scenarios, progress):
         assert not scenarios
