@@ -22,7 +22,7 @@ from stewart_drake.report.page import Provenance
 from stewart_drake.report.page import html as html_of
 from stewart_drake.report.report_document import mean_error
 from stewart_drake.report.run_document import comparison_document
-from stewart_drake.report.words import number
+from stewart_drake.report.words import number, wrap
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from stewart_drake.tuner.network import save_network
@@ -223,6 +223,14 @@ def test_who_completes_is_told_and_how_the_delay_was_found():
     assert not any("packets" in caption for caption in captions)
     alone = collect_of(lost.scenario, run=lost, comparison={"delay_lqi": lost})
     assert "completes" not in report_document.document(alone, "mine").verdict
+
+
+def test_no_line_is_broken_before_a_unit_or_in_it():
+    for unit in ("N m", "mN m", "kg", "deg", "mm", "s", "%", "% s"):
+        for room in range(60, 81):
+            lines = wrap("x" * room + f" of 12.5 {unit}, and more").splitlines()
+            assert any(f"12.5 {unit}," in line for line in lines)
+            assert all(len(line) <= 80 for line in lines)
 
 
 def test_what_is_not_plain_is_told_at_the_top():

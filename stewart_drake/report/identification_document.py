@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.identification.identify import WRONG, Identification
 from stewart_drake.identification.judgement import PoseUncertainty
+from stewart_drake.identification.logs import Log
 from stewart_drake.identification.plan import MOTION, Plan
 from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NAMES, UNITS
 from stewart_drake.report.document import (
@@ -73,7 +74,7 @@ def document(found: Identification) -> Document:
         Section("Geometry and offsets", _table(found, geometry=True), folded=True),
     ]
     facts = {
-        "logs": ", ".join(_log_names(found)),
+        "logs": ", ".join(file_names(found.logs)),
         "mechanism": found.unknowns.mechanism.name,
         "segments": str(len(found.problem.segments)),
     }
@@ -81,14 +82,13 @@ def document(found: Identification) -> Document:
     return Document("A machine from its log", text, shown, "good" if found.right else "bad", facts)
 
 
-def _log_names(found: Identification) -> list[str]:
+def file_names(logs: Sequence[Log]) -> list[str]:
     """The logs' files, with as many of their folders as tell them from each other."""
-    paths = [Path(log.name).resolve().parts for log in found.logs]
-    for depth in range(1, max(map(len, paths)) + 1):
-        names = ["/".join(parts[-depth:]) for parts in paths]
-        if len(set(names)) == len(set(paths)):
-            break
-    return names
+    paths = [Path(log.name).resolve().parts for log in logs]
+    depth, different = 1, len(set(paths))
+    while len({parts[-depth:] for parts in paths}) < different:
+        depth += 1
+    return ["/".join(parts[-depth:]) for parts in paths]
 
 
 def plan_document(plan: Plan) -> Document:
@@ -178,7 +178,7 @@ def _pictures(found: Identification) -> list[Block]:
             partial(residual_figure, found, i),
             f"{name}: what the fit leaves, in standard deviations of a measurement.",
         )
-        for i, name in enumerate(_log_names(found))
+        for i, name in enumerate(file_names(found.logs))
     ]
 
 

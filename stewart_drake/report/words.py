@@ -8,7 +8,9 @@ from typing import Final
 
 WIDTH: Final = 80
 _NO_BREAK: Final = "\N{NO-BREAK SPACE}"
-_TOGETHER: Final = r"(?<=\d) (?=(?:%|mm|ms|s|N|mN|kg|deg)(?!\w))|(?<=\bN) (?=m\b)|(?<=beatable:) "
+_TOGETHER: Final = (
+    r"(?<=\d) (?=(?:%|mm|ms|s|N|mN|kg|deg)(?!\w))|(?<=N) (?=m\b)|(?<=\d %) (?=s\b)|(?<=beatable:) "
+)
 """Spaces at which no line is broken: before a unit and in it."""
 
 
