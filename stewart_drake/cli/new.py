@@ -81,19 +81,13 @@ def new(
         "crank_mass": crank_mass,
         "rod_mass": rod_mass,
     }
-    from stewart_drake.studies.new_machine import (
-        MACHINE,
-        SCENARIO,
-        Measurements,
-        check_free,
-        new_machine,
-    )
+    from stewart_drake.studies import new_machine as study
 
     delivery = Delivery(folder, quiet, as_json)
-    check_free(folder)  # before nine questions
+    study.check_free(folder)  # before nine questions
     measured = _complete(given, asking=sys.stdin.isatty() and not (quiet or as_json))
     with _flags_named():
-        measurements = Measurements(
+        measurements = study.Measurements(
             **measured,
             shaft_height=shaft_height,
             upright=upright,
@@ -102,12 +96,12 @@ def new(
             delay=delay,
             gravity=gravity,
         )
-    made = new_machine(measurements, _name_of(folder), folder)
+    made = study.new_machine(measurements, _name_of(folder), folder)
     _tell(delivery, made)
-    delivery.wrote(MACHINE, SCENARIO)
+    delivery.wrote(study.MACHINE, study.SCENARIO)
     delivery.write(made.summary)
     status = delivery.end(made.summary)
-    delivery.say(f"next: stewart-drake simulate {folder / SCENARIO} --out {folder / 'run'}")
+    delivery.say(f"next: stewart-drake simulate {folder / study.SCENARIO} --out {folder / 'run'}")
     return status
 
 
