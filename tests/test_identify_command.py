@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.log_files import Precision, angle_std, read_log
 from stewart_drake.identification.logs import ANGLES, POSE
 from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.report.identification_document import file_names
 from stewart_drake.scenario.known import load_known
 from tests.mechanisms import PAPER
 
@@ -223,6 +225,16 @@ def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
     run = json.loads((tmp_path / "next" / "summary.json").read_text())
     assert run["status"] == "completed"
     assert run["delay"]["estimated_s"] == pytest.approx(summary["delay_s"], rel=1e-12)
+
+
+def test_logs_of_one_name_are_told_by_their_folders():
+    def told(*names):
+        return file_names([SimpleNamespace(name=name) for name in names])
+
+    assert told("a/signals.nc", "b/log.csv") == ["signals.nc", "log.csv"]
+    assert told("a/signals.nc", "b/signals.nc") == ["a/signals.nc", "b/signals.nc"]
+    assert told("x/a/s.nc", "y/a/s.nc", "b/s.nc")[:2] == ["x/a/s.nc", "y/a/s.nc"]
+    assert told("a/s.nc", "a/s.nc") == ["s.nc", "s.nc"]
 
 
 def test_a_plan_can_be_run(tmp_path):

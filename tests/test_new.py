@@ -82,8 +82,9 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(
     for other, words in (
         ({"rod": 260}, "--rod: got 260 m; expected metres, 0.26 for 260 mm"),
         ({"rod": 0.06}, "reach the plate"),
+        ({"crank": 0.3}, "--rod: got 0.26 m with cranks of 0.3 m; expected a rod longer"),
         ({"rod": float("nan")}, "--rod: got nan m; expected a positive length"),
-        ({"crank_mass": -1}, "--crank-mass: got -1; expected a mass in kg"),
+        ({"crank_mass": -1}, "--crank-mass: got -1; expected a mass in kg, above 0"),
         ({"shaft_distance": 0.35}, "--shaft-distance: got 0.35 m on a circle of radius 0.2 m"),
         ({"delay": -1}, "--delay: got -1; expected 0 to 5 s"),
         ({"torque_limit": 0}, "--torque-limit: got 0; expected N m above 0"),
@@ -98,21 +99,24 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(
     before = (tmp_path / "machine.yaml").read_bytes()
     assert main(["new", str(tmp_path), *flags(rod=0.3)]) == 2
     assert "machine.yaml: is there already" in capsys.readouterr().err
+    # Before anything is asked for.
+    assert main(["new", str(tmp_path)]) == 2
+    assert "machine.yaml: is there already" in capsys.readouterr().err
     assert (tmp_path / "machine.yaml").read_bytes() == before
 
 
 def test_what_is_missing_is_asked_for_and_millimetres_are_noticed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    answers, agreed = iter([260.0, 2.5]), list[str]()
+    answers, agreed = iter([270.0, 260.0, 2.5]), list[str]()
 
-    def agree(text: str, *_: Any) -> bool:
+    def agree(text: str, **_: Any) -> bool:
         agreed.append(text)
-        return True
+        return len(agreed) > 1  # no: it is asked for again
 
     monkeypatch.setattr(new.sys.stdin, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(new.typer, "prompt", lambda *_, **__: next(answers))
     monkeypatch.setattr(new.typer, "confirm", agree)
     assert main(["new", str(tmp_path), *flags(rod=None, plate_mass=None)]) == 0
-    assert agreed == ["260 m? 0.26 m for 260 mm"]
+    assert agreed == ["270 m? 0.27 m for 270 mm", "260 m? 0.26 m for 260 mm"]
     assert sd.load_mechanism(tmp_path / "machine.yaml").rod_lengths[0] == 0.26

@@ -23,7 +23,7 @@ from stewart_drake.report.page import Provenance
 from stewart_drake.report.page import html as html_of
 from stewart_drake.report.report_document import mean_error
 from stewart_drake.report.run_document import comparison_document
-from stewart_drake.report.words import number
+from stewart_drake.report.words import number, wrap
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from stewart_drake.tuner.network import save_network
@@ -227,6 +227,35 @@ def test_who_completes_is_told_and_how_the_delay_was_found():
     assert "completes" not in report_document.document(alone, "mine").verdict
 
 
+def test_no_line_is_broken_before_a_unit_or_in_it():
+    for unit in ("N m", "mN m", "kg", "deg", "mm", "s", "%", "% s"):
+        for room in range(60, 81):
+            lines = wrap("x" * room + f" of 12.5 {unit}, and more").splitlines()
+            assert any(f"12.5 {unit}," in line for line in lines)
+            assert all(len(line) <= 80 for line in lines)
+
+
+def test_what_is_not_plain_is_told_at_the_top():
+    plain = {"mechanism", "reference", "delay", "plant", "controller", "start"}
+    for controller, settings, told in (
+        (None, [], {}),
+        (None, ["link.kind=network"], {"link": "a network that loses 5 % of the packets"}),
+        (
+            "adaptive_lqi",
+            ["sensor.kind=encoders", "sensor.samples=5"],
+            {"sensor": "encoders, of 14 bit, 5 in a period"},
+        ),
+        ("servo_preview", ["actuator.kind=servo"], {"motors": "position servos, 10 Hz"}),
+        (None, ["tuner.kind=rule"], {"weights": "set by a rule"}),
+    ):
+        short = ["plant.kind=exact", "duration=0.3", *settings]
+        scenario = load_scenario("paper", controller, short)
+        facts = report_document.document(collect_of(scenario), "paper").facts
+        assert {name: facts[name] for name in facts.keys() - plain} == told
+        assert ("delay estimator constant" in facts["controller"]) == (controller == "adaptive_lqi")
+        assert ("sent ahead" in facts["controller"]) == (controller == "servo_preview")
+
+
 def test_a_motion_out_of_reach_gets_a_report_without_runs(tmp_path, capsys, monkeypatch):
     def only_workspace(scenario, scenarios, progress):
         assert not scenarios
@@ -270,6 +299,9 @@ def test_the_tuners_runs_are_there_where_there_is_a_network(monkeypatch, tmp_pat
     found = collect("paper", EXACT, controller=own)
     assert found.scenario == jobs[collect_module._OWN] == load_scenario("paper", own, EXACT)
     assert collect("paper", EXACT, controller="lqi").scenario == jobs["lqi"]
+    # One that is asked for is run, beside the comparison, which stays.
+    collect(mine, controller="servo_preview")
+    assert jobs[collect_module._OWN].controller.command == "cranks"
 
 
 def test_a_row_of_the_comparison_may_have_any_name(monkeypatch, tmp_path):

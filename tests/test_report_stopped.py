@@ -73,6 +73,12 @@ def test_ctrl_c_while_drake_is_loaded_is_one_as_well(monkeypatch):
 
     monkeypatch.setattr("stewart_drake.report.shipped_table.shipped_table", loading)
     assert main(["list"]) == 130
+    inner = ImportError("initialization failed")
+    inner.__cause__, stop = stop, inner  # a module that was loading another
+    assert main(["list"]) == 130
+    inner.__cause__ = None
+    with pytest.raises(ImportError):
+        main(["list"])
     stop = None
     with pytest.raises(ImportError):
         main(["list"])

@@ -30,6 +30,7 @@ from stewart_drake.mechanism import kinematics
 from stewart_drake.native.library import backend
 from stewart_drake.report.page import Provenance, html
 from stewart_drake.report.robustness_document import document
+from stewart_drake.report.robustness_figures import influence_figure
 from stewart_drake.scenario.config import Scenario, StateSensorConfig
 from stewart_drake.studies import robustness, statistics
 from stewart_drake.studies.failures import auc_interval, explain
@@ -639,6 +640,13 @@ def test_influences_are_found() -> None:
     told = document(study).plain().replace("\n  ", " ")
     assert "What matters for completing: delay error." in told
     assert "of those that completed: noise of the sensor, delay error." in told
+
+
+def test_what_was_asked_of_nothing_is_not_drawn() -> None:
+    """Where all runs complete, nothing can go with failing."""
+    assert len(influence_figure(made_up().influences()).axes) == 2
+    nothing_failed = with_failures(lambda one, chance: False).influences()
+    assert len(influence_figure(nothing_failed).axes) == 1
 
 
 def with_failures(failing: Any, n: int = 300) -> RobustnessStudy:

@@ -64,7 +64,10 @@ def main(arguments: list[str] | None = None) -> int:
     except typer.Abort:  # Ctrl-C in a command that has nothing to keep
         return INTERRUPTED
     except ImportError as error:  # what Drake makes of a Ctrl-C while it is loaded
-        if isinstance(error.__cause__, KeyboardInterrupt):
+        cause: BaseException | None = error
+        while isinstance(cause, ImportError):  # one for each module that was loading another
+            cause = cause.__cause__
+        if isinstance(cause, KeyboardInterrupt):
             return INTERRUPTED
         raise
     except BrokenPipeError:  # whoever read the output has seen enough

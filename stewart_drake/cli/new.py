@@ -81,11 +81,13 @@ def new(
         "crank_mass": crank_mass,
         "rod_mass": rod_mass,
     }
-    measured = _complete(given, asking=sys.stdin.isatty() and not (quiet or as_json))
-    from stewart_drake.studies.new_machine import MACHINE, SCENARIO, Measurements, new_machine
+    from stewart_drake.studies import new_machine as study
 
+    delivery = Delivery(folder, quiet, as_json)
+    study.check_free(folder)  # before nine questions
+    measured = _complete(given, asking=sys.stdin.isatty() and not (quiet or as_json))
     with _flags_named():
-        measurements = Measurements(
+        measurements = study.Measurements(
             **measured,
             shaft_height=shaft_height,
             upright=upright,
@@ -94,13 +96,12 @@ def new(
             delay=delay,
             gravity=gravity,
         )
-    delivery = Delivery(folder, quiet, as_json)
-    made = new_machine(measurements, _name_of(folder), folder)
+    made = study.new_machine(measurements, _name_of(folder), folder)
     _tell(delivery, made)
-    delivery.wrote(MACHINE, SCENARIO)
+    delivery.wrote(study.MACHINE, study.SCENARIO)
     delivery.write(made.summary)
     status = delivery.end(made.summary)
-    delivery.say(f"next: stewart-drake simulate {folder / SCENARIO} --out {folder / 'run'}")
+    delivery.say(f"next: stewart-drake simulate {folder / study.SCENARIO} --out {folder / 'run'}")
     return status
 
 
@@ -122,7 +123,10 @@ def _complete(given: dict[str, float | None], asking: bool) -> dict[str, float]:
     missing = [name for name, value in given.items() if value is None]
     if missing and not asking:
         flags = ", ".join(_flag(name) for name in missing)
-        raise ConfigError(f"new: got no {flags}; expected what is measured on the machine")
+        raise ConfigError(
+            f"new: got no {flags}; expected what is measured on the machine; "
+            "a terminal is asked for it"
+        )
     answers = {name: _ask(_ASKED[name]) for name in missing}
     return {name: answers[name] if value is None else value for name, value in given.items()}
 
@@ -130,11 +134,12 @@ def _complete(given: dict[str, float | None], asking: bool) -> dict[str, float]:
 def _ask(question: str) -> float:
     from stewart_drake.studies.new_machine import LARGEST
 
-    value = float(typer.prompt(question, type=float))
-    millimetres = question.endswith(", m") and value > LARGEST
-    if millimetres and typer.confirm(f"{value:g} m? {value / 1000:g} m for {value:g} mm", True):
-        return value / 1000
-    return value
+    while True:
+        value = float(typer.prompt(question, type=float))
+        if not (question.endswith(", m") and value > LARGEST):
+            return value
+        if typer.confirm(f"{value:g} m? {value / 1000:g} m for {value:g} mm", default=True):
+            return value / 1000
 
 
 def _flag(name: str) -> str:

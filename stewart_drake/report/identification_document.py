@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.identification.identify import WRONG, Identification
 from stewart_drake.identification.judgement import PoseUncertainty
+from stewart_drake.identification.logs import Log
 from stewart_drake.identification.plan import MOTION, Plan
 from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NAMES, UNITS
 from stewart_drake.report.document import (
@@ -49,15 +50,20 @@ _POSES_TEXT: Final = (
 
 def document(found: Identification) -> Document:
     """The fit, what was found, what was not."""
-    delay = f"{1e3 * found.values[DELAY]:.6g} ms"
+    delay = f"{1e3 * found.values[DELAY]:.6g}"
     chi2 = number(found.chi2["all"])
     if found.right:
-        delay += f" ± {number(1e3 * found.std[DELAY], 2)} ms"
-        text = f"The delay is {delay}; the machine that was found explains the log (chi²/n {chi2})."
+        interval = number(1e3 * found.std[DELAY], 2)
+        if "e" not in interval:  # as many decimals as the interval has
+            delay = f"{1e3 * found.values[DELAY]:.{len(interval.partition('.')[2])}f}"
+        text = (
+            f"The delay is {delay} ± {interval} ms; the machine that was found explains the log "
+            f"(chi²/n {chi2})."
+        )
     else:
         text = (
             f"No machine within these tolerances explains the log (chi²/n {chi2}, above {WRONG}): "
-            f"the values are guesses, among them a delay of {delay}, and have no intervals."
+            f"the values are guesses, among them a delay of {delay} ms, and have no intervals."
         )
     cautions = [Caution(one) for one in _cautions(found)]
     sections = [
@@ -68,12 +74,21 @@ def document(found: Identification) -> Document:
         Section("Geometry and offsets", _table(found, geometry=True), folded=True),
     ]
     facts = {
-        "logs": ", ".join(Path(log.name).name for log in found.logs),
+        "logs": ", ".join(file_names(found.logs)),
         "mechanism": found.unknowns.mechanism.name,
         "segments": str(len(found.problem.segments)),
     }
     shown = [section for section in sections if section.blocks]
     return Document("A machine from its log", text, shown, "good" if found.right else "bad", facts)
+
+
+def file_names(logs: Sequence[Log]) -> list[str]:
+    """The logs' files, with as many of their folders as tell them from each other."""
+    paths = [Path(log.name).resolve().parts for log in logs]
+    depth, different = 1, len(set(paths))
+    while len({parts[-depth:] for parts in paths}) < different:
+        depth += 1
+    return ["/".join(parts[-depth:]) for parts in paths]
 
 
 def plan_document(plan: Plan) -> Document:
@@ -161,9 +176,9 @@ def _pictures(found: Identification) -> list[Block]:
     return [
         Picture(
             partial(residual_figure, found, i),
-            f"{Path(log.name).name}: what the fit leaves, in standard deviations of a measurement.",
+            f"{name}: what the fit leaves, in standard deviations of a measurement.",
         )
-        for i, log in enumerate(found.logs)
+        for i, name in enumerate(file_names(found.logs))
     ]
 
 

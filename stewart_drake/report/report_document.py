@@ -27,7 +27,12 @@ from stewart_drake.report.figures import draw_comparison, draw_run, has_packets
 from stewart_drake.report.run_document import comparison_blocks, run_blocks
 from stewart_drake.report.tuner_figures import weights_figure
 from stewart_drake.report.words import number, sentence
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.config import (
+    EncoderSensorConfig,
+    NetworkConfig,
+    Scenario,
+    ServoActuatorConfig,
+)
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.studies.compare import LABELS, is_papers, label
 
@@ -226,12 +231,33 @@ def _pictures(figures: Mapping[str, Any], captions: Mapping[str, str]) -> list[P
 
 def _facts(scenario: Scenario) -> dict[str, str]:
     c, plant = scenario.controller, scenario.plant
+    sent = f"{c.prediction} prediction" if c.command == "torque" else "cranks sent ahead"
+    law = f"{sent}, feedforward {c.feedforward}, estimator {c.estimator}"
+    if c.delay_estimator != "none":
+        law += f", delay estimator {c.delay_estimator}"
     return {
         "mechanism": Path(scenario.mechanism).stem,
         "reference": f"{scenario.reference.kind}, {scenario.duration:g} s",
         "delay": f"{scenario.eta:.4g} s, {scenario.true_delay.periods:g} periods of {c.period:g} s",
         "plant": f"{plant.kind}, {'with' if plant.gravity else 'without'} gravity",
-        "controller": f"{c.prediction} prediction, feedforward {c.feedforward}, "
-        f"estimator {c.estimator}".replace("_", " "),
+        "controller": law.replace("_", " "),
         "start": f"{scenario.start.replace('_', ' ')}, torques in flight: {scenario.queue}",
-    }
+    } | _unusual(scenario)
+
+
+def _unusual(scenario: Scenario) -> dict[str, str]:
+    """Link, sensor, motors and weights, where they are not those of a plain scenario."""
+    told = {}
+    link, sensor, motors = scenario.link, scenario.sensor, scenario.actuator
+    if isinstance(link, NetworkConfig):
+        lost = "no packets" if link.loss == 0 else f"{100 * link.loss:g} % of the packets"
+        back = "" if link.back is None else ", and another way back"
+        told["link"] = f"a network that loses {lost}{back}"
+    if isinstance(sensor, EncoderSensorConfig):
+        fine = "exact" if sensor.bits is None else f"of {sensor.bits} bit"
+        told["sensor"] = f"encoders, {fine}, {sensor.samples} in a period"
+    if isinstance(motors, ServoActuatorConfig):
+        told["motors"] = f"position servos, {motors.bandwidth:g} Hz"
+    if scenario.tuner.kind != "fixed":
+        told["weights"] = {"ann": "set by a network", "rule": "set by a rule"}[scenario.tuner.kind]
+    return told

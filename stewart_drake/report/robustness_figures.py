@@ -90,12 +90,14 @@ def distribution_figure(study: RobustnessStudy) -> Figure:
 @figure_style()
 def influence_figure(influences: Sequence[Influence]) -> Figure:
     """Rank correlations with their intervals; hollow where chance explains them."""
-    figure, axes = panels(2, 1.2 + 0.27 * len(influences), sharey=True)
+    some_failed = any(np.isfinite(one.failure.rho) for one in influences)
+    figure, axes = panels(1 + some_failed, 1.2 + 0.27 * len(influences), sharey=True)
     names = [title(one.factor) for one in influences]
     errors = [(one.error, one.error_p) for one in influences]
     failures = [(one.failure, one.failure_p) for one in influences]
     _dots(axes[0], errors, "rank correlation with E_ac, completed runs")
-    _dots(axes[1], failures, "rank correlation with failing, all runs")
+    if some_failed:
+        _dots(axes[1], failures, "rank correlation with failing, all runs")
     axes[0].set_yticks(range(len(names)), names)
     axes[0].set_ylim(len(names) - 0.5, -0.5)
     return figure
@@ -120,6 +122,7 @@ def runs_figure(study: RobustnessStudy) -> Figure:
         if above.any():
             _scatter(ax, x[above], study.errors[above], "s", _ABOVE, "above the limit")
         ax.set(yscale="log", xlabel=f"{TITLES[name]}  [{unit}]")
+        ax.xaxis.set_major_locator(MaxNLocator(3))  # room between neighbours' labels
         if not np.isfinite(x).all():
             ax.text(0.5, 0.5, "none", transform=ax.transAxes, ha="center", color=_SOFT)
     low, high = _log_range(study.errors[done])
@@ -160,7 +163,7 @@ def _dots(ax: Axes, found: Sequence[tuple[Correlation, float]], label: str) -> N
         color = RUN.color if sure else _SOFT
         ax.plot([one.low, one.high], [row, row], color=color, lw=1.8 if sure else 1.0)
         ax.plot(one.rho, row, "o", ms=6, mec=color, mfc=color if sure else "white")
-    ax.set(xlim=(-1, 1), xlabel=label)
+    ax.set(xlim=(-1, 1), xlabel=label, xticks=(-1, -0.5, 0, 0.5, 1))
 
 
 def _scatter(ax: Axes, x: Array, y: Array, marker: str, color: str, label: str) -> None:

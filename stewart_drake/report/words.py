@@ -8,11 +8,15 @@ from typing import Final
 
 WIDTH: Final = 80
 _NO_BREAK: Final = "\N{NO-BREAK SPACE}"
+_TOGETHER: Final = (
+    r"(?<=\d) (?=(?:%|mm|ms|s|N|mN|kg|deg)(?!\w))|(?<=N) (?=m\b)|(?<=\d %) (?=s\b)|(?<=beatable:) "
+)
+"""Spaces at which no line is broken: before a unit and in it."""
 
 
 def wrap(text: str, first: str = "", rest: str = "  ") -> str:
     """One paragraph of at most WIDTH columns, its first line and the others opened as given."""
-    together = re.sub(r"(?<=\d) (?=%|mm\b|ms\b|s\b)|(?<=beatable:) ", _NO_BREAK, text)
+    together = re.sub(_TOGETHER, _NO_BREAK, text)
     filled = textwrap.fill(
         together, WIDTH, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
     )

@@ -90,9 +90,16 @@ class Measurements:
                 raise ConfigError(
                     f"{name}: got {value:g} m; expected metres, {value / 1000:g} for {value:g} mm"
                 )
+        if self.rod <= self.crank:
+            raise ConfigError(
+                f"rod: got {self.rod:g} m with cranks of {self.crank:g} m; expected a rod longer "
+                "than its crank"
+            )
         for name in ("plate_mass", "crank_mass", "rod_mass"):
             if not 0 < getattr(self, name) < 1e6:
-                raise ConfigError(f"{name}: got {getattr(self, name):g}; expected a mass in kg")
+                raise ConfigError(
+                    f"{name}: got {getattr(self, name):g}; expected a mass in kg above 0"
+                )
         for name, radius in (("shaft", self.base_radius), ("joint", self.plate_radius)):
             distance = getattr(self, f"{name}_distance")
             if distance >= math.sqrt(3) * radius:
@@ -239,6 +246,17 @@ delay: {{steps: {delay.steps}, fraction: {round(delay.fraction, 9)}}}   # of {m.
 """
 
 
+def check_free(folder: Path) -> None:
+    """Whether a folder has room for MACHINE and SCENARIO.
+
+    Raises:
+        ConfigError: one of them is there already.
+    """
+    for file in (MACHINE, SCENARIO):
+        if (folder / file).exists():
+            raise ConfigError(f"{folder / file}: is there already; expected a folder without")
+
+
 def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
     """Write MACHINE and SCENARIO into a folder and look at them; nothing is written of a bad one.
 
@@ -246,9 +264,7 @@ def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
         ConfigError: one line; a file is there already, a machine that cannot stand, or not be
             moved.
     """
-    for file in (MACHINE, SCENARIO):
-        if (folder / file).exists():
-            raise ConfigError(f"{folder / file}: is there already; expected a folder without")
+    check_free(folder)
     with TemporaryDirectory() as place:
         machine, scenario = Path(place) / MACHINE, Path(place) / SCENARIO
         machine.write_text(machine_text(m, name))
