@@ -140,10 +140,12 @@ def plain_log_ticks(axis: Axis) -> None:
 
 def powers_of_ten(axis: Axis) -> None:
     """Ticks such as 10⁻³ on a logarithmic axis, as text: formulas take ten times as long."""
-    axis.set_major_formatter(
-        FuncFormatter(lambda value, _: "10" + f"{round(np.log10(value))}".translate(_RAISED))
-    )
+    axis.set_major_formatter(FuncFormatter(_power_of_ten))
     axis.set_minor_formatter(NullFormatter())
+
+
+def _power_of_ten(value: float, _: int) -> str:
+    return "10" + f"{round(np.log10(value))}".translate(_RAISED)
 
 
 def panels(number: int, height: float, sharey: bool = False) -> tuple[Figure, list[Axes]]:
