@@ -98,7 +98,7 @@ class Measurements:
         for name in ("plate_mass", "crank_mass", "rod_mass"):
             if not 0 < getattr(self, name) < 1e6:
                 raise ConfigError(
-                    f"{name}: got {getattr(self, name):g}; expected a mass in kg above 0"
+                    f"{name}: got {getattr(self, name):g}; expected a mass in kg, above 0"
                 )
         for name, radius in (("shaft", self.base_radius), ("joint", self.plate_radius)):
             distance = getattr(self, f"{name}_distance")
