@@ -64,7 +64,8 @@ class Command:
             stderr=subprocess.STDOUT,
             text=True,
         )
-        threading.Thread(target=self._read, daemon=True).start()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
 
     def _read(self) -> None:
         assert self.process.stdout is not None
@@ -107,6 +108,7 @@ class Command:
                 self.process.wait(30)
             except subprocess.TimeoutExpired:
                 self.kill()
+        self._reader.join(30)
 
 
 def machine(*more: str) -> tuple[Command, str]:
