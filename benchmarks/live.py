@@ -38,6 +38,7 @@ MINUTES = float(os.environ.get("MINUTES", "10"))
 SIMULATED = float(os.environ.get("SIMULATED", "1"))
 """Of them, min; one ten seconds is as another after the first."""
 KILLS = int(os.environ.get("KILLS", "20"))
+PAUSES = int(os.environ.get("PAUSES", "3"))
 SEED = 29
 WAY = "low: 0.28, high: 0.32, loss: 0.02"
 """Evenly 20 ms to either side of 0.3 s."""
@@ -370,6 +371,45 @@ def _machine_killed(first: Command, killed: float, found: dict[str, list[Any]]) 
     found["lost"].append(at - killed)
 
 
+# ---------------------------------------------------------------- pauses
+
+
+def pauses() -> list[str]:
+    """Either process is suspended for a second, as by SIGSTOP; what it says, and how it ends."""
+    told = []
+    for side in ("controller", "machine"):
+        ends, lines = [], list[str]()
+        for _ in range(PAUSES):
+            began, where = machine("--set", LINK)
+            run = live(where, "--duration", f"{WINDOW + 0.1:g}")
+            began.wait_for("the run began")
+            time.sleep(5.0)
+            suspended = run if side == "controller" else began
+            suspended.process.send_signal(signal.SIGSTOP)
+            time.sleep(1.0)
+            suspended.process.send_signal(signal.SIGCONT)
+            _, said = suspended.wait_for("(stood still.*)")
+            _, how = run.wait_for(r"(left workspace.*|lost machine.*|E_ac +[\d.]+)", 60)
+            ends.append(" ".join(how.split()))
+            silent, again = (began.has(words, 0.0) for words in ("safe torque", "act again"))
+            lines.append(
+                f"{said}{', to its safe torque' * silent}{', which torques ended' * again}"
+            )
+            run.process.wait(60)
+            run.end()
+            began.end()
+            print(side, lines[-1], ends[-1], flush=True)
+        told += [f"- The {side}: {line}; {end}." for line, end in zip(lines, ends, strict=True)]
+    return [
+        f"## {PAUSES} pauses of each side",
+        "",
+        f"Suspended for 1 s each, 5 s after the run began. Load {os.getloadavg()[0]:.1f} on "
+        f"{os.cpu_count()} cores. E_ac in % s of the first ten seconds, which is 21.0 undisturbed.",
+        "",
+        *told,
+    ]
+
+
 # ---------------------------------------------------------------- the page
 
 
@@ -434,6 +474,7 @@ SECTIONS = {
     "minutes": ("minutes", minutes),
     "c": ("in C", minutes_in_c),
     "kills": ("kills", kills),
+    "pauses": ("of each side", pauses),
     "page": ("page", page),
 }
 """By name: what the heading of a section ends with, and what finds it out."""

@@ -257,6 +257,38 @@ def test_the_tighter_torque_limit_counts(offer):
     assert made.torque_limit == made.law.plant.motors.limit == 0.5
 
 
+def test_a_law_that_is_too_slow_for_its_period_says_so_before_it_starts(quiet_machine):
+    with Running(OVER_A_NETWORK) as running:
+        ready = prepare_session(scenario_of(), running.address)
+        took, backend = ready.design.step
+        assert 1e-4 < took < 1.0 and backend.startswith("python")
+        told = [
+            [
+                line
+                for line in plans(ready._replace(design=made), 1.0, "paper")
+                if line.startswith("law: ")
+            ]
+            for made in (ready.design._replace(step=(each, "python")) for each in (0.004, 0.0512))
+        ]
+        ready.endpoint.close()
+    assert told == [
+        ["law: python, a step takes 4.0 ms of a period of 100 ms"],
+        [
+            "law: python, a step takes 51.2 ms of a period of 100 ms; more than 50%: "
+            "expect missed deadlines"
+        ],
+    ]
+
+
+@pytest.mark.parametrize(("settings", "said"), [((), True), (FROM_REST, False)])
+def test_torques_in_flight_that_end_too_soon_are_told(quiet_machine, settings, said):
+    with Running(OVER_A_NETWORK, *settings) as running:
+        ready = prepare_session(scenario_of(*settings), running.address)
+        ready.endpoint.close()
+    told = [line for line in plans(ready, 1.0, "paper") if line.startswith("queue: reference")]
+    assert len(told) == said
+
+
 def test_a_real_machine_wants_to_be_armed(quiet_machine):
     with Running() as running:
         ready = prepare_session(scenario_of(), running.address)

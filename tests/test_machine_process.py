@@ -1,5 +1,6 @@
 """The machine as a process, in real time: signals, suspensions, kills; and both ends in C."""
 
+import ast
 import json
 import os
 import random
@@ -17,7 +18,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stewart_drake.live.protocol import SECOND
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.native import build
 from stewart_drake.report import export_c
@@ -322,6 +322,45 @@ def test_a_killed_machine_ends_the_controller_with_the_reason(folder: Path) -> N
     assert "the machine has fallen silent after" in driving.lines[-2]
 
 
+def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_successor(
+    folder: Path,
+) -> None:
+    port = free_port()
+    command = [str(folder / "stewart_machine"), str(port)]
+    with process(command) as running, process(c_controller(folder, port)) as driving:
+        running.until("the run began")
+        running.popen.kill()
+        running.popen.wait()
+        with process(command) as anew:
+            anew.until("a simulated machine at port")
+            assert driving.end() == 1  # what it sends is of a session that the new one never had
+            assert "the machine has fallen silent after" in driving.lines[-2]
+            with process(c_controller(folder, port, "seconds=1")) as second:
+                assert second.end() == 0, second.lines
+            assert anew.end(signal.SIGINT) == 0
+    assert sum("a session begins" in line for line in anew.lines) == 1
+    assert re.search(r" [1-9]\d* foreign", anew.lines[-1])
+
+
+def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_over(
+    folder: Path,
+) -> None:
+    port = free_port()
+    with process([str(folder / "stewart_machine"), str(port)]) as running:
+        running.until("a simulated machine at port")
+        with process(c_controller(folder, port)) as driving:
+            running.until("the run began")
+            time.sleep(1.5)
+            driving.popen.kill()
+            killed = time.monotonic()
+        running.until("nothing was heard for 1 s: the safe torque acts")
+        assert time.monotonic() - killed < 1.0 + 0.25
+        with process(c_controller(folder, port, "seconds=1")) as second:
+            assert second.end() == 0, second.lines
+        assert running.end(signal.SIGINT) == 0
+    assert sum("a session begins" in line for line in running.lines) == 2
+
+
 def test_wrong_commands_are_one_line(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from stewart_drake.cli import main
 
@@ -357,12 +396,42 @@ def test_a_slower_clock_is_told(folder: Path) -> None:
     assert "completed after 10 samples, 0 of them without" in driving.lines[-2]
 
 
-def test_a_clock_that_is_set_is_not_looked_at() -> None:
-    """Every time is of the monotonic clock: nothing in the room asks for another."""
-    from stewart_drake import live
+# ---------------------------------------------------------------- clocks
 
-    folder = Path(live.__file__).parent
-    for name in ("endpoint", "machine", "motors", "body", "protocol"):
-        text = (folder / f"{name}.py").read_text("utf-8")
-        assert not re.search(r"time\.time\(|datetime|time_ns\(", text.replace("monotonic_ns(", ""))
-    assert SECOND == 10**9
+WALL = {"time", "time_ns", "localtime", "gmtime", "ctime", "asctime", "strftime", "clock_gettime"}
+"""Of the module `time`: what follows a clock that somebody sets, or may."""
+WALL_IN_C = r"gettimeofday|CLOCK_(?!MONOTONIC)|[^_a-z](time|localtime|gmtime)\("
+
+
+def wall_clocks(source: str) -> list[str]:
+    """What a module asks a clock for that can be set."""
+    tree = ast.parse(source)
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import)]
+    aliases = {a.asname or a.name for node in imports for a in node.names if a.name == "time"}
+    found = [a.name for node in imports for a in node.names if a.name.startswith("datetime")]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            names = {a.name for a in node.names}
+            found += ["datetime"] * (node.module == "datetime")
+            found += sorted(names & WALL) if node.module == "time" else []
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            found += [node.attr] * (node.value.id in aliases and node.attr in WALL)
+    return found
+
+
+def test_no_clock_that_can_be_set_is_looked_at() -> None:
+    """Every time is of the monotonic clock, on either side, in Python and in C."""
+    import stewart_drake
+    from stewart_drake.native.build import FOLDER
+
+    assert wall_clocks("import time as clock\nclock.time()") == ["time"]
+    assert wall_clocks("from datetime import datetime\nfrom time import time_ns") != []
+    assert wall_clocks("import time\ntime.monotonic_ns(), time.perf_counter()") == []
+    assert re.search(WALL_IN_C, " x = time(NULL)") and re.search(WALL_IN_C, "CLOCK_REALTIME")
+    room = Path(stewart_drake.__file__).parent
+    modules = [*(room / "live").glob("*.py"), room / "cli" / "live.py", room / "cli" / "machine.py"]
+    assert len(modules) > 10
+    for path in modules:
+        assert wall_clocks(path.read_text("utf-8")) == [], path
+    for path in (*export_c.TEMPLATES.glob("*.[ch]"), *FOLDER.glob("*.[ch]")):
+        assert not re.search(WALL_IN_C, path.read_text("utf-8")), path

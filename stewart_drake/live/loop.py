@@ -61,6 +61,8 @@ _REPEATED: Final = 0.05
 """s after which it is asked for again."""
 _ANSWER: Final = 10.0
 """s in which the machine must have begun."""
+STOOD: Final = 0.2
+"""s by which a process that comes late has stood still."""
 _SPARE: Final = 0.002
 """s for which a measurement is waited for beside the usual."""
 _GONE: Final = 64
@@ -215,7 +217,7 @@ class LiveLoop:
         self._sequences = dict[int, int]()
         self._flags, self._silent_since = MachineFlags(0), 0
         self._asked, self._recording = NOTHING, True
-        self._parked = self._leads = False
+        self._parked = self._leads = self._late = False
 
     # -------------------------------------------------------------- the begin
 
@@ -291,6 +293,7 @@ class LiveLoop:
         if self._viewer.stopped():
             raise KeyboardInterrupt
         message = self._await(k)
+        self._tell_lag(k)
         return self._over(k, message) or self._sample(k, message) or End("completed", None)
 
     def _come_to_rest(self, k: int) -> None:
@@ -332,6 +335,15 @@ class LiveLoop:
         for old in [n for n in self._came if n < k - _GONE]:
             del self._came[old]
         return self._came.get(k)
+
+    def _tell_lag(self, k: int) -> None:
+        lag = (now() - self._due(k)) / SECOND - self._contact.lateness(self._period)
+        if lag > STOOD and not self._late:
+            at = k * self._period
+            self._say(
+                f"at {at:.1f} s: stood still for {lag:.1f} s; the machine went on by its buffer"
+            )
+        self._late = lag > STOOD
 
     def _over(self, k: int, message: MachineMessage | None) -> End | None:
         """Why it does not go on, or None; what changes about the machine is said."""
