@@ -1,10 +1,10 @@
 """The loop in real time, in two processes: `python benchmarks/live.py [section ...]`.
 
 Writes benchmarks/results/live.md. Sections: minutes (ten, or MINUTES of the environment), c (the
-same with the controller of export-c, needs a C compiler and make), kills (KILLS of them), page
-(needs chromium). The machine is that of `paper` on the exact plant, behind a
-link of 0.28 to 0.32 s each way that loses 2 % of the packets; every process shares this computer's
-cores with whatever else runs on it, so that the load is told beside the figures.
+same with the controller of export-c, needs a C compiler and make), kills (KILLS of them), pauses
+(PAUSES of either side), page (needs chromium). The machine is that of `paper` on the exact plant,
+behind a link of 0.28 to 0.32 s each way that loses 2 % of the packets; every process shares this
+computer's cores with whatever else runs on it, so that the load is told beside the figures.
 """
 
 import json

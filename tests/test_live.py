@@ -1,8 +1,10 @@
 """The controller's side of the loop in real time, against a simulated machine in a thread."""
 
+import itertools
 import json
 import math
 import threading
+import time
 import urllib.error
 import urllib.request
 from dataclasses import replace
@@ -76,7 +78,16 @@ def scenario_of(*settings):
 # ---------------------------------------------------------------- runs
 
 
-def test_on_a_wire_it_does_what_the_simulation_does(quiet_machine):
+@pytest.fixture(params=["a clock that is left alone", "a clock that jumps"])
+def wall_clock(request, monkeypatch):
+    """Whoever looks at the time of day sees it an hour off, by turns to either side."""
+    if "jumps" in request.param:
+        true, jumps = time.time, itertools.cycle((3600.0, -3600.0))
+        monkeypatch.setattr(time, "time", lambda: true() + next(jumps))
+        monkeypatch.setattr(time, "time_ns", lambda: int(1e9 * time.time()))
+
+
+def test_on_a_wire_it_does_what_the_simulation_does(quiet_machine, wall_clock):
     with Running() as running:
         ready = prepare_session(scenario_of(), running.address)
         told = "\n".join(plans(ready, 4.0, "paper"))

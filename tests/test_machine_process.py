@@ -280,6 +280,33 @@ def test_a_suspended_controller_is_survived_or_stopped(folder: Path) -> None:
     assert "the safe torque (zero) acts" in silent
 
 
+@pytest.mark.parametrize("side", ["controller", "machine"])
+def test_either_side_of_a_network_may_stand_still_for_a_second(side: str) -> None:
+    """Told in one line by whoever stood still; the machine is at its safe torque within the time
+    that it promises, and the controller leads the plate back, or says why not."""
+    way = "low: 0.1, high: 0.12"
+    link = f"link={{kind: network, {way}, return: {{{way}}}}}"
+    live = [*COMMAND, "live", "paper", "--no-browser", "--duration", "8", "--machine"]
+    with (
+        machine("--watchdog", "0.7", settings=("plant.kind=exact", link)) as (running, port),
+        process([*live, f"127.0.0.1:{port}"]) as driving,
+    ):
+        running.until("the run began")
+        time.sleep(3.0)
+        suspended = running if side == "machine" else driving
+        suspended.popen.send_signal(signal.SIGSTOP)
+        time.sleep(1.0)
+        suspended.popen.send_signal(signal.SIGCONT)
+        line = suspended.until("stood still for")
+        survived = driving.end() == 0
+        assert running.end(signal.SIGINT) == 130
+    assert 0.5 < float(line.split("stood still for ")[1].split()[0]) < 3.0
+    assert sum("stood still" in line for line in suspended.lines) == 1
+    assert "nothing was heard for 0.7 s: the safe torque (zero) acts" in running.said
+    told = r"E_ac +[\d.]+ % s" if survived else "left workspace|lost machine"
+    assert re.search(told, driving.said), driving.lines
+
+
 def kills(folder: Path, number: int, rng: random.Random) -> None:
     """Kill the controller at random times; the next one takes over from rest."""
     with machine("--watchdog", "0.4") as (running, port):
