@@ -33,6 +33,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.scenario.trajectories import make_reference
+from tests.browser import browser, needs_chromium
 
 WAY = "low: 0.1, high: 0.12, loss: 0.02"
 OVER_A_NETWORK = f"link={{kind: network, {WAY}, return: {{{WAY}}}}}"
@@ -401,3 +402,36 @@ def test_the_loop_goes_on_where_the_page_is_gone():
     for _ in range(3):
         viewer.show(seen)
     assert viewer.wish() == Wish()
+
+
+@needs_chromium
+def test_a_gamepad_moves_the_reference(quiet_machine):
+    """One that the page sees in the place of a true one: a button turns the plate about yaw."""
+    viewer, ends = PageViewer(load_mechanism("paper"), "live: a test"), threading.Event()
+    results = []
+    try:
+        url = viewer.opened()
+        with Running() as running, browser() as tab:
+            ready = prepare_session(scenario_of(), running.address)
+            how = {"viewer": viewer, "ending": ends.is_set, "say": lambda line: None}
+            driving = threading.Thread(target=lambda: results.append(drive(ready, **how)))
+            driving.start()
+            tab.call("Page.navigate", url=url)
+            tab.wait("window.live !== undefined && window.live.time > 1")
+            assert not tab.evaluate("window.live.byHand")
+            tab.evaluate(
+                "window.pressed = 1; navigator.getGamepads = () => [null, { axes: [0, 0, 0, 0], "
+                "buttons: [0, window.pressed, 0, 0, 0, 0, 0, 0].map(value => ({ value })) }]"
+            )
+            tab.wait("window.live.byHand && +document.getElementById('s2').value > 16")
+            tab.evaluate("window.pressed = 0")
+            asked = "[...document.querySelectorAll('#sliders input')].map(input => +input.value)"
+            tab.wait(f"{asked}.every((x, k) => Math.abs(x - window.live.wanted[k]) < 0.5)")
+            assert tab.evaluate("window.live.wanted[2]") > 15.5  # farther than the motion goes
+            ends.set()
+            driving.join()
+            assert tab.errors == []
+    finally:
+        ends.set()
+        viewer.close()
+    assert results[0].status == "interrupted"  # it came to rest where it was led
