@@ -102,9 +102,9 @@ class Command:
         return time.monotonic()
 
     def end(self) -> None:
-        """As by Ctrl-C."""
+        """As by Ctrl-C, which a process in the background may not hear."""
         if self.process.poll() is None:
-            self.process.send_signal(signal.SIGINT)
+            self.process.send_signal(signal.SIGTERM)
             try:
                 self.process.wait(30)
             except subprocess.TimeoutExpired:

@@ -15,7 +15,7 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.log_files import Precision, read_log
-from stewart_drake.live.connect import address_of, call, open_endpoint
+from stewart_drake.live.connect import address_of, await_free, call, open_endpoint
 from stewart_drake.live.contact import Contact, Link
 from stewart_drake.live.design import as_seen, check_peer, design
 from stewart_drake.live.endpoint import Endpoint
@@ -329,6 +329,17 @@ def test_nobody_there_is_told():
 def test_beyond_loopback_a_key_is_needed():
     with pytest.raises(ConfigError, match="without a key"):
         open_endpoint(("192.0.2.1", 7000), None)
+
+
+def test_what_came_while_nobody_looked_is_not_lost(quiet_machine):
+    with Running(OVER_A_NETWORK.replace("loss: 0.02", "loss: 0")) as running:
+        endpoint = open_endpoint(running.address, None)
+        contact = Contact(endpoint, running.address)
+        call(contact)
+        time.sleep(0.5)  # a round trip takes 0.2 s: some ten answers are on their way
+        await_free(contact)
+        endpoint.close()
+    assert contact.link.loss_back < 0.01
 
 
 def test_round_trips_and_losses_are_those_of_the_link(offer):
