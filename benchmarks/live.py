@@ -7,6 +7,7 @@ behind a link of 0.28 to 0.32 s each way that loses 2 % of the packets; every pr
 computer's cores with whatever else runs on it, so that the load is told beside the figures.
 """
 
+import itertools
 import json
 import os
 import random
@@ -438,12 +439,14 @@ def page() -> list[str]:
     lines = [
         "## The page",
         "",
-        "| width, px | frames per second | slider to loop, ms | to the ring at the target, ms |",
-        "| --- | --- | --- | --- |",
+        "| width, px | colours | frames per second | slider to loop, ms | ring at the target, ms |",
+        "| --- | --- | --- | --- | --- |",
     ]
     try:
         with browser() as b:
-            for width in (1280, 400):
+            for width, scheme in itertools.product((1280, 400), ("light", "dark")):
+                colors = [{"name": "prefers-color-scheme", "value": scheme}]
+                b.call("Emulation.setEmulatedMedia", features=colors)
                 b.call(
                     "Emulation.setDeviceMetricsOverride",
                     width=width,
@@ -457,7 +460,7 @@ def page() -> list[str]:
                 fps, (hand, there) = b.evaluate(frames), b.evaluate(moved)
                 b.evaluate("document.getElementById('motion').click()")
                 time.sleep(4.0)
-                lines.append(f"| {width} | {fps:.0f} | {hand:.0f} | {there:.0f} |")
+                lines.append(f"| {width} | {scheme} | {fps:.0f} | {hand:.0f} | {there:.0f} |")
                 assert b.evaluate("document.documentElement.scrollWidth") <= width
             errors = b.errors
     finally:
