@@ -9,7 +9,7 @@ its time, or never, the repetitions and plans of packets stand in for (theory.md
 import math
 import time as clock
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,6 +184,7 @@ def _step_time(law: PredictiveLqi, motion: Trajectory, queue: Array) -> tuple[fl
 
     What else the computer does meanwhile does not count: it is the least that a step takes.
     """
+    served: Any
     served, backend = serving(replace(law, silence=0))
     memory, weights, took = served.initial_memory(queue), np.ones(2), list[float]()
     measured = Measurement.of(law.sensing.seen(evaluate(motion, 0.0)[:NUM_STATE]))

@@ -24,7 +24,7 @@ from stewart_drake.law.timeline import Acting, Timeline
 from stewart_drake.live.connect import await_free
 from stewart_drake.live.contact import Contact
 from stewart_drake.live.design import Design
-from stewart_drake.live.endpoint import now
+from stewart_drake.live.endpoint import STOOD, now
 from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.protocol import (
     NEVER,
@@ -61,8 +61,6 @@ _REPEATED: Final = 0.05
 """s after which it is asked for again."""
 _ANSWER: Final = 10.0
 """s in which the machine must have begun."""
-STOOD: Final = 0.2
-"""s by which a process that comes late has stood still."""
 _SPARE: Final = 0.002
 """s for which a measurement is waited for beside the usual."""
 _GONE: Final = 64
@@ -337,11 +335,12 @@ class LiveLoop:
         return self._came.get(k)
 
     def _tell_lag(self, k: int) -> None:
-        lag = (now() - self._due(k)) / SECOND - self._contact.lateness(self._period)
+        """Say once that this process comes late, beside what the link adds."""
+        lag = now() - self._due(k) - self._contact.lateness(self._period) * SECOND
         if lag > STOOD and not self._late:
-            at = k * self._period
             self._say(
-                f"at {at:.1f} s: stood still for {lag:.1f} s; the machine went on by its buffer"
+                f"at {k * self._period:.1f} s: stood still for {lag / SECOND:.1f} s; the machine "
+                "went on by its buffer"
             )
         self._late = lag > STOOD
 
