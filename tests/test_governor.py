@@ -56,6 +56,10 @@ def test_the_response_is_that_of_three_equal_poles():
     np.testing.assert_allclose(response(state, g, w, times), wanted, atol=1e-8)
 
 
+def at_rest(pose):
+    return Governed(np.append(pose, np.zeros(12)), pose)
+
+
 @pytest.mark.parametrize(
     ("name", "gravity", "limit"),
     [("paper", False, 0.1), ("paper", True, 2.0), ("desktop", True, 0.4)],
@@ -63,7 +67,7 @@ def test_the_response_is_that_of_three_equal_poles():
 def test_whatever_is_asked_for_the_limits_hold(name, gravity, limit):
     one = governor(name, gravity, limit)
     dynamics = one.dynamics
-    begin = one.at_rest(dynamics.mechanism.home)
+    begin = at_rest(dynamics.mechanism.home)
     states, _ = ways(one, begin, wild_targets(dynamics.mechanism), each=17)
     assert min(margin(dynamics.mechanism, x[POSE]) for x in states) >= LEAST_MARGIN
     torques = [dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in states]
@@ -78,7 +82,7 @@ def test_whatever_is_asked_for_the_limits_hold(name, gravity, limit):
 def test_a_target_inside_is_reached_and_nothing_is_said():
     one = governor("paper", True, 10.0)
     target = one.dynamics.mechanism.home + [0.1, -0.1, 0.05, 0.01, 0.01, 0.03]
-    _, end = ways(one, one.at_rest(one.dynamics.mechanism.home), [target], each=60)
+    _, end = ways(one, at_rest(one.dynamics.mechanism.home), [target], each=60)
     assert end.limit is None
     np.testing.assert_allclose(end.state[POSE], target, atol=1e-9)
 
@@ -87,7 +91,7 @@ def test_a_target_outside_is_approached_as_far_as_it_goes():
     one = governor()
     home = one.dynamics.mechanism.home
     target = home + [0, 0, 0, 0, 0, 0.5]
-    _, end = ways(one, one.at_rest(home), [target], each=80)
+    _, end = ways(one, at_rest(home), [target], each=80)
     assert end.limit is not None and "leg" in end.limit
     assert LEAST_MARGIN <= margin(one.dynamics.mechanism, end.state[POSE]) < LEAST_MARGIN + 0.02
 
@@ -95,7 +99,7 @@ def test_a_target_outside_is_approached_as_far_as_it_goes():
 def test_coordinates_that_can_go_on_do_where_another_cannot():
     one = governor()
     home, tilted = one.dynamics.mechanism.home, np.array([0.3, 0, 0, 0, 0, 0])
-    _, blocked = ways(one, one.at_rest(home), [home + tilted, home + tilted + [0, 0, 0, 0, 0, 0.5]])
+    _, blocked = ways(one, at_rest(home), [home + tilted, home + tilted + [0, 0, 0, 0, 0, 0.5]])
     assert blocked.limit is not None and blocked.applied[0] == pytest.approx(0.3)
     _, end = ways(one, blocked, [home + [0, 0, 0, 0, 0, 0.5]], each=80)
     assert end.limit is not None and abs(end.state[0]) < 1e-3
@@ -105,7 +109,7 @@ def test_a_step_from_rest_never_turns_back():
     one = governor("paper", False, 0.1)  # so little that g goes there in many steps
     home = one.dynamics.mechanism.home
     target = home + [0.1, -0.15, 0.2, 0.02, -0.01, 0.05]
-    states, _ = ways(one, one.at_rest(home), [target], each=60)
+    states, _ = ways(one, at_rest(home), [target], each=60)
     assert (states[:, RATES] * np.sign(target - home) > -1e-12).all()
 
 
@@ -114,7 +118,7 @@ def test_a_stop_does_not_turn_back_and_is_soon():
     home = one.dynamics.mechanism.home
     targets = home + np.array([[0, 0, 0, 0, 0, 0.08], [0, 0, 0, 0, 0, -0.08], [0.2, 0, 0, 0, 0, 0]])
     for each in (3, 7, 12):
-        _, moving = ways(one, one.at_rest(home), targets, each)
+        _, moving = ways(one, at_rest(home), targets, each)
         stop = one.stop_pose(moving.state)
         after = response(moving.state, stop, one.pace, np.arange(0, 6, 1e-3))
         assert (after[:, RATES] * np.sign(moving.state[RATES]) >= -1e-9).all()
@@ -138,5 +142,5 @@ def test_a_motion_of_the_scenario_is_taken_over_and_given_back():
 
 def test_a_limit_that_leaves_no_way_is_told():
     one = governor("paper", True, 0.5)  # less than what holds the plate
-    begun = one.begin(one.at_rest(one.dynamics.mechanism.home).state)
+    begun = one.begin(at_rest(one.dynamics.mechanism.home).state)
     assert isinstance(begun, str) and begun.startswith("motor")

@@ -1,8 +1,10 @@
 """The controller's side of the loop in real time, against a simulated machine in a thread."""
 
+import itertools
 import json
 import math
 import threading
+import time
 import urllib.error
 import urllib.request
 from dataclasses import replace
@@ -13,7 +15,7 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.log_files import Precision, read_log
-from stewart_drake.live.connect import address_of, call, open_endpoint
+from stewart_drake.live.connect import address_of, await_free, call, open_endpoint
 from stewart_drake.live.contact import Contact, Link
 from stewart_drake.live.design import as_seen, check_peer, design
 from stewart_drake.live.endpoint import Endpoint
@@ -31,6 +33,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.scenario.trajectories import make_reference
+from tests.browser import browser, needs_chromium
 
 WAY = "low: 0.1, high: 0.12, loss: 0.02"
 OVER_A_NETWORK = f"link={{kind: network, {WAY}, return: {{{WAY}}}}}"
@@ -76,7 +79,16 @@ def scenario_of(*settings):
 # ---------------------------------------------------------------- runs
 
 
-def test_on_a_wire_it_does_what_the_simulation_does(quiet_machine):
+@pytest.fixture(params=["a clock that is left alone", "a clock that jumps"])
+def wall_clock(request, monkeypatch):
+    """Whoever looks at the time of day sees it an hour off, by turns to either side."""
+    if "jumps" in request.param:
+        true, jumps = time.time, itertools.cycle((3600.0, -3600.0))
+        monkeypatch.setattr(time, "time", lambda: true() + next(jumps))
+        monkeypatch.setattr(time, "time_ns", lambda: int(1e9 * time.time()))
+
+
+def test_on_a_wire_it_does_what_the_simulation_does(quiet_machine, wall_clock):
     with Running() as running:
         ready = prepare_session(scenario_of(), running.address)
         told = "\n".join(plans(ready, 4.0, "paper"))
@@ -257,6 +269,38 @@ def test_the_tighter_torque_limit_counts(offer):
     assert made.torque_limit == made.law.plant.motors.limit == 0.5
 
 
+def test_a_law_that_is_too_slow_for_its_period_says_so_before_it_starts(quiet_machine):
+    with Running(OVER_A_NETWORK) as running:
+        ready = prepare_session(scenario_of(), running.address)
+        took, backend = ready.design.step
+        assert 1e-4 < took < 1.0 and backend.startswith("python")
+        told = [
+            [
+                line
+                for line in plans(ready._replace(design=made), 1.0, "paper")
+                if line.startswith("law: ")
+            ]
+            for made in (ready.design._replace(step=(each, "python")) for each in (0.004, 0.0512))
+        ]
+        ready.endpoint.close()
+    assert told == [
+        ["law: python, a step takes 4.0 ms of a period of 100 ms"],
+        [
+            "law: python, a step takes 51.2 ms of a period of 100 ms; more than 50%: "
+            "expect missed deadlines"
+        ],
+    ]
+
+
+@pytest.mark.parametrize(("settings", "said"), [((), True), (FROM_REST, False)])
+def test_torques_in_flight_that_end_too_soon_are_told(quiet_machine, settings, said):
+    with Running(OVER_A_NETWORK, *settings) as running:
+        ready = prepare_session(scenario_of(*settings), running.address)
+        ready.endpoint.close()
+    told = [line for line in plans(ready, 1.0, "paper") if line.startswith("queue: reference")]
+    assert len(told) == said
+
+
 def test_a_real_machine_wants_to_be_armed(quiet_machine):
     with Running() as running:
         ready = prepare_session(scenario_of(), running.address)
@@ -285,6 +329,17 @@ def test_nobody_there_is_told():
 def test_beyond_loopback_a_key_is_needed():
     with pytest.raises(ConfigError, match="without a key"):
         open_endpoint(("192.0.2.1", 7000), None)
+
+
+def test_what_came_while_nobody_looked_is_not_lost(quiet_machine):
+    with Running(OVER_A_NETWORK.replace("loss: 0.02", "loss: 0")) as running:
+        endpoint = open_endpoint(running.address, None)
+        contact = Contact(endpoint, running.address)
+        call(contact)
+        time.sleep(0.5)  # a round trip takes 0.2 s: some ten answers are on their way
+        await_free(contact)
+        endpoint.close()
+    assert contact.link.loss_back < 0.01
 
 
 def test_round_trips_and_losses_are_those_of_the_link(offer):
@@ -358,3 +413,36 @@ def test_the_loop_goes_on_where_the_page_is_gone():
     for _ in range(3):
         viewer.show(seen)
     assert viewer.wish() == Wish()
+
+
+@needs_chromium
+def test_a_gamepad_moves_the_reference(quiet_machine):
+    """One that the page sees in the place of a true one: a button turns the plate about yaw."""
+    viewer, ends = PageViewer(load_mechanism("paper"), "live: a test"), threading.Event()
+    results = []
+    try:
+        url = viewer.opened()
+        with Running() as running, browser() as tab:
+            ready = prepare_session(scenario_of(), running.address)
+            how = {"viewer": viewer, "ending": ends.is_set, "say": lambda line: None}
+            driving = threading.Thread(target=lambda: results.append(drive(ready, **how)))
+            driving.start()
+            tab.call("Page.navigate", url=url)
+            tab.wait("window.live !== undefined && window.live.time > 1")
+            assert not tab.evaluate("window.live.byHand")
+            tab.evaluate(
+                "window.pressed = 1; navigator.getGamepads = () => [null, { axes: [0, 0, 0, 0], "
+                "buttons: [0, window.pressed, 0, 0, 0, 0, 0, 0].map(value => ({ value })) }]"
+            )
+            tab.wait("window.live.byHand && +document.getElementById('s2').value > 16")
+            tab.evaluate("window.pressed = 0")
+            asked = "[...document.querySelectorAll('#sliders input')].map(input => +input.value)"
+            tab.wait(f"{asked}.every((x, k) => Math.abs(x - window.live.wanted[k]) < 0.5)")
+            assert tab.evaluate("window.live.wanted[2]") > 15.5  # farther than the motion goes
+            ends.set()
+            driving.join()
+            assert tab.errors == []
+    finally:
+        ends.set()
+        viewer.close()
+    assert results[0].status == "interrupted"  # it came to rest where it was led

@@ -1,5 +1,6 @@
 """The machine as a process, in real time: signals, suspensions, kills; and both ends in C."""
 
+import ast
 import json
 import os
 import random
@@ -17,7 +18,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stewart_drake.live.protocol import SECOND
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.native import build
 from stewart_drake.report import export_c
@@ -88,13 +88,11 @@ def machine(*options: str, settings: tuple[str, ...] = SETTINGS) -> Iterator[tup
         yield made, int(first.split("127.0.0.1:")[1].split(":")[0])
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def exported(made: Path, settings: tuple[str, ...]) -> Path:
     """What export-c writes, with the examples over UDP under the sanitizers."""
     if build.compiler() is None or shutil.which("make") is None:
         pytest.skip("there is no C compiler, or no make")
-    made = tmp_path_factory.mktemp("board")
-    scenario = load_scenario("paper", settings=SETTINGS)
+    scenario = load_scenario("paper", settings=settings)
     export_c.write(export_c.exported(scenario, measured=False), made)
     # What is long is tried under them by tests/test_export_c.py.
     long, checked = ["dynamics.o", "riccati.o", "law.o"], "-fsanitize=address,undefined"
@@ -103,6 +101,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         done = subprocess.run(command, cwd=made, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
     return made
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return exported(tmp_path_factory.mktemp("board"), SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def soon(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same for torques that act 0.2 s after their measurement."""
+    return exported(tmp_path_factory.mktemp("soon"), (*SETTINGS, "delay.steps=2"))
 
 
 def c_controller(folder: Path, port: int, *options: str) -> list[str]:
@@ -114,10 +123,22 @@ def states_of(log: Path) -> np.ndarray:
     return np.loadtxt(log, delimiter=",")[:, 1:13]
 
 
-def simulated(samples: int) -> np.ndarray:
-    result = simulate(load_scenario("paper", settings=SETTINGS), margin=False)
+def simulated(samples: int, settings: tuple[str, ...] = SETTINGS) -> np.ndarray:
+    """(k, 12) states."""
+    result = simulate(load_scenario("paper", settings=settings), margin=False)
     kept = result.signals.sel(time=0.1 * np.arange(samples), method="nearest")
     return np.hstack([kept.pose.values, kept.rates.values])
+
+
+def over(
+    folder: Path, settings: tuple[str, ...], log: Path, rate: float = 1.0
+) -> tuple[np.ndarray, str]:
+    """States (k, 12) of the machine of a scenario that C drives, and what the machine said."""
+    with machine("--watchdog", "3", "--rate", f"{rate}", settings=settings) as (running, port):
+        with process(c_controller(folder, port, f"log={log}")) as driving:
+            assert driving.end() == 0, driving.lines
+        assert running.end(signal.SIGINT) == 130
+    return states_of(log), running.said
 
 
 # ---------------------------------------------------------------- the three pairs with C
@@ -140,14 +161,49 @@ def test_the_controller_in_c_drives_the_machine_in_python(folder: Path, tmp_path
 def test_a_lost_datagram_of_the_controller_in_c_costs_nothing(folder: Path, tmp_path: Path) -> None:
     """Where a buffer waits, those that follow say its torque again: the run without a loss."""
     lossy = "link={kind: network, low: 0.0, high: 0.02, loss: 0.3, playout: 0.8}"
-    log, settings = tmp_path / "log", (*SETTINGS, lossy, "controller.packet_repeats=0")
-    with machine(settings=settings) as (running, port):
-        with process(c_controller(folder, port, f"log={log}")) as driving:
-            assert driving.end() == 0, driving.lines
-        assert running.end(signal.SIGINT) == 130
-    lost = int(re.search(r"(\d+) lost by", running.said)[1])  # type: ignore[index]
-    assert lost >= 5 and "32 played, 0 periods dry" in running.said
-    np.testing.assert_allclose(states_of(log), simulated(40), atol=1e-6)
+    settings = (*SETTINGS, lossy, "controller.packet_repeats=0")
+    states, said = over(folder, settings, tmp_path / "log")
+    lost = int(re.search(r"(\d+) lost by", said)[1])  # type: ignore[index]
+    assert lost >= 5 and "32 played, 0 periods dry" in said
+    np.testing.assert_allclose(states, simulated(40), atol=1e-6)
+
+
+SLOW = 0.4
+"""Of the machine's clock, where a measurement is soon too late for a busy computer."""
+
+
+def in_a_row(number: int, loss: float, seed: int) -> tuple[str, ...]:
+    """A link that loses so many datagrams in a row; a torque acts 0.2 s after its measurement."""
+    lossy = f"low: 0.0, high: 0.02, loss: {loss}, burst: {number}, playout: 0.1"
+    return (*SETTINGS, f"link={{kind: network, {lossy}, seed: {seed}}}")
+
+
+MOTION = np.tile([0.26, 0.26, 0.26, 0.02, 0.02, 0.08], 2)
+"""Amplitudes of the scenario's motion, rad and m, and of its rates, per s."""
+
+
+def test_what_the_controller_in_c_plans_ahead_acts_in_the_place_of_what_is_lost(
+    soon: Path, tmp_path: Path
+) -> None:
+    """Too late to be said again, where 3 or 7 in a row are lost: as the law in Python under the
+    same losses. Without plans the plate leaves its workspace."""
+    settings = in_a_row(3, loss=0.3, seed=2)
+    states, said = over(soon, settings, tmp_path / "log", SLOW)
+    assert "0 periods dry" in said
+    off = np.abs(states - simulated(40, settings)) / MOTION
+    assert off.max() < 5e-3
+
+
+def test_the_controller_in_c_hears_what_has_acted(soon: Path, tmp_path: Path) -> None:
+    """Ten in a row are lost, so that the last torque is held: without being told, the filter would
+    take that for a torque bias, which takes the plate four amplitudes away."""
+    settings = in_a_row(10, loss=0.2, seed=12)
+    states, said = over(soon, settings, tmp_path / "log", SLOW)
+    dry = int(re.search(r"(\d+) periods dry", said)[1])  # type: ignore[index]
+    undisturbed = simulated(40, (*SETTINGS, "delay.steps=2"))
+    assert dry >= 2
+    most = np.abs(simulated(40, settings) - undisturbed) / MOTION
+    assert (np.abs(states - undisturbed) / MOTION).max() < min(0.5, most.max())
 
 
 def test_the_controller_in_python_drives_the_machine_in_c(folder: Path) -> None:
@@ -224,6 +280,33 @@ def test_a_suspended_controller_is_survived_or_stopped(folder: Path) -> None:
     assert "the safe torque (zero) acts" in silent
 
 
+@pytest.mark.parametrize("side", ["controller", "machine"])
+def test_either_side_of_a_network_may_stand_still_for_a_second(side: str) -> None:
+    """Told in one line by whoever stood still; the machine is at its safe torque within the time
+    that it promises, and the controller leads the plate back, or says why not."""
+    way = "low: 0.1, high: 0.12"
+    link = f"link={{kind: network, {way}, return: {{{way}}}}}"
+    live = [*COMMAND, "live", "paper", "--no-browser", "--duration", "8", "--machine"]
+    with (
+        machine("--watchdog", "0.7", settings=("plant.kind=exact", link)) as (running, port),
+        process([*live, f"127.0.0.1:{port}"]) as driving,
+    ):
+        running.until("the run began")
+        time.sleep(3.0)
+        suspended = running if side == "machine" else driving
+        suspended.popen.send_signal(signal.SIGSTOP)
+        time.sleep(1.0)
+        suspended.popen.send_signal(signal.SIGCONT)
+        line = suspended.until("stood still for")
+        survived = driving.end() == 0
+        assert running.end(signal.SIGINT) == 130
+    assert 0.5 < float(line.split("stood still for ")[1].split()[0]) < 3.0
+    assert sum("stood still" in line for line in suspended.lines) == 1
+    assert "nothing was heard for 0.7 s: the safe torque (zero) acts" in running.said
+    told = r"E_ac +[\d.]+ % s" if survived else "left workspace|lost machine"
+    assert re.search(told, driving.said), driving.lines
+
+
 def kills(folder: Path, number: int, rng: random.Random) -> None:
     """Kill the controller at random times; the next one takes over from rest."""
     with machine("--watchdog", "0.4") as (running, port):
@@ -266,6 +349,45 @@ def test_a_killed_machine_ends_the_controller_with_the_reason(folder: Path) -> N
     assert "the machine has fallen silent after" in driving.lines[-2]
 
 
+def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_successor(
+    folder: Path,
+) -> None:
+    port = free_port()
+    command = [str(folder / "stewart_machine"), str(port)]
+    with process(command) as running, process(c_controller(folder, port)) as driving:
+        running.until("the run began")
+        running.popen.kill()
+        running.popen.wait()
+        with process(command) as anew:
+            anew.until("a simulated machine at port")
+            assert driving.end() == 1  # what it sends is of a session that the new one never had
+            assert "the machine has fallen silent after" in driving.lines[-2]
+            with process(c_controller(folder, port, "seconds=1")) as second:
+                assert second.end() == 0, second.lines
+            assert anew.end(signal.SIGINT) == 0
+    assert sum("a session begins" in line for line in anew.lines) == 1
+    assert re.search(r" [1-9]\d* foreign", anew.lines[-1])
+
+
+def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_over(
+    folder: Path,
+) -> None:
+    port = free_port()
+    with process([str(folder / "stewart_machine"), str(port)]) as running:
+        running.until("a simulated machine at port")
+        with process(c_controller(folder, port)) as driving:
+            running.until("the run began")
+            time.sleep(1.5)
+            driving.popen.kill()
+            killed = time.monotonic()
+        running.until("nothing was heard for 1 s: the safe torque acts")
+        assert time.monotonic() - killed < 1.0 + 0.25
+        with process(c_controller(folder, port, "seconds=1")) as second:
+            assert second.end() == 0, second.lines
+        assert running.end(signal.SIGINT) == 0
+    assert sum("a session begins" in line for line in running.lines) == 2
+
+
 def test_wrong_commands_are_one_line(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from stewart_drake.cli import main
 
@@ -301,12 +423,42 @@ def test_a_slower_clock_is_told(folder: Path) -> None:
     assert "completed after 10 samples, 0 of them without" in driving.lines[-2]
 
 
-def test_a_clock_that_is_set_is_not_looked_at() -> None:
-    """Every time is of the monotonic clock: nothing in the room asks for another."""
-    from stewart_drake import live
+# ---------------------------------------------------------------- clocks
 
-    folder = Path(live.__file__).parent
-    for name in ("endpoint", "machine", "motors", "body", "protocol"):
-        text = (folder / f"{name}.py").read_text("utf-8")
-        assert not re.search(r"time\.time\(|datetime|time_ns\(", text.replace("monotonic_ns(", ""))
-    assert SECOND == 10**9
+WALL = {"time", "time_ns", "localtime", "gmtime", "ctime", "asctime", "strftime", "clock_gettime"}
+"""Of the module `time`: what follows a clock that somebody sets, or may."""
+WALL_IN_C = r"gettimeofday|CLOCK_(?!MONOTONIC)|[^_a-z](time|localtime|gmtime)\("
+
+
+def wall_clocks(source: str) -> list[str]:
+    """What a module asks a clock for that can be set."""
+    tree = ast.parse(source)
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import)]
+    aliases = {a.asname or a.name for node in imports for a in node.names if a.name == "time"}
+    found = [a.name for node in imports for a in node.names if a.name.startswith("datetime")]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            names = {a.name for a in node.names}
+            found += ["datetime"] * (node.module == "datetime")
+            found += sorted(names & WALL) if node.module == "time" else []
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            found += [node.attr] * (node.value.id in aliases and node.attr in WALL)
+    return found
+
+
+def test_no_clock_that_can_be_set_is_looked_at() -> None:
+    """Every time is of the monotonic clock, on either side, in Python and in C."""
+    import stewart_drake
+    from stewart_drake.native.build import FOLDER
+
+    assert wall_clocks("import time as clock\nclock.time()") == ["time"]
+    assert wall_clocks("from datetime import datetime\nfrom time import time_ns") != []
+    assert wall_clocks("import time\ntime.monotonic_ns(), time.perf_counter()") == []
+    assert re.search(WALL_IN_C, " x = time(NULL)") and re.search(WALL_IN_C, "CLOCK_REALTIME")
+    room = Path(stewart_drake.__file__).parent
+    modules = [*(room / "live").glob("*.py"), room / "cli" / "live.py", room / "cli" / "machine.py"]
+    assert len(modules) > 10
+    for path in modules:
+        assert wall_clocks(path.read_text("utf-8")) == [], path
+    for path in (*export_c.TEMPLATES.glob("*.[ch]"), *FOLDER.glob("*.[ch]")):
+        assert not re.search(WALL_IN_C, path.read_text("utf-8")), path

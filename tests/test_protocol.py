@@ -177,7 +177,6 @@ def test_crank_angles_follow_from_codes() -> None:
     expected = [turn / 2**14, 0.5 - turn / 2**14, turn / 4, -turn / 4, 0, np.nan]
     np.testing.assert_allclose(values, expected, rtol=1e-15)
     assert STATE.values is STATE.state
-    assert STATE.age == pytest.approx(0.1)
 
 
 # ---------------------------------------------------------------- random messages

@@ -43,7 +43,11 @@ def live(
         str | None, typer.Option(metavar="HOST:PORT", help="Where the machine listens.")
     ] = None,
     demo: Annotated[
-        bool, typer.Option("--demo", help="Start a simulated machine too, 0.3 s away each way.")
+        bool,
+        typer.Option(
+            "--demo",
+            help="Start a simulated machine too, each way 0.35 to 0.4 of the scenario's delay.",
+        ),
     ] = False,
     duration: Annotated[
         float | None, typer.Option(min=0.1, metavar="S", help="Until it is stopped by default.")

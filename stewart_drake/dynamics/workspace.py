@@ -24,7 +24,8 @@ LEAST = np.array([DEAD_CENTRE_SINE] * NUM_LEGS + [SINGULARITY_LIMIT, -PITCH_LIMI
 class Failure(NamedTuple):
     """Why a run stopped: time in s, leg (from 1, or None), margin and the reason in words.
 
-    `margin` is the reach margin of that leg in m, or the measure that the reason names.
+    `margin` is the reach margin of that leg in m, or the measure that the reason names, NaN for
+    none.
     """
 
     time: float
@@ -33,7 +34,8 @@ class Failure(NamedTuple):
     reason: str
 
     def __str__(self) -> str:
-        return f"{self.reason} at t = {self.time:.3f} s (margin {self.margin:.2g})"
+        margin = "" if np.isnan(self.margin) else f" (margin {self.margin:.2g})"
+        return f"{self.reason} at t = {self.time:.3f} s{margin}"
 
 
 class Standing(NamedTuple):

@@ -166,9 +166,9 @@ class Contact:
             yield message
 
     def forget_waiting(self) -> None:
-        """Throw away what came while nobody looked: how late it came says nothing of the link."""
-        for _ in self._endpoint.receive():
-            pass
+        """Count what came while nobody looked, and no more: how late it was is not the link's."""
+        for message, address in self._endpoint.receive():
+            self.link.came += self.session.refusal(message.head, address, now()) is None
 
     def refuse(self, cause: Refusal) -> None:
         """Count a message that was taken but is of no use."""

@@ -7,15 +7,19 @@ its time, or never, the repetitions and plans of packets stand in for (theory.md
 """
 
 import math
+import time as clock
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.law.native_law import serving
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.live.contact import Link
 from stewart_drake.live.protocol import (
@@ -34,6 +38,8 @@ from stewart_drake.scenario.config import (
     TorqueActuatorConfig,
 )
 from stewart_drake.scenario.link import usual_bound
+from stewart_drake.scenario.signals import NUM_STATE
+from stewart_drake.scenario.trajectories import evaluate
 
 Array = NDArray[np.float64]
 
@@ -41,6 +47,8 @@ _ROOM: Final = 0.25
 """Share of what was seen of the link's jitter by which a round trip may yet be longer."""
 _COMPUTING: Final = 0.01
 """s, for the law's step and for waking up."""
+_TRIED: Final = 5
+"""Steps of the law, before it is told how long one takes."""
 _LEAST_LOSS: Final = 0.01
 """Of packets; none was seen to be lost in a few seconds."""
 
@@ -55,6 +63,7 @@ class Design(NamedTuple):
         queue: (L, 6) torques in flight at a begin, as the scenario says.
         repeats: torques that a packet says again.
         torque_limit: of each motor, N m: the tighter one of the scenario's and of the machine's.
+        step: s that a step of the law takes here, and what it is stepped by.
     """
 
     experiment: Experiment
@@ -63,6 +72,7 @@ class Design(NamedTuple):
     queue: Array
     repeats: int
     torque_limit: float
+    step: tuple[float, str]
 
 
 def check_peer(scenario: Scenario, machine: MachineMessage) -> None:
@@ -166,4 +176,20 @@ def design(scenario: Scenario, machine: MachineMessage) -> Design:
         repeats = 0
     queue = first_queue(experiment, law)
     assert law.kept < MOST_HISTORY
-    return Design(experiment, law, planned, queue, repeats, limit)
+    return Design(experiment, law, planned, queue, repeats, limit, _step_time(law, planned, queue))
+
+
+def _step_time(law: PredictiveLqi, motion: Trajectory, queue: Array) -> tuple[float, str]:
+    """The shortest of some steps along a motion, s of this thread, and what the law is stepped by.
+
+    What else the computer does meanwhile does not count: it is the least that a step takes.
+    """
+    served: Any
+    served, backend = serving(replace(law, silence=0))
+    memory, weights, took = served.initial_memory(queue), np.ones(2), list[float]()
+    measured = Measurement.of(law.sensing.seen(evaluate(motion, 0.0)[:NUM_STATE]))
+    for _ in range(_TRIED):
+        started = clock.thread_time()
+        memory = served.step(memory, measured, KnownMotion(motion, motion, 0.0), weights)
+        took.append(clock.thread_time() - started)
+    return min(took), backend

@@ -16,6 +16,7 @@ from typing import Final
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.protocol import (
     LONGEST,
+    SECOND,
     Head,
     Message,
     Refusal,
@@ -34,6 +35,8 @@ SHORTEST_KEY: Final = 16
 """Bytes."""
 LONGEST_KEY: Final = 4096
 """Bytes."""
+STOOD: Final = SECOND // 5
+"""ns by which a process that comes late has stood still."""
 
 
 def now() -> int:

@@ -127,10 +127,6 @@ class Governor:
     def _size(self) -> Array:
         return sizes(self.dynamics.mechanism)
 
-    def at_rest(self, pose: Array) -> Governed:
-        """Of a plate that stands at a pose (6,)."""
-        return Governed(np.concatenate([pose, np.zeros(2 * NUM_COORDINATES)]), np.array(pose))
-
     def problem(self, states: Array) -> str | None:
         """Which limit states (n, 18) pass, in words, or None."""
         mechanism, least = self.dynamics.mechanism, LEAST_MARGIN + _GUARD

@@ -24,7 +24,7 @@ from stewart_drake.law.timeline import Acting, Timeline
 from stewart_drake.live.connect import await_free
 from stewart_drake.live.contact import Contact
 from stewart_drake.live.design import Design
-from stewart_drake.live.endpoint import now
+from stewart_drake.live.endpoint import STOOD, now
 from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.protocol import (
     NEVER,
@@ -215,7 +215,7 @@ class LiveLoop:
         self._sequences = dict[int, int]()
         self._flags, self._silent_since = MachineFlags(0), 0
         self._asked, self._recording = NOTHING, True
-        self._parked = self._leads = False
+        self._parked = self._leads = self._late = False
 
     # -------------------------------------------------------------- the begin
 
@@ -291,6 +291,7 @@ class LiveLoop:
         if self._viewer.stopped():
             raise KeyboardInterrupt
         message = self._await(k)
+        self._tell_lag(k)
         return self._over(k, message) or self._sample(k, message) or End("completed", None)
 
     def _come_to_rest(self, k: int) -> None:
@@ -332,6 +333,16 @@ class LiveLoop:
         for old in [n for n in self._came if n < k - _GONE]:
             del self._came[old]
         return self._came.get(k)
+
+    def _tell_lag(self, k: int) -> None:
+        """Say once that this process comes late, beside what the link adds."""
+        lag = now() - self._due(k) - self._contact.lateness(self._period) * SECOND
+        if lag > STOOD and not self._late:
+            self._say(
+                f"at {k * self._period:.1f} s: stood still for {lag / SECOND:.1f} s; the machine "
+                "went on by its buffer"
+            )
+        self._late = lag > STOOD
 
     def _over(self, k: int, message: MachineMessage | None) -> End | None:
         """Why it does not go on, or None; what changes about the machine is said."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.body import Body, body_of
-from stewart_drake.live.endpoint import Address, Endpoint, Session, draw, now
+from stewart_drake.live.endpoint import STOOD, Address, Endpoint, Session, draw, now
 from stewart_drake.live.motors import Motors, Plan, PlayoutMotors, WireMotors
 from stewart_drake.live.protocol import (
     MISSING,
@@ -53,9 +53,8 @@ from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
 Array = NDArray[np.float64]
 
 DRAWN: Final = 1 << 17
-"""Datagrams each way for which times and losses are drawn; then they begin anew."""
-STOOD: Final = SECOND // 5
-"""ns by which a process that comes late has stood still."""
+"""Datagrams each way for which times and losses are drawn; then they begin anew, but for a wire,
+which from then on takes what it took last."""
 _NOTHING: Final = MachineFlags(0)
 FURTHEST: Final = 3600 * SECOND
 """ns ahead that a run may begin, or torques be planned."""

@@ -1,9 +1,8 @@
 """The page of a live run: the machine in Meshcat, readouts, sliders, and the button that stops it.
 
 It is served by a process of its own, so that neither drawing nor a browser takes time from the
-loop.
-Both servers listen on this computer alone. What asks the machine to do something must bring the
-token that is in the page's address: other pages in the same browser, which can send to this
+loop. Both servers listen on this computer alone. What asks the machine to do something must bring
+the token that is in the page's address: other pages in the same browser, which can send to this
 computer too, do not know it.
 """
 
@@ -14,7 +13,7 @@ import secrets
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing.connection import Connection
 from typing import Any, Final, NamedTuple
@@ -65,7 +64,6 @@ class PageViewer:
     Args:
         mechanism: to be shown.
         title: of the page.
-
     """
 
     def __init__(self, mechanism: Mechanism, title: str) -> None:
@@ -120,28 +118,13 @@ class PageViewer:
                 else:
                     self._credit = True
 
-    def _gone(self) -> Any:
-        return _Gone(self)
-
-    def lose(self) -> None:
-        """Go on without the page: the motion leads again."""
-        self._there, self._wish = False, Wish()
-
-
-class _Gone:
-    """Where the page's process has ended, the loop goes on without it."""
-
-    def __init__(self, viewer: PageViewer) -> None:
-        self._viewer = viewer
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, *_: Any) -> bool:
-        if kind is not None and issubclass(kind, EOFError | OSError):
-            self._viewer.lose()
-            return True
-        return False
+    @contextmanager
+    def _gone(self) -> Iterator[None]:
+        """Where the page's process has ended the loop goes on without it, and the motion leads."""
+        try:
+            yield
+        except (EOFError, OSError):
+            self._there, self._wish = False, Wish()
 
 
 # ---------------------------------------------------------------- the page's process

@@ -184,11 +184,6 @@ class MachineMessage:
         return _equal(self, other)
 
     @property
-    def age(self) -> float:
-        """s since the measurement was taken, when it was sent."""
-        return (self.head.time - self.sampled) / SECOND
-
-    @property
     def values(self) -> Array | None:
         """(12,) the state, or (6 N,) crank angles in rad, the oldest first; NaN what is lost.
 

@@ -6,7 +6,7 @@ import os
 import time as clock
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.files.errors import ConfigError
@@ -21,6 +21,9 @@ from stewart_drake.live.steering import Steering, Way
 from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LiveSummary, SimulationResult
 from stewart_drake.scenario.config import NetworkConfig, Scenario
+
+_MOST: Final = 0.5
+"""Share of a period that a step may take."""
 
 
 class Ready(NamedTuple):
@@ -95,7 +98,24 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
         f"{1e3 * sc.controller.period:g} ms, motors {limit}",
         f"motion: {scenario}, {until}; after {machine.watchdog / SECOND:g} s without a word the "
         f"machine goes to {safe}",
+        *_cautions(made),
     ]
+
+
+def _cautions(made: Design) -> list[str]:
+    """How long a step takes, and what will go worse than in the scenario, in lines."""
+    sc, (step, backend) = made.experiment.scenario, made.step
+    period = sc.controller.period
+    slow = f"; more than {_MOST:.0%}: expect missed deadlines" if step > _MOST * period else ""
+    lines = [
+        f"law: {backend}, a step takes {1e3 * step:.1f} ms of a period of {1e3 * period:g} ms{slow}"
+    ]
+    if isinstance(sc.link, NetworkConfig) and sc.queue == "reference":
+        lines.append(
+            "queue: reference ends with the machine's own link, and its buffer is dry until this "
+            "controller's torques act: better --set start=rest --set queue=zero, on both sides"
+        )
+    return lines
 
 
 def check_armed(ready: Ready, armed: bool) -> None:

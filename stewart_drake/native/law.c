@@ -1113,5 +1113,14 @@ int stewart_step(const stewart_config *c, stewart_memory *m, stewart_workspace *
 
 void stewart_sent(const stewart_config *c, stewart_memory *m, const real *torque)
 {
-    copy(U, torque, m->in_flight[in_flight_length(c) - 1]);
+    stewart_acted(c, m, 1, 1, torque);
+}
+
+void stewart_acted(const stewart_config *c, stewart_memory *m, int ago, int number,
+                   const real *torques)
+{
+    const int length = in_flight_length(c);
+    for (int i = 0; i < number; i++)
+        if (ago + i >= 1 && ago + i <= length)
+            copy(U, torques + U * i, m->in_flight[length - ago - i]);
 }

@@ -4,6 +4,7 @@
    every period:   status = stewart_step(&config, &memory, &work, measurement, 0, preview, weights,
                                          torque);
    and only if something else was sent than `torque`, limited:   stewart_sent(&config, &memory, sent);
+   or acted, as a link may have it:   stewart_acted(&config, &memory, ago, number, acted);
 
    A pose is roll, pitch, yaw (rad) and x, y, z (m) of the plate's centre of mass, a state the pose
    and its rates, a reference the pose, its rates and its accelerations. Matrices are stored by rows.
@@ -111,6 +112,12 @@ int stewart_step(const stewart_config *config, stewart_memory *memory, stewart_w
 
 /* Something else was sent at the last sample than its torque within the limit. */
 void stewart_sent(const stewart_config *config, stewart_memory *memory, const real *torque);
+
+/* What has acted, where that may not be what was sent: `number` torques, the newest first, the first
+   in the place of the one computed `ago` >= 1 samples before the next step. What is longer ago than is
+   remembered is of no more use. */
+void stewart_acted(const stewart_config *config, stewart_memory *memory, int ago, int number,
+                   const real *torques);
 
 #include "workspace.h"
 

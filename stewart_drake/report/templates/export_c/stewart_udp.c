@@ -5,7 +5,7 @@
    It asks for a session, finds the machine's clock, chooses when to begin, and then steps the
    controller once a period of the machine. Without a key it talks to this computer only; a machine that
    does not say that it is a simulation is driven with `arm` only. The log has a line per sample: time,
-   measured state (12), torques (6). */
+   measured state (12), torques (6), how many periods before the sample that was measured. */
 
 #define _POSIX_C_SOURCE 200809L
 
@@ -22,6 +22,7 @@
 #define TRIPS 64
 #define ENOUGH 10 /* round trips that tell the clock */
 #define REPEATS 7 /* earlier torques that a datagram says again, for those that get lost */
+#define PLANNED 8 /* torques that it says ahead, for those that will */
 
 /* Round trips, and the machine's clock less the own one by each: the shortest one counts. */
 typedef struct {
@@ -39,9 +40,9 @@ typedef struct {
     uint64_t begin, used;  /* of the machine's clock; that of the measurement used last, plus 1 */
     uint32_t flags;
     unsigned refused[STEWART_REFUSALS];
-    stewart_memory memory;
+    stewart_memory memory, ahead;
     stewart_workspace work;
-    real sent[1 + REPEATS][STEWART_MOTORS]; /* the newest last */
+    real said[REPEATS + 1 + PLANNED][STEWART_MOTORS]; /* the last torques, and those that would follow */
     unsigned samples, missing, missed;
     double seconds;
     FILE *log;
@@ -99,8 +100,9 @@ static void receive(controller *c)
     }
 }
 
-/* A datagram with the last `rows` torques, the first of which is for `playout`. */
-static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playout, unsigned rows)
+/* A datagram with torques, the first of which is for `playout`. */
+static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playout,
+                real torques[][STEWART_MOTORS], unsigned rows)
 {
     uint8_t data[STEWART_LONGEST];
     stewart_plan plan;
@@ -112,7 +114,7 @@ static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playou
     plan.rows = (uint8_t)rows;
     for (unsigned row = 0; row < rows; row++)
         for (int i = 0; i < STEWART_MOTORS; i++)
-            plan.torques[row][i] = (double)c->sent[1 + REPEATS - rows + row][i];
+            plan.torques[row][i] = (double)torques[row][i];
     udp_put(c->socket, data, stewart_write_plan(&plan, c->key, data), &c->machine);
 }
 
@@ -130,47 +132,88 @@ static int take(controller *c, uint64_t sampled, real *measurement)
     return fresh ? (int)age : 0;
 }
 
-static void note(const controller *c, double t, const real *measurement, const real *torque)
+static void note(const controller *c, double t, const real *measurement, const real *torque,
+                 int age)
 {
     fprintf(c->log, "%.9g", t);
     for (int i = 0; i < STEWART_STATES; i++)
         fprintf(c->log, ",%.17g", (double)measurement[i]);
     for (int i = 0; i < STEWART_MOTORS; i++)
-        fprintf(c->log, i + 1 < STEWART_MOTORS ? ",%.17g" : ",%.17g\n", (double)torque[i]);
+        fprintf(c->log, ",%.17g", (double)torque[i]);
+    fprintf(c->log, ",%d\n", age);
+}
+
+/* From a sample to its torque, ns. */
+static uint64_t eta(const controller *c)
+{
+    const stewart_config *config = &stewart_configuration;
+    return (uint64_t)((config->steps + (double)config->fraction) * (double)c->last.period + 0.5);
+}
+
+/* The machine says what has acted: where torques came too late, or never, not what was sent. */
+static void correct(controller *c, unsigned k)
+{
+    real acted[STEWART_HISTORY][STEWART_MOTORS];
+    double period = (double)c->last.period;
+    if (c->last.history == 0)
+        return;
+    for (int row = 0; row < c->last.history; row++)
+        for (int i = 0; i < STEWART_MOTORS; i++)
+            acted[row][i] = (real)c->last.acted[row][i];
+    double since = (double)(c->begin + eta(c)) - (double)c->last.acted_from;
+    stewart_acted(&stewart_configuration, &c->memory, (int)k + (int)lround(since / period),
+                  c->last.history, acted[0]);
+}
+
+/* The law at sample k, its torque within the machine's limit. */
+static void compute(const controller *c, stewart_memory *memory, stewart_workspace *work, unsigned k,
+                    const real *measurement, int age, real *torque)
+{
+    const stewart_config *config = &stewart_configuration;
+    real times[STEWART_PREVIEW], preview[STEWART_PREVIEW * STEWART_REFERENCE];
+    real limit = (real)fmin(c->last.torque_limit, (double)config->torque_limit);
+    int rows = stewart_preview_times(config, times);
+    for (int i = 0; i < rows; i++)
+        stewart_reference(fmax(0, k * (double)config->period + (double)times[i]),
+                          preview + i * STEWART_REFERENCE);
+    stewart_step(config, memory, work, measurement, age, preview, stewart_weights, torque);
+    for (int i = 0; i < STEWART_MOTORS; i++)
+        torque[i] = (real)fmax(-limit, fmin(limit, torque[i]));
+    stewart_sent(config, memory, torque);
+}
+
+/* What would follow if no more measurements came: the model stands in for them. */
+static void plan(controller *c, unsigned k)
+{
+    real nothing[STEWART_STATES];
+    for (int i = 0; i < STEWART_STATES; i++)
+        nothing[i] = (real)NAN;
+    c->ahead = c->memory;
+    for (unsigned i = 1; i <= PLANNED; i++)
+        compute(c, &c->ahead, &c->work, k + i, nothing, 0, c->said[REPEATS + i]);
 }
 
 static void step(controller *c, unsigned k)
 {
-    const stewart_config *config = &stewart_configuration;
-    uint64_t sampled = c->begin + k * c->last.period;
-    real times[STEWART_PREVIEW], preview[STEWART_PREVIEW * STEWART_REFERENCE];
-    real measurement[STEWART_STATES], torque[STEWART_MOTORS];
-    int rows = stewart_preview_times(config, times), lower = 0;
-    for (int i = 0; i < rows; i++)
-        stewart_reference(fmax(0, k * (double)config->period + (double)times[i]),
-                          preview + i * STEWART_REFERENCE);
+    uint64_t period = c->last.period, sampled = c->begin + k * period;
+    real measurement[STEWART_STATES], *torque = c->said[REPEATS];
+    /* Repetitions and plans are of use where a buffer waits; the former for periods to come. */
+    int waits = !(c->last.head.flags & STEWART_WIRE);
+    unsigned steps = (unsigned)stewart_configuration.steps, repeats = steps < k ? steps : k;
+    repeats = !waits ? 0 : repeats < REPEATS ? repeats : REPEATS;
     int age = take(c, sampled, measurement);
-    stewart_step(config, &c->memory, &c->work, measurement, age, preview, stewart_weights, torque);
-    real limit = (real)fmin(c->last.torque_limit, (double)config->torque_limit);
-    for (int i = 0; i < STEWART_MOTORS; i++) {
-        torque[i] = (real)fmax(-limit, fmin(limit, torque[i]));
-        lower |= limit < config->torque_limit;
-    }
-    if (lower)
-        stewart_sent(config, &c->memory, torque);
-    memmove(c->sent[0], c->sent[1], REPEATS * sizeof c->sent[0]);
-    memcpy(c->sent[REPEATS], torque, sizeof torque);
-    /* Repetitions are of use where a buffer waits, for periods that are still to come. */
-    unsigned repeats = c->last.head.flags & STEWART_WIRE ? 0 : (unsigned)config->steps;
-    repeats = repeats < REPEATS ? repeats : REPEATS;
-    repeats = repeats < k ? repeats : k;
-    double eta = (config->steps + (double)config->fraction) * (double)c->last.period;
-    uint64_t playout = sampled + (uint64_t)(eta + 0.5);
-    say(c, 0, sampled, playout - repeats * c->last.period, 1 + repeats);
+    memmove(c->said[0], c->said[1], REPEATS * sizeof c->said[0]);
+    if (waits)
+        correct(c, k);
+    compute(c, &c->memory, &c->work, k, measurement, age, torque);
+    if (waits)
+        plan(c, k);
+    say(c, 0, sampled, sampled + eta(c) - repeats * period, c->said + REPEATS - repeats,
+        repeats + 1 + (waits ? PLANNED : 0));
     if (c->log)
-        note(c, k * (double)config->period, measurement, torque);
+        note(c, k * (double)stewart_configuration.period, measurement, torque, age);
     c->samples++;
-    c->missed += udp_now() > own_time(&c->clock, sampled + c->last.period);
+    c->missed += udp_now() > own_time(&c->clock, sampled + period);
 }
 
 /* Why a machine is not driven, or NULL. */
@@ -192,7 +235,7 @@ static const char *greet(controller *c)
     while (c->last.begin == STEWART_NEVER || c->begin == STEWART_NEVER || c->last.period == 0) {
         if (udp_interrupted() || udp_now() > patience)
             return busy ? "another controller drives it" : "the machine does not answer";
-        say(c, 0, 0, 0, 0);
+        say(c, 0, 0, 0, NULL, 0);
         uint64_t next = udp_now() + (c->last.period ? c->last.period : SECOND / 10);
         while (udp_now() < next) {
             udp_wait(c->socket, next);
@@ -222,7 +265,7 @@ static const char *drive(controller *c)
     unsigned number = (unsigned)(c->seconds / (double)stewart_configuration.period + 0.5);
     int waits = stewart_configuration.longest_wait == 0;
     for (uint64_t t = own_time(&c->clock, c->begin); udp_now() + SECOND / 20 < t;) {
-        say(c, 0, 0, 0, 0); /* still here */
+        say(c, 0, 0, 0, NULL, 0); /* still here */
         udp_wait(c->socket, udp_now() + SECOND / 20);
         receive(c);
     }
@@ -285,7 +328,7 @@ int main(int argc, char **argv)
         problem = drive(&c);
     }
     for (int i = 0; i < 3 && c.session.nonce; i++)
-        say(&c, STEWART_STOP, 0, 0, 0);
+        say(&c, STEWART_STOP, 0, 0, NULL, 0);
     printf("%s after %u samples, %u of them without a measurement, %u late\n",
            problem ? problem : "completed", c.samples, c.missing, c.missed);
     udp_tell(c.refused);
