@@ -318,6 +318,20 @@ def test_the_fastest_pole_is_told_where_it_is(tmp_path: Path) -> None:
     assert found.pole == pytest.approx(again, rel=1e-12)
 
 
+@pytest.mark.parametrize("kind", ["none", "constant"])
+@pytest.mark.parametrize("worst", [9.9, 10.1])
+def test_a_search_for_the_delay_longer_than_a_period_is_told(kind: str, worst: float) -> None:
+    experiment = prepare(scenario(f"controller.delay_estimator={kind}", name="gravity"))
+    summary = {
+        "controller_step_ms": {"median": 5.0, "worst": worst},
+        "controller_margin": None,
+        "status": "completed",
+    }
+    said = kind == "constant" and worst > 10  # ms, the period
+    found = cautions_after(experiment, summary)
+    assert [f"slowest step took {worst} ms" in line for line in found] == [True] * said
+
+
 # ---------------------------------------------------------------- the engine's step
 
 

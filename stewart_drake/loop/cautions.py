@@ -69,11 +69,17 @@ def _finer(scenario: Scenario) -> Iterator[float]:
 def cautions_after(experiment: Experiment, summary: RunSummary) -> list[str]:
     """What the run has shown."""
     found, period = [], 1e3 * experiment.scenario.controller.period
-    median = summary["controller_step_ms"]["median"]
+    median, worst = (summary["controller_step_ms"][which] for which in ("median", "worst"))
     if median > period:  # one slow step is the machine's doing, the median is not
         found.append(
             f"the controller's step took {median:.3g} ms at the median, longer than its period of "
             f"{period:.3g} ms: on this computer it would not keep up with a real machine"
+        )
+    elif worst > period and experiment.scenario.controller.delay_estimator != "none":
+        found.append(
+            f"the controller's slowest step took {worst:.3g} ms, longer than its period of "
+            f"{period:.3g} ms: the search for the delay takes as long as it has hypotheses, "
+            "and a real machine would get the torques of such samples late"
         )
     margin = summary["controller_margin"]
     if summary["status"] == "completed" and margin is not None and margin["stable"] is False:
