@@ -1,8 +1,8 @@
 """Motor encoders instead of the state: `python benchmarks/encoders.py [section ...]`.
 
 Writes benchmarks/results/encoders.md; SEEDS of the environment is the number of runs of a row, each
-with encoders whose codes begin elsewhere, FIRST the first seed. Sections: codes, rest, known,
-unknown, gravity, offsets, faults, delay, time. All runs are on the exact plant with the paper's
+with encoders whose codes begin elsewhere, FIRST the first seed, JOBS how many run side by side.
+Sections: codes, rest, known, unknown, gravity, offsets, faults, delay, time. All runs are on the exact plant with the paper's
 motion and delay of 0.8 s, on the reference, with the shipped priors, where a row says nothing else.
 "Identified" are standard deviations as a log leaves them: 6e-5 N m, 10 g and 6e-5 N m s/rad. Times
 are the CPU's.
@@ -30,6 +30,7 @@ RESULTS = Path(__file__).parent / "results"
 SEEDS = int(os.environ.get("SEEDS", "5"))
 FRESH = int(os.environ.get("FIRST", "100"))
 """The first seed."""
+JOBS = int(os.environ.get("JOBS", "-1"))
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 FINE = ("sensor.samples=100",)
 BIAS = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
@@ -73,7 +74,7 @@ def run(settings: Sequence[str], scenario: str, seed: int) -> Outcome:
 def collect(title: str, rows: Rows, scenario: str = "paper") -> str:
     """The table of named settings; means over the seeds, and how many runs completed if not all."""
     jobs = [(settings, seed) for settings in rows.values() for seed in range(FRESH, FRESH + SEEDS)]
-    ran = iter(Parallel(n_jobs=-1)(delayed(run)(s, scenario, seed) for s, seed in jobs))
+    ran = iter(Parallel(n_jobs=JOBS)(delayed(run)(s, scenario, seed) for s, seed in jobs))
     lines = ["| | E_ac | least, most | missing, frozen, rejected |", "| --- | --- | --- | --- |"]
     for name in rows:
         found = [next(ran) for _ in range(SEEDS)]
@@ -177,7 +178,7 @@ def offsets() -> str:
     text = collect("Offsets of 0.1 degree, narrow priors", rows)
     instants = (2.0, 5.0, 10.0)
     seeds = range(FRESH, FRESH + SEEDS)
-    left = Parallel(n_jobs=-1)(delayed(_left)((*FINE, NARROW), s, instants) for s in seeds)
+    left = Parallel(n_jobs=JOBS)(delayed(_left)((*FINE, NARROW), s, instants) for s in seeds)
     told = ", ".join(
         f"{1e3 * most:.2g} mrad after {t:g} s"
         for t, most in zip(instants, np.max(left, axis=0), strict=True)
