@@ -19,8 +19,8 @@ from typing import Any, NamedTuple, cast
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _sections import run_sections
 from joblib import Parallel, delayed
-from sections import run_sections
 
 import stewart_drake as sd
 from stewart_drake.law.observers import ParameterObserver

@@ -7,20 +7,18 @@ gravity, integral, delay, noise. All runs use `predictor_lqi` unless the row say
 import os
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _sections import run_sections
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.scenario.signals import PARAMETERS
 
-RESULTS = Path(__file__).parent / "results"
 EXACT = "plant.kind=exact"
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 BIAS = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
@@ -232,19 +230,5 @@ SECTIONS: dict[str, Callable[[], str]] = {
 }
 
 
-def main(names: Sequence[str]) -> None:
-    """Run the named sections, or all, and write or print the tables."""
-    parts = []
-    for name in names or SECTIONS:
-        parts.append(SECTIONS[name]())
-        print(parts[-1], flush=True)
-    if not names:
-        head = "# Tracking\n\nMade by `python benchmarks/tracking.py` with " + ", ".join(
-            f"{package} {number}" for package, number in versions().items()
-        )
-        RESULTS.mkdir(exist_ok=True)
-        (RESULTS / "tracking.md").write_text("\n\n".join([head + ".", *parts]))
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_sections("tracking", "Tracking", SECTIONS, sys.argv[1:])
