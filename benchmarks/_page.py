@@ -1,6 +1,6 @@
 """What the scripts beside it share: a table, and the page in results/ that a script writes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from stewart_drake.files.versions import versions
@@ -27,3 +27,21 @@ def write(script: str, title: str, parts: Sequence[str], more: str = "") -> None
     print(text)
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.md").write_text(text, encoding="utf-8")
+
+
+def run_sections(
+    script: str, title: str, sections: Mapping[str, Callable[[], str]], chosen: Sequence[str]
+) -> None:
+    """Print the chosen sections; the page is of all of them, and written where none is chosen.
+
+    Args:
+        script, title: as of `write`.
+        sections: what makes the text of each, by its name.
+        chosen: names.
+    """
+    texts = []
+    for section in chosen or sections:
+        texts.append(sections[section]().rstrip("\n") + "\n")
+        print(texts[-1], flush=True)
+    if not chosen:
+        write(script, title, texts)

@@ -12,21 +12,19 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import run_sections
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
 from stewart_drake.loop import controller
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.link import delay_at
 
-RESULTS = Path(__file__).parent / "results"
 AMPLITUDES = np.tile([0.2617993878] * 3 + [0.02, 0.02, 0.08], 2)
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 SEEDS = int(os.environ.get("SEEDS", "20"))
@@ -303,17 +301,5 @@ SECTIONS: dict[str, Callable[[], str]] = {
 }
 
 
-def main(names: Sequence[str]) -> None:
-    """Run sections and print them; all of them are written."""
-    used: Any = ", ".join(f"{name} {release}" for name, release in versions().items())
-    texts = []
-    for name in names or SECTIONS:
-        texts.append(SECTIONS[name]())
-        print(texts[-1], flush=True)
-    if not names:
-        head = f"# Unknown delay\n\nMade by `python benchmarks/delay_estimator.py` with {used}.\n\n"
-        (RESULTS / "delay_estimator.md").write_text(head + "\n\n".join(texts))
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_sections(__file__, "Unknown delay", SECTIONS, sys.argv[1:])

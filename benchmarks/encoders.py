@@ -1,35 +1,38 @@
 """Motor encoders instead of the state: `python benchmarks/encoders.py [section ...]`.
 
 Writes benchmarks/results/encoders.md; SEEDS of the environment is the number of runs of a row, each
-with encoders whose codes begin elsewhere, FIRST the first seed. Sections: codes, rest, known,
-unknown, gravity, offsets, faults, delay, time. All runs are on the exact plant with the paper's
-motion and delay of 0.8 s, on the reference, with the shipped priors, where a row says nothing else.
-"Identified" are standard deviations as a log leaves them: 6e-5 N m, 10 g and 6e-5 N m s/rad. Times
-are the CPU's.
+with encoders whose codes begin elsewhere, FIRST the first seed, JOBS how many run side by side.
+Sections: codes, rest, known, unknown, gravity, offsets, faults, delay, time.
+
+All runs are on the exact plant with the paper's motion and delay of 0.8 s, on the reference, with
+the shipped priors, where a row says nothing else. "Identified" are standard deviations as a log
+leaves them: 6e-5 N m, 10 g and 6e-5 N m s/rad. Times are the CPU's, of laws in Python.
 """
 
 import os
 import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple, cast
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import run_sections
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
+from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop import controller
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.simulation import make_simulator, simulate
 
-RESULTS = Path(__file__).parent / "results"
 SEEDS = int(os.environ.get("SEEDS", "5"))
 FRESH = int(os.environ.get("FIRST", "100"))
 """The first seed."""
+JOBS = int(os.environ.get("JOBS", "-1"))
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 FINE = ("sensor.samples=100",)
 BIAS = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
@@ -58,13 +61,23 @@ class Outcome(NamedTuple):
     """ms CPU at the median."""
 
 
+class InPython(ParameterObserver):
+    """As it is, but not known to the law in C."""
+
+
+def in_python(law: PredictiveLqi) -> PredictiveLqi:
+    """The law of a measured state in the language of that of encoders."""
+    return replace(law, observer=InPython(cast(ParameterObserver, law.observer).settings))
+
+
 def run(settings: Sequence[str], scenario: str, seed: int) -> Outcome:
     """One run."""
     controller.time = CpuTime  # type: ignore[assignment,attr-defined]
     base = ("plant.kind=exact", "sensor.kind=encoders", f"sensor.seed={seed}")
     state = any(setting == "sensor.kind=state" for setting in settings)
     chosen = (base[0], *settings) if state else (*base, *settings)
-    result = simulate(sd.load_scenario(scenario, settings=chosen), margin=False)
+    law = in_python if state else None
+    result = simulate(sd.load_scenario(scenario, settings=chosen), law=law, margin=False)
     counts = result.summary["counts"]
     bad = (counts[f"measurements_{cause}"] for cause in ("missing", "frozen", "rejected"))
     return Outcome(result.accumulated_error, *bad, result.summary["controller_step_ms"]["median"])
@@ -73,7 +86,7 @@ def run(settings: Sequence[str], scenario: str, seed: int) -> Outcome:
 def collect(title: str, rows: Rows, scenario: str = "paper") -> str:
     """The table of named settings; means over the seeds, and how many runs completed if not all."""
     jobs = [(settings, seed) for settings in rows.values() for seed in range(FRESH, FRESH + SEEDS)]
-    ran = iter(Parallel(n_jobs=-1)(delayed(run)(s, scenario, seed) for s, seed in jobs))
+    ran = iter(Parallel(n_jobs=JOBS)(delayed(run)(s, scenario, seed) for s, seed in jobs))
     lines = ["| | E_ac | least, most | missing, frozen, rejected |", "| --- | --- | --- | --- |"]
     for name in rows:
         found = [next(ran) for _ in range(SEEDS)]
@@ -177,7 +190,7 @@ def offsets() -> str:
     text = collect("Offsets of 0.1 degree, narrow priors", rows)
     instants = (2.0, 5.0, 10.0)
     seeds = range(FRESH, FRESH + SEEDS)
-    left = Parallel(n_jobs=-1)(delayed(_left)((*FINE, NARROW), s, instants) for s in seeds)
+    left = Parallel(n_jobs=JOBS)(delayed(_left)((*FINE, NARROW), s, instants) for s in seeds)
     told = ", ".join(
         f"{1e3 * most:.2g} mrad after {t:g} s"
         for t, most in zip(instants, np.max(left, axis=0), strict=True)
@@ -238,17 +251,5 @@ SECTIONS: dict[str, Callable[[], str]] = {
 }
 
 
-def main(names: Sequence[str]) -> None:
-    """Run sections and print them; all of them are written."""
-    used: Any = ", ".join(f"{name} {release}" for name, release in versions().items())
-    texts = []
-    for name in names or SECTIONS:
-        texts.append(SECTIONS[name]())
-        print(texts[-1], flush=True)
-    if not names:
-        head = f"# Motor encoders\n\nMade by `python benchmarks/encoders.py` with {used}.\n\n"
-        (RESULTS / "encoders.md").write_text(head + "\n\n".join(texts))
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_sections(__file__, "Motor encoders", SECTIONS, sys.argv[1:])

@@ -10,12 +10,18 @@ Times are the CPU's.
 `ranges` draws machines as `analyze robustness` does; the tolerances of lengths and joints are the
 root mean square of what it draws. `drawing` draws lengths and joints with a standard deviation of
 0.2 mm, the default tolerance.
+
+The next run of each machine is the paper's at full amplitude, its state measured without noise and
+nothing limiting its torques but the motors, of a controller that goes by what was found
+(`mechanism.yaml`, `known.yaml`); beside it one that knows the truth, and one that has the drawing
+and the delay that was found.
 """
 
 import dataclasses
 import os
 import sys
 import time
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -39,8 +45,10 @@ from stewart_drake.identification.unknowns import DELAY, DYNAMIC, GEOMETRY, NAME
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
+from stewart_drake.mechanism.geometry import Mechanism, fingerprint
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.known import KNOWABLE, Known, save_known
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COULOMB_SPEED
 from stewart_drake.studies import uncertainty
@@ -58,6 +66,17 @@ STEP = 2 * np.pi / 2**14
 PRECISION = Precision()
 TOLERANCE = 2e-4
 OFFSET = 2e-3
+STARTS = {"on the reference": ("start=on_reference", "queue=reference"), "from rest": ()}
+PLANT = (
+    "torque_bias",
+    "payload_mass",
+    "joint_damping",
+    "coulomb_friction",
+    "coulomb_speed",
+    "payload_position",
+)
+"""Fields of the plant that a draw changes."""
+GOES_BY = ("what was found", "the truth", "the drawing, and the delay that was found")
 
 
 def excitation(folder: Path) -> Path:
@@ -197,6 +216,8 @@ class Found(NamedTuple):
     """(unknowns,) whether the 95 % interval holds the truth; NaN where nothing was sought."""
     away: Array
     """(unknowns,) error."""
+    next_runs: Array
+    """(3, 2) E_ac by GOES_BY and STARTS; NaN for a run that did not complete."""
 
 
 def find(kind: str, seed: int, motion: Path, poses: bool) -> Found:
@@ -212,7 +233,57 @@ def find(kind: str, seed: int, motion: Path, poses: bool) -> Found:
     inside = np.where(std > 0, np.abs(away) <= 1.96 * std, np.nan)
     if true[6] == 0:  # where no payload is, it is nowhere
         inside[COULOMB_SPEED + 1 : DYNAMIC.stop] = np.nan
-    return Found(run.status, float(away[DELAY]), found.chi2["all"], seconds, inside, away)
+    following = next_runs(truth, found, true)
+    late, chi2 = float(away[DELAY]), found.chi2["all"]
+    return Found(run.status, late, chi2, seconds, inside, away, following)
+
+
+def next_runs(truth: Truth, found: Identification, true: Array) -> Array:
+    """(3, 2) as of `Found.next_runs`; `true` values of the unknowns."""
+    unknowns = found.unknowns
+    drawn = unknowns.mean.copy()
+    drawn[DELAY] = found.values[DELAY]
+    return np.array(
+        [
+            runs_by(truth, found.mechanism, found.known),
+            runs_by(truth, unknowns.machine(true), lambda m: surely(m, true, KNOWABLE)),
+            runs_by(truth, unknowns.mechanism, lambda m: surely(m, drawn, (NAMES[DELAY],))),
+        ]
+    )
+
+
+def runs_by(
+    truth: Truth, machine: Mechanism, known: Callable[[Mechanism], Known]
+) -> tuple[float, ...]:
+    """E_ac by STARTS of a controller that goes by a machine and what is known of it."""
+    plant, delay = truth.scenario.plant, truth.scenario.delay
+    with TemporaryDirectory() as folder:
+        mechanism, file = Path(folder) / "mechanism.yaml", Path(folder) / "known.yaml"
+        mechanism.write_text(mechanism_yaml(machine))
+        save_known(file, known(load_mechanism(mechanism)))
+        settings = (
+            "plant.kind=exact",
+            *(f"plant.{name}={getattr(plant, name)}" for name in PLANT),
+            f"delay.steps={delay.steps}",
+            f"delay.fraction={delay.fraction}",
+            f"mechanism={mechanism}",
+            f"controller.known={file}",
+        )
+        runs = (
+            simulate(
+                load_scenario("paper", "predictor_lqi", (*settings, *start)),
+                truth=truth.mechanism,
+                margin=False,
+            )
+            for start in STARTS.values()
+        )
+        return tuple(run.accumulated_error for run in runs)
+
+
+def surely(machine: Mechanism, values: Array, names: tuple[str, ...]) -> Known:
+    """Of the unknowns' values, those of names, without a doubt."""
+    mean = values[[NAMES.index(name) for name in names]]
+    return Known(fingerprint(machine), names, mean, np.zeros((len(names), len(names))))
 
 
 def identified(log: Log, kind: str, poses: bool) -> tuple[Identification, float]:
@@ -272,7 +343,27 @@ def table(title: str, found: list[Found]) -> str:
             size = np.sqrt(np.nanmean(away[:, part] ** 2))
             shown = "" if name == "all" else f"{size:.2g}"
             text += f"| {name} | {shown} | {100 * np.nanmean(inside[:, part]):.1f} % |\n"
-    return text
+    return text + next_table(np.array([one.next_runs for one in found]))
+
+
+def next_table(errors: Array) -> str:
+    """Of (machines, 3, 2): mean E_ac of the next runs, and the largest, by what is gone by."""
+    heads = ("the next run goes by", *(f"{start}: mean, largest" for start in STARTS))
+    text = f"\n| {' | '.join(heads)} |\n| {' | '.join(['---'] * len(heads))} |\n"
+    for row, name in enumerate(GOES_BY):
+        cells = [name]
+        for one in errors[:, row].T:
+            done = one[np.isfinite(one)]
+            lost = "" if len(done) == len(one) else f", {len(one) - len(done)} lost"
+            cells.append((f"{done.mean():.3g}, {done.max():.3g}" if len(done) else "-") + lost)
+        text += f"| {' | '.join(cells)} |\n"
+    extra = errors[:, 0] - errors[:, 1]
+    worst = ", ".join(
+        f"{np.nanmean(one):.3g} and {np.nanmax(one):.3g} {start}"
+        for start, one in zip(STARTS, extra.T, strict=True)
+        if np.isfinite(one).any()
+    )
+    return f"{text}\nFound less truth, mean and largest: {worst}.\n"
 
 
 SECTIONS = {"ranges": lambda: machines("ranges"), "drawing": lambda: machines("drawing")}

@@ -12,8 +12,8 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import run_sections
 from _page import table as plain_table
-from _page import write
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
@@ -230,15 +230,5 @@ SECTIONS: dict[str, Callable[[], str]] = {
 }
 
 
-def main(names: Sequence[str]) -> None:
-    """Run the named sections, or all, and write or print the tables."""
-    parts = []
-    for name in names or SECTIONS:
-        parts.append(SECTIONS[name]())
-        print(parts[-1], flush=True)
-    if not names:
-        write(__file__, "Tracking", parts)
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_sections(__file__, "Tracking", SECTIONS, sys.argv[1:])

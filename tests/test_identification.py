@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
+from benchmarks.identification import excitation, find
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.excitation import fitted_multisine, multisine
@@ -509,3 +510,24 @@ def test_steps_are_halved_until_they_do_not_matter():
     values = guess.values.copy()
     values[8] = 0.0
     assert finer(problem, Guess(values, guess.first)) is None
+
+
+# ---------------------------------------------------------------- many machines
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("poses", [False, True], ids=["encoders", "pose"])
+def test_fifty_machines_are_found(tmp_path: Path, poses: bool) -> None:
+    """Machines of the robustness study, 14 bit at 50 Hz, 20 s, a delay that is 130 ms off."""
+    motion = excitation(tmp_path)
+    found = [find("ranges", seed, motion, poses) for seed in range(50)]
+    assert max(abs(one.late) for one in found) < 1e-4
+    assert all(0.9 < one.chi2 < 1.1 for one in found)
+    assert max(one.seconds for one in found) < 30
+    assert 0.90 < np.nanmean([one.inside for one in found]) < 0.99
+    ends = np.array([one.next_runs for one in found])
+    assert np.all(np.isfinite(ends[:, :2]))
+    if poses:
+        on_reference, from_rest = np.mean(ends[:, 0], axis=0)
+        assert on_reference < 0.15
+        assert from_rest < np.mean(ends[:, 1, 1]) + 0.2

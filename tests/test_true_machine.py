@@ -5,13 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import Simulator
 from ruamel.yaml import YAML
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import data_root
+from stewart_drake.law.servos import crank_mobility
+from stewart_drake.loop.cautions import cautions_before
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.experiment import compose_law, prepare, simulated_machine
+from stewart_drake.loop.multibody_stewart import MultibodyStewart
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.scenario.signals import COULOMB
 from tests.mechanisms import PAPER
@@ -40,6 +44,38 @@ def test_both_plants_go_the_same_way() -> None:
     plain = run("plant.kind=exact", "duration=1.5")
     assert float(np.abs(plain.signals.pose - exact).max()) > 30 * coarse
     assert coarse / fine == pytest.approx(2, rel=0.2)
+
+
+@pytest.mark.parametrize("stiffness", [0.5, 1.5, 1.9, 2.1, 2.5])
+def test_friction_in_steps_of_the_engine_is_a_factor_per_step(stiffness: float) -> None:
+    """Slow cranks in the direction of the least inertia: rates go by 1 - h c / s H^-1."""
+    h, speed = 1e-3, 0.02
+    dynamics = sd.StewartDynamics(PAPER, gravity=False)
+    mobility, modes = np.linalg.eigh(crank_mobility(dynamics, PAPER.home))
+    friction = stiffness * speed / (h * mobility[-1])
+    plant = MultibodyStewart(
+        PAPER, h, gravity=False, coulomb_friction=friction, coulomb_speed=speed
+    )
+    simulator, J = Simulator(plant), PAPER.jacobian(PAPER.home)
+    context = simulator.get_mutable_context()
+    plant.GetInputPort("torque").FixValue(context, np.zeros(6))
+    slow = 1e-2 * speed * modes[:, -1]
+    plant.set_state(context, np.concatenate([PAPER.home, np.linalg.solve(J, slow)]))
+    simulator.AdvanceTo(4 * h)
+    rates = J @ plant.GetOutputPort("state").Eval(context)[6:]
+    np.testing.assert_allclose(modes[:, -1] @ rates, (1 - stiffness) ** 4 * 1e-2 * speed, rtol=0.03)
+
+
+def test_a_step_in_which_friction_makes_cranks_tremble_is_told() -> None:
+    def said(*settings: str) -> list[str]:
+        return cautions_before(prepare(sd.load_scenario("paper", settings=settings)), None)
+
+    heavy = "plant.coulomb_friction=0.06"
+    (line,) = said(heavy)
+    assert line.startswith("plant.time_step of 1 ms is too coarse for Coulomb friction of 0.06 N m")
+    step = next(word for word in line.split() if word.startswith("plant.time_step="))
+    assert said(heavy, step) == said(heavy, "plant.coulomb_speed=0.1") == []
+    assert said(heavy, "plant.kind=exact") == said("plant.coulomb_friction=2e-3") == said() == []
 
 
 @pytest.mark.parametrize("controller", ["predictor_lqi", "adaptive_lqi"])

@@ -9,8 +9,9 @@ from itertools import product
 from typing import Final
 
 from stewart_drake.loop.controller_margin import ControllerMargin
-from stewart_drake.loop.experiment import Experiment
+from stewart_drake.loop.experiment import Experiment, true_dynamics
 from stewart_drake.loop.results import RunSummary
+from stewart_drake.loop.servo_design import quickest_crank
 from stewart_drake.scenario.config import Scenario
 
 TOLERABLE: Final = 1e5
@@ -24,14 +25,45 @@ should, from 5e6 on they are lost or wrong by a hundred times the exact plant's 
 
 def cautions_before(experiment: Experiment, margin: ControllerMargin | None) -> list[str]:
     """What can be said before the run; `margin` is None where the loop was not judged."""
+    said = (stiff_friction(experiment), _of_loop(experiment, margin))
+    return [line for line in said if line is not None]
+
+
+def _of_loop(experiment: Experiment, margin: ControllerMargin | None) -> str | None:
     if experiment.own.unjudged:
-        return [f"the loop was not judged: its {experiment.own.unjudged} is not the scenario's"]
+        return f"the loop was not judged: its {experiment.own.unjudged} is not the scenario's"
     if margin is None or experiment.scenario.controller.command != "torque":
-        return []  # servos have no loop across the delay
+        return None  # servos have no loop across the delay
     if margin.problem:
-        return [f"the loop was not judged: {margin.problem}"]
-    coarse = coarse_step(experiment, margin)
-    return [coarse] if coarse else []
+        return f"the loop was not judged: {margin.problem}"
+    return coarse_step(experiment, margin)
+
+
+def stiff_friction(experiment: Experiment) -> str | None:
+    """What is wrong with Coulomb friction in the step of a multibody plant, and which would do.
+
+    Friction c tanh(rate / s) acts on the rates that a step h begins with. Near rest that is a
+    damper of c / s: with H^-1 the accelerations of the cranks per torque, rates go
+
+        rates_{k+1} = (1 - h c / s H^-1) rates_k,
+
+    which grow, up to h c H^-1, where h c / s exceeds 2 over the largest eigenvalue of H^-1. Then a
+    crank that should creep trembles.
+    """
+    plant = experiment.scenario.plant
+    if plant.kind != "multibody" or plant.coulomb_friction == 0:
+        return None
+    quickest = quickest_crank(true_dynamics(experiment), experiment)
+    longest = 2 * plant.coulomb_speed / (plant.coulomb_friction * quickest)
+    if plant.time_step <= longest:
+        return None
+    finer = next((h for h in _finer(experiment.scenario) if h <= longest), None)
+    remedy = f"plant.time_step={finer:g} would do" if finer else "no multibody step would do"
+    return (
+        f"plant.time_step of {1e3 * plant.time_step:g} ms is too coarse for Coulomb friction of "
+        f"{plant.coulomb_friction:g} N m within {plant.coulomb_speed:g} rad/s, with which cranks "
+        f"tremble where they should stand: {remedy}, or plant.kind=exact"
+    )
 
 
 def coarse_step(experiment: Experiment, margin: ControllerMargin) -> str | None:

@@ -203,8 +203,9 @@ class PlateState(LeafSystem):
 class CoulombFriction(LeafSystem):
     """What reaches the shafts: the torque less friction tanh(crank rate / speed).
 
-    A discrete plant reads it at its steps' beginnings, so that it stays stable as long as friction
-    / speed times the step is small beside the inertia that a motor feels.
+    A discrete plant reads it at its steps' beginnings, which is stable near rest as long as
+    friction / speed times the step is less than twice the least inertia of the cranks; beyond that
+    `loop.cautions.stiff_friction` warns.
 
     | port | direction | size | unit |
     | --- | --- | --- | --- |

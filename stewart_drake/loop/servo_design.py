@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.catch_up import PIECE, shortest
@@ -57,9 +58,7 @@ def servo_loop(experiment: Experiment) -> ServoLoop:
         motors=TorqueLimit(experiment.torque_limit),
         speed_limit=math.inf if actuator.speed_limit is None else actuator.speed_limit,
     )
-    instants = spread_instants(sc.duration, INSTANTS)
-    poses = [experiment.mechanism.home, *(experiment.reference.value(t)[:, 0] for t in instants)]
-    most = max(np.linalg.eigvalsh(crank_mobility(nominal, pose)).max() for pose in poses)
+    most = quickest_crank(nominal, experiment)
     highest = loop.highest_bandwidth(np.array([1 / most])) / (2 * math.pi)
     if actuator.bandwidth >= highest:
         raise ConfigError(
@@ -67,6 +66,17 @@ def servo_loop(experiment: Experiment) -> ServoLoop:
             f"Hz, from which on loops of {1 / loop.period:.4g} Hz are unstable with this machine"
         )
     return loop
+
+
+def quickest_crank(dynamics: StewartDynamics, experiment: Experiment) -> float:
+    """Largest acceleration per torque, rad/s^2 per N m, at home and along the reference.
+
+    Of `crank_mobility`, whatever motors push together: one over the least inertia of a mode.
+    """
+    instants = spread_instants(experiment.scenario.duration, INSTANTS)
+    along = (experiment.reference.value(t)[:, 0] for t in instants)
+    poses = (dynamics.mechanism.home, *along)
+    return max(float(np.linalg.eigvalsh(crank_mobility(dynamics, pose)).max()) for pose in poses)
 
 
 def _ticks(scenario: Scenario) -> int:

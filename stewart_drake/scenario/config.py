@@ -574,7 +574,7 @@ class Scenario:
         return (
             f"controller.estimate_offsets: got true with sensor.kind {self.sensor.kind!r} and "
             f"delay_estimator {self.controller.delay_estimator!r}; expected false, or 'encoders' "
-            "and 'none'"
+            "and 'none', as offsets are found beside a known delay alone"
         )
 
     def check(self, where: str = "scenario") -> None:
