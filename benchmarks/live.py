@@ -50,7 +50,6 @@ PERIOD = 0.1
 """s, of the controller."""
 SCALE = 2 * np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
 """How far the motion goes, rad and m."""
-COMMAND = "import sys; from stewart_drake.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
 class Command:
@@ -59,7 +58,7 @@ class Command:
     def __init__(self, *words: str) -> None:
         self.lines: list[tuple[float, str]] = []
         self.process = subprocess.Popen(
-            [sys.executable, "-u", "-c", COMMAND, *words],
+            [sys.executable, "-u", "-m", "stewart_drake", *words],
             cwd=ROOT,
             env=os.environ | {"PYTHONPATH": str(ROOT)},
             stdout=subprocess.PIPE,

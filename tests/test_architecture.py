@@ -250,6 +250,8 @@ def cycle(sources: dict[str, tuple[str, bool]]) -> list[str]:
 def package_sources() -> dict[str, tuple[str, bool]]:
     sources = {}
     for path in sorted((ROOT / PACKAGE).rglob("*.py")):
+        if path.name == "__main__.py":
+            continue  # which starts the command
         parts = path.relative_to(ROOT).with_suffix("").parts
         is_package = parts[-1] == "__init__"
         module = ".".join(parts[:-1] if is_package else parts)

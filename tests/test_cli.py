@@ -35,8 +35,7 @@ RUN_FILES = {
 
 
 def command(*arguments: str) -> list[str]:
-    code = "import sys; from stewart_drake.cli import main; sys.exit(main())"
-    return [sys.executable, "-c", code, *arguments]
+    return [sys.executable, "-m", "stewart_drake", *arguments]
 
 
 def files(folder: Path) -> set[str]:

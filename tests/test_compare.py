@@ -166,3 +166,10 @@ def test_a_bad_row_is_refused_in_one_line(row, message, tmp_path):
     assert len(str(caught.value).splitlines()) == 1
     with pytest.raises(ConfigError, match=re.escape("compare.lqi: " + message)):
         load_scenario(file)
+
+
+def test_a_row_that_could_not_be_saved_is_refused(tmp_path):
+    file = tmp_path / "scenario.yaml"
+    file.write_text("compare: {a/b: {controller: lqi}}\n")
+    with pytest.raises(ConfigError, match=r"compare\.a/b: names its signals' file"):
+        load_scenario(file)

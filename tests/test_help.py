@@ -100,11 +100,9 @@ def test_the_shell_completes_commands_names_and_settings(monkeypatch, capsys):
         assert err == "" and done.value.code == 0
         return out.split()
 
-    code = "import sys; from stewart_drake.cli import main; sys.exit(main())"
     environment = {**os.environ, **asked("stewart-drake si")}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
-    )
+    command = [sys.executable, "-m", "stewart_drake"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert (done.stderr, done.returncode, done.stdout.split()) == ("", 0, ["simulate"])
     assert offered("stewart-drake si") == ["simulate"]
     assert set(offered("stewart-drake simulate ")) >= set(shipped("scenario"))
@@ -118,10 +116,9 @@ def test_the_shell_completes_commands_names_and_settings(monkeypatch, capsys):
 
 
 def test_the_script_for_a_shell_can_be_had():
-    code = "import sys; from stewart_drake.cli import main; sys.exit(main())"
     # The command asks which shell it was started from, and a shell that has nothing left to do
     # would give its place to the command.
-    line = f"'{sys.executable}' -c '{code}' --show-completion; exit $?"
+    line = f"'{sys.executable}' -m stewart_drake --show-completion; exit $?"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
     assert done.returncode == 0 and "stewart-drake" in done.stdout
 

@@ -25,7 +25,7 @@ from stewart_drake.scenario.loading import load_scenario
 from tests.live_driver import Driver, drive_in_real_time
 
 SETTINGS = ("plant.kind=exact", "duration=4.0")
-COMMAND = [sys.executable, "-c", "import sys; from stewart_drake.cli import main; sys.exit(main())"]
+COMMAND = [sys.executable, "-m", "stewart_drake"]
 
 
 def free_port() -> int:

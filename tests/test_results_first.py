@@ -22,7 +22,6 @@ from stewart_drake.report import (
 from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, LABELS, SERVOS
 
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.3", "--set", "delay.steps=1")
-COMMAND = (sys.executable, "-c", "import sys; from stewart_drake.cli import main; sys.exit(main())")
 
 
 def broken(folder: Path) -> Callable[..., None]:
@@ -96,9 +95,9 @@ def test_nothing_of_an_earlier_comparison_stays_beside_new_results(tmp_path, mon
 def start(folder: Path, redirection: str = "", **environment: str) -> subprocess.CompletedProcess:
     """`simulate` from a shell."""
     arguments = " ".join(("simulate", *EXACT, "--out", str(folder)))
-    line = f'"$0" -c "$1" {arguments} {redirection}'
+    line = f'"$0" -m stewart_drake {arguments} {redirection}'
     return subprocess.run(
-        ["bash", "-o", "pipefail", "-c", line, COMMAND[0], COMMAND[2]],
+        ["bash", "-o", "pipefail", "-c", line, sys.executable],
         capture_output=True,
         text=True,
         env={**os.environ, **environment},

@@ -181,6 +181,12 @@ class Delivery:
         if not self.silent:
             echo(text)
 
+    def tell(self, line: str) -> None:
+        """Print a line, wrapped to a screen."""
+        from stewart_drake.report.words import wrap
+
+        self.say(wrap(line))
+
     def discard(self, *names: str) -> None:
         """Delete files of an earlier run, as far as they exist, and its summary."""
         if self.out is not None:

@@ -75,7 +75,6 @@ def live(
     from stewart_drake.live.connect import address_of
     from stewart_drake.live.endpoint import read_key
     from stewart_drake.live.session import check_armed, drive, plans, prepare_session
-    from stewart_drake.report.words import wrap
     from stewart_drake.scenario.loading import load_scenario
 
     if (machine is None) != demo:
@@ -84,9 +83,6 @@ def live(
     delivery = Delivery(out, quiet, as_json)
     span = math.inf if duration is None else duration
     name = Path(scenario).stem
-
-    def say(line: str) -> None:
-        delivery.say(wrap(line))
 
     with contextlib.ExitStack() as running:
         viewer = None if no_browser else running.enter_context(_page(loaded, name))
@@ -97,14 +93,14 @@ def live(
         secret = None if key is None else read_key(key)
         ready = prepare_session(loaded, address_of(where), secret)
         for line in plans(ready, span, name):
-            say(line)
+            delivery.tell(line)
         check_armed(ready, arm)
         if viewer is not None:
             _show(viewer.opened())
         if not ready.simulated and sys.stdin.isatty():
             input("Enter begins, Ctrl-C leaves it alone")
         with _Ending() as ending:
-            result = drive(ready, span, armed=arm, viewer=viewer, ending=ending, say=say)
+            result = drive(ready, span, armed=arm, viewer=viewer, ending=ending, say=delivery.tell)
     return _told(delivery, result)
 
 
@@ -131,13 +127,12 @@ def _show(url: str) -> None:
 def _told(delivery: Delivery, result: "SimulationResult") -> int:
     """Write and print what has come of it."""
     from stewart_drake.report.run_document import run_document
-    from stewart_drake.report.words import wrap
 
     stopped = result.stopped
     told: Any = result.summary
     s = told["live"]
     if stopped is not None:
-        delivery.say(wrap(f"{result.status.replace('_', ' ')}: {stopped}"))
+        delivery.tell(f"{result.status.replace('_', ' ')}: {stopped}")
     if result.status == "completed":
         delivery.say(run_document(result).plain())
     late = s["sent_after_due_ms"]
@@ -146,7 +141,7 @@ def _told(delivery: Delivery, result: "SimulationResult") -> int:
         f"{late['median']:.0f} ms after the soonest measurement (99 %: {late['p99']:.0f}, worst "
         f"{late['worst']:.0f}); {s['periods_played']} periods played, {s['periods_dry']} dry"
     )
-    delivery.say(wrap(text))
+    delivery.tell(text)
     if delivery.out is not None:
         result.save(delivery.out)
         delivery.wrote("summary.json", "signals.nc")
@@ -166,9 +161,8 @@ def _demo_machine(
     link = f"link={{kind: network, {way}, return: {{{way}}}}}"
     for setting in (*settings, "plant.kind=exact", link):
         words += ["--set", setting]
-    program = "import sys; from stewart_drake.cli import main; sys.exit(main(sys.argv[1:]))"
     process = subprocess.Popen(
-        [sys.executable, "-u", "-c", program, *words],
+        [sys.executable, "-u", "-m", "stewart_drake", *words],
         stdout=subprocess.PIPE,
         text=True,
         start_new_session=True,  # Ctrl-C is for the controller, which stops it

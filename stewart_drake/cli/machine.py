@@ -70,7 +70,7 @@ def machine(
     experiment = prepare(loaded)
     delivery = Delivery(None, quiet, as_json)
     endpoint = Endpoint(ControllerMessage, host, port, None if key is None else read_key(key))
-    running = Machine(experiment, endpoint, chosen, lambda text: delivery.say(wrap(text)))
+    running = Machine(experiment, endpoint, chosen, delivery.tell)
     interrupted = _run(
         running,
         duration or float("inf"),

@@ -108,14 +108,13 @@ def new(
 def _tell(delivery: Delivery, made: "NewMachine") -> None:
     """The machine at home, the motion, and what the delay does."""
     from stewart_drake.report.mechanism_document import document
-    from stewart_drake.report.words import wrap
     from stewart_drake.studies.verdict import Verdict, loop_verdict
 
     delivery.say(document(made.check).plain())
     margin = made.margin
     delay = Verdict(margin.eta, margin.pole, margin.pole_time)
     for text in (made.verdict, loop_verdict(margin), str(delay)):
-        delivery.say(wrap(text))
+        delivery.tell(text)
 
 
 def _complete(given: dict[str, float | None], asking: bool) -> dict[str, float]:

@@ -62,7 +62,6 @@ def simulate(
     from stewart_drake.loop.simulation import simulate as run
     from stewart_drake.report.document import Caution
     from stewart_drake.report.run_document import run_document
-    from stewart_drake.report.words import wrap
     from stewart_drake.scenario.loading import load_scenario
     from stewart_drake.studies.verdict import Verdict, loop_verdict
 
@@ -73,8 +72,8 @@ def simulate(
     delivery = Delivery(out, quiet, as_json)
     viewer = open_meshcat() if meshcat else None
     margin = controller_margin(experiment)
-    delivery.say(wrap(loop_verdict(margin)))
-    delivery.say(wrap(str(Verdict(margin.eta, margin.pole, margin.pole_time))))
+    delivery.tell(loop_verdict(margin))
+    delivery.tell(str(Verdict(margin.eta, margin.pole, margin.pole_time)))
     for text in cautions_before(experiment, margin):
         delivery.say(Caution(text).plain())
     if viewer is not None:
@@ -199,7 +198,6 @@ def compare(
     """Run the shipped controllers on a scenario, as a table."""
     from stewart_drake.loop.experiment import prepare
     from stewart_drake.report.run_document import comparison_document
-    from stewart_drake.report.words import wrap
     from stewart_drake.scenario.loading import load_understood
     from stewart_drake.studies import compare as study
     from stewart_drake.studies.verdict import delay_verdict
@@ -212,7 +210,7 @@ def compare(
     experiment = prepare(load_understood(scenario, settings=settings or ()))
     delivery = Delivery(out, quiet, as_json)
     names = tuple(study.shown(scenario, settings or ()))
-    delivery.say(wrap(str(delay_verdict(experiment))))
+    delivery.tell(str(delay_verdict(experiment)))
     with progress_bars(names, experiment.scenario.duration, quiet) as progress:
         results = study.compare(
             scenario, settings or (), lambda name, time, error: progress[name](time, error)

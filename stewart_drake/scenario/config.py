@@ -612,6 +612,8 @@ class Scenario:
         """
         for row, change in self.compare.items():
             place, fields = f"{where}: compare.{row}", dict(change)
+            if "/" in row:
+                raise ConfigError(f"{place}: names its signals' file; expected no slash")
             controller = fields.pop("controller", row)
             if not isinstance(controller, str):
                 raise ConfigError(f"{place}: controller: got {brief(controller)}; expected text")
