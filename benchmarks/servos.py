@@ -97,7 +97,9 @@ class Table:
     def done(self) -> None:
         """Do them."""
         jobs = [key for key, found in self.asked.items() if not found]
-        pool = Parallel(n_jobs=int(os.environ.get("JOBS", "2")), verbose=5, backend="multiprocessing")
+        pool = Parallel(
+            n_jobs=int(os.environ.get("JOBS", "2")), verbose=5, backend="multiprocessing"
+        )
         results = pool(delayed(run)(*key) for key in jobs)
         self.asked |= dict(zip(jobs, results, strict=True))
 
