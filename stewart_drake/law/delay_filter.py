@@ -52,7 +52,9 @@ TRIED = 15
 MEMORY = 5.0
 """s over which the timing of single torques is judged."""
 TORQUES = 1.0
-"""So many torques are taken to have been on time before any was looked at."""
+"""So many torques are taken to have come early or late by `FilterSettings.timing_std`, what the
+filter of a known delay allows for, before any was looked at. Were they taken to have been on time,
+the first late ones would be outliers, and the next ones payload and bias."""
 UNTIMELY = 0.05
 """Periods by which a single torque may come early or late at the most."""
 JERKED = 0.02

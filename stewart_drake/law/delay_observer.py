@@ -193,7 +193,9 @@ class _Search:
         covariance = np.zeros((len(mean), len(mean)))
         covariance[:NUM_STATE, :NUM_STATE] = first.covariance
         covariance[NUM_STATE:-2, NUM_STATE:-2] = prior.covariance
-        master = Cell(Guess(mean, covariance, 0.0, observer.delay.longest), 0.0)
+        timing = observer.settings.timing_std**2
+        nothing = Guess(mean, covariance, 0.0, observer.delay.longest, timing=timing)
+        master = Cell(nothing, 0.0)
         cells = []
         for k in range(1, sent + 1):
             if k * self.period < observer.delay.longest:
