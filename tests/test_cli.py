@@ -227,7 +227,7 @@ def test_ctrl_c_in_simulate_keeps_what_was_computed(tmp_path):
     settings = ("--set", "controller.period=0.02", "--set", "delay.steps=4")
     arguments = ["simulate", "paper", *MULTIBODY, "--set", "duration=200", *settings]
     arguments += ["--out", str(tmp_path)]
-    assert interrupted(arguments, wait=1.0, group=False) == (130, "")
+    assert interrupted(arguments, wait=3.0, group=False) == (130, "")
     assert files(tmp_path) >= RUN_FILES
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["status"] == "interrupted"
