@@ -249,8 +249,14 @@ def layout(
         scenario: or a shipped name or a path; its machine, which has a pattern, is begun from.
         directory: where the machines found and finished searches are kept, so that a second call
             goes on with them; None is nowhere.
-        goal, limits, vary, keep, best, starts, generations, seed: as of
-            `studies.layout.study_layout`.
+        goal: of `studies.layout_measures.MEASURES`, what should be as good as can be.
+        limits: least or largest values by measure, SI and degrees; others are as usual.
+        vary: bounds by parameter.
+        keep: parameters and choices that stay as they are.
+        best: how many machines are written.
+        starts: searches per arrangement.
+        generations: of each search, at most.
+        seed: of the searches.
 
     Raises:
         ConfigError: bad input.
