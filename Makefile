@@ -38,8 +38,7 @@ docs: $(DOCS_VENV)/.installed  ## the documentation as a site with search, in ou
 # Workers of one thread each, so that they do not fight over the processor.
 # Each takes a stretch of the files, so that what their tests share is made once, and who is done
 # takes from the other.
-# One more than there are processors: some tests wait for a clock, a browser or another process.
-WORKERS := -n $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1) --maxprocesses 4 --dist worksteal
+WORKERS := -n logical --maxprocesses 4 --dist worksteal
 test casadi soak bench: export OMP_NUM_THREADS := 1
 test casadi soak bench: export OPENBLAS_NUM_THREADS := 1
 # Tests start commands, and each would compile all of the package anew.

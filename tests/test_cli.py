@@ -218,7 +218,7 @@ def interrupted(arguments: list[str], wait: float, group: bool) -> tuple[int, st
     time.sleep(wait)
     # A terminal sends it to the whole group, `kill -INT` to one process.
     (os.killpg if group else os.kill)(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=180)  # figures of all runs, on a busy machine
     said = [line for line in err.splitlines() if not re.search(r", after \d+ s$", line)]
     return process.returncode, "\n".join(said)
 

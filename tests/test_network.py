@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
@@ -127,6 +127,7 @@ def written(tmp_path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
     return path
 
 
+@settings(deadline=None)
 @given(
     hidden=st.integers(1, 4),
     data=st.data(),
