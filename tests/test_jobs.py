@@ -224,7 +224,7 @@ def start(folder: Path) -> "subprocess.Popen[str]":
 
 
 def wait_for(folder: Path, number: int) -> None:
-    limit = time.monotonic() + 60
+    limit = time.monotonic() + 180
     while len(list(folder.glob("job*.json"))) < number:
         assert time.monotonic() < limit
         time.sleep(0.02)
