@@ -603,6 +603,15 @@ def rows_of(path: Path, heading: str) -> list[list[str]]:
     return [[cell.strip() for cell in row.strip("|").split(" | ")] for row in table.split("\n")[2:]]
 
 
+@pytest.mark.parametrize("path", DOCS, ids=lambda path: path.stem)
+def test_no_document_names_a_folder_of_one_computer(path: Path) -> None:
+    """As a warning does that was printed between the tables of a benchmark."""
+    folder = re.search(
+        r"(?<![\w.])/(home|root|work|tmp|usr|opt|dev/shm)/.*", path.read_text("utf-8")
+    )
+    assert folder is None, folder
+
+
 TRACKING = ROOT / "benchmarks" / "results" / "tracking.md"
 
 
