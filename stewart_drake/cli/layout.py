@@ -80,11 +80,9 @@ def layout(
     The best few become machine files, beside a page that compares them. With --out the same
     command goes on where it was stopped.
     """
-    from stewart_drake.report.answer import answer_of
-    from stewart_drake.report.layout_document import document
+    from stewart_drake.report.analyses import analyze
     from stewart_drake.report.page import command_line
     from stewart_drake.scenario.loading import load_scenario
-    from stewart_drake.studies.layout import study_layout
 
     limits, bounds = _limits(limit or ()), _bounds(vary or ())
     delivery, given = Delivery(out, quiet, as_json), settings or []
@@ -98,21 +96,19 @@ def layout(
         stopping(kept),
         count_bar("searches and runs", quiet) as progress,
     ):
-        answer = answer_of(
-            lambda: study_layout(
-                loaded,
-                out or scratch,
-                goal=goal,
-                limits=limits,
-                vary=bounds,
-                keep=keep or (),
-                workers=workers,
-                scheduler=scheduler,
-                progress=progress,
-                **numbers,
-            ),
-            document,
-            command,
+        answer = analyze(
+            "layout",
+            loaded,
+            out or scratch,
+            command=command,
+            goal=goal,
+            limits=limits,
+            vary=bounds,
+            keep=keep or (),
+            workers=workers,
+            scheduler=scheduler,
+            progress=progress,
+            **numbers,
         )
     machines = [f"{one.name}.yaml" for one in answer.study.layouts]
     return delivery.answer(answer, *machines, "searches/", "judged/")

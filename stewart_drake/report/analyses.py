@@ -1,4 +1,4 @@
-"""The analyses of a scenario: what studies it, and what is told of that."""
+"""The analyses of a scenario, and the search for a machine: what studies it, what is told of it."""
 
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
@@ -6,6 +6,7 @@ from typing import Any, Final, NamedTuple
 from stewart_drake.report import (
     delay_document,
     hautus_document,
+    layout_document,
     link_document,
     robustness_document,
     workspace_document,
@@ -14,6 +15,7 @@ from stewart_drake.report.answer import Answer, answer_of
 from stewart_drake.report.document import Document
 from stewart_drake.studies.delay_limits import study_delay
 from stewart_drake.studies.hautus import study_hautus
+from stewart_drake.studies.layout import study_layout
 from stewart_drake.studies.link_bound import study_link
 from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.studies.workspace import study_workspace
@@ -32,11 +34,12 @@ class Analysis(NamedTuple):
 ANALYSES: Final = {
     "delay": Analysis(study_delay, delay_document.document),
     "hautus": Analysis(study_hautus, hautus_document.document),
+    "layout": Analysis(study_layout, layout_document.document),
     "link": Analysis(study_link, link_document.document),
     "workspace": Analysis(study_workspace, workspace_document.document),
     "robustness": Analysis(study_robustness, robustness_document.document),
 }
-"""By the word after `analyze`."""
+"""By the word after `analyze`; `layout` is a command of its own."""
 
 
 def analyze(name: str, *subject: Any, command: str, **options: Any) -> Answer:

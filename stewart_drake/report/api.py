@@ -13,9 +13,9 @@ from pydrake.geometry import Meshcat
 from stewart_drake.loop.experiment import simulated_machine
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.report import layout_document, report_document
+from stewart_drake.report import report_document
 from stewart_drake.report.analyses import analyze
-from stewart_drake.report.answer import Answer, answer_of, framed
+from stewart_drake.report.answer import Answer, framed
 from stewart_drake.report.collect import collect
 from stewart_drake.report.figures import comparison_figures, draw_comparison, draw_run, run_figures
 from stewart_drake.report.page import Provenance, source
@@ -24,7 +24,6 @@ from stewart_drake.report.replay import replay_html, write_replay
 from stewart_drake.report.run_document import comparison_document, run_document
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.layout import study_layout
 from stewart_drake.studies.ranges import Ranges
 
 Results = SimulationResult | Mapping[str, SimulationResult]
@@ -263,21 +262,19 @@ def layout(
         ChildProcessError: a worker process died.
     """
     with TemporaryDirectory() as scratch:
-        return answer_of(
-            lambda: study_layout(
-                _loaded(scenario),
-                directory or scratch,
-                goal=goal,
-                limits=limits,
-                vary=vary,
-                keep=keep,
-                best=best,
-                starts=starts,
-                generations=generations,
-                seed=seed,
-            ),
-            layout_document.document,
-            f"sd.layout({scenario!r}, goal={goal!r}, seed={seed})",
+        return analyze(
+            "layout",
+            _loaded(scenario),
+            directory or scratch,
+            command=f"sd.layout({scenario!r}, goal={goal!r}, seed={seed})",
+            goal=goal,
+            limits=limits,
+            vary=vary,
+            keep=keep,
+            best=best,
+            starts=starts,
+            generations=generations,
+            seed=seed,
         )
 
 
