@@ -21,7 +21,7 @@ PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
 COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null || true
 
 .DEFAULT_GOAL := help
-.PHONY: generate demo docs test casadi lint format-check types wheel newest bench soak clean help
+.PHONY: generate demo docs test slow casadi lint format-check types wheel newest bench soak clean help
 
 demo: $(INSTALLED)  ## the paper's comparison, from rest, on the reference, and with a delay of 0.8 s believed to be 0.6 s
 	$(BIN)/stewart-drake compare paper --out out/demo/rest
@@ -39,20 +39,23 @@ docs: $(DOCS_VENV)/.installed  ## the documentation as a site with search, in ou
 # Each takes a stretch of the files, so that what their tests share is made once, and who is done
 # takes from the other.
 WORKERS := -n logical --maxprocesses 4 --dist worksteal
-test casadi soak bench: export OMP_NUM_THREADS := 1
-test casadi soak bench: export OPENBLAS_NUM_THREADS := 1
+test slow casadi soak bench: export OMP_NUM_THREADS := 1
+test slow casadi soak bench: export OPENBLAS_NUM_THREADS := 1
 # Tests start commands, and each would compile all of the package anew.
-test casadi soak: export PYTHONDONTWRITEBYTECODE :=
+test slow casadi soak: export PYTHONDONTWRITEBYTECODE :=
 
-test: $(INSTALLED)  ## the tests; ARGS="..." is handed to pytest
+test: $(INSTALLED)  ## the tests but for the slow ones; ARGS="..." is handed to pytest
 	$(BIN)/pytest $(WORKERS) $(ARGS)
+
+slow: $(INSTALLED)  ## the slow ones: whole commands, documents and processes
+	$(BIN)/pytest $(WORKERS) -m "slow and not soak" $(ARGS)
 
 WITHOUT_C := test_dynamics test_exact_plant test_wrench test_control_law test_estimator test_closed_loop
 casadi: $(INSTALLED)  ## the tests of dynamics, plant and law on CasADi's virtual machine
-	STEWART_NATIVE=0 $(BIN)/pytest $(WORKERS) $(WITHOUT_C:%=tests/%.py) $(ARGS)
+	STEWART_NATIVE=0 $(BIN)/pytest $(WORKERS) -m "not soak" $(WITHOUT_C:%=tests/%.py) $(ARGS)
 
-soak: $(INSTALLED)  ## the endurance runs, which `make test` leaves out
-	$(BIN)/pytest $(WORKERS) -m soak $(ARGS)
+soak: $(INSTALLED)  ## the endurance runs
+	$(BIN)/pytest $(WORKERS) -m soak -o faulthandler_timeout=0 $(ARGS)
 
 lint: $(INSTALLED)  ## ruff's rules
 	$(BIN)/ruff check .

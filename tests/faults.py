@@ -1,12 +1,8 @@
-"""What can go wrong: files, by faults made from the dataclass that describes them; processes."""
+"""What can go wrong with files, by faults made from the dataclass that describes them."""
 
-import contextlib
 import copy
 import dataclasses
 import json
-import os
-import signal
-import time
 import types
 import typing
 from collections.abc import Callable, Iterator
@@ -214,45 +210,3 @@ def refusal(arguments: list[str], capsys: Any) -> str:
     assert "Traceback" not in err
     check_remedy(err)
     return err
-
-
-def forked(work: Callable[[], object]) -> int:
-    """Start `work` in a copy of this process, which has everything imported; its process id.
-
-    The copy leads a process group. Its exit status is what `work` returns, 0 for None, 70 where it
-    raises.
-    """
-    pid = os.fork()
-    if pid:
-        with contextlib.suppress(OSError):  # both do it, so that it is done whoever comes first
-            os.setpgid(pid, pid)
-        return pid
-    status = 70
-    try:
-        os.setpgid(0, 0)
-        nowhere = os.open(os.devnull, os.O_RDWR)
-        os.dup2(nowhere, 1)
-        os.dup2(nowhere, 2)
-        result = work()
-        status = result if isinstance(result, int) else 0
-    finally:
-        os._exit(status)
-
-
-def killed(work: Callable[[], object], after: float) -> bool:
-    """Run `work` in a copy of this process and kill -9 it after so many s; whether it came to that.
-
-    Raises:
-        AssertionError: it failed before.
-    """
-    pid = forked(work)
-    limit = time.monotonic() + after
-    while time.monotonic() < limit:
-        done, status = os.waitpid(pid, os.WNOHANG)
-        if done:
-            assert os.waitstatus_to_exitcode(status) == 0
-            return False
-        time.sleep(0.005)
-    os.killpg(pid, signal.SIGKILL)
-    os.waitpid(pid, 0)
-    return True

@@ -1,7 +1,7 @@
 """kill -9, dead workers, two processes: nothing finished is lost, nothing is half.
 
-Instants are drawn from a seed. Work runs in copies of this process, so that a kill costs no
-imports; `make soak` kills dozens of times.
+Instants are drawn from a seed. Work runs in copies of a process, so that a kill costs no imports;
+`make soak` kills dozens of times.
 """
 
 import json
@@ -21,7 +21,8 @@ from stewart_drake.cli import main
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.tuning.dataset import data_hash, load_dataset, make_dataset
-from tests.faults import killed, refusal
+from tests.copies import duration, killed
+from tests.faults import refusal
 from tests.test_cli import command
 from tests.test_dataset import shrink
 from tests.test_robustness import short
@@ -35,13 +36,6 @@ LITTLE = ("plant.kind=exact", "reference.amplitude=[0.01, 0.01, 0.01, 0.001, 0.0
 def kill_times(number: int, longest: float, seed: int) -> Iterator[float]:
     """So many waiting times in s."""
     yield from np.random.default_rng(seed).uniform(0.0, longest, number)
-
-
-def duration(work: Callable[[], object]) -> float:
-    """s; a kill at any time of it meets the work somewhere, however fast the machine is."""
-    began = time.monotonic()
-    work()
-    return time.monotonic() - began
 
 
 def finished_runs(folder: Path, pattern: str) -> dict[str, tuple[bytes, int]]:
@@ -86,7 +80,9 @@ def kill_and_resume(
 
 
 def little_dataset(folder: Path) -> None:
-    make_dataset(load_scenario("paper", "delay_lqi", LITTLE), folder, workers=1)
+    with pytest.MonkeyPatch.context() as patch:
+        shrink(patch)
+        make_dataset(load_scenario("paper", "delay_lqi", LITTLE), folder, workers=1)
 
 
 def kill_dataset(number: int, tmp_path: Path) -> None:
@@ -98,8 +94,7 @@ def kill_dataset(number: int, tmp_path: Path) -> None:
     assert killed_hash == whole_hash
 
 
-def test_a_data_set_survives_kill_9(tmp_path, monkeypatch):
-    shrink(monkeypatch)
+def test_a_data_set_survives_kill_9(tmp_path):
     kill_dataset(KILLS, tmp_path)
 
 
@@ -164,14 +159,14 @@ def kill_writers(number: int, tmp_path: Path) -> None:
         assert not list(folder.glob(".*.part"))
 
 
+@pytest.mark.slow
 def test_reports_survive_kill_9(tmp_path):
     kill_writers(KILLS, tmp_path)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("kill", [kill_dataset, kill_study, kill_writers])
-def test_many_kills(kill, tmp_path, monkeypatch):
-    shrink(monkeypatch)
+def test_many_kills(kill, tmp_path):
     kill(SOAK_KILLS, tmp_path)
 
 
@@ -185,6 +180,7 @@ def children(pid: int) -> list[int]:
     return [i for i in ids if b"popen_loky" in Path(f"/proc/{i}/cmdline").read_bytes()]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
 def test_a_worker_that_dies_and_a_second_process(tmp_path, capsys):
     """The whole command, on the whole grid, which is stopped long before its end."""

@@ -1,10 +1,10 @@
 """Reading up to a limit, writing whole or not: kinds of file, temporary names, permissions."""
 
+import contextlib
 import csv
 import errno
 import os
 import re
-import signal
 import stat
 import threading
 import time
@@ -19,7 +19,8 @@ from stewart_drake.files.jsonio import write_json
 from stewart_drake.scenario.reference_config import CsvConfig
 from stewart_drake.scenario.trajectories import make_reference
 from stewart_drake.studies.jobs import run_jobs
-from tests.faults import forked, tree
+from tests.copies import copied, kill
+from tests.faults import tree
 from tests.test_jobs import SETTINGS, numbered, text
 
 PARTIAL = re.compile(r"\.out\.json\.[0-9a-f]{16}\.part")
@@ -155,26 +156,24 @@ def test_what_kill_9_leaves_is_cleared_and_what_is_being_written_is_not(tmp_path
             (tmp_path / "ready").touch()
             time.sleep(60)
 
-    children = []
-    for _ in range(3):
-        children.append(forked(work))
-        limit = time.monotonic() + 20
-        while not (tmp_path / "ready").exists():
-            assert time.monotonic() < limit
-            time.sleep(0.01)
-        (tmp_path / "ready").unlink()
-    for pid in children[:2]:
-        os.kill(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
-    mine = tmp_path / ".mine.part"
-    mine.touch()
-    os.symlink(mine, tmp_path / ".out.json.0123456789abcdef.part")
-    assert len(hidden(tmp_path)) == 5
-    remove_partials(tmp_path)
-    kept = hidden(tmp_path)
-    assert len(kept) == 3 and mine.exists(), "a link is no leftover of ours"
-    os.kill(children[2], signal.SIGKILL)
-    os.waitpid(children[2], 0)
+    with contextlib.ExitStack() as stack:
+        copies = []
+        for _ in range(3):
+            copies.append(stack.enter_context(copied(work)))
+            limit = time.monotonic() + 20
+            while not (tmp_path / "ready").exists():
+                assert time.monotonic() < limit
+                time.sleep(0.01)
+            (tmp_path / "ready").unlink()
+        for copy in copies[:2]:
+            kill(copy)
+        mine = tmp_path / ".mine.part"
+        mine.touch()
+        os.symlink(mine, tmp_path / ".out.json.0123456789abcdef.part")
+        assert len(hidden(tmp_path)) == 5
+        remove_partials(tmp_path)
+        kept = hidden(tmp_path)
+        assert len(kept) == 3 and mine.exists(), "a link is no leftover of ours"
     remove_partials(tmp_path)
     assert len(hidden(tmp_path)) == 2
 

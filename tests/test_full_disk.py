@@ -15,19 +15,17 @@ import pytest
 
 from stewart_drake.cli import main
 from stewart_drake.tuning.dataset import data_hash, load_dataset
-from tests.faults import forked
-from tests.test_dataset import shrink
+from tests.copies import status_of
 from tests.test_faults import EXACT, check_whole, finished_runs, little_dataset
 
 
 def on_small_disk(folder: Path, body: Callable[[Callable[[int], None]], None]) -> None:
-    """Run `body` in a copy of this process that alone sees a disk mounted on `folder`.
+    """Run `body` in a copy of a process that alone sees a disk mounted on `folder`.
 
     It is handed a function that gives the disk so many kB. Whatever happens, nothing stays mounted.
     """
     folder.mkdir()
     trace = folder.parent / "trace"
-    libc = ctypes.CDLL(None, use_errno=True)
 
     def sized(kilobytes: int) -> None:
         remount = "remount," if os.path.ismount(folder) else ""
@@ -36,7 +34,9 @@ def on_small_disk(folder: Path, body: Callable[[Callable[[int], None]], None]) -
 
     def work() -> int:
         new_mounts = 0x00020000  # CLONE_NEWNS
-        if libc.unshare(new_mounts) or subprocess.call(["mount", "--make-rprivate", "/"]):
+        if ctypes.CDLL(None).unshare(new_mounts) or subprocess.call(
+            ["mount", "--make-rprivate", "/"]
+        ):
             return 77
         try:
             body(sized)
@@ -45,10 +45,10 @@ def on_small_disk(folder: Path, body: Callable[[Callable[[int], None]], None]) -
             raise
         return 0
 
-    _, status = os.waitpid(forked(work), 0)
-    if os.waitstatus_to_exitcode(status) == 77:
+    status = status_of(work)
+    if status == 77:
         pytest.skip("a small disk can only be mounted by root, where namespaces are allowed")
-    assert os.waitstatus_to_exitcode(status) == 0, trace.read_text()
+    assert status == 0, trace.read_text()
 
 
 def fill(folder: Path) -> None:
@@ -58,8 +58,7 @@ def fill(folder: Path) -> None:
             file.write(bytes(4096))
 
 
-def test_a_full_disk_stops_a_data_set_that_then_goes_on(tmp_path, monkeypatch):
-    shrink(monkeypatch)
+def test_a_full_disk_stops_a_data_set_that_then_goes_on(tmp_path):
     whole, disk = tmp_path / "whole", tmp_path / "disk"
     little_dataset(whole)
 
@@ -78,6 +77,7 @@ def test_a_full_disk_stops_a_data_set_that_then_goes_on(tmp_path, monkeypatch):
     on_small_disk(disk, body)
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_no_half_result(tmp_path):
     """From no room at all to room for the signals, the summary and some of the figures."""
     arguments = ["simulate", *EXACT, "--quiet", "--out"]
@@ -116,15 +116,14 @@ def test_a_full_disk_leaves_no_half_result(tmp_path):
 
 @pytest.mark.parametrize("largest", [1_000, 20_000, 60_000])
 def test_a_limit_on_file_sizes_is_one_line_as_well(largest, tmp_path):
-    """Which needs no root; the limit holds in a copy of this process only."""
+    """Which needs no root; the limit holds in a copy of a process only."""
 
     def work() -> int:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
         return main(["simulate", *EXACT, "--quiet", "--out", str(tmp_path)])
 
-    _, status = os.waitpid(forked(work), 0)
-    assert os.waitstatus_to_exitcode(status) == 2
+    assert status_of(work) == 2
     check_whole(tmp_path)
     assert not list(tmp_path.glob(".*.part"))
     there = {path.name for path in tmp_path.iterdir()}

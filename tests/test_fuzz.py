@@ -6,18 +6,15 @@ of the tables in test_bad_input.py and test_bad_files.py.
 
 import io
 import json
-import os
 import random
 import resource
-import select
 import shutil
-import signal
 import time
 import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -42,6 +39,7 @@ from stewart_drake.studies.runs import read_outcome
 from stewart_drake.tuner.network import load_network, save_network
 from stewart_drake.tuning.dataset import assemble, load_dataset, read_run, summarize
 from stewart_drake.tuning.grid import paper_runs
+from tests.copies import copied
 from tests.faults import yaml_text
 from tests.mutations import (
     NASTY,
@@ -370,7 +368,7 @@ def attempt(kind: Kind, path: Path, content: bytes) -> str:
 
 
 def fuzz_files(name: str, folder: Path, numbers: range) -> Counter[str]:
-    """Reads damaged files in copies of this process, which may neither hang nor take much memory.
+    """Reads damaged files in copies of a process, which may neither hang nor take much memory.
 
     Returns:
         How many were read and how many refused.
@@ -380,58 +378,41 @@ def fuzz_files(name: str, folder: Path, numbers: range) -> Counter[str]:
     """
     kind, results = KINDS[name], Counter[str]()
     good = kind.good(folder)
-    path = folder / kind.file
+    path, log = folder / kind.file, folder / "log"
     attempt(kind, path, good)
     start = numbers.start
     while start < numbers.stop:
-        reader, writer = os.pipe()
-        pid = os.fork()
-        if not pid:
-            try:
-                _try_all(name, good, path, range(start, numbers.stop), writer)
-            finally:
-                os._exit(70)
-        os.close(writer)
-        lines = _lines(reader, pid)
-        _, status = os.waitpid(pid, 0)
-        for line in lines:
-            results[line.partition(" ")[2]] += 1
+        log.touch()
+        with copied(partial(_try_all, name, good, path, range(start, numbers.stop), log)) as copy:
+            before = -1
+            while copy.is_alive() and log.stat().st_size > before:
+                before = log.stat().st_size
+                copy.join(PATIENCE)
+            lines = log.read_text().splitlines()
+        log.unlink()
+        results.update(lines)
         start += len(lines)
         if start < numbers.stop:
             shutil.copy(path, folder / f"found{start}{path.suffix}")
             trace = folder / "trace"
             told = trace.read_text() if trace.exists() else "hang, crash or memory"
-            raise AssertionError(f"{name} {start}, {path}, status {status}: {told}")
+            raise AssertionError(f"{name} {start}, {path}, status {copy.exitcode}: {told}")
     return results
 
 
-def _try_all(name: str, good: bytes, path: Path, numbers: range, writer: int) -> None:
+def _try_all(name: str, good: bytes, path: Path, numbers: range, log: Path) -> None:
     """In the copy: a line for every file."""
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, resource.RLIM_INFINITY))
     kind = KINDS[name]
     try:
-        for number in numbers:
-            content = damaged(kind, good, random.Random(f"{name} {number}"))
-            os.write(writer, f"{number} {attempt(kind, path, content)}\n".encode())
+        with log.open("a", buffering=1) as lines:
+            for number in numbers:
+                content = damaged(kind, good, random.Random(f"{name} {number}"))
+                print(attempt(kind, path, content), file=lines)
     except BaseException:
         (path.parent / "trace").write_text(traceback.format_exc())
-        os._exit(70)
-    os._exit(0)
-
-
-def _lines(reader: int, pid: int) -> list[str]:
-    """What the copy says, until its end or its silence."""
-    said = b""
-    while select.select([reader], [], [], PATIENCE)[0]:
-        piece = os.read(reader, 65536)
-        if not piece:
-            break
-        said += piece
-    else:
-        os.kill(pid, signal.SIGKILL)
-    os.close(reader)
-    return said.decode().splitlines()
+        raise
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -238,6 +239,7 @@ def group_is_gone(group: int) -> bool:
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole_group", [True, False])
 def test_ctrl_c_keeps_what_has_finished(tmp_path, whole_group):
     process = start(tmp_path)
@@ -250,6 +252,7 @@ def test_ctrl_c_keeps_what_has_finished(tmp_path, whole_group):
     assert not list(tmp_path.glob(".*.part"))
 
 
+@pytest.mark.slow
 def test_after_kill_9_the_next_start_gives_the_same_files(tmp_path):
     process = start(tmp_path / "killed")
     wait_for(tmp_path / "killed", 3)
@@ -296,6 +299,7 @@ def test_a_cluster_of_one_worker_is_used_too(tmp_path):
     assert int(there) != os.getpid()
 
 
+@pytest.mark.slow
 def test_a_job_that_kills_its_workers_is_given_up(tmp_path, cluster):
     with pytest.raises(ChildProcessError, match="Dask gave up"):
         run_jobs({"job3": (3,)}, die_at_three, tmp_path, settings=SETTINGS, scheduler=cluster)
@@ -333,9 +337,11 @@ def test_an_address_without_a_scheduler_is_refused(tmp_path, monkeypatch):
     from stewart_drake.studies import cluster as backend
 
     monkeypatch.setattr(backend, "_CONNECT_TIMEOUT", 0.2)
+    before = threading.active_count()
     for address in ("nonsense", "tcp://127.0.0.1:1"):
         with pytest.raises(
             ConfigError, match=r"--scheduler: got .* expected the address"
         ) as caught:
             run_jobs(numbered(1), text, tmp_path, settings=SETTINGS, scheduler=address)
         assert "\n" not in str(caught.value)
+    assert threading.active_count() == before, "an event loop is left running"

@@ -12,7 +12,7 @@ import pytest
 from stewart_drake.cli import main
 from stewart_drake.report.document import Document, Listing, Section
 from stewart_drake.report.page import Provenance, write_page
-from tests.faults import forked
+from tests.copies import copied
 
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
 
@@ -28,6 +28,7 @@ def started(code: str, folder: Path) -> subprocess.Popen:
     )
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_with_nothing_written(tmp_path):
     code = (
         "import sys, stewart_drake.loop.simulation; from stewart_drake.cli import main;"
@@ -53,14 +54,13 @@ def test_kill_9_leaves_no_half_page(tmp_path):
 
     for wait in (0.0, 0.013, 0.037, 0.071):
         before = time.time()
-        pid = forked(work)
-        while os.waitpid(pid, os.WNOHANG) == (0, 0) and not any(
-            path.stat().st_mtime > before for path in tmp_path.glob("report.html")
-        ):
-            time.sleep(0.001)
-        time.sleep(wait)
-        os.killpg(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
+        with copied(work) as copy:
+            while copy.is_alive() and not any(
+                path.stat().st_mtime > before for path in tmp_path.glob("report.html")
+            ):
+                time.sleep(0.001)
+            time.sleep(wait)
+            assert copy.is_alive()
         assert (tmp_path / "report.html").read_text().rstrip().endswith("</html>")
 
 

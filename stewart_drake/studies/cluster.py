@@ -1,6 +1,8 @@
 """A Dask cluster as the place where jobs run."""
 
+import asyncio
 from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, Final, TypeVar
 
@@ -32,6 +34,8 @@ def on_cluster(scheduler: str, calls: Sequence[Callable[[], _T]]) -> Generator[_
     untyped: Any = (Client, as_completed)
     connect, in_turn = untyped
     try:
+        with ThreadPoolExecutor(1) as thread:  # this one may have an event loop, as in a notebook
+            thread.submit(asyncio.run, _greet(scheduler)).result()
         client = connect(scheduler, timeout=_CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())
@@ -58,6 +62,25 @@ def on_cluster(scheduler: str, calls: Sequence[Callable[[], _T]]) -> Generator[_
                 f"--scheduler: the workers of {scheduler} lack a module ({error}); install the "
                 "same stewart-drake there"
             ) from None
+
+
+# A client that finds nobody leaves a running event loop behind, and is closed by whatever thread
+# happens to collect garbage; where that is the loop of the next client, both wait for each other.
+async def _greet(scheduler: str) -> None:
+    """Connect once, before there is a client.
+
+    Raises:
+        OSError: nobody is there.
+        ValueError: it is no address.
+    """
+    from distributed import Security
+    from distributed.comm.core import connect
+
+    untyped: Any = (Security, connect)
+    security, reach = untyped
+    options = security().get_connection_args("client")
+    comm = await reach(scheduler, timeout=_CONNECT_TIMEOUT, **options)
+    await comm.close()
 
 
 def _check_workers(scheduler: str, threads: Mapping[str, int]) -> None:

@@ -1,0 +1,94 @@
+"""Copies of a process that has everything imported: to be killed, limited or given a small disk.
+
+The process of the tests has threads, and a lock that one of them holds while it is copied would be
+held in the copy for ever. The one that is copied here has a single thread.
+"""
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+
+import cloudpickle
+
+PATIENCE = 180.0
+"""s after which a copy that does not begin, or does not end, is taken to hang."""
+
+_server = get_context("forkserver")
+_server.set_forkserver_preload(["pytest", "stewart_drake.cli", "stewart_drake.loop.simulation"])
+
+
+@contextmanager
+def copied(work: Callable[[], object]) -> Iterator[BaseProcess]:
+    """A copy that has begun with `work`; it is killed where it has not come to its end.
+
+    The copy leads a process group and says nothing; what is patched here is not patched there. Its
+    exit status is what `work` returns, 0 for None, 70 where it raises.
+    """
+    here, there = _server.Pipe(duplex=False)
+    copy = _server.Process(target=_carry_out, args=(cloudpickle.dumps(work), there))
+    copy.start()
+    try:
+        there.close()
+        with here:
+            assert here.poll(PATIENCE), "the copy does not begin"
+            here.recv()
+        yield copy
+    finally:
+        kill(copy)
+
+
+def _carry_out(work: bytes, begun: Connection) -> None:
+    status = 70
+    try:
+        os.setpgid(0, 0)
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        call = cloudpickle.loads(work)
+        begun.send(None)
+        result = call()
+        status = result if isinstance(result, int) else 0
+    finally:
+        os._exit(status)
+
+
+def kill(copy: BaseProcess) -> None:
+    """Kill -9 it and what it has started."""
+    assert copy.pid is not None
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(copy.pid, signal.SIGKILL)
+    copy.kill()  # it may not lead its group yet
+    copy.join()
+
+
+def status_of(work: Callable[[], object]) -> int:
+    """The exit status of a copy, which must come to its end."""
+    with copied(work) as copy:
+        copy.join(PATIENCE)
+        assert copy.exitcode is not None, f"no end after {PATIENCE} s"
+        return copy.exitcode
+
+
+def killed(work: Callable[[], object], after: float) -> bool:
+    """Run `work` in a copy and kill -9 it after so many s; whether it came to that.
+
+    Raises:
+        AssertionError: it failed before.
+    """
+    with copied(work) as copy:
+        copy.join(after)
+        assert copy.exitcode in (None, 0)
+        return copy.exitcode is None
+
+
+def duration(work: Callable[[], object]) -> float:
+    """s; a kill at any time of it meets the work somewhere, however fast the machine is."""
+    began = time.monotonic()
+    assert status_of(work) == 0
+    return time.monotonic() - began
