@@ -21,6 +21,7 @@ def check(folder, answer):
     assert json.loads((folder / "summary.json").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "less"), [("delay", {"simulations": False}), ("hautus", {}), ("workspace", {})]
 )
@@ -31,6 +32,7 @@ def test_a_script_answers_its_question(name, less, tmp_path, capsys):
     check(tmp_path, answer)
 
 
+@pytest.mark.slow
 def test_robustness_from_either_start(tmp_path, capsys):
     answers = script("robustness").main("2", "duration=0.3", out=str(tmp_path))
     printed = capsys.readouterr().out
@@ -40,6 +42,7 @@ def test_robustness_from_either_start(tmp_path, capsys):
     assert set(answers) == {"rest", "on_reference"}
 
 
+@pytest.mark.slow
 def test_table_two_on_three_plants_and_what_its_law_lacks(tmp_path, capsys):
     tables, rows = script("table2").main("duration=0.3", out=str(tmp_path))
     assert list(tables) == ["exact", "multibody", "paper"]

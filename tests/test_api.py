@@ -50,6 +50,7 @@ def test_version_and_types_are_told():
     assert (Path(sd.__file__).parent / "py.typed").is_file()
 
 
+@pytest.mark.slow
 def test_report_is_there_whatever_was_imported_first():
     for first in ("import stewart_drake.report.page", "sd.plot", "sd.simulate"):
         code = f"import stewart_drake as sd; {first}; assert callable(sd.report); sd.report.page"
@@ -81,6 +82,7 @@ def test_replay_as_a_file_in_a_notebook_or_in_meshcat(run, tmp_path):
     assert "/reference/ring" in meshcat.StaticHtml() or meshcat.HasPath("/reference/ring")
 
 
+@pytest.mark.slow
 def test_analyses_are_answers_that_can_be_printed_shown_and_saved(tmp_path):
     found = sd.analyze_workspace(sd.load_scenario("paper"))
     assert isinstance(found, Answer) and "\n" in str(found)
@@ -101,6 +103,7 @@ def test_a_network_is_analysed(monkeypatch):
         sd.analyze_link("paper")
 
 
+@pytest.mark.slow
 def test_compare_takes_own_controllers_and_disturbances(tmp_path):
     results = sd.compare("paper", SHORT, controllers={"nothing": Still}, disturbance=Push)
     assert list(results)[-1] == "nothing" and len(results) == 6

@@ -67,6 +67,7 @@ def test_errors_and_requests_would_be_seen(tab, tmp_path):
     assert tab.requests == ["http://127.0.0.1:9/three.png"]
 
 
+@pytest.mark.slow
 def test_the_canvas_shows_a_machine(replay):
     seek(replay, 0.0)
     image = scene(replay)
@@ -76,6 +77,7 @@ def test_the_canvas_shows_a_machine(replay):
     assert ((green > red + 0.15) & (green > blue + 0.05)).sum() > 200, "no green reference"
 
 
+@pytest.mark.slow
 def test_hidden_things_leave_a_blank_canvas(replay):
     """What the test above takes for a machine is one."""
     seek(replay, 0.0)
@@ -87,6 +89,7 @@ def test_hidden_things_leave_a_blank_canvas(replay):
     assert ((green > red + 0.15) & (green > blue + 0.05)).sum() == 0
 
 
+@pytest.mark.slow
 def test_the_animation_advances_by_itself(replay):
     replay.evaluate("player.reset(); player.play()")
     first, image = replay.evaluate("player.time"), scene(replay)
@@ -95,6 +98,7 @@ def test_the_animation_advances_by_itself(replay):
     assert 0 < replay.evaluate("Number(slider.value)") <= 3.0
 
 
+@pytest.mark.slow
 def test_the_button_and_the_space_bar_play_and_pause(replay):
     replay.evaluate("button.click()")
     replay.wait("!player.playing && button.textContent === 'Play'")
@@ -106,6 +110,7 @@ def test_the_button_and_the_space_bar_play_and_pause(replay):
     replay.wait(f"player.playing && player.time > {held}")
 
 
+@pytest.mark.slow
 def test_plate_reference_and_readout_are_where_the_run_had_them(replay, run):
     world = (
         "(path => { const o = viewer.scene_tree.find(path).object; o.updateWorldMatrix(true, true);"
@@ -127,6 +132,7 @@ def test_plate_reference_and_readout_are_where_the_run_had_them(replay, run):
         assert told == pytest.approx(off, rel=0.1, abs=5e-3)
 
 
+@pytest.mark.slow
 def test_cranks_take_the_colour_of_their_torque(replay, run):
     loudest = run.signals.torque_applied.values
     row, leg = np.unravel_index(np.abs(loudest).argmax(), loudest.shape)
@@ -140,6 +146,7 @@ def test_cranks_take_the_colour_of_their_torque(replay, run):
     assert np.ptp(grey) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(1600, 900), (1000, 700), (375, 640)])
 def test_panels_are_whole_and_leave_the_machine_visible_on_any_screen(tab, page, width, height):
     tab.open(page, width, height)
@@ -164,6 +171,7 @@ def test_panels_are_whole_and_leave_the_machine_visible_on_any_screen(tab, page,
     assert "N m" in tab.evaluate("document.querySelector('#run-about').innerText")
 
 
+@pytest.mark.slow
 def test_the_scene_is_dark_where_the_reader_prefers_it(tab, page):
     brightness = {}
     for scheme in ("light", "dark"):

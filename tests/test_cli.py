@@ -45,6 +45,7 @@ def files(folder: Path) -> set[str]:
 # ---------------------------------------------------------------- bad input
 
 
+@pytest.mark.slow
 def test_a_scenario_is_prepared_once(tmp_path, monkeypatch) -> None:
     """Its reference is looked at over all of its duration, and its mechanism is read."""
     prepared = []
@@ -223,6 +224,7 @@ def interrupted(arguments: list[str], wait: float, group: bool) -> tuple[int, st
     return process.returncode, "\n".join(said)
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_simulate_keeps_what_was_computed(tmp_path):
     settings = ("--set", "controller.period=0.02", "--set", "delay.steps=4")
     arguments = ["simulate", "paper", *MULTIBODY, "--set", "duration=200", *settings]
@@ -237,6 +239,7 @@ def test_ctrl_c_in_simulate_keeps_what_was_computed(tmp_path):
         assert np.isfinite(signals.pose.values).all()
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_compare_reaches_the_processes_in_an_orderly_way(tmp_path):
     # Early, when they are still importing: there a signal of their own would break them.
     arguments = ["compare", "paper", *MULTIBODY, "--set", "duration=40", "--out", str(tmp_path)]
@@ -311,6 +314,7 @@ def test_colours_only_where_they_are_wanted(monkeypatch, capsys):
         assert ("\x1b[32m" in capsys.readouterr().out) is expected
 
 
+@pytest.mark.slow
 def test_meshcat_replays_an_exact_run_and_leaves_a_file(tmp_path, capsys):
     settings = ("--set", "duration=0.2", "--quiet", "--meshcat", "--out", str(tmp_path))
     assert main(["simulate", *EXACT, *settings]) == 0

@@ -358,6 +358,7 @@ def shrunk(folder: Path, scale: float) -> list[str]:
     ]
 
 
+@pytest.mark.slow
 def test_a_small_machine_is_warned_of_the_step_that_loses_it(tmp_path: Path) -> None:
     """A plate of 80 mm: lost at 1 ms, followed at the step that is named."""
     small = shrunk(tmp_path, 1 / 3)
@@ -374,6 +375,7 @@ def test_a_small_machine_is_warned_of_the_step_that_loses_it(tmp_path: Path) -> 
     assert cautions_before(prepare(exact), judged(exact)) == []
 
 
+@pytest.mark.slow
 def test_shipped_scenarios_are_warned_only_where_the_step_is_too_coarse() -> None:
     for name in ("paper", "desktop", "motion_base"):
         sc = scenario(name=name)

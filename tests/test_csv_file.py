@@ -105,6 +105,7 @@ def test_what_is_not_a_number_is_an_empty_cell(run):
     assert "nan" not in signals_csv(signals)
 
 
+@pytest.mark.slow
 def test_export_gives_what_simulate_wrote(tmp_path, capsys):
     assert main(["simulate", *SHORT, "--out", str(tmp_path), "--csv", "--quiet"]) == 0
     written = (tmp_path / "signals.csv").read_text()

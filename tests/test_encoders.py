@@ -171,11 +171,13 @@ def test_the_error_on_the_reference(settings: tuple[str, ...], bound: float) -> 
     assert run(*ON_REFERENCE, *settings).accumulated_error < bound
 
 
+@pytest.mark.slow
 def test_from_rest() -> None:
     """With the state 21.08."""
     assert run(*ENCODERS, "sensor.bits=14", *FINE).accumulated_error < 21.5
 
 
+@pytest.mark.slow
 def test_what_is_not_known_is_found() -> None:
     bias = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
     more = ("plant.payload_mass=0.4", "plant.joint_damping=1e-3")
@@ -186,6 +188,7 @@ def test_what_is_not_known_is_found() -> None:
     assert np.all(left < 4 * result.signals.parameter_std.values[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "counted"),
     [
@@ -212,12 +215,14 @@ def test_a_frozen_leg_is_called_so(samples: int) -> None:
     assert stuck >= 3
 
 
+@pytest.mark.slow
 def test_measurements_that_come_late_or_get_lost() -> None:
     late = run(*ON_REFERENCE, *FINE, "sensor.delay=0.1", "sensor.loss=0.1")
     assert late.status == "completed"
     assert late.accumulated_error < 2.0
 
 
+@pytest.mark.slow
 def test_a_delay_that_is_not_known_either() -> None:
     wrong = ("controller.delay_estimator=constant", "controller.delay_steps=7")
     for where in (ON_REFERENCE, ENCODERS):
@@ -226,6 +231,7 @@ def test_a_delay_that_is_not_known_either() -> None:
         assert result.summary["delay"]["estimated_s"] == pytest.approx(0.8, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_offsets_are_found() -> None:
     """A tenth of a degree each; 0.1 mrad are left after 10 s."""
     offsets = np.deg2rad(0.1) * np.array([1, -1, 1, 1, -1, -1])

@@ -58,6 +58,7 @@ def made(folder: Path, target: str, *variables: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [pytest.param(n, marks=() if n in QUICK else pytest.mark.soak) for n in RUNS]
 )
@@ -88,6 +89,7 @@ def test_other_compilers_and_processors(compiler: str, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_controller_that_is_off_is_told(tmp_path: Path) -> None:
     """What the replay says to a change of one weight, and to another fault."""
     folder = exported(tmp_path, "paper", ("duration=2.0",))
@@ -107,6 +109,7 @@ def test_a_controller_that_is_off_is_told(tmp_path: Path) -> None:
         assert done.returncode != 0
 
 
+@pytest.mark.slow
 def test_single_precision_without_the_filter_only(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"controller.estimator: got 'parameters' with --single"):
         exported(tmp_path, "paper", (), single=True)
@@ -117,6 +120,7 @@ def test_single_precision_without_the_filter_only(tmp_path: Path) -> None:
     assert 1e-9 < error < 1e-2
 
 
+@pytest.mark.slow
 def test_the_sizes_are_told_and_kept_to(tmp_path: Path) -> None:
     """For `paper`: text of 180 kB at the most, state of 8 kB."""
     files = export_c.exported(load_scenario("paper", settings=(*SHORT, "duration=1.0")))
@@ -154,6 +158,7 @@ int main(void) {
 """Runs the replay on a stack that was painted before, and says how much of it was used."""
 
 
+@pytest.mark.slow
 def test_the_stack_is_not_deeper_than_told(tmp_path: Path, compiler: list[str]) -> None:
     folder = exported(tmp_path, "paper", ("duration=1.0",))
     (folder / "painted.c").write_text(PAINTED)
@@ -193,6 +198,7 @@ def test_a_run_that_does_not_end_is_refused() -> None:
         export_c.exported(scenario, measured=False)
 
 
+@pytest.mark.slow
 def test_the_command_writes_all_files_or_none(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

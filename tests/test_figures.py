@@ -135,6 +135,7 @@ def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(compar
     assert legend == ["reference", *(LABELS[name] for name in CONTROLLERS), "run ended"]
 
 
+@pytest.mark.slow
 def test_labels_of_small_values_stay_off_the_names_of_the_axes(run, drawn):
     """A plate that follows to 1e-3 has many digits to be shown."""
     for size in (3e-6, 8e-6, 3e-5, 2e-4, 5e-3, 0.1):

@@ -424,6 +424,7 @@ def test_a_machine_is_found_from_encoders_of_14_bit(log_and_truth):
         assert abs(found.values[NAMES.index(name)] - true[NAMES.index(name)]) < size
 
 
+@pytest.mark.slow
 def test_a_drawing_that_is_trusted_too_much_is_refused(log_and_truth):
     log, _ = log_and_truth
     found = identify([log], PAPER, Tolerances(lengths=0.0, joints=0.0, offsets=0.0))
@@ -434,6 +435,7 @@ def test_a_drawing_that_is_trusted_too_much_is_refused(log_and_truth):
     assert abs(summary["delay_s"] - 0.93) < 1e-3  # the delay stands all the same
 
 
+@pytest.mark.slow
 def test_two_logs_tell_more_than_one(log_and_truth):
     log, true = log_and_truth
     half = len(log.times) // 2

@@ -198,6 +198,7 @@ def test_a_bad_command_is_told_in_one_line(tmp_path, capsys, arguments, named):
     assert not list((tmp_path / "out").glob("*.yaml"))
 
 
+@pytest.mark.slow
 def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
     assert main(["identify", str(lost), "--mechanism", "paper", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
@@ -237,6 +238,7 @@ def test_logs_of_one_name_are_told_by_their_folders():
     assert told("a/s.nc", "a/s.nc") == ["s.nc", "s.nc"]
 
 
+@pytest.mark.slow
 def test_a_plan_can_be_run(tmp_path):
     assert main(["identify", "--plan", "paper", "--out", str(tmp_path), "--quiet"]) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())

@@ -291,6 +291,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return done
 
 
+@pytest.mark.slow
 def test_the_command_writes_machines_that_run_and_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], in_process: list[int]
 ) -> None:

@@ -88,6 +88,7 @@ def wall_clock(request, monkeypatch):
         monkeypatch.setattr(time, "time_ns", lambda: int(1e9 * time.time()))
 
 
+@pytest.mark.slow
 def test_on_a_wire_it_does_what_the_simulation_does(quiet_machine, wall_clock):
     with Running() as running:
         ready = prepare_session(scenario_of(), running.address)
@@ -102,6 +103,7 @@ def test_on_a_wire_it_does_what_the_simulation_does(quiet_machine, wall_clock):
     assert set(result.signals.data_vars) == set(simulated.signals.data_vars)
 
 
+@pytest.mark.slow
 def test_over_a_network_packets_bridge_what_is_lost(quiet_machine, tmp_path):
     with Running(OVER_A_NETWORK, *FROM_REST) as running:
         ready = prepare_session(scenario_of(*FROM_REST), running.address)
@@ -135,6 +137,7 @@ class Hand(Nobody):
         return Wish(self._target if len(self.seen) >= self._after else None)
 
 
+@pytest.mark.slow
 def test_a_hand_leads_and_a_target_beyond_reach_is_told(quiet_machine):
     target = load_mechanism("paper").home + [0, 0, 0, 0, 0, 0.3]
     hand = Hand(target)
@@ -153,6 +156,7 @@ def test_a_hand_leads_and_a_target_beyond_reach_is_told(quiet_machine):
     assert last.state[5] > 0.45
 
 
+@pytest.mark.slow
 def test_a_second_controller_takes_over_in_motion(quiet_machine):
     said = []
     with Running(restart="motion", watchdog=0.3) as running:
@@ -269,6 +273,7 @@ def test_the_tighter_torque_limit_counts(offer):
     assert made.torque_limit == made.law.plant.motors.limit == 0.5
 
 
+@pytest.mark.slow
 def test_a_law_that_is_too_slow_for_its_period_says_so_before_it_starts(quiet_machine):
     with Running(OVER_A_NETWORK) as running:
         ready = prepare_session(scenario_of(), running.address)
@@ -292,6 +297,7 @@ def test_a_law_that_is_too_slow_for_its_period_says_so_before_it_starts(quiet_ma
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("settings", "said"), [((), True), (FROM_REST, False)])
 def test_torques_in_flight_that_end_too_soon_are_told(quiet_machine, settings, said):
     with Running(OVER_A_NETWORK, *settings) as running:
@@ -317,6 +323,7 @@ def test_an_address_that_is_none_is_refused(text):
         address_of(text)
 
 
+@pytest.mark.slow
 def test_nobody_there_is_told():
     endpoint = Endpoint(ControllerMessage, "127.0.0.1", 0)
     try:
@@ -331,6 +338,7 @@ def test_beyond_loopback_a_key_is_needed():
         open_endpoint(("192.0.2.1", 7000), None)
 
 
+@pytest.mark.slow
 def test_what_came_while_nobody_looked_is_not_lost(quiet_machine):
     with Running(OVER_A_NETWORK.replace("loss: 0.02", "loss: 0")) as running:
         endpoint = open_endpoint(running.address, None)
@@ -377,6 +385,7 @@ def test_wishes_are_in_degrees_and_mm():
     assert read_wish(b'{"target": null, "stop": true}') == Asked(None, True)
 
 
+@pytest.mark.slow
 def test_the_page_does_what_its_own_buttons_ask_for_and_nobody_else():
     viewer = PageViewer(load_mechanism("paper"), "live: a test")
     try:
@@ -405,6 +414,7 @@ def test_the_page_does_what_its_own_buttons_ask_for_and_nobody_else():
         viewer.close()
 
 
+@pytest.mark.slow
 def test_the_loop_goes_on_where_the_page_is_gone():
     viewer = PageViewer(load_mechanism("paper"), "live: a test")
     viewer.opened()
@@ -415,6 +425,7 @@ def test_the_loop_goes_on_where_the_page_is_gone():
     assert viewer.wish() == Wish()
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_a_gamepad_moves_the_reference(quiet_machine):
     """One that the page sees in the place of a true one: a button turns the plate about yaw."""

@@ -56,6 +56,7 @@ def growth_per_run(runs: int, warm_up: int) -> float:
 PLANTS = ("exact", "multibody")
 
 
+@pytest.mark.slow
 @needs_proc
 def test_some_runs_leave_nothing_behind():
     assert growth_per_run(runs=18, warm_up=6) < 0.1 * MB
@@ -157,6 +158,7 @@ def check_steady(rows: list[tuple[float, float, float, float]], gap: float, erro
     assert errors.max() < error and errors[5:].max() < 2 * errors[:5].max() + 1e-6
 
 
+@pytest.mark.slow
 @needs_proc
 @pytest.mark.parametrize(
     ("kind", "duration", "gap"),

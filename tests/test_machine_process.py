@@ -158,6 +158,7 @@ def test_the_controller_in_c_drives_the_machine_in_python(folder: Path, tmp_path
     np.testing.assert_allclose(states_of(log), simulated(40), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_lost_datagram_of_the_controller_in_c_costs_nothing(folder: Path, tmp_path: Path) -> None:
     """Where a buffer waits, those that follow say its torque again: the run without a loss."""
     lossy = "link={kind: network, low: 0.0, high: 0.02, loss: 0.3, playout: 0.8}"
@@ -182,6 +183,7 @@ MOTION = np.tile([0.26, 0.26, 0.26, 0.02, 0.02, 0.08], 2)
 """Amplitudes of the scenario's motion, rad and m, and of its rates, per s."""
 
 
+@pytest.mark.slow
 def test_what_the_controller_in_c_plans_ahead_acts_in_the_place_of_what_is_lost(
     soon: Path, tmp_path: Path
 ) -> None:
@@ -194,6 +196,7 @@ def test_what_the_controller_in_c_plans_ahead_acts_in_the_place_of_what_is_lost(
     assert off.max() < 5e-3
 
 
+@pytest.mark.slow
 def test_the_controller_in_c_hears_what_has_acted(soon: Path, tmp_path: Path) -> None:
     """Ten in a row are lost, so that the last torque is held: without being told, the filter would
     take that for a torque bias, which takes the plate four amplitudes away."""
@@ -206,6 +209,7 @@ def test_the_controller_in_c_hears_what_has_acted(soon: Path, tmp_path: Path) ->
     assert (np.abs(states - undisturbed) / MOTION).max() < min(0.5, most.max())
 
 
+@pytest.mark.slow
 def test_the_controller_in_python_drives_the_machine_in_c(folder: Path) -> None:
     port = free_port()
     with process([str(folder / "stewart_machine"), str(port)]) as running:
@@ -238,6 +242,7 @@ def test_both_ends_in_c(folder: Path, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- signals
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_with_one_summary() -> None:
     with machine() as (running, _):
         assert running.end(signal.SIGINT) == 130
@@ -251,6 +256,7 @@ def test_ctrl_c_ends_it_with_one_summary() -> None:
     assert summary["sessions"] == 0 and set(summary["refused"].values()) == {0}
 
 
+@pytest.mark.slow
 def test_a_suspended_machine_goes_on_and_says_so(folder: Path) -> None:
     with machine() as (running, port):
         with process(c_controller(folder, port)) as driving:
@@ -266,6 +272,7 @@ def test_a_suspended_machine_goes_on_and_says_so(folder: Path) -> None:
     assert sum("stood still" in line for line in running.lines) == 1
 
 
+@pytest.mark.slow
 def test_a_suspended_controller_is_survived_or_stopped(folder: Path) -> None:
     with machine("--watchdog", "0.5") as (running, port):
         with process(c_controller(folder, port)) as driving:
@@ -280,6 +287,7 @@ def test_a_suspended_controller_is_survived_or_stopped(folder: Path) -> None:
     assert "the safe torque (zero) acts" in silent
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["controller", "machine"])
 def test_either_side_of_a_network_may_stand_still_for_a_second(side: str) -> None:
     """Told in one line by whoever stood still; the machine is at its safe torque within the time
@@ -338,6 +346,7 @@ def test_killed_twenty_times(folder: Path) -> None:
     kills(folder, 20, random.Random())
 
 
+@pytest.mark.slow
 def test_a_killed_machine_ends_the_controller_with_the_reason(folder: Path) -> None:
     with (
         machine("--watchdog", "0.3") as (running, port),
@@ -349,6 +358,7 @@ def test_a_killed_machine_ends_the_controller_with_the_reason(folder: Path) -> N
     assert "the machine has fallen silent after" in driving.lines[-2]
 
 
+@pytest.mark.slow
 def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_successor(
     folder: Path,
 ) -> None:
@@ -369,6 +379,7 @@ def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_s
     assert re.search(r" [1-9]\d* foreign", anew.lines[-1])
 
 
+@pytest.mark.slow
 def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_over(
     folder: Path,
 ) -> None:
@@ -409,6 +420,7 @@ def test_wrong_commands_are_one_line(capfd: pytest.CaptureFixture[str], tmp_path
     busy.close()
 
 
+@pytest.mark.slow
 def test_a_slower_clock_is_told(folder: Path) -> None:
     """At half the rate 1 s of the machine takes two; its datagrams say so."""
     with machine("--rate", "0.5") as (running, port):

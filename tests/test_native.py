@@ -224,6 +224,7 @@ def test_the_c_is_what_the_equations_are(native, tmp_path: Path) -> None:
             assert_equal(native, seed)
 
 
+@pytest.mark.slow
 def test_other_equations_are_told_from_these(native, tmp_path: Path) -> None:
     """What the tests above would say to a sign that is wrong in one place of each function."""
     text = generate.FILE.read_text()
@@ -309,6 +310,7 @@ def test_without_a_library_nothing_but_speed_is_missing(native, monkeypatch) -> 
     assert np.abs(torques[0] - torques[1]).max() < 1e-7 * np.abs(torques[1]).max()
 
 
+@pytest.mark.slow
 def test_native_dynamics_build_nothing(native) -> None:
     """No expression of CasADi is made where the library serves."""
     code = """if True:

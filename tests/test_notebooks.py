@@ -44,6 +44,7 @@ def test_outputs_are_not_committed(name):
     assert code and all(c["outputs"] == [] and c["execution_count"] is None for c in code)
 
 
+@pytest.mark.slow
 def test_the_first_hour_shows_figures_and_pages(capsys):
     names, shown = run("first_hour.ipynb")
     assert len(shown) >= 6
@@ -53,6 +54,7 @@ def test_the_first_hour_shows_figures_and_pages(capsys):
     assert names["blind"].status == "left_workspace"
 
 
+@pytest.mark.slow
 def test_an_own_controller_holds_without_delay_and_not_with_it(capsys):
     names, _ = run("own_controller.ipynb")
     prompt, errors, late = (names[name] for name in ("prompt", "errors", "late"))
@@ -65,6 +67,7 @@ def test_an_own_controller_holds_without_delay_and_not_with_it(capsys):
     assert capsys.readouterr().out.count("left_workspace") >= 1
 
 
+@pytest.mark.slow
 def test_a_lost_log_leads_to_full_amplitude(capsys):
     names, _ = run("lost_log.ipynb")
     assert names["lost"].status == "left_workspace"

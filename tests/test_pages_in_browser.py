@@ -66,6 +66,7 @@ def enlarged(tab: Browser) -> bool:
     return tab.evaluate("document.querySelector('.figure:popover-open') !== null")
 
 
+@pytest.mark.slow
 def test_the_hautus_page_is_short_on_a_telephone(tab, hautus):
     tab.open(hautus, NARROW, 800)
     assert tab.evaluate("document.documentElement.scrollHeight") < 3000

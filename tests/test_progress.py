@@ -71,6 +71,7 @@ def test_a_closed_stderr_costs_nothing():
     assert (done.returncode, done.stdout) == (0, b"done\n")
 
 
+@pytest.mark.slow
 def test_a_long_command_speaks_when_its_output_goes_to_a_file(tmp_path, monkeypatch):
     """Which it did not for as long as it took."""
     monkeypatch.setattr(terminal, "EVERY", 0.01)

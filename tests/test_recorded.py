@@ -31,7 +31,13 @@ def test_every_scenario_is_recorded_with_every_controller_on_both_plants() -> No
     assert set(RECORDED) == set(runs.ROWS)
 
 
-@pytest.mark.parametrize("row", runs.ROWS)
+QUICK = [row for row in runs.ROWS if row.startswith("paper/") and row.endswith("/exact")]
+"""Every controller once; the other rows are slow."""
+
+
+@pytest.mark.parametrize(
+    "row", [pytest.param(r, marks=() if r in QUICK else pytest.mark.slow) for r in runs.ROWS]
+)
 def test_torques_are_what_they_were(row: str) -> None:
     """The law's answers to 1e-12 of the peak torque; to 1e-9 around the loop with its plant.
 

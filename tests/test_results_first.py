@@ -71,6 +71,7 @@ def test_a_report_that_cannot_be_drawn_leaves_its_numbers(tmp_path, monkeypatch,
     assert names(tmp_path) == {"summary.json"}
 
 
+@pytest.mark.slow
 def test_figures_of_an_earlier_run_do_not_stay_beside_new_results(tmp_path, monkeypatch) -> None:
     arguments = ["simulate", *EXACT, "--quiet", "--out", str(tmp_path)]
     assert main(arguments) == 0
@@ -81,6 +82,7 @@ def test_figures_of_an_earlier_run_do_not_stay_beside_new_results(tmp_path, monk
     assert names(tmp_path) == {"summary.json", "signals.nc"}
 
 
+@pytest.mark.slow
 def test_nothing_of_an_earlier_comparison_stays_beside_new_results(tmp_path, monkeypatch) -> None:
     assert {*figures.TORQUE_CONTROLLERS, ADAPTIVE, *SERVOS} <= set(LABELS)
     for name in LABELS:
@@ -105,6 +107,7 @@ def start(folder: Path, redirection: str = "", **environment: str) -> subprocess
     )
 
 
+@pytest.mark.slow
 def test_figures_do_not_depend_on_the_backend_of_the_surroundings(tmp_path) -> None:
     assert main(["simulate", *EXACT, "--quiet", "--out", str(tmp_path / "usual")]) == 0
     other = start(tmp_path / "other", MPLBACKEND="nonsense")
@@ -115,6 +118,7 @@ def test_figures_do_not_depend_on_the_backend_of_the_surroundings(tmp_path) -> N
         assert one == two
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("redirection", ["2>&-", ">&-", "<&- >&- 2>&-", "| true"])
 def test_a_closed_stream_costs_its_text_only(redirection: str, tmp_path) -> None:
     done = start(tmp_path / "out", redirection)

@@ -554,6 +554,7 @@ def test_a_killed_study_goes_on(tmp_path: Path, whole: tuple[Path, RobustnessStu
     assert contents(tmp_path) == contents(folder)
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same_study(
     tmp_path: Path, whole: tuple[Path, RobustnessStudy]
 ) -> None:
@@ -670,6 +671,7 @@ def median_of(study: RobustnessStudy, name: str) -> float:
     return float(np.median(factor_values(study.draws)[name]))
 
 
+@pytest.mark.slow
 def test_one_cause_of_failing_is_found_and_counted() -> None:
     bias = factor_values(made_up(300).draws)["torque_bias"]
     high = float(np.quantile(bias, 0.6))
@@ -725,6 +727,7 @@ def test_two_causes_that_only_work_together_are_found_as_a_pair(opposite: bool) 
         assert "For completing no single quantity matters beyond chance." in told
 
 
+@pytest.mark.slow
 def test_failures_by_chance_are_explained_by_nothing() -> None:
     """But for the one in twenty that chance is allowed, for single quantities and for pairs."""
     rng, values = np.random.default_rng(5), factor_values(made_up(300).draws)
@@ -754,6 +757,7 @@ def test_the_auc_interval_covers_the_truth() -> None:
     assert 0.5 < clear.low < 1 == clear.high
 
 
+@pytest.mark.slow
 def test_all_failing_or_none_needs_no_explanation() -> None:
     for fails in (True, False):
         study = with_failures(lambda one, luck, fails=fails: fails, 20)
@@ -781,6 +785,7 @@ def test_failures_are_counted_and_never_dropped() -> None:
     assert strict.success.value < study.success.value
 
 
+@pytest.mark.slow
 def test_tables_and_pages_of_extreme_studies() -> None:
     for study in (
         made_up(1),
@@ -797,6 +802,7 @@ def test_tables_and_pages_of_extreme_studies() -> None:
         json.dumps(jsonable(study.summary), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     words = ["analyze", "robustness", "paper", "--runs", "3", "--seed", "5", "--out", str(out)]

@@ -333,6 +333,7 @@ def test_the_torque_limit_clips_and_is_counted() -> None:
     assert free.summary["counts"]["saturated_steps"] == 0
 
 
+@pytest.mark.slow
 def test_a_speed_limit_that_the_motion_exceeds_makes_it_late() -> None:
     slow = run(*ON, "duration=3", "actuator.speed_limit=0.3")
     assert slow.status == "completed"
@@ -388,6 +389,7 @@ def test_the_parameters_are_found_from_the_reports(kind: str) -> None:
     assert np.abs((found - true) / scale).max() < (0.01 if kind == "exact" else 0.5)
 
 
+@pytest.mark.slow
 def test_lost_and_late_measurements_cost_little() -> None:
     sensor = ("sensor.loss=0.3", "sensor.delay=0.25", "sensor.seed=5")
     more = (*ON, *UNKNOWN, "duration=6")
@@ -487,6 +489,7 @@ def test_servos_do_not_follow_what_is_no_number() -> None:
         ("servo_feedforward", (*ON, *UNKNOWN, "plant.gravity=true"), 0.2),
     ],
 )
+@pytest.mark.slow
 def test_what_servos_reach_across_the_paper_s_delay(
     controller: str, more: tuple[str, ...], most: float
 ) -> None:

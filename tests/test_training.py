@@ -260,6 +260,7 @@ def _no_torch(name, *rest, _import=__import__):
 # ---------------------------------------------------------------- the command
 
 
+@pytest.mark.slow
 def test_the_command_writes_network_figures_and_summary(tmp_path, capsys):
     toy_data(cells=3).to_netcdf(tmp_path / "dataset.nc", engine="h5netcdf")
     out = tmp_path / "new" / "net.json"

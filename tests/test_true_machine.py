@@ -78,6 +78,7 @@ def test_a_step_in_which_friction_makes_cranks_tremble_is_told() -> None:
     assert said(heavy, "plant.kind=exact") == said("plant.coulomb_friction=2e-3") == said() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("controller", ["predictor_lqi", "adaptive_lqi"])
 def test_friction_is_found_where_it_is_asked_for(controller: str) -> None:
     """Without it is taken for bias and damping, which it is not, and the run is lost or bad."""

@@ -198,6 +198,7 @@ def test_a_run_stopped_before_its_first_sample_can_be_drawn(run: sd.SimulationRe
     weights_figure({"nothing": nothing}).draw_without_rendering()
 
 
+@pytest.mark.slow
 def test_weights_are_shown_where_a_network_set_them(
     run: sd.SimulationResult, tmp_path: Path
 ) -> None:

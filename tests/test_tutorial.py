@@ -71,6 +71,7 @@ def summary(name: str) -> dict:
     return json.loads(Path(f"out/{name}/summary.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_machine_and_a_motion_of_one_s_own(do):
     told = do(OTHERS)
     run = summary("waves")
@@ -101,6 +102,7 @@ def test_a_machine_and_a_motion_of_one_s_own(do):
     assert real.startswith(sample), "the output that the text shows"
 
 
+@pytest.mark.slow
 def test_from_a_lost_run_to_full_amplitude(do):
     do(IDENTIFICATION)
     lost, half, full = (summary(name) for name in ("lost", "half", "full"))

@@ -211,6 +211,7 @@ def test_the_exit_of_a_heave_is_where_the_travel_says() -> None:
         prepare(heave(0.2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("later", "fits"), [(-1e-3, True), (1e-3, False)])
 def test_a_motion_is_checked_up_to_its_end_and_not_beyond(later: float, fits: bool) -> None:
     leaves = math.asin(travel(PAPER)[5].high / 0.2)
@@ -320,6 +321,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stewart_drake.studies.workspace_map._ROUGH", 15)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_the_command_writes_a_table_a_page_and_a_summary(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -116,6 +116,7 @@ def test_who_looks_on_changes_nothing() -> None:
     assert ratio_of(plain.weights[3]) == pytest.approx(-1.5)
 
 
+@pytest.mark.slow
 def test_data_go_on_where_they_stopped(tmp_path: Path) -> None:
     settings = ("duration=1",)
     first = make_curves("N2", tmp_path, number=10, seed=3, settings=settings, workers=1)
@@ -177,6 +178,7 @@ def test_the_loss_is_the_regret_between_the_ratios() -> None:
     assert found == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_network_learns_to_lose_little_where_it_was_not_trained() -> None:
     curves = synthetic(120)
     one = trainer(curves)
@@ -189,6 +191,7 @@ def test_a_network_learns_to_lose_little_where_it_was_not_trained() -> None:
     assert np.prod(network(np.zeros(18))) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_network() -> None:
     curves = synthetic(30)
     found = [(one := trainer(curves, seed)).fit(one.start, [one.rows], 1) for seed in (4, 4, 5)]
@@ -267,6 +270,7 @@ def test_intervals_cover_what_they_should() -> None:
     assert 0.9 <= held / 200 <= 0.99
 
 
+@pytest.mark.slow
 def test_data_training_and_worth_by_commands(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     short = ["--set", "duration=1", "--workers", "1", "--quiet"]
