@@ -94,6 +94,7 @@ def kill_dataset(number: int, tmp_path: Path) -> None:
     assert killed_hash == whole_hash
 
 
+@pytest.mark.slow
 def test_a_data_set_survives_kill_9(tmp_path):
     kill_dataset(KILLS, tmp_path)
 
@@ -111,6 +112,7 @@ def kill_study(number: int, tmp_path: Path) -> None:
     assert one == other
 
 
+@pytest.mark.slow
 def test_a_monte_carlo_survives_kill_9(tmp_path):
     kill_study(KILLS, tmp_path)
 

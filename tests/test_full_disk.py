@@ -58,6 +58,7 @@ def fill(folder: Path) -> None:
             file.write(bytes(4096))
 
 
+@pytest.mark.slow
 def test_a_full_disk_stops_a_data_set_that_then_goes_on(tmp_path):
     whole, disk = tmp_path / "whole", tmp_path / "disk"
     little_dataset(whole)

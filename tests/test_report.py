@@ -33,6 +33,8 @@ from tests.test_network import small_network
 EXACT = ("plant.kind=exact",)
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
 
+pytestmark = pytest.mark.slow  # one report of all there is, which most of them look at
+
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory) -> Path:
@@ -74,7 +76,6 @@ def text_of(html: str) -> str:
 # ---------------------------------------------------------------- what it holds
 
 
-@pytest.mark.slow
 def test_there_are_three_files_and_no_half_ones(report):
     assert sorted(os.listdir(report)) == ["replay.html", "report.html", "summary.json"]
 
@@ -85,7 +86,6 @@ def test_without_its_replay_the_page_is_small(report, html):
     assert inside and len(html) - len(inside[1]) < 2.2e6
 
 
-@pytest.mark.slow
 def test_the_summary_agrees_with_the_commands_of_their_own(summary, tmp_path, capsys):
     assert main(["simulate", "paper", *SETTINGS, "--json"]) == 0
     own = json.loads(capsys.readouterr().out)
@@ -211,7 +211,6 @@ def test_a_run_that_ends_early_is_told_at_once():
     assert "mine" in page.title and "<h1>" in html_of(page, Provenance("command"))
 
 
-@pytest.mark.slow
 def test_who_completes_is_told_and_how_the_delay_was_found():
     settings = ("plant.kind=exact", "duration=2.5", "controller.delay_steps=6")
     lost, found = (
@@ -238,7 +237,6 @@ def test_no_line_is_broken_before_a_unit_or_in_it():
             assert all(len(line) <= 80 for line in lines)
 
 
-@pytest.mark.slow
 def test_what_is_not_plain_is_told_at_the_top():
     plain = {"mechanism", "reference", "delay", "plant", "controller", "start"}
     for controller, settings, told in (
@@ -260,7 +258,6 @@ def test_what_is_not_plain_is_told_at_the_top():
         assert ("sent ahead" in facts["controller"]) == (controller == "servo_preview")
 
 
-@pytest.mark.slow
 def test_a_motion_out_of_reach_gets_a_report_without_runs(tmp_path, capsys, monkeypatch):
     def only_workspace(scenario, scenarios, progress):
         assert not scenarios

@@ -44,6 +44,7 @@ def test_ctrl_c_ends_it_with_nothing_written(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_kill_9_leaves_no_half_page(tmp_path):
     """Killed at some moment while pages of several MB are written over and over."""
     document = Document("t", "v", [Section("s", Listing("x" * 20_000_000))])

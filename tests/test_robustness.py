@@ -327,6 +327,7 @@ def test_what_the_link_does_is_drawn_too() -> None:
     assert 0 <= loss.min() < 0.02 and 0.28 < loss.max() <= 0.3
 
 
+@pytest.mark.slow
 def test_other_controllers_run_the_same_machines(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
