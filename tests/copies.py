@@ -20,7 +20,18 @@ PATIENCE = 180.0
 """s after which a copy that does not begin, or does not end, is taken to hang."""
 
 _server = get_context("forkserver")
-_server.set_forkserver_preload(["pytest", "stewart_drake.cli", "stewart_drake.loop.simulation"])
+_server.set_forkserver_preload(
+    [
+        "hypothesis",
+        "pytest",
+        "h5netcdf",
+        "matplotlib.pyplot",
+        "stewart_drake.cli",
+        "stewart_drake.report.csv_file",
+        "stewart_drake.studies.robustness",
+        "stewart_drake.tuning.dataset",
+    ]
+)
 
 
 @contextmanager

@@ -46,6 +46,7 @@ def scene(tab: Browser) -> np.ndarray:
     return tab.screenshot()[60:620, 380:900]
 
 
+@pytest.mark.slow
 def test_it_loads_without_an_error_and_without_a_network(replay):
     seek(replay, 1.0)
     assert replay.errors == []

@@ -256,7 +256,8 @@ def test_a_run_tells_the_margin_of_its_loop() -> None:
     assert set(told) == {
         "stable", "spectral_radius", "delay_margin_s", "gain_margin", "growth"
     }  # fmt: skip
-    assert told == judged(short).summary
+    for name, value in judged(short).summary.items():  # threads of BLAS round as they like
+        np.testing.assert_allclose(told[name], value, rtol=1e-9, err_msg=name)
     assert told["stable"] and told["spectral_radius"] < 1
     down, up = told["gain_margin"]
     assert 0 < down < 1 < up

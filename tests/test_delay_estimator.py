@@ -182,6 +182,7 @@ def test_a_torque_that_is_early_or_late_does_what_the_filter_says(eta: float) ->
     assert not np.any(found.others)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("jitter", "least", "most"), [(0.0, 0.0, 3e-4), (3e-3, 1.5e-3, 4.5e-3)])
 def test_how_early_or_late_single_torques_come_is_found(
     jitter: float, least: float, most: float

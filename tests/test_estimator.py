@@ -278,6 +278,7 @@ def test_filter_is_the_batch_least_squares_estimate_where_noise_is_small(fractio
     assert np.abs((batch.x[12:] - result.truth) / std).max() < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [inside, at_bounds])
 def test_errors_of_the_parameters_are_as_large_as_the_filter_says(draw) -> None:  # type: ignore[no-untyped-def]
     """60 runs of 1.5 s, every second one with two torques per period.

@@ -222,6 +222,7 @@ def test_the_controller_in_python_drives_the_machine_in_c(folder: Path) -> None:
     np.testing.assert_allclose(states, simulated(40), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_both_ends_in_c(folder: Path, tmp_path: Path) -> None:
     log, port, key = tmp_path / "log", free_port(), tmp_path / "key"
     key.write_bytes(b"a key of some length\n")
@@ -335,6 +336,7 @@ def kills(folder: Path, number: int, rng: random.Random) -> None:
     assert f"{number} sessions, {number} runs" in running.said
 
 
+@pytest.mark.slow
 def test_a_killed_controller_ends_in_the_safe_torque_and_the_next_one_takes_over(
     folder: Path,
 ) -> None:

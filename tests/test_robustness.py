@@ -142,6 +142,7 @@ def test_too_few_pairs_have_no_correlation() -> None:
     assert math.isnan(statistics.rank_correlation([1, 2, 3], [1, 2, 3]).rho)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("q", [0.5, 0.9])
 @pytest.mark.parametrize("n", [20, 200])
 def test_quantiles_are_covered(n: int, q: float) -> None:
@@ -516,6 +517,7 @@ def told(outcomes: list[Outcome]) -> list[str]:
     return [repr(outcome) for outcome in outcomes]
 
 
+@pytest.mark.slow
 def test_a_resumed_study_equals_an_uninterrupted_one(
     tmp_path: Path, whole: tuple[Path, RobustnessStudy]
 ) -> None:

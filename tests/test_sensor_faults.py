@@ -88,6 +88,7 @@ def test_the_same_under_noise() -> None:
         assert ill.accumulated_error < 1.1 * well.accumulated_error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("controller", CONTROLLERS[:4])
 def test_the_papers_controllers_count_them_too(controller: str) -> None:
     """Without a delay, where they keep the plate."""

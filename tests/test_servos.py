@@ -379,6 +379,7 @@ def test_the_machine_reports_what_has_acted(kind: str) -> None:
     assert len(said.torques) == 2 * layout.parts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
 def test_the_parameters_are_found_from_the_reports(kind: str) -> None:
     result = run(*ON, *UNKNOWN, "duration=4", controller="servo_feedforward", kind=kind)
@@ -588,6 +589,7 @@ def build_closed_loop_with(experiment: Any, own: Any) -> None:
     _add_servos(None, experiment._replace(own=own))  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
 def test_encoders_do_where_the_state_is_not_measured(kind: str) -> None:
     """A payload that nobody told is found through the delay, from crank angles alone."""

@@ -258,6 +258,7 @@ def test_g_is_the_geometric_mean_and_hindsight_has_the_best_of_each() -> None:
     assert s["candidates"][HINDSIGHT]["m"] == pytest.approx(fixed.min(axis=0).mean())
 
 
+@pytest.mark.slow
 def test_intervals_cover_what_they_should() -> None:
     """Of 200 samples of 60 conditions with log J off by -0.1 +- 0.3, 95 % hold the truth."""
     rng, held = np.random.default_rng(5), 0
