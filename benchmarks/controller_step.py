@@ -1,5 +1,6 @@
 """Where the computing time of a closed loop goes: one controller step, one run, one process.
 
+The parts of a step are those of the law in Python, which the law in C does not call.
 Times of steps are medians over a run and its worst step, each the least of several runs. Writes
 benchmarks/results/controller_step.md.
 """
@@ -21,14 +22,19 @@ import numpy as np
 from _page import table, write
 
 import stewart_drake as sd
+from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
+from stewart_drake.law.native_law import Serving
 from stewart_drake.law.observers import NoObserver, ParameterObserver
 from stewart_drake.law.predictors import NonlinearPredictor
+from stewart_drake.loop import controller
 from stewart_drake.native.library import backend
 
 RUNS = 6
+REPEATS = 300
+"""Of an evaluation, 40 times each."""
 SCENARIOS = {"paper": ["duration=10.0"], "gravity": ["duration=2.0"]}
 ESTIMATORS = ("parameters", "none")
 PARTS = {
@@ -45,7 +51,7 @@ PARTS = {
 
 @contextmanager
 def timed_parts() -> Iterator[dict[str, list[float]]]:
-    """Within it, every call of PARTS appends its milliseconds under the part's name."""
+    """Within it the law is Python's, and every call of PARTS appends its ms under its name."""
     spent: dict[str, list[float]] = defaultdict(list)
     originals = {name: getattr(*place) for name, place in PARTS.items()}
 
@@ -61,9 +67,12 @@ def timed_parts() -> Iterator[dict[str, list[float]]]:
 
     for name, place in PARTS.items():
         setattr(*place, timed(name, originals[name]))
+    served = controller.serving
+    controller.serving = lambda law: Serving(law, "python (its parts are timed)")
     try:
         yield spent
     finally:
+        controller.serving = served
         for name, place in PARTS.items():
             setattr(*place, originals[name])
 
@@ -79,13 +88,16 @@ def steps() -> tuple[list[list[str]], list[list[str]]]:
             medians: dict[str, list[float]] = defaultdict(list)
             sd.simulate(scenario)
             for _ in range(RUNS):
+                step_ms = sd.simulate(scenario).summary["controller_step_ms"]
                 with timed_parts() as spent:
-                    step_ms = sd.simulate(scenario).summary["controller_step_ms"]
-                for part, milliseconds in (spent | {k: [v] for k, v in step_ms.items()}).items():
+                    in_python = sd.simulate(scenario).summary["controller_step_ms"]["median"]
+                told = {"Python, median": [in_python], **{k: [v] for k, v in step_ms.items()}}
+                for part, milliseconds in (spent | told).items():
                     medians[part].append(float(np.median(milliseconds)))
             least = {part: f"{min(values):.3g}" for part, values in medians.items()}
             totals.append([name, estimator, least["median"], least["worst"]])
-            parts.append([name, estimator, *(least.get(part, "") for part in PARTS)])
+            named = ("Python, median", *PARTS)
+            parts.append([name, estimator, *(least.get(part, "") for part in named)])
     return totals, parts
 
 
@@ -132,14 +144,14 @@ def evaluations() -> list[list[str]]:
     mechanism = sd.load_mechanism("paper")
     dynamics, pose, rates, torque = sd.StewartDynamics(mechanism), mechanism.home, *np.ones((2, 6))
     dynamics.accelerations(pose, rates, torque)
-    compiled, theta = dynamics._functions.accelerations, dynamics.parameters
+    compiled, theta = dynamics._functions.accelerations, plant_parameters(dynamics.parameters)
     calls: dict[str, Callable[[], object]] = {
         f"the function alone, {backend().name}": compiled.own_buffers().evaluate,
         "with its arguments": lambda: compiled(pose, rates, torque, theta, dynamics.gravity),
         "`StewartDynamics.accelerations`": lambda: dynamics.accelerations(pose, rates, torque),
     }
     least = dict.fromkeys(calls, np.inf)
-    for _ in range(300):
+    for _ in range(REPEATS):
         for name, call in calls.items():
             least[name] = min(least[name], timeit(call, number=40) / 40)
     rows = [[name, f"{1e6 * seconds:.1f} us"] for name, seconds in least.items()]
@@ -162,8 +174,8 @@ def main() -> None:
         [
             "## One step of `predictor_lqi` in the running loop, exact plant, ms\n",
             table(["scenario", "estimator", "median", "worst"], totals),
-            "## Medians of its parts, ms\n",
-            table(["scenario", "estimator", *PARTS], parts),
+            "## The same in Python, medians of the whole and of its parts, ms\n",
+            table(["scenario", "estimator", "all", *PARTS], parts),
             "## Ten simulated seconds of `paper`, s\n",
             table(["what", "s"], walls()),
             "## One evaluation of the accelerations\n",

@@ -33,7 +33,7 @@ ACCURACIES = (1e-4, 1e-5, 1e-6)
 REPEATS = 3
 DELAYS = (0, 8, 16, 30)
 PERIODS = (0.2, 0.1, 0.05, 0.02)
-RUNS = (4, 8, 16)
+RUNS = (100, 400, 1600)
 
 
 def plants() -> Rows:

@@ -441,12 +441,13 @@ def test_a_gamepad_moves_the_reference(quiet_machine):
             tab.call("Page.navigate", url=url)
             tab.wait("window.live !== undefined && window.live.time > 1")
             assert not tab.evaluate("window.live.byHand")
-            tab.evaluate(
-                "window.pressed = 1; navigator.getGamepads = () => [null, { axes: [0, 0, 0, 0], "
-                "buttons: [0, window.pressed, 0, 0, 0, 0, 0, 0].map(value => ({ value })) }]"
+            yaw = "+document.getElementById('s2').value"
+            tab.evaluate(  # let go by itself: beyond the reach it would not be followed
+                f"window.pressed = () => {yaw} > 16 ? 0 : 1; "
+                "navigator.getGamepads = () => [null, { axes: [0, 0, 0, 0], "
+                "buttons: [0, window.pressed(), 0, 0, 0, 0, 0, 0].map(value => ({ value })) }]"
             )
-            tab.wait("window.live.byHand && +document.getElementById('s2').value > 16")
-            tab.evaluate("window.pressed = 0")
+            tab.wait(f"window.live.byHand && {yaw} > 16")
             asked = "[...document.querySelectorAll('#sliders input')].map(input => +input.value)"
             tab.wait(f"{asked}.every((x, k) => Math.abs(x - window.live.wanted[k]) < 0.5)")
             assert tab.evaluate("window.live.wanted[2]") > 15.5  # farther than the motion goes
