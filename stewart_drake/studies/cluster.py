@@ -2,8 +2,9 @@
 
 import asyncio
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import suppress
+from threading import Thread
 from typing import Any, Final, TypeVar
 
 from stewart_drake.files.errors import ConfigError
@@ -34,10 +35,9 @@ def on_cluster(scheduler: str, calls: Sequence[Callable[[], _T]]) -> Generator[_
     untyped: Any = (Client, as_completed)
     connect, in_turn = untyped
     try:
-        with ThreadPoolExecutor(1) as thread:  # this one may have an event loop, as in a notebook
-            thread.submit(asyncio.run, _greet(scheduler)).result()
+        _find(scheduler)
         client = connect(scheduler, timeout=_CONNECT_TIMEOUT, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:  # the last where TLS is not configured
         reason = " ".join(str(error).split())
         raise ConfigError(
             f"--scheduler: got {scheduler!r}; expected the address of a running Dask scheduler, "
@@ -66,13 +66,29 @@ def on_cluster(scheduler: str, calls: Sequence[Callable[[], _T]]) -> Generator[_
 
 # A client that finds nobody leaves a running event loop behind, and is closed by whatever thread
 # happens to collect garbage; where that is the loop of the next client, both wait for each other.
-async def _greet(scheduler: str) -> None:
+def _find(scheduler: str) -> None:
     """Connect once, before there is a client.
 
     Raises:
         OSError: nobody is there.
         ValueError: it is no address.
     """
+    told = Future[None]()
+
+    def find() -> None:
+        try:
+            told.set_result(asyncio.run(_greet(scheduler)))
+        except BaseException as error:
+            told.set_exception(error)  # raised below
+
+    # This thread may have an event loop already, as in a notebook, and Ctrl-C has to end its wait.
+    thread = Thread(target=find, daemon=True)
+    thread.start()
+    thread.join()
+    told.result()
+
+
+async def _greet(scheduler: str) -> None:
     from distributed import Security
     from distributed.comm.core import connect
 
