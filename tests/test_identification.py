@@ -525,6 +525,7 @@ def test_fifty_machines_are_found(tmp_path: Path, poses: bool) -> None:
     found = [find("ranges", seed, motion, poses) for seed in range(50)]
     assert max(abs(one.late) for one in found) < 1e-4
     assert all(0.9 < one.chi2 < 1.1 for one in found)
+    assert max(one.seconds for one in found) < 30
     assert 0.90 < np.nanmean([one.inside for one in found]) < 0.99
     if poses:
         ends = np.array([one.next_runs for one in found])
