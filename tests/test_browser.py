@@ -10,7 +10,7 @@ import stewart_drake as sd
 from stewart_drake.report.replay import write_replay
 from tests.browser import Browser, needs_chromium
 
-pytestmark = needs_chromium
+pytestmark = [needs_chromium, pytest.mark.slow]
 
 SETTINGS = ("plant.kind=exact", "duration=3.0")  # from rest: the plate is far off at first
 
@@ -46,7 +46,6 @@ def scene(tab: Browser) -> np.ndarray:
     return tab.screenshot()[60:620, 380:900]
 
 
-@pytest.mark.slow
 def test_it_loads_without_an_error_and_without_a_network(replay):
     seek(replay, 1.0)
     assert replay.errors == []
@@ -68,7 +67,6 @@ def test_errors_and_requests_would_be_seen(tab, tmp_path):
     assert tab.requests == ["http://127.0.0.1:9/three.png"]
 
 
-@pytest.mark.slow
 def test_the_canvas_shows_a_machine(replay):
     seek(replay, 0.0)
     image = scene(replay)
@@ -78,7 +76,6 @@ def test_the_canvas_shows_a_machine(replay):
     assert ((green > red + 0.15) & (green > blue + 0.05)).sum() > 200, "no green reference"
 
 
-@pytest.mark.slow
 def test_hidden_things_leave_a_blank_canvas(replay):
     """What the test above takes for a machine is one."""
     seek(replay, 0.0)
@@ -90,7 +87,6 @@ def test_hidden_things_leave_a_blank_canvas(replay):
     assert ((green > red + 0.15) & (green > blue + 0.05)).sum() == 0
 
 
-@pytest.mark.slow
 def test_the_animation_advances_by_itself(replay):
     replay.evaluate("player.reset(); player.play()")
     first, image = replay.evaluate("player.time"), scene(replay)
@@ -99,7 +95,6 @@ def test_the_animation_advances_by_itself(replay):
     assert 0 < replay.evaluate("Number(slider.value)") <= 3.0
 
 
-@pytest.mark.slow
 def test_the_button_and_the_space_bar_play_and_pause(replay):
     replay.evaluate("button.click()")
     replay.wait("!player.playing && button.textContent === 'Play'")
@@ -111,7 +106,6 @@ def test_the_button_and_the_space_bar_play_and_pause(replay):
     replay.wait(f"player.playing && player.time > {held}")
 
 
-@pytest.mark.slow
 def test_plate_reference_and_readout_are_where_the_run_had_them(replay, run):
     world = (
         "(path => { const o = viewer.scene_tree.find(path).object; o.updateWorldMatrix(true, true);"
@@ -133,7 +127,6 @@ def test_plate_reference_and_readout_are_where_the_run_had_them(replay, run):
         assert told == pytest.approx(off, rel=0.1, abs=5e-3)
 
 
-@pytest.mark.slow
 def test_cranks_take_the_colour_of_their_torque(replay, run):
     loudest = run.signals.torque_applied.values
     row, leg = np.unravel_index(np.abs(loudest).argmax(), loudest.shape)
@@ -147,7 +140,6 @@ def test_cranks_take_the_colour_of_their_torque(replay, run):
     assert np.ptp(grey) < 1e-6
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(1600, 900), (1000, 700), (375, 640)])
 def test_panels_are_whole_and_leave_the_machine_visible_on_any_screen(tab, page, width, height):
     tab.open(page, width, height)
@@ -172,7 +164,6 @@ def test_panels_are_whole_and_leave_the_machine_visible_on_any_screen(tab, page,
     assert "N m" in tab.evaluate("document.querySelector('#run-about').innerText")
 
 
-@pytest.mark.slow
 def test_the_scene_is_dark_where_the_reader_prefers_it(tab, page):
     brightness = {}
     for scheme in ("light", "dark"):
