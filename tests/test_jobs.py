@@ -338,7 +338,7 @@ def test_an_address_without_a_scheduler_is_refused(tmp_path, monkeypatch):
 
     monkeypatch.setattr(backend, "_CONNECT_TIMEOUT", 0.2)
     before = set(threading.enumerate())
-    for address in ("nonsense", "tcp://127.0.0.1:1", "tls://127.0.0.1:1"):
+    for address in ("", "nonsense", "tcp://127.0.0.1:1", "tls://127.0.0.1:1"):
         with pytest.raises(
             ConfigError, match=r"--scheduler: got .* expected the address"
         ) as caught:

@@ -113,7 +113,9 @@ def run_jobs(
         _check_manifest(folder, settings, suffix)
         found = _kept(paths, read)
         calls = [partial(_named, k, function, job) for k, job in jobs.items() if k not in found]
-        made = on_cluster(scheduler, calls) if scheduler else _on_this_machine(workers, calls)
+        made = (
+            _on_this_machine(workers, calls) if scheduler is None else on_cluster(scheduler, calls)
+        )
         tell = progress or (lambda *_: None)
         tell(len(found), len(jobs))
         with closing(made):
