@@ -96,6 +96,19 @@ def test_a_target_outside_is_approached_as_far_as_it_goes():
     assert LEAST_MARGIN <= margin(one.dynamics.mechanism, end.state[POSE]) < LEAST_MARGIN + 0.02
 
 
+@pytest.mark.parametrize("far", [1e3, 1e303])
+def test_a_huge_target_takes_as_few_looks_ahead_as_a_near_one(far, monkeypatch):
+    one = governor()
+    looks, within = [], Governor._within
+    monkeypatch.setattr(
+        Governor, "_within", lambda self, states: looks.append(1) or within(self, states)
+    )
+    home = one.dynamics.mechanism.home
+    governed = one.follow(at_rest(home), np.array([0, 0, 0, 0, 0, far]))
+    assert 0 < len(looks) <= 20
+    assert governed.applied[5] > home[5] + 0.01 and governed.limit
+
+
 def test_coordinates_that_can_go_on_do_where_another_cannot():
     one = governor()
     home, tilted = one.dynamics.mechanism.home, np.array([0.3, 0, 0, 0, 0, 0])

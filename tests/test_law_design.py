@@ -62,6 +62,19 @@ def test_it_is_the_law_of_the_scenario(fraction):
     assert np.abs(diagram.GetOutputPort("state").Eval(context)[POSE] - wanted).max() < 0.1
 
 
+@pytest.mark.parametrize("gravity", [False, True])
+def test_the_plate_stays_where_it_is_until_the_first_torque_acts(gravity):
+    """Without a word about the queue, with gravity too."""
+    dynamics = sd.StewartDynamics(PAPER, gravity)
+    motion = PiecewisePolynomial(PAPER.home.reshape(6, 1))
+    law = sd.design_law(dynamics, motion, period=0.01, delay=0.05)
+    rest = np.concatenate([PAPER.home, np.zeros(6)])
+    states = dynamics.predict(rest, law.queue, 0.01)
+    assert np.abs(states[-1] - rest).max() < 1e-6
+    fallen = sd.design_law(dynamics, motion, period=0.01, delay=0.05, queue="zero")
+    assert not fallen.queue.any()
+
+
 def test_repr_and_parts():
     law = law_of(sd.load_scenario("paper"))
     assert repr(law).startswith("DesignedLaw(every 0.1 s, delay 0.8 s, ")

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import socket
 import threading
 import time
 import urllib.error
@@ -24,11 +25,12 @@ from stewart_drake.live.loop import LiveLoop, Nobody, Seen
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.page import Asked, PageViewer, read_wish
 from stewart_drake.live.protocol import NOTHING, ControllerMessage, MachineFlags
-from stewart_drake.live.session import check_armed, drive, plans, prepare_session
+from stewart_drake.live.session import _queue_advice, check_armed, drive, plans, prepare_session
 from stewart_drake.live.steering import Steering, Way, Wish
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.report.style import FACTORS
+from stewart_drake.report.viewer import slider_range
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
@@ -297,6 +299,14 @@ def test_a_law_that_is_too_slow_for_its_period_says_so_before_it_starts(quiet_ma
     ]
 
 
+@pytest.mark.parametrize(("gravity", "better"), [("false", "zero"), ("true", "equilibrium")])
+def test_the_advised_queue_holds_the_plate(offer, gravity, better):
+    message, link = offer
+    made = as_seen(scenario_of(f"plant.gravity={gravity}"), link, message)
+    advised = _queue_advice(made)
+    assert advised is not None and f"--set queue={better}," in advised
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("settings", "said"), [((), True), (FROM_REST, False)])
 def test_torques_in_flight_that_end_too_soon_are_told(quiet_machine, settings, said):
@@ -372,6 +382,10 @@ def test_round_trips_and_losses_are_those_of_the_link(offer):
         b'{"target": [1, 2, 3, 4, 5, true]}',
         b'{"stop": 1}',
         b'{"target": "home"}',
+        b'{"target": [0, 0, 0, 0, 0, %s]}' % (b"9" * 400),
+        b'{"target": [0, 0, 0, 0, 0, %s]}' % (b"9" * 4400),
+        b"[" * 3000,
+        b'{"target": ' + b"[" * 3000,
     ],
 )
 def test_what_is_no_wish_is_refused(data):
@@ -407,11 +421,40 @@ def test_the_page_does_what_its_own_buttons_ask_for_and_nobody_else():
         assert viewer.wish() == Wish() and not viewer.stopped()
         assert ask({"X-Token": token}) == 200
         np.testing.assert_allclose(viewer.wish().target, [0, 0, 0, 0, 0, 0.4])
+        assert ask({"X-Token": token}, b'{"target": [1e303, -1e303, 0, 0, 0, 400]}') == 200
+        low, high = slider_range(load_mechanism("paper")) / FACTORS
+        np.testing.assert_allclose(viewer.wish().target, [high[0], low[1], 0, 0, 0, 0.4])
         assert ask({"X-Token": token}, b'{"stop": true}') == 200
         viewer.wish()
         assert viewer.stopped()
     finally:
         viewer.close()
+
+
+@pytest.mark.slow
+def test_the_page_answers_any_request_without_a_traceback(capfd):
+    viewer = PageViewer(load_mechanism("paper"), "live: a test")
+    try:
+        address, token = viewer.opened().split("/?token=")
+        host, port = address.removeprefix("http://").split(":")
+
+        def answer(text):
+            with socket.create_connection((host, int(port)), 10.0) as connection:
+                connection.sendall(text.encode())
+                connection.shutdown(socket.SHUT_WR)
+                return connection.recv(4096).split()[1:2]
+
+        known = f"Host: {host}:{port}\r\nX-Token: {token}\r\n"
+        for body in ("[" * 3000, f'{{"target": [0, 0, 0, 0, 0, {"9" * 400}]}}'):
+            asked = f"POST /wish HTTP/1.0\r\n{known}Content-Length: {len(body)}\r\n\r\n{body}"
+            assert answer(asked) == [b"400"]
+        longest = "9" * 5000
+        asked = f"POST /wish HTTP/1.0\r\n{known}Content-Length: {longest}\r\n\r\n"
+        assert answer(asked) == [b"413"]
+        assert answer(f"GET http://[ HTTP/1.0\r\n{known}\r\n") == [b"400"]
+    finally:
+        viewer.close()
+    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.slow

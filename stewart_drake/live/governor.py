@@ -58,6 +58,8 @@ _FINE, _COARSE, _UNTIL = 0.1, 0.5, 6.0
 """Steps of w t of the look ahead, before and after `_UNTIL`."""
 _CLOSE: Final = 2e-4
 """rad, and shares of the reach, to which it is found how far a target can be approached."""
+_FARTHEST: Final = 4.0
+"""The same, from home: farther targets are clipped to it. No machine travels that far."""
 _THERE: Final = 1e-6
 """The same, within which it is reached."""
 _BLENDS: Final = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
@@ -164,6 +166,10 @@ class Governor:
 
     def follow(self, governed: Governed, target: Array) -> Governed:
         """With g moved towards a target (6,) as far as the limits let it; the state is the same."""
+        # A huge target would take a bisection per factor of two, and overflow.
+        reach = _FARTHEST * self._size
+        home = self.dynamics.mechanism.home
+        target = np.clip(target, home - reach, home + reach)
         away = target - governed.applied
         if np.abs(away / self._size).max() <= _THERE:
             return governed._replace(applied=np.array(target), limit=None)

@@ -10,6 +10,7 @@ import json
 import logging
 import multiprocessing
 import secrets
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -169,19 +170,21 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     scene, board = Scene(mechanism, meshcat), _Board()
     token, lock = secrets.token_urlsafe(24), threading.Lock()
 
+    low, high = slider_range(mechanism)
+
     def ask(asked: Asked) -> None:
+        if asked.target is not None:
+            asked = asked._replace(target=np.clip(asked.target, low / FACTORS, high / FACTORS))
         with lock, suppress(OSError):
             connection.send(asked)
 
-    low, high = slider_range(mechanism)
     sliders = [
         {"name": name, "unit": "deg" if i < 3 else "mm", "low": low[i], "high": high[i]}
         for i, name in enumerate(COORDINATE_NAMES)
     ]
     page = environment().get_template("live.html.j2")
     text = page.render(title=title, meshcat=meshcat.web_url(), token=token, sliders=sliders)
-    server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(text, token, board, ask))
-    server.daemon_threads = True
+    server = _Server(("127.0.0.1", 0), _handler(text, token, board, ask))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     with lock:
         connection.send(Opened(f"http://127.0.0.1:{server.server_port}/?token={token}"))
@@ -235,6 +238,15 @@ def _words(seen: Seen) -> dict[str, Any]:
     }
 
 
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Report what goes wrong, but for a browser that closes its connection."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
+
 def _handler(text: str, token: str, board: _Board, ask: Any) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         def log_message(self, *_: Any) -> None:
@@ -251,7 +263,11 @@ def _handler(text: str, token: str, board: _Board, ask: Any) -> type[BaseHTTPReq
             return good
 
         def do_GET(self) -> None:
-            parts = urlsplit(self.path)
+            try:
+                parts = urlsplit(self.path)
+            except ValueError:  # such as http://[
+                self.send_error(400)
+                return
             if not self._allowed(parse_qs(parts.query).get("token", [""])[0]):
                 return
             if parts.path == "/":
@@ -265,7 +281,9 @@ def _handler(text: str, token: str, board: _Board, ask: Any) -> type[BaseHTTPReq
             if not self._allowed(self.headers.get("X-Token", "")):
                 return
             length = self.headers.get("Content-Length", "")
-            if not length.isdecimal() or int(length) > _LONGEST:
+            # Python refuses to convert thousands of digits.
+            few = len(length) <= len(str(_LONGEST))
+            if not (few and length.isdecimal() and int(length) <= _LONGEST):
                 self.send_error(413)
                 return
             asked = read_wish(self.rfile.read(int(length)))
@@ -312,7 +330,7 @@ def read_wish(data: bytes) -> Asked | None:
     """
     try:
         found = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):  # thousands of brackets
         return None
     if not isinstance(found, dict) or not isinstance(found.get("stop", False), bool):
         return None
@@ -322,5 +340,8 @@ def read_wish(data: bytes) -> Asked | None:
     numbers = isinstance(target, list) and len(target) == NUM_COORDINATES
     if not numbers or not all(type(x) in (int, float) for x in target):
         return None
-    pose = np.array(target, dtype=np.float64) / FACTORS
+    try:
+        pose = np.array(target, dtype=np.float64) / FACTORS
+    except OverflowError:  # an integer of hundreds of digits
+        return None
     return Asked(pose, found.get("stop", False)) if np.all(np.isfinite(pose)) else None

@@ -110,12 +110,19 @@ def _cautions(made: Design) -> list[str]:
     lines = [
         f"law: {backend}, a step takes {1e3 * step:.1f} ms of a period of {1e3 * period:g} ms{slow}"
     ]
-    if isinstance(sc.link, NetworkConfig) and sc.queue == "reference":
-        lines.append(
-            "queue: reference ends with the machine's own link, and its buffer is dry until this "
-            "controller's torques act: better --set start=rest --set queue=zero, on both sides"
-        )
-    return lines
+    advice = _queue_advice(sc)
+    return lines if advice is None else [*lines, advice]
+
+
+def _queue_advice(scenario: Scenario) -> str | None:
+    """Return the line about a queue that is too short over a network, or None."""
+    if not isinstance(scenario.link, NetworkConfig) or scenario.queue != "reference":
+        return None
+    better = "equilibrium" if scenario.plant.gravity else "zero"  # zero lets the plate fall
+    return (
+        "queue: reference ends with the machine's own link, and its buffer is dry until this "
+        f"controller's torques act: better --set start=rest --set queue={better}, on both sides"
+    )
 
 
 def check_armed(ready: Ready, armed: bool) -> None:

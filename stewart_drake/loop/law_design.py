@@ -97,7 +97,7 @@ def design_law(
     delay: float,
     *,
     start: ArrayLike | None = None,
-    queue: Literal["zero", "equilibrium", "reference"] = "zero",
+    queue: Literal["zero", "equilibrium", "reference"] | None = None,
     noise_std: ArrayLike = (0.0,) * NUM_STATE,
     torque_limit: float | None = None,
     horizon: float | None = None,
@@ -113,7 +113,8 @@ def design_law(
         delay: between computing a torque and feeling it, s, as the law believes.
         start: (12,) pose and rates at t = 0 from which a way onto the reference is planned; None is
             on the reference.
-        queue: torques in flight at t = 0.
+        queue: torques in flight at t = 0, as a scenario's `queue`; None is `zero` without gravity
+            and `equilibrium` with it, where the plate would otherwise fall during the first delay.
         noise_std: (12,) of the measurement, rad, m and per s.
         torque_limit: of each motor, N m; None is the mechanism's, if it has one.
         horizon: s of the reference that weights and steps are chosen by; None is its end, or 10 s.
@@ -133,7 +134,7 @@ def design_law(
     sections = {
         "duration": horizon,
         "start": "on_reference" if start is None else "rest",
-        "queue": queue,
+        "queue": ("zero" if dynamics.gravity == 0 else "equilibrium") if queue is None else queue,
         "plant": {"kind": "exact", "gravity": dynamics.gravity != 0},
         "delay": dataclasses.asdict(believed),
         "controller": chosen
