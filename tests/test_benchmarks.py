@@ -48,3 +48,37 @@ def test_one_evaluation_is_timed(monkeypatch):
     monkeypatch.setattr(steps, "REPEATS", 1)
     rows = steps.evaluations()
     assert len(rows) == 4 and all(float(value.split()[0]) > 0 for _, value in rows)
+
+
+def test_every_claim_has_a_name_and_settings_that_load(monkeypatch, tmp_path):
+    claims = script("claims", monkeypatch)
+    rows = [row for make in claims.SECTIONS.values() for row in make()]
+    assert len({row.name for row in rows}) == len(rows) > 200
+    for row in rows:
+        claims.scenario_of(row, claims.SEEDS[0], str(tmp_path))
+
+
+def test_a_bias_of_the_claims_has_random_signs(monkeypatch, tmp_path):
+    claims = script("claims", monkeypatch)
+    row = claims.chosen_rows(["bias-noise"])["bias-noise"]
+    scenarios = [claims.scenario_of(row, seed, str(tmp_path)) for seed in claims.SEEDS]
+    biases = {tuple(scenario.plant.torque_bias) for scenario in scenarios}
+    assert len(biases) > 10 and all(abs(b) == 3e-4 for bias in biases for b in bias)
+    assert len({scenario.sensor.seed for scenario in scenarios}) == len(claims.SEEDS) == 20
+
+
+def test_a_row_counts_lost_runs(monkeypatch):
+    claims = script("claims", monkeypatch)
+    found = {"E_ac": [1.0, None, 3.0], "lost_at": [1.234]}
+    assert claims.numbers(found) == ["3", "3", "2", "1.4", "3", "1, from 1.23 s on"]
+    found = {"E_ac": [None, None, 3.0], "lost_at": [2.0, 1.5]}
+    assert claims.numbers(found) == ["3", "lost", "3", "-", "3", "2, from 1.50 s on"]
+
+
+def test_a_push_of_the_claims_moves_the_plate(monkeypatch):
+    claims = script("claims", monkeypatch)
+    short = (*claims.ON, "duration=1.5")
+    calm = claims.Row("calm", "", short)
+    pushed = claims.Row("pushed", "", short, force=0.05, span=(0.5, 9.0))
+    (clean, _), (moved, _) = claims.run(calm, 0), claims.run(pushed, 0)
+    assert moved > 10 * clean
