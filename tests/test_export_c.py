@@ -52,7 +52,7 @@ def exported(folder: Path, name: str, settings: tuple[str, ...], single: bool = 
 def made(folder: Path, target: str, *variables: str) -> str:
     """What make says; it must succeed."""
     done = subprocess.run(
-        ["make", "-s", target, *variables], cwd=folder, capture_output=True, text=True
+        ["make", "-s", *target.split(), *variables], cwd=folder, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -74,6 +74,34 @@ def test_the_replay_is_exact(case: str, tmp_path: Path) -> None:
     seen = {int(status) for status in statuses.split(",")}
     for bit in BITS.get(case, ()):
         assert any(status & bit for status in seen)
+
+
+@pytest.mark.slow
+def test_gravity_is_exported_as_it_is_shipped(tmp_path: Path) -> None:
+    """Its plant with steps of 1 ms, which the loop is unstable with, is no part of the controller."""
+    scenario = load_scenario("gravity", settings=("duration=1.7",))
+    assert scenario.plant.kind == "multibody"
+    export_c.write(export_c.exported(scenario, measured=False), tmp_path)
+    said = made(tmp_path, "test")
+    assert said.startswith("100 steps") and "statuses that differ: 0" in said
+
+
+@pytest.mark.parametrize("option", ["-ffast-math", "-ffinite-math-only"])
+def test_compiling_without_checks_for_nan_is_refused(
+    option: str, tmp_path: Path, compiler: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of every source of the controller, and of the package's own library."""
+    for source in (name for name in export_c.SOURCES if name.endswith(".c")):
+        done = subprocess.run(
+            [*compiler, "-std=c99", option, "-fsyntax-only", str(build.FOLDER / source)],
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode != 0 and "compile without -ffast-math" in done.stderr, source
+    monkeypatch.setenv("CC", f"{compiler[0]} {option}")
+    problem = build.compile_library(tmp_path / "library.so")
+    assert problem is not None and "compile without -ffast-math" in problem
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.soak

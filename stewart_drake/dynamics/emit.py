@@ -11,11 +11,11 @@ _UNARY: Final = {
     ca.OP_INV: "1 / {0}",
     ca.OP_SQ: "{0} * {0}",
     ca.OP_TWICE: "2 * {0}",
-    ca.OP_SQRT: "sqrt({0})",
-    ca.OP_SIN: "sin({0})",
-    ca.OP_COS: "cos({0})",
-    ca.OP_ACOS: "acos({0})",
-    ca.OP_FABS: "fabs({0})",
+    ca.OP_SQRT: "REAL(sqrt)({0})",
+    ca.OP_SIN: "REAL(sin)({0})",
+    ca.OP_COS: "REAL(cos)({0})",
+    ca.OP_ACOS: "REAL(acos)({0})",
+    ca.OP_FABS: "REAL(fabs)({0})",
     ca.OP_SIGN: "SIGN({0})",
     ca.OP_NOT: "!{0}",
 }
@@ -30,7 +30,7 @@ _BINARY: Final = {
     ca.OP_NE: "{0} != {1}",
     ca.OP_FMIN: "MIN({0}, {1})",
     ca.OP_FMAX: "MAX({0}, {1})",
-    ca.OP_ATAN2: "atan2({0}, {1})",
+    ca.OP_ATAN2: "REAL(atan2)({0}, {1})",
 }
 _FORMS: Final = _UNARY | _BINARY
 

@@ -1,7 +1,6 @@
 /* The dynamics of a mechanism: see dynamics.h. What is long is written by a program, in equations.h. */
 
 #include <string.h>
-#include <tgmath.h>
 
 #include "dynamics.h"
 
@@ -19,7 +18,7 @@
 static void slips(const real *crank_rates, const real *parameters, real *slip)
 {
     for (int leg = 0; leg < NUM_LEGS; leg++)
-        slip[leg] = tanh(crank_rates[leg] / parameters[COULOMB_SPEED]);
+        slip[leg] = REAL(tanh)(crank_rates[leg] / parameters[COULOMB_SPEED]);
 }
 
 /* Plate and legs, summed, B' by columns, rates and slips of the cranks. */

@@ -14,20 +14,20 @@ typedef const real fixed;
 
 static void plate_motion(fixed *restrict pose, fixed *restrict rates, fixed *restrict parameters, fixed *restrict gravity, fixed *restrict common, real *restrict plate, real *restrict sums)
 {
-    fixed a1 = cos(pose[2]);
-    fixed a3 = cos(pose[1]);
+    fixed a1 = REAL(cos)(pose[2]);
+    fixed a3 = REAL(cos)(pose[1]);
     fixed a4 = a1 * a3;
     plate[0] = a4;
-    fixed a6 = sin(pose[2]);
+    fixed a6 = REAL(sin)(pose[2]);
     fixed a7 = a6 * a3;
     plate[1] = a7;
-    fixed a9 = sin(pose[1]);
+    fixed a9 = REAL(sin)(pose[1]);
     fixed a10 = -a9;
     plate[2] = a10;
     fixed a12 = a1 * a9;
-    fixed a14 = sin(pose[0]);
+    fixed a14 = REAL(sin)(pose[0]);
     fixed a15 = a12 * a14;
-    fixed a16 = cos(pose[0]);
+    fixed a16 = REAL(cos)(pose[0]);
     fixed a17 = a6 * a16;
     fixed a18 = a15 - a17;
     plate[3] = a18;
@@ -348,7 +348,7 @@ static void leg_motion(fixed *restrict plate, fixed *restrict common, fixed *res
         fixed a91 = a90 + a32;
         fixed a92 = a91 - a28;
         fixed a93 = 2 * legs[0 + leg];
-        fixed a94 = sqrt(a80);
+        fixed a94 = REAL(sqrt)(a80);
         fixed a95 = a93 * a94;
         fixed a96 = a92 / a95;
         fixed a97 = a96 * a96;
@@ -371,10 +371,10 @@ static void leg_motion(fixed *restrict plate, fixed *restrict common, fixed *res
         fixed a120 = a119 - a101;
         fixed a121 = a118 * a120;
         fixed a122 = a97 + a121;
-        fixed a123 = sqrt(a122);
+        fixed a123 = REAL(sqrt)(a122);
         fixed a124 = a96 / a123;
         fixed a125 = a69 * a124;
-        fixed a127 = sqrt(a121);
+        fixed a127 = REAL(sqrt)(a121);
         fixed a128 = legs[12 + leg] * a127;
         fixed a129 = a128 / a123;
         fixed a130 = a78 * a129;
@@ -392,7 +392,7 @@ static void leg_motion(fixed *restrict plate, fixed *restrict common, fixed *res
         fixed a142 = a141 * a141;
         fixed a143 = a135 + a142;
         fixed a144 = a143 + a89;
-        fixed a145 = sqrt(a144);
+        fixed a145 = REAL(sqrt)(a144);
         fixed a146 = a134 / a145;
         fixed a147 = a141 / a145;
         fixed a148 = a147 * a132;
@@ -426,7 +426,7 @@ static void leg_motion(fixed *restrict plate, fixed *restrict common, fixed *res
         fixed a177 = common[9] * a176;
         fixed a178 = a161 + a177;
         fixed a179 = (real)1.0 + a157;
-        fixed a182 = sqrt(a166);
+        fixed a182 = REAL(sqrt)(a166);
         fixed a183 = a146 / a182;
         fixed a184 = a183 * a163;
         fixed a185 = a184 / legs[6 + leg];
@@ -1033,18 +1033,18 @@ static void leg_motion(fixed *restrict plate, fixed *restrict common, fixed *res
 
 static void solve_accelerations(fixed *restrict pose, fixed *restrict rates, fixed *restrict torque, fixed *restrict parameters, fixed *restrict crank_rates, fixed *restrict slip, fixed *restrict sums, fixed *restrict arms, real *restrict accelerations)
 {
-    fixed a1 = cos(pose[2]);
-    fixed a3 = cos(pose[1]);
+    fixed a1 = REAL(cos)(pose[2]);
+    fixed a3 = REAL(cos)(pose[1]);
     fixed a4 = a1 * a3;
     fixed a5 = a4 * a4;
-    fixed a6 = sin(pose[2]);
+    fixed a6 = REAL(sin)(pose[2]);
     fixed a7 = a6 * a3;
     fixed a8 = a7 * a7;
     fixed a9 = a5 + a8;
-    fixed a10 = sin(pose[1]);
+    fixed a10 = REAL(sin)(pose[1]);
     fixed a11 = a10 * a10;
     fixed a12 = a9 + a11;
-    fixed a13 = sqrt(a12);
+    fixed a13 = REAL(sqrt)(a12);
     fixed a14 = a4 / a13;
     fixed a18 = torque[0] + parameters[0];
     fixed a21 = parameters[7] * crank_rates[0];
@@ -1088,7 +1088,7 @@ static void solve_accelerations(fixed *restrict pose, fixed *restrict rates, fix
     fixed a86 = arms[5] * a85;
     fixed a87 = a75 + a86;
     fixed a89 = a87 - sums[21];
-    fixed a91 = sqrt(sums[0]);
+    fixed a91 = REAL(sqrt)(sums[0]);
     fixed a92 = a89 / a91;
     fixed a94 = sums[1] / sums[0];
     fixed a95 = a91 * a94;
@@ -1108,7 +1108,7 @@ static void solve_accelerations(fixed *restrict pose, fixed *restrict rates, fix
     fixed a116 = a114 - a115;
     fixed a118 = sums[1] * a94;
     fixed a119 = sums[2] - a118;
-    fixed a120 = sqrt(a119);
+    fixed a120 = REAL(sqrt)(a119);
     fixed a121 = a116 / a120;
     fixed a124 = a94 * sums[3];
     fixed a125 = sums[4] - a124;
@@ -1136,7 +1136,7 @@ static void solve_accelerations(fixed *restrict pose, fixed *restrict rates, fix
     fixed a155 = sums[5] - a154;
     fixed a156 = a125 * a126;
     fixed a157 = a155 - a156;
-    fixed a158 = sqrt(a157);
+    fixed a158 = REAL(sqrt)(a157);
     fixed a159 = a152 / a158;
     fixed a162 = a147 * sums[6];
     fixed a163 = sums[8] - a162;
@@ -1174,7 +1174,7 @@ static void solve_accelerations(fixed *restrict pose, fixed *restrict rates, fix
     fixed a204 = a202 - a203;
     fixed a205 = a168 * a169;
     fixed a206 = a204 - a205;
-    fixed a207 = sqrt(a206);
+    fixed a207 = REAL(sqrt)(a206);
     fixed a208 = a199 / a207;
     fixed a211 = a190 * sums[9];
     fixed a212 = sums[16] - a211;
@@ -1224,7 +1224,7 @@ static void solve_accelerations(fixed *restrict pose, fixed *restrict rates, fix
     fixed a266 = a264 - a265;
     fixed a267 = a224 * a225;
     fixed a268 = a266 - a267;
-    fixed a269 = sqrt(a268);
+    fixed a269 = REAL(sqrt)(a268);
     fixed a270 = a259 / a269;
     fixed a273 = a246 * sums[12];
     fixed a274 = sums[19] - a273;
@@ -1288,7 +1288,7 @@ static void solve_accelerations(fixed *restrict pose, fixed *restrict rates, fix
     fixed a343 = a341 - a342;
     fixed a344 = a295 * a296;
     fixed a345 = a343 - a344;
-    fixed a346 = sqrt(a345);
+    fixed a346 = REAL(sqrt)(a345);
     fixed a347 = a334 / a346;
     fixed a348 = a347 / a346;
     fixed a349 = a297 * a348;
@@ -1368,7 +1368,7 @@ static void solve_accelerations(fixed *restrict pose, fixed *restrict rates, fix
     fixed a426 = a418 * a408;
     fixed a427 = a426 * a426;
     fixed a428 = a425 + a427;
-    fixed a429 = sqrt(a428);
+    fixed a429 = REAL(sqrt)(a428);
     fixed a430 = a420 / a429;
     fixed a431 = a415 * a430;
     fixed a432 = a422 / a429;
@@ -1390,7 +1390,7 @@ static void solve_accelerations(fixed *restrict pose, fixed *restrict rates, fix
     fixed a449 = a437 - a448;
     fixed a450 = a449 * a449;
     fixed a451 = a447 + a450;
-    fixed a452 = sqrt(a451);
+    fixed a452 = REAL(sqrt)(a451);
     fixed a453 = a442 / a452;
     fixed a454 = a453 * a396;
     fixed a455 = a445 / a452;
@@ -1434,18 +1434,18 @@ static void solve_torque(fixed *restrict pose, fixed *restrict rates, fixed *res
     fixed a13 = a10 + a12;
     fixed a15 = arms[30] * arms[30];
     fixed a16 = a13 + a15;
-    fixed a17 = sqrt(a16);
+    fixed a17 = REAL(sqrt)(a16);
     fixed a18 = arms[0] / a17;
-    fixed a21 = cos(pose[2]);
-    fixed a23 = cos(pose[1]);
+    fixed a21 = REAL(cos)(pose[2]);
+    fixed a23 = REAL(cos)(pose[1]);
     fixed a24 = a21 * a23;
     fixed a26 = a24 * accelerations[0];
-    fixed a27 = sin(pose[2]);
+    fixed a27 = REAL(sin)(pose[2]);
     fixed a29 = a27 * accelerations[1];
     fixed a30 = a26 - a29;
     fixed a33 = a27 * rates[2];
     fixed a34 = a23 * a33;
-    fixed a35 = sin(pose[1]);
+    fixed a35 = REAL(sin)(pose[1]);
     fixed a37 = a35 * rates[1];
     fixed a38 = a21 * a37;
     fixed a39 = a34 + a38;
@@ -1701,7 +1701,7 @@ static void solve_torque(fixed *restrict pose, fixed *restrict rates, fixed *res
     fixed a369 = arms[31] - a368;
     fixed a370 = a369 * a369;
     fixed a371 = a367 + a370;
-    fixed a372 = sqrt(a371);
+    fixed a372 = REAL(sqrt)(a371);
     fixed a373 = a350 / a372;
     fixed a374 = a337 * a373;
     fixed a375 = a335 * a145;
@@ -1788,7 +1788,7 @@ static void solve_torque(fixed *restrict pose, fixed *restrict rates, fixed *res
     fixed a456 = a433 - a455;
     fixed a457 = a456 * a456;
     fixed a458 = a454 + a457;
-    fixed a459 = sqrt(a458);
+    fixed a459 = REAL(sqrt)(a458);
     fixed a460 = a437 / a459;
     fixed a461 = a401 * a460;
     fixed a462 = a399 * a377;
@@ -1898,7 +1898,7 @@ static void solve_torque(fixed *restrict pose, fixed *restrict rates, fixed *res
     fixed a566 = a543 - a565;
     fixed a567 = a566 * a566;
     fixed a568 = a564 + a567;
-    fixed a569 = sqrt(a568);
+    fixed a569 = REAL(sqrt)(a568);
     fixed a570 = a547 / a569;
     fixed a571 = a488 * a570;
     fixed a572 = a486 * a464;
@@ -2031,7 +2031,7 @@ static void solve_torque(fixed *restrict pose, fixed *restrict rates, fixed *res
     fixed a699 = a676 - a698;
     fixed a700 = a699 * a699;
     fixed a701 = a697 + a700;
-    fixed a702 = sqrt(a701);
+    fixed a702 = REAL(sqrt)(a701);
     fixed a703 = a680 / a702;
     fixed a704 = a598 * a703;
     fixed a705 = a596 * a574;
@@ -2082,7 +2082,7 @@ static void solve_torque(fixed *restrict pose, fixed *restrict rates, fixed *res
     fixed a750 = a726 - a749;
     fixed a751 = a750 * a750;
     fixed a752 = a748 + a751;
-    fixed a753 = sqrt(a752);
+    fixed a753 = REAL(sqrt)(a752);
     fixed a754 = a731 / a753;
     fixed a755 = a754 * a143;
     fixed a756 = a734 / a753;
@@ -2190,15 +2190,15 @@ static void solve_torque(fixed *restrict pose, fixed *restrict rates, fixed *res
 
 static void pose_terms(fixed *restrict pose, fixed *restrict rates, fixed *restrict sums, fixed *restrict arms, real *restrict M, real *restrict h, real *restrict B)
 {
-    fixed a1 = cos(pose[2]);
-    fixed a3 = cos(pose[1]);
+    fixed a1 = REAL(cos)(pose[2]);
+    fixed a3 = REAL(cos)(pose[1]);
     fixed a4 = a1 * a3;
     fixed a6 = a4 * sums[0];
-    fixed a7 = sin(pose[2]);
+    fixed a7 = REAL(sin)(pose[2]);
     fixed a8 = a7 * a3;
     fixed a10 = a8 * sums[1];
     fixed a11 = a6 + a10;
-    fixed a12 = sin(pose[1]);
+    fixed a12 = REAL(sin)(pose[1]);
     fixed a14 = a12 * sums[3];
     fixed a15 = a11 - a14;
     fixed a16 = a15 * a4;
@@ -2483,16 +2483,16 @@ static void pose_terms(fixed *restrict pose, fixed *restrict rates, fixed *restr
 
 static void plate_derivatives(fixed *restrict pose, fixed *restrict rates, fixed *restrict accelerations, fixed *restrict parameters, fixed *restrict gravity, fixed *restrict common, real *restrict dF_dx, real *restrict M)
 {
-    fixed a1 = cos(pose[2]);
-    fixed a3 = cos(pose[1]);
+    fixed a1 = REAL(cos)(pose[2]);
+    fixed a3 = REAL(cos)(pose[1]);
     fixed a4 = a1 * a3;
     fixed a6 = a4 * accelerations[0];
-    fixed a7 = sin(pose[2]);
+    fixed a7 = REAL(sin)(pose[2]);
     fixed a9 = a7 * accelerations[1];
     fixed a10 = a6 - a9;
     fixed a13 = a7 * rates[2];
     fixed a14 = a3 * a13;
-    fixed a15 = sin(pose[1]);
+    fixed a15 = REAL(sin)(pose[1]);
     fixed a17 = a15 * rates[1];
     fixed a18 = a1 * a17;
     fixed a19 = a14 + a18;
@@ -2502,9 +2502,9 @@ static void plate_derivatives(fixed *restrict pose, fixed *restrict rates, fixed
     fixed a23 = a20 + a22;
     fixed a24 = a10 - a23;
     fixed a25 = a1 * a15;
-    fixed a27 = sin(pose[0]);
+    fixed a27 = REAL(sin)(pose[0]);
     fixed a28 = a25 * a27;
-    fixed a29 = cos(pose[0]);
+    fixed a29 = REAL(cos)(pose[0]);
     fixed a30 = a7 * a29;
     fixed a31 = a28 - a30;
     fixed a33 = a25 * a29;
@@ -3819,15 +3819,15 @@ static void plate_derivatives(fixed *restrict pose, fixed *restrict rates, fixed
 
 static void crank_rates(fixed *restrict pose, fixed *restrict rates, fixed *restrict legs, real *restrict arm_rates)
 {
-    fixed a3 = cos(pose[2]);
-    fixed a5 = cos(pose[1]);
+    fixed a3 = REAL(cos)(pose[2]);
+    fixed a5 = REAL(cos)(pose[1]);
     fixed a6 = a3 * a5;
-    fixed a9 = sin(pose[1]);
+    fixed a9 = REAL(sin)(pose[1]);
     fixed a10 = a3 * a9;
-    fixed a12 = sin(pose[0]);
+    fixed a12 = REAL(sin)(pose[0]);
     fixed a13 = a10 * a12;
-    fixed a14 = sin(pose[2]);
-    fixed a15 = cos(pose[0]);
+    fixed a14 = REAL(sin)(pose[2]);
+    fixed a15 = REAL(cos)(pose[0]);
     fixed a16 = a14 * a15;
     fixed a17 = a13 - a16;
     fixed a21 = a10 * a15;
@@ -3898,7 +3898,7 @@ static void crank_rates(fixed *restrict pose, fixed *restrict rates, fixed *rest
         fixed a90 = legs[6 + leg] * legs[6 + leg];
         fixed a91 = a88 - a90;
         fixed a92 = 2 * legs[0 + leg];
-        fixed a93 = sqrt(a76);
+        fixed a93 = REAL(sqrt)(a76);
         fixed a94 = a92 * a93;
         fixed a95 = a91 / a94;
         fixed a96 = a95 * a95;
@@ -3921,10 +3921,10 @@ static void crank_rates(fixed *restrict pose, fixed *restrict rates, fixed *rest
         fixed a119 = a118 - a100;
         fixed a120 = a117 * a119;
         fixed a121 = a96 + a120;
-        fixed a122 = sqrt(a121);
+        fixed a122 = REAL(sqrt)(a121);
         fixed a123 = a95 / a122;
         fixed a124 = a64 * a123;
-        fixed a126 = sqrt(a120);
+        fixed a126 = REAL(sqrt)(a120);
         fixed a127 = legs[12 + leg] * a126;
         fixed a128 = a127 / a122;
         fixed a129 = a74 * a128;
@@ -3942,7 +3942,7 @@ static void crank_rates(fixed *restrict pose, fixed *restrict rates, fixed *rest
         fixed a141 = a140 * a140;
         fixed a142 = a134 + a141;
         fixed a143 = a142 + a85;
-        fixed a144 = sqrt(a143);
+        fixed a144 = REAL(sqrt)(a143);
         fixed a145 = a133 / a144;
         fixed a146 = a140 / a144;
         fixed a147 = a146 * a131;
@@ -3991,15 +3991,15 @@ static void crank_rates(fixed *restrict pose, fixed *restrict rates, fixed *rest
 
 static void leg_derivatives(fixed *restrict pose, fixed *restrict rates, fixed *restrict accelerations, fixed *restrict parameters, fixed *restrict gravity, fixed *restrict common, fixed *restrict legs, fixed *restrict torque, fixed *restrict bias, fixed *restrict slip, real *restrict dF_dx, real *restrict M, real *restrict arms)
 {
-    fixed a1 = sin(pose[2]);
-    fixed a3 = cos(pose[1]);
+    fixed a1 = REAL(sin)(pose[2]);
+    fixed a3 = REAL(cos)(pose[1]);
     fixed a4 = a1 * a3;
-    fixed a7 = sin(pose[1]);
+    fixed a7 = REAL(sin)(pose[1]);
     fixed a8 = a1 * a7;
-    fixed a10 = sin(pose[0]);
+    fixed a10 = REAL(sin)(pose[0]);
     fixed a11 = a8 * a10;
-    fixed a12 = cos(pose[2]);
-    fixed a13 = cos(pose[0]);
+    fixed a12 = REAL(cos)(pose[2]);
+    fixed a13 = REAL(cos)(pose[0]);
     fixed a14 = a12 * a13;
     fixed a15 = a11 + a14;
     fixed a19 = a8 * a13;
@@ -4229,7 +4229,7 @@ static void leg_derivatives(fixed *restrict pose, fixed *restrict rates, fixed *
         fixed a195 = a194 + a154;
         fixed a196 = a195 - a150;
         fixed a197 = 2 * legs[0 + leg];
-        fixed a198 = sqrt(a184);
+        fixed a198 = REAL(sqrt)(a184);
         fixed a199 = a197 * a198;
         fixed a200 = a196 / a199;
         fixed a201 = a200 * a200;
@@ -4252,10 +4252,10 @@ static void leg_derivatives(fixed *restrict pose, fixed *restrict rates, fixed *
         fixed a224 = a223 - a205;
         fixed a225 = a222 * a224;
         fixed a226 = a201 + a225;
-        fixed a227 = sqrt(a226);
+        fixed a227 = REAL(sqrt)(a226);
         fixed a228 = a200 / a227;
         fixed a229 = a173 * a228;
-        fixed a231 = sqrt(a225);
+        fixed a231 = REAL(sqrt)(a225);
         fixed a232 = legs[12 + leg] * a231;
         fixed a233 = a232 / a227;
         fixed a234 = a182 * a233;
@@ -4273,7 +4273,7 @@ static void leg_derivatives(fixed *restrict pose, fixed *restrict rates, fixed *
         fixed a246 = a245 * a245;
         fixed a247 = a239 + a246;
         fixed a248 = a247 + a193;
-        fixed a249 = sqrt(a248);
+        fixed a249 = REAL(sqrt)(a248);
         fixed a250 = a238 / a249;
         fixed a251 = a245 / a249;
         fixed a252 = a251 * a236;
@@ -4440,7 +4440,7 @@ static void leg_derivatives(fixed *restrict pose, fixed *restrict rates, fixed *
         fixed a415 = a243 * a256;
         fixed a416 = legs[0 + leg] * a415;
         fixed a417 = (real)1.0 + a416;
-        fixed a420 = sqrt(a374);
+        fixed a420 = REAL(sqrt)(a374);
         fixed a421 = a250 / a420;
         fixed a422 = a421 * a371;
         fixed a423 = a422 / legs[6 + leg];
@@ -8842,16 +8842,16 @@ static void pose_derivatives(fixed *restrict pose, fixed *restrict rates, fixed 
     dF_dp[34] = a103;
     fixed a106 = -arms[35];
     dF_dp[35] = a106;
-    fixed a109 = sin(pose[2]);
-    fixed a111 = cos(pose[1]);
+    fixed a109 = REAL(sin)(pose[2]);
+    fixed a111 = REAL(cos)(pose[1]);
     fixed a112 = a109 * a111;
     fixed a114 = a112 * parameters[10];
-    fixed a115 = sin(pose[1]);
+    fixed a115 = REAL(sin)(pose[1]);
     fixed a116 = a109 * a115;
-    fixed a118 = sin(pose[0]);
+    fixed a118 = REAL(sin)(pose[0]);
     fixed a119 = a116 * a118;
-    fixed a120 = cos(pose[2]);
-    fixed a121 = cos(pose[0]);
+    fixed a120 = REAL(cos)(pose[2]);
+    fixed a121 = REAL(cos)(pose[0]);
     fixed a122 = a120 * a121;
     fixed a123 = a119 + a122;
     fixed a125 = a123 * parameters[11];
@@ -9484,15 +9484,15 @@ static void pose_derivatives(fixed *restrict pose, fixed *restrict rates, fixed 
 
 static void leg_measures(fixed *restrict pose, fixed *restrict common, fixed *restrict legs, real *restrict sines, real *restrict wrenches)
 {
-    fixed a4 = cos(pose[2]);
-    fixed a6 = cos(pose[1]);
+    fixed a4 = REAL(cos)(pose[2]);
+    fixed a6 = REAL(cos)(pose[1]);
     fixed a7 = a4 * a6;
-    fixed a10 = sin(pose[1]);
+    fixed a10 = REAL(sin)(pose[1]);
     fixed a11 = a4 * a10;
-    fixed a13 = sin(pose[0]);
+    fixed a13 = REAL(sin)(pose[0]);
     fixed a14 = a11 * a13;
-    fixed a15 = sin(pose[2]);
-    fixed a16 = cos(pose[0]);
+    fixed a15 = REAL(sin)(pose[2]);
+    fixed a16 = REAL(cos)(pose[0]);
     fixed a17 = a15 * a16;
     fixed a18 = a14 - a17;
     fixed a22 = a11 * a16;
@@ -9555,28 +9555,28 @@ static void leg_measures(fixed *restrict pose, fixed *restrict common, fixed *re
         fixed a91 = legs[6 + leg] * legs[6 + leg];
         fixed a92 = a89 - a91;
         fixed a93 = 2 * legs[0 + leg];
-        fixed a94 = sqrt(a76);
+        fixed a94 = REAL(sqrt)(a76);
         fixed a95 = a93 * a94;
         fixed a96 = a92 / a95;
         fixed a97 = a96 * a96;
         fixed a98 = (real)1.0 - a97;
         fixed a99 = SIGN(a98);
-        fixed a100 = fabs(a98);
-        fixed a101 = sqrt(a100);
+        fixed a100 = REAL(fabs)(a98);
+        fixed a101 = REAL(sqrt)(a100);
         fixed a102 = a99 * a101;
         sines[0 + leg] = a102;
-        fixed a104 = atan2(a74, a65);
+        fixed a104 = REAL(atan2)(a74, a65);
         fixed a107 = MAX(a96, (real)-1.0);
         fixed a108 = MIN(a107, (real)1.0);
-        fixed a109 = acos(a108);
+        fixed a109 = REAL(acos)(a108);
         fixed a110 = legs[12 + leg] * a109;
         fixed a111 = a104 + a110;
-        fixed a112 = cos(a111);
+        fixed a112 = REAL(cos)(a111);
         fixed a113 = legs[0 + leg] * a112;
         fixed a114 = a65 - a113;
         fixed a115 = a114 / legs[6 + leg];
         fixed a116 = legs[30 + leg] * a115;
-        fixed a117 = sin(a111);
+        fixed a117 = REAL(sin)(a111);
         fixed a118 = legs[0 + leg] * a117;
         fixed a119 = a74 - a118;
         fixed a120 = a119 / legs[6 + leg];
@@ -9618,15 +9618,15 @@ static void leg_measures(fixed *restrict pose, fixed *restrict common, fixed *re
 
 static void leg_measures_of_tree(fixed *restrict pose, fixed *restrict common, fixed *restrict legs, fixed *restrict angles, real *restrict sines, real *restrict wrenches)
 {
-    fixed a5 = cos(pose[2]);
-    fixed a7 = cos(pose[1]);
+    fixed a5 = REAL(cos)(pose[2]);
+    fixed a7 = REAL(cos)(pose[1]);
     fixed a8 = a5 * a7;
-    fixed a11 = sin(pose[1]);
+    fixed a11 = REAL(sin)(pose[1]);
     fixed a12 = a5 * a11;
-    fixed a14 = sin(pose[0]);
+    fixed a14 = REAL(sin)(pose[0]);
     fixed a15 = a12 * a14;
-    fixed a16 = sin(pose[2]);
-    fixed a17 = cos(pose[0]);
+    fixed a16 = REAL(sin)(pose[2]);
+    fixed a17 = REAL(cos)(pose[0]);
     fixed a18 = a16 * a17;
     fixed a19 = a15 - a18;
     fixed a23 = a12 * a17;
@@ -9674,17 +9674,17 @@ static void leg_measures_of_tree(fixed *restrict pose, fixed *restrict common, f
         fixed a71 = a68 + a70;
         fixed a73 = legs[30 + leg] * a64;
         fixed a74 = a71 + a73;
-        fixed a75 = atan2(a66, a74);
+        fixed a75 = REAL(atan2)(a66, a74);
         fixed a76 = angles[0 + leg] - a75;
-        fixed a77 = sin(a76);
+        fixed a77 = REAL(sin)(a76);
         fixed a78 = legs[12 + leg] * a77;
         sines[0 + leg] = a78;
-        fixed a81 = cos(angles[0 + leg]);
+        fixed a81 = REAL(cos)(angles[0 + leg]);
         fixed a82 = legs[0 + leg] * a81;
         fixed a83 = a74 - a82;
         fixed a85 = a83 / legs[6 + leg];
         fixed a86 = legs[30 + leg] * a85;
-        fixed a87 = sin(angles[0 + leg]);
+        fixed a87 = REAL(sin)(angles[0 + leg]);
         fixed a88 = legs[0 + leg] * a87;
         fixed a89 = a66 - a88;
         fixed a90 = a89 / legs[6 + leg];
@@ -10053,7 +10053,7 @@ static void all_measures(fixed *restrict pose, fixed *restrict sines, fixed *res
     fixed a361 = wrenches[5] * a360;
     fixed a362 = a350 - a361;
     measures[6] = a362;
-    fixed a365 = fabs(pose[1]);
+    fixed a365 = REAL(fabs)(pose[1]);
     fixed a366 = -a365;
     measures[7] = a366;
 }

@@ -1,9 +1,7 @@
 /* The predictive LQI law: see stewart.h. law/predictive_lqi.py and its parts are the reference, with
    the derivations; names and order of operations are theirs. */
 
-#include <float.h>
 #include <string.h>
-#include <tgmath.h>
 
 #include "stewart.h"
 
@@ -67,9 +65,9 @@ static int solve(int n, int m, real *A, real *restrict B)
     for (int k = 0; k < n; k++) {
         int best = k;
         for (int i = k + 1; i < n; i++)
-            if (fabs(A[n * i + k]) > fabs(A[n * best + k]))
+            if (REAL(fabs)(A[n * i + k]) > REAL(fabs)(A[n * best + k]))
                 best = i;
-        if (!(fabs(A[n * best + k]) > 0)) /* or NaN */
+        if (!(REAL(fabs)(A[n * best + k]) > 0)) /* or NaN */
             return 0;
         for (int j = 0; j < n; j++) {
             real a = A[n * best + j];
@@ -131,16 +129,15 @@ static void fill(int n, real value, real *x)
 static void exponential(int m, const real *A, const real *B, real *Phi, real *S,
                         stewart_workspace *w)
 {
-    static const double factorials[12] = {1.0,       2.0,        6.0,         24.0,
-                                          120.0,     720.0,      5040.0,      40320.0,
-                                          362880.0,  3628800.0,  39916800.0,  479001600.0};
+    static const real factorials[12] = {1,     2,      6,       24,      120,      720,
+                                        5040,  40320,  362880,  3628800, 39916800, 479001600};
     real *A1 = w->power[0], *A2 = w->power[1], *A3 = w->power[2], *sum = w->power[3];
     real *next = w->power[4], size = 0, scale = 1;
     int doublings = 0;
     for (int j = 0; j < X; j++) {
         real column = 0;
         for (int i = 0; i < X; i++)
-            column += fabs(A[X * i + j]);
+            column += REAL(fabs)(A[X * i + j]);
         size = column > size ? column : size;
     }
     for (; size * scale > (real)0.5 && doublings < 60; doublings++)
@@ -152,11 +149,11 @@ static void exponential(int m, const real *A, const real *B, real *Phi, real *S,
     fill(X * X, 0, sum);
     for (int block = 9; block >= 0; block -= 3) {
         multiply(X, X, X, sum, A3, next);
-        const double *f = factorials + block;
+        const real *f = factorials + block;
         for (int i = 0; i < X * X; i++)
-            sum[i] = next[i] + A1[i] / (real)f[1] + A2[i] / (real)f[2];
+            sum[i] = next[i] + A1[i] / f[1] + A2[i] / f[2];
         for (int i = 0; i < X; i++)
-            sum[(X + 1) * i] += 1 / (real)f[0];
+            sum[(X + 1) * i] += 1 / f[0];
     }
     multiply(X, X, X, A1, sum, Phi);
     for (int i = 0; i < X; i++)
@@ -196,8 +193,8 @@ static int within_reach(const stewart_config *c, const real *pose, int strictly)
     const real *g = c->geometry;
     real sines[3], cosines[3];
     for (int i = 0; i < 3; i++) {
-        sines[i] = sin(pose[i]);
-        cosines[i] = cos(pose[i]);
+        sines[i] = REAL(sin)(pose[i]);
+        cosines[i] = REAL(cos)(pose[i]);
     }
     real cf = cosines[0], ct = cosines[1], cp = cosines[2], sf = sines[0], st = sines[1];
     real sp = sines[2];
@@ -217,8 +214,8 @@ static int within_reach(const stewart_config *c, const real *pose, int strictly)
             for (int i = 0; i < 3; i++)
                 q[j] += own[6 * (3 + 3 * j + i)] * p[i];
         }
-        real rho = hypot(q[0], q[1]), shortest = hypot(rho - crank, q[2]);
-        real longest = hypot(rho + crank, q[2]);
+        real rho = REAL(hypot)(q[0], q[1]), shortest = REAL(hypot)(rho - crank, q[2]);
+        real longest = REAL(hypot)(rho + crank, q[2]);
         real margin = rod - shortest < longest - rod ? rod - shortest : longest - rod;
         if (!(strictly ? margin > 0 : margin >= 0)) /* or NaN */
             return 0;
@@ -229,7 +226,7 @@ static int within_reach(const stewart_config *c, const real *pose, int strictly)
 static int at_limit(const stewart_config *c, int torques, const real *torque)
 {
     for (int i = 0; i < U * torques; i++)
-        if (fabs(torque[i]) >= c->torque_limit)
+        if (REAL(fabs)(torque[i]) >= c->torque_limit)
             return 1;
     return 0;
 }
@@ -237,7 +234,7 @@ static int at_limit(const stewart_config *c, int torques, const real *torque)
 static int substeps_for(const stewart_config *c, int torques, const real *torque)
 {
     for (int i = 0; i < U * torques; i++)
-        if (fabs(torque[i]) > c->gentle_torque)
+        if (REAL(fabs)(torque[i]) > c->gentle_torque)
             return VIGOROUS * c->substeps;
     return c->substeps;
 }
@@ -360,7 +357,7 @@ static void start_estimate(const stewart_config *c, const real *measurement, con
 static int is_known(const stewart_config *c, const real *covariance, real share)
 {
     for (int i = 0; i < THETA; i++)
-        if (!(sqrt(covariance[(ALL + 1) * (X + i)]) <= share * c->std[i])) /* or NaN */
+        if (!(REAL(sqrt)(covariance[(ALL + 1) * (X + i)]) <= share * c->std[i])) /* or NaN */
             return 0;
     return 1;
 }
@@ -471,7 +468,7 @@ static int within_bounds(const stewart_config *c, const real *mean, const real *
         for (int i = 0; i < THETA; i++) {
             real x = moved[X + i];
             real inside = x < c->lower[i] ? c->lower[i] : x > c->upper[i] ? c->upper[i] : x;
-            real excess = fabs(x - inside) / sqrt(P[(ALL + 1) * (X + i)]);
+            real excess = REAL(fabs)(x - inside) / REAL(sqrt)(P[(ALL + 1) * (X + i)]);
             if (isnan(excess))
                 return 0;
             if (excess > furthest) {
@@ -556,7 +553,7 @@ static int correct(const real *P, const real *R, stewart_filter_work *f)
 static int all_small(const real *x, const real *R)
 {
     for (int i = 0; i < X; i++)
-        if (!(fabs(x[i]) <= SMALL * sqrt(R[i])))
+        if (!(REAL(fabs)(x[i]) <= SMALL * REAL(sqrt)(R[i])))
             return 0;
     return 1;
 }
@@ -720,17 +717,17 @@ static int fault_of(const stewart_config *c, const real *y, const real *last)
     if (!all_finite(X, y))
         return STEWART_MEASUREMENT_MISSING;
     for (int i = 0; i < X; i++) {
-        real unit = nextafter(fabs(y[i]), (real)HUGE_VAL) - fabs(y[i]);
+        real unit = REAL(nextafter)(REAL(fabs)(y[i]), (real)HUGE_VAL) - REAL(fabs)(y[i]);
         if (y[i] == last[i] && c->noise_std[i] > NOISY * unit)
             return STEWART_MEASUREMENT_FROZEN;
     }
     for (int i = 0; i < 6; i++) {
-        real moved = c->period / 2 * fabs(y[6 + i] + last[6 + i]);
+        real moved = c->period / 2 * REAL(fabs)(y[6 + i] + last[6 + i]);
         real perhaps = MOVED * c->motion[i] + SIGMAS * c->period * c->noise_std[6 + i];
         if (y[i] == last[i] && moved > perhaps)
             return STEWART_MEASUREMENT_FROZEN;
     }
-    if (fabs(y[1]) >= STEEPEST || !within_reach(c, y, 0))
+    if (REAL(fabs)(y[1]) >= STEEPEST || !within_reach(c, y, 0))
         return STEWART_MEASUREMENT_REJECTED;
     return 0;
 }
@@ -944,7 +941,7 @@ static int design(int n, stewart_workspace *w, real *K)
     for (int i = 0; i < U; i++) {
         if (!(w->R[(U + 1) * i] > 0 && isfinite(w->R[(U + 1) * i])))
             return 0;
-        u[i] = 1 / sqrt(w->R[(U + 1) * i]);
+        u[i] = 1 / REAL(sqrt)(w->R[(U + 1) * i]);
     }
     for (int i = 0; i < n; i++) {
         real cost = Q[(n + 1) * i];
@@ -952,7 +949,7 @@ static int design(int n, stewart_workspace *w, real *K)
             return 0;
         for (int j = 0; j < n; j++)
             cost += A[n * j + i] * Q[(n + 1) * j] * A[n * j + i];
-        x[i] = cost > 0 && isfinite(cost) ? 1 / sqrt(cost) : 1;
+        x[i] = cost > 0 && isfinite(cost) ? 1 / REAL(sqrt)(cost) : 1;
     }
     if (n > X + 6)
         copy(U, u, x + X + 6);

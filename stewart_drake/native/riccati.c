@@ -11,7 +11,6 @@
    its limit. A_k = (I + G_k P) (A - B K)^(2^k) vanishes where, and only where, the loop is stable. */
 
 #include <string.h>
-#include <tgmath.h>
 
 #include "riccati.h"
 
@@ -89,9 +88,9 @@ static int solve(int n, int m, rows *W, rows *X, rows *Y)
     for (int k = 0; k < n; k++) {
         int best = k;
         for (int i = k + 1; i < n; i++)
-            if (fabs(W[i][k]) > fabs(W[best][k]))
+            if (REAL(fabs)(W[i][k]) > REAL(fabs)(W[best][k]))
                 best = i;
-        if (!(fabs(W[best][k]) > 0)) /* or NaN */
+        if (!(REAL(fabs)(W[best][k]) > 0)) /* or NaN */
             return 0;
         if (best != k) {
             swap_rows(W[best], W[k]);
@@ -133,7 +132,7 @@ static real norm(int n, rows *A)
     for (int i = 0; i < n; i++)
         for (int j = 0; j < n; j++)
             sum += A[i][j] * A[i][j];
-    return sqrt(sum);
+    return REAL(sqrt)(sum);
 }
 
 static void load(int n, int m, const real *from, rows *to)
@@ -210,7 +209,7 @@ static void corrected(int n, stewart_riccati_work *w)
     for (int i = 0; i < n; i++)
         for (int j = 0; j < i; j++)
             w->other[j][i] = w->other[i][j] = (w->other[i][j] + w->other[j][i]) / 2;
-    for (int count = 0; count < DOUBLINGS && norm(n, w->closed) > 1e-3; count++) {
+    for (int count = 0; count < DOUBLINGS && norm(n, w->closed) > (real)1e-3; count++) {
         transpose(n, n, w->closed, w->left);
         multiply(n, n, n, WHOLE, w->other, w->closed, w->product);
         multiply(n, n, n, LOWER, w->left, w->product, w->right);

@@ -14,7 +14,7 @@
 #define STEWART_H
 
 #include "dynamics.h"
-#include "limits.h"
+#include "stewart_limits.h"
 #include "riccati.h"
 
 #define STEWART_STATES 12

@@ -11,7 +11,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -39,7 +39,8 @@ from stewart_drake.scenario.loading import scenario_yaml
 Array = NDArray[np.float64]
 
 SOURCES: Final = (
-    *("limits.h", "real.h", "dynamics.h", "equations.h", "riccati.h", "stewart.h", "workspace.h"),
+    *("stewart_limits.h", "real.h", "dynamics.h", "equations.h", "riccati.h"),
+    *("stewart.h", "workspace.h"),
     *("dynamics.c", "riccati.c", "law.c"),
 )
 TEMPLATES: Final = Path(__file__).with_name("templates") / "export_c"
@@ -107,7 +108,10 @@ class RecordedLqi(PredictiveLqi):
 
 
 def recorded_law(scenario: Scenario) -> RecordedLqi:
-    """The law of a scenario, with what it did in a run.
+    """Return the law of a scenario, with what it did in a run on the exact plant.
+
+    The test replays the controller. The steps of a *multibody* plant are an error that some stable
+    loops, such as that of `gravity`, cannot correct.
 
     Raises:
         ConfigError: it has what the law in C has not, naming the field; or bad input.
@@ -125,7 +129,8 @@ def recorded_law(scenario: Scenario) -> RecordedLqi:
         found.append(RecordedLqi(**parts))
         return found[-1]
 
-    result = simulate(scenario, law=recorded, margin=False)
+    exact = replace(scenario, plant=replace(scenario.plant, kind="exact"))
+    result = simulate(exact, law=recorded, margin=False)
     if result.failure is not None:
         raise ConfigError(
             f"scenario: {result.failure}; expected one whose run the test can replay to its end"
@@ -152,7 +157,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     law = recorded_law(scenario)
     suffix = "f" if single else ""
     files = {name: (FOLDER / name).read_text("utf-8") for name in SOURCES}
-    files["limits.h"] = _limits(files["limits.h"], law, single)
+    files["stewart_limits.h"] = _limits(files["stewart_limits.h"], law, single)
     values = {
         "SCENARIO": scenario_yaml(scenario).replace("*/", "* /").strip(),
         "STEPS": str(len(law.steps)),
