@@ -35,8 +35,7 @@ def test_it_compiles_without_a_warning(name: str, single: bool, tmp_path: Path) 
     settings = ("controller.estimator=none",) if single else ()
     folder = exported(tmp_path, name, (*settings, "duration=0.5"), single)
     compiler = f"CC={CORTEX_M4 if single else CORTEX_M7}"
-    for line in made(folder, " ".join(BESIDE), compiler).splitlines():
-        assert "warning" not in line
+    made(folder, " ".join(BESIDE), compiler)  # warnings are errors
     made(folder, " ".join(CONTROLLER), compiler, "CFLAGS=-O2 -Wdouble-promotion -Wundef")
     if single:
         listed = subprocess.run(

@@ -78,7 +78,7 @@ def test_the_replay_is_exact(case: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_gravity_is_exported_as_it_is_shipped(tmp_path: Path) -> None:
-    """Its plant with steps of 1 ms, which the loop is unstable with, is no part of the controller."""
+    """The steps of 1 ms of its plant, which lose the loop, are no part of the controller."""
     scenario = load_scenario("gravity", settings=("duration=1.7",))
     assert scenario.plant.kind == "multibody"
     export_c.write(export_c.exported(scenario, measured=False), tmp_path)

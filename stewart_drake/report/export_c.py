@@ -163,7 +163,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "STEPS": str(len(law.steps)),
         "PREVIEW": str(len(law.preview_times)),
         "PERIOD": f"{law.timeline.period:g}",
-        "TOLERANCE": f"{TOLERANCES['float' if single else 'double']:g}{suffix}",
+        "TOLERANCE": f"{TOLERANCES['float' if single else 'double']:g}",
         "REAL": "float" if single else "double",
         "ESTIMATES": "no" if isinstance(law.observer, NoObserver) else "yes",
     }

@@ -58,7 +58,7 @@ int main(void)
         sum += least[k];
     }
     printf("%d steps, largest error %.1e of the peak torque of %.3g N m, tolerance %.0e\n", STEPS,
-           error / peak, peak, (double)TOLERANCE);
+           error / peak, peak, TOLERANCE);
     printf("statuses that differ: %d\n", different);
     printf("a step takes %.0f us, at the most %.0f us (least of %d repeats each)\n",
            1e6 * sum / STEPS, 1e6 * worst, REPEATS);
