@@ -347,6 +347,29 @@ def test_a_delay_believed_wrongly_is_found_in_the_loop(
     assert 0 < result.summary["delay"]["std_s"] < 3e-4
 
 
+@pytest.mark.parametrize("fraction", [0.0, 0.3])
+@pytest.mark.parametrize("sensor", ["state", "encoders"])
+def test_a_delay_of_less_than_a_period_may_be_believed_in(fraction: float, sensor: str) -> None:
+    """The torques become those of the law that knows the delay, and those of the reference."""
+    settings = (*ON_REFERENCE, "delay.steps=0", f"delay.fraction={fraction}", "duration=3")
+    precise = (f"sensor.kind={sensor}", *["sensor.bits=null"] * (sensor == "encoders"))
+    run, known = (
+        looped(*settings, *precise, kind=kind).signals.sel(time=slice(2, None))
+        for kind in ("constant", "none")
+    )
+    peak = np.abs(known.torque_commanded.values).max()
+    np.testing.assert_allclose(run.torque_commanded, known.torque_commanded, atol=2e-3 * peak)
+    assert np.all(np.abs(run.delay_estimate - 0.1 * fraction) < 3e-3)
+    assert np.abs(run.pose - run.reference).max() < 1e-4
+
+
+@pytest.mark.parametrize("true", [0.0, 0.8])
+def test_no_delay_may_be_believed_in(true: float) -> None:
+    result = looped("controller.delay_steps=0", f"delay.steps={true / DT:.0f}", "duration=4")
+    assert result.status == "completed"
+    assert result.summary["delay"]["estimated_s"] == pytest.approx(true, abs=1e-3)
+
+
 @pytest.mark.parametrize("fraction", [0.1, 0.37, 0.5, 0.63])
 def test_a_right_belief_of_a_part_of_a_period_is_kept(fraction: float) -> None:
     """What was in flight at t = 0 was held from instants that the controller does not know."""

@@ -342,6 +342,19 @@ def test_pose_uncertainty_is_that_of_drawn_machines():
     assert whole.angle[0] <= whole.angle[1] and whole.position_beside[0] < whole.position[0]
 
 
+def test_pose_uncertainty_is_taken_over_the_workspace_of_the_machine_found():
+    """Poses near the end of the drawn machine's workspace may be out of reach of another one."""
+    unknowns, rng = some_unknowns(PAPER, offsets=1e-3), np.random.default_rng(0)
+    values, legs = unknowns.mean.copy(), np.zeros((6, 8))
+    legs[:, :2] = -6e-3  # cranks and rods are shorter
+    values[GEOMETRY] += legs.ravel() + 1e-4 * rng.standard_normal(48)
+    spread = np.diag(unknowns.std[unknowns.free] ** 2)
+    found = pose_uncertainty(unknowns, values, spread, PAPER.home)
+    assert found is not None and np.all(np.isfinite(found))
+    far = PAPER.home + np.array([0, 0, 0, 0, 0, 1.0])
+    assert pose_uncertainty(unknowns, values, spread, far) is None
+
+
 # ---------------------------------------------------------------- where to begin
 
 

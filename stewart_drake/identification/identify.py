@@ -135,7 +135,7 @@ class Identification:
 
     @cached_property
     def pose_uncertainty(self) -> PoseUncertainty | None:
-        """Over the workspace; None where the fit is wrong."""
+        """Over the workspace; None if the fit is wrong or `middle` is out of reach."""
         if not self.right:
             return None
         return pose_uncertainty(self.unknowns, self.values, self.fit.covariance, self.middle)

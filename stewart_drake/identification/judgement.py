@@ -158,8 +158,8 @@ def workspace_poses(mechanism: Mechanism, middle: Array, seed: int = 0) -> Array
 
 def pose_uncertainty(
     unknowns: Unknowns, values: Array, covariance: Array, middle: Array
-) -> PoseUncertainty:
-    """How well poses follow from crank angles with what is known of geometry and offsets.
+) -> PoseUncertainty | None:
+    """Return how well crank angles determine poses, None if the machine does not reach `middle`.
 
     alpha = h(pose; geometry) + offset stays as it is, so that
     d pose = -J^-1 (dh/dgeometry d geometry + d offset),   J = dh/dpose.
@@ -174,8 +174,11 @@ def pose_uncertainty(
     whole[np.ix_(unknowns.free, unknowns.free)] = covariance
     of_angles = np.r_[GEOMETRY, OFFSETS]
     P = whole[np.ix_(of_angles, of_angles)]
-    poses = workspace_poses(unknowns.mechanism, middle)
-    slopes = pose_slopes(unknowns, unknowns.numbers(values), poses)
+    found = unknowns.machine(values)
+    if not margin(found, middle) > 0:
+        return None
+    slopes = pose_slopes(unknowns, unknowns.numbers(values), workspace_poses(found, middle))
+    slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]  # a ray may leave and come back
     return PoseUncertainty(*_spread(slopes, P), *_spread(slopes - slopes[0], P))
 
 

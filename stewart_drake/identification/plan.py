@@ -64,7 +64,9 @@ class Plan:
     def pose_uncertainty(self) -> PoseUncertainty:
         """Over the workspace, after the log."""
         middle = np.median(self.poses, axis=0)
-        return pose_uncertainty(self.unknowns, self.unknowns.mean, self.covariance, middle)
+        found = pose_uncertainty(self.unknowns, self.unknowns.mean, self.covariance, middle)
+        assert found is not None, "a planned motion stays inside the workspace"
+        return found
 
     @property
     def std(self) -> Array:

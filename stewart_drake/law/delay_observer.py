@@ -149,7 +149,9 @@ class DelayObserver:
         y = measurement.values if after.fault is None else None
         filtering = DelayFilter(plant, sensing, self.settings, self.delay)
         if len(belief.timeline.before) == 0:  # the first sample: all in flight is others'
-            since = now = replace(belief.timeline, before=in_flight[1:])
+            # Without a queue the torque of the last period goes on.
+            before = in_flight[1:] if len(in_flight) > 1 else in_flight
+            since = now = replace(belief.timeline, before=before)
         else:
             now = belief.timeline.later(len(in_flight))
             since = replace(belief.timeline, sent=now.sent)

@@ -68,7 +68,7 @@ def document(found: Identification) -> Document:
     cautions = [Caution(one) for one in _cautions(found)]
     sections = [
         Section("What was found", *cautions, _table(found, geometry=False)),
-        _poses(found.pose_uncertainty),
+        _poses(found.pose_uncertainty) if found.right else Section(""),
         _unseen(found.unseen),
         Section("The fit", _FIT_TEXT, _chi2(found), *_pictures(found)),
         Section("Geometry and offsets", _table(found, geometry=True), folded=True),
@@ -183,8 +183,13 @@ def _pictures(found: Identification) -> list[Block]:
 
 
 def _poses(poses: PoseUncertainty | None) -> Section:
+    heading = "Poses from crank angles, over the workspace"
     if poses is None:
-        return Section("")
+        reason = (
+            "No figures: the pose in the middle of the motion, measured with the drawn machine, is "
+            "outside the workspace of the machine that was found."
+        )
+        return Section(heading, Paragraph(reason, brief=True))
 
     def told(pair: tuple[float, float], unit: str) -> str:
         middle, worst = (number(1e3 * value, 2) for value in pair)
@@ -198,7 +203,7 @@ def _poses(poses: PoseUncertainty | None) -> Section:
             "angles, from the middle": told(poses.angle_beside, "mrad"),
         }
     )
-    return Section("Poses from crank angles, over the workspace", _POSES_TEXT, values)
+    return Section(heading, _POSES_TEXT, values)
 
 
 def _unseen(directions: tuple[int, list[str]]) -> Section:
