@@ -324,6 +324,9 @@ def test_a_network_with_a_wrong_field(tmp_path, capsys):
     [
         ({"plat": {}}, "plat: unknown key; did you mean plant?"),
         ({"plant": {"gravty": True}}, "plant.gravty: unknown key; did you mean plant.gravity?"),
+        ({"controller": {"w_q": 3.0}}, "controller.w_q: unknown key; did you mean controller.w_Q?"),
+        ({"controller": {"W_R": 3.0}}, "did you mean controller.w_R?"),
+        ({"controller": {"delay_stp": 3}}, "did you mean controller.delay_std?"),
         ({"plant": None}, "plant: got None"),
         ({"plant": [1]}, "plant: got [1]"),
         ({"plant": 3}, "plant: got 3"),

@@ -3,12 +3,11 @@
 A word is a shipped name; anything with a slash, or ending in `.yaml`, `.yml` or `.json`, is a path.
 """
 
-import difflib
 import os
 from pathlib import Path
 from typing import Final, Literal
 
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.errors import ConfigError, resembling
 
 Kind = Literal["mechanism", "scenario", "controller", "overlay", "weights"]
 
@@ -92,5 +91,5 @@ def resolve(kind: Kind, name_or_path: str | Path, relative_to: Path | None = Non
 def _nearest(kind: Kind, name: str) -> str:
     """The shipped names, those that resemble `name` first."""
     names = shipped(kind)
-    alike = difflib.get_close_matches(name, names)
+    alike = resembling(name, names)
     return ", ".join([*alike, *(n for n in names if n not in alike)]) or "none"

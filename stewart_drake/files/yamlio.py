@@ -6,7 +6,6 @@ these into a pydantic dataclass. Both report the first problem as a one-line `Co
 
 import copy
 import dataclasses
-import difflib
 import functools
 import io
 import json
@@ -26,7 +25,7 @@ from ruamel.yaml.events import AliasEvent
 from ruamel.yaml.nodes import ScalarNode
 from ruamel.yaml.representer import RoundTripRepresenter
 
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.errors import ConfigError, resembling
 from stewart_drake.files.fileio import read_bytes
 from stewart_drake.files.schema import field_hint, field_names, kinds, place_of
 
@@ -339,7 +338,7 @@ def _explain_unknown(type_: type, error: Any) -> str:
             f"{field}: got {brief(error['input'])}, which kind {section.kind!r} does not use; "
             f"expected only its own fields: {own}"
         )
-    alike = difflib.get_close_matches(name, known, n=1)
+    alike = resembling(name, known)
     # A field may have been named without its section.
     deeper = [f"{at}.{name}" for at in known if name in field_names(field_hint(section, at))]
     meant = alike[0] if alike else deeper[0] if len(deeper) == 1 else None
