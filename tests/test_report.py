@@ -5,6 +5,7 @@ import os
 import pickle
 import re
 import time
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 from stewart_drake.cli import main
 from stewart_drake.files.yamlio import load_yaml
 from stewart_drake.loop.simulation import simulate
+from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.report import collect as collect_module
 from stewart_drake.report import report_document
 from stewart_drake.report.answer import Answer
@@ -209,6 +211,33 @@ def test_a_run_that_ends_early_is_told_at_once():
     assert page.tone == "bad"
     assert re.match(r"The run ended after 1\.\d\d of 10 s: .*leg 2", page.verdict)
     assert "mine" in page.title and "<h1>" in html_of(page, Provenance("command"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "tone", "said"),
+    [
+        ((), "good", "The plate follows its reference"),
+        (("controller.delay_steps=7",), "bad", "Not reliable: the loop is unstable, errors grow"),
+        (("sensor.loss=0.2",), "fair", r"Caution: \d+ bad measurements in 31 samples"),
+        (("sensor.loss=0.7",), "bad", r"Not reliable: \d+ bad measurements in 31 samples"),
+        (("actuator.torque_limit=0.008",), "fair", "Caution: a mean error of"),
+    ],
+)
+def test_the_worst_finding_makes_the_verdict(settings, tone, said):
+    fixed = ("plant.kind=exact", "start=on_reference", "queue=reference")
+    duration = "duration=1.5" if "delay_steps" in str(settings) else "duration=3"
+    run = simulate(load_scenario("paper", None, (*fixed, duration, *settings)))
+    assert run.status == "completed"
+    page = report_document.document(collect_of(run.scenario, run=run), "mine")
+    assert page.tone == tone and re.search(said, page.verdict)
+
+
+def test_a_machine_is_called_by_its_name_and_not_by_its_file(tmp_path):
+    path = tmp_path / "machine.yaml"
+    path.write_text(mechanism_yaml(replace(load_mechanism("paper"), name="ruler")))
+    scenario = load_scenario("paper", None, (f"mechanism={path}", *EXACT, "duration=0.3"))
+    page = report_document.document(collect_of(scenario), "mine")
+    assert page.facts["mechanism"] == "ruler"
 
 
 def test_who_completes_is_told_and_how_the_delay_was_found():

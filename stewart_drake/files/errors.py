@@ -27,7 +27,5 @@ def resembling(name: str, names: Iterable[str]) -> list[str]:
         return row[-1]
 
     folded = name.casefold()
-    close = {
-        other for other in names if difflib.get_close_matches(folded, [other.casefold()], n=1)
-    }
+    close = {other for other in names if difflib.get_close_matches(folded, [other.casefold()], n=1)}
     return sorted(close, key=lambda other: (other.casefold() != folded, distance(other), other))

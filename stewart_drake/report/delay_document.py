@@ -104,7 +104,7 @@ def _verdict(study: DelayStudy) -> tuple[str, Tone]:
         sentences.append(f"{capital(loop_verdict(loop))}.{_knowledge(loop)}")
         if loop.stable is False:
             tone = "bad"
-        elif loop.stable and tone == "good" and loop.delay_margin < FRAGILE * study.eta:
+        elif tone == "good" and (loop.problem or loop.delay_margin < FRAGILE * study.eta):
             tone = "fair"
     sentences.append(capital(str(study.verdict)) + ".")
     return " ".join(sentences), "bad" if obstacles else tone

@@ -21,6 +21,7 @@ from stewart_drake.report.document import (
     Picture,
     Section,
     Table,
+    Tone,
     Values,
 )
 from stewart_drake.report.identification_figures import motion_figure, residual_figure
@@ -79,7 +80,8 @@ def document(found: Identification) -> Document:
         "segments": str(len(found.problem.segments)),
     }
     shown = [section for section in sections if section.blocks]
-    return Document("A machine from its log", text, shown, "good" if found.right else "bad", facts)
+    tone: Tone = "bad" if not found.right else "fair" if cautions else "good"
+    return Document("A machine from its log", text, shown, tone, facts)
 
 
 def file_names(logs: Sequence[Log]) -> list[str]:

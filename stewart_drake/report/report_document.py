@@ -5,12 +5,12 @@ and 7, what the analyses say beforehand, and the scenario itself.
 """
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from stewart_drake.loop.results import SimulationResult
+from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.report.answer import Answer
 from stewart_drake.report.collect import ANALYSES, Collected
 from stewart_drake.report.document import (
@@ -33,12 +33,18 @@ from stewart_drake.scenario.config import (
     Scenario,
     ServoActuatorConfig,
 )
+from stewart_drake.scenario.link import number_sent
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.studies.compare import LABELS, is_papers, label
 
 GOOD: Final = 5.0
-"""% of peak to peak: a mean error up to here, once torques can act, is called good."""
+POOR: Final = 25.0
+"""% of peak to peak: mean errors, once torques can act, up to which a run is good, and not bad."""
+FEW_BAD: Final = 0.01
+MANY_BAD: Final = 0.5
+"""Bad measurements per sample up to which a run is good, and not bad."""
 
+_LEVELS: Final[tuple[Tone, ...]] = ("good", "fair", "bad")
 _QUESTIONS: Final = {
     "delay": "Does the loop bear its delay?",
     "hautus": "Can the models be controlled and observed?",
@@ -122,7 +128,7 @@ def report_summary(found: Collected) -> dict[str, Any]:
 
 
 def verdict(found: Collected) -> tuple[str, Tone]:
-    """How the scenario went in a few sentences, and how good that is."""
+    """Return how the scenario went in a few sentences, and the level of the worst finding."""
     if found.run is None:
         return sentence(found.analyses["workspace"].verdict), "bad"
     run, s = found.run, found.run.summary
@@ -133,7 +139,11 @@ def verdict(found: Collected) -> tuple[str, Tone]:
             "bad",
         )
     error, floor, mean = s["accumulated_error"], s["delay_floor"], mean_error(run)
-    text = f"The plate follows its reference for all of {run.scenario.duration:g} s: E_ac is "
+    findings, duration = _findings(run), f"all of {run.scenario.duration:g} s"
+    told = {tone: "; ".join(one for level, one in findings if level == tone) for tone in _LEVELS}
+    text = f"The plate follows its reference for {duration}: E_ac is "
+    if told["bad"]:
+        text = f"Not reliable: {told['bad']}. The run completed {duration}: E_ac is "
     average = f"{number(mean, 2)} % of peak to peak on average"
     if floor > 0:
         text += (
@@ -142,7 +152,32 @@ def verdict(found: Collected) -> tuple[str, Tone]:
         )
     else:
         text += f"{number(error)} % s, {average}."
-    return text, "good" if mean <= GOOD else "fair"
+    if told["fair"]:
+        text += f" Caution: {told['fair']}."
+    return text, max((level for level, _ in findings), key=_LEVELS.index, default="good")
+
+
+def _findings(run: SimulationResult) -> list[tuple[Tone, str]]:
+    """Return what speaks against a completed run, each with its level."""
+    s, found, mean = run.summary, list[tuple[Tone, str]](), mean_error(run)
+    margin, counts = s["controller_margin"], s["counts"]
+    if margin is not None and margin["stable"] is False:
+        growth = f"errors grow {margin['spectral_radius']:.3g} fold per period"
+        found.append(("bad", f"the loop is unstable, {growth}"))
+    samples = number_sent(run.scenario.duration, run.scenario.controller.period)
+    wrong = counts["bad_measurements"]
+    if wrong > FEW_BAD * samples:
+        text = f"{wrong} bad measurements in {samples} samples"
+        found.append(("bad" if wrong > MANY_BAD * samples else "fair", text))
+    failed = sum(counts[name] for name in ("riccati_failures", "unreachable", "nonfinite_torque"))
+    if failed:
+        found.append(("fair", f"{failed} of {samples} samples without a new gain or torque"))
+    if not mean <= GOOD:  # or NaN
+        text = f"a mean error of {number(mean, 2)} % of peak to peak"
+        found.append(("bad" if mean > POOR else "fair", text))
+    if s["warnings"]:
+        found.append(("fair", "see the warnings below"))
+    return found
 
 
 def _who_completes(found: Collected) -> str:
@@ -236,7 +271,7 @@ def _facts(scenario: Scenario) -> dict[str, str]:
     if c.delay_estimator != "none":
         law += f", delay estimator {c.delay_estimator}"
     return {
-        "mechanism": Path(scenario.mechanism).stem,
+        "mechanism": load_mechanism(scenario.mechanism).name,
         "reference": f"{scenario.reference.kind}, {scenario.duration:g} s",
         "delay": f"{scenario.eta:.4g} s, {scenario.true_delay.periods:g} periods of {c.period:g} s",
         "plant": f"{plant.kind}, {'with' if plant.gravity else 'without'} gravity",

@@ -154,9 +154,16 @@ def _motors(sizing: Sizing, limit: float | None, motors: list[dict[str, Any]]) -
 def _nearest_text(nearest: Nearest | None) -> str:
     if nearest is None:
         return "-"
-    crossing = ", they cross" if nearest.distance < 0 else ""
+    crossing = _crossing(nearest)
     where = f"{nearest.pair}, t = {nearest.time:.2f} s"
-    return f"{number(1e3 * nearest.distance)} mm, {where}{crossing}"
+    return f"{number(1e3 * nearest.distance)} mm, {where}{crossing and f', {crossing}'}"
+
+
+def _crossing(nearest: Nearest) -> str:
+    """Return whether two parts cross; the disc of the base is only drawn."""
+    if nearest.distance >= 0:
+        return ""
+    return "crosses the disc as drawn" if "base" in nearest.pair else "they cross"
 
 
 def _clearance(study: WorkspaceStudy) -> Section:
@@ -167,24 +174,26 @@ def _clearance(study: WorkspaceStudy) -> Section:
             str(one.pair),
             number(1e3 * one.distance),
             f"{one.time:.2f}",
-            "they cross" if one.distance < 0 else "",
+            _crossing(one),
         )
         for one in _told(found.along.nearest)
     ]
     columns = ("parts", "distance [mm]", "at [s]", "")
     caption = "On the reference, the nearest first; negative: by how far they are in each other."
     values = {
-        "links, reference": _nearest_text(found.along.least(fixed=False)),
-        "base, reference": _nearest_text(found.along.least(fixed=True)),
+        "links": _nearest_text(found.along.least(fixed=False)),
+        "motors and posts": _nearest_text(found.along.stand),
+        "drawn disc of the base": _nearest_text(found.along.disc),
     }
     if found.along.touching:
         told = (f"{one.pair} ({1e3 * one.distance:.1f} mm)" for one in found.along.touching)
         values["links that cross"] = ", ".join(told)
     parts: list[Block | str] = [
-        "Distances between the shapes of the model, without those that meet in a joint. Links are "
-        "cranks, rods and plate. How thick they are no machine's file says: they are drawn in "
-        "proportion to its lengths, and so is the base with its motors, whose disc may lie "
-        "elsewhere in a real machine. In a simulation nothing of a machine touches itself.",
+        "Least distances on the reference between shapes of the model, without those that meet in "
+        "a joint. Links are cranks, rods and plate. A machine's file does not give their "
+        "thickness: they are drawn in proportion to its lengths, and so is the base with its "
+        "motors. The base's disc may lie elsewhere in a real machine. In a simulation nothing of a "
+        "machine touches itself.",
         Values(values),
         Table(columns, rows, caption),
         Picture(

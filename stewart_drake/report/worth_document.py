@@ -51,7 +51,10 @@ def worth_document(worth: Worth) -> Document:
 def _tone(summary: Mapping[str, Any], networks: Sequence[str]) -> Tone:
     if not networks:
         return "plain"
-    return "good" if all(summary["gains"][name]["g"][1] > 0 for name in networks) else "fair"
+    gains = [summary["gains"][name]["g"] for name in networks]
+    if any(high < 0 for _, _, high in gains):
+        return "bad"
+    return "good" if all(low > 0 for _, low, _ in gains) else "fair"
 
 
 def _verdict(worth: Worth, networks: Sequence[str]) -> str:

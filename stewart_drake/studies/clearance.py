@@ -51,8 +51,19 @@ class ClearanceAlong(NamedTuple):
     """Of every pair, the nearest first; empty where no pose is in reach."""
 
     def least(self, fixed: bool) -> Nearest | None:
-        """The nearest of all links, or (`fixed`) of what comes near the base."""
+        """Return the nearest pair of links, or (`fixed`) the nearest pair with the base."""
         return next((one for one in self.nearest if one.pair.fixed == fixed), None)
+
+    @property
+    def disc(self) -> Nearest | None:
+        """Nearest link to the base's disc, which is drawn and not in the machine's file."""
+        return next((one for one in self.nearest if "base" in one.pair), None)
+
+    @property
+    def stand(self) -> Nearest | None:
+        """Nearest link to a motor or a post."""
+        fixed = (one for one in self.nearest if one.pair.fixed and "base" not in one.pair)
+        return next(fixed, None)
 
     @property
     def touching(self) -> list[Nearest]:
@@ -95,16 +106,20 @@ class ClearanceStudy(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """In a clause."""
-        least = self.along.least(fixed=False)
+        """The answer in a clause."""
+        least, disc = self.along.least(fixed=False), self.along.disc
         if least is None:
             return "no pose of it is in reach, so that nothing is known of links that touch"
         where = f"{least.pair}, t = {least.time:.2f} s"
+        drawn = ""
+        if disc is not None and disc.distance < 0:
+            deep = f"{-1e3 * disc.distance:.3g} mm"
+            drawn = f"; {disc.pair.second} would enter the base's disc, as it is drawn, by {deep}"
         if least.distance >= 0:
-            return f"links stay {1e3 * least.distance:.3g} mm apart at least ({where})"
+            return f"links stay {1e3 * least.distance:.3g} mm apart at least ({where}){drawn}"
         count = len(self.along.touching)
         pairs = "one pair of links crosses" if count == 1 else f"{count} pairs of links cross"
-        return f"{pairs}, at worst {-1e3 * least.distance:.3g} mm deep ({where})"
+        return f"{pairs}, at worst {-1e3 * least.distance:.3g} mm deep ({where}){drawn}"
 
     @property
     def summary(self) -> dict[str, Any]:
