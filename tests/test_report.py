@@ -251,7 +251,8 @@ def test_who_completes_is_told_and_how_the_delay_was_found():
     error = number(found.accumulated_error)
     assert page.verdict.endswith(f"LQI, delay found completes it, with an E_ac of {error} % s.")
     captions = [picture.caption for section in page.sections for picture in section.all(Picture)]
-    assert "How LQI, delay found came to know the delay: with its band, and its error." in captions
+    said = "How LQI, delay found found the delay: with its band, and its error."
+    assert f"{said} {report_document.WIDE}" in captions
     assert "Applied torques of LQI, delay found." in captions
     assert not any("packets" in caption for caption in captions)
     alone = collect_of(lost.scenario, run=lost, comparison={"delay_lqi": lost})

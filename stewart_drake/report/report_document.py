@@ -45,6 +45,7 @@ MANY_BAD: Final = 0.5
 """Bad measurements per sample up to which a run is good, and not bad."""
 
 _LEVELS: Final[tuple[Tone, ...]] = ("good", "fair", "bad")
+WIDE: Final = "The stated deviation is 1.6 to 2.6 times too large."
 _QUESTIONS: Final = {
     "delay": "Does the loop bear its delay?",
     "hautus": "Can the models be controlled and observed?",
@@ -70,7 +71,7 @@ _RUN_CAPTIONS: Final = {
     "states": "Where the plate was, and where it should have been.",
     "errors": "The difference.",
     "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay.",
-    "delay": "The delay as it was found, with its band, and its error.",
+    "delay": f"The delay as it was found, with its band, and its error. {WIDE}",
     "parameters": "What the controller found out about the plant, which nobody told it.",
     "weights": "The weights that the tuner set.",
 }
@@ -240,7 +241,7 @@ def _caption_of(figure: str) -> str:
     """Of a figure about a controller that is not always among those compared."""
     what, _, controller = figure.partition("_")
     if what == "delay":
-        return f"How {label(controller)} came to know the delay: with its band, and its error."
+        return f"How {label(controller)} found the delay: with its band, and its error. {WIDE}"
     return f"Applied torques of {label(controller)}."
 
 
