@@ -27,6 +27,7 @@ from stewart_drake.scenario.link import delay_at
 
 AMPLITUDES = np.tile([0.2617993878] * 3 + [0.02, 0.02, 0.08], 2)
 ON_REFERENCE = ("start=on_reference", "queue=reference")
+NETWORK = ("link.kind=network", "link.low=0.5", "link.high=0.9")
 SEEDS = int(os.environ.get("SEEDS", "20"))
 COVERED = int(os.environ.get("COVERED", "200"))
 FRESH = 100
@@ -220,7 +221,7 @@ def limits() -> str:
 
 def network() -> str:
     """Packets under way for 0.5 to 0.9 s, played out after 0.9 s, the delay known."""
-    usual = ("link.kind=network", "link.playout=0.9")
+    usual = (*NETWORK, "link.playout=0.9")
     rows: dict[str, tuple[tuple[str, ...], bool]] = {
         "5 % lost": ((*ON_REFERENCE, "link.loss=0.05"), False),
         "5 % lost, dirty": ((*ON_REFERENCE, "link.loss=0.05"), True),
@@ -283,7 +284,7 @@ def multibody() -> str:
     cases["20 ms at 1 rad/s"] = [("drifting", (*on, "delay.swing=0.02"))]
     jump = ("delay.jump=0.1", "delay.jump_time=4")
     cases["jump of +0.1 s at 4 s"] = [("constant", (*on, *jump))]
-    network = ("link.kind=network", "link.playout=0.9", "link.loss=0.05")
+    network = (*NETWORK, "link.playout=0.9", "link.loss=0.05")
     cases["network, 5 % lost, delay known"] = [
         ("none", (*on, *network, f"link.seed={seed}")) for seed in few
     ]

@@ -211,4 +211,5 @@ def _answer(
     words = {"controller": controller, **(typed or {}), "out": delivery.out}
     command = command_line("analyze", name, scenario, settings=given, options=words)
     loaded = load_scenario(scenario, controller, (*fixed, *given))
+    delivery.tell_link(loaded)
     return analyze(name, loaded, command=command, **options)

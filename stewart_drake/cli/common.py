@@ -18,6 +18,7 @@ from stewart_drake.report.terminal import echo
 if TYPE_CHECKING:
     from stewart_drake.files.resources import Kind
     from stewart_drake.report.answer import Answer
+    from stewart_drake.scenario.config import Scenario
 
 INTERRUPTED: Final = 130
 """Exit status after Ctrl-C."""
@@ -186,6 +187,13 @@ class Delivery:
         from stewart_drake.report.words import wrap
 
         self.say(wrap(line))
+
+    def tell_link(self, scenario: "Scenario") -> None:
+        """Print the network that is assumed, if there is one."""
+        from stewart_drake.scenario.link import link_text
+
+        if text := link_text(scenario):
+            self.tell(f"link: {text}")
 
     def discard(self, *names: str) -> None:
         """Delete files of an earlier run, as far as they exist, and its summary."""

@@ -69,6 +69,7 @@ def machine(
     check_scenario(loaded)
     experiment = prepare(loaded)
     delivery = Delivery(None, quiet, as_json)
+    delivery.tell_link(loaded)
     endpoint = Endpoint(ControllerMessage, host, port, None if key is None else read_key(key))
     running = Machine(experiment, endpoint, chosen, delivery.tell)
     interrupted = _run(

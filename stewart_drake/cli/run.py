@@ -71,6 +71,7 @@ def simulate(
     experiment = prepare(load_scenario(scenario, controller, settings or ()))
     delivery = Delivery(out, quiet, as_json)
     viewer = open_meshcat() if meshcat else None
+    delivery.tell_link(experiment.scenario)
     margin = controller_margin(experiment)
     delivery.tell(loop_verdict(margin))
     delivery.tell(str(Verdict(margin.eta, margin.pole, margin.pole_time)))
@@ -210,6 +211,7 @@ def compare(
     experiment = prepare(load_understood(scenario, settings=settings or ()))
     delivery = Delivery(out, quiet, as_json)
     names = tuple(study.shown(scenario, settings or ()))
+    delivery.tell_link(experiment.scenario)
     delivery.tell(str(delay_verdict(experiment)))
     with progress_bars(names, experiment.scenario.duration, quiet) as progress:
         results = study.compare(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.scenario.link import NO_LOSSES, BurstChain
 from stewart_drake.scenario.signals import NUM_TORQUES
 
 Array = NDArray[np.float64]
@@ -21,11 +22,13 @@ Array = NDArray[np.float64]
 SURE: Final = 2.0
 """Times as probable as what was decided is what the law changes its mind for. A change makes it
 correct what it thinks has gone wrong, and correct that again if it has not."""
+_LEAST: Final = 1e-9
+"""Probability of a packet that is later than any, so that no report is impossible."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """What the machine says of packets and torques, with a measurement.
+    """Report of the machine on packets and torques, sent with a measurement.
 
     Attributes:
         arrived: (n,) whether the packet sent i + 1 samples before the report's has arrived.
@@ -40,7 +43,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Sent:
-    """What a channel remembers.
+    """Memory of a channel.
 
     Attributes:
         packets: (n, rows, 6) last packets, the newest last; NaN before there were any.
@@ -68,7 +71,7 @@ class Channel(Protocol):
     def in_flight(
         self, sent: Sent, in_flight: Array, timeline: Timeline, report: Report | None
     ) -> tuple[Sent, Array]:
-        """What is known of packets, and the torques (n, 6) in flight as they now seem to be.
+        """Return the updated memory and the most probable torques (n, 6) in flight.
 
         Args:
             sent: after the last sample.
@@ -79,7 +82,7 @@ class Channel(Protocol):
         ...
 
     def send(self, sent: Sent, plan: Array, in_flight: Array) -> Sent:
-        """With the packet of a plan (N, 6) too; `in_flight` (n, 6) before its first torque."""
+        """Return the memory with the packet of a plan (N, 6); `in_flight` (n, 6) before it."""
         ...
 
 
@@ -99,7 +102,7 @@ class Wire:
     def in_flight(
         self, sent: Sent, in_flight: Array, timeline: Timeline, report: Report | None
     ) -> tuple[Sent, Array]:
-        """What was sent."""
+        """Return what was sent."""
         return sent, in_flight
 
     def send(self, sent: Sent, plan: Array, in_flight: Array) -> Sent:
@@ -114,9 +117,11 @@ class Packets:
     Attributes:
         torques: N.
         repeats: r, how many earlier torques a packet says again.
-        in_time: per row, the probability that a packet has arrived by the row's time.
-        arrived_by: the same by so many periods after it was sent, 0 among them; as many packets are
+        in_time: per row, the probability that a packet which is not lost has arrived by the row's
+            time.
+        arrived_by: the same after 0, 1, ... periods; its length is the number of packets that are
             remembered.
+        losses: Markov chain of the packets that are lost.
         holds: whether a dry buffer holds the last torque, or puts out zero.
         told: periods that a report looks back: of older packets that had not arrived by then it
             does not tell whether they have since.
@@ -126,6 +131,7 @@ class Packets:
     repeats: int
     in_time: tuple[float, ...]
     arrived_by: tuple[float, ...]
+    losses: BurstChain = NO_LOSSES
     holds: bool = True
     told: int = sys.maxsize
 
@@ -159,42 +165,75 @@ class Packets:
             for d, torque in enumerate(acted, start=since + timeline.steps):
                 flying[-1 - d] = torque
         last = min(since + timeline.steps, kept, len(flying) - 1)
-        for d in reversed(range(last)):
-            if np.isnan(sent.packets[-1 - d, 0, 0]):
-                continue  # under way since before the first sample
-            torque = self._expected(sent.packets, arrived, d, since)
+        known = kept - int(np.isnan(sent.packets[:, 0, 0]).sum())
+        chances = self._chances(arrived[kept - known :], since, last)
+        for d in reversed(range(min(last, known))):  # others are from before the first sample
+            torque = self._expected(sent.packets, chances[d], d)
             if torque is None:
                 torque = flying[-2 - d] if self.holds else np.zeros(NUM_TORQUES)
             flying[-1 - d] = torque
         return replace(sent, arrived=arrived, since=since), flying
 
-    def _expected(
-        self, packets: Array, arrived: NDArray[np.bool_], d: int, since: int
-    ) -> Array | None:
-        """What will most probably act as T_{k-1-d}; None for a dry buffer.
+    def _chances(self, arrived: NDArray[np.bool_], since: int, last: int) -> Array:
+        """Return the probabilities (last, n + 1) of the sources of T_{k-1-d}, d = 0 to last - 1.
 
-        The newest packet that is there decides. With p_i the probability that packet i is, what it
-        says acts with p_i prod (1 - p) over the newer ones; repetitions say the same, and add up.
-        What was decided counts SURE times.
+        Column i < n: the packet sent i + 1 samples ago is in time and no newer one is; column n: no
+        packet is. The losses are the hidden states of a Markov chain, so that this is its
+        forward-backward algorithm. With the evidence E_i on packet i (arrived, or not by the last
+        report), older packets give P(state of i | E of older ones) and c_i = P(E_i | the same), the
+        newer ones, backwards, P(E and not in time for all newer ones | state of i).
+
+        Args:
+            arrived: (n,) whether each packet is known to have arrived, the newest last.
+            since: periods since the last report.
+            last: number of torques.
         """
-        kept, left, chances = len(packets), 1.0, list[tuple[float, Array | None]]()
-        decided = 0.0
-        for row in range(max(0, self.repeats - d), len(self.in_time)):
-            i = row + 1 + d - self.repeats  # samples since the packet was sent
-            if i > kept or np.isnan(packets[-i, row, 0]):
-                break
-            here = 1.0 if arrived[-i] else self.in_time[row]
-            if since < kept and i > since and not arrived[-i]:
-                # Bayes: it had not arrived when the report was made.
-                before = self.arrived_by[min(i - since, self.told)]
-                here = max(0.0, here - before) / (1 - before) if before < 1 else 0.0
-            if row <= self.repeats:
-                decided += left * here
-                chances = [(SURE * decided, packets[-i, row])]
-            else:
-                chances.append((left * here, packets[-i, row]))
-            left *= 1 - here
-        return max([*chances, (left, None)], key=lambda chance: chance[0])[1]
+        rows, chain, there = len(self.in_time), self.losses, arrived[::-1]
+        # An arrived packet ends all bursts: newer packets do not depend on older ones.
+        relevant = max(0, min(last + self.torques, len(there)) - 1)
+        n = next((i + 1 for i in range(relevant, len(there)) if there[i]), len(there))
+        there, ago = there[:n], np.arange(1, n + 1)
+        # If it is not lost: the probability that it had not arrived by the report ...
+        told = np.minimum(np.maximum(ago - since, 0), self.told)
+        reported = (ago > since) & ~there & (since < len(self.arrived_by))
+        absent = np.where(reported, 1 - np.take(self.arrived_by, told), 1.0)
+        # ... and that it is not in time, where it has a row for this torque.
+        row = ago - 1 - np.arange(last)[:, None] + self.repeats
+        due = np.where(there, 1.0, np.take(self.in_time, np.clip(row, 0, rows - 1)))
+        late = np.where((row >= 0) & (row < rows), 1 - due, absent)
+        absent = np.maximum(absent, _LEAST)
+        late = np.clip(late, np.where(there, 0.0, _LEAST), absent)
+
+        state, before, evidence = chain.stationary, np.empty(n), np.empty(n)
+        for i in reversed(range(n)):
+            before[i] = state[-1]
+            state = state * ~there[i]
+            state[-1] = absent[i] * before[i]
+            evidence[i] = state.sum()
+            state = chain.after(state / evidence[i])
+        newer, chances = np.ones((last, chain.burst + 1)), np.empty((last, n + 1))
+        for i in range(n):
+            chances[:, i] = newer[:, -1]
+            newer = newer * (~there[i] / evidence[i])
+            newer[:, -1] = late[:, i] / evidence[i] * chances[:, i]
+            if i < n - 1:
+                newer = chain.before(newer)
+        chances[:, :n] *= before * (absent - late) / evidence
+        chances[:, n] = newer @ chain.stationary
+        return chances
+
+    def _expected(self, packets: Array, chances: Array, d: int) -> Array | None:
+        """Return what most probably acts as T_{k-1-d}; None for a dry buffer.
+
+        Repetitions say the same, so that their probabilities add up. What was decided counts SURE
+        times.
+        """
+        n, r = len(chances) - 1, self.repeats
+        decided = SURE * chances[max(0, d - r) : d + 1].sum()
+        best = [(decided, packets[-1 - d, r]), (chances[n], None)]
+        plans = range(d + 1, min(d + self.torques, n))
+        best[1:1] = [(chances[i], packets[-1 - i, r + i - d]) for i in plans]
+        return max(best, key=lambda chance: chance[0])[1]
 
     def send(self, sent: Sent, plan: Array, in_flight: Array) -> Sent:
         """See `Channel.send`."""

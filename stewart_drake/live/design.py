@@ -133,6 +133,7 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
         low=link.shortest,
         high=longest,
         loss=max(link.loss_there, _LEAST_LOSS),
+        burst=scenario.link.burst if isinstance(scenario.link, NetworkConfig) else 1,
         dry="hold" if MachineFlags.HOLDS in machine.flags else "zero",
     )
     eta, period = _whole_delay(scenario, network), c.period

@@ -95,7 +95,7 @@ class Drawn(NamedTuple):
 def drawn(scenario: Scenario) -> Drawn:
     """As the scenario's simulation has it, sample by sample."""
     link = scenario.link
-    forward = forward_times(link, DRAWN) if isinstance(link, NetworkConfig) else np.zeros(1)
+    forward = forward_times(scenario, DRAWN) if isinstance(link, NetworkConfig) else np.zeros(1)
     return Drawn(
         *(
             _by_number(times)

@@ -427,7 +427,7 @@ def _link(experiment: Experiment, channel: Channel, reports: int) -> System:
     period, queue = sc.controller.period, torques_in_flight(experiment, delay)
     if isinstance(sc.link, NetworkConfig):
         repeats = channel.repeats if isinstance(channel, Packets) else 0
-        times = forward_times(sc.link, number_sent(sc.duration, period))
+        times = forward_times(sc, number_sent(sc.duration, period))
         return PlayoutBuffer(
             period,
             times,

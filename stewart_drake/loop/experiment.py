@@ -74,7 +74,7 @@ from stewart_drake.scenario.config import (
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.known import DELAY, OFFSETS, Known, load_known
-from stewart_drake.scenario.link import in_time, times_under_way
+from stewart_drake.scenario.link import BurstChain, in_time, times_under_way
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,
@@ -403,19 +403,17 @@ def waits_at_rest(scenario: Scenario) -> bool:
 
 
 def believed_delay(scenario: Scenario) -> Delay:
-    """The delay that the controller assumes; null means the known one, else the true one.
+    """Return the delay that the controller assumes; null is the known one, else the true one.
 
-    When torques act that are sent over a network says the controller itself, unless it knows of no
-    delay.
+    Over a network the play-out bound sets the delay, whatever is known of the machine.
     """
     controller = scenario.controller
-    says = isinstance(scenario.link, NetworkConfig) and controller.delay_steps != 0
-    known = None if says or controller.delay_steps is not None else known_of(scenario)
+    if controller.delay_steps is not None:
+        return Delay(controller.delay_steps, controller.delay_fraction or 0.0)
+    known = None if isinstance(scenario.link, NetworkConfig) else known_of(scenario)
     if known is not None and (seconds := known.value(DELAY)) is not None:
         return Delay.of(seconds, controller.period)
-    if controller.delay_steps is None or says:
-        return scenario.true_delay
-    return Delay(controller.delay_steps, controller.delay_fraction or 0.0)
+    return scenario.true_delay
 
 
 def torques_in_flight(experiment: Experiment, delay: Delay) -> Array:
@@ -658,17 +656,18 @@ def longest_wait(scenario: Scenario) -> int:
 
 
 def _channel(scenario: Scenario, timeline: Timeline, waits: int) -> Channel:
-    link, c = scenario.link, scenario.controller
+    link, c = scenario.assumed_link, scenario.controller
     if not isinstance(link, NetworkConfig) or c.delay_steps == 0:
         return Wire()
     rows = c.packet_repeats + c.packet_torques
-    due = [timeline.eta + (row - c.packet_repeats) * c.period for row in range(rows)]
+    due = timeline.eta + (np.arange(rows) - c.packet_repeats) * c.period
     kept = rows + timeline.steps + waits + _REPORTS + 1
     return Packets(
         torques=c.packet_torques,
         repeats=c.packet_repeats,
-        in_time=tuple(in_time(link, time) for time in due),
-        arrived_by=tuple(in_time(link, i * c.period) for i in range(kept)),
+        in_time=tuple(in_time(link, due).tolist()),
+        arrived_by=tuple(in_time(link, c.period * np.arange(kept)).tolist()),
+        losses=BurstChain(link.loss, link.burst),
         holds=link.dry == "hold",
         told=reported(waits + _REPORTS),
     )

@@ -18,6 +18,7 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
+from stewart_drake.files.schema import plain
 from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.experiment import (
@@ -154,6 +155,7 @@ class _Key:
             del fields[section][name]
         del fields["tuner"]
         fields["delay"] = believed.steps, believed.fraction
+        fields["link"] = plain(scenario.assumed_link)
         fields["controller"] |= {"delay_steps": None, "delay_fraction": None}
         machines = scenario.mechanism, scenario.plant.mechanism
         files = [resolve("mechanism", name) for name in machines if name is not None]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
 from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.files.schema import plain
 from stewart_drake.files.versions import versions
 from stewart_drake.law.memory import Counts
 from stewart_drake.loop import metrics
@@ -234,6 +235,7 @@ def summarize(
         "backend": backend().name,
         "controller_backend": recorder.controller_backend,
         "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
+        "link": plain(sc.assumed_link),
         "own": experiment.own.names,
         "scenario": scenario_to_dict(sc),
         "versions": versions(),

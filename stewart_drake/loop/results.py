@@ -82,6 +82,8 @@ class RunSummary(TypedDict):
     """What stepped the controller: `native`, `own`, or `python`, and the field that C has not."""
     counts: dict[str, int]
     """What went wrong and was survived, by name (`law.memory.Counts`, `tuner_fallbacks`)."""
+    link: dict[str, Any]
+    """The assumed link with all its numbers (`Scenario.assumed_link`)."""
     own: dict[str, str]
     """The user's own systems in the loop, by their part in it."""
     scenario: dict[str, Any]

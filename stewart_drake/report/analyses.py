@@ -1,8 +1,10 @@
 """The analyses of a scenario, and the search for a machine: what studies it, what is told of it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
+from stewart_drake.files.schema import plain
 from stewart_drake.report import (
     delay_document,
     hautus_document,
@@ -13,6 +15,7 @@ from stewart_drake.report import (
 )
 from stewart_drake.report.answer import Answer, answer_of
 from stewart_drake.report.document import Document
+from stewart_drake.scenario.link import link_text
 from stewart_drake.studies.delay_limits import study_delay
 from stewart_drake.studies.hautus import study_hautus
 from stewart_drake.studies.layout import study_layout
@@ -51,5 +54,11 @@ def analyze(name: str, *subject: Any, command: str, **options: Any) -> Answer:
         command: what does the same again, as typed.
         options: of the study.
     """
-    analysis = ANALYSES[name]
-    return answer_of(lambda: analysis.study(*subject, **options), analysis.document, command)
+    analysis, scenario = ANALYSES[name], subject[0]
+    found = answer_of(lambda: analysis.study(*subject, **options), analysis.document, command)
+    facts = {"link": text} if (text := link_text(scenario)) else {}
+    return replace(
+        found,
+        summary=found.summary | {"link": plain(scenario.assumed_link)},
+        document=replace(found.document, facts={**facts, **found.document.facts}),
+    )

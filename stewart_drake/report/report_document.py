@@ -27,13 +27,8 @@ from stewart_drake.report.figures import draw_comparison, draw_run, has_packets
 from stewart_drake.report.run_document import comparison_blocks, run_blocks
 from stewart_drake.report.tuner_figures import weights_figure
 from stewart_drake.report.words import number, sentence
-from stewart_drake.scenario.config import (
-    EncoderSensorConfig,
-    NetworkConfig,
-    Scenario,
-    ServoActuatorConfig,
-)
-from stewart_drake.scenario.link import number_sent
+from stewart_drake.scenario.config import EncoderSensorConfig, Scenario, ServoActuatorConfig
+from stewart_drake.scenario.link import link_text, number_sent
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.studies.compare import LABELS, is_papers, label
 
@@ -284,11 +279,9 @@ def _facts(scenario: Scenario) -> dict[str, str]:
 def _unusual(scenario: Scenario) -> dict[str, str]:
     """Link, sensor, motors and weights, where they are not those of a plain scenario."""
     told = {}
-    link, sensor, motors = scenario.link, scenario.sensor, scenario.actuator
-    if isinstance(link, NetworkConfig):
-        lost = "no packets" if link.loss == 0 else f"{100 * link.loss:g} % of the packets"
-        back = "" if link.back is None else ", and another way back"
-        told["link"] = f"a network that loses {lost}{back}"
+    sensor, motors = scenario.sensor, scenario.actuator
+    if text := link_text(scenario):
+        told["link"] = text
     if isinstance(sensor, EncoderSensorConfig):
         fine = "exact" if sensor.bits is None else f"of {sensor.bits} bit"
         told["sensor"] = f"encoders, {fine}, {sensor.samples} in a period"

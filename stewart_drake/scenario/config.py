@@ -6,7 +6,7 @@ here needs a mechanism. `scenario.loading` reads scenarios from files.
 
 import dataclasses
 from dataclasses import field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -301,10 +301,6 @@ class WireConfig:
 
     kind: Literal["wire"] = "wire"
 
-    def problem(self) -> str | None:
-        """Nothing can be."""
-        return None
-
 
 @dataclass(config=STRICT)
 class PacketsConfig:
@@ -312,29 +308,34 @@ class PacketsConfig:
 
     Attributes:
         distribution: of the time under way, `uniform` from `low` to `high`, or `lognormal`.
-        low, high: of the uniform one, s.
-        median: of the lognormal one, s.
-        sigma: of the lognormal one, standard deviation of its logarithm.
+        low, high: of the uniform one, s; null otherwise.
+        median: of the lognormal one, s; null otherwise.
+        sigma: of the lognormal one, standard deviation of its logarithm; null otherwise.
         loss: share of the packets that never arrive.
-        burst: how many in a row are lost together.
+        burst: number of packets in a row that are lost together.
     """
 
     distribution: Literal["uniform", "lognormal"] = "uniform"
-    low: Seconds = 0.5
-    high: Seconds = 0.9
+    low: Seconds | None = None
+    high: Seconds | None = None
     median: Positive | None = None
     sigma: Annotated[float, Field(gt=0, le=10)] | None = None
     loss: Annotated[float, Field(ge=0, le=0.99)] = 0.05
     burst: Annotated[int, Field(ge=1, le=1000)] = 1
 
     def times_problem(self, where: str) -> str | None:
-        """What is wrong with the times, or None."""
-        if self.distribution == "uniform" and self.low > self.high:
+        """Return what is wrong with the times, or None."""
+        used = ("low", "high") if self.distribution == "uniform" else ("median", "sigma")
+        for name in ("low", "high", "median", "sigma"):
+            value = getattr(self, name)
+            if (value is None) == (name in used):
+                got, expected = ("null", "a number") if name in used else (f"{value:g}", "null")
+                return (
+                    f"{where}.{name}: got {got} with distribution {self.distribution!r}; "
+                    f"expected {expected}"
+                )
+        if self.low is not None and self.high is not None and self.low > self.high:
             return f"{where}.low: got {self.low:g} s; expected at most high, {self.high:g} s"
-        if self.distribution == "lognormal":
-            for name in ("median", "sigma"):
-                if getattr(self, name) is None:
-                    return f"{where}.{name}: got null with a lognormal one; expected a number"
         return None
 
 
@@ -342,16 +343,18 @@ class PacketsConfig:
 class NetworkConfig(PacketsConfig):
     """Packets of torques with the times at which they shall act, and a buffer at the machine.
 
-    Each packet takes a time of its own, see `PacketsConfig`; `delay` is not used. A torque acts at
-    its time, a bound later than it was sent. Where no packet has brought one for a period, the
-    buffer is dry. Clocks agree.
+    Each packet takes a time of its own, see `PacketsConfig`. Without `low` and `high` a uniform one
+    is between 0.8 and 1.2 times the constant delay that `delay` gives, for which nothing else uses
+    `delay`; `Scenario.assumed_link` has the numbers. A torque acts at its time, a bound later than
+    it was sent. Where no packet has brought one for a period, the buffer is dry. Clocks agree.
 
     Attributes:
         kind: `network`.
         playout: the bound, s; null is the one that makes late packets as rare as lost ones
             (`scenario.link.usual_bound`). The controller adds its `packet_repeats` periods.
         dry: what a dry buffer does, `hold` the last torque or put out `zero`.
-        back: `return` in files, how measurements come back; null is at once and all of them.
+        back: `return` in files, how measurements come back, with times of its own; null is at once
+            and all of them.
         acknowledged: whether each measurement tells which packets have arrived and what has acted.
         seed: of times and losses.
     """
@@ -363,13 +366,15 @@ class NetworkConfig(PacketsConfig):
     acknowledged: bool = True
     seed: Seed = 0
 
-    def problem(self) -> str | None:
-        """What is wrong with fields that are well formed one by one, or None."""
-        back = self.back.times_problem("link.return") if self.back else None
-        return self.times_problem("link") or back
+    @property
+    def follows_delay(self) -> bool:
+        """Whether the times of packets are those of the scenario's delay."""
+        return self.distribution == "uniform" and self.low is None and self.high is None
 
 
 LinkConfig = Annotated[WireConfig | NetworkConfig, ByKind()]
+ASSUMED_TIMES: Final = (0.8, 1.2)
+"""Shortest and longest time under way, in delays, of a network without `low` and `high`."""
 
 
 @dataclass(config=STRICT)
@@ -519,14 +524,35 @@ class Scenario:
         return f"Scenario({differences(self, Scenario())})"
 
     @property
+    def assumed_link(self) -> WireConfig | NetworkConfig:
+        """The link with all its numbers: times that follow the delay, and the play-out bound.
+
+        Raises:
+            ConfigError: they shall follow the delay, which is none or not constant.
+        """
+        link, c = self.link, self.controller
+        if not isinstance(link, NetworkConfig):
+            return link
+        if problem := self._times_problem(link):
+            raise ConfigError(problem)
+        if link.follows_delay:
+            eta = Delay(self.delay.steps, self.delay.fraction).eta(c.period)
+            low, high = (round(share * eta, 12) for share in ASSUMED_TIMES)
+            link = dataclasses.replace(link, low=low, high=high)
+        if link.playout is None:
+            from stewart_drake.scenario.link import usual_bound  # numpy, which --help goes without
+
+            bound = usual_bound(link, c.packet_repeats, c.period)
+            link = dataclasses.replace(link, playout=bound)
+        return link
+
+    @property
     def true_delay(self) -> Delay:
         """What the torques wait for at t = 0, which the controller need not know."""
-        if isinstance(self.link, NetworkConfig):
-            from stewart_drake.scenario.link import (
-                network_delay,
-            )  # numpy, which --help goes without
-
-            return network_delay(self.link, self.controller)
+        c, link = self.controller, self.assumed_link
+        if isinstance(link, NetworkConfig):
+            assert link.playout is not None
+            return Delay.of(link.playout + c.packet_repeats * c.period, c.period)
         return Delay(self.delay.steps, self.delay.fraction)
 
     @property
@@ -556,11 +582,35 @@ class Scenario:
             "believed in; expected as much or more"
         )
 
-    def _wait_problem(self) -> str | None:
-        """Whether torques over a network wait longer than they may over a wire."""
-        if not isinstance(self.link, NetworkConfig) or self.true_delay.steps <= MOST_PERIODS:
+    def _times_problem(self, link: NetworkConfig) -> str | None:
+        """Return what is wrong with the times of packets, or None."""
+        if not link.follows_delay:
+            return link.times_problem("link")
+        nothing = self.delay.steps + self.delay.fraction == 0
+        if self.delay.constant and not nothing:
+            return dataclasses.replace(link, low=0.0, high=0.0).times_problem("link")
+        return (
+            f"link.low: got null with a delay that is {'0' if nothing else 'not constant'}; "
+            "expected link.low and link.high in s, or a constant delay, of which they are then "
+            f"{ASSUMED_TIMES[0]:g} and {ASSUMED_TIMES[1]:g} times"
+        )
+
+    def _network_problem(self) -> str | None:
+        """Return what is wrong with a network and with what is believed of it, or None."""
+        link, c = self.link, self.controller
+        if not isinstance(link, NetworkConfig):
             return None
-        bound = "null" if self.link.playout is None else f"{self.link.playout:g} s"
+        back = link.back.times_problem("link.return") if link.back else None
+        if problem := self._times_problem(link) or back:
+            return problem
+        if c.delay_steps:
+            return (
+                f"controller.delay_steps: got {c.delay_steps} with link.kind 'network'; expected "
+                "null, as the play-out bound sets the delay, or 0 for a controller without one"
+            )
+        if self.true_delay.steps <= MOST_PERIODS:
+            return None
+        bound = "null" if link.playout is None else f"{link.playout:g} s"
         return (
             f"link.playout: got {bound}, with which torques wait for more than {MOST_PERIODS} "
             "periods; expected a shorter one, or a quicker network"
@@ -596,7 +646,7 @@ class Scenario:
             self._command_problem(),
             self._map_problem(),
             self.sensor.problem(),
-            self.link.problem() or self._wait_problem(),
+            self._network_problem(),
             self._delay_problem(),
             self._offsets_problem(),
             self.step_problem(step) if step else log_problem(self.log_period, self.duration, None),

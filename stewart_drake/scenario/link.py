@@ -1,16 +1,18 @@
-"""What a link does to what is sent over it: when each torque arrives, or that it does not.
+"""Times at which torques and measurements arrive over a link, and those that are lost.
 
 Everything is drawn beforehand from a seed, so that the same scenario gives the same run.
 """
 
 from bisect import bisect_left
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stewart_drake.scenario.config import (
-    ControllerConfig,
+    ASSUMED_TIMES,
     DelayConfig,
     NetworkConfig,
     PacketsConfig,
@@ -66,7 +68,7 @@ def torque_delays(scenario: Scenario) -> Array:
 
 
 def acting(arrivals: Array, together: float = 0.0) -> NDArray[np.bool_]:
-    """Which of (n,) torques ever act: those that arrive before every newer one.
+    """Return which of (n,) torques ever act: those that arrive before every newer one.
 
     The motors take the newest torque that has arrived, whatever comes after it: one that was
     overtaken says what was right for an earlier instant. Of several that arrive within `together`,
@@ -77,7 +79,7 @@ def acting(arrivals: Array, together: float = 0.0) -> NDArray[np.bool_]:
 
 
 def releases(period: float, delays: Array, delay: Delay) -> tuple[NDArray[np.int64], Array]:
-    """Which torques ever act over a wire, and when they begin to, s, in the order in which they do.
+    """Return the torques that ever act over a wire, and when they begin to, s, in that order.
 
     Torque k >= 0 is sent at k dt and waits for `delays[k]`; torques -L to -1 were sent before, each
     a period after the other, and wait for `delay`, of which L is the length of the queue.
@@ -101,19 +103,79 @@ def times_under_way(config: PacketsConfig) -> Any:
     from scipy.stats import lognorm, uniform  # a fifth of a second, which others need not wait
 
     if config.distribution == "uniform":
+        assert config.low is not None and config.high is not None  # see `Scenario.assumed_link`
         return uniform(config.low, max(config.high - config.low, 1e-12))
     assert config.sigma is not None and config.median is not None  # or it is refused
     return lognorm(s=config.sigma, scale=config.median)
 
 
-def losses(number: int, loss: float, burst: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Which of `number` packets are lost.
+@dataclass(frozen=True)
+class BurstChain:
+    """Markov chain of lost packets.
 
-    A burst loses that many in a row. Where one begins with probability p, independently of others,
-    a packet is kept if none of the last `burst` began one: 1 - loss = (1 - p)^burst.
+    The state a counts the packets since the last burst began, up to `burst`:
+
+        a+ = 0 with probability p, else min(a + 1, burst)
+
+    A packet is lost where a < burst. It is kept where none of the last `burst` packets began one,
+    so that 1 - loss = (1 - p)^burst. The chain reads the same backwards in time.
+
+    Attributes:
+        loss: share of the packets that are lost.
+        burst: number of packets that one burst loses.
     """
-    begins = rng.random(number) < 1 - (1 - loss) ** (1 / burst)
-    return np.convolve(begins, np.ones(burst))[:number] > 0
+
+    loss: float
+    burst: int
+
+    @cached_property
+    def begins(self) -> float:
+        """Probability p that a burst begins at a packet."""
+        return 1 - (1 - self.loss) ** (1 / self.burst)
+
+    @cached_property
+    def stationary(self) -> Array:
+        """(burst + 1,) probability of each state: p (1 - p)^a, and 1 - loss."""
+        shares = self.begins * (1 - self.begins) ** np.arange(self.burst)
+        return np.append(shares, 1 - self.loss)
+
+    def after(self, shares: Array) -> Array:
+        """Return the weights (burst + 1,) of the states one packet later."""
+        later = np.empty_like(shares)
+        later[1:] = (1 - self.begins) * shares[:-1]
+        later[-1] += (1 - self.begins) * shares[-1]
+        later[0] = self.begins * shares.sum()
+        return later
+
+    def before(self, values: Array) -> Array:
+        """Return the expectation (..., burst + 1) of a function of the next state."""
+        longer = np.minimum(np.arange(self.burst + 1) + 1, self.burst)
+        return self.begins * values[..., :1] + (1 - self.begins) * values[..., longer]
+
+    def none_in_time(self, late: Array) -> float:
+        """Return the probability that of consecutive packets each is lost or late.
+
+        The weights of the states are carried from packet to packet; at each the weight of "kept" is
+        multiplied with the probability that this packet is late.
+
+        Args:
+            late: (n,) probability that each is late if it is not lost.
+        """
+        shares = self.stationary.copy()
+        shares[-1] *= late[0]
+        for share in late[1:]:
+            shares = self.after(shares)
+            shares[-1] *= share
+        return float(shares.sum())
+
+
+NO_LOSSES: Final = BurstChain(0.0, 1)
+
+
+def losses(number: int, loss: float, burst: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Draw which of `number` packets are lost: a `BurstChain` from its stationary state."""
+    begins = rng.random(number + burst - 1) < BurstChain(loss, burst).begins
+    return np.convolve(begins, np.ones(burst), "valid") > 0.5
 
 
 def packet_times(config: PacketsConfig, number: int, seed: int, stream: int = _FORWARD) -> Array:
@@ -125,8 +187,10 @@ def packet_times(config: PacketsConfig, number: int, seed: int, stream: int = _F
     return np.where(losses(number, config.loss, config.burst, rng), np.inf, times)
 
 
-def forward_times(link: NetworkConfig, number: int) -> Array:
+def forward_times(scenario: Scenario, number: int) -> Array:
     """(number,) s that each packet of torques is under way; infinite for one that is lost."""
+    link = scenario.assumed_link
+    assert isinstance(link, NetworkConfig)
     return packet_times(link, number, link.seed)
 
 
@@ -168,26 +232,30 @@ def newest_measurements(times: Array, period: float) -> NDArray[np.int64]:
     return np.where(newest > np.append(-1, so_far[:-1]), newest, -1)
 
 
-def in_time(config: PacketsConfig, time: float) -> float:
-    """Probability that a packet has arrived so many s after it was sent."""
-    return float((1 - config.loss) * times_under_way(config).cdf(time + 1e-9))
+def in_time(config: PacketsConfig, time: ArrayLike) -> Array:
+    """Return F: the probability that a packet which is not lost has arrived after `time` s."""
+    return np.asarray(times_under_way(config).cdf(np.asarray(time) + 1e-9))
 
 
 def torque_missing(config: PacketsConfig, bound: float, repeats: int, period: float) -> float:
-    """Probability that a torque is not there in time, in its own packet or a repetition."""
-    chances = [1 - in_time(config, bound + i * period) for i in range(repeats + 1)]
-    return float(np.prod(chances))
+    """Return the probability that a torque is not there in time, in none of its 1 + r packets.
+
+    Sent one after the other they have B + r dt, ..., B + dt, B left (theory.md, section 25).
+    """
+    late = 1 - in_time(config, bound + period * np.arange(repeats + 1))
+    return BurstChain(config.loss, config.burst).none_in_time(late)
 
 
 def usual_bound(config: PacketsConfig, repeats: int, period: float) -> float:
-    """The least bound in s, in whole periods, at which being late is rarer than being lost.
+    """Return the least bound in s, in whole periods, at which being late is rarer than being lost.
 
-    A longer one cannot bring back what is lost, and costs delay. With the bound B and r repetitions
-    a torque is missing with q(B) = prod_i [1 - (1 - loss) F(B + i dt)], i = 0 to r, which falls to
-    loss^(r+1); wanted is the least B with q(B) <= RARE loss^(r+1), or ALMOST_NONE. Beyond
-    MOST_PERIODS, which no delay may have, it is not looked for.
+    A longer one cannot bring back what is lost, and costs delay. A torque is missing with a
+    probability q(B) that falls to q(inf), that of losing all its packets (`torque_missing`). Wanted
+    is the least B with q(B) <= RARE q(inf), or ALMOST_NONE. Bounds beyond MOST_PERIODS, which no
+    delay may have, are not tried.
     """
-    enough = max(RARE * config.loss ** (repeats + 1), ALMOST_NONE)
+    all_lost = BurstChain(config.loss, config.burst).none_in_time(np.zeros(repeats + 1))
+    enough = max(RARE * all_lost, ALMOST_NONE)
 
     def there(steps: int) -> bool:
         return torque_missing(config, steps * period, repeats, period) <= enough
@@ -195,8 +263,25 @@ def usual_bound(config: PacketsConfig, repeats: int, period: float) -> float:
     return bisect_left(range(MOST_PERIODS + 1), True, key=there) * period
 
 
-def network_delay(link: NetworkConfig, controller: ControllerConfig) -> Delay:
-    """From computing a torque to its time: the bound, and the periods for repetitions."""
-    period, repeats = controller.period, controller.packet_repeats
-    bound = usual_bound(link, repeats, period) if link.playout is None else link.playout
-    return Delay.of(bound + repeats * period, period)
+def link_text(scenario: Scenario) -> str | None:
+    """Return the assumed network in a few words, None for a wire."""
+    link = scenario.assumed_link
+    if not isinstance(link, NetworkConfig):
+        return None
+    if link.distribution == "lognormal":
+        times = f"{link.median:g} s in the median, sigma {link.sigma:g}"
+    else:
+        times = f"{link.low:g} to {link.high:g} s"
+    if isinstance(scenario.link, NetworkConfig) and scenario.link.follows_delay:
+        delay, period = scenario.delay, scenario.controller.period
+        times += (
+            f" ({ASSUMED_TIMES[0]:g} to {ASSUMED_TIMES[1]:g} times the delay of "
+            f"{Delay(delay.steps, delay.fraction).eta(period):g} s, as link.low and link.high are "
+            "null)"
+        )
+    bursts = f" in bursts of {link.burst}" if link.burst > 1 else ""
+    back = "measurements at once" if link.back is None else "measurements over a network too"
+    return (
+        f"network, packets take {times}, {100 * link.loss:g} % lost{bursts}, play-out bound "
+        f"{link.playout:g} s; {back}"
+    )

@@ -1,8 +1,10 @@
-"""Which play-out bound suits a network, and how much of its packets may be lost.
+"""Search for the best play-out bound of a network, and for the losses that it survives.
 
 A longer bound makes packets late less often and every torque later: what is computed from a
-measurement acts bound + repetitions later, whatever the packet took. The scenario is simulated over
-bounds and, at the best of them, over losses, with several seeds each.
+measurement acts bound + repetitions later, also if its packet was quicker. The scenario is
+simulated over bounds, first in whole periods, then in half periods near the best, and at the best
+of them over losses, with several seeds each. The seeds of the losses are new: the best bound was
+chosen by the others, which are therefore too good there.
 """
 
 import math
@@ -19,9 +21,10 @@ from stewart_drake.scenario.link import in_time, times_under_way, torque_missing
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.jobs import Progress, finished, run_jobs
 from stewart_drake.studies.runs import read_outcome, run_scenario
+from stewart_drake.studies.statistics import least_share
 
 LOSSES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4)
-"""Shares of the packets, looked at beside the scenario's own."""
+"""Shares of the packets that are tried, in addition to the scenario's own."""
 _FEW: Final = 0.4
 _NEARLY_ALL: Final = 0.999
 """Shares of the packets that are there by the shortest and by the longest bound looked at."""
@@ -50,6 +53,14 @@ class Cell(NamedTuple):
         return len(self.errors) / self.runs if self.runs else math.nan
 
     @property
+    def no_worse(self) -> float:
+        """Share of all runs that at least completes, with 95 % confidence; NaN for none simulated.
+
+        Where all that were simulated completed, with at most the largest of their errors.
+        """
+        return least_share(len(self.errors), self.runs) if self.runs else math.nan
+
+    @property
     def expected(self) -> float:
         """Mean E_ac in % s of the completed runs, infinite where one was lost."""
         return float(np.mean(self.errors)) if self.errors and self.completed == 1 else math.inf
@@ -57,14 +68,15 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class LinkStudy:
-    """What was found.
+    """Result of the study.
 
     Attributes:
         scenario: with the network.
         runs: seeds per bound and loss.
         bounds: over the bound, the shortest first, at the scenario's loss.
-        losses: over the loss, at the best bound.
+        losses: over the loss, at the best bound, with new seeds.
         usual: bound that a scenario with `playout: null` takes, s.
+        left_out: bounds in s that the multibody plant of the scenario cannot have.
         interrupted: whether Ctrl-C ended it early.
     """
 
@@ -73,12 +85,20 @@ class LinkStudy:
     bounds: tuple[Cell, ...]
     losses: tuple[Cell, ...]
     usual: float
+    left_out: tuple[float, ...]
     interrupted: bool
 
     @property
     def best(self) -> Cell | None:
-        """Of the bounds at which most runs completed that of the least mean E_ac, or None."""
+        """Cell of the least mean E_ac among those with the most completed runs, or None."""
         return _best(self.bounds)
+
+    @property
+    def checked(self) -> Cell | None:
+        """The best bound at the scenario's loss with new seeds, or None."""
+        link = self.scenario.link
+        assert isinstance(link, NetworkConfig)
+        return next((cell for cell in self.losses if cell.loss == link.loss), None)
 
     @property
     def survivable(self) -> float:
@@ -92,11 +112,15 @@ class LinkStudy:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What summary.json holds."""
+        """Contents of summary.json."""
         best = self.best
 
         def told(cells: Iterable[Cell]) -> list[dict[str, Any]]:
-            return [c._asdict() | {"completed": c.completed, "expected": c.expected} for c in cells]
+            return [
+                c._asdict()
+                | {"completed": c.completed, "expected": c.expected, "no_worse": c.no_worse}
+                for c in cells
+            ]
 
         return {
             "best_bound": None if best is None else best.bound,
@@ -105,6 +129,7 @@ class LinkStudy:
             "runs": self.runs,
             "bounds": told(self.bounds),
             "losses": told(self.losses),
+            "left_out": self.left_out,
             "interrupted": self.interrupted,
         }
 
@@ -120,24 +145,58 @@ def study_link(scenario: Scenario, runs: int = 5, progress: Progress | None = No
     Raises:
         ConfigError: no network, or no runs.
     """
-    link = scenario.link
+    link = scenario.assumed_link
     if not isinstance(link, NetworkConfig):
         raise ConfigError(f"link.kind: got {link.kind!r}; expected 'network'")
     if runs < 1:
         raise ConfigError(f"runs: got {runs}; expected at least 1")
     period, repeats = scenario.controller.period, scenario.controller.packet_repeats
-    base = replace(scenario, plant=scenario.plant.without_engine)
-    bounds = bounds_for(link, period)
+    base = replace(scenario, link=link, plant=scenario.plant.without_engine)
     losses = sorted({*LOSSES, link.loss})
-    total = runs * (len(bounds) + len(losses))
-    found, stopped = _simulated(base, [(b, link.loss) for b in bounds], runs, progress, 0, total)
-    best = _best(found)
+    done = 0
+
+    def simulated(
+        base: Scenario, cells: list[tuple[float, float]], following: int
+    ) -> tuple[list[Cell], bool]:
+        """Simulate cells, before some number of `following` ones."""
+        nonlocal done
+        if not cells:
+            return [], False
+        before, total = done, done + runs * (len(cells) + following)
+        done += runs * len(cells)
+
+        def tell(now: int, _: int) -> None:
+            if progress is not None:
+                progress(before + now, total)
+
+        return _simulated(base, cells, runs, tell)
+
+    wanted, left_out, found = bounds_for(link, period), set[float](), list[Cell]()
+    for step in (1.0, 0.5, 0.0):  # periods between the best bound and those that are tried next
+        following = len(losses) + (2 if step else 0)
+        cells, stopped = simulated(base, [(bound, link.loss) for bound in wanted], following)
+        found = sorted([*found, *cells])
+        best = _best(found)
+        if best is None or stopped:
+            break
+        near = {round(best.bound + sign * step * period, 12) for sign in (-1, 1)}
+        near = {b for b in near if b > 0 and min(abs(b - cell.bound) for cell in found) > 1e-9}
+        left_out |= {bound for bound in near if not _possible(scenario, link, bound)}
+        wanted = sorted(near - left_out)
     kept: list[Cell] = []
     if best is not None and not stopped:
-        wanted = [(best.bound, loss) for loss in losses]
-        kept, stopped = _simulated(base, wanted, runs, progress, runs * len(bounds), total)
+        sensor = replace(base.sensor, seed=base.sensor.seed + runs)
+        fresh = replace(base, link=replace(link, seed=link.seed + runs), sensor=sensor)
+        kept, stopped = simulated(fresh, [(best.bound, loss) for loss in losses], 0)
     usual = usual_bound(link, repeats, period)
-    return LinkStudy(scenario, runs, tuple(found), tuple(kept), usual, stopped)
+    there = tuple(sorted(left_out))
+    return LinkStudy(scenario, runs, tuple(found), tuple(kept), usual, there, stopped)
+
+
+def _possible(scenario: Scenario, link: NetworkConfig, bound: float) -> bool:
+    """Return whether the scenario's own plant can have a bound in s."""
+    other = replace(scenario, link=replace(link, playout=bound))
+    return scenario.plant.kind != "multibody" or not other.step_problem(scenario.plant.time_step)
 
 
 def bounds_for(link: NetworkConfig, period: float) -> list[float]:
@@ -154,14 +213,9 @@ def _best(cells: Iterable[Cell]) -> Cell | None:
 
 
 def _simulated(
-    base: Scenario,
-    wanted: list[tuple[float, float]],
-    runs: int,
-    progress: Progress | None,
-    before: int,
-    total: int,
+    base: Scenario, wanted: list[tuple[float, float]], runs: int, progress: Progress
 ) -> tuple[list[Cell], bool]:
-    """A cell for each bound and loss, and whether Ctrl-C ended it early."""
+    """Return a cell for each bound and loss, and whether Ctrl-C ended it early."""
     link, c = base.link, base.controller
     assert isinstance(link, NetworkConfig)
     jobs = {
@@ -175,16 +229,11 @@ def _simulated(
         for bound, loss in wanted
         for seed in range(runs)
     }
-
-    def tell(done: int, _: int) -> None:
-        if progress is not None:
-            progress(before + done, total)
-
     stopped = False
     with TemporaryDirectory() as folder:
         try:
             settings = scenario_to_dict(base)
-            run_jobs(jobs, run_scenario, folder, settings=settings, progress=tell)
+            run_jobs(jobs, run_scenario, folder, settings=settings, progress=progress)
         except KeyboardInterrupt:
             stopped = True
         results = {key: read_outcome(path) for key, path in finished(jobs, folder).items()}
@@ -193,8 +242,7 @@ def _simulated(
         keys = [f"bound{bound:g}-loss{loss:g}-seed{seed}" for seed in range(runs)]
         there = [results[key] for key in keys if key in results]
         errors = tuple(one.error for one in there if one.status == "completed")
-        lossy = replace(link, loss=loss)
-        late = 1 - in_time(replace(link, loss=0.0), bound)
-        missing = torque_missing(lossy, bound, c.packet_repeats, c.period)
+        late = 1 - float(in_time(link, bound))
+        missing = torque_missing(replace(link, loss=loss), bound, c.packet_repeats, c.period)
         cells.append(Cell(bound, loss, late, missing, len(there), errors))
     return cells, stopped

@@ -28,7 +28,7 @@ class Ranges:
         torque_limit: of the motors, least and most, uniform; what limits the undisturbed run, the
             scenario's number or the mechanism's motors, is never exceeded.
         damping: friction torque of a crank, uniform from 0.
-        delay: true delay less the believed one, uniform in +-.
+        delay: true delay less the believed one, uniform in +-; over a wire.
         delay_steps: the same, each number in +- alike; adds to `delay`.
         lengths: error of crank and rod lengths, rms over the twelve, uniform from 0.
         anchors: error of the coordinates of motor shafts and plate joints, rms over the 36,

@@ -48,6 +48,19 @@ def wilson_interval(successes: int, trials: int, confidence: float = CONFIDENCE)
     return Interval(share, min(share, float(ends.low)), max(share, float(ends.high)))
 
 
+def least_share(successes: int, trials: int, confidence: float = CONFIDENCE) -> float:
+    """Return the lower end of the one-sided Clopper-Pearson interval of a share of successes.
+
+    Where all n trials succeed this is (1 - confidence)^(1/n), which is also the distribution-free
+    bound of Wilks: with this confidence at least so large a share of all trials has a value no
+    larger than the largest of the n. Both statements are wrong together in at most 1 - confidence
+    of all samples if the second is made only where all trials succeed.
+    """
+    if successes == 0:
+        return 0.0
+    return float(stats.beta.ppf(1 - confidence, successes, trials - successes + 1))
+
+
 def quantile_interval(
     values: ArrayLike, probability: float, confidence: float = CONFIDENCE
 ) -> Interval:

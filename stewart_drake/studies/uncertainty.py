@@ -162,7 +162,13 @@ def draw_seed(rng: Generator, _: Any) -> int:
     return int(rng.integers(2**31))
 
 
+def _over_network(truth: Truth) -> bool:
+    return isinstance(truth.scenario.link, NetworkConfig)
+
+
 def _jitter(truth: Truth, std: float) -> None:
+    if _over_network(truth):
+        return
     truth.fields["delay"]["jitter_std"] += std
 
 
@@ -174,8 +180,7 @@ def _lose(truth: Truth, share: float) -> None:
 
 def _lossy(truth: Truth) -> dict[str, Any]:
     """What loses something: a network its packets, else the sensor its measurements."""
-    over_network = isinstance(truth.scenario.link, NetworkConfig)
-    return truth.fields["link" if over_network else "sensor"]
+    return truth.fields["link" if _over_network(truth) else "sensor"]
 
 
 def _seed_link(truth: Truth, seed: int) -> None:
@@ -208,6 +213,8 @@ def _move_payload(truth: Truth, errors: tuple[float, ...]) -> None:
 
 
 def _delay(truth: Truth, late: float) -> None:
+    if _over_network(truth):  # whose buffer sets the delay
+        return
     sc, believed = truth.scenario, believed_delay(truth.scenario)
     fraction = sc.delay.fraction + late / sc.controller.period
     whole = math.floor(fraction + 1e-9)
