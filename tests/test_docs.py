@@ -632,28 +632,67 @@ def test_the_readme_s_table_is_that_of_the_benchmark() -> None:
         assert float(plants["exact"][column]) == float(exact)
 
 
-@pytest.mark.parametrize(
-    ("page", "heading", "results"),
-    [
-        ("figures.md", "`predictor_lqi`, exact plant", ("tracking.md",)),
-        ("howto/delay.md", "`adaptive_lqi`, exact plant", ("delay_estimator.md",)),
-    ],
-)
-def test_figures_of_a_table_are_in_the_results(
-    page: str, heading: str, results: tuple[str, ...]
-) -> None:
-    """Each is a figure that was measured, rounded to its digits."""
-    texts = [(ROOT / "benchmarks" / "results" / name).read_text("utf-8") for name in results]
-    measured = [
-        float(word)
-        for text in texts
-        for word in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?:e-\d+)?(?![\w.])", text)
-    ]
-    for _, *cells in rows_of(ROOT / "docs" / page, heading):
-        for word in re.findall(r"\d[\d.]*", " ".join(cells).replace("1.0 s", "")):
-            digits = len(word.partition(".")[2])
-            rounded = {f"{value:.{digits}f}" for value in measured}
-            assert word in rounded, f"{page}: {word}"
+CLAIMS = ROOT / "benchmarks" / "results" / "claims.md"
+STATISTICS = ("median of all", "completed, %", "median", "mean", "standard deviation", "worst")
+STATISTICS += ("lost", "runs", "AUC")
+
+
+def tables(path: Path) -> Iterator[tuple[list[str], list[list[str]]]]:
+    """Head and rows of every table of a document."""
+    for text in re.findall(r"^\|.*\n\| ?-.*\n(?:\|.*\n)*", path.read_text("utf-8"), re.MULTILINE):
+        head, _, *rows = (re.split(r"\s*\|\s*", row)[1:-1] for row in text.splitlines())
+        yield head, rows
+
+
+@functools.cache
+def claims() -> dict[str, dict[str, str]]:
+    """Figures of the table of claims by the name of a row and the statistic."""
+    found: dict[str, dict[str, str]] = {}
+    for head, rows in tables(CLAIMS):
+        if head[0] == "row":
+            found |= {row[0].strip("`"): dict(zip(head, row, strict=True)) for row in rows}
+    return found
+
+
+def problem_with_claim(name: str, statistic: str, shown: str) -> str | None:
+    """Compare a cell with the row that it quotes, rounded to the digits that it shows."""
+    if name not in claims():
+        return f"no claim is called {name}"
+    measured = claims()[name][statistic]
+    if statistic == "lost":
+        measured = measured.partition(",")[0]
+    elif re.fullmatch(r"[\d.]+(e-\d+)?", measured) and re.fullmatch(r"[\d.]+", shown):
+        measured = f"{float(measured):.{len(shown.partition('.')[2])}f}"
+    return None if shown == measured else f"{name}, {statistic}: {shown}, measured {measured}"
+
+
+def quoted(path: Path) -> Iterator[tuple[str, str, str]]:
+    """Row, statistic and cell of the tables that name rows of the table of claims.
+
+    A column's head says the statistic, and in code type what to append to the row's name.
+    """
+    for head, rows in tables(path):
+        for cells in rows if "row" in head else []:
+            name = cells[head.index("row")].strip("`")
+            for title, cell in zip(head, cells, strict=True):
+                statistic = next((s for s in STATISTICS if s in title), None)
+                if statistic and cell:
+                    end = re.search(r"\(`(-[^`]*)`\)", title)
+                    yield name + (end[1] if end else ""), statistic, cell
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")], ids=document)
+def test_figures_of_a_row_are_those_of_the_table_of_claims(path: Path) -> None:
+    problems = {problem_with_claim(*one) for one in quoted(path)} - {None}
+    assert not problems, "\n".join(sorted(map(str, problems)))
+
+
+def test_the_documents_quote_the_table_of_claims() -> None:
+    pages = ("README.md", "docs/figures.md", "docs/limits.md", "docs/theory.md")
+    assert all(len(list(quoted(ROOT / page))) > 3 for page in pages)
+    _, *others = claims()
+    assert problem_with_claim("no-such-row", "median", "1")
+    assert problem_with_claim(others[0], "median", "1234.5")
 
 
 def port_rows(text: str) -> dict[str, tuple[str, str]]:
