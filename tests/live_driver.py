@@ -21,6 +21,7 @@ from stewart_drake.live.protocol import (
     MachineMessage,
 )
 from stewart_drake.loop.experiment import control_law, first_queue, prepare
+from stewart_drake.loop.peer import identity_of
 from stewart_drake.scenario.config import Scenario
 
 
@@ -44,6 +45,7 @@ class Driver:
         self.memory = self.served.initial_memory(first_queue(self.experiment, self.law))
         self.endpoint = Endpoint(MachineMessage, key=key)
         self.session = Session.drawn(machine)
+        self.identity = identity_of(scenario)
         self.begin, self.first = NEVER, 0
         self.period = round(scenario.controller.period * SECOND)
         self.got: list[MachineMessage] = []
@@ -75,7 +77,8 @@ class Driver:
         """Send a datagram."""
         rows = np.empty((0, 6)) if torques is None else torques
         head = self.session.head(time)
-        message = ControllerMessage(head, flags, sampled, playout, self.begin, rows)
+        asks = None if self.session.nonce else self.identity
+        message = ControllerMessage(head, flags, sampled, playout, self.begin, rows, asks)
         self.endpoint.send(message, self.session.address)
         return message
 

@@ -18,7 +18,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.log_files import Precision, read_log
 from stewart_drake.live.connect import address_of, await_free, call, open_endpoint
 from stewart_drake.live.contact import Contact, Link
-from stewart_drake.live.design import as_seen, check_peer, design
+from stewart_drake.live.design import as_seen, check_controller, design
 from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.governor import Governor
 from stewart_drake.live.loop import LiveLoop, Nobody, Seen
@@ -28,6 +28,7 @@ from stewart_drake.live.protocol import NOTHING, ControllerMessage, MachineFlags
 from stewart_drake.live.session import _queue_advice, check_armed, drive, plans, prepare_session
 from stewart_drake.live.steering import Steering, Way, Wish
 from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.peer import identity_of
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.report.style import FACTORS
 from stewart_drake.report.viewer import slider_range
@@ -235,23 +236,51 @@ def offer():
         patch.setattr(Machine, "stop", lambda self: None)
         with Running(OVER_A_NETWORK) as running:
             endpoint = open_endpoint(running.address, None)
-            contact = Contact(endpoint, running.address)
+            contact = Contact(endpoint, running.address, identity_of(scenario_of()))
             message = call(contact)
             endpoint.close()
             yield message, contact.link
 
 
+SERVO = ("actuator.kind=servo", "controller.command=cranks")
+
+
 @pytest.mark.parametrize(
-    ("settings", "field"),
+    ("settings", "parts"),
     [
-        (("controller.period=0.05",), "controller.period"),
-        (("sensor.kind=encoders",), "sensor.kind"),
-        (("tuner.kind=ann",), "tuner.kind"),
+        (("mechanism=paper_clear",), ("mechanism paper", "mechanism paper_clear")),
+        (("controller.period=0.05",), ("period 0.1 s", "period 0.05 s")),
+        (("sensor.kind=encoders",), ("sensor state", "sensor encoders, 1 samples, 14 bits")),
+        (SERVO, ("actuator torque", "actuator servo")),
+        (
+            ("mechanism=paper_clear", "controller.period=0.05"),
+            ("mechanism paper, period 0.1 s", "mechanism paper_clear, period 0.05 s"),
+        ),
     ],
 )
-def test_a_scenario_of_another_machine_is_refused(offer, settings, field):
-    with pytest.raises(ConfigError, match=f"^{field}: got"):
-        check_peer(scenario_of(*settings), offer[0])
+def test_a_scenario_of_another_machine_is_refused_by_both_sides(quiet_machine, settings, parts):
+    with Running() as running:
+        with pytest.raises(ConfigError) as refused:
+            prepare_session(scenario_of(*settings), running.address)
+        host, port = running.address
+    machine, controller = parts
+    assert str(refused.value) == (
+        f"machine at {host}:{port} has {machine}; the controller is designed for {controller}"
+    )
+    (said,) = running.lines
+    assert said.endswith(f"designed for {controller}; this machine has {machine}")
+    assert running.machine.session is None
+
+
+def test_what_was_identified_does_not_change_the_identity(tmp_path):
+    assert identity_of(scenario_of()) == identity_of(
+        scenario_of("plant.mechanism=paper_clear", "plant.gravity=true", "delay.steps=3")
+    )
+
+
+def test_a_tuner_that_runs_is_refused():
+    with pytest.raises(ConfigError, match=r"^tuner\.kind: got"):
+        check_controller(scenario_of("tuner.kind=ann"))
 
 
 def test_a_link_that_takes_longer_than_the_delay_is_refused(offer):
@@ -352,7 +381,7 @@ def test_beyond_loopback_a_key_is_needed():
 def test_what_came_while_nobody_looked_is_not_lost(quiet_machine):
     with Running(OVER_A_NETWORK.replace("loss: 0.02", "loss: 0")) as running:
         endpoint = open_endpoint(running.address, None)
-        contact = Contact(endpoint, running.address)
+        contact = Contact(endpoint, running.address, identity_of(scenario_of()))
         call(contact)
         time.sleep(0.5)  # a round trip takes 0.2 s: some ten answers are on their way
         await_free(contact)
@@ -462,7 +491,7 @@ def test_the_loop_goes_on_where_the_page_is_gone():
     viewer = PageViewer(load_mechanism("paper"), "live: a test")
     viewer.opened()
     viewer.close()
-    seen = Seen(0.0, np.zeros(12), np.zeros(18), np.zeros(6), *[0.0] * 5, 0, False, False, None)
+    seen = Seen(0.0, np.zeros(12), np.zeros(18), np.zeros(6), *[0.0] * 5, 0, None, False, None)
     for _ in range(3):
         viewer.show(seen)
     assert viewer.wish() == Wish()

@@ -144,7 +144,8 @@ def test_silence_ends_in_the_safe_torque_in_time(safe: str, settings: tuple[str,
     run.at(heard + 2 * SECOND)
     np.testing.assert_array_equal(torque_of(run), expected)
     assert run.machine.counts["silences"] == 1
-    assert sum("nothing was heard for 0.35 s" in line for line in run.said) == 1
+    said = "nothing was heard from the controller for 0.35 s: the safe torque"
+    assert sum(said in line for line in run.said) == 1
     last = messages(run)[-1]
     assert MachineFlags.SAFE in last.flags
     assert (MachineFlags.SAFE_HOLDS in last.flags) == (safe == "hold")

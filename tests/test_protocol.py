@@ -9,6 +9,7 @@ import struct
 import subprocess
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,8 +46,11 @@ from stewart_drake.live.protocol import (
     decode,
     encode,
 )
+from stewart_drake.loop.peer import Fault, Identity, Part, Reason, identity_of
 from stewart_drake.native import build
 from stewart_drake.report.export_c import TEMPLATES
+from stewart_drake.scenario.loading import load_scenario
+from tests import exchange
 from tests.live_driver import OtherClock
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -79,7 +83,11 @@ STATE = MachineMessage(
     dry=1,
     refused=4,
     state=np.array([0, 0.5, -0.5, 0.25, 0, 0.375, 0, 0, 0, 1, 0, np.nan]),
+    reason=Reason(Fault.REACH, leg=2),
+    before=Reason(Fault.STOOD, lasted=330_000_000),
 )
+IDENTITY = identity_of(load_scenario("paper"))
+REQUEST = ControllerMessage(HEAD, identity=IDENTITY)
 ENCODERS = MachineMessage(
     head=HEAD,
     flags=MachineFlags.PARKED,
@@ -96,17 +104,26 @@ ENCODERS = MachineMessage(
     bits=14,
     zeros=np.array([0, 0.5, 0, 0, 0, -0.5]),
 )
+OFFER = replace(ENCODERS, codes=None, bits=0, zeros=None, identity=IDENTITY)
 VECTORS: list[tuple[Message, bytes | None]] = [
     (PLAN, None),
     (PLAN, KEY),
     (STATE, None),
     (ENCODERS, None),
+    (REQUEST, None),
+    (OFFER, None),
 ]
 
 
 def documented() -> list[bytes]:
     """The vectors of docs/protocol.md."""
-    text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split("## Test vectors")[1]
+    return blocks_of("Test vectors")
+
+
+def blocks_of(section: str) -> list[bytes]:
+    """The datagrams of a section of docs/protocol.md."""
+    text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split(f"## {section}\n")[1]
+    text = text.split("\n## ")[0]
     return [bytes.fromhex(block) for block in re.findall(r"```text\n(.*?)```", text, re.DOTALL)]
 
 
@@ -135,19 +152,36 @@ def test_the_documented_bytes_are_written_and_read(number: int) -> None:
     assert decode(data, key) == message
 
 
+def test_the_documented_exchange_is_what_a_machine_answers() -> None:
+    """`python -m tests.exchange` prints the blocks."""
+    said = exchange.exchange()
+    assert [encode(message) for message in said] == blocks_of("A worked exchange")
+    request, offer, confirmation, measurement, torques = said
+    assert isinstance(offer, MachineMessage) and offer.identity == request.identity != None  # noqa: E711
+    assert offer.head.nonce == confirmation.head.nonce == torques.head.nonce != 0
+    assert isinstance(measurement, MachineMessage) and measurement.begin == torques.begin
+    assert len(encode(offer)) <= len(encode(request))
+
+
 def test_each_field_lies_where_the_tables_say() -> None:
     """Every row of the tables of docs/protocol.md whose place is a number, read by itself."""
     text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split("## A session")[0]
     head, machine, controller = re.split(r"## (?:Machine|Controller) to ", text)
     formats = {"u8": "<B", "u16": "<H", "u32": "<I", "u64": "<Q", "f64": "<d"}
     wanted = {
-        "version": 1,
+        "version": 2,
         "tag": 0,
         "kind": 1,
         "samples": 1,
         "bits": 0,
         "history": 1,
         "arrived": 0b1011,
+        "reason": 1,
+        "leg": 2,
+        "before": 8,
+        "lasted": 0,
+        "before_lasted": 330_000_000,
+        "content": 0,
         "rows": 2,
     }
     seen = 0
@@ -162,7 +196,7 @@ def test_each_field_lies_where_the_tables_say() -> None:
                 expected = getattr(message.head, name) if expected is None else expected
             assert value == expected, name
             seen += 1
-    assert seen == 2 * 11 + 15 + 4
+    assert seen == 2 * 11 + 20 + 5
 
 
 def test_the_tag_is_the_first_half_of_an_hmac() -> None:
@@ -193,8 +227,21 @@ def rows(most: int) -> st.SearchStrategy[np.ndarray]:
     return st.lists(row, max_size=most).map(lambda found: np.array(found).reshape(-1, 6))
 
 
+PARTS = st.builds(
+    Part,
+    st.binary(min_size=8, max_size=8),
+    st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_size=32),
+)
+IDENTITIES = st.builds(Identity, PARTS, PARTS, PARTS, PARTS)
+REASONS = st.builds(Reason, st.sampled_from(Fault), st.integers(0, 6), U64)
+
+
 @st.composite
 def plans(draw: st.DrawFn) -> ControllerMessage:
+    if draw(st.booleans()):
+        flags = ControllerFlags(draw(st.integers(0, 3)))
+        times = draw(U64), draw(U64), draw(U64)
+        return ControllerMessage(draw(HEADS), flags, *times, identity=draw(IDENTITIES))
     torques = draw(rows(MOST_ROWS))
     begin = draw(U64.filter(lambda t: t != NEVER)) if len(torques) else draw(U64)
     flags = ControllerFlags(draw(st.integers(0, 3)))
@@ -203,8 +250,11 @@ def plans(draw: st.DrawFn) -> ControllerMessage:
 
 @st.composite
 def reports(draw: st.DrawFn) -> MachineMessage:
-    kind = draw(st.integers(0, 2))
-    said: dict[str, object] = {}
+    kind = draw(st.integers(0, 3))
+    said: dict[str, object] = {
+        "reason": draw(REASONS),
+        "before": draw(REASONS)._replace(leg=0),
+    }
     if kind == 1:
         said["state"] = np.array(draw(st.lists(st.floats(width=64), min_size=12, max_size=12)))
     elif kind == 2:
@@ -214,6 +264,8 @@ def reports(draw: st.DrawFn) -> MachineMessage:
         said["codes"] = np.array(found, np.int32).reshape(-1, 6)
         said["bits"] = draw(st.integers(1, MOST_BITS))
         said["zeros"] = np.array(draw(st.lists(FINITE, min_size=6, max_size=6)))
+    elif kind == 3:
+        said["identity"] = draw(IDENTITIES)
     return MachineMessage(
         draw(HEADS),
         MachineFlags(draw(st.integers(0, 1023))),
@@ -222,7 +274,7 @@ def reports(draw: st.DrawFn) -> MachineMessage:
         draw(st.one_of(st.just(math.inf), st.floats(1e-300, 1e300))),
         np.array(draw(st.lists(st.booleans(), min_size=64, max_size=64))),
         draw(U64),
-        draw(rows(MOST_HISTORY)),
+        draw(rows(MOST_HISTORY if kind < 3 else 0)),
         *(draw(U32), draw(U32), draw(U32)),
         **said,  # type: ignore[arg-type]
     )
@@ -260,10 +312,11 @@ def test_every_shorter_datagram_is_malformed() -> None:
 
 def test_the_first_thing_that_is_wrong_is_the_cause() -> None:
     plan, report, nan = encode(PLAN), encode(STATE), struct.pack("<d", math.nan)
+    request, offer = encode(REQUEST), encode(OFFER)
     wrong: list[tuple[bytes, bytes | None, Refusal]] = [
         (changed(plan, 0, b"XTWC"), None, Refusal.MALFORMED),
-        (changed(plan, 4, b"\2"), None, Refusal.VERSION),
-        (changed(encode(PLAN, KEY), 4, b"\2"), None, Refusal.VERSION),
+        (changed(plan, 4, b"\1"), None, Refusal.VERSION),
+        (changed(encode(PLAN, KEY), 4, b"\1"), None, Refusal.VERSION),
         (changed(plan, 5, b"\7"), None, Refusal.MALFORMED),
         (encode(PLAN, KEY), None, Refusal.KEY),
         (plan, KEY, Refusal.KEY),
@@ -275,6 +328,13 @@ def test_the_first_thing_that_is_wrong_is_the_cause() -> None:
         (changed(plan, 60, b"\3"), None, Refusal.MALFORMED),
         (changed(plan, 60, b"\xff"), None, Refusal.MALFORMED),
         (changed(plan, 61, b"\1"), None, Refusal.MALFORMED),
+        (changed(plan, 62, b"\1"), None, Refusal.MALFORMED),
+        (changed(request, 60, b"\1"), None, Refusal.MALFORMED),
+        (changed(request, 96, b"\n"), None, Refusal.MALFORMED),
+        (changed(request, 103, b"x"), None, Refusal.MALFORMED),
+        (changed(request, len(request) - 1, b"\1"), None, Refusal.MALFORMED),
+        (changed(offer, 63, b"\1"), None, Refusal.MALFORMED),
+        (changed(offer, 168, b"\x80"), None, Refusal.MALFORMED),
         (changed(plan, 80, b"\xff" * 8), None, Refusal.MALFORMED),
         (changed(plan, 88, nan), None, Refusal.MALFORMED),
         (changed(report, 60, b"\3"), None, Refusal.MALFORMED),
@@ -283,12 +343,15 @@ def test_the_first_thing_that_is_wrong_is_the_cause() -> None:
         (changed(report, 80, bytes(8)), None, Refusal.MALFORMED),
         (changed(report, 96, nan), None, Refusal.MALFORMED),
         (changed(report, 104, bytes(8)), None, Refusal.MALFORMED),
-        (changed(report, 140, b"\1"), None, Refusal.MALFORMED),
+        (changed(report, 140, bytes([len(Fault)])), None, Refusal.MALFORMED),
+        (changed(report, 141, b"\7"), None, Refusal.MALFORMED),
+        (changed(report, 142, bytes([len(Fault)])), None, Refusal.MALFORMED),
+        (changed(report, 143, b"\1"), None, Refusal.MALFORMED),
         (changed(report, len(report) - 8, nan), None, Refusal.MALFORMED),
     ]
     for data, key, expected in wrong:
         assert cause(data, key) == expected
-    assert cause(changed(report, 144, nan)) is None  # a value that is lost
+    assert cause(changed(report, 160, nan)) is None  # a value that is lost
 
 
 def test_a_window_takes_each_number_once() -> None:
@@ -458,15 +521,26 @@ def any_message(rng: random.Random) -> Message:
     """Of either side, with numbers of all sizes."""
     head = Head(*(rng.randrange(1, 2**n) for n in (64, 64, 32, 32, 64, 64, 64)))
     some = np.array([rng.uniform(-1, 1) * 10.0 ** rng.randrange(-300, 300) for _ in range(6)])
+    names = ("paper", "0.1 s", "encoders, 1 samples, 14 bits", "x" * 32)
+    identity = Identity(*(Part(rng.randbytes(8), name) for name in names))
     if rng.random() < 0.5:
+        if rng.random() < 0.3:
+            return ControllerMessage(head, identity=identity)
         torques = np.tile(some, (rng.randrange(MOST_ROWS + 1), 1))
         return ControllerMessage(head, ControllerFlags.STOP, 3, 4, rng.randrange(2**63), torques)
     acted = np.tile(some, (rng.randrange(MOST_HISTORY + 1), 1))
     times = (rng.randrange(1, 2**64) for _ in range(4))
     flags, there = MachineFlags(rng.randrange(1024)), np.array(rng.choices([True, False], k=64))
     fixed = (1.0, math.inf, there, 5, acted, 1, 2, 3)
+    faults = {
+        "reason": Reason(rng.choice(list(Fault)), rng.randrange(7), rng.randrange(2**64)),
+        "before": Reason(rng.choice(list(Fault)), 0, rng.randrange(2**64)),
+    }
+    if rng.random() < 0.3:
+        offered = (*fixed[:4], acted[:0], *fixed[5:])
+        return MachineMessage(head, flags, *times, *offered, identity=identity, **faults)
     if rng.random() < 0.5:
-        return MachineMessage(head, flags, *times, *fixed, state=np.append(some, some))
+        return MachineMessage(head, flags, *times, *fixed, state=np.append(some, some), **faults)
     codes = np.array([rng.randrange(-(2**31), 2**31) for _ in range(24)], np.int32).reshape(-1, 6)
     return MachineMessage(head, flags, *times, *fixed, codes=codes, bits=9, zeros=some)
 

@@ -7,7 +7,7 @@ from typing import Final
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.contact import Contact
 from stewart_drake.live.endpoint import Address, Endpoint, is_loopback, now
-from stewart_drake.live.protocol import SECOND, MachineFlags, MachineMessage
+from stewart_drake.live.protocol import SECOND, VERSION, MachineFlags, MachineMessage
 
 _CALLS: Final = SECOND // 50
 """ns between two datagrams that ask for a session."""
@@ -57,17 +57,24 @@ def call(contact: Contact) -> MachineMessage:
         What the machine last said of itself.
 
     Raises:
-        ConfigError: nobody answers.
+        ConfigError: nothing answers, or a machine that the controller is not designed for.
     """
-    began, first = now(), 0
+    began, first, where = now(), 0, _where(contact)
     while True:
         came = _ask(contact)
+        _check_identity(contact)
         first = first or (now() if came else 0)
+        for other in contact.endpoint.versions:
+            if other.address == contact.session.address:
+                raise ConfigError(
+                    f"--machine: {where} speaks protocol version {other.version}; expected "
+                    f"{VERSION}, of the same release on both sides"
+                )
         if not first and now() - began > _PATIENCE * SECOND:
-            host, port = contact.session.address
             raise ConfigError(
-                f"--machine: got {host}:{port}, where nothing answers{_why(contact)}; expected a "
-                "machine, such as stewart-drake machine SCENARIO --port PORT"
+                f"--machine: got {where.removeprefix('machine at ')}, where nothing "
+                f"answers{_why(contact)}; expected a machine of protocol version {VERSION}, such "
+                "as stewart-drake machine SCENARIO --port PORT"
             )
         enough = len(contact.link.trips) >= _TRIPS or now() - first > _LONGEST * SECOND
         if first and enough and contact.last is not None:
@@ -86,17 +93,54 @@ def await_free(contact: Contact) -> None:
     patience = max(_PATIENCE * SECOND, 2 * last.watchdog)
     while True:
         if _ask(contact) and MachineFlags.BUSY not in (contact.last or last).flags:
+            _check_identity(contact)
             return
         if now() - began > patience:
-            raise ConfigError(
-                "--machine: got one that another controller drives, or that is gone; expected a "
-                f"free one, as it is {last.watchdog / SECOND:g} s after the last word of that one"
-            )
+            raise ConfigError(_not_free(contact, patience / SECOND))
+
+
+def _not_free(contact: Contact, patience: float) -> str:
+    """Say why a machine that has answered offers no session any more."""
+    last, where = contact.last, _where(contact)
+    assert last is not None
+    silent = (now() - contact.heard) / SECOND
+    if silent < patience:
+        return (
+            f"{where} is in use by another controller (retry {last.watchdog / SECOND:g} s after it "
+            "stops)"
+        )
+    if contact.endpoint.refusal:
+        return (
+            f"{where} sent nothing for {silent:.1f} s{_why(contact)}; the last was "
+            f"{contact.endpoint.refusal}"
+        )
+    return f"{where} was silent for {silent:.1f} s"
+
+
+def _check_identity(contact: Contact) -> None:
+    """Refuse a machine that the controller is not designed for.
+
+    Raises:
+        ConfigError: naming what differs, on both sides.
+    """
+    last = contact.last
+    if last is None or last.identity is None:
+        return
+    differs = last.identity.differing(contact.identity)
+    if differs is not None:
+        raise ConfigError(
+            f"{_where(contact)} has {differs[0]}; the controller is designed for {differs[1]}"
+        )
+
+
+def _where(contact: Contact) -> str:
+    host, port = contact.session.address
+    return f"machine at {host}:{port}"
 
 
 def _ask(contact: Contact) -> bool:
     """Ask once; whether something came before it is time to ask again."""
-    contact.send()
+    contact.ask()
     until, came = now() + _CALLS, False
     while now() < until:
         for _ in contact.wait(until):

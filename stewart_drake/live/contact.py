@@ -9,7 +9,7 @@ import math
 import select
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -25,6 +25,7 @@ from stewart_drake.live.protocol import (
     MachineMessage,
     Refusal,
 )
+from stewart_drake.loop.peer import Identity
 from stewart_drake.scenario.signals import NUM_TORQUES
 
 Array = NDArray[np.float64]
@@ -48,12 +49,15 @@ class Link:
         lost: of them, as the machine says.
         missed: measurements that never came, by their numbers.
         came: that did.
+
+    A request without an answer counts as half a datagram lost there and half an answer missed: the
+    machine remembers nothing of requests.
     """
 
     trips: deque[float] = field(default_factory=lambda: deque(maxlen=_TRIPS))
     sent: int = 0
-    lost: int = 0
-    missed: int = 0
+    lost: float = 0
+    missed: float = 0
     came: int = 0
 
     @property
@@ -93,21 +97,25 @@ class Contact:
     Args:
         endpoint: to be used; whoever made it closes it.
         address: of the machine.
+        identity: of the machine that the controller is designed for.
 
     Attributes:
         link: see `Link`.
         last: newest message of the machine, by its sequence, or None.
+        offered: nonce of the newest offer; 0 without one.
         session: see `live.endpoint.Session`.
         heard: ns of the own clock, when something of the machine was last taken.
     """
 
-    def __init__(self, endpoint: Endpoint, address: Address) -> None:
-        self._endpoint = endpoint
+    def __init__(self, endpoint: Endpoint, address: Address, identity: Identity) -> None:
+        self._endpoint, self.identity, self.offered = endpoint, identity, 0
         self.session = Session.drawn(address)
         self.link = Link()
         self.last: MachineMessage | None = None
         self.heard = now()
         self._pending: dict[int, bool] = {}
+        self._requests = set[int]()
+        self._unanswered, self._first, self._followed = 0.0, 0, 0
         self._phases: deque[float] = deque(maxlen=_PHASES)
         self._newest = 0
 
@@ -121,9 +129,23 @@ class Contact:
         """Datagrams that the system did not take."""
         return self._endpoint.unsent
 
-    def join(self, nonce: int) -> None:
+    @property
+    def endpoint(self) -> Endpoint:
+        """Where datagrams come in."""
+        return self._endpoint
+
+    def join(self) -> None:
         """From now on as in the session that the machine has offered."""
-        self.session.nonce = nonce
+        self.session.nonce = self.offered
+
+    def ask(self) -> None:
+        """Send a request for a session, or for another look at the machine's offer."""
+        head = replace(self.session.head(now()), nonce=self.offered)
+        message = ControllerMessage(head, identity=self.identity)
+        self._endpoint.send(message, self.session.address)
+        if self.offered:  # else the machine may leave it unanswered
+            self._pending[head.sequence] = False
+            self._requests.add(head.sequence)
 
     def send(
         self,
@@ -157,9 +179,10 @@ class Contact:
         for message, address in self._endpoint.receive():
             assert isinstance(message, MachineMessage)
             time = now()
+            newest = self.session.window.tell(message.head.sequence)
             refused = self.session.refusal(message.head, address, time)
             if refused is not None:
-                self._endpoint.refused[refused] += 1
+                self._endpoint.refuse(refused, newest if refused != Refusal.FOREIGN else "")
                 continue
             self.heard = time
             self._note(message, time)
@@ -168,28 +191,43 @@ class Contact:
     def forget_waiting(self) -> None:
         """Count what came while nobody looked, and no more: how late it was is not the link's."""
         for message, address in self._endpoint.receive():
-            self.link.came += self.session.refusal(message.head, address, now()) is None
+            assert isinstance(message, MachineMessage)
+            if self.session.refusal(message.head, address, now()) is None:
+                self.link.came += 1
+                self._mark(message)
 
-    def refuse(self, cause: Refusal) -> None:
+    def refuse(self, cause: Refusal, detail: str = "") -> None:
         """Count a message that was taken but is of no use."""
-        self._endpoint.refused[cause] += 1
+        self._endpoint.refuse(cause, detail)
 
     def _note(self, message: MachineMessage, time: int) -> None:
         head, link = message.head, self.link
         if self.last is None or head.sequence > self.last.head.sequence:
             self.last = message
         link.came += 1
-        link.missed = max(0, self.session.window.newest - link.came)
+        if message.identity is not None:
+            self.offered = head.nonce
+        else:
+            self._first, self._followed = self._first or head.sequence, self._followed + 1
+        gaps = self.session.window.newest - self._first + 1 - self._followed if self._first else 0
         self._phases.append((time - message.sampled / message.rate) / SECOND)
         if head.acknowledged > self._newest:  # else its answer was there before
             self._newest = head.acknowledged
             link.trips.append((time - head.echo - head.held / message.rate) / SECOND)
-        for i, there in enumerate(message.arrived):
-            if there and head.acknowledged - i in self._pending:
-                self._pending[head.acknowledged - i] = True
+        self._mark(message)
         for settled in [n for n in self._pending if n <= head.acknowledged - _SETTLED]:
             link.sent += 1
-            link.lost += not self._pending.pop(settled)
+            unanswered = not self._pending.pop(settled)
+            asked = settled in self._requests
+            self._requests.discard(settled)
+            link.lost += 0.5 * unanswered if asked else unanswered
+            self._unanswered += 0.5 * unanswered * asked
+        link.missed = self._unanswered + max(0, gaps)
+
+    def _mark(self, message: MachineMessage) -> None:
+        for i, there in enumerate(message.arrived):
+            if there and message.head.acknowledged - i in self._pending:
+                self._pending[message.head.acknowledged - i] = True
 
     @property
     def soonest(self) -> float:

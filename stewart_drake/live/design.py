@@ -25,13 +25,11 @@ from stewart_drake.live.contact import Link
 from stewart_drake.live.protocol import (
     MOST_HISTORY,
     MOST_ROWS,
-    SECOND,
     MachineFlags,
     MachineMessage,
 )
 from stewart_drake.loop.experiment import Experiment, control_law, first_queue, prepare
 from stewart_drake.scenario.config import (
-    EncoderSensorConfig,
     FixedTunerConfig,
     NetworkConfig,
     Scenario,
@@ -75,27 +73,12 @@ class Design(NamedTuple):
     step: tuple[float, str]
 
 
-def check_peer(scenario: Scenario, machine: MachineMessage) -> None:
-    """Refuse a machine that the scenario is not of.
+def check_controller(scenario: Scenario) -> None:
+    """Refuse what `live` does not run.
 
     Raises:
         ConfigError: one line.
     """
-    sensor, period = scenario.sensor, scenario.controller.period
-    if round(period * SECOND) != machine.period:
-        raise ConfigError(
-            f"controller.period: got {period:g} s; expected the machine's, "
-            f"{machine.period / SECOND:g} s"
-        )
-    encoders = isinstance(sensor, EncoderSensorConfig)
-    if encoders != (machine.codes is not None):
-        says = "encoders" if machine.codes is not None else "state"
-        raise ConfigError(
-            f"sensor.kind: got {sensor.kind!r}; expected {says!r}, as the machine has"
-        )
-    read = 0 if machine.codes is None else len(machine.codes)
-    if isinstance(sensor, EncoderSensorConfig) and read != sensor.samples:
-        raise ConfigError(f"sensor.samples: got {sensor.samples}; expected the machine's {read}")
     if not isinstance(scenario.tuner, FixedTunerConfig):
         raise ConfigError(f"tuner.kind: got {scenario.tuner.kind!r}; expected 'fixed' for live")
     if not isinstance(scenario.actuator, TorqueActuatorConfig):

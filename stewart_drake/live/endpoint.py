@@ -3,15 +3,19 @@
 Without a key only the loopback interface is used. What is not acted upon is counted by its cause.
 """
 
+import contextlib
+import hashlib
+import hmac
 import ipaddress
 import secrets
 import socket
+import struct
 import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.protocol import (
@@ -23,6 +27,7 @@ from stewart_drake.live.protocol import (
     RefusedError,
     decode,
     encode,
+    version_refusal,
 )
 
 Address = tuple[str, int]
@@ -35,6 +40,10 @@ SHORTEST_KEY: Final = 16
 """Bytes."""
 LONGEST_KEY: Final = 4096
 """Bytes."""
+ANSWERS: Final = 50
+"""Requests of unknown addresses that are answered in a second."""
+ANSWERS_AT_ONCE: Final = 10
+"""Of them, without a pause."""
 STOOD: Final = SECOND // 5
 """ns by which a process that comes late has stood still."""
 
@@ -42,6 +51,15 @@ STOOD: Final = SECOND // 5
 def now() -> int:
     """ns of this process's clock, which nobody sets."""
     return time.monotonic_ns()
+
+
+class OtherVersion(NamedTuple):
+    """A datagram of another version of the protocol, and where it came from."""
+
+    version: int
+    session: int
+    sequence: int
+    address: Address
 
 
 class Endpoint:
@@ -55,6 +73,8 @@ class Endpoint:
 
     Attributes:
         refused: datagrams that were not acted upon, by cause; who finds more of them adds them.
+        refusal: the last of them, in words; empty before there is one.
+        versions: other versions of the protocol that were heard, since they were last looked at.
         unsent: datagrams that the system did not take: a full buffer, no way there.
 
     Raises:
@@ -69,6 +89,7 @@ class Endpoint:
         key: bytes | None = None,
     ) -> None:
         self._takes, self._key, self.refused, self.unsent = takes, key, Counter[Refusal](), 0
+        self.refusal, self.versions = "", list[OtherVersion]()
         if key is not None and len(key) < SHORTEST_KEY:
             raise ConfigError(f"key: got {len(key)} bytes; expected at least {SHORTEST_KEY}")
         self._check_reach(host, "host")
@@ -115,6 +136,16 @@ class Endpoint:
             return False
         return True
 
+    def refuse(self, cause: Refusal, detail: str = "") -> None:
+        """Count a datagram that is not acted upon."""
+        self.refused[cause] += 1
+        self.refusal = f"{cause.value}: {detail}" if detail else cause.value
+
+    def refuse_version(self, other: "OtherVersion") -> None:
+        """Say to a peer of another version which one is spoken here, in a head alone."""
+        with contextlib.suppress(OSError):
+            self._socket.sendto(version_refusal(other.session, other.sequence), other.address)
+
     def receive(self) -> Iterator[tuple[Message, Address]]:
         """What has come, at most AT_ONCE of it; the rest next time."""
         for _ in range(AT_ONCE):
@@ -127,12 +158,15 @@ class Endpoint:
             try:
                 message = decode(data, self._key)
             except RefusedError as refused:
-                self.refused[refused.cause] += 1
+                self.refuse(refused.cause, refused.detail)
+                if refused.cause == Refusal.VERSION:
+                    session, sequence = struct.unpack_from("<Q8xI", data, 8)
+                    self.versions = [OtherVersion(data[4], session, sequence, address)]
                 continue
             if isinstance(message, self._takes):
                 yield message, address
             else:
-                self.refused[Refusal.MALFORMED] += 1
+                self.refuse(Refusal.MALFORMED, "a datagram of this side's own")
 
 
 def read_key(path: Path) -> bytes:
@@ -175,6 +209,10 @@ class Window:
     newest: int = 0
     seen: int = 0
 
+    def tell(self, sequence: int) -> str:
+        """Return what is wrong with a number that `take` refuses."""
+        return f"sequence {sequence} after {self.newest}"
+
     def take(self, sequence: int) -> Refusal | None:
         """Note a number; why it is refused, or None."""
         behind = self.newest - sequence
@@ -216,6 +254,16 @@ class Session:
         """A new one of a controller's."""
         return cls(draw(), address)
 
+    @classmethod
+    def confirmed(cls, head: Head, address: Address, time: int) -> "Session":
+        """Return a machine's, begun by a datagram with the nonce of an offer.
+
+        The machine counts on from the sequences of its offers, which are those of the requests.
+        """
+        session = cls(head.session, address, head.nonce, _sent=head.sequence - 1)
+        session.refusal(head, address, time)
+        return session
+
     def head(self, time: int) -> Head:
         """Of the next datagram, which is sent now, in ns of the own clock."""
         self._sent += 1
@@ -242,3 +290,38 @@ class Session:
 def draw() -> int:
     """A number of 64 bits that nobody guesses, not 0."""
     return secrets.randbits(64) or 1
+
+
+class Offers:
+    """Offers of sessions, without any memory of who has asked.
+
+    A nonce follows from the session, the address that asks and the number of sessions so far, under
+    a secret that is drawn at the start. So only who got an offer knows it, and what was recorded of
+    earlier sessions is worthless.
+
+    Args:
+        secret: 32 bytes; drawn if None.
+    """
+
+    def __init__(self, secret: bytes | None = None) -> None:
+        self._secret = secrets.token_bytes(32) if secret is None else secret
+        self._sessions, self._tokens, self._counted = 0, float(ANSWERS_AT_ONCE), 0
+
+    def nonce(self, session: int, address: Address) -> int:
+        """Return the nonce that is offered to an address for a session, not 0."""
+        text = f"{session} {address[0]} {address[1]} {self._sessions}"
+        digest = hmac.new(self._secret, text.encode(), hashlib.sha256).digest()
+        return int.from_bytes(digest[:8], "little") or 1
+
+    def taken(self) -> None:
+        """Withdraw all offers: a session has begun."""
+        self._sessions += 1
+
+    def may_answer(self, time: int) -> bool:
+        """Whether an unknown address is answered at ns of the own clock; then it counts."""
+        grown = self._tokens + (time - self._counted) * ANSWERS / SECOND
+        self._tokens, self._counted = min(float(ANSWERS_AT_ONCE), grown), time
+        if self._tokens < 1:
+            return False
+        self._tokens -= 1
+        return True

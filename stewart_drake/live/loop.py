@@ -35,9 +35,11 @@ from stewart_drake.live.protocol import (
     MachineMessage,
     Refusal,
 )
+from stewart_drake.live.reports import ReportCheck
 from stewart_drake.live.steering import Steering, Wish
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.experiment import motion_scale
+from stewart_drake.loop.peer import Fault
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, PACKETS, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
 
@@ -73,6 +75,12 @@ class End(NamedTuple):
     status: str
     stopped: Failure | None
 
+    @property
+    def words(self) -> str:
+        """The status, and what stopped the run."""
+        status = self.status.replace("_", " ")
+        return status if self.stopped is None else f"{status}: {self.stopped}"
+
 
 class Viewer(Protocol):
     """Who watches, and may ask for something."""
@@ -87,6 +95,10 @@ class Viewer(Protocol):
 
     def stopped(self) -> bool:
         """Whether the end is asked for."""
+        ...
+
+    def ended(self, words: str) -> None:
+        """Show how the run ended; the last call."""
         ...
 
 
@@ -104,6 +116,9 @@ class Nobody:
         """Never."""
         return False
 
+    def ended(self, words: str) -> None:
+        """Nothing."""
+
 
 class Seen(NamedTuple):
     """The loop at a sample.
@@ -119,7 +134,7 @@ class Seen(NamedTuple):
         spread: s, standard deviation of those.
         lost: share of the datagrams that are lost, there and back.
         missed: deadlines.
-        safe: whether the machine is at its safe torque.
+        safe: why the machine is at its safe torque, or None.
         by_hand: whether a hand leads.
         limit: what keeps the plate from what is asked for, or None.
     """
@@ -134,7 +149,7 @@ class Seen(NamedTuple):
     spread: float
     lost: float
     missed: int
-    safe: bool
+    safe: str | None
     by_hand: bool
     limit: str | None
 
@@ -216,6 +231,8 @@ class LiveLoop:
         self._flags, self._silent_since = MachineFlags(0), 0
         self._asked, self._recording = NOTHING, True
         self._parked = self._leads = self._late = False
+        self._safe: str | None = None
+        self._check = ReportCheck(design.torque_limit)
 
     # -------------------------------------------------------------- the begin
 
@@ -230,7 +247,7 @@ class LiveLoop:
         await_free(contact)
         last = contact.last
         assert last is not None
-        contact.join(last.head.nonce)
+        contact.join()
         self._parked = bool(last.flags & (MachineFlags.PARKED | MachineFlags.RESETS))
         # Of the machine's clock, or earlier by the way back.
         here = (clock.monotonic() - contact.soonest) * last.rate
@@ -252,6 +269,11 @@ class LiveLoop:
     def _take(self, message: MachineMessage) -> None:
         """Keep a measurement until its sample."""
         if message.begin == NEVER or message.sampled < message.begin:
+            return
+        values, size = message.values, self._design.law.sensing.size
+        if values is not None and values.size != size:
+            found = f"a measurement of {values.size} numbers; expected {size}"
+            self._contact.refuse(Refusal.MALFORMED, found)
             return
         k = round((message.sampled - message.begin) / message.period)
         if k < len(self.pace.late):
@@ -285,6 +307,7 @@ class LiveLoop:
         except KeyboardInterrupt:
             end = End("interrupted", Failure(k * self._period, None, math.nan, "stopped"))
         self.stop()
+        self._viewer.ended(end.words)
         return end
 
     def _step(self, k: int) -> End:
@@ -359,18 +382,18 @@ class LiveLoop:
             gone = (self._contact.heard - self._silent_since) / SECOND
             self._silent_since = 0
             self._say(f"at {time:.1f} s: the machine is heard again, after {gone:.1f} s")
+        last = self._contact.last
+        if last is not None and last.reason.fault == Fault.ENDED:
+            return End("lost_machine", Failure(time, None, math.nan, last.why))
         if message is None:
             return None
         before, self._flags = self._flags, message.flags
         if MachineFlags.LEFT in message.flags:
-            pose = self.memory.belief.state[POSE]
-            found = diagnose(self._design.experiment.mechanism, time, pose)
-            said = Failure(
-                time, None, math.nan, "the machine says that the plate left its workspace"
-            )
-            return End("left_workspace", found or said)
+            leg = message.reason.leg or None
+            return End("left_workspace", Failure(time, leg, math.nan, message.why))
+        self._safe = message.why if MachineFlags.SAFE in message.flags else None
         if MachineFlags.SAFE in message.flags & ~before:
-            self._say(f"at {time:.1f} s: the machine is at its safe torque")
+            self._say(f"at {time:.1f} s: the machine is at its safe torque: {self._safe}")
         if MachineFlags.SAFE in before & ~message.flags:
             self._say(f"at {time:.1f} s: torques act again")
         return None
@@ -381,7 +404,11 @@ class LiveLoop:
         nothing = np.full(design.law.sensing.size, np.nan)
         measurement, report = Measurement.of(nothing if measured is None else measured), None
         if message is not None:
-            self.record.acted(self._acted(message))
+            acted = self._acted(message)
+            problem = self._check.problem(acted) if self._sends else None
+            if problem is not None:
+                return End("refused", Failure(t, None, math.nan, problem))
+            self.record.acted(acted)
             report = self._report(k)
         if not self._leads:
             if not measurement.complete and not self._parked:  # who knows where it is
@@ -434,6 +461,8 @@ class LiveLoop:
             flags=self._asked,
         )
         self._sequences.pop(k - 2 * _GONE, None)
+        timeline = self._design.law.timeline
+        self._check.sent(first + round((eta - timeline.fraction * P) / P), packet)
 
     def _note_pace(self, k: int) -> None:
         late = (now() - self._due(k)) / SECOND
@@ -560,7 +589,7 @@ class LiveLoop:
             spread=link.spread,
             lost=1 - (1 - link.loss_there) * (1 - link.loss_back),
             missed=self.pace.missed,
-            safe=MachineFlags.SAFE in self._flags,
+            safe=self._safe,
             by_hand=self._by_hand,
             limit=self._steering.limit,
         )

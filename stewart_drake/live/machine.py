@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.body import Body, body_of
-from stewart_drake.live.endpoint import STOOD, Address, Endpoint, Session, draw, now
+from stewart_drake.live.endpoint import STOOD, Address, Endpoint, Offers, Session, now
 from stewart_drake.live.motors import Motors, Plan, PlayoutMotors, WireMotors
 from stewart_drake.live.protocol import (
     MISSING,
-    MOST_BITS,
     MOST_SAMPLES,
     NEVER,
     SECOND,
+    VERSION,
     ControllerFlags,
     ControllerMessage,
     Head,
@@ -36,6 +36,7 @@ from stewart_drake.live.protocol import (
     Refusal,
 )
 from stewart_drake.loop.experiment import Experiment, torques_in_flight
+from stewart_drake.loop.peer import FAULTS, Fault, Reason, code_bits, identity_of, in_words
 from stewart_drake.scenario.config import (
     EncoderSensorConfig,
     NetworkConfig,
@@ -55,7 +56,10 @@ Array = NDArray[np.float64]
 DRAWN: Final = 1 << 17
 """Datagrams each way for which times and losses are drawn; then they begin anew, but for a wire,
 which from then on takes what it took last."""
-_NOTHING: Final = MachineFlags(0)
+RECENT: Final = 10 * SECOND
+"""ns for which a fault that is over counts as what came before the next one."""
+LAST_WORDS: Final = 3
+"""Datagrams at the end, which say that it is one: some may be lost."""
 FURTHEST: Final = 3600 * SECOND
 """ns ahead that a run may begin, or torques be planned."""
 
@@ -142,6 +146,14 @@ def motors_of(experiment: Experiment) -> Motors:
     return WireMotors(limit, period, lambda k: round(delays[min(k, len(delays) - 1)] * SECOND))
 
 
+def reason_of(failure: Failure) -> Reason:
+    """Return how a plate left its workspace as a datagram says it."""
+    if failure.leg is not None:
+        return Reason(Fault.REACH, failure.leg)
+    known = (fault for fault, words in FAULTS.items() if words == failure.reason)
+    return Reason(next(known, Fault.LEFT))
+
+
 class Measured:
     """What a sensor has read, as a datagram says it."""
 
@@ -149,7 +161,7 @@ class Measured:
         s = scenario.sensor
         self.bits = 0
         if isinstance(s, EncoderSensorConfig):
-            self.bits = MOST_BITS if s.bits is None else min(s.bits, MOST_BITS)
+            self.bits = code_bits(s)
         self._zeros: Array = np.full(NUM_LEGS, np.nan)
 
     def said(self, values: Array) -> dict[str, Any]:
@@ -186,6 +198,9 @@ class Machine:
         session: of the controller that drives, or did last.
         begin: ns, when the run began or will begin, or NEVER.
         failure: how the plate left its workspace, or None.
+        identity: what a controller must be designed for.
+        offers: of sessions.
+        reason: why torques do not act any more, and `before`, what preceded it.
         counts: what happened, by name.
         goes_by: what computes the plate, see `live.body.body_of`.
         longest_lag: ns by which something was done late while the plate moved.
@@ -208,7 +223,8 @@ class Machine:
         self._drawn, self._measured = drawn(sc), Measured(sc)
         self._make, self.goes_by = body_of(experiment)
         self.session: Session | None = None
-        self._offered: Session | None = None
+        self.identity, self.offers = identity_of(sc), Offers()
+        self._told_refusal = 0
         self._due: list[tuple[int, int, int, Callable[[int], None]]] = []
         self._number = self.sample = 0
         self.counts: Counter[str] = Counter()
@@ -224,6 +240,8 @@ class Machine:
         self.begin = self._origin = NEVER
         self.failure: Failure | None = None
         self._running = False
+        self.reason = self.before = Reason()
+        self._preceded = 0
 
     # -------------------------------------------------------------- time
 
@@ -252,7 +270,11 @@ class Machine:
         time = self.time()
         if self._running and not self._safe:
             self._go_safe(time)
-        if self.session is not None:
+        if self.session is None:
+            return
+        if self.failure is None:
+            self._fail(Reason(Fault.ENDED), time)
+        for _ in range(LAST_WORDS):
             self._endpoint.send(self._message(time, time, {}), self.session.address)
 
     def poll(self, time: int) -> None:
@@ -268,6 +290,21 @@ class Machine:
                 self.counts["lost"] += 1
                 continue
             self._at(time + under_way, 0, partial(self._arrive, message, address))
+        for other in self._endpoint.versions:
+            if self.offers.may_answer(self._clock()):
+                self._endpoint.refuse_version(other)
+                host, port = other.address
+                self._refuse_aloud(
+                    other.session,
+                    f"refused a controller at {host}:{port}: it speaks protocol version "
+                    f"{other.version}; expected {VERSION}",
+                )
+        self._endpoint.versions = []
+
+    def _refuse_aloud(self, session: int, line: str) -> None:
+        if session != self._told_refusal:
+            self._told_refusal = session
+            self._say(line)
 
     def advance(self, time: int) -> int:
         """Do all that is due by a time; when there is something next."""
@@ -297,10 +334,8 @@ class Machine:
     def _tell_lag(self, lag: int, when: int) -> None:
         if when > self._told_until:
             self.counts["stood still"] += 1
-            self._say(
-                f"{when / SECOND:.3f} s: stood still for {lag / SECOND:.2f} s; the plate went on "
-                "by its buffer"
-            )
+            self._precede(Reason(Fault.STOOD, lasted=lag), when)
+            self._say(f"{when / SECOND:.3f} s: {self.before}; the plate went on by its buffer")
         self._told_until = when + lag
 
     # -------------------------------------------------------------- the plate
@@ -316,11 +351,24 @@ class Machine:
     def _leave(self, failure: Failure) -> None:
         self.failure = failure
         self.counts["left workspace"] += 1
-        left = self._origin / SECOND + failure.time
+        left = self._origin + round(failure.time * SECOND)
+        self._fail(reason_of(failure), left)
+        why = in_words(self.reason, self.before)
         self._say(
-            f"{left:.3f} s: the plate left its workspace ({failure.reason}): stopped; a new "
-            "session begins at rest"
+            f"{left / SECOND:.3f} s: the plate left its workspace: {why}; stopped, a new session "
+            "begins at rest"
         )
+
+    def _fail(self, reason: Reason, time: int) -> None:
+        """Note why torques do not act any more."""
+        if self.reason.fault:
+            self._precede(self.reason, time)
+        if time - self._preceded > RECENT:
+            self.before = Reason()
+        self.reason = reason
+
+    def _precede(self, reason: Reason, time: int) -> None:
+        self.before, self._preceded = reason, time
 
     def _begin(self, time: int) -> None:
         if time != self.begin or self._running:
@@ -342,7 +390,8 @@ class Machine:
         self._follow(time)
         self._motors.change(time)
         if self._safe and self._motors.fed:
-            self._safe = False
+            self._precede(self.reason, time)
+            self._safe, self.reason = False, Reason()
             self._say(f"{time / SECOND:.3f} s: torques act again")
 
     def _take_sample(self, time: int) -> None:
@@ -374,9 +423,9 @@ class Machine:
     def _silence(self, time: int) -> None:
         self.counts["silences"] += 1
         self._go_safe(time)
+        self._fail(Reason(Fault.SILENCE, lasted=self.watchdog), time)
         self._say(
-            f"{time / SECOND:.3f} s: nothing was heard for {self._settings.watchdog:g} s: the safe "
-            f"torque ({self._settings.safe}) acts"
+            f"{time / SECOND:.3f} s: {self.reason}: the safe torque ({self._settings.safe}) acts"
         )
 
     def _go_safe(self, time: int) -> None:
@@ -384,46 +433,58 @@ class Machine:
         self._motors.safe(time, self._settings.safe == "hold")
         self._safe = True
 
-    def _refuse(self, refusal: Refusal | None) -> bool:
+    def _refuse(self, refusal: Refusal | None, detail: str = "") -> bool:
         if refusal is not None:
-            self._endpoint.refused[refusal] += 1
+            self._endpoint.refuse(refusal, detail)
         return refusal is not None
 
     def _arrive(self, message: ControllerMessage, address: Address, time: int) -> None:
-        head = message.head
-        if head.nonce == 0:
-            self._greet(head, address, time)
+        head, driving = message.head, self.session
+        if message.identity is not None:
+            self._greet(message, address, time)
             return
-        driving, offered = self.session, self._offered
         if driving is not None and (head.session, head.nonce) == (driving.number, driving.nonce):
             if self._refuse(driving.refusal(head, address, time)):
                 return
-        elif offered is None or self._alive(time):
+        elif self._alive(time) or head.nonce != self.offers.nonce(head.session, address):
             self._refuse(Refusal.FOREIGN)
             return
-        elif self._refuse(offered.refusal(head, address, time)):
-            return
         else:
-            self._adopt(offered, time)
+            self._adopt(Session.confirmed(head, address, time), time)
         if not self._stopped:
             self._obey(message, time)
 
-    def _greet(self, head: Head, address: Address, time: int) -> None:
-        """Offer a session to who asks for one."""
+    def _greet(self, request: ControllerMessage, address: Address, time: int) -> None:
+        """Answer a request for a session; nothing is remembered of it."""
+        head, nonce = request.head, self.offers.nonce(request.head.session, address)
+        assert request.identity is not None
         if self.session is not None and head.session == self.session.number:
-            self._refuse(self.session.window.take(head.sequence))  # it was overtaken
+            self._refuse(Refusal.LATE)  # it was overtaken, or is replayed
             return
-        if self._offered is None or self._offered.number != head.session:
-            self._offered = Session(head.session, address, draw())
-        offered = self._offered
-        if self._refuse(offered.refusal(replace(head, nonce=offered.nonce), address, time)):
+        if head.nonce != nonce and not self.offers.may_answer(self._clock()):
+            self._refuse(Refusal.RATE)
             return
-        busy = MachineFlags.BUSY if self._alive(time) else _NOTHING
-        said = self._measured.said(self._body.measurement())
-        self._send(self._message(time, time, said, offered, busy), offered)
+        differs = self.identity.differing(request.identity)
+        if differs is not None:
+            host, port = address
+            self._refuse_aloud(
+                head.session,
+                f"refused a controller at {host}:{port}, which is designed for {differs[1]}; this "
+                f"machine has {differs[0]}",
+            )
+        said = {"identity": self.identity}
+        offer = self._message(time, time, said, Session(head.session, address))
+        answer = Head(
+            *(head.session, 0 if differs else nonce, head.sequence, head.sequence),
+            *(time, head.time, 0),
+        )
+        flags = offer.flags | (MachineFlags.BUSY if self._alive(time) else MachineFlags(0))
+        there = np.arange(64) == 0
+        self._send(replace(offer, head=answer, flags=flags, arrived=there), address)
 
     def _adopt(self, session: Session, time: int) -> None:
-        self.session, self._offered, self._stopped = session, None, False
+        self.session, self._stopped = session, False
+        self.offers.taken()
         self.counts["sessions"] += 1
         host, port = session.address
         where = "in motion"
@@ -433,6 +494,7 @@ class Machine:
             where = "at rest"
         else:
             self._go_safe(time)
+            self.reason = self.before = Reason()
         self.begin = NEVER
         self._say(
             f"{time / SECOND:.3f} s: session {self.counts['sessions']}, of {host}:{port}, {where}"
@@ -443,7 +505,9 @@ class Machine:
             self._stopped = True
             if self._running:
                 self._go_safe(time)
-            self._say(f"{time / SECOND:.3f} s: the controller said stop")
+            if self.failure is None:
+                self._fail(Reason(Fault.STOP), time)
+            self._say(f"{time / SECOND:.3f} s: {FAULTS[Fault.STOP]}")
             return
         if max(message.begin % NEVER, message.playout) > time + FURTHEST:
             self._refuse(Refusal.MALFORMED)
@@ -464,16 +528,16 @@ class Machine:
     def _answer(self, time: int, sampled: int, said: dict[str, Any], number: int) -> None:
         """To who drives; `number` is that of the sample."""
         if self.session is not None:
-            self._send(self._message(self.time(), sampled, said), self.session, number)
+            message = self._message(self.time(), sampled, said)
+            self._send(message, self.session.address, number)
 
-    def _send(self, message: MachineMessage, session: Session, number: int | None = None) -> None:
+    def _send(self, message: MachineMessage, to: Address, number: int | None = None) -> None:
         under_way = self._drawn.back(message.head.sequence if number is None else number)
         if under_way is None:
             self.counts["measurements lost"] += 1
         else:
             self.counts["sent"] += 1
-            address = session.address
-            self._at(message.head.time + under_way, 3, lambda _: self._put(message, address))
+            self._at(message.head.time + under_way, 3, lambda _: self._put(message, to))
 
     def _put(self, message: MachineMessage, address: Address) -> None:
         self._endpoint.send(message, address)
@@ -500,21 +564,20 @@ class Machine:
         time: int,
         sampled: int,
         said: dict[str, Any],
-        session: Session | None = None,
-        more: MachineFlags = _NOTHING,
+        offered: Session | None = None,
     ) -> MachineMessage:
-        to = session or self.session
+        to = offered or self.session
         assert to is not None
         link, acted = self._experiment.scenario.link, self._motors.acted
-        if isinstance(link, NetworkConfig) and not link.acknowledged:
+        if offered or (isinstance(link, NetworkConfig) and not link.acknowledged):
             acted = type(acted)()
         rows = [torque for _, torque in acted]
         seen = to.window.seen if to.window.newest else 0
         return MachineMessage(
             head=to.head(time),
-            flags=self._flags() | more,
+            flags=self._flags(),
             sampled=sampled,
-            begin=self.begin if to is self.session else NEVER,
+            begin=NEVER if offered else self.begin,
             period=self.period,
             watchdog=self.watchdog,
             rate=self._settings.rate,
@@ -525,6 +588,8 @@ class Machine:
             played=self._motors.played,
             dry=self._motors.dry,
             refused=sum(self._endpoint.refused.values()),
+            reason=self.reason,
+            before=self.before,
             **said,
         )
 

@@ -38,6 +38,8 @@ _FRAME: Final = 1 / 30
 """s between two frames."""
 _TOLD: Final = 0.1
 """s between two readouts."""
+_LAST: Final = 0.5
+"""s for which the page is served after the loop is gone."""
 _START: Final = 60.0
 """s in which the page must be there."""
 _LONGEST: Final = 4096
@@ -50,6 +52,12 @@ class Opened(NamedTuple):
     """Of the page's process, once it is there."""
 
     url: str
+
+
+class Ended(NamedTuple):
+    """How the run ended, in words."""
+
+    words: str
 
 
 class Asked(NamedTuple):
@@ -102,6 +110,13 @@ class PageViewer:
     def stopped(self) -> bool:
         """See `Viewer`."""
         return self._stop
+
+    def ended(self, words: str) -> None:
+        """See `Viewer`: the page says so, and its process stays until it was sent."""
+        self._read()
+        if self._there:
+            with self._gone():
+                self._connection.send(Ended(words))
 
     def close(self) -> None:
         """End the page's process."""
@@ -190,6 +205,7 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
         connection.send(Opened(f"http://127.0.0.1:{server.server_port}/?token={token}"))
     with suppress(EOFError, OSError):
         _draw(connection, lock, scene, board)
+    time.sleep(_LAST)  # for the browsers to hear how it ended
     server.shutdown()
     scene.close()
 
@@ -199,10 +215,16 @@ def _draw(connection: Connection, lock: threading.Lock, scene: Any, board: _Boar
     from stewart_drake.loop.scene import full_color, torque_shares
 
     seen, came, largest, told = None, 0.0, list[float](), 0.0
+    ended: dict[str, Any] = {}
     while True:
         started = time.monotonic()
         if connection.poll(_FRAME if seen is None else 0):
-            seen, came = connection.recv(), started
+            said = connection.recv()
+            if isinstance(said, Ended):
+                ended = {"ended": said.words}
+                board.put(ended if seen is None else _words(seen) | ended)
+                continue
+            seen, came = said, started
             with lock:
                 connection.send(None)  # ready for more
             largest = [*largest[-1000:], float(np.abs(seen.torque).max())]
@@ -215,7 +237,7 @@ def _draw(connection: Connection, lock: threading.Lock, scene: Any, board: _Boar
             scene.show(pose, wanted)
         if started - told >= _TOLD:
             told = started
-            board.put(_words(seen))
+            board.put(_words(seen) | ended)
         time.sleep(max(0.0, _FRAME - (time.monotonic() - started)))
 
 

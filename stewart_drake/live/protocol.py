@@ -17,11 +17,22 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.loop.peer import (
+    DIGEST,
+    MOST_BITS,
+    NAME,
+    NO_FAULT,
+    Fault,
+    Identity,
+    Part,
+    Reason,
+    in_words,
+)
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, NUM_TORQUES
 
 Array = NDArray[np.float64]
 
-VERSION: Final = 1
+VERSION: Final = 2
 MAGIC_MACHINE: Final = b"STWM"
 MAGIC_CONTROLLER: Final = b"STWC"
 TAG: Final = 16
@@ -36,8 +47,6 @@ MOST_HISTORY: Final = 16
 """Torques that have acted, in a report."""
 MOST_SAMPLES: Final = 16
 """Of each encoder in a measurement."""
-MOST_BITS: Final = 30
-"""Of an encoder's turn."""
 MISSING: Final = -(2**31)
 """A code that was not read."""
 SECOND: Final = 10**9
@@ -46,10 +55,15 @@ SECOND: Final = 10**9
 # echo, held, flags
 _HEAD: Final = struct.Struct("<4sBBHQQIIQQQI")
 # kind, samples, bits, history; sampled, begin, period, watchdog, rate, torque_limit, arrived,
-# acted_from; played, dry, refused, reserved
-_MACHINE: Final = struct.Struct("<BBBBQQQQddQQIIII")
-# rows, reserved (3); sampled, playout, begin
-_CONTROLLER: Final = struct.Struct("<B3xQQQ")
+# acted_from; played, dry, refused; reason, leg, before, reserved; their durations
+_MACHINE: Final = struct.Struct("<BBBBQQQQddQQIIIBBBBQQ")
+# rows, content, reserved (2); sampled, playout, begin
+_CONTROLLER: Final = struct.Struct("<BB2xQQQ")
+_PART: Final = struct.Struct(f"<{DIGEST}s{NAME}s")
+_PADDING: Final = bytes(_MACHINE.size - _CONTROLLER.size)
+"""After the identity of a request, which is thus as long as its answer."""
+_OFFERS: Final = 3
+"""Kind of a machine's datagram that holds its identity in the place of a measurement."""
 
 
 class Refusal(Enum):
@@ -66,6 +80,8 @@ class Refusal(Enum):
     """It has been there before."""
     LATE = "late"
     """So old that it is of no use, or cannot be told from a replay."""
+    RATE = "rate"
+    """A request of an unknown address, beyond the rate at which these are answered."""
 
 
 class RefusedError(Exception):
@@ -73,7 +89,7 @@ class RefusedError(Exception):
 
     def __init__(self, cause: Refusal, detail: str = "") -> None:
         super().__init__(f"{cause.value}: {detail}" if detail else cause.value)
-        self.cause = cause
+        self.cause, self.detail = cause, detail
 
 
 class MachineFlags(IntFlag):
@@ -119,7 +135,7 @@ class Head:
 
     Attributes:
         session: drawn by the controller, not 0.
-        nonce: drawn by the machine for each session, that of its last offer; 0 asks for one.
+        nonce: of the machine's offer; 0 in a first request, and in the refusal of one.
         sequence: of the datagrams that a side sends in a session, from 1 on; each is 1 more.
         acknowledged: newest sequence that was got from the other side, 0 for none.
         time: ns, of the sender's clock, when it was sent.
@@ -159,6 +175,9 @@ class MachineMessage:
         codes: (N, 6) of encoders, int32, the oldest first, MISSING what is lost; or None.
         bits: of an encoder's turn, 0 without encoders.
         zeros: (6,) rad at code 0; or None.
+        identity: of the machine, in the answer to a request; or None.
+        reason: why torques do not act any more.
+        before: fault that preceded it; its `leg` is 0.
     """
 
     head: Head
@@ -179,9 +198,17 @@ class MachineMessage:
     codes: NDArray[np.int32] | None = None
     bits: int = 0
     zeros: Array | None = None
+    identity: Identity | None = None
+    reason: Reason = NO_FAULT
+    before: Reason = NO_FAULT
 
     def __eq__(self, other: object) -> bool:
         return _equal(self, other)
+
+    @property
+    def why(self) -> str:
+        """The reason in words, with the fault before it."""
+        return in_words(self.reason, self.before)
 
     @property
     def values(self) -> Array | None:
@@ -200,13 +227,14 @@ class ControllerMessage:
     """Torques for coming periods, controller to machine.
 
     Attributes:
-        head: see `Head`; with a nonce of 0 it asks for a session, and nothing in it is acted upon.
+        head: see `Head`.
         flags: see `ControllerFlags`.
         sampled: ns, the instant for which the torques were computed.
         playout: ns, when the first row shall act; row i acts i periods later, each for a period.
         begin: ns, when the run shall begin, in each datagram from when it is known, all that have
             torques among them; or NEVER.
         torques: (rows, 6) N m; without a row it only says that the controller is there.
+        identity: of the machine that the controller is designed for, in a request; or None.
     """
 
     head: Head
@@ -215,6 +243,7 @@ class ControllerMessage:
     playout: int = 0
     begin: int = NEVER
     torques: Array = field(default_factory=lambda: np.empty((0, NUM_TORQUES)))
+    identity: Identity | None = None
 
     def __eq__(self, other: object) -> bool:
         return _equal(self, other)
@@ -275,19 +304,37 @@ def _machine_body(m: MachineMessage) -> bytes:
         _check(m.codes, "codes", MOST_SAMPLES)
         zeros, codes = np.asarray(m.zeros, "<f8"), np.asarray(m.codes, "<i4")
         measured = zeros.tobytes() + codes.tobytes()
+    elif m.identity is not None:
+        kind, measured = _OFFERS, _identity_bytes(m.identity)
     arrived = sum(1 << i for i, there in enumerate(m.arrived[:64]) if there)
     times = (m.sampled, m.begin, m.period, m.watchdog)
     packed = _MACHINE.pack(
         *(kind, samples, m.bits, len(m.acted), *times, m.rate, m.torque_limit),
-        *(arrived, m.acted_from, m.played, m.dry, m.refused, 0),
+        *(arrived, m.acted_from, m.played, m.dry, m.refused),
+        *(m.reason.fault, m.reason.leg, m.before.fault, 0, m.reason.lasted, m.before.lasted),
     )
     return packed + measured + np.asarray(m.acted, "<f8").tobytes()
 
 
 def _controller_body(m: ControllerMessage) -> bytes:
     _check(m.torques, "torques", MOST_ROWS)
-    packed = _CONTROLLER.pack(len(m.torques), m.sampled, m.playout, m.begin)
+    asks = m.identity is not None
+    packed = _CONTROLLER.pack(len(m.torques), asks, m.sampled, m.playout, m.begin)
+    if m.identity is not None:
+        if len(m.torques):
+            raise ValueError("torques: got some in a request; expected none")
+        return packed + _identity_bytes(m.identity) + _PADDING
     return packed + np.asarray(m.torques, "<f8").tobytes()
+
+
+def _identity_bytes(identity: Identity) -> bytes:
+    return b"".join(_PART.pack(part.digest, part.name.encode("ascii")) for part in identity)
+
+
+def version_refusal(session: int, acknowledged: int) -> bytes:
+    """A head alone, which says to a controller of another version which one is spoken here."""
+    numbers = (session, 0, 1, acknowledged, 0, 0, 0, 0)
+    return _HEAD.pack(MAGIC_MACHINE, VERSION, 0, _HEAD.size, *numbers)
 
 
 def _check(rows: NDArray[Any], name: str, most: int) -> None:
@@ -336,14 +383,17 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
         raise RefusedError(Refusal.MALFORMED, "a short body")
     kind, samples, bits, history, *rest = _MACHINE.unpack_from(body)
     sampled, begin, period, watchdog, rate, limit, arrived, acted_from, *counts = rest
-    played, dry, refused, zero = counts
+    played, dry, refused, fault, leg, before, zero, lasted, before_lasted = counts
     fits = {
         0: samples == 0 and bits == 0,
         1: samples == 1 and bits == 0,
         2: 1 <= samples <= MOST_SAMPLES and 1 <= bits <= MOST_BITS,
+        _OFFERS: samples == 0 and bits == 0 and history == 0,
     }
-    sizes = {0: 0, 1: 8 * NUM_STATE, 2: 8 * NUM_LEGS + 4 * NUM_LEGS * samples}
+    encoders = 8 * NUM_LEGS + 4 * NUM_LEGS * samples
+    sizes = {0: 0, 1: 8 * NUM_STATE, 2: encoders, _OFFERS: _PART.size * len(Identity._fields)}
     plausible = rate > 0 and math.isfinite(rate) and limit > 0 and period > 0 and zero == 0
+    plausible = plausible and max(fault, before) < len(Fault) and leg <= NUM_LEGS
     if not (fits.get(kind) and history <= MOST_HISTORY and plausible and flags < 1024):
         raise RefusedError(Refusal.MALFORMED, "a number outside its range")
     if len(body) != _MACHINE.size + sizes[kind] + 8 * NUM_TORQUES * history:
@@ -357,6 +407,7 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
         zeros = np.frombuffer(measured, "<f8", NUM_LEGS).astype(np.float64)
         read = np.frombuffer(measured, "<i4", NUM_LEGS * samples, 8 * NUM_LEGS)
         codes = read.astype(np.int32).reshape(samples, NUM_LEGS)
+    identity = _identity(measured) if kind == _OFFERS else None
     if not np.all(np.isfinite(acted)) or (zeros is not None and not np.all(np.isfinite(zeros))):
         raise RefusedError(Refusal.MALFORMED, "a torque or an angle that is no number")
     there = np.array([bool(arrived >> i & 1) for i in range(64)])
@@ -379,15 +430,36 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
         codes=codes,
         bits=bits,
         zeros=zeros,
+        identity=identity,
+        reason=Reason(Fault(fault), leg, lasted),
+        before=Reason(Fault(before), 0, before_lasted),
     )
+
+
+def _identity(data: bytes) -> Identity:
+    parts = []
+    for digest, padded in _PART.iter_unpack(data[: _PART.size * len(Identity._fields)]):
+        name = padded.rstrip(b"\0")
+        if any(not 0x20 <= letter <= 0x7E for letter in name):
+            raise RefusedError(Refusal.MALFORMED, "a name that cannot be printed")
+        parts.append(Part(digest, name.decode("ascii")))
+    return Identity(*parts)
 
 
 def _controller(head: Head, flags: int, body: bytes) -> ControllerMessage:
     if len(body) < _CONTROLLER.size:
         raise RefusedError(Refusal.MALFORMED, "a short body")
-    rows, sampled, playout, begin = _CONTROLLER.unpack_from(body)
-    if rows > MOST_ROWS or flags > 3 or any(body[1:4]):
+    rows, asks, sampled, playout, begin = _CONTROLLER.unpack_from(body)
+    if rows > MOST_ROWS or asks > 1 or (asks and rows) or flags > 3 or any(body[2:4]):
         raise RefusedError(Refusal.MALFORMED, "a number outside its range")
+    if asks:
+        size = _PART.size * len(Identity._fields)
+        said, padding = body[_CONTROLLER.size :][:size], body[_CONTROLLER.size + size :]
+        if padding != _PADDING or len(said) != size:
+            raise RefusedError(Refusal.MALFORMED, "a request of another length")
+        no_torques = np.empty((0, NUM_TORQUES))
+        numbers = (sampled, playout, begin, no_torques)
+        return ControllerMessage(head, ControllerFlags(flags), *numbers, _identity(said))
     if len(body) != _CONTROLLER.size + 8 * NUM_TORQUES * rows:
         raise RefusedError(Refusal.MALFORMED, "a body of another length")
     torques = _rows(body[_CONTROLLER.size :])

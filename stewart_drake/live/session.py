@@ -12,12 +12,13 @@ from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.connect import call, open_endpoint
 from stewart_drake.live.contact import Contact
-from stewart_drake.live.design import Design, as_seen, check_peer, design
+from stewart_drake.live.design import Design, as_seen, check_controller, design
 from stewart_drake.live.endpoint import Address, Endpoint
 from stewart_drake.live.governor import Governor
 from stewart_drake.live.loop import LiveLoop, Nobody, Viewer
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
 from stewart_drake.live.steering import Steering, Way
+from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LiveSummary, SimulationResult
 from stewart_drake.scenario.config import NetworkConfig, Scenario
@@ -62,9 +63,9 @@ def prepare_session(
     """
     endpoint = open_endpoint(address, key)
     try:
-        contact = Contact(endpoint, address)
+        contact = Contact(endpoint, address, identity_of(scenario))
         machine = call(contact)
-        check_peer(scenario, machine)
+        check_controller(scenario)
         with one_blas_thread:
             made = design(as_seen(scenario, contact.link, machine), machine)
         return Ready(endpoint, contact, made)

@@ -29,6 +29,7 @@ from stewart_drake.law.native_law import configuration, uncovered
 from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.experiment import control_law, prepare
+from stewart_drake.loop.peer import FAULTS, identity_of
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.native.build import FOLDER, compiler
 from stewart_drake.native.law_layout import CONFIG_FIELDS, CONFIG_FLAGS
@@ -195,6 +196,13 @@ def _surroundings(scenario: Scenario, law: RecordedLqi, suffix: str) -> dict[str
         "LEAST": _list(LEAST, suffix),
         "HOME_SIGN": _list(home_sign(experiment.mechanism), suffix),
         "QUEUE_ROWS": str(len(law.queue[0])),
+        "IDENTITY": ",\n    ".join(
+            f'{{{{{", ".join(f"0x{b:02x}" for b in part.digest)}}}, "{part.name}"}}'
+            for part in identity_of(scenario)
+        ),
+        "FAULTS": ",\n    ".join(
+            f'"{words.replace("{:", "%").replace("}", "")}"' for words in FAULTS.values()
+        ),
         "KNOTS": str(len(rows)),
         "MOTION": ",\n    ".join(_list(row, "") for row in rows),
         "MOTION_TOLERANCE": f"{TOLERANCE:g}",

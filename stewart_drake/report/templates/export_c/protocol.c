@@ -84,10 +84,10 @@ static void digest_end(sha256 *s, uint8_t *out)
         out[i] = (uint8_t)(s->h[i / 4] >> (24 - 8 * (i % 4)));
 }
 
-/* The first STEWART_TAG bytes of HMAC-SHA256 (RFC 2104). */
-static void tag_of(stewart_key key, const uint8_t *data, size_t size, uint8_t *tag)
+/* HMAC-SHA256 (RFC 2104), 32 bytes. */
+static void hmac(stewart_key key, const uint8_t *data, size_t size, uint8_t *outer)
 {
-    uint8_t pad[64] = {0}, inner[32], outer[32];
+    uint8_t pad[64] = {0}, inner[32];
     sha256 s;
     if (key.size > 64) {
         digest_begin(&s);
@@ -108,7 +108,14 @@ static void tag_of(stewart_key key, const uint8_t *data, size_t size, uint8_t *t
     digest_add(&s, pad, 64);
     digest_add(&s, inner, 32);
     digest_end(&s, outer);
-    memcpy(tag, outer, STEWART_TAG);
+}
+
+/* Its first STEWART_TAG bytes. */
+static void tag_of(stewart_key key, const uint8_t *data, size_t size, uint8_t *tag)
+{
+    uint8_t whole[32];
+    hmac(key, data, size, whole);
+    memcpy(tag, whole, STEWART_TAG);
 }
 
 /* ---------------------------------------------------------------- numbers */
@@ -165,7 +172,7 @@ static void put_head(uint8_t **at, const char *magic, const stewart_head *h, ste
 {
     memcpy(*at, magic, 4);
     *at += 4;
-    put(at, 1, 1);
+    put(at, STEWART_PROTOCOL, 1);
     put(at, key.size ? STEWART_TAG : 0, 1);
     put(at, 0, 2); /* the length, once it is known */
     put(at, h->session, 8);
@@ -200,7 +207,7 @@ static int get_head(const uint8_t *data, size_t size, stewart_key key, stewart_h
     if (size < STEWART_HEAD || size > STEWART_LONGEST ||
         !(same_kind(data, "STWM") || same_kind(data, "STWC")))
         return STEWART_MALFORMED;
-    if (data[4] != 1)
+    if (data[4] != STEWART_PROTOCOL)
         return STEWART_VERSION;
     *at = data + 5;
     size_t tag = (size_t)get(at, 1), length = (size_t)get(at, 2);
@@ -238,9 +245,65 @@ static int get_head_of(const char *magic, size_t least, const uint8_t *data, siz
     return same_kind(data, magic) && *body >= least ? STEWART_TAKEN : STEWART_MALFORMED;
 }
 
+size_t stewart_write_version(const uint8_t *data, uint8_t *answer)
+{
+    const uint8_t *session = data + 8, *sequence = data + 24;
+    stewart_key none = {NULL, 0};
+    stewart_head head = {get(&session, 8), 0, 1, (uint32_t)get(&sequence, 4), 0, 0, 0, 0};
+    put_head(&answer, "STWM", &head, none);
+    return finish(answer - STEWART_HEAD, answer, none);
+}
+
+/* ---------------------------------------------------------------- identity */
+
+#define IDENTITY (STEWART_PARTS * (STEWART_DIGEST + STEWART_NAME))
+
+static void put_identity(uint8_t **at, const stewart_identity *identity)
+{
+    for (int i = 0; i < STEWART_PARTS; i++) {
+        const stewart_part *part = &identity->parts[i];
+        int ended = 0;
+        memcpy(*at, part->digest, STEWART_DIGEST);
+        *at += STEWART_DIGEST;
+        for (int j = 0; j < STEWART_NAME; j++) {
+            ended |= part->name[j] == 0;
+            *(*at)++ = ended ? 0 : (uint8_t)part->name[j];
+        }
+    }
+}
+
+/* Whether all names can be printed. */
+static int get_identity(const uint8_t **at, stewart_identity *identity)
+{
+    int printable = 1;
+    for (int i = 0; i < STEWART_PARTS; i++) {
+        stewart_part *part = &identity->parts[i];
+        int ended = 0;
+        memcpy(part->digest, *at, STEWART_DIGEST);
+        *at += STEWART_DIGEST;
+        for (int j = 0; j < STEWART_NAME; j++) {
+            uint8_t letter = *(*at)++;
+            ended |= letter == 0;
+            printable &= ended ? letter == 0 : letter >= 0x20 && letter <= 0x7e;
+            part->name[j] = (char)(letter & 0x7f);
+        }
+        part->name[STEWART_NAME] = 0;
+    }
+    return printable;
+}
+
+unsigned stewart_differing(const stewart_identity *one, const stewart_identity *other)
+{
+    unsigned differing = 0;
+    for (unsigned i = 0; i < STEWART_PARTS; i++)
+        if (memcmp(one->parts[i].digest, other->parts[i].digest, STEWART_DIGEST) != 0)
+            differing |= 1u << i;
+    return differing;
+}
+
 /* ---------------------------------------------------------------- machine to controller */
 
-#define MACHINE_BODY 84
+#define MACHINE_BODY 100
 
 size_t stewart_write_measured(const stewart_measured *m, stewart_key key, uint8_t *data)
 {
@@ -261,7 +324,14 @@ size_t stewart_write_measured(const stewart_measured *m, stewart_key key, uint8_
     put(&at, m->played, 4);
     put(&at, m->dry, 4);
     put(&at, m->refused, 4);
-    put(&at, 0, 4);
+    put(&at, m->reason.fault, 1);
+    put(&at, m->reason.leg, 1);
+    put(&at, m->before.fault, 1);
+    put(&at, 0, 1);
+    put(&at, m->reason.lasted, 8);
+    put(&at, m->before.lasted, 8);
+    if (m->kind == STEWART_OFFER)
+        put_identity(&at, &m->identity);
     if (m->kind == STEWART_STATE)
         put_doubles(&at, m->state, 12);
     if (m->kind == STEWART_ENCODERS) {
@@ -277,11 +347,13 @@ size_t stewart_write_measured(const stewart_measured *m, stewart_key key, uint8_
 static int plausible(const stewart_measured *m, uint64_t zero)
 {
     int fits = (m->kind == STEWART_NOTHING && m->samples == 0 && m->bits == 0) ||
+               (m->kind == STEWART_OFFER && m->samples == 0 && m->bits == 0 && m->history == 0) ||
                (m->kind == STEWART_STATE && m->samples == 1 && m->bits == 0) ||
                (m->kind == STEWART_ENCODERS && m->samples >= 1 && m->samples <= STEWART_SAMPLES &&
                 m->bits >= 1 && m->bits <= STEWART_BITS);
     return fits && m->history <= STEWART_HISTORY && m->rate > 0 && isfinite(m->rate) &&
-           m->torque_limit > 0 && m->period > 0 && zero == 0 && m->head.flags < 1024;
+           m->torque_limit > 0 && m->period > 0 && zero == 0 && m->head.flags < 1024 &&
+           m->reason.fault < STEWART_FAULTS && m->reason.leg <= 6 && m->before.fault < STEWART_FAULTS;
 }
 
 int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, stewart_measured *m)
@@ -307,14 +379,23 @@ int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, ste
     m->played = (uint32_t)get(&at, 4);
     m->dry = (uint32_t)get(&at, 4);
     m->refused = (uint32_t)get(&at, 4);
-    if (!plausible(m, get(&at, 4)))
+    m->reason.fault = (uint8_t)get(&at, 1);
+    m->reason.leg = (uint8_t)get(&at, 1);
+    m->before.fault = (uint8_t)get(&at, 1);
+    uint64_t zero = get(&at, 1);
+    m->reason.lasted = get(&at, 8);
+    m->before.lasted = get(&at, 8);
+    if (!plausible(m, zero))
         return STEWART_MALFORMED;
     size_t measured = m->kind == STEWART_STATE      ? 96u
+                      : m->kind == STEWART_OFFER    ? IDENTITY
                       : m->kind == STEWART_ENCODERS ? 48u + 24u * m->samples
                                                     : 0u;
     if (body != MACHINE_BODY + measured + 48u * m->history)
         return STEWART_MALFORMED;
     int finite = 1;
+    if (m->kind == STEWART_OFFER)
+        return get_identity(&at, &m->identity) ? STEWART_TAKEN : STEWART_MALFORMED;
     if (m->kind == STEWART_STATE)
         get_doubles(&at, m->state, 12); /* NaN is what was lost */
     if (m->kind == STEWART_ENCODERS) {
@@ -332,17 +413,25 @@ int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, ste
 /* ---------------------------------------------------------------- controller to machine */
 
 #define CONTROLLER_BODY 28
+#define PADDING (MACHINE_BODY - CONTROLLER_BODY) /* a request is as long as its answer */
 
 size_t stewart_write_plan(const stewart_plan *m, stewart_key key, uint8_t *data)
 {
     uint8_t *at = data;
     put_head(&at, "STWC", &m->head, key);
-    put(&at, m->rows, 1);
-    put(&at, 0, 3);
+    put(&at, m->asks ? 0 : m->rows, 1);
+    put(&at, m->asks, 1);
+    put(&at, 0, 2);
     put(&at, m->sampled, 8);
     put(&at, m->playout, 8);
     put(&at, m->begin, 8);
-    put_doubles(&at, &m->torques[0][0], 6 * m->rows);
+    if (m->asks) {
+        put_identity(&at, &m->identity);
+        memset(at, 0, PADDING);
+        at += PADDING;
+    } else {
+        put_doubles(&at, &m->torques[0][0], 6 * m->rows);
+    }
     return finish(data, at, key);
 }
 
@@ -355,13 +444,20 @@ int stewart_read_plan(const uint8_t *data, size_t size, stewart_key key, stewart
     if (refused)
         return refused;
     m->rows = (uint8_t)get(&at, 1);
-    uint64_t zero = get(&at, 3);
+    m->asks = (uint8_t)get(&at, 1);
+    uint64_t zero = get(&at, 2);
     m->sampled = get(&at, 8);
     m->playout = get(&at, 8);
     m->begin = get(&at, 8);
-    if (m->rows > STEWART_ROWS || zero || m->head.flags > 3 ||
-        body != CONTROLLER_BODY + 48u * m->rows)
+    if (m->rows > STEWART_ROWS || m->asks > 1 || (m->asks && m->rows) || zero || m->head.flags > 3 ||
+        body != CONTROLLER_BODY + (m->asks ? IDENTITY + PADDING : 48u * m->rows))
         return STEWART_MALFORMED;
+    if (m->asks) {
+        int good = get_identity(&at, &m->identity);
+        for (int i = 0; i < PADDING; i++)
+            good &= *at++ == 0;
+        return good ? STEWART_TAKEN : STEWART_MALFORMED;
+    }
     int finite = get_doubles(&at, &m->torques[0][0], 6 * m->rows);
     return finite && !(m->rows && m->begin == STEWART_NEVER) ? STEWART_TAKEN : STEWART_MALFORMED;
 }
@@ -391,6 +487,45 @@ stewart_head stewart_next(stewart_session *s, uint64_t now, uint32_t flags)
     stewart_head head = {s->number, s->nonce, ++s->sent, newest, now, s->echo, newest ? now - s->got : 0,
                          flags};
     return head;
+}
+
+uint64_t stewart_nonce(const stewart_offers *offers, uint64_t session, uint32_t address, uint16_t port)
+{
+    stewart_key key = {offers->secret, STEWART_SECRET};
+    uint8_t data[18], digest[32], *at = data;
+    const uint8_t *from = digest;
+    put(&at, session, 8);
+    put(&at, address, 4);
+    put(&at, port, 2);
+    put(&at, offers->sessions, 4);
+    hmac(key, data, sizeof data, digest);
+    uint64_t nonce = get(&from, 8);
+    return nonce ? nonce : 1;
+}
+
+int stewart_may_answer(stewart_offers *offers, uint64_t now)
+{
+    offers->tokens += 1e-9 * STEWART_ANSWERS * (double)(now - offers->counted);
+    offers->tokens = fmin(STEWART_AT_ONCE, offers->tokens);
+    offers->counted = now;
+    if (offers->tokens < 1)
+        return 0;
+    offers->tokens -= 1;
+    return 1;
+}
+
+stewart_head stewart_answer(const stewart_head *request, uint64_t nonce, uint64_t now)
+{
+    stewart_head head = {request->session, nonce, request->sequence, request->sequence, now,
+                         request->time, 0, 0};
+    return head;
+}
+
+stewart_session stewart_confirmed(const stewart_head *head, uint64_t now)
+{
+    stewart_session session = {head->session, head->nonce, {0, 0}, head->sequence - 1, 0, 0, 0};
+    stewart_note(&session, head, now);
+    return session;
 }
 
 int stewart_note(stewart_session *s, const stewart_head *head, uint64_t now)

@@ -7,6 +7,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#define STEWART_PROTOCOL 2 /* the version that is spoken here */
 #define STEWART_LONGEST 1452
 #define STEWART_HEAD 60
 #define STEWART_TAG 16
@@ -16,6 +17,12 @@
 #define STEWART_SAMPLES 16
 #define STEWART_BITS 30
 #define STEWART_MISSING INT32_MIN /* a code that was not read */
+#define STEWART_PARTS 4           /* of an identity: mechanism, period, sensor, actuator */
+#define STEWART_DIGEST 8
+#define STEWART_NAME 32
+#define STEWART_SECRET 32
+#define STEWART_ANSWERS 50 /* requests of unknown addresses that are answered in a second */
+#define STEWART_AT_ONCE 10 /* of them, without a pause */
 
 /* Why a datagram is not acted upon. */
 enum {
@@ -26,6 +33,7 @@ enum {
     STEWART_FOREIGN,
     STEWART_REPLAYED,
     STEWART_LATE,
+    STEWART_RATE,
     STEWART_REFUSALS
 };
 
@@ -44,8 +52,40 @@ enum {
 };
 enum { STEWART_STOP = 1, STEWART_ARMED = 2 };
 
-/* Kinds of measurement. */
-enum { STEWART_NOTHING, STEWART_STATE, STEWART_ENCODERS };
+/* Kinds of measurement; an offer has the machine's identity in its place. */
+enum { STEWART_NOTHING, STEWART_STATE, STEWART_ENCODERS, STEWART_OFFER };
+
+/* What kept a machine from going on. */
+enum {
+    STEWART_NO_FAULT,
+    STEWART_REACH,
+    STEWART_PITCH,
+    STEWART_SINGULAR,
+    STEWART_NOT_FINITE,
+    STEWART_LEFT_WORKSPACE,
+    STEWART_SILENCE,
+    STEWART_SAID_STOP,
+    STEWART_STOOD,
+    STEWART_ENDED,
+    STEWART_DRIVE,
+    STEWART_FAULTS
+};
+
+/* What machine and controller must agree on: bytes of SHA-256 of each part, and its name. */
+typedef struct {
+    uint8_t digest[STEWART_DIGEST];
+    char name[STEWART_NAME + 1];
+} stewart_part;
+
+typedef struct {
+    stewart_part parts[STEWART_PARTS];
+} stewart_identity;
+
+/* A fault, the leg from 1 on or 0, and how long it lasted, ns. */
+typedef struct {
+    uint8_t fault, leg;
+    uint64_t lasted;
+} stewart_reason;
 
 typedef struct {
     uint64_t session, nonce;
@@ -61,6 +101,8 @@ typedef struct {
     double rate, torque_limit;
     uint64_t arrived, acted_from;
     uint32_t played, dry, refused;
+    stewart_reason reason, before; /* why torques do not act, and the fault before that */
+    stewart_identity identity;     /* of an offer */
     double state[12], zeros[6]; /* the one or the other, by kind */
     int32_t codes[STEWART_SAMPLES][6];
     double acted[STEWART_HISTORY][6];
@@ -68,8 +110,9 @@ typedef struct {
 
 typedef struct {
     stewart_head head;
-    uint8_t rows;
+    uint8_t rows, asks; /* asks: a request, with an identity and no rows */
     uint64_t sampled, playout, begin;
+    stewart_identity identity;
     double torques[STEWART_ROWS][6];
 } stewart_plan;
 
@@ -87,6 +130,13 @@ size_t stewart_write_plan(const stewart_plan *message, stewart_key key, uint8_t 
 int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key,
                           stewart_measured *message);
 int stewart_read_plan(const uint8_t *data, size_t size, stewart_key key, stewart_plan *message);
+
+/* A head alone, which tells a controller of another version which one is spoken here; `data` is
+   its datagram. Returns STEWART_HEAD. */
+size_t stewart_write_version(const uint8_t *data, uint8_t *answer);
+
+/* Bit i is set where parts i differ. */
+unsigned stewart_differing(const stewart_identity *one, const stewart_identity *other);
 
 /* Which sequences were there already; starts as zeros. */
 typedef struct {
@@ -108,6 +158,26 @@ typedef struct {
 
 /* The head of the next datagram, which is sent now. */
 stewart_head stewart_next(stewart_session *session, uint64_t now, uint32_t flags);
+
+/* Offers of sessions, without any memory of who has asked. */
+typedef struct {
+    uint8_t secret[STEWART_SECRET]; /* drawn at the start */
+    uint32_t sessions;              /* so far; each one withdraws all offers */
+    double tokens;
+    uint64_t counted;
+} stewart_offers;
+
+/* The nonce that is offered to an address for a session, not 0. */
+uint64_t stewart_nonce(const stewart_offers *offers, uint64_t session, uint32_t address, uint16_t port);
+
+/* Whether an unknown address is answered now; then it counts. */
+int stewart_may_answer(stewart_offers *offers, uint64_t now);
+
+/* The answer to a request: its head, without flags. */
+stewart_head stewart_answer(const stewart_head *request, uint64_t nonce, uint64_t now);
+
+/* A machine's session, begun by a datagram with the nonce of an offer. */
+stewart_session stewart_confirmed(const stewart_head *head, uint64_t now);
 
 /* Why a datagram is not of this session, or STEWART_TAKEN: then it is noted. A nonce of 0 takes any. */
 int stewart_note(stewart_session *session, const stewart_head *head, uint64_t now);

@@ -20,6 +20,9 @@
 #define FINEST 1000000u      /* ns, a step of the simulated plate */
 #define WATCHDOG SECOND      /* ns of silence */
 #define FURTHEST (3600ull * SECOND)
+#define STOOD (SECOND / 5)   /* ns by which a process that comes late has stood still */
+#define RECENT (10ull * SECOND) /* for which a fault counts as what came before the next one */
+#define LAST_WORDS 3         /* datagrams at the end: some may be lost */
 
 typedef struct {
     uint64_t at;
@@ -32,8 +35,10 @@ typedef struct {
     stewart_key key;
     uint64_t started, period;
     /* who drives, and who may next */
-    stewart_session session, offered;
-    struct sockaddr_in driver, asks;
+    stewart_session session;
+    stewart_offers offers;
+    struct sockaddr_in driver;
+    uint64_t told_refusal; /* session of it */
     int driven, stopped;
     /* what acts, and what waits */
     row waiting[WAITING];
@@ -42,6 +47,8 @@ typedef struct {
     int history;
     uint64_t acted_from, changed, begin, sample;
     int running, safe, counts_dry, left;
+    stewart_reason reason, before; /* why torques do not act, and the fault before that */
+    uint64_t preceded, told_until; /* when that was; until when the machine stood still */
     uint32_t played, dry;
     unsigned refused[STEWART_REFUSALS], sent, silences;
     /* the simulated plate */
@@ -54,17 +61,55 @@ static uint64_t machine_now(const machine *m)
     return udp_now() - m->started;
 }
 
+/* ---------------------------------------------------------------- faults */
+
+static void precede(machine *m, stewart_reason reason, uint64_t time)
+{
+    m->before = reason;
+    m->preceded = time;
+}
+
+/* Why torques do not act any more. */
+static void fail(machine *m, uint8_t fault, uint8_t leg, uint64_t lasted, uint64_t time)
+{
+    stewart_reason reason = {fault, leg, lasted}, none = {0, 0, 0};
+    if (m->reason.fault)
+        precede(m, m->reason, time);
+    if (time - m->preceded > RECENT)
+        m->before = none;
+    m->reason = reason;
+}
+
+/* In words. */
+static const char *why(const machine *m)
+{
+    static char text[160];
+    udp_reason(&m->reason, &m->before, text, sizeof text);
+    return text;
+}
+
 /* ---------------------------------------------------------------- the plate: yours */
 
-static int plate_left(const machine *m)
+/* How the plate left its workspace, or STEWART_NO_FAULT. */
+static uint8_t plate_fault(const machine *m, uint8_t *leg)
 {
     real measures[STEWART_MEASURES];
+    int worst = 0;
+    *leg = 0;
+    for (int i = 0; i < STEWART_STATES; i++)
+        if (!isfinite(m->state[i]))
+            return STEWART_NOT_FINITE;
     stewart_measures(stewart_configuration.geometry, m->state, NULL, measures);
     measures[6] *= stewart_home_sign;
-    int left = 0;
-    for (int i = 0; i < STEWART_MEASURES; i++)
-        left |= !(measures[i] > stewart_least[i]);
-    return left;
+    for (int i = 1; i < STEWART_MOTORS; i++)
+        worst = measures[i] < measures[worst] ? i : worst;
+    if (!(measures[worst] > stewart_least[worst])) {
+        *leg = (uint8_t)(worst + 1);
+        return STEWART_REACH;
+    }
+    if (!(measures[7] > stewart_least[7]))
+        return STEWART_PITCH;
+    return measures[6] > stewart_least[6] ? STEWART_NO_FAULT : STEWART_SINGULAR;
 }
 
 /* On to an instant under the torque that acts; brakes hold before the run. */
@@ -79,9 +124,13 @@ static void plate_follow(machine *m, uint64_t time)
         uint64_t h = time - m->time < FINEST ? time - m->time : FINEST;
         stewart_move(&plant, torque, (real)(1e-9 * (double)h), m->state);
         m->time += h;
-        m->left = plate_left(m);
-        if (m->left)
-            printf("the plate left its workspace at %.3f s; stopped\n", 1e-9 * (double)m->time);
+        uint8_t leg, fault = plate_fault(m, &leg);
+        m->left = fault != STEWART_NO_FAULT;
+        if (m->left) {
+            fail(m, fault, leg, 0, m->time);
+            printf("the plate left its workspace at %.3f s: %s; stopped\n", 1e-9 * (double)m->time,
+                   why(m));
+        }
     }
     m->time = time > m->time ? time : m->time;
 }
@@ -155,7 +204,12 @@ static void change(machine *m, uint64_t time)
         return;
     }
     m->played += m->waiting[next].sequence > 0;
-    m->safe = m->safe && m->waiting[next].sequence == 0;
+    if (m->safe && m->waiting[next].sequence > 0) {
+        stewart_reason none = {0, 0, 0};
+        precede(m, m->reason, time);
+        m->reason = none;
+        m->safe = 0;
+    }
     act(m, m->waiting[next].torque, time);
     m->waiting[next] = m->waiting[--m->rows];
 }
@@ -179,7 +233,9 @@ static void put_back(machine *m)
     m->begin = m->acted_from = STEWART_NEVER;
     m->rows = m->history = m->running = m->safe = m->left = m->counts_dry = 0;
     m->played = m->dry = 0;
-    m->changed = 0;
+    m->changed = m->preceded = 0;
+    memset(&m->reason, 0, sizeof m->reason);
+    memset(&m->before, 0, sizeof m->before);
 }
 
 static int alive(const machine *m, uint64_t time)
@@ -210,56 +266,83 @@ static void begin(machine *m)
 
 /* ---------------------------------------------------------------- what is said */
 
-static void say(machine *m, stewart_session *to, const struct sockaddr_in *where, uint64_t sampled,
-                uint32_t flags)
+/* What every datagram says of the machine. */
+static void describe(const machine *m, uint64_t sampled, stewart_measured *s)
+{
+    memset(s, 0, sizeof *s);
+    s->head.flags = STEWART_SIMULATION | STEWART_HOLDS | STEWART_RESETS;
+    s->head.flags |= (uint32_t)(m->running ? STEWART_RUNNING : STEWART_PARKED);
+    s->head.flags |= (uint32_t)((m->safe ? STEWART_SAFE : 0) | (m->left ? STEWART_LEFT : 0));
+    s->sampled = sampled;
+    s->begin = s->acted_from = STEWART_NEVER;
+    s->period = m->period;
+    s->watchdog = WATCHDOG;
+    s->rate = 1;
+    s->torque_limit = (double)stewart_configuration.torque_limit;
+    s->played = m->played;
+    s->dry = m->dry;
+    for (int i = 1; i < STEWART_REFUSALS; i++)
+        s->refused += m->refused[i];
+    s->reason = m->reason;
+    s->before = m->before;
+}
+
+/* A measurement and what has acted, to who drives. */
+static void say(machine *m, uint64_t sampled)
 {
     static stewart_measured s;
     uint8_t data[STEWART_LONGEST];
-    memset(&s, 0, sizeof s);
-    flags |= STEWART_SIMULATION | STEWART_HOLDS | STEWART_RESETS;
-    flags |= (uint32_t)(m->running ? STEWART_RUNNING : STEWART_PARKED);
-    flags |= (uint32_t)((m->safe ? STEWART_SAFE : 0) | (m->left ? STEWART_LEFT : 0));
-    s.head = stewart_next(to, machine_now(m), flags);
+    describe(m, sampled, &s);
+    s.head = stewart_next(&m->session, machine_now(m), s.head.flags);
     s.kind = STEWART_STATE;
     s.samples = 1;
     s.history = (uint8_t)m->history;
-    s.sampled = sampled;
-    s.begin = to == &m->session ? m->begin : STEWART_NEVER;
-    s.period = m->period;
-    s.watchdog = WATCHDOG;
-    s.rate = 1;
-    s.torque_limit = (double)stewart_configuration.torque_limit;
-    s.arrived = to->window.newest ? to->window.seen : 0;
+    s.begin = m->begin;
+    s.arrived = m->session.window.newest ? m->session.window.seen : 0;
     s.acted_from = m->history ? m->acted_from : STEWART_NEVER;
-    s.played = m->played;
-    s.dry = m->dry;
-    for (int i = 1; i < STEWART_REFUSALS; i++)
-        s.refused += m->refused[i];
     plate_read(m, s.state);
     memcpy(s.acted, m->acted, sizeof m->acted[0] * (size_t)m->history);
-    m->sent += (unsigned)udp_put(m->socket, data, stewart_write_measured(&s, m->key, data), where);
+    m->sent += (unsigned)udp_put(m->socket, data, stewart_write_measured(&s, m->key, data), &m->driver);
 }
 
 /* ---------------------------------------------------------------- who drives */
 
-static int greet(machine *m, const stewart_plan *plan, const struct sockaddr_in *from, uint64_t now)
+/* Once for each session: who asks may go on asking. */
+static void refuse_aloud(machine *m, uint64_t session, const char *why)
 {
-    stewart_head head = plan->head;
-    if (m->driven && head.session == m->session.number)
-        return stewart_take(&m->session.window, head.sequence); /* it was overtaken */
-    if (m->offered.number != head.session) {
-        memset(&m->offered, 0, sizeof m->offered);
-        m->offered.number = head.session;
-        m->offered.nonce = udp_draw();
-        m->asks = *from;
+    if (session != m->told_refusal)
+        printf("refused a controller: %s\n", why);
+    m->told_refusal = session;
+}
+
+/* The answer to a request for a session; nothing is remembered of it. */
+static int greet(machine *m, const stewart_plan *request, const struct sockaddr_in *from, uint64_t now)
+{
+    static stewart_measured s;
+    uint8_t data[STEWART_LONGEST];
+    const stewart_head *head = &request->head;
+    uint64_t nonce = udp_nonce(&m->offers, head->session, from);
+    if (m->driven && head->session == m->session.number)
+        return STEWART_LATE; /* it was overtaken, or is replayed */
+    if (head->nonce != nonce && !stewart_may_answer(&m->offers, now))
+        return STEWART_RATE;
+    if (stewart_differing(&stewart_own_identity, &request->identity)) {
+        char why[512], own[160], other[160];
+        udp_differing(&stewart_own_identity, &request->identity, own, sizeof own);
+        udp_differing(&request->identity, &stewart_own_identity, other, sizeof other);
+        snprintf(why, sizeof why, "it is designed for %s; this machine has %s", other, own);
+        refuse_aloud(m, head->session, why);
+        nonce = 0;
     }
-    head.nonce = m->offered.nonce;
-    if (!udp_same(from, &m->asks))
-        return STEWART_FOREIGN;
-    int cause = stewart_note(&m->offered, &head, now);
-    if (!cause)
-        say(m, &m->offered, from, m->time, alive(m, now) ? STEWART_BUSY : 0);
-    return cause;
+    describe(m, m->time, &s);
+    uint32_t flags = s.head.flags | (uint32_t)(alive(m, now) ? STEWART_BUSY : 0);
+    s.head = stewart_answer(head, nonce, now);
+    s.head.flags = flags;
+    s.kind = STEWART_OFFER;
+    s.arrived = 1;
+    s.identity = stewart_own_identity;
+    m->sent += (unsigned)udp_put(m->socket, data, stewart_write_measured(&s, m->key, data), from);
+    return STEWART_TAKEN;
 }
 
 /* Torques; why they are of no use, or STEWART_TAKEN. */
@@ -290,6 +373,8 @@ static int obey(machine *m, const stewart_plan *plan, uint64_t now)
     m->stopped = 1;
     if (m->running)
         go_safe(m, now);
+    if (!m->left)
+        fail(m, STEWART_SAID_STOP, 0, 0, now);
     printf("the controller said stop at %.3f s\n", 1e-9 * (double)now);
     return STEWART_TAKEN;
 }
@@ -298,26 +383,35 @@ static int arrive(machine *m, const stewart_plan *plan, const struct sockaddr_in
 {
     const stewart_head *h = &plan->head;
     int cause;
-    if (h->nonce == 0)
+    if (plan->asks)
         return greet(m, plan, from, now);
     if (m->driven && h->session == m->session.number && h->nonce == m->session.nonce) {
         cause = udp_same(from, &m->driver) ? stewart_note(&m->session, h, now) : STEWART_FOREIGN;
         return cause ? cause : obey(m, plan, now);
     }
-    if (alive(m, now) || m->offered.nonce == 0 || h->nonce != m->offered.nonce ||
-        !udp_same(from, &m->asks))
+    if (alive(m, now) || h->nonce != udp_nonce(&m->offers, h->session, from))
         return STEWART_FOREIGN;
-    cause = stewart_note(&m->offered, h, now);
-    if (cause)
-        return cause;
-    m->session = m->offered;
-    m->driver = m->asks;
-    memset(&m->offered, 0, sizeof m->offered);
+    m->session = stewart_confirmed(h, now);
+    m->driver = *from;
+    m->offers.sessions++; /* withdraws what else was offered */
     m->driven = 1;
     m->stopped = 0;
     put_back(m);
     printf("a session begins\n");
     return obey(m, plan, now);
+}
+
+static void refuse_version(machine *m, const uint8_t *data, const struct sockaddr_in *from)
+{
+    uint8_t answer[STEWART_HEAD];
+    char why[80];
+    uint64_t session;
+    if (!stewart_may_answer(&m->offers, machine_now(m)))
+        return;
+    memcpy(&session, data + 8, sizeof session); /* only compared */
+    snprintf(why, sizeof why, "it speaks protocol version %u; expected %d", data[4], STEWART_PROTOCOL);
+    refuse_aloud(m, session, why);
+    udp_put(m->socket, answer, stewart_write_version(data, answer), from);
 }
 
 static void receive(machine *m)
@@ -326,9 +420,11 @@ static void receive(machine *m)
     static stewart_plan plan;
     struct sockaddr_in from;
     size_t size;
-    for (int i = 0; i < 256 && (size = udp_get(m->socket, data, &from)) > 0; i++) {
+    for (int i = 0; i < 256 && udp_get(m->socket, data, &size, &from); i++) {
         int cause = stewart_read_plan(data, size, m->key, &plan);
         m->refused[cause ? cause : arrive(m, &plan, &from, machine_now(m))]++;
+        if (cause == STEWART_VERSION)
+            refuse_version(m, data, &from);
     }
 }
 
@@ -345,16 +441,24 @@ static uint64_t advance(machine *m, uint64_t now)
         next = silent < next ? silent : next;
         if (next > now)
             return next;
+        if (m->running && now - next > STOOD && next != silent && now > m->told_until) {
+            stewart_reason stood = {STEWART_STOOD, 0, now - next};
+            m->told_until = now;
+            precede(m, stood, next);
+            printf("at %.3f s: the machine stood still for %.2f s\n", 1e-9 * (double)next,
+                   1e-9 * (double)stood.lasted);
+        }
         if (next == silent) {
             m->silences++;
             go_safe(m, silent);
-            printf("nothing was heard for %.3g s: the safe torque acts\n", 1e-9 * WATCHDOG);
+            fail(m, STEWART_SILENCE, 0, WATCHDOG, silent);
+            printf("%s: the safe torque acts\n", why(m));
         } else if (next == starts) {
             begin(m);
         } else if (next == m->sample) {
             plate_follow(m, next);
             if (m->driven)
-                say(m, &m->session, &m->driver, next, 0);
+                say(m, next);
             m->sample += m->period;
         } else {
             change(m, next);
@@ -374,8 +478,9 @@ int main(int argc, char **argv)
     }
     udp_interrupted();
     m.socket = udp_open((uint16_t)atoi(argv[1]), m.key);
-    if (m.socket < 0)
+    if (m.socket < 0 || !udp_draw(m.offers.secret, sizeof m.offers.secret))
         return 2;
+    m.offers.tokens = STEWART_AT_ONCE;
     m.started = udp_now();
     m.period = (uint64_t)((double)stewart_configuration.period * SECOND + 0.5);
     put_back(&m);
@@ -389,8 +494,10 @@ int main(int argc, char **argv)
     uint64_t now = machine_now(&m);
     if (m.running && !m.safe)
         go_safe(&m, now);
-    if (m.driven)
-        say(&m, &m.session, &m.driver, now, 0);
+    if (!m.left)
+        fail(&m, STEWART_ENDED, 0, 0, now);
+    for (int i = 0; i < LAST_WORDS && m.driven; i++)
+        say(&m, now);
     printf("ended after %.1f s: %u measurements sent, %u torques played, %u periods dry, %u silences\n",
            1e-9 * (double)now, m.sent, (unsigned)m.played, (unsigned)m.dry, m.silences);
     udp_tell(m.refused);

@@ -9,6 +9,10 @@ const real stewart_start[STEWART_STATES] = @START@;
 const real stewart_least[STEWART_MEASURES] = @LEAST@;
 const real stewart_home_sign = @HOME_SIGN@;
 const int stewart_rows = @QUEUE_ROWS@;
+const stewart_identity stewart_own_identity = {{
+    @IDENTITY@}};
+const char *const stewart_faults[STEWART_FAULTS] = {
+    @FAULTS@};
 
 #define KNOTS @KNOTS@
 static const double knots[KNOTS][1 + STEWART_REFERENCE] = {

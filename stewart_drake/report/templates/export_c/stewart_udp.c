@@ -35,6 +35,8 @@ typedef struct {
     struct sockaddr_in machine;
     stewart_key key;
     stewart_session session;
+    int offered, busy, other_version; /* what a machine has answered */
+    stewart_identity identity;        /* of the machine */
     other_clock clock;
     stewart_measured last; /* the newest by `sampled` */
     uint64_t begin, used;  /* of the machine's clock; that of the measurement used last, plus 1 */
@@ -83,9 +85,11 @@ static void receive(controller *c)
     struct sockaddr_in from;
     stewart_measured m;
     size_t size;
-    while ((size = udp_get(c->socket, data, &from)) > 0) {
+    while (udp_get(c->socket, data, &size, &from)) {
         uint64_t now = udp_now();
         int cause = stewart_read_measured(data, size, c->key, &m);
+        if (cause == STEWART_VERSION && udp_same(&from, &c->machine))
+            c->other_version = data[4];
         if (!cause && !udp_same(&from, &c->machine))
             cause = STEWART_FOREIGN;
         if (!cause)
@@ -93,7 +97,13 @@ static void receive(controller *c)
         c->refused[cause]++;
         if (cause)
             continue;
-        c->session.nonce = m.head.nonce;
+        if (m.kind == STEWART_OFFER) {
+            c->offered = 1;
+            c->busy = (m.head.flags & STEWART_BUSY) != 0;
+            c->identity = m.identity;
+            if (!c->busy && c->session.nonce == 0)
+                c->session.nonce = m.head.nonce;
+        }
         clock_note(&c->clock, &m.head, m.rate, now);
         if (m.sampled >= c->last.sampled)
             c->last = m;
@@ -111,6 +121,8 @@ static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playou
     plan.sampled = sampled;
     plan.playout = playout;
     plan.begin = c->begin;
+    plan.asks = c->session.nonce == 0;
+    plan.identity = stewart_own_identity;
     plan.rows = (uint8_t)rows;
     for (unsigned row = 0; row < rows; row++)
         for (int i = 0; i < STEWART_MOTORS; i++)
@@ -219,36 +231,68 @@ static void step(controller *c, unsigned k)
 /* Why a machine is not driven, or NULL. */
 static const char *objection(const controller *c)
 {
-    double period = (double)stewart_configuration.period * SECOND;
+    static char text[512], own[160], other[160];
+    if (c->other_version) {
+        snprintf(text, sizeof text, "the machine speaks protocol version %d; expected %d",
+                 c->other_version, STEWART_PROTOCOL);
+        return text;
+    }
+    if (!c->offered)
+        return NULL;
+    if (stewart_differing(&stewart_own_identity, &c->identity)) {
+        udp_differing(&stewart_own_identity, &c->identity, own, sizeof own);
+        udp_differing(&c->identity, &stewart_own_identity, other, sizeof other);
+        snprintf(text, sizeof text, "the machine has %s; this controller is designed for %s", other, own);
+        return text;
+    }
     if (!(c->last.head.flags & STEWART_SIMULATION) && !(c->flags & STEWART_ARMED))
         return "this is a real machine: say `arm` to drive it";
-    if (fabs((double)c->last.period - period) > 1)
-        return "its period is another one";
     return NULL;
+}
+
+static const char *in_use(const controller *c)
+{
+    static char text[160];
+    char address[INET_ADDRSTRLEN];
+    inet_ntop(AF_INET, &c->machine.sin_addr, address, sizeof address);
+    snprintf(text, sizeof text,
+             "machine at %s:%u is in use by another controller (retry %g s after it stops)", address,
+             ntohs(c->machine.sin_port), 1e-9 * (double)c->last.watchdog);
+    return text;
+}
+
+/* Why the machine does not go on, or NULL. */
+static const char *fault(const controller *c)
+{
+    static char text[200];
+    const stewart_measured *m = &c->last;
+    size_t used = 0;
+    if (!(m->head.flags & STEWART_LEFT) && m->reason.fault != STEWART_ENDED)
+        return NULL;
+    if (m->head.flags & STEWART_LEFT)
+        used = (size_t)snprintf(text, sizeof text, "left workspace: ");
+    udp_reason(&m->reason, &m->before, text + used, sizeof text - used);
+    return text;
 }
 
 /* A session and a run that will begin, or why not. */
 static const char *greet(controller *c)
 {
     uint64_t patience = udp_now() + 10ull * SECOND;
-    int busy = 0;
     while (c->last.begin == STEWART_NEVER || c->begin == STEWART_NEVER || c->last.period == 0) {
         if (udp_interrupted() || udp_now() > patience)
-            return busy ? "another controller drives it" : "the machine does not answer";
+            return c->busy ? in_use(c) : "the machine does not answer";
         say(c, 0, 0, 0, NULL, 0);
         uint64_t next = udp_now() + (c->last.period ? c->last.period : SECOND / 10);
         while (udp_now() < next) {
             udp_wait(c->socket, next);
             receive(c);
         }
-        busy = c->session.nonce && (c->last.head.flags & STEWART_BUSY);
-        if (busy) /* asks for another offer */
-            c->session.nonce = 0;
-        if (c->session.nonce == 0)
-            continue;
         const char *problem = objection(c);
         if (problem)
             return problem;
+        if (c->session.nonce == 0)
+            continue;
         if (c->begin == STEWART_NEVER && c->clock.number >= ENOUGH) {
             double trip = c->clock.trip[shortest(&c->clock)], ahead = 5 * (double)c->last.period;
             double wanted = machine_time(&c->clock, udp_now()) + ahead + 2 * c->clock.rate * trip;
@@ -276,8 +320,9 @@ static const char *drive(controller *c)
             udp_wait(c->socket, patience);
         if (udp_interrupted())
             return "interrupted";
-        if (c->last.head.flags & STEWART_LEFT)
-            return "the plate has left its workspace";
+        const char *problem = fault(c);
+        if (problem)
+            return problem;
         if (udp_now() > c->session.heard + 2 * c->last.watchdog)
             return "the machine has fallen silent";
         step(c, k);
@@ -317,7 +362,9 @@ int main(int argc, char **argv)
     }
     udp_interrupted();
     c.socket = udp_open(0, c.key);
-    c.session.number = udp_draw();
+    if (!udp_draw(&c.session.number, sizeof c.session.number))
+        return 2;
+    c.session.number += c.session.number == 0;
     c.begin = c.last.begin = STEWART_NEVER;
     stewart_init(&stewart_configuration, &c.memory, stewart_queue);
     const char *problem = c.socket < 0 ? "no socket" : greet(&c);

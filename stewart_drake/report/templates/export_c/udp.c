@@ -10,7 +10,14 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "stewart_motion.h"
 #include "udp.h"
+
+#define SHORTEST_KEY 16
+#define LONGEST_KEY 4096
+#ifndef UDP_RANDOM
+#define UDP_RANDOM "/dev/urandom"
+#endif
 
 uint64_t udp_now(void)
 {
@@ -19,15 +26,15 @@ uint64_t udp_now(void)
     return (uint64_t)t.tv_sec * SECOND + (uint64_t)t.tv_nsec;
 }
 
-uint64_t udp_draw(void)
+int udp_draw(void *bytes, size_t size)
 {
-    uint64_t number = 0;
-    FILE *file = fopen("/dev/urandom", "rb");
-    if (!file || fread(&number, sizeof number, 1, file) != 1)
-        number = udp_now();
+    FILE *file = fopen(UDP_RANDOM, "rb");
+    int drawn = file && fread(bytes, size, 1, file) == 1;
     if (file)
         fclose(file);
-    return number ? number : 1;
+    if (!drawn)
+        fprintf(stderr, "%s: no random bytes; expected them for session and nonce\n", UDP_RANDOM);
+    return drawn;
 }
 
 int udp_open(uint16_t port, stewart_key key)
@@ -57,11 +64,12 @@ void udp_wait(int socket, uint64_t until)
     nanosleep(&rest, NULL);
 }
 
-size_t udp_get(int socket, uint8_t *data, struct sockaddr_in *from)
+int udp_get(int socket, uint8_t *data, size_t *size, struct sockaddr_in *from)
 {
-    socklen_t size = sizeof *from;
-    ssize_t got = recvfrom(socket, data, STEWART_LONGEST + 1, 0, (struct sockaddr *)from, &size);
-    return got > 0 ? (size_t)got : 0;
+    socklen_t length = sizeof *from;
+    ssize_t got = recvfrom(socket, data, STEWART_LONGEST + 1, 0, (struct sockaddr *)from, &length);
+    *size = got > 0 ? (size_t)got : 0;
+    return got >= 0;
 }
 
 int udp_put(int socket, const uint8_t *data, size_t size, const struct sockaddr_in *to)
@@ -76,7 +84,7 @@ int udp_same(const struct sockaddr_in *one, const struct sockaddr_in *other)
 
 stewart_key udp_key(const char *path)
 {
-    static uint8_t bytes[4096];
+    static uint8_t bytes[LONGEST_KEY + 1];
     stewart_key key = {bytes, 0};
     FILE *file = path ? fopen(path, "rb") : NULL;
     if (file) {
@@ -85,11 +93,17 @@ stewart_key udp_key(const char *path)
     }
     while (key.size && (bytes[key.size - 1] == '\n' || bytes[key.size - 1] == '\r'))
         key.size--;
-    if (path && key.size < 16) {
-        fprintf(stderr, "%s: expected a key of at least 16 bytes\n", path);
+    if (path && (key.size < SHORTEST_KEY || key.size > LONGEST_KEY)) {
+        fprintf(stderr, "%s: got %u bytes or more; expected a key of %d to %d\n", path,
+                (unsigned)key.size, SHORTEST_KEY, LONGEST_KEY);
         key.size = 0;
     }
     return key;
+}
+
+uint64_t udp_nonce(const stewart_offers *offers, uint64_t session, const struct sockaddr_in *from)
+{
+    return stewart_nonce(offers, session, ntohl(from->sin_addr.s_addr), ntohs(from->sin_port));
 }
 
 static volatile sig_atomic_t interrupted;
@@ -116,9 +130,40 @@ int udp_interrupted(void)
 
 void udp_tell(const unsigned *refused)
 {
-    static const char *const names[STEWART_REFUSALS] = {"",        "malformed", "version", "key",
-                                                        "foreign", "replayed",  "late"};
+    static const char *const names[STEWART_REFUSALS] = {
+        "", "malformed", "version", "key", "foreign", "replayed", "late", "rate"};
     printf("refused:");
     for (int i = 1; i < STEWART_REFUSALS; i++)
         printf(" %u %s%s", refused[i], names[i], i + 1 < STEWART_REFUSALS ? "," : "\n");
+}
+
+static size_t put_reason(const stewart_reason *reason, char *text, size_t size)
+{
+    double number = reason->leg ? reason->leg : 1e-9 * (double)reason->lasted;
+    int length = snprintf(text, size, stewart_faults[reason->fault], number);
+    return length < 0 ? 0 : (size_t)length < size ? (size_t)length : size - 1;
+}
+
+void udp_reason(const stewart_reason *reason, const stewart_reason *before, char *text, size_t size)
+{
+    size_t used = put_reason(reason, text, size);
+    if (!before->fault)
+        return;
+    used += (size_t)snprintf(text + used, size - used, " (before that, ");
+    if (used < size)
+        used += put_reason(before, text + used, size - used);
+    if (used < size)
+        snprintf(text + used, size - used, ")");
+}
+
+void udp_differing(const stewart_identity *one, const stewart_identity *other, char *text, size_t size)
+{
+    static const char *const names[STEWART_PARTS] = {"mechanism", "period", "sensor", "actuator"};
+    unsigned differing = stewart_differing(one, other);
+    size_t used = 0;
+    text[0] = 0;
+    for (unsigned i = 0; i < STEWART_PARTS && used < size; i++)
+        if (differing >> i & 1u)
+            used += (size_t)snprintf(text + used, size - used, "%s%s %s", used ? ", " : "", names[i],
+                                     one->parts[i].name);
 }

@@ -13,8 +13,8 @@
 /* ns of the own clock. */
 uint64_t udp_now(void);
 
-/* A random number that is not 0. */
-uint64_t udp_draw(void);
+/* Random bytes of the system; 0 where there are none, which is told. */
+int udp_draw(void *bytes, size_t size);
 
 /* A socket at a port, 0 for any, of the loopback interface or, with a key, of all; -1 on an error,
    which is told. */
@@ -23,21 +23,30 @@ int udp_open(uint16_t port, stewart_key key);
 /* Wait for a datagram, at the longest until an instant of the own clock. */
 void udp_wait(int socket, uint64_t until);
 
-/* The next datagram, of up to STEWART_LONGEST + 1 bytes; 0 for none. */
-size_t udp_get(int socket, uint8_t *data, struct sockaddr_in *from);
+/* Whether there was a datagram, and its size, of up to STEWART_LONGEST + 1 bytes, which may be 0. */
+int udp_get(int socket, uint8_t *data, size_t *size, struct sockaddr_in *from);
 
 /* Whether it went out. */
 int udp_put(int socket, const uint8_t *data, size_t size, const struct sockaddr_in *to);
 
 int udp_same(const struct sockaddr_in *one, const struct sockaddr_in *other);
 
-/* The key of a file, NULL for none; with no bytes if it is shorter than 16, which is told. */
+/* The key of a file, NULL for none; with no bytes if it has not 16 to 4096, which is told. */
 stewart_key udp_key(const char *path);
+
+/* See `stewart_nonce`. */
+uint64_t udp_nonce(const stewart_offers *offers, uint64_t session, const struct sockaddr_in *from);
 
 /* Whether Ctrl-C was pressed since this was called first. */
 int udp_interrupted(void);
 
 /* Datagrams that were not acted upon, by cause. */
 void udp_tell(const unsigned *refused);
+
+/* Why torques do not act, in words. */
+void udp_reason(const stewart_reason *reason, const stewart_reason *before, char *text, size_t size);
+
+/* The parts of an identity that differ from another one's, by name. */
+void udp_differing(const stewart_identity *one, const stewart_identity *other, char *text, size_t size);
 
 #endif

@@ -1,0 +1,128 @@
+"""What a machine and its controller say of themselves: identity and faults (docs/protocol.md)."""
+
+import hashlib
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import fingerprint
+from stewart_drake.scenario.config import EncoderSensorConfig, Scenario
+
+DIGEST: Final = 8
+"""Bytes of SHA-256 that stand for a part of an identity."""
+NAME: Final = 32
+"""Bytes of its name, zeros after the last letter."""
+MOST_BITS: Final = 30
+"""Of an encoder's turn, in a datagram."""
+SECOND: Final = 10**9
+
+
+class Fault(IntEnum):
+    """What kept a machine from going on. `FAULTS` has the words."""
+
+    NONE = 0
+    REACH = 1
+    PITCH = 2
+    SINGULAR = 3
+    NOT_FINITE = 4
+    LEFT = 5
+    SILENCE = 6
+    STOP = 7
+    STOOD = 8
+    ENDED = 9
+    DRIVE = 10
+
+
+FAULTS: Final = {
+    Fault.NONE: "no fault",
+    Fault.REACH: "leg {:g} reached the end of its reach",
+    Fault.PITCH: "the pitch passed 85 degrees",
+    Fault.SINGULAR: "parallel singularity: the cranks do not hold the plate",
+    Fault.NOT_FINITE: "the simulated state is not finite",
+    Fault.LEFT: "the plate left its workspace",
+    Fault.SILENCE: "nothing was heard from the controller for {:g} s",
+    Fault.STOP: "the controller said stop",
+    Fault.STOOD: "the machine stood still for {:.2f} s",
+    Fault.ENDED: "the machine was ended",
+    Fault.DRIVE: "a drive of the machine failed",
+}
+"""The words of each fault, for `live`, its page and `machine`; C prints them too. The number in
+them is the leg, or the duration in s."""
+
+
+class Reason(NamedTuple):
+    """A fault, the leg from 1 on or 0, and how long it lasted, ns."""
+
+    fault: Fault = Fault.NONE
+    leg: int = 0
+    lasted: int = 0
+
+    def __str__(self) -> str:
+        return FAULTS[self.fault].format(self.leg or self.lasted / SECOND)
+
+
+def in_words(reason: Reason, before: Reason) -> str:
+    """Return a reason, and the fault before it if there was one."""
+    return f"{reason} (before that, {before})" if before.fault else f"{reason}"
+
+
+NO_FAULT: Final = Reason()
+
+
+class Part(NamedTuple):
+    """First bytes of the SHA-256 of one thing that both sides must agree on, and its name."""
+
+    digest: bytes
+    name: str
+
+
+class Identity(NamedTuple):
+    """What a machine and the controller designed for it must agree on."""
+
+    mechanism: Part
+    period: Part
+    sensor: Part
+    actuator: Part
+
+    def differing(self, other: "Identity") -> tuple[str, str] | None:
+        """Names of the parts that differ, of this side and of the other; None if all agree."""
+        pairs = zip(self._fields, self, other, strict=True)
+        found = [(field, a, b) for field, a, b in pairs if a.digest != b.digest]
+        if not found:
+            return None
+        texts = [
+            ", ".join(
+                f"{field} {part.name}{f' ({part.digest.hex()})' if a.name == b.name else ''}"
+                for field, a, b in found
+                for part in ((a, b)[side],)
+            )
+            for side in (0, 1)
+        ]
+        return texts[0], texts[1]
+
+
+def identity_of(scenario: Scenario) -> Identity:
+    """Return the identity of a scenario's machine as it is drawn.
+
+    Numbers that were identified (`controller.known`) and the simulated machine (`plant.mechanism`)
+    are not part of it.
+    """
+    mechanism, sensor = load_mechanism(scenario.mechanism), scenario.sensor
+    period, read = scenario.controller.period, str(sensor.kind)
+    if isinstance(sensor, EncoderSensorConfig):
+        read = f"encoders, {sensor.samples} samples, {code_bits(sensor)} bits"
+    return Identity(
+        Part(bytes.fromhex(fingerprint(mechanism)), mechanism.name[:NAME]),
+        _part(f"period {round(period * SECOND)} ns", f"{period:g} s"),
+        _part(f"sensor {read}", read),
+        _part(f"actuator {scenario.actuator.kind}", scenario.actuator.kind),
+    )
+
+
+def code_bits(sensor: EncoderSensorConfig) -> int:
+    """Return the bits of a turn in the codes of a datagram."""
+    return MOST_BITS if sensor.bits is None else min(sensor.bits, MOST_BITS)
+
+
+def _part(text: str, name: str) -> Part:
+    return Part(hashlib.sha256(text.encode("ascii")).digest()[:DIGEST], name[:NAME])

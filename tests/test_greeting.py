@@ -1,0 +1,445 @@
+"""Requests, offers, identities and faults, as both sides say them."""
+
+import re
+import socket
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.live import connect
+from stewart_drake.live.connect import await_free, call, open_endpoint
+from stewart_drake.live.contact import Contact
+from stewart_drake.live.endpoint import ANSWERS, ANSWERS_AT_ONCE, Session
+from stewart_drake.live.loop import Nobody
+from stewart_drake.live.machine import Machine
+from stewart_drake.live.page import PageViewer
+from stewart_drake.live.protocol import (
+    NEVER,
+    SECOND,
+    ControllerFlags,
+    ControllerMessage,
+    MachineFlags,
+    MachineMessage,
+    Refusal,
+    encode,
+)
+from stewart_drake.live.reports import ReportCheck
+from stewart_drake.live.session import drive, prepare_session
+from stewart_drake.loop.peer import FAULTS, Fault, Part, Reason, identity_of, in_words
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.scenario.loading import load_scenario
+from tests.live_driver import Driver, Together
+from tests.test_live import FROM_REST, OVER_A_NETWORK, Running, quiet_machine, scenario_of
+from tests.test_machine import begun, messages, together
+from tests.test_protocol import HEAD, IDENTITY, KEY, OFFER, PLAN, changed
+
+ROOT = Path(__file__).resolve().parents[1]
+EXACT = "plant.kind=exact"
+SAMPLED = "sensor={kind: encoders, samples: 16, bits: 30}"
+__all__ = ["quiet_machine"]
+
+
+# ---------------------------------------------------------------- requests
+
+
+def request_of(driver: Driver, sequence: int = 1) -> bytes:
+    """A request for a session, as somebody may record it."""
+    driver.session._sent = sequence - 1
+    return encode(ControllerMessage(driver.session.head(0), identity=driver.identity), KEY)
+
+
+def test_replayed_requests_do_not_keep_a_controller_out() -> None:
+    """Twenty a second, from another address and without the key: 10 of 10 runs connect."""
+    run = together(EXACT, key=KEY)
+    period, connected = run.driver.period, 0
+    attacker = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    recorded = request_of(Driver(run.scenario, run.ear.address, KEY))
+    for _ in range(10):
+        run.driver = driver = Driver(run.scenario, run.ear.address, KEY)
+        start = -(-run.machine.time() // period) * period
+        for k in range(20):
+            for half in range(2):
+                run.at(start + k * period + half * period // 2)
+                attacker.sendto(recorded, run.ear.address)
+            now = run.machine.time()
+            driver.receive(now)
+            driver.begin = start + 30 * period if driver.session.nonce else NEVER
+            driver.say(now)
+        session = run.machine.session
+        connected += session is not None and session.number == driver.session.number
+        driver.say(run.machine.time(), ControllerFlags.STOP)
+        run.at(run.machine.time() + 1)
+    attacker.close()
+    assert connected == run.machine.counts["sessions"] == 10
+
+
+def ask(run: Together, time: int, number: int = 1) -> list[MachineMessage]:
+    """The answers to so many requests of an address, at a time of the machine's clock."""
+    endpoint, said = run.driver.endpoint, []
+    run.at(time)
+    for _ in range(number):
+        run.driver.say(time)
+        run.machine.poll(time)
+    run.at(time)
+    for message, _ in endpoint.receive():
+        assert isinstance(message, MachineMessage)
+        said.append(message)
+    return said
+
+
+def test_answers_to_unknown_addresses_have_a_rate_and_are_no_longer_than_requests() -> None:
+    run = together(EXACT)
+    asked, offers = 0, list[MachineMessage]()
+    for k in range(100):
+        offers += ask(run, k * SECOND // 50, number=10)
+        asked += 10
+    assert 2 * ANSWERS <= len(offers) <= 2 * ANSWERS + ANSWERS_AT_ONCE
+    assert run.ear.refused == {Refusal.RATE: asked - len(offers)}
+    assert run.machine.session is None
+    request = ControllerMessage(HEAD, identity=IDENTITY)
+    assert all(len(encode(m)) <= len(encode(request)) for m in offers)
+    # Who was answered may ask on.
+    known = offers[-1].head.nonce
+    driver, time = run.driver, run.machine.time()
+    for _ in range(100):
+        head = replace(driver.session.head(time), nonce=known)
+        driver.endpoint.send(ControllerMessage(head, identity=driver.identity), run.ear.address)
+    run.at(time + 1)
+    assert len(list(driver.endpoint.receive())) == 100
+
+
+def test_a_machine_remembers_nothing_of_a_request() -> None:
+    run = together(EXACT)
+    ask(run, 0)
+    names = {n for n, value in vars(run.machine).items() if isinstance(value, Session)}
+    before = {n: repr(v) for n, v in vars(run.machine.offers).items() if "session" in n}
+    ask(run, SECOND)
+    assert names == set()
+    assert before == {n: repr(v) for n, v in vars(run.machine.offers).items() if "session" in n}
+
+
+def test_an_offer_ends_with_the_next_session() -> None:
+    """What was recorded of a confirmation does not begin a session a second time."""
+    run = begun(samples=3)
+    driver, time = run.driver, run.machine.time()
+    session = run.machine.session
+    assert session is not None
+    driver.say(time, ControllerFlags.STOP)
+    run.driver = other = Driver(run.scenario, run.ear.address)
+    period = other.period
+    run.greet(run.machine.time() // period * period + period, time // period * period + 9 * period)
+    assert run.machine.session.number == other.session.number  # type: ignore[union-attr]
+    other.say(run.machine.time(), ControllerFlags.STOP)
+    run.at(run.machine.time() + 1)
+    driver.session._sent = 0
+    before = run.ear.refused[Refusal.FOREIGN]
+    driver.say(run.machine.time())
+    run.at(run.machine.time() + 1)
+    assert run.ear.refused[Refusal.FOREIGN] == before + 1
+    assert run.machine.counts["sessions"] == 2
+
+
+# ---------------------------------------------------------------- another version
+
+
+def test_a_controller_of_version_1_is_refused_in_one_line() -> None:
+    run = together(EXACT)
+    old = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    old.settimeout(5)
+    run.at(0)
+    for _ in range(3):
+        old.sendto(changed(encode(PLAN), 4, b"\1"), run.ear.address)
+    run.at(1)
+    answer = old.recv(2000)
+    assert len(answer) == 60 and answer[:5] == b"STWM\2"
+    _, port = old.getsockname()
+    assert run.said == [
+        f"refused a controller at 127.0.0.1:{port}: it speaks protocol version 1; expected 2"
+    ]
+    old.close()
+
+
+def answering(reply: bytes) -> tuple[threading.Thread, threading.Event, tuple[str, int]]:
+    """A machine that answers whatever it gets with the same bytes."""
+    ear = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    ear.bind(("127.0.0.1", 0))
+    ear.settimeout(0.05)
+    ends = threading.Event()
+
+    def answer() -> None:
+        while not ends.is_set():
+            try:
+                data, address = ear.recvfrom(2000)
+            except TimeoutError:
+                continue
+            ear.sendto(changed(reply, 8, data[8:16]), address)
+        ear.close()
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    return thread, ends, ear.getsockname()
+
+
+@pytest.fixture
+def contact_with() -> Iterator[object]:
+    """Makes a contact with a machine that always answers the same."""
+    made = []
+
+    def contact(reply: bytes) -> Contact:
+        thread, ends, address = answering(reply)
+        endpoint = open_endpoint(address, None)
+        made.append((thread, ends, endpoint))
+        return Contact(endpoint, address, IDENTITY)
+
+    yield contact
+    for thread, ends, endpoint in made:
+        ends.set()
+        thread.join()
+        endpoint.close()
+
+
+def test_a_machine_of_version_1_is_refused_in_one_line(contact_with) -> None:  # type: ignore[no-untyped-def]
+    contact = contact_with(changed(encode(OFFER), 4, b"\1"))
+    with pytest.raises(ConfigError) as refused:
+        call(contact)
+    assert re.fullmatch(
+        r"--machine: machine at 127.0.0.1:\d+ speaks protocol version 1; expected 2, of the same "
+        "release on both sides",
+        str(refused.value),
+    )
+
+
+# ---------------------------------------------------------------- a machine that is not free
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connect, "_PATIENCE", 0.3)
+
+
+def test_a_machine_in_use_is_named(quiet_machine, impatient) -> None:  # type: ignore[no-untyped-def]
+    with Running(watchdog=0.5) as running:
+        first = prepare_session(scenario_of(), running.address)
+        await_free(first.contact)
+        first.contact.join()
+        first.contact.send()
+        stays = threading.Event()
+
+        def stay() -> None:
+            while not stays.wait(0.1):
+                first.contact.send()
+
+        thread = threading.Thread(target=stay)
+        thread.start()
+        time.sleep(0.2)
+        second = prepare_session(scenario_of(), running.address)
+        with pytest.raises(ConfigError) as refused:
+            await_free(second.contact)
+        stays.set()
+        thread.join()
+        for each in (first, second):
+            each.endpoint.close()
+        host, port = running.address
+    assert str(refused.value) == (
+        f"machine at {host}:{port} is in use by another controller (retry 0.5 s after it stops)"
+    )
+
+
+def test_a_sequence_that_restarts_is_named(contact_with, impatient) -> None:  # type: ignore[no-untyped-def]
+    """Every answer has sequence 7: only the first is taken."""
+    contact = contact_with(encode(replace(OFFER, watchdog=SECOND // 10)))
+    contact.ask()
+    time.sleep(0.1)
+    assert [m.head.sequence for m in contact.receive()] == [7]
+    with pytest.raises(ConfigError) as refused:
+        await_free(contact)
+    assert re.fullmatch(
+        r"machine at 127.0.0.1:\d+ sent nothing for 0.\d s that could be taken "
+        r"\(\d+ of cause replayed refused\); the last was replayed: sequence 7 after 7",
+        str(refused.value),
+    ), refused.value
+
+
+@pytest.mark.parametrize(("off", "word"), [(-1, "early"), (1, "late")])
+def test_reports_that_are_a_period_off_are_named(off: int, word: str) -> None:
+    check, right = ReportCheck(1.0), ReportCheck(1.0)
+    rng = np.random.default_rng(3)
+    torques = rng.uniform(-2, 2, (40, 6))
+    for number in range(30):
+        for each in (check, right):
+            each.sent(number, torques[number : number + 3])
+        acted = {number - i: np.clip(torques[number - i], -1, 1) for i in range(3) if number >= i}
+        assert right.problem(acted) is None
+        if word in (check.problem({n + off: torque for n, torque in acted.items()}) or ""):
+            assert number < 12
+            return
+    raise AssertionError
+
+
+@pytest.mark.slow
+def test_a_machine_that_reports_a_period_too_late_is_refused(quiet_machine, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    message = Machine._message
+
+    def off(self: Machine, *given: object) -> MachineMessage:
+        made = message(self, *given)  # type: ignore[arg-type]
+        shift = 0 if made.acted_from == NEVER else self.period
+        return replace(made, acted_from=made.acted_from + shift)
+
+    monkeypatch.setattr(Machine, "_message", off)
+    with Running(OVER_A_NETWORK, *FROM_REST) as running:
+        ready = prepare_session(scenario_of(*FROM_REST), running.address)
+        result = drive(ready, 6.0, say=lambda line: None)
+    assert result.status == "refused" and result.stopped is not None
+    assert "acted_from in the machine's datagrams is one period late" in result.stopped.reason
+
+
+# ---------------------------------------------------------------- identity
+
+
+def test_parts_of_one_name_are_told_apart_by_their_numbers() -> None:
+    other = IDENTITY._replace(mechanism=Part(bytes(8), "paper"))
+    assert IDENTITY.differing(IDENTITY) is None
+    assert IDENTITY.differing(other) == (
+        f"mechanism paper ({IDENTITY.mechanism.digest.hex()})",
+        "mechanism paper (0000000000000000)",
+    )
+
+
+def test_long_names_are_cut_to_what_a_datagram_holds(tmp_path: Path) -> None:
+    scenario = load_scenario("paper", settings=(EXACT, SAMPLED))
+    assert identity_of(scenario).sensor.name == "encoders, 16 samples, 30 bits"
+    assert all(len(part.name) <= 32 for part in identity_of(scenario))
+
+
+# ---------------------------------------------------------------- faults
+
+
+def test_every_way_to_leave_the_workspace_has_its_fault() -> None:
+    from stewart_drake.live.machine import reason_of
+
+    mechanism = load_mechanism("paper")
+    home = mechanism.home
+    for change, fault in (
+        ([0, 0, 0, 0, 0, 9.0], Fault.REACH),
+        ([0, np.nan, 0, 0, 0, 0], Fault.NOT_FINITE),
+    ):
+        failure = diagnose(mechanism, 1.0, home + change)
+        assert failure is not None
+        reason = reason_of(failure)
+        assert reason.fault == fault and str(reason) == failure.reason
+    for fault in (Fault.PITCH, Fault.SINGULAR):
+        failure = failure._replace(leg=None, reason=FAULTS[fault])
+        assert reason_of(failure).fault == fault
+    assert reason_of(failure._replace(reason="something else")).fault == Fault.LEFT
+    source = (ROOT / "stewart_drake/dynamics/workspace.py").read_text("utf-8")
+    for fault in (Fault.PITCH, Fault.SINGULAR, Fault.NOT_FINITE):
+        assert f'"{FAULTS[fault]}"' in source
+
+
+def test_the_documented_faults_are_those_of_the_table() -> None:
+    text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split("## Faults")[1]
+    rows = dict(re.findall(r"^\| (\d+) \| (.*) \|$", text.split("\n## ")[0], re.MULTILINE))
+    words = {f: re.sub("{.*?}", "N", text) for f, text in FAULTS.items()} | {Fault.NONE: "none"}
+    assert rows == {str(int(fault)): text for fault, text in words.items()}
+
+
+def test_a_loss_is_said_with_what_came_before_it() -> None:
+    """A machine that stood still: the same words in its terminal and in its last datagrams."""
+    run = begun("queue=equilibrium", "plant.gravity=true", samples=1, watchdog=20)
+    machine = run.machine
+    run.clock.time += round(0.33 * SECOND)
+    machine.advance(machine.time())
+    run.at(machine.time() + 9 * SECOND)
+    assert machine.failure is not None
+    last = messages(run)[-1]
+    assert MachineFlags.LEFT in last.flags
+    assert last.reason == Reason(Fault.REACH, machine.failure.leg or 0)
+    assert last.before.fault == Fault.STOOD
+    assert re.fullmatch(
+        r"leg \d reached the end of its reach \(before that, the machine stood still for "
+        r"0\.\d\d s\)",
+        last.why,
+    )
+    assert sum(last.why in line for line in run.said) == 1
+
+
+def test_silence_stop_and_end_are_said() -> None:
+    run = begun(samples=5, watchdog=0.35)
+    run.at(run.machine.time() + round(0.6 * SECOND))
+    assert messages(run)[-1].why == "nothing was heard from the controller for 0.35 s"
+    run.driver.say(run.machine.time(), ControllerFlags.STOP)
+    run.at(run.machine.time() + SECOND // 5)
+    last = messages(run)[-1]
+    assert last.reason.fault == Fault.STOP and last.before.fault == Fault.SILENCE
+    run.machine.stop()
+    ends = [m.reason.fault for m in run.driver.receive(run.machine.time())]
+    assert ends[-3:] == [Fault.ENDED] * 3
+    # A new session begins without a fault.
+    run.driver = Driver(run.scenario, run.ear.address)
+    now = -(-run.machine.time() // run.driver.period) * run.driver.period
+    run.greet(now + run.driver.period, now + 9 * run.driver.period)
+    run.at(run.machine.time() + SECOND // 5)
+    assert messages(run)[-1].why == FAULTS[Fault.NONE]
+
+
+class Watching(Nobody):
+    """Keeps how it ended."""
+
+    def __init__(self) -> None:
+        self.words = ""
+
+    def ended(self, words: str) -> None:
+        self.words = words
+
+
+@pytest.mark.slow
+def test_live_and_machine_say_a_loss_in_the_same_words(quiet_machine) -> None:  # type: ignore[no-untyped-def]
+    """A machine under gravity, of which the controller knows nothing, falls."""
+    watching = Watching()
+    with Running("plant.gravity=true") as running:
+        ready = prepare_session(scenario_of(), running.address)
+        result = drive(ready, 6.0, viewer=watching, say=lambda line: None)
+        machine = running.machine
+    assert result.status == "left_workspace" and result.stopped is not None
+    why = in_words(machine.reason, machine.before)
+    assert result.stopped.reason == why and machine.failure is not None
+    assert result.stopped.leg == machine.failure.leg
+    assert any(f"left its workspace: {why}" in line for line in running.lines)
+    assert watching.words.startswith(f"left workspace: {why} at t = ")
+
+
+@pytest.mark.slow
+def test_a_machine_that_is_ended_ends_the_run_with_its_words() -> None:
+    """At once, and not after ten seconds of silence."""
+    said = list[str]()
+    with Running() as running:
+        machine = running.machine
+        running.machine.stop = lambda: None  # type: ignore[method-assign]
+        ready = prepare_session(scenario_of(), running.address)
+        ends = threading.Timer(2.0, lambda: Machine.stop(machine))
+        ends.start()
+        began = time.monotonic()
+        result = drive(ready, 8.0, say=said.append)
+        took = time.monotonic() - began
+    assert result.status == "lost_machine" and result.stopped is not None
+    assert result.stopped.reason == FAULTS[Fault.ENDED] and took < 8
+
+
+@pytest.mark.slow
+def test_the_page_shows_how_a_run_ended() -> None:
+    viewer = PageViewer(load_mechanism("paper"), "live: a test")
+    url = viewer.opened()
+    events = urllib.request.urlopen(url.replace("/?", "/events?"))
+    assert b"ended" not in events.readline()
+    viewer.ended("left workspace: leg 2 reached the end of its reach at t = 1.500 s")
+    viewer.close()
+    said = events.read().decode()
+    assert '"ended": "left workspace: leg 2 reached the end of its reach at t = 1.500 s"' in said
