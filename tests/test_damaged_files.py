@@ -23,7 +23,7 @@ from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.studies.runs import read_outcome
 from stewart_drake.tuning.dataset import load_dataset, read_run
 from tests.faults import put, refusal, written
-from tests.mutations import other_npz
+from tests.mutations import other_npz, sealed
 from tests.test_fuzz import (
     RUN_ARRAYS,
     RUN_FILE,
@@ -61,9 +61,13 @@ BAD_OUTCOMES: list[tuple[str, Any]] = [
 ]
 
 
+def sealed_text(document: Any) -> bytes:
+    return sealed(json.dumps(document).encode())
+
+
 @pytest.mark.parametrize(("field", "value"), BAD_OUTCOMES, ids=str)
 def test_a_damaged_outcome_is_refused(field, value, tmp_path):
-    path = written(tmp_path / "run000000.json", json.dumps(put(RUN_FILE, field, value)))
+    path = written(tmp_path / "run000000.json", sealed_text(put(RUN_FILE, field, value)))
     with pytest.raises(ConfigError) as caught:
         read_outcome(path)
     said = str(caught.value)
@@ -73,17 +77,17 @@ def test_a_damaged_outcome_is_refused(field, value, tmp_path):
 
 
 def test_a_sound_outcome_is_read(tmp_path):
-    path = written(tmp_path / "run.json", json.dumps(RUN_FILE))
+    path = written(tmp_path / "run.json", sealed_text(RUN_FILE))
     one = read_outcome(path)
     assert one.status == "completed" and one.error == 9.1 and np.isnan(one.time)
     failed = {"status": "left_workspace", "reason": "leg 3 out of reach", "leg": 3, "time": 0.5}
     failed |= {"error": None, "peak_torque": None}
-    one = read_outcome(written(path, json.dumps({"draw": {}, "outcome": failed})))
+    one = read_outcome(written(path, sealed_text({"draw": {}, "outcome": failed})))
     assert one.leg == 3 and np.isnan(one.error) and one.time == 0.5
     for field, value in (("reason", ""), ("error", 1.0), ("time", None)):
         wrong = {"draw": {}, "outcome": failed | {field: value}}
         with pytest.raises(ConfigError, match=field):
-            read_outcome(written(path, json.dumps(wrong)))
+            read_outcome(written(path, sealed_text(wrong)))
 
 
 @pytest.mark.parametrize(
@@ -96,6 +100,34 @@ def test_what_is_no_run_file(content, tmp_path):
     assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
 
 
+def test_no_file_with_a_changed_digit_is_read_as_sound(tmp_path):
+    """Without a checksum 146 of 500 were."""
+    study_robustness(short(), tmp_path, runs=1, workers=1)
+    path, dice = tmp_path / "runs" / "run000000.json", random.Random(0)
+    good = path.read_text()
+    assert read_outcome(path).status == "completed"
+    digits = [i for i, letter in enumerate(good) if letter.isdigit()]
+    for _ in range(500):
+        at = dice.choice(digits)
+        other = dice.choice([d for d in "0123456789" if d != good[at]])
+        with pytest.raises(ConfigError, match=r"checksum|JSON|run of a study"):
+            read_outcome(written(path, good[:at] + other + good[at + 1 :]))
+
+
+def test_a_run_file_of_0_2_is_done_again_with_a_word(tmp_path, caplog):
+    study_robustness(short(), tmp_path, runs=1, workers=1)
+    path = tmp_path / "runs" / "run000000.json"
+    good = path.read_text()
+    old = json.loads(good)
+    del old["crc32"]
+    written(path, json.dumps(old))
+    with caplog.at_level(logging.WARNING, "stewart_drake"):
+        study_robustness(short(), tmp_path, runs=1, workers=1)
+    (record,) = caplog.records
+    assert "has no checksum" in record.getMessage() and "done again" in record.getMessage()
+    assert path.read_text() == good
+
+
 def test_a_damaged_run_is_done_again_with_a_word(tmp_path, caplog):
     """A run of status null and no reason was a success: "100 % completed"."""
     study_robustness(short(), tmp_path, runs=3, workers=1)
@@ -103,7 +135,8 @@ def test_a_damaged_run_is_done_again_with_a_word(tmp_path, caplog):
     runs = tmp_path / "runs"
     good = json.loads((runs / "run000001.json").read_text())
     nothing = put(put(good, "outcome.status", None), "outcome.reason", "")
-    written(runs / "run000001.json", json.dumps(nothing))
+    del nothing["crc32"]
+    written(runs / "run000001.json", sealed_text(nothing))
     written(runs / "run000002.json", DEEP)
     (runs / "run000000.json").unlink()
     os.mkfifo(runs / "run000000.json")

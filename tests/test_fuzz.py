@@ -46,6 +46,7 @@ from tests.mutations import (
     json_bytes,
     other_netcdf,
     other_npz,
+    sealed,
     spoiled_bytes,
     spoiled_document,
     yaml_bytes,
@@ -310,7 +311,11 @@ KINDS: dict[str, Kind] = {
         lambda _: json.dumps(network()).encode(),
         lambda dice: json_bytes(spoiled_document(network(), dice), dice),
     ),
-    "run": Kind(read_outcome, "f.json", plain(RUN_FILE), document=RUN_FILE),
+    "run": Kind(
+        *(read_outcome, "f.json", lambda _: sealed(json.dumps(RUN_FILE).encode())),
+        document=RUN_FILE,
+        write=lambda document, dice: sealed(json_bytes(document, dice)),
+    ),
     "manifest": Kind(resumed, "manifest.json", plain(MANIFEST_FILE), document=MANIFEST_FILE),
     "npz": Kind(
         read_run, "f.npz", lambda _: npz_of_a_run(), lambda dice: other_npz(RUN_ARRAYS, dice)

@@ -5,6 +5,8 @@ Written whole or not at all, with null for what is no number.
 
 import json
 import math
+import re
+import zlib
 from collections import Counter
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -16,15 +18,18 @@ from stewart_drake.files.fileio import read_bytes, replacing
 from stewart_drake.files.yamlio import brief
 
 _MAX_DEPTH: Final = 50
+_SEAL: Final = re.compile(rb'\{"crc32": "([0-9a-f]{8})", ')
 
 
-def load_json(path: Path, most: int, expected: str) -> dict[str, Any]:
+def load_json(path: Path, most: int, expected: str, *, sealed: bool = False) -> dict[str, Any]:
     """Reads one JSON object from a file; nothing in it is executed.
 
     Args:
         path: a UTF-8 file.
         most: number of bytes above which it is refused.
         expected: what the file is, in words, closing every message.
+        sealed: whether it must have the checksum that `sealed_json` writes, which is checked and
+            not returned.
 
     Raises:
         ConfigError: the file cannot be read or decoded, is not one object, or holds a key twice, a
@@ -32,6 +37,16 @@ def load_json(path: Path, most: int, expected: str) -> dict[str, Any]:
             levels. One line, opened by the path.
     """
     raw = read_bytes(path, most, expected)
+    if sealed:
+        seal = _SEAL.match(raw)
+        if seal is None:
+            raise ConfigError(
+                f"{path}: has no checksum, which files of 0.2 lack too; expected {expected}"
+            )
+        raw = raw[seal.end() :]
+        if zlib.crc32(raw) != int(seal[1], 16):
+            raise ConfigError(f"{path}: is damaged, its checksum differs; expected {expected}")
+        raw = b"{" + raw
     try:
         data = json.loads(
             raw.decode("utf-8"),
@@ -50,6 +65,12 @@ def load_json(path: Path, most: int, expected: str) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: holds {brief(data)}; expected a JSON object, {expected}")
     return data
+
+
+def sealed_json(data: dict[str, Any]) -> bytes:
+    """Return a JSON object that begins with a checksum of what follows it."""
+    rest = json.dumps(jsonable(data), allow_nan=False).encode()[1:]
+    return b'{"crc32": "%08x", ' % zlib.crc32(rest) + rest
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -8,7 +8,6 @@ back, measured with the shapes themselves (`loop.clearance`) and run through the
 """
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from scipy.optimize import Bounds, differential_evolution
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.jsonio import jsonable, load_json
+from stewart_drake.files.jsonio import load_json, sealed_json
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import validate, yaml_text
 from stewart_drake.loop.bulk import run_in_bulk
@@ -568,12 +567,16 @@ def _finite(measures: Mapping[str, float]) -> dict[str, float]:
 
 
 def _bytes_of(kept: Found | _Judged) -> bytes:
-    return json.dumps(jsonable(dataclasses.asdict(kept))).encode()
+    return sealed_json(dataclasses.asdict(kept))
 
 
 def _read_found(path: Path) -> Found:
-    return validate(Found, load_json(path, _MAX_BYTES, "the file of a search"), str(path))
+    return validate(Found, _load(path, "the file of a search"), str(path))
 
 
 def _read_judged(path: Path) -> _Judged:
-    return validate(_Judged, load_json(path, _MAX_BYTES, "the file of a judgement"), str(path))
+    return validate(_Judged, _load(path, "the file of a judgement"), str(path))
+
+
+def _load(path: Path, expected: str) -> dict[str, Any]:
+    return load_json(path, _MAX_BYTES, expected, sealed=True)

@@ -5,7 +5,6 @@ completed run has is there; whatever breaks a rule is a ConfigError, never a suc
 """
 
 import dataclasses
-import json
 import math
 from collections import Counter
 from collections.abc import Iterable
@@ -16,7 +15,7 @@ from pydantic import ConfigDict, Field, WrapValidator
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.jsonio import jsonable, load_json
+from stewart_drake.files.jsonio import jsonable, load_json, sealed_json
 from stewart_drake.files.yamlio import brief, validate
 from stewart_drake.loop.bulk import Ending, run_in_bulk
 from stewart_drake.scenario.config import Scenario
@@ -91,7 +90,7 @@ def loops_of(outcomes: Iterable[Outcome]) -> dict[str, int]:
 def run_file(outcome: Outcome, draw: dict[str, Any] | None = None) -> bytes:
     """The file of a run, JSON: what was drawn for it, and how it ended."""
     data = {"draw": draw or {}, "outcome": dataclasses.asdict(outcome)}
-    return json.dumps(jsonable(data)).encode()
+    return sealed_json(data)
 
 
 def run_scenario(scenario: Scenario) -> bytes:
@@ -109,7 +108,7 @@ def read_outcome(path: Path) -> Outcome:
     Raises:
         ConfigError: the file is damaged; one line, with the field.
     """
-    one = validate(_File, load_json(path, _MAX_BYTES, _EXPECTED), str(path)).outcome
+    one = validate(_File, load_json(path, _MAX_BYTES, _EXPECTED, sealed=True), str(path)).outcome
     done = one.status == "completed"
     rules = {
         "error": (math.isnan(one.error) != done, "a number" if done else "null"),

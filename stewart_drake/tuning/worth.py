@@ -7,7 +7,6 @@ conditions*, by g and by m; hindsight has the best one of each. Intervals are of
 """
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -21,7 +20,7 @@ from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import read_bytes
-from stewart_drake.files.jsonio import jsonable, load_json
+from stewart_drake.files.jsonio import load_json, sealed_json
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import validate
 from stewart_drake.loop.bulk import Ending, run_in_bulk
@@ -120,7 +119,7 @@ def _file(endings: list[Ending], scenario: Scenario, tuned: bool) -> bytes:
         "fallbacks": last.counts["tuner_fallbacks"],
         "loop": last.loop,
     }
-    return json.dumps(jsonable(told)).encode()
+    return sealed_json(told)
 
 
 def read_told(path: Path, runs: int = 1) -> Told:
@@ -130,7 +129,7 @@ def read_told(path: Path, runs: int = 1) -> Told:
         ConfigError: it is damaged; one line.
     """
     expected = "the file of one condition of `tune evaluate --family`"
-    told = validate(Told, load_json(path, _MAX_BYTES, expected), str(path))
+    told = validate(Told, load_json(path, _MAX_BYTES, expected, sealed=True), str(path))
     for name in ("cost", "completed"):
         if len(getattr(told, name)) != runs:
             raise ConfigError(
