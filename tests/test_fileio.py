@@ -138,9 +138,22 @@ def test_errors_name_the_file_and_leave_the_old_one(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"), replacing(path) as partial:
+    with (
+        pytest.raises(OSError, match=r"No space left on device: '.*/out\.json'$"),
+        replacing(path) as partial,
+    ):
         partial.write_text("new")
     monkeypatch.undo()
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO):
+        with pytest.raises(OSError, match=r"out\.json'$") as caught, replacing(path):
+            raise OSError(number, os.strerror(number))
+        assert caught.value.errno == number and caught.value.filename == str(path)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"/folder'$"):
+        write_json(tmp_path / "folder", 1)
+    (tmp_path / "folder").rmdir()
+    with pytest.raises(OSError, match=r"^what a library says$"), replacing(path):
+        raise OSError("what a library says")
     with pytest.raises(OSError, match=r"out\.json'$") as caught, replacing(path) as partial:
         partial.unlink()
         partial.read_text()

@@ -1,8 +1,10 @@
 """The stewart-drake command. Drake is imported by the commands that need it, not for --help."""
 
+import errno
 import functools
 import os
 import sys
+import tempfile
 from typing import Annotated, Any, Final
 
 import typer
@@ -25,6 +27,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.report.terminal import echo
 
 _BAD_INPUT: Final = 2
+_NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Releases of typer keep their usage errors in different places; all derive from this class.
 _UsageError: Final[Any] = typer.BadParameter.__mro__[1]
 
@@ -74,7 +77,9 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except _bad_input() as error:
-        return _complain(str(error))
+        no_room = isinstance(error, OSError) and error.errno in _NO_ROOM and not error.filename
+        where = f" (standard output, or a file in {tempfile.gettempdir()})" if no_room else ""
+        return _complain(f"{error}{where}")
     finally:
         release()
 

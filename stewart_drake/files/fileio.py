@@ -68,7 +68,7 @@ def replacing(path: Path) -> Iterator[Path]:
     -9 leaves there is cleared by `remove_partials`. The permissions of a replaced file stay.
 
     Raises:
-        OSError: `path` cannot be replaced, e.g. because it is a folder.
+        OSError: `path` cannot be written or replaced, e.g. because it is a folder; it is named.
     """
     old = None
     with contextlib.suppress(OSError):
@@ -87,8 +87,9 @@ def replacing(path: Path) -> Iterator[Path]:
             os.close(descriptor)
     except BaseException as error:
         partial.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename == str(partial):
-            error.filename = str(path)  # which the user knows
+        # A failing write, such as on a full disk, names no file, others name the temporary one.
+        if isinstance(error, OSError) and error.errno and error.filename in (None, str(partial)):
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 
