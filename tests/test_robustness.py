@@ -829,6 +829,26 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "belongs to other settings" in capsys.readouterr().err
 
 
+def test_nothing_is_drawn_where_the_undisturbed_run_fails(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All runs were drawn, for a page of dashes."""
+    words = ["analyze", "robustness", "paper", "--set", "duration=1", "--out", str(tmp_path)]
+    assert main([*words, "--runs", "50", "--set", "plant.gravity=true"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: robustness: the undisturbed run fails at 0.") and "reach" in said
+    assert said.count("\n") == 1
+    files = {path.name for path in tmp_path.rglob("*.*") if path.is_file()}
+    assert files == {"manifest.json", "undisturbed.json", ".lock"}
+
+
+def test_another_controller_that_fails_undisturbed_is_named(tmp_path: Path) -> None:
+    lost = replace(short(), plant=replace(short().plant, gravity=True), duration=1.0)
+    with pytest.raises(ConfigError, match="robustness with heavy: the undisturbed run fails"):
+        study_robustness(short(), tmp_path, runs=3, workers=1, beside={"heavy": lost})
+    assert not list(tmp_path.glob("*/run0*.json"))
+
+
 def test_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     def interrupted(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt

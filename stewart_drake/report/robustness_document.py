@@ -118,10 +118,7 @@ def _beside(study: RobustnessStudy) -> Section:
         median, most = one.quantile(0.5).value, one.quantile(0.95).value
         kept = int(np.sum(~one.failed))
         cells = (f"{kept} of {len(one.outcomes)}", _percent(one.success))
-        alone = (
-            _failed(one.undisturbed.error) if one.undisturbed.status == "completed" else "failed"
-        )
-        rows.append((name, alone, *cells, _failed(median), _failed(most)))
+        rows.append((name, number(one.undisturbed.error), *cells, _failed(median), _failed(most)))
     columns = ("controller", "undisturbed, % s", "runs kept", "share", "median, % s", "95 %, % s")
     brief = ("controller", "alone", "runs kept", None, "median", "95 %")
     return Section("Controllers", _SAME, Table(columns, rows, brief=brief))
@@ -132,8 +129,6 @@ def _verdict(study: RobustnessStudy) -> tuple[str, Tone]:
     total, kept = len(study.outcomes), int(np.sum(~study.failed))
     aim = "completed" if study.limit is None else f"completed with E_ac up to {study.limit:g} % s"
     text = f"{kept} of {total} runs {aim}: {_percent(study.success)}. {_median(study)}"
-    if study.undisturbed.status != "completed":
-        text += " The undisturbed run failed already: " + study.undisturbed.reason + "."
     explanation = study.explanation
     strong = [title(one.factor) for one in explanation.found]
     aim = "completing" if study.limit is None else "staying within the limit"

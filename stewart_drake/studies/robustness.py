@@ -39,6 +39,8 @@ def study_robustness(
 ) -> RobustnessStudy:
     """Run a scenario undisturbed and then with so many drawn machines, or go on with it.
 
+    Nothing is drawn where an undisturbed run, with this or another controller, does not complete.
+
     Args:
         scenario: what is to be borne; draws add to what it says already.
         directory: for runs.csv; the runs are kept in runs/. More runs may be asked for later.
@@ -51,7 +53,8 @@ def study_robustness(
         workers, scheduler, progress: as `run_jobs` takes them.
 
     Raises:
-        As `run_jobs`, and ConfigError for a scenario or numbers that do not suit.
+        As `run_jobs`, and ConfigError for a scenario or numbers that do not suit, and for an
+            undisturbed run that does not complete.
     """
     if runs < 1:
         raise ConfigError(f"--runs: got {runs}; expected 1 or more")
@@ -70,28 +73,41 @@ def study_robustness(
         "scheduler": scheduler,
         "read": read_outcome,
     }
-    first: dict[str, tuple[Scenario, Draw]] = {"undisturbed": (scenario, {})}
-    undisturbed = run_jobs(first, run_draw, directory / "runs", **common)["undisturbed"]
+    undisturbed = _undisturbed(scenario, "", directory / "runs", common)
+    alone = {
+        name: _undisturbed(other, name, directory / f"runs_{name}", common)
+        for name, other in (beside or {}).items()
+    }
     scales = scales_of(experiment, undisturbed.peak_torque)
     draws = [draw(ranges, scales, scenario, seed, index) for index in range(runs)]
     jobs = {f"run{i:06d}": (scenario, one) for i, one in enumerate(draws)}
     outcomes = run_jobs(jobs, run_draw, directory / "runs", progress=progress, **common)
     others = {}
     for name, other in (beside or {}).items():
-        settings["scenario"] = scenario_to_dict(other)
-        again = {
-            "undisturbed": (other, Draw()),
-            **{key: (other, d) for key, (_, d) in jobs.items()},
-        }
+        common["settings"] = settings | {"scenario": scenario_to_dict(other)}
+        again = {key: (other, d) for key, (_, d) in jobs.items()}
         place = directory / f"runs_{name}"
         found = run_jobs(again, run_draw, place, progress=progress, **common)
-        others[name] = (found.pop("undisturbed"), list(found.values()))
+        others[name] = (alone[name], list(found.values()))
     study = RobustnessStudy(
         experiment, ranges, scales, seed, limit, undisturbed, draws, list(outcomes.values()), others
     )
     remove_partials(directory)
     write_atomically(directory / "runs.csv", table(study).encode())
     return study
+
+
+def _undisturbed(scenario: Scenario, name: str, folder: Path, common: dict[str, Any]) -> Outcome:
+    settings = common["settings"] | {"scenario": scenario_to_dict(scenario)}
+    first = {"undisturbed": (scenario, Draw())}
+    one = run_jobs(first, run_draw, folder, **(common | {"settings": settings}))["undisturbed"]
+    if one.status != "completed":
+        raise ConfigError(
+            f"robustness{f' with {name}' if name else ''}: the undisturbed run fails at "
+            f"{one.time:.2f} s ({one.reason}), so no machine was drawn; expected a scenario and a "
+            "controller that complete undisturbed"
+        )
+    return one
 
 
 def run_draw(scenario: Scenario, one: Draw) -> bytes:
