@@ -11,6 +11,7 @@ import pytest
 from stewart_drake.cli import main
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.studies.jobs import settings_hash
 from tests.faults import refusal, tree, written
 
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.1", "--set", "delay.steps=1")
@@ -168,7 +169,7 @@ def test_two_commands_do_not_write_into_one_directory(tmp_path, capsys):
 def test_runs_of_other_settings_keep_their_summary(words, tmp_path, capsys):
     runs = tmp_path / ("runs" if words[1] == "dataset" else "fixed")
     runs.mkdir()
-    written(runs / "manifest.json", json.dumps({"hash": "0", "settings": {}}))
+    written(runs / "manifest.json", json.dumps({"hash": settings_hash({}), "settings": {}}))
     written(tmp_path / "summary.json", "of those runs")
     assert "other settings" in refusal([*words, "--out", str(tmp_path)], capsys)
     assert (tmp_path / "summary.json").read_text() == "of those runs"
@@ -206,4 +207,5 @@ def test_standard_output_that_is_full_is_one_line(capsys, monkeypatch):
         assert main(["model", "sdf", "paper"]) == 2
         monkeypatch.undo()
         full.close = lambda: None  # type: ignore[method-assign]
-    assert json.dumps(capsys.readouterr().err).count("\\n") == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "No space left on device (standard output" in said

@@ -58,6 +58,9 @@ def test_the_first_hour_shows_figures_and_pages(capsys):
 def test_an_own_controller_holds_without_delay_and_not_with_it(capsys):
     names, _ = run("own_controller.ipynb")
     prompt, errors, late = (names[name] for name in ("prompt", "errors", "late"))
+    compared = names["compared"]
+    assert list(compared)[-1] == "computed torque" and len(compared) == 6
+    assert compared["computed torque"].accumulated_error == errors[2].accumulated_error
     assert prompt.status == "completed" and prompt.accumulated_error < 1
     # The text: what a delay does grows with it, and ten periods are too many.
     assert errors[2].status == "completed" and errors[10].status == "left_workspace"

@@ -2,6 +2,7 @@
 
 import math
 import pickle
+import re
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import replace
@@ -52,6 +53,7 @@ PAPER_DELAY: Final = 0.8
 Progress = Callable[[str, float, float], None]
 """Called with a controller's name, its simulated time in s and its error in % of peak to peak."""
 
+_NO_KEY: Final = re.compile(r"[^A-Za-z0-9_+-]")
 _POLL = 0.1
 """s between two looks at the runs."""
 
@@ -75,8 +77,10 @@ def compare(
     """Run every shipped controller on a scenario, and controllers of your own, on all cores.
 
     Ctrl-C ends the runs that have begun, with status `interrupted`, and leaves out the others.
-    Systems of your own are given as functions that make one, such as their class: each run is in a
-    process of its own.
+    Give systems of your own as functions that make one, such as their class. Runs are shared out to
+    worker processes; a run whose system no other process can read, such as a class of a script or
+    a notebook that derives from `LeafSystem`, runs in this process. An exception of a run is
+    raised as it is, with a note that names the controller.
 
     Args:
         scenario_name: a shipped name or a path; its start, plant and tuner stay as they are.
@@ -106,10 +110,13 @@ def compare(
     }
     with TemporaryDirectory() as folder, ThreadPoolExecutor(1) as thread:
         board = _Board(Path(folder) / "board", len(scenarios), new=True)
+        keys = [f"run{i}_{_NO_KEY.sub('_', name)[:99]}" for i, name in enumerate(scenarios)]
         jobs = {
-            f"run{i}": (name, scenarios[name], given[name], board.path, i, len(scenarios))
-            for i, name in enumerate(scenarios)
+            key: (name, scenarios[name], given[name], board.path, i, len(scenarios))
+            for i, (key, name) in enumerate(zip(keys, scenarios, strict=True))
         }
+        # Own controllers first: what runs in this process does so while workers do the others.
+        jobs = dict(sorted(jobs.items(), key=lambda job: job[1][0] not in controllers))
         # Ctrl-C reaches this thread alone, which tells the processes by the board.
         run: Callable[..., dict[str, SimulationResult | None]] = run_jobs
         runs = thread.submit(
@@ -127,8 +134,8 @@ def compare(
                     board.stop()
         finally:
             board.stop()
-        results = zip(scenarios, runs.result().values(), strict=True)
-    return Comparison({name: result for name, result in results if result is not None})
+        results = {name: runs.result()[key] for name, key in zip(scenarios, keys, strict=True)}
+    return Comparison({name: one for name, one in results.items() if one is not None})
 
 
 def shown(scenario_name: str | Path, settings: Iterable[str] = ()) -> dict[str, Scenario]:

@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import os
+import pickle
 import re
 import signal
 import threading
@@ -21,8 +22,9 @@ from contextlib import closing, contextmanager
 from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+import cloudpickle
 import joblib
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
@@ -79,7 +81,9 @@ def run_jobs(
     Args:
         jobs: by key; a key is a file name without its suffix, of letters, digits and `_.+-`.
         function: of a module, so that workers can import it. The same arguments must give the same
-            bytes if a resumed folder shall equal an uninterrupted one.
+            bytes if a resumed folder shall equal an uninterrupted one. A job that cannot be sent to
+            a process of this machine, such as one with a script's own class of a Drake system, runs
+            in this process.
         folder: where KEY + suffix go; made if there is none.
         settings: what all jobs depend on, plain data. A folder that was begun with others is
             refused.
@@ -99,6 +103,7 @@ def run_jobs(
         ChildProcessError: a worker process died, e.g. for want of memory.
         OSError: a file cannot be written, e.g. because the disk is full.
         KeyboardInterrupt: Ctrl-C.
+        Exception: whatever `function` raised, with a note that names the job.
     """
     for key in jobs:
         if not _KEY.fullmatch(key):
@@ -163,10 +168,14 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def _named(key: str, function: Callable[..., bytes], job: Job) -> tuple[str, bytes]:
+    """Call a job, and name it in its exception."""
     try:
         return key, function(*job)
     except ConfigError as error:
         raise ConfigError(f"{key}: {error}") from None
+    except (Exception, SystemExit) as error:  # the latter is how some of Drake's checks end
+        error.add_note(f"raised by the job {key}")
+        raise
 
 
 @contextmanager
@@ -211,7 +220,10 @@ def read_manifest(folder: Path, expected: str) -> Manifest:
         ConfigError: there is none, or it is damaged; one line with what is `expected`.
     """
     path = folder / MANIFEST
-    return validate(Manifest, load_json(path, _MAX_MANIFEST, expected), str(path))
+    manifest = validate(Manifest, load_json(path, _MAX_MANIFEST, expected), str(path))
+    if manifest.hash != settings_hash(manifest.settings):
+        raise ConfigError(f"{path}: is damaged, its hash differs; expected {expected}")
+    return manifest
 
 
 def _canonical(settings: Mapping[str, Any]) -> str:
@@ -227,6 +239,44 @@ def _difference(theirs: Any, mine: Any, name: str = "") -> str:
     return f"{name or 'settings'}: {brief(theirs)} there, {brief(mine)} now"
 
 
+class _Unsent(NamedTuple):
+    """A job that a worker could not read."""
+
+    number: int
+    reason: str
+
+
+def _pack(call: Callable[[], Any]) -> bytes | str:
+    """A call as bytes, or why that cannot be."""
+    try:
+        packed: bytes = cloudpickle.dumps(call)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return packed
+
+
+# cloudpickle sends a class of a script or notebook by its contents. One that derives from a class
+# of pydrake cannot be made again from them; in an executor's own reading that ends the worker.
+def _call_packed(number: int, packed: bytes | str) -> tuple[str, bytes] | _Unsent:
+    """Call in a worker what was packed."""
+    if isinstance(packed, str):
+        return _Unsent(number, packed)
+    try:
+        call: Callable[[], tuple[str, bytes]] = pickle.loads(packed)
+    except Exception as error:
+        return _Unsent(number, f"{type(error).__name__}: {error}")
+    try:
+        return call()
+    except Exception as error:
+        try:
+            pickle.loads(cloudpickle.dumps(error))
+        except Exception:
+            told = RuntimeError(f"{type(error).__name__}: {error}")
+            told.__notes__ = getattr(error, "__notes__", [])
+            raise told from None
+        raise
+
+
 # Ctrl-C is for this process. Workers inherit the signal mask of the thread that starts them, and
 # the threads of the executor that of the thread that starts the executor; in a worker the signal
 # would break imports in the middle. The resource tracker comes first, because some Pythons
@@ -236,6 +286,9 @@ def _on_this_machine(
 ) -> Generator[tuple[str, bytes]]:
     """What calls return, as they finish; closing the iterator ends the workers."""
     number = min(workers or joblib.cpu_count(), max(1, len(calls)))
+    if number == 1:
+        yield from (call() for call in calls)
+        return
     backend = joblib.parallel_config(
         backend="loky", inner_max_num_threads=1, initializer=_end_with, initargs=(os.getpid(),)
     )
@@ -247,16 +300,23 @@ def _on_this_machine(
             resource_tracker.ensure_running()
             mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             try:
-                outcomes = parallel(joblib.delayed(call)() for call in calls)
+                outcomes = parallel(
+                    joblib.delayed(_call_packed)(i, _pack(call)) for i, call in enumerate(calls)
+                )
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         try:
             with closing(outcomes):
-                yield from outcomes
-        except BrokenProcessPool:
+                for outcome in outcomes:
+                    if isinstance(outcome, _Unsent):
+                        _log.debug("a job runs here: no process could read it (%s)", outcome.reason)
+                        outcome = calls[outcome.number]()
+                    yield outcome
+        except BrokenProcessPool as error:
+            how = re.search(r"exit codes of the workers are \{(.*)\}", str(error))
             raise ChildProcessError(
-                "a worker process was killed, perhaps for want of memory; what had finished is "
-                "kept and the same command goes on from there"
+                f"a worker process was killed{f' ({how[1]})' if how else ''}, perhaps for want of "
+                "memory; what had finished is kept and the same command goes on from there"
             ) from None
 
 

@@ -1,0 +1,168 @@
+"""`compare` with controllers of a script, a notebook and a module; jobs that cannot be sent."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cloudpickle
+import pytest
+from pydrake.systems.framework import LeafSystem
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.studies.jobs import run_jobs
+from tests.test_jobs import ROOT, SETTINGS, contents
+
+CLASS = '''
+from pydrake.systems.framework import LeafSystem
+
+import stewart_drake as sd
+
+
+class Steady(LeafSystem):
+    """One torque, whatever happens."""
+
+    def __init__(self, torque=0.0):
+        super().__init__()
+        self.torque = torque
+        self.DeclareVectorInputPort("measurement", 12)
+        self.DeclareVectorOutputPort("torque", 6, self.calc)
+
+    def calc(self, context, output):
+        output.SetFromVector([self.torque] * 6)
+
+
+class Broken(Steady):
+    def calc(self, context, output):
+        raise KeyError("no gain")
+'''
+COMPARE = """
+import pydrake.systems.primitives as blocks
+
+SHORT = ("plant.kind=exact", "duration=0.1")
+own = {"class": Steady, "a lambda": lambda: Steady(1e-3)}
+results = sd.compare("paper", SHORT, controllers=own)
+assert list(results)[5:] == list(own) and len(results) == 7, results
+for name, torque in (("class", 0.0), ("a lambda", 1e-3)):
+    commanded = results[name].signals.torque_commanded
+    assert float(abs(commanded - torque).max()) < 1e-15, name
+    assert results[name].summary["own"] == {"controller": "Steady"}
+try:
+    sd.compare("paper", SHORT, controllers={"broken": Broken})
+except KeyError as error:
+    assert error.args == ("no gain",) and "broken" in error.__notes__[0], error.__notes__
+    print("told")
+"""
+
+
+def run(workers: int, *arguments: str, folder: Path) -> str:
+    """What another Python prints, on so many cores."""
+    surroundings = os.environ | {"LOKY_MAX_CPU_COUNT": str(workers), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, *arguments]
+    done = subprocess.run(command, cwd=folder, env=surroundings, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("place", ["script", "module", "notebook"])
+def test_own_controllers_are_compared(place, workers, tmp_path):
+    """Those of a script ended in "a worker process was killed, perhaps for want of memory"."""
+    script, code = tmp_path / "mine.py", CLASS + COMPARE
+    if place == "module":
+        (tmp_path / "parts.py").write_text(CLASS)
+        code = "import stewart_drake as sd\nfrom parts import Broken, Steady\n" + COMPARE
+    if place == "notebook":  # whose cells are executed in __main__, with no file
+        script.write_text(f"for cell in ({CLASS!r}, {COMPARE!r}):\n    exec(cell, globals())\n")
+    else:
+        script.write_text(code)
+    assert run(workers, str(script), folder=tmp_path) == "told\n"
+
+
+# ---------------------------------------------------------------- jobs that cannot be sent
+
+
+def system_of_a_script() -> type:
+    """A class that cloudpickle sends by its contents."""
+    names = {"__name__": "__main__", "LeafSystem": LeafSystem}
+    exec("class Mine(LeafSystem):\n    pass", names)
+    made = names["Mine"]
+    assert isinstance(made, type)
+    return made
+
+
+class Unreadable:
+    def __reduce__(self) -> tuple[object, ...]:
+        return refused, ("by whoever reads it",)
+
+
+class Unwritable:
+    def __reduce__(self) -> tuple[object, ...]:
+        raise OSError("not for others")
+
+
+def refused(what: str) -> None:
+    raise RuntimeError(what)
+
+
+def told(number: int, thing: object = None) -> bytes:
+    return f"{number} {type(thing).__name__} {os.getpid()}".encode()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_what_no_process_can_read_runs_in_this_one(workers, tmp_path):
+    things = [None, system_of_a_script(), Unreadable(), Unwritable(), 4, 5]
+    jobs = {f"job{i}": (i, thing) for i, thing in enumerate(things)}
+    run_jobs(jobs, told, tmp_path, settings=SETTINGS, workers=workers, suffix=".txt")
+    for i, thing in enumerate(things):
+        number, name, process = contents(tmp_path)[f"job{i}.txt"].decode().split()
+        here = workers == 1 or i in (1, 2, 3)
+        assert (number, name) == (str(i), type(thing).__name__)
+        assert (int(process) == os.getpid()) == here
+
+
+class Odd(Exception):
+    """One that pickle writes and cannot read."""
+
+    def __init__(self, first: int, second: int) -> None:
+        super().__init__(f"{first} and {second}")
+
+
+def fails(number: int, how: str) -> bytes:
+    if how == "odd":
+        raise Odd(1, 2)
+    if how == "exit":
+        raise SystemExit("Drake says no")
+    raise ZeroDivisionError("by nothing")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize(
+    ("how", "kind", "message"),
+    [
+        ("plain", ZeroDivisionError, "by nothing"),
+        ("odd", (Odd, RuntimeError), "(Odd: )?1 and 2"),
+        ("exit", SystemExit, "Drake says no"),
+    ],
+)
+def test_an_exception_of_a_job_is_told_as_it_is(how, kind, message, workers, tmp_path):
+    """The odd one was taken for a killed worker."""
+    jobs = {"first": (0, how), "second": (1, how)}
+    with pytest.raises(kind, match=rf"^{message}\nraised by the job (first|second)$"):
+        run_jobs(jobs, fails, tmp_path, settings=SETTINGS, workers=workers)
+
+
+def test_a_class_of_a_script_can_still_not_be_read_elsewhere(tmp_path):
+    """Once it can, it need not run in the process that asks."""
+    (tmp_path / "packed").write_bytes(cloudpickle.dumps(system_of_a_script()))
+    code = "import pickle; pickle.load(open('packed', 'rb'))"
+    with pytest.raises(AssertionError, match="metaclass conflict"):
+        run(1, "-c", code, folder=tmp_path)
+
+
+def test_a_refused_own_controller_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="controllers"):
+        import stewart_drake as sd
+
+        sd.compare("paper", controllers={"lqr": LeafSystem})
