@@ -1,5 +1,6 @@
 """The controller's side of the loop in real time, against a simulated machine in a thread."""
 
+import io
 import itertools
 import json
 import math
@@ -8,14 +9,19 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import stewart_drake as sd
+from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.log_files import Precision, read_log
+from stewart_drake.law.belief import Estimate
+from stewart_drake.law.linear_loop import Margins
+from stewart_drake.live.blind import stays_within_reach
 from stewart_drake.live.connect import address_of, await_free, call, open_endpoint
 from stewart_drake.live.contact import Contact, Link
 from stewart_drake.live.design import as_seen, check_controller, design
@@ -24,12 +30,13 @@ from stewart_drake.live.governor import Governor
 from stewart_drake.live.loop import LiveLoop, Nobody, Seen
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.page import Asked, PageViewer, read_wish
-from stewart_drake.live.protocol import NOTHING, ControllerMessage, MachineFlags
+from stewart_drake.live.protocol import NOTHING, SECOND, ControllerMessage, MachineFlags
 from stewart_drake.live.session import _queue_advice, check_armed, drive, plans, prepare_session
 from stewart_drake.live.steering import Steering, Way, Wish
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.experiment import control_law, prepare
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.report.run_document import run_document
 from stewart_drake.report.style import FACTORS
 from stewart_drake.report.viewer import slider_range
 from stewart_drake.scenario.loading import load_scenario
@@ -47,11 +54,11 @@ SETTINGS = ("plant.kind=exact", "start=on_reference", "queue=reference")
 class Running:
     """A machine in a thread."""
 
-    def __init__(self, *settings, **how):
+    def __init__(self, *settings, kind=Machine, **how):
         scenario = scenario_of(*settings)
         self.lines = []
         self.endpoint = Endpoint(ControllerMessage, "127.0.0.1", 0)
-        self.machine = Machine(prepare(scenario), self.endpoint, Settings(**how), self.lines.append)
+        self.machine = kind(prepare(scenario), self.endpoint, Settings(**how), self.lines.append)
         self.address, self._stopping = self.endpoint.address, threading.Event()
         self._thread = threading.Thread(target=self._run)
 
@@ -97,7 +104,7 @@ def test_on_a_wire_it_does_what_the_simulation_does(quiet_machine, wall_clock):
         ready = prepare_session(scenario_of(), running.address)
         told = "\n".join(plans(ready, 4.0, "paper"))
         assert "a simulation" in told and "0.8 s after the measurement" in told
-        result = drive(ready, 4.0, say=lambda line: None)
+        result = drive(ready, 4.0, accept_jitter=True, say=lambda line: None)
     simulated = sd.simulate(scenario_of("duration=3.9"))
     assert result.status == "completed" and result.signals.sizes["time"] == 40
     assert result.accumulated_error < simulated.accumulated_error + 0.05
@@ -148,6 +155,7 @@ def test_a_hand_leads_and_a_target_beyond_reach_is_told(quiet_machine):
         result = drive(
             prepare_session(scenario_of(), running.address),
             7.0,
+            accept_jitter=True,
             viewer=hand,
             say=lambda line: None,
         )
@@ -172,7 +180,7 @@ def test_a_second_controller_takes_over_in_motion(quiet_machine):
             loop._step(k)
         second = prepare_session(scenario_of(), running.address)
         first.endpoint.close()  # as a process that was killed
-        result = drive(second, 3.0, say=said.append)
+        result = drive(second, 3.0, accept_jitter=True, say=said.append)
         assert running.machine.failure is None or result.status in ("refused", "left_workspace")
     if result.status == "completed":
         assert result.summary["live"]["taken_over"]
@@ -185,6 +193,119 @@ def test_a_second_controller_takes_over_in_motion(quiet_machine):
 def steering_of(made):
     governor = Governor(made.law.plant.dynamics, made.torque_limit)
     return Steering(governor, made.experiment.reference, Way.along(made.planned))
+
+
+# ---------------------------------------------------------------- measurements that do not come
+
+
+class Misnumbers(Machine):
+    """Numbers every measurement after the first second as that of the begin."""
+
+    def _message(self, time, sampled, *others, **more):
+        late = self._running and sampled > self._origin + SECOND
+        return super()._message(time, self._origin if late else sampled, *others, **more)
+
+
+class Blind(Machine):
+    """Says nothing of the plate after the first second."""
+
+    def _message(self, time, sampled, said, *others, **more):
+        late = self._running and sampled > self._origin + SECOND
+        return super()._message(time, sampled, {} if late else said, *others, **more)
+
+
+class Halves(Machine):
+    """Says something of the plate at every second sample."""
+
+    def _message(self, time, sampled, said, *others, **more):
+        odd = self._running and round((sampled - self._origin) / self.period) % 2
+        return super()._message(time, sampled, {} if odd else said, *others, **more)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "missing"), [(Misnumbers, None), (Blind, None), (Blind, 0.35)])
+def test_a_run_ends_where_measurements_stay_away(quiet_machine, kind, missing):
+    with Running(kind=kind) as running:
+        ready = prepare_session(scenario_of(), running.address)
+        result = drive(ready, 5.0, accept_jitter=True, say=lambda line: None, max_missing=missing)
+        time.sleep(0.1)
+        assert "the controller said stop" in " ".join(running.lines)
+        assert not running.machine._motors.torque.any()  # the safe torque
+    assert result.status == result.summary["status"] == "lost_contact"
+    gap = missing or 1.0
+    assert 1.0 + gap - 0.1 <= result.stopped.time <= 1.0 + gap + 0.31
+    assert "no usable measurement for" in result.stopped.reason
+    assert math.isnan(result.accumulated_error)
+    assert 0.4 < result.summary["measured_share"] < 0.8
+
+
+@pytest.mark.slow
+def test_an_error_of_which_half_was_measured_is_none(quiet_machine):
+    with Running(kind=Halves) as running:
+        result = drive(
+            prepare_session(scenario_of(), running.address),
+            3.0,
+            accept_jitter=True,
+            say=lambda line: None,
+        )
+    assert result.status == "completed" and math.isnan(result.accumulated_error)
+    assert result.summary["measured_share"] == pytest.approx(0.5, abs=0.1)
+    assert "measured at 5" in " ".join(run_document(result).plain().split())
+
+
+def test_the_share_that_was_measured_of_a_simulation_leaves_its_error():
+    lossy = ("sensor.loss=0.5", "duration=2", "plant.kind=exact")
+    result = sd.simulate(scenario_of(*lossy), margin=False)
+    missing = result.summary["counts"]["measurements_missing"]
+    assert missing > 5 and result.summary["measured_share"] == pytest.approx(1 - missing / 21)
+    assert math.isfinite(result.accumulated_error)
+
+
+def test_a_leg_that_is_silent_leaves_measurements(tmp_path):
+    """What is left out of a measurement is counted; the rest is used."""
+    encoders = "sensor={kind: encoders, faults: [{kind: missing, leg: 2, from: 0, to: 2}]}"
+    result = sd.simulate(scenario_of(encoders, "duration=1", "plant.kind=exact"), margin=False)
+    assert result.summary["counts"]["bad_measurements"] >= 10
+    assert result.summary["measured_share"] == 1
+
+
+@pytest.mark.parametrize("gravity", [False, True])
+def test_what_is_uncertain_grows_until_a_leg_may_be_out_of_reach(gravity):
+    made = law_of(gravity)
+    home = made.plant.mechanism.home
+    mean = np.concatenate([home, np.zeros(14)])
+    torque = made.plant.dynamics.equilibrium_torque(home)
+
+    def safe(std, span):
+        covariance = np.diag(np.concatenate([np.full(12, std), np.full(8, 1e-9)]) ** 2)
+        return stays_within_reach(made.plant, Estimate(mean, covariance, mean), torque, span)
+
+    assert safe(1e-6, 1.0) and not safe(0.1, 0.01)
+    spans = np.linspace(0.0, 3.0, 31)
+    held = [safe(1e-3, span) for span in spans]
+    assert held[0] and held == sorted(held, reverse=True)
+    # A covariance of nothing is that of a law without an estimator.
+    unknown = np.full((20, 20), np.nan)
+    assert stays_within_reach(made.plant, Estimate(mean, unknown, mean), torque, 9.0)
+
+
+def test_without_forces_the_limit_is_where_three_deviations_of_a_rate_lead():
+    made = law_of(False)
+    mechanism, rate = made.plant.mechanism, 0.02
+    mean = np.concatenate([mechanism.home, np.zeros(14)])
+    covariance = np.zeros((20, 20))
+    covariance[11, 11] = rate**2  # of the height
+    left = mechanism.reach_margins(mechanism.home)
+    higher = mechanism.reach_margins(mechanism.home + [0, 0, 0, 0, 0, 1e-6])
+    longest = np.min(left / (3 * rate * np.abs(higher - left) / 1e-6))
+    for share in (0.99, 1.01):
+        estimate = Estimate(mean, covariance, mean)
+        within = stays_within_reach(made.plant, estimate, np.zeros(6), share * longest)
+        assert within == (share < 1)
+
+
+def law_of(gravity):
+    return control_law(prepare(scenario_of(f"plant.gravity={gravity}")))[0]
 
 
 # ---------------------------------------------------------------- the way
@@ -356,6 +477,61 @@ def test_a_real_machine_wants_to_be_armed(quiet_machine):
         check_armed(ready, True)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("settings", "asks"), [((), True), ((OVER_A_NETWORK,), False), (None, True)]
+)
+def test_the_jitter_stands_beside_the_margin_and_asks(quiet_machine, settings, asks):
+    """On a wire what arrives late acts late; a play-out buffer absorbs it. None is unstable."""
+    with Running(*(settings or ())) as running:
+        ready = prepare_session(scenario_of(*FROM_REST), running.address)
+        trips = deque([0.001] * 50 + [0.012])
+        ready.contact.link.trips = trips
+        if settings is None:
+            trips.clear()
+            lost = replace(ready.margin, radius=1.1, margins=Margins(0.0, 0.0, 1.0, 1.0))
+            ready = ready._replace(margin=lost)
+        told = " ".join(plans(ready, 1.0, "paper"))
+        if settings is not None:
+            assert "stable for delay errors from -1.72 ms to +1.51 ms" in told
+            assert "round trips vary by 11 ms (standard deviation 1.53 ms)" in told
+        else:
+            assert "this loop is unstable; " in told
+        assert ("play-out buffer absorbs" in told) == (not asks)
+        assert ("What helps: " in told) == asks
+        if asks:
+            with pytest.raises(ConfigError, match=r"^--yes: not given, and the "):
+                drive(ready, 1.0, say=lambda line: None)
+        else:
+            assert ready.jitter_problem is None
+            ready.endpoint.close()
+        assert running.machine.counts["runs"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "answer", "status"),
+    [((), None, 2), ((), "n\n", 2), ((), "", 2), ((), "y\n", 0), (("--yes",), None, 0)],
+)
+def test_live_goes_on_after_an_answer_or_with_yes(
+    quiet_machine, monkeypatch, capsys, words, answer, status
+):
+    monkeypatch.setattr(Link, "jitter", 0.011)
+    stdin = io.StringIO(answer)
+    stdin.isatty = lambda: answer is not None
+    monkeypatch.setattr("sys.stdin", stdin)
+    settings = [word for setting in SETTINGS for word in ("--set", setting)]
+    with Running() as running:
+        where = f"127.0.0.1:{running.address[1]}"
+        command = ["live", "paper", "--machine", where, "--no-browser", "--duration", "0.5"]
+        assert main([*command, *settings, *words]) == status
+        assert running.machine.counts["runs"] == (status == 0)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.startswith("error: --yes: not given") for line in lines] == (
+        [False] * (answer is not None) + [True] * (status != 0)
+    )
+
+
 @pytest.mark.parametrize("text", ["localhost", "127.0.0.1:", "127.0.0.1:0", ":7000", "a b:7000"])
 def test_an_address_that_is_none_is_refused(text):
     with pytest.raises(ConfigError, match=r"^--machine: got"):
@@ -507,7 +683,12 @@ def test_a_gamepad_moves_the_reference(quiet_machine):
         url = viewer.opened()
         with Running() as running, browser() as tab:
             ready = prepare_session(scenario_of(), running.address)
-            how = {"viewer": viewer, "ending": ends.is_set, "say": lambda line: None}
+            how = {
+                "viewer": viewer,
+                "accept_jitter": True,
+                "ending": ends.is_set,
+                "say": lambda line: None,
+            }
             driving = threading.Thread(target=lambda: results.append(drive(ready, **how)))
             driving.start()
             tab.call("Page.navigate", url=url)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from stewart_drake.loop.results import SimulationResult
     from stewart_drake.scenario.config import Scenario
 
+LOG: Final = "log.csv"
 _EACH_WAY: Final = (0.35, 0.4)
 """Of the scenario's delay, between which the link of the demo's machine takes: 0.28 to 0.32 s of
 the paper's 0.8 s."""
@@ -37,30 +38,45 @@ _LOST: Final = 0.02
 _REQUESTS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
+Arm = Annotated[bool, typer.Option("--arm", help="Drive a machine that is no simulation.")]
+Demo = Annotated[
+    bool,
+    typer.Option(
+        "--demo",
+        help="Start a simulated machine too, each way 0.35 to 0.4 of the scenario's delay.",
+    ),
+]
+Duration = Annotated[
+    float | None, typer.Option(min=0.1, metavar="S", help="Until it is stopped by default.")
+]
+Key = Annotated[Path | None, typer.Option(metavar="FILE", help="Whose bytes both sides share.")]
+MaxMissing = Annotated[
+    float | None,
+    typer.Option(
+        min=0.001,
+        metavar="SECONDS",
+        help="Without measurements, then it ends; by the estimator's uncertainty by default.",
+    ),
+]
+Yes = Annotated[
+    bool, typer.Option("--yes", help="Start without the question that a large jitter raises.")
+]
+
+
 def live(
     scenario: ScenarioName = "paper",
     machine: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Where the machine listens.")
     ] = None,
-    demo: Annotated[
-        bool,
-        typer.Option(
-            "--demo",
-            help="Start a simulated machine too, each way 0.35 to 0.4 of the scenario's delay.",
-        ),
-    ] = False,
-    duration: Annotated[
-        float | None, typer.Option(min=0.1, metavar="S", help="Until it is stopped by default.")
-    ] = None,
+    demo: Demo = False,
+    duration: Duration = None,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Without a page; only what is printed.")
     ] = False,
-    arm: Annotated[
-        bool, typer.Option("--arm", help="Drive a machine that is no simulation.")
-    ] = False,
-    key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Whose bytes both sides share.")
-    ] = None,
+    arm: Arm = False,
+    key: Key = None,
+    max_missing: MaxMissing = None,
+    yes: Yes = False,
     controller: Controller = None,
     settings: Settings = None,
     out: Out = None,
@@ -74,7 +90,7 @@ def live(
     """
     from stewart_drake.live.connect import address_of
     from stewart_drake.live.endpoint import read_key
-    from stewart_drake.live.session import check_armed, drive, plans, prepare_session
+    from stewart_drake.live.session import check_armed, check_jitter, drive, plans, prepare_session
     from stewart_drake.scenario.loading import load_scenario
 
     if (machine is None) != demo:
@@ -95,13 +111,27 @@ def live(
         for line in plans(ready, span, name):
             delivery.tell(line)
         check_armed(ready, arm)
+        # Nothing is at stake with the demo's own machine.
+        problem = None if yes or demo else ready.jitter_problem
+        check_jitter(ready, problem is None or _agreed(problem))
         if viewer is not None:
             _show(viewer.opened())
         if not ready.simulated and sys.stdin.isatty():
             input("Enter begins, Ctrl-C leaves it alone")
+        delivery.discard("signals.nc")
+        how: Any = {"armed": arm, "viewer": viewer, "max_missing": max_missing}
+        how["log"] = None if out is None else out / LOG
         with _Ending() as ending:
-            result = drive(ready, span, armed=arm, viewer=viewer, ending=ending, say=delivery.tell)
+            result = drive(ready, span, ending=ending, say=delivery.tell, accept_jitter=True, **how)
     return _told(delivery, result)
+
+
+def _agreed(problem: str) -> bool:
+    """Ask at a terminal whether to go on; without one the answer is no."""
+    if not sys.stdin.isatty():
+        return False
+    echo(f"{problem}; go on? [y/N]", error=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 @contextlib.contextmanager
@@ -144,8 +174,8 @@ def _told(delivery: Delivery, result: "SimulationResult") -> int:
     delivery.tell(text)
     if delivery.out is not None:
         result.save(delivery.out)
-        delivery.wrote("summary.json", "signals.nc")
-    lost = result.status in ("lost_machine", "refused", "left_workspace")
+        delivery.wrote("summary.json", "signals.nc", LOG)
+    lost = result.status in ("lost_machine", "lost_contact", "refused", "left_workspace")
     return delivery.end(result.summary, result.status == "interrupted") or int(lost)
 
 

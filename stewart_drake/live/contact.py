@@ -81,6 +81,11 @@ class Link:
         return min(self.trips, default=math.nan)
 
     @property
+    def jitter(self) -> float:
+        """Difference of the longest and the shortest round trip, s."""
+        return self.longest - self.shortest
+
+    @property
     def loss_there(self) -> float:
         """Share of the datagrams that did not arrive."""
         return self.lost / max(self.sent, 1)

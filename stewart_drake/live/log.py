@@ -1,11 +1,13 @@
 """The record of a live run: the same signals as of a simulation, at the controller's samples.
 
-Nobody knows where the plate truly is, so that `pose` and `rates` are what was measured, or what the
-law goes on where that was lost or where encoders measure. What acted is known when the machine has
-said so: rows wait for that.
+The true state is unknown. `pose` and `rates` are what was measured, or the law's estimate where it
+could not use that or where encoders measure. What acted is known when the machine has said so: rows
+wait for that.
 """
 
 import math
+from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -13,31 +15,53 @@ from numpy.typing import NDArray
 
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.native_law import AnyMemory
+from stewart_drake.live.rows import RowFile
 from stewart_drake.loop.controller import HELD
 from stewart_drake.loop.experiment import Experiment
-from stewart_drake.loop.recording import Record
+from stewart_drake.loop.recording import Record, Table
+from stewart_drake.report.csv_file import columns_of
 from stewart_drake.scenario.config import Scenario, StateSensorConfig
-from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE, TUNER_INPUTS, ports_of
+from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, TUNER_INPUTS, ports_of
 
 Array = NDArray[np.float64]
 
 _WAITS: Final = 24
 """Samples that a row waits to be told what acted then."""
+_LATEST: Final = 0.5
+"""s, the same."""
 _KEPT: Final = 96
 """Periods for which it is remembered what acted."""
 
 
 class LiveRecord(Record):
-    """Collects the signals of a live run, sample by sample.
+    """Writes the signals of a live run to a CSV file, sample by sample.
+
+    The columns are those of `report.csv_file.signals_csv` but for the error, then computing time
+    and delay of the step (`step[s]`, `late[s]`).
+
+    Args:
+        experiment: that is run.
+        backend: what steps the law.
+        limit: of each motor, N m.
+        path: of the file; None is a temporary one.
+        say: prints a line.
 
     Attributes:
         applied: torque (6,) in N m by the period that it began in, as far as the machine has said.
         latest: (6,) of them, the newest.
     """
 
-    def __init__(self, experiment: Experiment, backend: str) -> None:
+    def __init__(
+        self,
+        experiment: Experiment,
+        backend: str,
+        limit: float,
+        path: Path | None,
+        say: Callable[[str], None],
+    ) -> None:
         super().__init__(experiment, backend)
-        self._period = experiment.scenario.controller.period
+        self._period, self._limit = experiment.scenario.controller.period, limit
+        self._waits = max(1, min(_WAITS, round(_LATEST / self._period)))
         self._eta = experiment.scenario.eta
         # What acts at a sample began then, or, with a part of a period, in the one before.
         self._began_before = int(experiment.scenario.true_delay.fraction > 0)
@@ -46,6 +70,12 @@ class LiveRecord(Record):
         self.applied: dict[int, Array] = {}
         self.latest: Array = np.zeros(NUM_TORQUES)
         self._acts: Array = np.full(NUM_TORQUES, np.nan)
+        header = ["time[s]"]
+        for signal in self._recorded:
+            dimension = signal.quantity.dimension
+            labels = () if dimension is None else self._dimensions[dimension].labels
+            header += columns_of(signal, labels)
+        self._file = RowFile(path, [*header, "step[s]", "late[s]"], say)
 
     def acted(self, torques: dict[int, Array]) -> None:
         """Note what the machine says that acted, by period."""
@@ -66,6 +96,7 @@ class LiveRecord(Record):
         measurement: Measurement,
         wanted: Array,
         seconds: float,
+        late: float,
         packets: Array,
     ) -> None:
         """Add a sample.
@@ -76,15 +107,12 @@ class LiveRecord(Record):
             measurement: as it came.
             wanted: (18,) of the reference.
             seconds: that the step took.
+            late: s, from when the sample was due until its torques went out.
             packets: (5,) as of `scenario.signals.PACKETS`.
         """
         state = np.array(memory.belief.state)
-        if self._measures_state and measurement.complete:
+        if self.count(memory) and self._measures_state:
             state = measurement.values
-        error, time = state[POSE] - wanted[POSE], number * self._period
-        self.on_grid.append(time, error, wanted[POSE])
-        self.samples.append(error, memory.torque, memory.in_flight[-1], seconds)
-        self.counts = memory.counts
         belief = memory.belief
         self.delay = {
             "true_s": self._eta,
@@ -99,10 +127,14 @@ class LiveRecord(Record):
             "density": np.full(len(TUNER_INPUTS), math.nan),
             "delay_true": np.array([self._eta]),
             "packets": packets,
+            "step": np.array([seconds, late]),
         }
         self._rows[number] = row
-        while len(self._rows) > _WAITS:
-            self._write(min(self._rows))
+        while self._rows:
+            first = min(self._rows)
+            if first - self._began_before not in self.applied and first > number - self._waits:
+                break
+            self._write(first)
 
     def ran(self, scenario: Scenario) -> None:
         """What the record says that was run."""
@@ -113,10 +145,32 @@ class LiveRecord(Record):
         while self._rows:
             self._write(min(self._rows))
 
+    def finish(self) -> Array:
+        """Close the file and take from it what `summarize` and `dataset` need.
+
+        Returns:
+            (n,) `late` of the rows in the file, s.
+        """
+        self.flush()
+        rows = self._file.close()
+        logged, (seconds, late) = rows[:, :-2], rows[:, -2:].T
+        at, columns = 1, {}
+        for signal in self._recorded:
+            columns[signal.name], at = logged[:, at : at + signal.size], at + signal.size
+        reference, asked = columns["reference"], columns["torque_commanded"]
+        error = columns["pose"] - reference
+        sent = np.clip(asked, -self._limit, self._limit)
+        self._log = Table.of(logged)
+        self.on_grid = Table.of(np.column_stack([logged[:, 0], error, reference]))
+        self.samples = Table.of(np.column_stack([error, asked, sent, seconds]))
+        return late
+
     def _write(self, number: int) -> None:
         row = self._rows.pop(number)
         self._acts = self.applied.get(number - self._began_before, self._acts)
-        self.log(number * self._period, row | {"torque_applied": self._acts})
+        row["torque_applied"] = self._acts
+        parts = [row[signal.exported][signal.part] for signal in self._recorded]
+        self._file.append(np.concatenate([[number * self._period], *parts, row["step"]]))
 
 
 _HELD: Final = tuple(ports_of("controller").values())

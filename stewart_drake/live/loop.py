@@ -11,6 +11,7 @@ import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -21,6 +22,7 @@ from stewart_drake.law.channel import Packets, Report, Wire
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.native_law import AnyMemory, serving
 from stewart_drake.law.timeline import Acting, Timeline
+from stewart_drake.live.blind import LONGEST_GAP, stays_within_reach
 from stewart_drake.live.connect import await_free
 from stewart_drake.live.contact import Contact
 from stewart_drake.live.design import Design
@@ -40,6 +42,7 @@ from stewart_drake.live.steering import Steering, Wish
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.experiment import motion_scale
 from stewart_drake.loop.peer import Fault
+from stewart_drake.loop.recording import has_measured
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, PACKETS, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
 
@@ -65,6 +68,8 @@ _ANSWER: Final = 10.0
 """s in which the machine must have begun."""
 _SPARE: Final = 0.002
 """s for which a measurement is waited for beside the usual."""
+_FURTHEST: Final = 4096
+"""Samples ahead of the next one whose measurements are kept."""
 _GONE: Final = 64
 """Samples after which what came is forgotten."""
 
@@ -159,22 +164,27 @@ class Pace:
     """How periodic the loop was.
 
     Attributes:
-        late: s, from the soonest that a sample's measurement could have come until its torques went
-            out: what the link adds, the wait for what is lost, the step.
+        samples: number of steps.
+        late: s, of the last one: from the soonest that its measurement could have come until its
+            torques went out: what the link adds, the wait for what is lost, the step.
+        resting: the same of the steps that bring the plate to rest, which are not recorded.
         missed: how many of them took a period longer than measurements usually do.
         overtaken: measurements that came after their step.
     """
 
-    late: list[float] = field(default_factory=list)
+    samples: int = 0
+    late: float = math.nan
+    resting: list[float] = field(default_factory=list)
     missed: int = 0
     overtaken: int = 0
 
-    def summary(self) -> dict[str, Any]:
-        """For summary.json."""
-        late = np.array(self.late or [math.nan])
+    def summary(self, recorded: Array) -> dict[str, Any]:
+        """For summary.json, with `late` (n,) of the recorded steps."""
+        late = np.append(recorded, self.resting)
+        late = late if len(late) else np.array([math.nan])
         median = float(np.median(late))
         return {
-            "samples": len(self.late),
+            "samples": self.samples,
             "deadlines_missed": self.missed,
             "measurements_overtaken": self.overtaken,
             "sent_after_due_ms": {
@@ -195,6 +205,10 @@ class LiveLoop:
         contact: a session that the machine has offered.
         viewer: who watches.
         say: is told in a line what happens.
+        max_missing: s without a usable measurement after which the run ends; None is as long as the
+            estimator's uncertainty allows (`live.blind`).
+        log: CSV file that the rows of the record are written to as they come; None is a temporary
+            one.
 
     Attributes:
         record: of the run.
@@ -212,14 +226,18 @@ class LiveLoop:
         contact: Contact,
         viewer: Viewer,
         say: Callable[[str], None],
+        max_missing: float | None = None,
+        log: Path | None = None,
     ) -> None:
         self._design, self._steering, self._contact = design, steering, contact
-        self._viewer, self._say = viewer, say
+        self._viewer, self._say, self._max_missing = viewer, say, max_missing
         self._law: Any
         self._law, self.backend = serving(design.law)
-        self.record, self.pace = LiveRecord(design.experiment, self.backend), Pace()
+        self.record = LiveRecord(design.experiment, self.backend, design.torque_limit, log, say)
+        self.pace = Pace()
         self.memory: AnyMemory = self._law.initial_memory(design.queue)
         self.recoveries, self.taken_over = 0, False
+        self._measured, self._known = -1, self.memory
         c = design.experiment.scenario.controller
         self._period, self._weights = c.period, np.array([c.w_Q, c.w_R])
         self._size = 2 * motion_scale(design.experiment)
@@ -276,7 +294,10 @@ class LiveLoop:
             self._contact.refuse(Refusal.MALFORMED, found)
             return
         k = round((message.sampled - message.begin) / message.period)
-        if k < len(self.pace.late):
+        if k > self.pace.samples + _FURTHEST:
+            self._contact.refuse(Refusal.MALFORMED)
+            return
+        if k < self.pace.samples:
             self.pace.overtaken += 1
             self._contact.refuse(Refusal.LATE)
         self._came.setdefault(k, message)
@@ -333,7 +354,6 @@ class LiveLoop:
         for _ in range(3):
             self._contact.send(flags=ControllerFlags.STOP | self._asked)
             clock.sleep(0.01)
-        self.record.flush()
 
     def _due(self, k: int) -> int:
         """ns of the own clock at which the measurement of a sample may come at the soonest."""
@@ -413,11 +433,12 @@ class LiveLoop:
         if not self._leads:
             if not measurement.complete and not self._parked:  # who knows where it is
                 self._contact.send(begin=self._began, flags=self._asked)
-                return None
+                return self._lost(k)
             refused = self._start(t, measurement, message)
             if refused is not None:
                 return End("refused", Failure(t, None, math.nan, refused))
             self._leads = True
+        counts = self.memory.counts
         wish = self._viewer.wish() if self._recording else Wish(rest=True)
         self._steering = self._steering.on(t + self._horizon, wish)
         way = self._steering.way
@@ -437,10 +458,45 @@ class LiveLoop:
             # A way onto the motion is judged by the motion, as in a simulation.
             judged = wanted if self._by_hand else evaluate(self._steering.motion, t)
             packets = self._packets(k, message)
-            self.record.sample(k, self.memory, measurement, judged, seconds, packets)
+            late = self.pace.late
+            self.record.sample(k, self.memory, measurement, judged, seconds, late, packets)
         self._recover(k)
         self._viewer.show(self._seen(k, wanted))
-        return None
+        if has_measured(self.memory, counts):
+            self._measured, self._known = k, self.memory
+        return self._lost(k)
+
+    def _lost(self, k: int) -> End | None:
+        """Return the end of a run whose measurements have been missing for too long, or None."""
+        gap = (k - self._measured) * self._period
+        if self._may_miss(gap):
+            return None
+        last = self._contact.last
+        assert last is not None
+        silent = last.rate * (now() - self._contact.heard) / SECOND
+        before, after = self._known.counts._asdict(), self.memory.counts._asdict()
+        causes = [
+            f"{after[name] - before[name]} {name.removeprefix('measurements_')}"
+            for name in after
+            if name.startswith("measurements_") and after[name] > before[name]
+        ]
+        status = "lost_contact"
+        reason = f"no usable measurement for {gap:.3g} s ({', '.join(causes) or 'none came'})"
+        if silent >= gap - self._period:
+            status, reason = "lost_machine", f"the machine was silent for {silent:.3g} s"
+        return End(status, Failure(k * self._period, None, math.nan, reason))
+
+    def _may_miss(self, gap: float) -> bool:
+        """Return whether the run goes on after so many s without a usable measurement."""
+        if gap < self._period / 2:
+            return True
+        if self._max_missing is not None:
+            return gap <= self._max_missing + 1e-9
+        eta = self._design.law.timeline.eta
+        if gap > LONGEST_GAP + 1e-9 or self._measured < 0:
+            return gap <= LONGEST_GAP + 1e-9
+        plant, estimate = self._design.law.plant, self._known.belief.estimate
+        return gap <= eta or stays_within_reach(plant, estimate, self.record.latest, gap + eta)
 
     @property
     def _by_hand(self) -> bool:
@@ -466,7 +522,9 @@ class LiveLoop:
 
     def _note_pace(self, k: int) -> None:
         late = (now() - self._due(k)) / SECOND
-        self.pace.late.append(late)
+        self.pace.samples, self.pace.late = self.pace.samples + 1, late
+        if not self._recording:
+            self.pace.resting.append(late)
         self.pace.missed += late > self._period + self._contact.lateness(self._period)
 
     # -------------------------------------------------------------- reports

@@ -6,7 +6,11 @@ import os
 import time as clock
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.files.errors import ConfigError
@@ -18,11 +22,18 @@ from stewart_drake.live.governor import Governor
 from stewart_drake.live.loop import LiveLoop, Nobody, Viewer
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
 from stewart_drake.live.steering import Steering, Way
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LiveSummary, SimulationResult
-from stewart_drake.scenario.config import NetworkConfig, Scenario
+from stewart_drake.scenario.config import DelayConfig, NetworkConfig, Scenario, WireConfig
+from stewart_drake.studies.verdict import milliseconds
 
+Array = NDArray[np.float64]
+
+LEAST_MEASURED: Final = 0.9
+"""Share of the samples that must have been measured for E_ac and the cost to mean something."""
 _MOST: Final = 0.5
 """Share of a period that a step may take."""
 
@@ -33,17 +44,34 @@ class Ready(NamedTuple):
     Attributes:
         endpoint, contact: through which it is found.
         design: of the scenario over the link as it was found.
+        margin: of the loop whose torques all act the time eta after their measurement.
     """
 
     endpoint: Endpoint
     contact: Contact
     design: Design
+    margin: ControllerMargin
 
     @property
     def simulated(self) -> bool:
         """Whether the machine says that it is a simulation."""
         last = self.contact.last
         return last is not None and MachineFlags.SIMULATION in last.flags
+
+    @property
+    def jitter_problem(self) -> str | None:
+        """Why the link's jitter may lose the plate, in words, or None."""
+        if self.margin.stable is False:
+            return "the loop is unstable whatever the jitter: the plate may be lost"
+        jitter, on_wire = self.contact.link.jitter, self.design.experiment.scenario.link
+        if isinstance(on_wire, NetworkConfig) or not jitter > self.margin.delay_margin:
+            return None  # a torque that comes early waits for its play-out time
+        return (
+            f"the jitter of {milliseconds(jitter)} is more than the "
+            f"{milliseconds(self.margin.delay_margin)} of delay error that the loop is stable for, "
+            "and the machine has no play-out buffer: where the jitter reaches the motors, errors "
+            "grow until the plate is lost"
+        )
 
 
 def prepare_session(
@@ -68,10 +96,23 @@ def prepare_session(
         check_controller(scenario)
         with one_blas_thread:
             made = design(as_seen(scenario, contact.link, machine), machine)
-        return Ready(endpoint, contact, made)
+            margin = controller_margin(_in_time(made.experiment))
+        return Ready(endpoint, contact, made, margin)
     except BaseException:
         endpoint.close()
         raise
+
+
+def _in_time(experiment: Experiment) -> Experiment:
+    """Return the experiment with a constant delay, as where every packet comes in time."""
+    sc = experiment.scenario
+    if not isinstance(sc.link, NetworkConfig):
+        return experiment
+    eta = sc.true_delay
+    controller = replace(sc.controller, delay_steps=eta.steps, delay_fraction=eta.fraction)
+    delay = DelayConfig(steps=eta.steps, fraction=eta.fraction)
+    scenario = replace(sc, link=WireConfig(), delay=delay, controller=controller)
+    return experiment._replace(scenario=scenario)
 
 
 def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
@@ -99,7 +140,36 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
         f"{1e3 * sc.controller.period:g} ms, motors {limit}",
         f"motion: {scenario}, {until}; after {machine.watchdog / SECOND:g} s without a word the "
         f"machine goes to {safe}",
+        *_stability(ready),
         *_cautions(made),
+    ]
+
+
+def _stability(ready: Ready) -> list[str]:
+    """Return lines on the loop's margin beside the link's jitter, and what helps."""
+    margin, link, sc = ready.margin, ready.contact.link, ready.design.experiment.scenario
+    shorter, longer = (milliseconds(s) for s in (margin.margins.shorter, margin.margins.longer))
+    judged = f"stable for delay errors from -{shorter} to +{longer}"
+    if margin.stable is None:
+        judged = f"not judged: {margin.problem}"
+    elif not margin.stable:
+        judged = "unstable"
+    found = (
+        f"this loop is {judged}; round trips vary by {milliseconds(link.jitter)} (standard "
+        f"deviation {milliseconds(link.spread)})"
+    )
+    if isinstance(sc.link, NetworkConfig):
+        found += (
+            "; the machine's play-out buffer absorbs that while they take less than "
+            f"{milliseconds(sc.eta)}"
+        )
+    if ready.jitter_problem is None:
+        return [found]
+    return [
+        found,
+        f"warning: {ready.jitter_problem}. What helps: a machine with a play-out buffer that is "
+        "longer than any round trip; a lower bandwidth (--set controller.w_R=1000); --controller "
+        "adaptive_lqi where the delay is off by a constant",
     ]
 
 
@@ -140,6 +210,18 @@ def check_armed(ready: Ready, armed: bool) -> None:
         )
 
 
+def check_jitter(ready: Ready, accepted: bool) -> None:
+    """Refuse a link whose jitter is more than the loop is stable for, unless that was accepted.
+
+    Raises:
+        ConfigError: one line.
+    """
+    problem = ready.jitter_problem
+    if problem is not None and not accepted:
+        ready.endpoint.close()
+        raise ConfigError(f"--yes: not given, and {problem}; expected --yes to start all the same")
+
+
 @contextlib.contextmanager
 def before_others() -> Iterator[str]:
     """Let this process run before all that are not in real time, where the system permits it.
@@ -164,9 +246,12 @@ def drive(
     duration: float = math.inf,
     *,
     armed: bool = False,
+    accept_jitter: bool = False,
     viewer: Viewer | None = None,
     ending: Callable[[], bool] = lambda: False,
     say: Callable[[str], None] = print,
+    max_missing: float | None = None,
+    log: Path | None = None,
 ) -> SimulationResult:
     """Run the loop; the machine moves.
 
@@ -174,18 +259,23 @@ def drive(
         ready: of `prepare_session`; its socket is closed in the end.
         duration: s, or infinite.
         armed: whether a machine that is no simulation may be driven.
+        accept_jitter: whether to start where the jitter is more than the loop is stable for.
         viewer: who watches.
         ending: whether to come to rest and end.
         say: is told in a line what happens.
+        max_missing: s without a usable measurement after which the run ends, see `LiveLoop`.
+        log: file that the rows of the record are written to as they come, see `LiveLoop`.
 
     Raises:
-        ConfigError: not armed for a real machine, or one that does not begin.
+        ConfigError: not armed for a real machine, more jitter than is accepted, or a machine that
+            does not begin.
     """
     check_armed(ready, armed)
+    check_jitter(ready, accept_jitter)
     made, contact = ready.design, ready.contact
     governor = Governor(made.law.plant.dynamics, made.torque_limit)
     steering = Steering(governor, made.experiment.reference, Way.along(made.planned))
-    loop = LiveLoop(made, steering, contact, viewer or Nobody(), say)
+    loop = LiveLoop(made, steering, contact, viewer or Nobody(), say, max_missing, log)
     started = clock.perf_counter()
     try:
         with one_blas_thread, before_others() as scheduled:
@@ -195,14 +285,22 @@ def drive(
         raise ConfigError(f"--machine: {error}; expected one that does") from None
     finally:
         ready.endpoint.close()
-    wall, samples = clock.perf_counter() - started, len(loop.record.samples)
+        late = loop.record.finish()
+    wall, samples = clock.perf_counter() - started, loop.record.sampled
     period = made.experiment.scenario.controller.period
     as_run = replace(made.experiment.scenario, duration=max(samples - 1, 1) * period)
     as_run = replace(as_run, log_period=period)
     loop.record.ran(as_run)
     experiment = made.experiment._replace(scenario=as_run)
     summary = summarize(experiment, loop.record, status, stopped, wall, None)
-    told = _told(loop, contact) | {"scheduled": scheduled}
+    if len(late) < samples:
+        summary["warnings"].append(
+            f"the log ends {(samples - len(late)) * period:.3g} s before the run; what is shown of "
+            "the run is from before that"
+        )
+    if len(late) < samples or not summary["measured_share"] >= LEAST_MEASURED:
+        summary["accumulated_error"] = summary["cost"] = math.nan
+    told = _told(loop, contact, late) | {"scheduled": scheduled}
     return SimulationResult(
         scenario=as_run,
         status=status,
@@ -212,10 +310,10 @@ def drive(
     )
 
 
-def _told(loop: LiveLoop, contact: Contact) -> dict[str, Any]:
+def _told(loop: LiveLoop, contact: Contact, late: Array) -> dict[str, Any]:
     """For summary.json."""
     link, last = contact.link, contact.last
-    return loop.pace.summary() | {
+    return loop.pace.summary(late) | {
         "taken_over": loop.taken_over,
         "recoveries": loop.recoveries,
         "round_trip_ms": {

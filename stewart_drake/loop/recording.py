@@ -45,6 +45,13 @@ class Table:
     def __init__(self, width: int) -> None:
         self._width, self._chunks, self._used = width, list[Array](), _CHUNK
 
+    @classmethod
+    def of(cls, rows: Array) -> "Table":
+        """Return a table of rows (n, width), to which nothing is appended."""
+        table = cls(rows.shape[1])
+        table._chunks, table._used = [rows], len(rows)
+        return table
+
     def __len__(self) -> int:
         return _CHUNK * (len(self._chunks) - 1) + self._used
 
@@ -80,6 +87,8 @@ class Record:
             for (6), what the limit lets through of it (6), computing time.
         peak_applied: largest torque that acted, N m.
         counts: what went wrong and was survived, as of the last sample.
+        sampled: number of the controller's samples.
+        measured: number of those whose measurement it could use.
         tuner_fallbacks: samples at which the tuner passed its network over.
         controller_backend: what steps the law.
         delay: at the last sample, s: true, as it is believed in or estimated, standard deviation.
@@ -95,6 +104,7 @@ class Record:
         self.on_grid, self.samples = Table(13), Table(19)
         self.peak_applied = 0.0
         self.counts, self.tuner_fallbacks = Counts(), 0
+        self.sampled = self.measured = 0
         nan = float("nan")
         self.delay: DelaySummary = {"true_s": nan, "estimated_s": nan, "std_s": nan}
 
@@ -102,6 +112,13 @@ class Record:
         """Add a row to the log: at a time in s, by port what is exported there."""
         row = [seen[signal.exported][signal.part] for signal in self._recorded]
         self._log.append(time, *row)
+
+    def count(self, memory: Any) -> bool:
+        """Take the counts of a sample from the controller's memory; return `has_measured`."""
+        usable = has_measured(memory, self.counts)
+        self.counts, self.sampled = memory.counts, self.sampled + 1
+        self.measured += usable
+        return usable
 
     def dataset(self) -> xr.Dataset:
         """The log, see `SimulationResult.signals`."""
@@ -162,7 +179,7 @@ class Recorder(Record):
         if instant.sampled:
             controller_context = self._controller.GetMyContextFromRoot(context)
             memory, seconds = self._controller.sample(controller_context)
-            self.counts = memory.counts
+            self.count(memory)
             if self._tuner is not None:
                 tuner_context = self._tuner.GetMyContextFromRoot(context)
                 self.tuner_fallbacks = self._tuner.fallbacks(tuner_context)
@@ -185,6 +202,19 @@ class Recorder(Record):
     def current_error(self) -> float:
         """Mean pose error in % of peak to peak."""
         return float(100 * np.mean(np.abs(self._error) / self._scale))
+
+
+def has_measured(memory: Any, before: Counts) -> bool:
+    """Return whether the controller could use its last measurement, or a part of it.
+
+    Args:
+        memory: of the controller after that sample.
+        before: its counts at the sample before.
+    """
+    belief = getattr(memory, "belief", None)  # a controller of the user's own has none
+    partly = 0 if belief is None else len(belief.partly)
+    more: int = memory.counts.bad_measurements - before.bad_measurements
+    return more <= partly
 
 
 def _variable(signal: Signal, values: Array) -> tuple[tuple[str, ...], Array, dict[str, str]]:
@@ -218,6 +248,7 @@ def summarize(
     return {
         "status": status,
         "accumulated_error": found.accumulated_error,
+        "measured_share": recorder.measured / recorder.sampled if recorder.sampled else nan,
         "failure": None if stopped is None else stopped._asdict(),
         "cost": found.cost,
         "peak_torque": found.peak_torque,

@@ -53,9 +53,12 @@ class RunSummary(TypedDict):
 
     status: str
     """`completed`, `left_workspace`, `solver_failed` or `interrupted`; in real time also
-    `lost_machine`, which fell silent, or `refused`, where there was no way to take it over."""
+    `lost_machine`, which fell silent, `lost_contact`, where datagrams came but no usable
+    measurements, or `refused`, where there was no way to take it over."""
     accumulated_error: float
-    """E_ac in % s, equation (47)."""
+    """E_ac in % s, equation (47). NaN for a run in real time with a `measured_share` below 0.9."""
+    measured_share: float
+    """Share of the controller's samples whose measurement it could use, or a part of it."""
     failure: dict[str, Any] | None
     """What stopped it: `time` in s, `leg`, `margin`, `reason`."""
     cost: float

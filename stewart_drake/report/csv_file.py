@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -34,19 +35,29 @@ def signals_csv(signals: xr.Dataset) -> str:
     header, columns = ["time[s]"], [signals.time.values[:, None]]
     for name, signal in signals.data_vars.items():
         others = [dimension for dimension in signal.dims if dimension != "time"]
-        labels = [f"_{_spoken(str(label))}" for other in others for label in signal[other].values]
+        labels = [str(label) for other in others for label in signal[other].values]
         known = _known(str(name), signal)
-        units = ("1",) * len(labels or [""]) if known is None else known.quantity.units
+        units = ("1",) * max(1, len(labels)) if known is None else known.quantity.units
         if signal.dims == _ENCODERS:
             units = ("rad",) * len(labels)
-        for label, unit in zip(labels or [""], units, strict=True):
-            header.append(f"{name}{label}[{'-' if unit == '1' else unit}]")
+        header += _columns(str(name), labels, units)
         columns.append(signal.transpose("time", *others).values.reshape(len(signal.time), -1))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
     writer.writerows([_cell(value) for value in row] for row in np.hstack(columns))
     return text.getvalue()
+
+
+def columns_of(signal: Signal, labels: Iterable[str | int]) -> list[str]:
+    """Return the header's cells of a signal with these labels of its components, if it has any."""
+    return _columns(signal.name, [str(label) for label in labels], signal.quantity.units)
+
+
+def _columns(name: str, labels: Sequence[str], units: Sequence[str]) -> list[str]:
+    named = [f"{name}_{_spoken(label)}" for label in labels] or [name]
+    pairs = zip(named, units, strict=True)
+    return [f"{column}[{'-' if unit == '1' else unit}]" for column, unit in pairs]
 
 
 def write_csv(signals: xr.Dataset, path: Path) -> Path:

@@ -1,5 +1,6 @@
 """How one run went, and several beside each other."""
 
+import math
 from collections.abc import Mapping
 from typing import Final
 
@@ -32,6 +33,8 @@ _COLUMNS: Final = {
     "var. [N\u00a0m]": "var.\nN m",
     "step [ms]": "step\nms",
 }
+_NEARLY_ALL: Final = 0.9995
+"""Share of samples with a measurement from which nothing is said of the others."""
 _NOTE: Final = (
     "Floor: what the delay alone adds to E_ac. Cost: squared errors and their integrals by w_Q, "
     "and squared torques by w_R. N m: the largest torque that was asked for (commanded) and that "
@@ -57,9 +60,12 @@ def run_blocks(result: SimulationResult) -> list[Block]:
         entries["status"] += f" at {result.stopped.time:.3f} s"
         if result.status != "interrupted":
             entries["reason"] = result.stopped.reason
+    share = s["measured_share"]
+    if share < _NEARLY_ALL:
+        floor += f", measured at {100 * share:.1f} % of the samples"
     entries |= {
         "E_ac": f"{number(s['accumulated_error'])} % s, {floor}"
-        if result.status == "completed"
+        if math.isfinite(s["accumulated_error"])
         else f"none, {floor}",
         "peak error": ", ".join(f"{name} {number(value)}" for name, value in peaks)
         + " % of peak to peak",
