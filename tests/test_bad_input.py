@@ -125,6 +125,8 @@ FOR_KIND = {
         for name in ("distribution", "return.distribution", "dry", "acknowledged")
     },
     **{name: {"kind": "network"} for name in SCENARIO_RANGES if name.startswith("link.")},
+    **{f"link.{name}": {"kind": "network", "low": 0.5, "high": 0.9} for name in ("low", "high")},
+    "link.return.low": {"kind": "network", "return": {"low": 0.5, "high": 0.9}},
 }
 """What a field needs beside it, so that it means something."""
 FITS_NOT = ("reference.times", "too long")

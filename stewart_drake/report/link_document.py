@@ -81,9 +81,9 @@ def _verdict(study: LinkStudy) -> tuple[str, Tone]:
     if study.losses:
         survived = study.survivable
         text += (
-            " At that bound no loss is survived in every run."
+            " At the best bound no loss is survived in every run."
             if math.isnan(survived)
-            else f" At that bound every run completed up to a loss of {100 * survived:.3g} %."
+            else f" At the best bound every run completed up to a loss of {100 * survived:.3g} %."
         )
     checked = study.checked
     if checked is not None and checked.runs:

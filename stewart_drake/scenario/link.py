@@ -174,7 +174,9 @@ NO_LOSSES: Final = BurstChain(0.0, 1)
 
 def losses(number: int, loss: float, burst: int, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Draw which of `number` packets are lost: a `BurstChain` from its stationary state."""
-    begins = rng.random(number + burst - 1) < BurstChain(loss, burst).begins
+    # Bursts of before the first packet have random numbers of their own.
+    earlier = np.random.Generator(rng.bit_generator.jumped()).random(burst - 1)  # type: ignore[attr-defined]
+    begins = np.append(earlier, rng.random(number)) < BurstChain(loss, burst).begins
     return np.convolve(begins, np.ones(burst), "valid") > 0.5
 
 
