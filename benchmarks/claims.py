@@ -99,7 +99,6 @@ def of_seed(drawn: str, seed: int) -> list[str]:
         "half_noise": (noise(5e-4), f"sensor.seed={seed}"),
         "codes": (f"sensor.seed={seed}",),
         "losses": (f"sensor.seed={seed}",),
-        "mounting": (f"sensor.offset={(np.deg2rad(0.1) * signs).tolist()}",),
         "packets": (f"link.seed={seed}",),
         "jitter": (f"delay.seed={seed}",),
         "direction": (),
@@ -383,64 +382,35 @@ def encoders() -> list[Row]:
     """Motor encoders in the place of the measured state."""
     rows = []
 
-    def add(name: str, words: str, bits: int | None, *settings: str, drawn: str = "codes") -> None:
-        code = "null" if bits is None else str(bits)
-        given = (*settings, ENCODERS, f"sensor.bits={code}")
-        rows.append(Row(name, words, given, drawn if bits else ""))
+    def add(name: str, words: str, *settings: str, drawn: str = "codes") -> None:
+        rows.append(Row(name, words, (*settings, ENCODERS), drawn))
 
-    for often, (words, more) in {"": ("one sample", ()), "-1k": ("1 kHz", (OFTEN,))}.items():
-        for bits in (None, 20, 17, 14, 12):
-            name = "exact" if bits is None else f"{bits} bit"
-            end = f"{'exact' if bits is None else bits}{often}"
-            add(f"codes-{end}", f"{name}, {words}", bits, *ON, *more)
-            if bits in (None, 14, 12):
-                add(f"rest-codes-{end}", f"from rest, {name}, {words}", bits, *more)
-            if bits == 14 or (bits == 17 and not more) or (bits == 12 and more):
-                add(f"narrow-{end}", f"narrow priors, {name}, {words}", bits, *ON, *more, NARROW)
-                words_of = f"priors as identified, {name}, {words}"
-                add(f"identified-{end}", words_of, bits, *ON, *more, IDENTIFIED)
+    for bits in (None, 20, 17, 14, 12):
+        drawn, code = ("codes", str(bits)) if bits else ("", "null")
+        words, end = f"{bits} bit" if bits else "exact", str(bits or "exact")
+        given = f"sensor.bits={code}"
+        add(f"codes-{end}", f"{words}, one sample", *ON, given, drawn=drawn)
+        if bits not in (20, 17):
+            add(f"rest-codes-{end}", f"from rest, {words}, one sample", given, drawn=drawn)
+        if bits in (17, 14):
+            add(f"narrow-{end}", f"narrow priors, {words}, one sample", *ON, given, NARROW)
+            add(f"identified-{end}", f"priors as identified, {words}", *ON, given, IDENTIFIED)
+    often = (*ON, OFTEN, "sensor.bits=14")
     plant = (PAYLOAD, "plant.joint_damping=1e-3")
-    for bits in (14, 12):
-        for name, prior in (("", ()), ("-narrow", (NARROW,))):
-            words = f"bias, payload, damping 1e-3 unknown, {bits} bit, 1 kHz"
-            words += ", narrow priors" if prior else ""
-            settings = (*ON, OFTEN, *plant, *prior)
-            add(f"three-codes-{bits}{name}", words, bits, *settings, drawn="codes bias")
-    for name, look in (("", "false"), ("-found", "true")):
-        words = f"0.1 degree off at each motor, {'estimated' if name else 'not looked for'}"
-        settings = (*ON, OFTEN, NARROW, f"controller.estimate_offsets={look}")
-        add(f"mounting{name}", words, 14, *settings, drawn="codes mounting")
+    add("codes-14-1k", "14 bit, 1 kHz", *often)
+    add("identified-14-1k", "priors as identified, 14 bit, 1 kHz", *often, IDENTIFIED)
+    words = "bias, payload, damping 1e-3 unknown, 14 bit, 1 kHz"
+    add("three-codes-14-1k", words, *often, *plant, drawn="codes bias")
+    add("rest-codes-14-1k", "from rest, 14 bit, 1 kHz", OFTEN, "sensor.bits=14")
+    add("codes-12-1k", "12 bit, 1 kHz", *ON, OFTEN, "sensor.bits=12")
     return rows
-
-
-def encoders_under_gravity() -> list[Row]:
-    """The same where an error of the prediction grows 300 fold within the delay."""
-    rows = []
-    for bits in (20, 17, 14):
-        for often, samples in (("one sample", ()), ("1 kHz", ("sensor.samples=10",))):
-            words = f"full gravity, {bits} bit, {often}"
-            name = f"gravity-codes-{bits}{'-1k' if samples else ''}"
-            settings = (ENCODERS, f"sensor.bits={bits}", *samples)
-            rows.append(Row(name, words, settings, "codes", scenario="gravity"))
-    return rows
-
-
-def encoders_and_delay() -> list[Row]:
-    """Encoders and a delay that is believed 0.1 s too short."""
-    settings = (ENCODERS, "sensor.bits=14", OFTEN, *believed(0.7))
-    words = "14 bit, 1 kHz, delay believed 0.1 s too short"
-    on = Row("codes-found", words, (*ON, *settings), "codes", "adaptive_lqi")
-    rest = on._replace(name="rest-codes-found", words=f"from rest, {words}", settings=settings)
-    return [on, rest]
 
 
 def servos() -> list[Row]:
     """Position servos, bias, payload and damping 3e-4 unknown."""
     settings = (*ON, PAYLOAD, "plant.joint_damping=3e-4", "actuator.kind=servo")
     words = "bias, payload, damping 3e-4 unknown, servos of 10 Hz"
-    sent = Row("servo-preview", words, settings, "bias", "servo_preview")
-    torque = Row("servo-feedforward", words, settings, "bias", "servo_feedforward")
-    return [sent, *both(torque)]
+    return [Row("servo-preview", words, settings, "bias", "servo_preview")]
 
 
 def network() -> list[Row]:
@@ -491,8 +461,6 @@ SECTIONS = {
     "push": push,
     "servos": servos,
     "encoders": encoders,
-    "encoders_and_delay": encoders_and_delay,
-    "encoders_under_gravity": encoders_under_gravity,
     "network": network,
 }
 STUDIES = {
@@ -661,10 +629,16 @@ def main() -> None:
 
 
 def save(data: dict[str, Any], whole: bool) -> None:
-    """Write the file of all values, unless the runs were a trial."""
-    if whole:
-        with replacing(DATA) as partial_file:
-            partial_file.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    """Write the file of all values, a line for each row, unless the runs were a trial."""
+    if not whole:
+        return
+
+    def lines(some: dict[str, Any]) -> str:
+        return ",\n".join(f"{json.dumps(name)}: {json.dumps(one)}" for name, one in some.items())
+
+    parts = ",\n".join(f'"{part}": {{\n{lines(some)}\n}}' for part, some in data.items())
+    with replacing(DATA) as partial_file:
+        partial_file.write_text(f"{{\n{parts}\n}}\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
