@@ -532,6 +532,14 @@ def test_live_goes_on_after_an_answer_or_with_yes(
     )
 
 
+@pytest.mark.slow
+def test_the_demo_runs_unattended_and_shows_its_jitter(capsys):
+    assert main(["live", "paper", "--demo", "--no-browser", "--duration", "1"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "round trips vary by" in said and "play-out buffer absorbs" in said
+    assert "status completed" in said
+
+
 @pytest.mark.parametrize("text", ["localhost", "127.0.0.1:", "127.0.0.1:0", ":7000", "a b:7000"])
 def test_an_address_that_is_none_is_refused(text):
     with pytest.raises(ConfigError, match=r"^--machine: got"):

@@ -199,8 +199,8 @@ def _demo_machine(
     )
     try:
         assert process.stdout is not None
-        first = process.stdout.readline()
-        _, _, rest = first.partition(" at ")
+        named = (line for line in process.stdout if line.startswith("machine "))
+        _, _, rest = next(named, "").partition(" at ")
         if not rest:
             raise ConfigError("--demo: the simulated machine did not start")
         yield rest.split(": ", 1)[0]
