@@ -75,10 +75,12 @@ wheel:  ## builds the wheel and tries it in a clean environment, from an empty f
 newest:  ## the tests with the newest Drake, on Python 3.12 or later, without torch
 	@bash .ci/newest $(ARGS)
 
-bench: $(INSTALLED_BENCH)  ## every script in benchmarks/, one after the other
-	@set -e; for script in $(sort $(wildcard benchmarks/[a-z]*.py)); do \
-		echo "== $$script"; $(BIN)/python $$script; \
-	done
+# Without arguments a script runs all of its sections.
+bench: export QUICK := $(QUICK)
+bench: $(INSTALLED_BENCH)  ## every script in benchmarks/; QUICK=1: at the least size, pages in out/bench
+	@failed=; for script in $(sort $(wildcard benchmarks/[a-z]*.py)); do \
+		echo "== $$script"; $(BIN)/python $$script || failed="$$failed $$script"; \
+	done; test -z "$$failed" || { echo "failed:$$failed"; exit 1; }
 
 generate: $(INSTALLED)  ## writes the equations in C anew, after a change of theirs, and compiles them
 	$(BIN)/python -m stewart_drake.dynamics.generate

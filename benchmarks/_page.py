@@ -1,11 +1,19 @@
-"""What the scripts beside it share: a table, and the page in results/ that a script writes."""
+"""Sizes, tables and pages in results/, shared by the scripts of this folder."""
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from stewart_drake.files.versions import versions
 
-RESULTS = Path(__file__).parent / "results"
+QUICK = bool(os.environ.get("QUICK"))
+"""Whether to run everything once, at the least size, to see that it runs."""
+RESULTS = Path("out/bench") if QUICK else Path(__file__).parent / "results"
+
+
+def size(name: str, usual: int, least: int = 1) -> int:
+    """Return a number of runs: the variable `name` of the environment, else the usual one."""
+    return int(os.environ.get(name, least if QUICK else usual))
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], rule: str = "---") -> str:
@@ -25,7 +33,7 @@ def write(script: str, title: str, parts: Sequence[str], more: str = "") -> None
     head = f"# {title}\n\nMade by `python benchmarks/{name}.py` with {packages}{more}.\n"
     text = "\n".join([head, *parts]).rstrip("\n") + "\n"
     print(text)
-    RESULTS.mkdir(exist_ok=True)
+    RESULTS.mkdir(parents=True, exist_ok=True)
     (RESULTS / f"{name}.md").write_text(text, encoding="utf-8")
 
 

@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from _page import table, write
+from _page import size, table, write
+from _push import Push
 from joblib import Parallel, delayed
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from true_machine import told
 
 import stewart_drake as sd
@@ -70,19 +70,6 @@ class Row(NamedTuple):
     """s, beginning and end of the force."""
     known: bool = False
     """Whether the controller reads the plant's true numbers from a file."""
-
-
-class Push(LeafSystem):
-    """Force on the plate's centre of mass; output `wrench` (6): moment (N m), force (N)."""
-
-    def __init__(self, force: np.ndarray, span: tuple[float, float]) -> None:
-        super().__init__()
-        self.force, self.span = force, span
-        self.DeclareVectorOutputPort("wrench", 6, self._calc)
-
-    def _calc(self, context: Context, output: BasicVector) -> None:
-        pushed = self.span[0] <= context.get_time() < self.span[1]
-        output.SetFromVector([0.0] * 3 + [float(f) if pushed else 0.0 for f in self.force])
 
 
 def noise(share: float) -> str:
@@ -585,7 +572,9 @@ def main() -> None:
     """Run and write what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", metavar="ROW or SECTION")
-    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="fewer: nothing is written")
+    parser.add_argument(
+        "--seeds", type=int, default=size("SEEDS", len(SEEDS)), help="fewer: nothing is written"
+    )
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--missing", action="store_true", help="only rows not measured yet")
     parser.add_argument("--command", action="store_true", help="print commands, run nothing")

@@ -7,10 +7,10 @@ and motions, the delay believed a quarter too short or too long, with the estima
 
 import math
 import os
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from _page import RESULTS
 from delay_estimator import CpuTime
 from joblib import Parallel, delayed
 
@@ -18,7 +18,6 @@ import stewart_drake as sd
 from stewart_drake.files.versions import versions
 from stewart_drake.loop import controller as step_timer
 
-RESULTS = Path(__file__).parent / "results"
 SCALED = "reference.amplitude=[0.13,0.13,0.13,0.01,0.01,0.04]"
 ON = ("start=on_reference", "queue=reference")
 
@@ -84,6 +83,7 @@ def main() -> None:
     text += "E_ac in % s; behind it the slowest step with the estimator, CPU time. "
     text += "Believed are three and five quarters of the true delay, or itself.\n\n"
     text += "\n".join(f"| {line} |" for line in lines) + "\n"
+    RESULTS.mkdir(parents=True, exist_ok=True)
     (RESULTS / "conditions.md").write_text(text, encoding="utf-8")
     print(text)
 

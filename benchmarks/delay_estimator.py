@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from _page import run_sections
+from _page import run_sections, size
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
@@ -28,8 +28,8 @@ from stewart_drake.scenario.link import delay_at
 AMPLITUDES = np.tile([0.2617993878] * 3 + [0.02, 0.02, 0.08], 2)
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 NETWORK = ("link.kind=network", "link.low=0.5", "link.high=0.9")
-SEEDS = int(os.environ.get("SEEDS", "20"))
-COVERED = int(os.environ.get("COVERED", "200"))
+SEEDS = size("SEEDS", 20)
+COVERED = size("COVERED", 200, least=2)
 FRESH = 100
 """The first seed; those below were looked at while the law was made."""
 FRESH_SEEDS = range(FRESH, FRESH + SEEDS)

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, cast
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from _page import run_sections
+from _page import run_sections, size
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
@@ -29,7 +29,7 @@ from stewart_drake.loop import controller
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.simulation import make_simulator, simulate
 
-SEEDS = int(os.environ.get("SEEDS", "5"))
+SEEDS = size("SEEDS", 5)
 FRESH = int(os.environ.get("FIRST", "100"))
 """The first seed."""
 JOBS = int(os.environ.get("JOBS", "-1"))

@@ -22,7 +22,6 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -31,6 +30,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from _page import RESULTS, size
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
@@ -56,8 +56,7 @@ from stewart_drake.studies.ranges import Ranges
 
 Array = NDArray[np.float64]
 
-RESULTS = Path(__file__).parent / "results"
-MACHINES = int(os.environ.get("MACHINES", "50"))
+MACHINES = size("MACHINES", 50)
 FRESH = int(os.environ.get("FRESH", "1000"))
 """The first seed; those below were looked at while this was made."""
 AMPLITUDE = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
@@ -99,11 +98,11 @@ class Truth(NamedTuple):
     values: Array
 
 
-def of_ranges(seed: int, motion: Path) -> Truth:
-    """A draw of the robustness study."""
+def of_ranges(seed: int, motion: Path, calm: float) -> Truth:
+    """A draw of the robustness study; `calm` is of `calm_torque`."""
     scenario = log_scenario(motion)
     experiment = prepare(scenario)
-    scales = uncertainty.scales_of(experiment, calm_torque(motion))
+    scales = uncertainty.scales_of(experiment, calm)
     one = uncertainty.draw(Ranges(), scales, scenario, FRESH, seed)
     changed = uncertainty.drawn(uncertainty.MACHINE, scenario, experiment.mechanism, one)
     machine, drawn = changed.machine(), changed.as_scenario()
@@ -112,7 +111,6 @@ def of_ranges(seed: int, motion: Path) -> Truth:
     return Truth(machine, drawn, values)
 
 
-@cache
 def calm_torque(motion: Path) -> float:
     """Largest that the undisturbed run commands, N m."""
     scenario = load_scenario("paper", "adaptive_lqi", _settings(motion, late=0.0))
@@ -220,9 +218,9 @@ class Found(NamedTuple):
     """(3, 2) E_ac by GOES_BY and STARTS; NaN for a run that did not complete."""
 
 
-def find(kind: str, seed: int, motion: Path, poses: bool) -> Found:
+def find(kind: str, seed: int, motion: Path, calm: float, poses: bool) -> Found:
     """Draw a machine, log it, find it."""
-    truth = (of_ranges if kind == "ranges" else of_drawing)(seed, motion)
+    truth = of_ranges(seed, motion, calm) if kind == "ranges" else of_drawing(seed, motion)
     run = simulate(truth.scenario, truth=truth.mechanism, margin=False)
     log, offsets = log_of(run, truth.mechanism, FRESH + seed, poses)
     found, seconds = identified(log, kind, poses)
@@ -316,10 +314,11 @@ def machines(kind: str) -> str:
     jobs = Parallel(n_jobs=int(os.environ.get("JOBS", "-1")))
     with TemporaryDirectory() as folder:
         motion = excitation(Path(folder))
+        calm = calm_torque(motion)
         return "\n".join(
             table(
                 f"{kind}, {'with pose' if poses else 'encoders alone'}",
-                jobs(delayed(find)(kind, seed, motion, poses) for seed in range(MACHINES)),
+                jobs(delayed(find)(kind, seed, motion, calm, poses) for seed in range(MACHINES)),
             )
             for poses in (False, True)
         )
@@ -371,7 +370,7 @@ SECTIONS = {"ranges": lambda: machines("ranges"), "drawing": lambda: machines("d
 
 def main() -> None:
     """Write the results of the sections that are asked for, all of them by default."""
-    RESULTS.mkdir(exist_ok=True)
+    RESULTS.mkdir(parents=True, exist_ok=True)
     names = sys.argv[1:] or list(SECTIONS)
     text = "\n".join(SECTIONS[name]() for name in names)
     made = ", ".join(f"{name} {version}" for name, version in versions().items())

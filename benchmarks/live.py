@@ -26,6 +26,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import xarray as xr
+from _page import QUICK, RESULTS, size
 
 import stewart_drake as sd
 from stewart_drake.files.versions import versions
@@ -34,12 +35,11 @@ from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
 
 ROOT = Path(__file__).parents[1]
-RESULTS = Path(__file__).parent / "results"
-MINUTES = float(os.environ.get("MINUTES", "10"))
+MINUTES = float(os.environ.get("MINUTES", "1" if QUICK else "10"))
 SIMULATED = float(os.environ.get("SIMULATED", "1"))
 """Of them, min; one ten seconds is as another after the first."""
-KILLS = int(os.environ.get("KILLS", "20"))
-PAUSES = int(os.environ.get("PAUSES", "3"))
+KILLS = size("KILLS", 20)
+PAUSES = size("PAUSES", 3)
 SEED = 29
 WAY = "low: 0.28, high: 0.32, loss: 0.02"
 """Evenly 20 ms to either side of 0.3 s."""
@@ -493,7 +493,7 @@ def main() -> None:
         parts = {head: part for head, part in parts.items() if not head.endswith(ending)}
         parts[lines[0]] = "\n".join(lines)
         head = f"Written by `python benchmarks/live.py`, with Drake {versions()['drake']}."
-        RESULTS.mkdir(exist_ok=True)
+        RESULTS.mkdir(parents=True, exist_ok=True)
         told = "\n\n".join(["# The loop in real time", head, *parts.values()])
         path.write_text(told + "\n")
 

@@ -19,7 +19,7 @@ from typing import Any, Final
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from _page import table, write
+from _page import size, table, write
 
 import stewart_drake as sd
 from stewart_drake.loop.bulk import run_in_bulk
@@ -101,7 +101,7 @@ def measure(scenario: Scenario, runs: int, seed: int, other: Executor) -> dict[s
 def main() -> None:
     """Measure, print, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=500)
+    parser.add_argument("--runs", type=int, default=size("RUNS", 500, least=5))
     parser.add_argument("--seed", type=int, default=20261)
     given = parser.parse_args()
     scenario = sd.load_scenario("paper", settings=["plant.kind=exact"])

@@ -6,19 +6,19 @@ an unknown delay, a machine that is not as drawn, a push, and the torques that a
 
 import os
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import RESULTS
+from _push import Push
 from joblib import Parallel, delayed
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 import stewart_drake as sd
 from stewart_drake.files.versions import versions
 from stewart_drake.scenario.loading import load_understood
 
-RESULTS = Path(__file__).parent / "results"
 EXACT, GRAVITY = ("plant.kind=exact",), ("plant.gravity=true",)
 ON, REST = ("start=on_reference", "queue=reference"), ()
 ALL = (
@@ -44,17 +44,8 @@ MACHINES = range(101, 106)
 SERVOS = ("servo_preview", "servo_feedforward")
 LAWS = ("predictor_lqi", "adaptive_lqi")
 KNOWN = "controller.estimator=none"
-
-
-class Push(LeafSystem):
-    """1 N along x at the plate's centre from t = 4 s on."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.DeclareVectorOutputPort("wrench", 6, self._push)
-
-    def _push(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([0, 0, 0, 1.0 if context.get_time() >= 4 else 0.0, 0, 0])
+PUSH = partial(Push, (1.0, 0.0, 0.0), (4.0, np.inf))
+"""1 N along x from t = 4 s on."""
 
 
 def as_built(seed: int) -> sd.Mechanism:
@@ -76,7 +67,7 @@ def run(
     result = sd.simulate(
         scenario,
         truth=None if machine is None else as_built(machine),
-        disturbance=Push if pushed else None,
+        disturbance=PUSH if pushed else None,
         margin=False,
     )
     peak = result.summary["peak_torque_applied"]
@@ -97,7 +88,7 @@ class Table:
     def done(self) -> None:
         """Do them."""
         jobs = [key for key, found in self.asked.items() if not found]
-        pool = Parallel(n_jobs=int(os.environ.get("JOBS", "2")), backend="multiprocessing")
+        pool = Parallel(n_jobs=int(os.environ.get("JOBS", "2")))
         results = pool(delayed(run)(*key) for key in jobs)
         self.asked |= dict(zip(jobs, results, strict=True))
 
@@ -186,6 +177,7 @@ along x from 4 s on.
 
 {not_seen(found)}
 """
+    RESULTS.mkdir(parents=True, exist_ok=True)
     (RESULTS / "servos.md").write_text(text, encoding="utf-8")
     print(text)
 

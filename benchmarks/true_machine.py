@@ -15,6 +15,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import RESULTS, size
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
@@ -23,11 +24,10 @@ from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.known import Known, save_known
 from stewart_drake.scenario.signals import PLANT_PARAMETERS
 
-RESULTS = Path(__file__).parent / "results"
 AMPLITUDES = np.tile([0.2617993878] * 3 + [0.02, 0.02, 0.08], 2)
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 STARTS = {"on the reference": ON_REFERENCE, "from rest": ()}
-SEEDS = range(100, 100 + int(os.environ.get("SEEDS", "5")))
+SEEDS = range(100, 100 + size("SEEDS", 5))
 BIAS = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
 THREE = (BIAS, "plant.payload_mass=0.4", "plant.joint_damping=1e-3")
 ASIDE = ("plant.payload_mass=0.4", "plant.payload_position=[0.03,-0.02,0.05]")
@@ -175,7 +175,7 @@ def main() -> None:
         for section in (friction, noisy, multibody, priors):
             parts.append(section(folder))
             print(parts[-1], flush=True)
-    RESULTS.mkdir(exist_ok=True)
+    RESULTS.mkdir(parents=True, exist_ok=True)
     (RESULTS / "true_machine.md").write_text("\n".join(parts))
 
 

@@ -1,4 +1,4 @@
-"""What the delay estimator leaves for a tuner: `python benchmarks/tuner_families.py FOLDER`.
+"""What the delay estimator leaves for a tuner: `python benchmarks/tuner_families.py [FOLDER]`.
 
 Fresh conditions of family T (`tune evaluate --family T` weighs all candidates without the delay
 estimator). The runs are kept in FOLDER, so that a second start goes on; the table goes to
@@ -13,6 +13,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from _page import RESULTS, size
 
 from stewart_drake.files.versions import versions
 from stewart_drake.scenario.config import AnnTunerConfig, RuleTunerConfig, Scenario
@@ -21,8 +22,7 @@ from stewart_drake.studies.jobs import run_jobs
 from stewart_drake.tuning.curves import LEAST, at_ratio
 from stewart_drake.tuning.worth import read_told, tuned_run
 
-RESULTS = Path(__file__).parent / "results" / "tuner_families.md"
-CONDITIONS = int(os.environ.get("CONDITIONS", "24"))
+CONDITIONS = size("CONDITIONS", 24)
 SEED = int(os.environ.get("SEED", "20263"))
 WORKERS = int(os.environ.get("WORKERS", "2"))
 ESTIMATOR = ("controller.delay_estimator=constant", "controller.delay_std=0.02")
@@ -86,8 +86,9 @@ def main(folder: Path) -> None:
         cells = [f"{done}", *(f"{x:.3g}" for x in (every, J.mean(), *g))]
         lines.append(f"| {name} | {' | '.join(cells)} |")
         print(lines[-1], flush=True)
-    RESULTS.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    (RESULTS / "tuner_families.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1] if sys.argv[1:] else "out/tuner-families"))

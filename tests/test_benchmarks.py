@@ -1,10 +1,14 @@
 """The scripts of benchmarks/ still find what they measure; their figures are no matter of tests."""
 
 import importlib
+import os
+import re
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
 
+import cloudpickle
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
@@ -29,6 +33,42 @@ def test_a_script_finds_what_it_imports(name, monkeypatch):
     if name in ("plants", "speed", "mujoco_model"):
         pytest.importorskip("mujoco")
     assert script(name, monkeypatch).__doc__
+
+
+def sent(path: Path) -> set[str]:
+    """Names of the functions that a script hands to `delayed`."""
+    return set(re.findall(r"\bdelayed\(([a-zA-Z_]+)\)", path.read_text(encoding="utf-8")))
+
+
+def test_what_scripts_send_to_workers_can_be_read_there(monkeypatch, tmp_path):
+    """A cached function of a script cannot: `identification.py` ended in BrokenProcessPool."""
+    scripts = {path.stem: sent(path) for path in FOLDER.glob("[a-z]*.py")}
+    scripts = {name: functions for name, functions in scripts.items() if functions}
+    assert {"identification", "tracking", "table2"} <= set(scripts)
+    code = (
+        "import pickle, sys; from pathlib import Path; packed = Path(sys.argv[1]).read_bytes()\n"
+        "sys.modules[Path(sys.argv[1]).name] = None; pickle.loads(packed)"
+    )
+    for name, functions in scripts.items():
+        module = script(name, monkeypatch)
+        # As joblib sends what a script defines, which is a __main__ that a worker has not.
+        cloudpickle.register_pickle_by_value(module)
+        packed = cloudpickle.dumps([vars(module).get(one) for one in functions])
+        cloudpickle.unregister_pickle_by_value(module)
+        (tmp_path / name).write_bytes(packed)
+        command = [sys.executable, "-c", code, str(tmp_path / name)]
+        surroundings = os.environ | {"PYTHONPATH": f"{FOLDER.parent}:{FOLDER}"}
+        done = subprocess.run(command, env=surroundings, capture_output=True, text=True)
+        assert done.returncode == 0, f"{name}: {done.stderr}"
+
+
+def test_every_script_shares_one_place_for_its_page_and_one_way_to_be_quick():
+    """`make bench QUICK=1` runs all of them at the least size, and overwrites no result."""
+    for path in FOLDER.glob("[a-z]*.py"):
+        text = path.read_text(encoding="utf-8")
+        assert "RESULTS =" not in text, f"{path.name}: takes RESULTS of _page.py"
+        for name in ("SEEDS", "MACHINES", "KILLS", "RUNS"):
+            assert f'environ.get("{name}"' not in text, f"{path.name}: takes size() of _page.py"
 
 
 def test_every_part_of_a_step_is_timed(monkeypatch):
