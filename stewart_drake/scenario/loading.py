@@ -1,14 +1,15 @@
 """Scenarios and controllers from files, overlays and settings.
 
 Precedence, lowest first: the scenario file, a controller laid over it, single settings. Each layer
-is checked on its own, so that a message names the place to mend.
+is checked on its own, so that a message names the place to mend. A field that is set where it has no
+effect is refused (`scenario.dependencies`), unless a layer above it made it so: then it is dropped.
 """
 
 import dataclasses
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import absolute_path, is_path, resolve, shipped
@@ -20,6 +21,7 @@ from stewart_drake.scenario.config import (
     understanding,
     with_actuator,
 )
+from stewart_drake.scenario.dependencies import Idle, idle_fields, reset
 
 _SETTINGS = "settings"
 _FILES = ("file", "known")
@@ -47,9 +49,12 @@ def load_scenario(
     Raises:
         ConfigError: the first problem, in one line.
     """
-    scenario, where = read_scenario(name_or_path, controller, settings)
-    scenario.check(where)
-    return scenario
+    read = read_scenario(name_or_path, controller, settings)
+    read.scenario.check(read.where)
+    for idle in idle_fields(read.scenario):
+        if place := read.asker(idle):
+            raise ConfigError(f"{place}: {idle.problem}")
+    return _without_idle(read.scenario)
 
 
 def load_understood(
@@ -57,35 +62,82 @@ def load_understood(
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
 ) -> Scenario:
-    """As `load_scenario`, with motors that understand the controller whatever the scenario's are.
+    """As `load_scenario`, for one of several controllers on a scenario.
 
     What the scenario says of servos is for controllers that send cranks. Others drive the same
-    machine without them, within the same torque limit.
+    machine without them, within the same torque limit. Fields without an effect are not refused.
     """
-    scenario, where = read_scenario(name_or_path, controller, settings)
+    scenario, where, *_ = read_scenario(name_or_path, controller, settings)
     scenario.actuator = understanding(scenario.controller.command, scenario.actuator)
     scenario.check(where)
-    return scenario
+    return _without_idle(scenario)
+
+
+class Read(NamedTuple):
+    """A scenario that was read.
+
+    Attributes:
+        scenario: its fields are checked one by one only.
+        where: what it is, for messages.
+        places: the file, or "settings", that set a field last, by the field's dotted name.
+        idle: names of the fields without an effect in the scenario's file by itself.
+        path: of that file.
+    """
+
+    scenario: Scenario
+    where: str
+    places: dict[str, str]
+    idle: set[str]
+    path: str
+
+    def asker(self, idle: Idle) -> str | None:
+        """Return the place that is to be mended, None if a layer above made the field idle.
+
+        A controller's file is for scenarios of any kind: only its own fields are to fit.
+        """
+        place = self.places.get(idle.field)
+        if place == self.path:
+            return place if idle.field in self.idle else None
+        return place if place == _SETTINGS or idle.other.startswith("controller.") else None
 
 
 def read_scenario(
     name_or_path: str | Path,
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
-) -> tuple[Scenario, str]:
-    """As `load_scenario`, its fields checked one by one only; and what it is, for messages."""
+) -> Read:
+    """Read a scenario, its fields checked one by one only."""
     path = resolve("scenario", name_or_path)
     data = load_yaml(path)
     _drop_foreign_nulls(data)
-    validate(Scenario, data, str(path))
+    idle = {one.field for one in idle_fields(validate(Scenario, data, str(path)))}
+    places = dict.fromkeys(_dotted_names(data), str(path))
     _make_paths_absolute(data, path.parent)
     if controller is not None:
-        data["controller"] = {**data.get("controller", {}), **load_controller(controller)}
+        laid = load_controller(controller)
+        places |= dict.fromkeys(_dotted_names({"controller": laid}), str(controller))
+        data["controller"] = {**data.get("controller", {}), **laid}
     overlay = _parse_settings(settings, data)
+    places |= dict.fromkeys(_dotted_names(overlay), _SETTINGS)
     for name, change in overlay.items():
         data[name] = _laid_over(name, data.get(name), change)
     where = f"{path} with settings" if overlay else str(path)
-    return validate(Scenario, data, str(path)), where
+    return Read(validate(Scenario, data, str(path)), where, places, idle, str(path))
+
+
+def _dotted_names(data: dict[str, Any], above: str = "") -> Iterator[str]:
+    """Every field in the data, with those that it is in."""
+    for name, value in data.items():
+        yield f"{above}{name}"
+        if isinstance(value, dict):
+            yield from _dotted_names(value, f"{above}{name}.")
+
+
+def _without_idle(scenario: Scenario) -> Scenario:
+    """The scenario with fields without an effect at their defaults."""
+    for idle in idle_fields(scenario):
+        reset(scenario, idle.field)
+    return scenario
 
 
 def load_controller(name_or_path: str | Path) -> dict[str, Any]:
@@ -113,7 +165,10 @@ def load_controller(name_or_path: str | Path) -> dict[str, Any]:
 
 
 def load_comparison(
-    name_or_path: str | Path, controllers: Iterable[str], settings: Iterable[str] = ()
+    name_or_path: str | Path,
+    controllers: Iterable[str],
+    settings: Iterable[str] = (),
+    refuse_idle: bool = True,
 ) -> dict[str, Scenario]:
     """Reads a scenario once for every controller, and for every further row of its `compare`.
 
@@ -123,6 +178,7 @@ def load_comparison(
     Args:
         name_or_path, settings: as of `load_scenario`.
         controllers: names or paths.
+        refuse_idle: whether to refuse a field that has an effect in no row.
 
     Returns:
         Scenarios by row: the controllers, then the further rows in the file's order.
@@ -132,20 +188,28 @@ def load_comparison(
     """
     settings = tuple(settings)
     others = tuple(s for s in settings if not s.strip().startswith("controller.delay_"))
-    unchecked, place = read_scenario(name_or_path, settings=settings)
-    unchecked.check_rows(place)
-    changes, rows = unchecked.compare, {}
+    unchecked = read_scenario(name_or_path, settings=settings)
+    unchecked.scenario.check_rows(unchecked.where)
+    changes, rows = unchecked.scenario.compare, {}
+    everywhere = {one.field for one in idle_fields(unchecked.scenario)}
     for row in dict.fromkeys([*controllers, *changes]):
         where, change = f"{name_or_path}: compare.{row}", dict(changes.get(row, {}))
         controller, actuator = change.pop("controller", row), change.pop("actuator", {})
         blind = load_controller(controller).get("delay_steps") == 0
-        scenario, _ = read_scenario(name_or_path, controller, others if blind else settings)
+        scenario = read_scenario(name_or_path, controller, others if blind else settings).scenario
         changed = dataclasses.asdict(scenario.controller) | change
         scenario.controller = validate(ControllerConfig, changed, where)
         motors = understanding(scenario.controller.command, scenario.actuator)
         scenario.actuator = with_actuator(plain(motors), actuator, where)
         scenario.check(where)
-        rows[row] = scenario
+        idle = {one.field: one for one in idle_fields(scenario)}
+        for field in idle.keys() & {f"controller.{name}" for name in change}:
+            raise ConfigError(f"{where}: {idle[field].problem}")
+        everywhere &= idle.keys()
+        rows[row] = _without_idle(scenario)
+    for one in idle_fields(unchecked.scenario) if refuse_idle else ():
+        if one.field in everywhere and (place := unchecked.asker(one)):
+            raise ConfigError(f"{place}: {one.problem}")
     return rows
 
 

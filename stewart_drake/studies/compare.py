@@ -148,16 +148,16 @@ def shown(scenario_name: str | Path, settings: Iterable[str] = ()) -> dict[str, 
         ConfigError: bad input.
     """
     settings = tuple(settings)
-    rows, further = load_comparison(scenario_name, CONTROLLERS, settings), list[str]()
+    rows, further = load_comparison(scenario_name, CONTROLLERS, settings, False), list[str]()
     aware = rows["predictor_lqi"]
     known = aware.delay.constant and believed_delay(aware) == aware.true_delay
     at_once = isinstance(aware.link, WireConfig) and aware.sensor.delay == 0
     if not known and at_once and not aware.controller.estimate_offsets:
         further.append(ADAPTIVE)
-    if isinstance(read_scenario(scenario_name, settings=settings)[0].actuator, ServoActuatorConfig):
+    if isinstance(
+        read_scenario(scenario_name, settings=settings).scenario.actuator, ServoActuatorConfig
+    ):
         further += SERVOS
-    if not further:
-        return rows
     return load_comparison(scenario_name, (*CONTROLLERS, *further), settings)
 
 
