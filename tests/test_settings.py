@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import shipped
 from stewart_drake.files.schema import spelling
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.config import PriorConfig, Scenario
-from stewart_drake.scenario.dependencies import NEEDS
+from stewart_drake.scenario.dependencies import NEEDS, idle_fields
 from stewart_drake.scenario.known import DELAY, Known, save_known
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import shown
@@ -252,6 +253,7 @@ NO_EFFECT: dict[str, Callable[[Scenario], bool]] = {
     "plant.accuracy": lambda sc: sc.plant.kind == "multibody",
     "plant.payload_position": lambda sc: sc.plant.payload_mass == 0,
     "plant.coulomb_speed": lambda sc: sc.plant.coulomb_friction == 0,
+    "actuator.gear_ratio": lambda sc: sc.actuator.rotor_inertia == 0,
     "delay.swing_frequency": lambda sc: sc.delay.swing == 0 or sc.link.kind == "network",
     "delay.jump_time": lambda sc: sc.delay.jump == 0 or sc.link.kind == "network",
     "delay.seed": lambda sc: sc.delay.jitter_std == 0 or sc.link.kind == "network",
@@ -288,6 +290,95 @@ def outcome(name: str, value: Any, chosen: tuple[Any, ...], before: Any) -> str:
         for one in before.data_vars
     )
     return "none" if same else "effective"
+
+
+# ---------------------------------------------------------------- what is refused, and where
+
+
+REFUSED = {
+    "controller.estimator=none": [
+        *("controller.estimate_coulomb=true", "controller.prior={payload: 0.1}"),
+        *("controller.prior={torque_bias: 0.1}", "controller.prior={damping: 0.1}"),
+    ],
+    "controller.delay_estimator=none": [
+        *("controller.rejoin=0.3", "controller.delay_std=0.1", "controller.delay_max=2.0"),
+    ],
+    "tuner.kind=rule": ["controller.w_Q=2.0", "controller.w_R=2.0"],
+    "controller.integral=false": ["controller.integral_weight=2.0"],
+    "sensor.kind=state": ["controller.prior={rates: [1, 1, 1, 1, 1, 1]}"],
+    "controller.estimate_offsets=false": ["controller.prior={offsets: 0.1}"],
+    "start=on_reference": ["controller.catch_up=1.0"],
+}
+
+
+@pytest.mark.parametrize("beside", REFUSED)
+def test_a_setting_without_an_effect_is_refused_in_one_line(beside: str) -> None:
+    assert load_scenario("paper", None, (beside,))
+    for setting in REFUSED[beside]:
+        with pytest.raises(
+            ConfigError, match=r"^settings: [\w.]+: got .* with .*; expected"
+        ) as said:
+            load_scenario("paper", None, (beside, setting))
+        name = setting.split("=")[0].split(".")[-1]
+        assert name in str(said.value) and beside.split("=")[0] in str(said.value)
+
+
+def test_every_row_of_the_table_names_fields_that_exist() -> None:
+    known = {name for chosen in SCENARIOS.values() for name in fields_of(load_scenario(*chosen))}
+    assert {name for row in NEEDS for name in (*row.fields, row.other)} <= known
+
+
+def test_a_field_of_the_file_may_be_made_useless_by_what_is_laid_over_it(tmp_path: Path) -> None:
+    mine, asked = tmp_path / "mine.yaml", "controller: {estimate_coulomb: true, w_Q: 3.0}\n"
+    mine.write_text(asked)
+    assert load_scenario(mine).controller.estimate_coulomb
+    assert not load_scenario(mine, "delay_lqr").controller.estimate_coulomb
+    assert load_scenario(mine, None, ("tuner.kind=rule",)).controller.w_Q == 1.0
+    assert load_scenario(mine, "delay_lqr").controller.w_Q == 3.0
+    with pytest.raises(ConfigError, match=r"^settings: controller\.estimate_coulomb"):
+        load_scenario(mine, "delay_lqr", ("controller.estimate_coulomb=true",))
+    mine.write_text(asked.replace("{", "{estimator: none, "))
+    with pytest.raises(ConfigError, match=r"mine\.yaml: controller\.estimate_coulomb: got true"):
+        load_scenario(mine)
+    assert load_scenario(mine, "predictor_lqi").controller.estimate_coulomb  # which uses it
+
+
+def test_a_controller_file_is_to_fit_by_itself(tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text("estimator: none\nestimate_coulomb: true\n")
+    with pytest.raises(ConfigError, match=r"own\.yaml: controller\.estimate_coulomb: got true"):
+        load_scenario("paper", own)
+    own.write_text("catch_up: 0.5\n")
+    assert load_scenario("table2", own).controller.catch_up is None  # it begins on the reference
+
+
+def test_a_comparison_refuses_what_no_row_uses(tmp_path: Path) -> None:
+    rows = shown("paper", ("controller.estimate_coulomb=true",))
+    assert rows["predictor_lqi"].controller.estimate_coulomb
+    assert not rows["delay_lqi"].controller.estimate_coulomb
+    late = ("controller.delay_steps=7", "controller.rejoin=0.3")
+    assert shown("paper", late)["adaptive_lqi"].controller.rejoin == 0.3
+    for settings in (late[1:], ("controller.estimator=none", "controller.estimate_coulomb=true")):
+        with pytest.raises(ConfigError, match=r"^settings: controller"):
+            shown("paper", settings)
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("compare: {delay_lqr: {integral_weight: 3.0}}\n")
+    with pytest.raises(ConfigError, match=r"compare\.delay_lqr: controller\.integral_weight"):
+        shown(mine)
+
+
+@pytest.mark.parametrize("name", shipped("scenario"))
+@pytest.mark.parametrize("controller", [None, *shipped("controller")])
+def test_everything_shipped_goes_together(name: str, controller: str | None) -> None:
+    servos = ("actuator.kind=servo",) if (controller or "").startswith("servo") else ()
+    scenario = load_scenario(name, controller, servos)
+    assert not idle_fields(scenario)
+
+
+def test_what_is_accepted_without_an_effect_stands_in_the_docs() -> None:
+    rows = [line for line in DOCS.read_text().splitlines() if line.startswith("| `")]
+    told = {word for row in rows for word in re.findall(r"`([\w.]+)", row.split("|")[1])}
+    assert "delay" in told and {name for name in NO_EFFECT if name[:6] != "delay."} <= told
 
 
 @pytest.mark.slow

@@ -18,12 +18,12 @@ class Needs(NamedTuple):
     Attributes:
         fields: names, dotted, as in files.
         other: field that decides whether these have an effect.
-        accepted: values of `other` with which they have; empty for any but 0.
+        accepted: values of `other` with which they have.
     """
 
     fields: tuple[str, ...]
     other: str
-    accepted: tuple[Any, ...] = ()
+    accepted: tuple[Any, ...]
 
 
 _TORQUE_LAW: Final = (
@@ -41,7 +41,6 @@ def _of_controller(*names: str) -> tuple[str, ...]:
 
 
 NEEDS: Final = (
-    Needs(("actuator.gear_ratio",), "actuator.rotor_inertia"),
     Needs(_of_controller("integral_weight"), "controller.integral", (True,)),
     Needs(_of_controller(*_FILTER), "controller.estimator", ("parameters",)),
     Needs(_of_controller("prior.rates"), "sensor.kind", ("encoders",)),
@@ -80,8 +79,9 @@ def idle_fields(scenario: Scenario) -> list[Idle]:
     found = []
     for row in NEEDS:
         place = _place(scenario, row.other)
-        got = getattr(*place) if place else None
-        if place is None or (got in row.accepted if row.accepted else got):
+        assert place is not None  # every section has such a field
+        got = getattr(*place)
+        if got in row.accepted:
             continue
         for field in row.fields:
             owner_and_name = _place(scenario, field)
@@ -90,7 +90,7 @@ def idle_fields(scenario: Scenario) -> list[Idle]:
             value, usual = getattr(*owner_and_name), _default(*owner_and_name)
             if value == usual or value in (0, None):
                 continue
-            accepted = " or ".join(map(_spelled, row.accepted)) or "other than 0"
+            accepted = " or ".join(map(_spelled, row.accepted))
             problem = (
                 f"{field}: got {_spelled(value)} with {row.other} {_spelled(got)}, where it has no "
                 f"effect; expected {_spelled(usual)}, or {row.other} {accepted}"

@@ -1,8 +1,9 @@
 """Scenarios and controllers from files, overlays and settings.
 
 Precedence, lowest first: the scenario file, a controller laid over it, single settings. Each layer
-is checked on its own, so that a message names the place to mend. A field that is set where it has no
-effect is refused (`scenario.dependencies`), unless a layer above it made it so: then it is dropped.
+is checked on its own, so that a message names the place to mend. A field that is set where it has
+no effect is refused (`scenario.dependencies`), unless a layer above it made it so: then it is
+dropped.
 """
 
 import dataclasses
