@@ -145,8 +145,6 @@ def _verdict(study: RobustnessStudy) -> tuple[str, Tone]:
         n = int(np.sum(~one.failed))
         text += f" With {name}, on the same machines: {n} of {total}."
     low = study.success.low
-    if study.undisturbed.status != "completed":
-        return text, "bad"
     return text, "good" if low >= _GOOD else "fair" if low >= _FAIR else "bad"
 
 
