@@ -23,7 +23,7 @@ from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, POSE, RAT
 Array = NDArray[np.float64]
 
 LONGEST_GAP: Final = 1.0
-"""s without a usable measurement, at most, whatever the uncertainty; without an estimator too."""
+"""Longest gap that is ever allowed, s; the gap that is allowed without an estimator."""
 _DEVIATIONS: Final = 3.0
 _STEP: Final = 1e-6
 """rad and m, of the differences that J is made of."""

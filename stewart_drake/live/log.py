@@ -26,11 +26,11 @@ from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, TUNER_INPUTS,
 Array = NDArray[np.float64]
 
 _WAITS: Final = 24
-"""Samples that a row waits to be told what acted then."""
+"""Longest wait of a row for the machine's report of what acted then, samples."""
 _LATEST: Final = 0.5
-"""s, the same."""
+"""The same in s."""
 _KEPT: Final = 96
-"""Periods for which it is remembered what acted."""
+"""Number of periods whose applied torques are kept."""
 
 
 class LiveRecord(Record):

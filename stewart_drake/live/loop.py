@@ -57,7 +57,7 @@ STANDS: Final = 0.005
 RESTING: Final = 8.0
 """s in which it must."""
 SILENT: Final = 1.0
-"""s, or ten periods, of silence that are told."""
+"""Silence that is reported, s, or ten periods."""
 PATIENCE: Final = 10.0
 """s of silence after which the controller gives up."""
 _LEAD: Final = 0.05
@@ -71,7 +71,7 @@ _SPARE: Final = 0.002
 _FURTHEST: Final = 4096
 """Samples ahead of the next one whose measurements are kept."""
 _GONE: Final = 64
-"""Samples after which what came is forgotten."""
+"""Number of past samples whose messages are kept."""
 
 
 class End(NamedTuple):
@@ -179,7 +179,7 @@ class Pace:
     overtaken: int = 0
 
     def summary(self, recorded: Array) -> dict[str, Any]:
-        """For summary.json, with `late` (n,) of the recorded steps."""
+        """Return entries of summary.json, from `late` (n,) of the recorded steps."""
         late = np.append(recorded, self.resting)
         late = late if len(late) else np.array([math.nan])
         median = float(np.median(late))
@@ -204,7 +204,7 @@ class LiveLoop:
         steering: of the reference, from t = 0 on.
         contact: a session that the machine has offered.
         viewer: who watches.
-        say: is told in a line what happens.
+        say: prints a line.
         max_missing: s without a usable measurement after which the run ends; None is as long as the
             estimator's uncertainty allows (`live.blind`).
         log: CSV file that the rows of the record are written to as they come; None is a temporary
@@ -350,7 +350,7 @@ class LiveLoop:
             k += 1
 
     def stop(self) -> None:
-        """The safe torque, said three times."""
+        """Order the safe torque, in three datagrams."""
         for _ in range(3):
             self._contact.send(flags=ControllerFlags.STOP | self._asked)
             clock.sleep(0.01)
@@ -378,7 +378,7 @@ class LiveLoop:
         return self._came.get(k)
 
     def _tell_lag(self, k: int) -> None:
-        """Say once that this process comes late, beside what the link adds."""
+        """Report once that this process is late by more than the link adds."""
         lag = now() - self._due(k) - self._contact.lateness(self._period) * SECOND
         if lag > STOOD and not self._late:
             self._say(
@@ -487,7 +487,7 @@ class LiveLoop:
         return End(status, Failure(k * self._period, None, math.nan, reason))
 
     def _may_miss(self, gap: float) -> bool:
-        """Return whether the run goes on after so many s without a usable measurement."""
+        """Return whether the run goes on after `gap` s without a usable measurement."""
         if gap < self._period / 2:
             return True
         if self._max_missing is not None:

@@ -1,8 +1,8 @@
 """A CSV file that grows by rows while a run goes on, written by a thread.
 
-Each row is written as a whole line, so that the file is readable up to its last row whatever ends
-the process. An error, such as a full disk, is said once; what was written stays, and the run goes
-on without the file.
+Each row is written as a whole line, so that the file is readable up to its last row after a kill
+of the process. An error, such as a full disk, is reported once. What was written stays, and the run
+goes on without the file.
 """
 
 import math

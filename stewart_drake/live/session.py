@@ -60,9 +60,9 @@ class Ready(NamedTuple):
 
     @property
     def jitter_problem(self) -> str | None:
-        """Why the link's jitter may lose the plate, in words, or None."""
+        """Reason for which the link's jitter may lose the plate, or None."""
         if self.margin.stable is False:
-            return "the loop is unstable whatever the jitter: the plate may be lost"
+            return "the loop is unstable even without jitter: the plate may be lost"
         jitter, on_wire = self.contact.link.jitter, self.design.experiment.scenario.link
         if isinstance(on_wire, NetworkConfig) or not jitter > self.margin.delay_margin:
             return None  # a torque that comes early waits for its play-out time
@@ -87,7 +87,7 @@ def prepare_session(
         key: shared with it; None for loopback.
 
     Raises:
-        ConfigError: one line, whatever does not fit.
+        ConfigError: one line that names what does not fit.
     """
     endpoint = open_endpoint(address, key)
     try:
@@ -116,7 +116,7 @@ def _in_time(experiment: Experiment) -> Experiment:
 
 
 def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
-    """What will happen, in lines, before anything moves."""
+    """Return lines on what will happen, before anything moves."""
     contact, made = ready.contact, ready.design
     machine, link, sc = contact.last, contact.link, made.experiment.scenario
     assert machine is not None
@@ -146,7 +146,7 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
 
 
 def _stability(ready: Ready) -> list[str]:
-    """Return lines on the loop's margin beside the link's jitter, and what helps."""
+    """Return lines that compare the loop's margin with the link's jitter, and what helps."""
     margin, link, sc = ready.margin, ready.contact.link, ready.design.experiment.scenario
     shorter, longer = (milliseconds(s) for s in (margin.margins.shorter, margin.margins.longer))
     judged = f"stable for delay errors from -{shorter} to +{longer}"
@@ -174,7 +174,7 @@ def _stability(ready: Ready) -> list[str]:
 
 
 def _cautions(made: Design) -> list[str]:
-    """How long a step takes, and what will go worse than in the scenario, in lines."""
+    """Return lines on the time of a step, and on what will go worse than in the scenario."""
     sc, (step, backend) = made.experiment.scenario, made.step
     period = sc.controller.period
     slow = f"; more than {_MOST:.0%}: expect missed deadlines" if step > _MOST * period else ""
@@ -262,7 +262,7 @@ def drive(
         accept_jitter: whether to start where the jitter is more than the loop is stable for.
         viewer: who watches.
         ending: whether to come to rest and end.
-        say: is told in a line what happens.
+        say: prints a line.
         max_missing: s without a usable measurement after which the run ends, see `LiveLoop`.
         log: file that the rows of the record are written to as they come, see `LiveLoop`.
 
@@ -295,8 +295,8 @@ def drive(
     summary = summarize(experiment, loop.record, status, stopped, wall, None)
     if len(late) < samples:
         summary["warnings"].append(
-            f"the log ends {(samples - len(late)) * period:.3g} s before the run; what is shown of "
-            "the run is from before that"
+            f"the log ends {(samples - len(late)) * period:.3g} s before the run; signals and "
+            "figures are of the time before that"
         )
     if len(late) < samples or not summary["measured_share"] >= LEAST_MEASURED:
         summary["accumulated_error"] = summary["cost"] = math.nan
@@ -311,7 +311,7 @@ def drive(
 
 
 def _told(loop: LiveLoop, contact: Contact, late: Array) -> dict[str, Any]:
-    """For summary.json."""
+    """Return `live` of summary.json."""
     link, last = contact.link, contact.last
     return loop.pace.summary(late) | {
         "taken_over": loop.taken_over,
