@@ -1,6 +1,6 @@
 """JSON, strict to read: one object, every key once, finite numbers, text that is text.
 
-Written whole or not at all, with null for what is no number.
+Written whole or not at all, with null for a number that is not finite.
 """
 
 import json
@@ -68,7 +68,7 @@ def load_json(path: Path, most: int, expected: str, *, sealed: bool = False) -> 
 
 
 def sealed_json(data: dict[str, Any]) -> bytes:
-    """Return a JSON object that begins with a checksum of what follows it."""
+    """Return a JSON object whose first key is a checksum of the rest."""
     rest = json.dumps(jsonable(data), allow_nan=False).encode()[1:]
     return b'{"crc32": "%08x", ' % zlib.crc32(rest) + rest
 

@@ -30,7 +30,7 @@ from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.studies.jobs import run_jobs
 
 ADAPTIVE: Final = "adaptive_lqi"
-"""Shown beside the others where the delay that they go by is not the true one."""
+"""Shown with the others where their delay is not the true one."""
 CONTROLLERS: Final = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
 """Shipped names, in the order of tables and legends: the paper's four, and ours."""
 SERVOS: Final = ("servo_preview", "servo_feedforward")
@@ -162,7 +162,7 @@ def shown(scenario_name: str | Path, settings: Iterable[str] = ()) -> dict[str, 
 
 
 def label(name: str) -> str:
-    """What tables and legends call a controller."""
+    """Return the name of a controller in tables and legends."""
     return LABELS.get(name, name)
 
 
@@ -223,12 +223,12 @@ def save_comparison(results: dict[str, SimulationResult], directory: str | Path)
 
 
 def comparison_summary(results: dict[str, SimulationResult]) -> dict[str, Any]:
-    """What `summary.json` of a comparison holds: each controller's summary by its name."""
+    """Return the content of `summary.json`: each controller's summary by its name."""
     return {"controllers": {name: result.summary for name, result in results.items()}}
 
 
 class _Board:
-    """Where each run notes its time and error and reads whether to stop; processes share a file."""
+    """File in which each run notes its time and error, and reads whether to stop."""
 
     def __init__(self, path: Path, runs: int, new: bool = False) -> None:
         self.path = path

@@ -88,8 +88,8 @@ def run_jobs(
         settings: what all jobs depend on, plain data. A folder that was begun with others is
             refused.
         suffix: of the files.
-        read: what becomes of a file. Where it raises ConfigError of one that an earlier start has
-            left, that job is done again, which a warning of the package's logger tells in one line.
+        read: reads a file. Where it raises ConfigError for a file of an earlier start, that job is
+            done again, with a warning of one line from the package's logger.
         workers: processes on this machine, with one numerical thread each; all cores by default.
         scheduler: address of a Dask scheduler, whose workers are used instead.
         progress: called at the start and for each finished job.
@@ -103,7 +103,7 @@ def run_jobs(
         ChildProcessError: a worker process died, e.g. for want of memory.
         OSError: a file cannot be written, e.g. because the disk is full.
         KeyboardInterrupt: Ctrl-C.
-        Exception: whatever `function` raised, with a note that names the job.
+        Exception: the exception of `function`, with a note that names the job.
     """
     for key in jobs:
         if not _KEY.fullmatch(key):
@@ -138,7 +138,7 @@ def finished(jobs: Mapping[str, Job], folder: str | Path, suffix: str = ".json")
 
 
 def _kept(paths: Mapping[str, Path], read: Callable[[Path], T]) -> dict[str, T]:
-    """What there is from an earlier start; a file that is damaged is as good as none."""
+    """Return the sound files of an earlier start; warn of damaged ones."""
     found, damaged = {}, []
     for key, path in paths.items():
         try:
@@ -214,7 +214,7 @@ def _check_manifest(folder: Path, settings: Mapping[str, Any], suffix: str) -> N
 
 
 def read_manifest(folder: Path, expected: str) -> Manifest:
-    """What the runs in a folder depend on.
+    """Return the settings that the runs in a folder depend on.
 
     Raises:
         ConfigError: there is none, or it is damaged; one line with what is `expected`.
@@ -284,7 +284,7 @@ def _call_packed(number: int, packed: bytes | str) -> tuple[str, bytes] | _Unsen
 def _on_this_machine(
     workers: int | None, calls: Sequence[Callable[[], tuple[str, bytes]]]
 ) -> Generator[tuple[str, bytes]]:
-    """What calls return, as they finish; closing the iterator ends the workers."""
+    """Yield what calls return, as they finish; closing the iterator ends the workers."""
     number = min(workers or joblib.cpu_count(), max(1, len(calls)))
     if number == 1:
         yield from (call() for call in calls)
@@ -322,9 +322,9 @@ def _on_this_machine(
 
 @contextmanager
 def _silent_trackers() -> Iterator[None]:
-    """Let processes that are started here say nothing of what a killed worker has left to clear.
+    """Silence the resource trackers of processes that are started here.
 
-    The trackers that clear it are processes of their own, which warn beside our one line.
+    They clear what a killed worker leaves, and would add warnings to our one line.
     """
     before = os.environ.get("PYTHONWARNINGS")
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [before, "ignore:resource_tracker"]))

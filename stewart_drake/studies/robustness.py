@@ -1,4 +1,4 @@
-"""How a scenario bears what is not known of the machine: many runs, each with one drawn machine."""
+"""Monte Carlo study of a scenario: many runs, each with one drawn machine."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -37,14 +37,14 @@ def study_robustness(
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> RobustnessStudy:
-    """Run a scenario undisturbed and then with so many drawn machines, or go on with it.
+    """Run a scenario undisturbed and then with drawn machines, or go on with an earlier study.
 
     Nothing is drawn where an undisturbed run, with this or another controller, does not complete.
 
     Args:
-        scenario: what is to be borne; draws add to what it says already.
+        scenario: to run; draws add to its own disturbances.
         directory: for runs.csv; the runs are kept in runs/. More runs may be asked for later.
-        ranges: of what is drawn, the defaults if None.
+        ranges: of the drawn quantities, the defaults if None.
         runs: number of draws.
         seed: of all draws.
         limit: E_ac in % s above which a completed run counts as failed, or None.
