@@ -159,6 +159,32 @@ def test_the_sizes_are_told_and_kept_to(tmp_path: Path) -> None:
     assert "@" not in readme
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("paper", ("start=on_reference", "queue=reference")),
+        ("paper", ("sensor.delay=0.2", "delay.fraction=0.3")),
+        pytest.param("gravity", ("controller.estimator=none",), marks=pytest.mark.soak),
+        pytest.param("gravity", ("delay.steps=0",), marks=pytest.mark.soak),
+    ],
+    ids=["paper", "late", "without estimator", "no delay"],
+)
+def test_odd_inputs_are_survived(
+    name: str, settings: tuple[str, ...], tmp_path: Path, compiler: list[str]
+) -> None:
+    """NaN, infinity, huge numbers, INT_MIN and INT_MAX, under both sanitizers."""
+    folder = exported(tmp_path, name, (*settings, "duration=0.5"))
+    shutil.copy(Path(__file__).with_name("odd_inputs.c"), folder)
+    names = "odd_inputs dynamics riccati law stewart_config stewart_motion"
+    sources = [f"{n}.c" for n in names.split()]
+    options = ["-std=c99", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    command = [*compiler, *options, *sources, "-lm", "-o", "odd_inputs"]
+    subprocess.run(command, cwd=folder, check=True)
+    done = subprocess.run(["./odd_inputs"], cwd=folder, capture_output=True, text=True)
+    assert (done.stdout, done.stderr, done.returncode) == ("odd inputs: survived\n", "", 0)
+
+
 PAINTED: Final = """
 #include <pthread.h>
 #include <stdio.h>

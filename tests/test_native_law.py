@@ -233,19 +233,17 @@ class Pair:
         self.late = round(sc.sensor.delay / sc.controller.period)
         self.weights = np.array([sc.controller.w_Q, sc.controller.w_R])
 
-    def step(self, k: int, noise: Array, spoil: Spoil | None) -> float:
-        """By how much the torques differ."""
+    def step(self, k: int, noise: Array, spoil: Spoil | None, lose: Spoil | None = None) -> float:
+        """By how much the torques differ; `lose` spoils the reference."""
         law, period = self.law, self.law.timeline.period
         age = min(self.late, k)
         y = self.states[-1 - age] + noise
         y = y if spoil is None else spoil(k, y)
         times = law.preview_times
-        reference = [evaluate(self.planned, max(0.0, k * period + t)) for t in times]
-        given = (
-            Measurement.of(y, age * period),
-            Preview(times, np.array(reference)),
-            self.weights,
-        )
+        reference = np.array([evaluate(self.planned, max(0.0, k * period + t)) for t in times])
+        reference = reference if lose is None else lose(k, reference)
+        weights = np.full(2, np.nan) if lose is not None and k in (6, 20) else self.weights
+        given = Measurement.of(y, age * period), Preview(times, reference), weights
         self.one = law.step(self.one, *given)
         self.other = self.native.step(self.other, *given)
         gap = float(np.abs(self.one.torque - self.other.torque).max())
@@ -276,6 +274,44 @@ def test_step_by_step_the_torques_are_those_of_python(library, case: str) -> Non
     assert max(gaps) <= 1e-9 * peak
     for count in HAPPENED.get(case, ()):
         assert getattr(pair.one.counts, count) > 0
+
+
+def lost(k: int, reference: Array) -> Array:
+    """One number, one row, all accelerations, the last rows, everything, and that several times."""
+    reference, rng = reference.copy(), np.random.default_rng(k)
+    if k in (4, 5, 9, 15):
+        reference.flat[rng.integers(reference.size)] = (np.nan, np.inf, -np.inf)[k % 3]
+    if k in (11, 33):
+        reference[rng.integers(len(reference))] = np.nan
+    if k == 13:
+        reference[:, 12:] = np.inf
+    if k == 17:
+        reference[-2:] = np.nan
+    if k in (0, 22, 23, 24):
+        reference[:] = np.nan
+    return reference
+
+
+@pytest.mark.parametrize("case", ["paper", "a fraction of a period", "no delay", "gravity"])
+@pytest.mark.parametrize("start", ["measured", "unmeasured"])
+def test_a_reference_that_is_missing_is_continued_as_in_python(
+    library, case: str, start: str
+) -> None:
+    """The same torques, counts and memory; with weights that are no numbers, too."""
+    name, settings, _ = CASES[case]
+    pair = Pair(library, name, (*settings, "start=on_reference", "queue=reference"))
+    gaps, peak = [], 0.0
+    for k in range(40):
+        blind = np.full(12, np.nan) if start == "unmeasured" and k < 2 else np.zeros(12)
+        gaps.append(pair.step(k, blind, None, lost))
+        one, other = pair.one, pair.other
+        peak = max(peak, float(np.abs(one.torque).max()))
+        assert one.counts == other.counts, k
+        for part in (lambda m: m.error, lambda m: m.integral, lambda m: m.torque):
+            assert np.all(np.isfinite(part(one))), k
+            assert np.allclose(part(one), part(other), rtol=1e-8, atol=1e-11), k
+    assert max(gaps) <= 1e-9 * peak
+    assert pair.one.counts.references_missing == 12
 
 
 def test_what_was_sent_in_its_place_is_in_flight(library) -> None:

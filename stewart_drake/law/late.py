@@ -67,7 +67,7 @@ class LateObserver:
         assert isinstance(belief, LateBelief) and belief.past is not None
         past, behind = belief.past, belief.behind + 1
         age = round(measurement.age / past.timeline.period)
-        there = bool(np.any(measurement.valid))
+        there = bool(np.any(measurement.valid)) and age >= 0
         wanted = min(age, self.longest) if there else self.longest
         fault: str | None = "measurements_missing" if not there else None
         partly: tuple[str, ...] = ()

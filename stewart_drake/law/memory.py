@@ -9,6 +9,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Sent
+from stewart_drake.law.motion import Previewed
 from stewart_drake.scenario.signals import NUM_TORQUES
 
 Array = NDArray[np.float64]
@@ -26,6 +27,8 @@ class Counts(NamedTuple):
         measurements_rejected: measurements that the plate cannot have, or that the filter takes
             for outliers, or values of theirs.
         saturated_steps: samples with a torque at the limit.
+        references_missing: samples with NaN or infinity in the reference, which continued from the
+            last one.
     """
 
     riccati_failures: int = 0
@@ -35,6 +38,7 @@ class Counts(NamedTuple):
     measurements_frozen: int = 0
     measurements_rejected: int = 0
     saturated_steps: int = 0
+    references_missing: int = 0
 
     def plus(self, *causes: str | None) -> "Counts":
         """One more of each cause that is not None."""
@@ -73,6 +77,7 @@ class Memory:
         path: that was planned in flight, or None.
         silence: samples that are still to go on without feedback.
         feedforward: (6,) how much of `torque` rests on no measurement; NaN before the first sample.
+        reference: that was followed, None before the first sample.
     """
 
     in_flight: Array
@@ -89,6 +94,7 @@ class Memory:
     path: Trajectory | None = None
     silence: int = 0
     feedforward: Array = field(default_factory=lambda: np.full(NUM_TORQUES, np.nan))
+    reference: Previewed | None = None
 
     def without_error(self) -> "Memory":
         """The same with nothing integrated."""

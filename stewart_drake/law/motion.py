@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.law.timeline import Timeline
+from stewart_drake.scenario.signals import ACCELERATIONS, NUM_COORDINATES, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
 
 Array = NDArray[np.float64]
@@ -59,3 +62,79 @@ class KnownMotion:
     def __call__(self, times: Array) -> Array:
         """`planned` at all of `times`."""
         return np.array([evaluate(self.planned, max(0.0, self.now + t)) for t in times])
+
+
+class Previewed(NamedTuple):
+    """A reference as it was followed: instants (p,) in s from its sample, rows (p, 18) there."""
+
+    times: Array
+    reference: Array
+
+
+def completed(given: Previewed, last: Previewed | None, timeline: Timeline) -> Array:
+    """Return the reference (p, 18), with numbers for what is NaN or infinite in the given one.
+
+    They lie between the rows next to them in time, of this preview or of the last one, or continue
+    one of them. Without any complete row, which is at the start only, they stay missing.
+
+    Args:
+        given: for this sample.
+        last: what `completed` returned for the sample before, with its instants, or None.
+        timeline: period and delay.
+    """
+    times, preview = given
+    finite = np.all(np.isfinite(preview), axis=1)
+    if np.all(finite):
+        return preview
+    known, rows = times[finite], preview[finite]
+    if last is not None:
+        there = np.all(np.isfinite(last.reference[1:]), axis=1)
+        known = np.append(known, last.times[1:][there] - timeline.period)
+        rows = np.vstack([rows, last.reference[1:][there]])
+    if not len(known):
+        return preview.copy()
+    rate = 2 / (timeline.eta + timeline.period)
+    complete = preview.copy()
+    for i in np.flatnonzero(~finite):
+        gaps = known - times[i]
+        sides = [np.where(gaps <= 0, -gaps, np.inf), np.where(gaps > 0, gaps, np.inf)]
+        nearest = [int(np.argmin(side)) for side in sides if np.isfinite(side).any()]
+        j, k = nearest[0], nearest[-1]
+        if j == k:
+            found = _continued(rows[j], -gaps[j], rate)
+        else:
+            found = between(rows[j], rows[k], gaps[k] - gaps[j], gaps[j] / (gaps[j] - gaps[k]))
+        v, near = preview[i, RATES], [j, k] if j != k else [j]
+        if np.all(np.isfinite(v)) and np.all(np.abs(gaps[near]) >= timeline.period / 20):
+            # (v1 - v) / h = (a + a1) / 2, to each side
+            slopes = 2 * (rows[near][:, RATES] - v) / gaps[near, None]
+            found[ACCELERATIONS] = np.mean(slopes - rows[near][:, ACCELERATIONS], axis=0)
+        complete[i] = np.where(np.isfinite(preview[i]), preview[i], found)
+    return complete
+
+
+def _continued(row: Array, later: float, w: float) -> Array:
+    """Return the reference (18,) `later` s after a row, coming to rest with the rate w in 1/s.
+
+    From da/dt = -2 w a - w^2 v, with b = a0 + w v0: v = (v0 + b t) e^(-w t).
+    """
+    x, v, a = row[POSE], row[RATES], row[ACCELERATIONS]
+    left, b = np.exp(-w * later), a + w * v
+    moved = (v * (1 - left) + b / w * (1 - left * (1 + w * later))) / w
+    return np.concatenate([x + moved, left * (v + b * later), left * (a - w * b * later)])
+
+
+def between(a: Array, b: Array, h: float, s: float) -> Array:
+    """Return the reference (18,) at the share s of the way between two rows that are h s apart.
+
+    The polynomial of fifth order with their poses, rates and accelerations.
+    """
+    (p0, v0, a0), (p1, v1, a1) = (row.reshape(3, NUM_COORDINATES) for row in (a, b))
+    v0, v1, a0, a1 = h * v0, h * v1, h * h * a0, h * h * a1
+    c2, d = a0 / 2, p1 - p0 - v0 - a0 / 2
+    e, f = v1 - v0 - a0, a1 - a0
+    c3, c4, c5 = 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2
+    pose = p0 + s * (v0 + s * (c2 + s * (c3 + s * (c4 + s * c5))))
+    rates = v0 + s * (2 * c2 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))
+    accelerations = 2 * c2 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))
+    return np.concatenate([pose, rates / h, accelerations / h**2])

@@ -26,7 +26,7 @@ from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
-from stewart_drake.law.motion import Motion
+from stewart_drake.law.motion import Motion, Previewed, completed
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import Observer
 from stewart_drake.law.planner import NoPlanner, Planner
@@ -188,7 +188,10 @@ class PredictiveLqi:
         samples = 1 + len(self.predictor.samples(belief.timeline))
         as_assumed = belief.timeline == self.timeline
         times = self.preview_times if as_assumed else self.times_for(belief.timeline)
-        preview = followed.motion(times)
+        given = Previewed(times, followed.motion(times))
+        preview = completed(given, memory.reference, belief.timeline)
+        if preview is not given.reference:  # which spoils the plan as a limit does
+            memory = replace(memory, silence=0)
         nodes_end = samples + 2 * (self.predictor.pending(belief.timeline) + 3)
         wanted, nodes = preview[:samples, :NUM_STATE], preview[samples:nodes_end]
         if not belief.has_state:  # nothing else to go on with
@@ -217,10 +220,12 @@ class PredictiveLqi:
                 trouble,
                 "nonfinite_torque" if nonfinite else None,
                 "saturated_steps" if saturated else None,
+                None if preview is given.reference else "references_missing",
             ),
             path=followed.path,
             silence=max(memory.silence - 1, 0),
             feedforward=feedforward,
+            reference=Previewed(times, preview),
             plan=plan,
             sent=self.channel.send(sent, plan, memory.in_flight),
         )
@@ -235,6 +240,8 @@ class PredictiveLqi:
         weights: Array,
     ) -> tuple[Belief, Response]:
         """What is done, and the belief that it goes by."""
+        if not np.all(np.isfinite(nodes)):  # nothing to follow yet: hold the torque
+            return belief, self._unregulated(memory.torque, memory, belief, wanted)
         # A limit spoils the plan: what it takes away is known without a measurement.
         quiet = memory.silence > 0 and not self.plant.motors.reached(memory.in_flight)
         if belief.feeds_back and not quiet:
@@ -267,12 +274,16 @@ class PredictiveLqi:
     def _go_on_alone(self, memory: Memory, belief: Belief, wanted: Array, nodes: Array) -> Response:
         """The feedforward of what is known beforehand; errors do not count."""
         held, _ = self.feedforward.held(nodes, self.plant.dynamics, belief.parameters)
+        return self._unregulated(held[-1], memory, belief, wanted)
+
+    def _unregulated(
+        self, torque: Array, memory: Memory, belief: Belief, wanted: Array
+    ) -> Response:
+        """A torque without feedback; errors do not count."""
         nothing = np.zeros(NUM_COORDINATES)
-        none, ahead = (
-            self._no_gain(belief.timeline),
-            Ahead(wanted[-1], np.zeros(NUM_STATE), nothing),
-        )
-        return Response(held[-1], nothing, memory.integral, ahead, none, None, held[-1])
+        ahead = Ahead(wanted[-1], np.zeros(NUM_STATE), nothing)
+        none = self._no_gain(belief.timeline)
+        return Response(torque, nothing, memory.integral, ahead, none, None, torque)
 
     def _plan(
         self, first: Array, belief: Belief, ahead: Ahead, queue: Array, gain: Array, preview: Array

@@ -1,6 +1,7 @@
 /* The predictive LQI law: see stewart.h. law/predictive_lqi.py and its parts are the reference, with
    the derivations; names and order of operations are theirs. */
 
+#include <limits.h>
 #include <string.h>
 
 #include "stewart.h"
@@ -678,7 +679,7 @@ static void advance(const interval *t, stewart_memory *m, const real *y, stewart
     copy(ALL, m->mean, prior->mean);
     copy(ALL * ALL, m->covariance, prior->covariance);
     if (!y) {
-        m->unseen++;
+        m->unseen += m->unseen < INT_MAX;
         if (attempt(t, prior, NULL, &f->found, w)) {
             remember(m, &f->found);
             m->outliers = 0;
@@ -706,7 +707,7 @@ static void advance(const interval *t, stewart_memory *m, const real *y, stewart
     }
     remember(m, &f->alone);
     m->outliers = outliers;
-    m->unseen++;
+    m->unseen += m->unseen < INT_MAX;
     copy(X, y, m->outlier);
 }
 
@@ -778,6 +779,7 @@ static int estimate(const stewart_config *c, stewart_memory *m, const real *y, i
     int there = 0;
     for (int i = 0; i < X; i++)
         there |= isfinite(y[i]) != 0;
+    there &= age >= 0;
     int fault = there ? 0 : STEWART_MEASUREMENT_MISSING;
     int wanted = there && age < c->longest_wait ? age : c->longest_wait;
     m->behind++;
@@ -800,6 +802,94 @@ static int estimate(const stewart_config *c, stewart_memory *m, const real *y, i
         }
     }
     return fault;
+}
+
+/* ---- the reference: law/motion.py -------------------------------------------------------------- */
+
+/* The reference `later` s after a row of it (negative: before). It comes to rest with the rate w:
+   da/dt = -2 w a - w^2 v, of accelerations a and rates v. */
+static void continued(const real *from, real later, real w, real *row)
+{
+    real left = REAL(exp)(-w * later);
+    for (int i = 0; i < 6; i++) {
+        real v = from[6 + i], a = from[12 + i], b = a + w * v;
+        row[i] = from[i] + (v * (1 - left) + b / w * (1 - left * (1 + w * later))) / w;
+        row[6 + i] = left * (v + b * later);
+        row[12 + i] = left * (a - w * b * later);
+    }
+}
+
+/* The share s of the way between two rows that are h seconds apart: the polynomial of fifth order. */
+static void between(const real *from, const real *to, real h, real s, real *row)
+{
+    for (int i = 0; i < 6; i++) {
+        real v0 = h * from[6 + i], v1 = h * to[6 + i], a0 = h * h * from[12 + i];
+        real a1 = h * h * to[12 + i], c2 = a0 / 2, d = to[i] - from[i] - v0 - c2, e = v1 - v0 - a0;
+        real f = a1 - a0, c3 = 10 * d - 4 * e + f / 2, c4 = -15 * d + 7 * e - f;
+        real c5 = 6 * d - 3 * e + f / 2;
+        row[i] = from[i] + s * (v0 + s * (c2 + s * (c3 + s * (c4 + s * c5))));
+        row[6 + i] = (v0 + s * (2 * c2 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))) / h;
+        row[12 + i] = (2 * c2 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))) / (h * h);
+    }
+}
+
+/* Accelerations from rates v and the rows before and after, `later` s away, unless one is next to it:
+   (v1 - v) / h = (a + a1) / 2. */
+static void slopes(const real *const next[2], const real later[2], const real *v, real closest,
+                   real *accelerations)
+{
+    int sides = 0;
+    real sum[6] = {0};
+    for (int side = 0; side < 2; side++)
+        if (next[side] && REAL(fabs)(later[side]) < closest)
+            return;
+        else if (next[side] && ++sides)
+            for (int i = 0; i < 6; i++)
+                sum[i] += 2 * (next[side][6 + i] - v[i]) / later[side] - next[side][12 + i];
+    for (int i = 0; i < 6; i++)
+        accelerations[i] = sum[i] / (real)sides;
+}
+
+/* `preview` of the workspace: the given one, in which what is missing of a row lies between the rows
+   next to it in time, of this preview or the last one, or continues one of them. Without any, which is
+   at the start only, it stays missing. The status. */
+static int complete(const stewart_config *c, stewart_memory *m, const real *given,
+                    stewart_workspace *w)
+{
+    enum { R = STEWART_REFERENCE };
+    real times[STEWART_PREVIEW], found[R];
+    const int n = stewart_preview_times(c, times), missing = !all_finite(R * n, given);
+    const real rate = 2 / (((real)c->steps + c->fraction + 1) * c->period);
+    copy(R * n, given, w->preview);
+    for (int i = 0; missing && i < n; i++) {
+        const real *next[2] = {NULL, NULL}; /* before and after */
+        real later[2] = {-(real)HUGE_VAL, (real)HUGE_VAL};
+        for (int j = 0; j < 2 * n - 1; j++) {
+            int last = j >= n, k = last ? j - n + 1 : j;
+            const real *source = last ? m->reference[k - 1] : given + R * k;
+            real gap = times[k] - times[i] - (last ? c->period : 0);
+            int side = gap > 0;
+            if ((side ? gap < later[1] : gap > later[0]) && all_finite(R, source)) {
+                next[side] = source;
+                later[side] = gap;
+            }
+        }
+        if (next[0] && next[1])
+            between(next[0], next[1], later[1] - later[0], later[0] / (later[0] - later[1]), found);
+        else if (next[0] || next[1])
+            continued(next[!next[0]], -later[!next[0]], rate, found);
+        else
+            break;
+        real *row = w->preview + R * i;
+        if (all_finite(6, row + 6))
+            slopes(next, later, row + 6, c->period / 20, found + 12);
+        for (int k = 0; k < R; k++)
+            if (!isfinite(row[k]))
+                row[k] = found[k];
+    }
+    for (int i = 1; i < n; i++)
+        copy(R, w->preview + R * i, m->reference[i - 1]);
+    return missing ? STEWART_REFERENCE_MISSING : 0;
 }
 
 /* ---- the law: law/predictive_lqi.py and its parts --------------------------------------------- */
@@ -1045,13 +1135,20 @@ static int feed_back(const stewart_config *c, stewart_memory *m, const real *pre
     return trouble;
 }
 
+/* A torque in flight, if it is finite. */
+static void keep(const real *torque, real *in_flight)
+{
+    if (all_finite(U, torque))
+        copy(U, torque, in_flight);
+}
+
 void stewart_init(const stewart_config *c, stewart_memory *m, const real *queue)
 {
     const int length = stewart_queue_length(c);
     memset(m, 0, sizeof *m);
-    copy(U * length, queue, m->in_flight[1 + c->kept]);
-    if (length > 0)
-        copy(U, queue + U * (length - 1), m->torque);
+    for (int i = 0; i < length; i++)
+        keep(queue + U * i, m->in_flight[1 + c->kept + i]);
+    copy(U, m->in_flight[c->kept + length], m->torque);
     fill(X, (real)NAN, m->mean);
     copy(THETA, c->estimates ? c->prior : c->parameters, m->mean + X);
     fill(ALL * ALL, (real)NAN, m->covariance);
@@ -1062,6 +1159,7 @@ void stewart_init(const stewart_config *c, stewart_memory *m, const real *queue)
     fill(2, (real)NAN, m->weights);
     fill(U, (real)NAN, m->feedforward);
     fill(U * STEWART_MAX_ORDER, (real)NAN, m->gain);
+    fill((STEWART_PREVIEW - 1) * STEWART_REFERENCE, (real)NAN, m->reference[0]);
     m->silence = c->silence;
 }
 
@@ -1070,14 +1168,22 @@ int stewart_step(const stewart_config *c, stewart_memory *m, stewart_workspace *
                  real *torque)
 {
     const int length = in_flight_length(c);
-    const real *nodes = preview + STEWART_REFERENCE * (1 + c->steps);
     int status = estimate(c, m, measurement, age, w);
+    status |= complete(c, m, preview, w);
+    preview = w->preview;
+    if (status & STEWART_REFERENCE_MISSING) /* which spoils the plan as a limit does */
+        m->silence = 0;
+    const real *nodes = preview + STEWART_REFERENCE * (1 + c->steps);
     if (!all_finite(X, m->state)) { /* nothing else to go on with */
         copy(X, preview, m->state);
         if (m->behind == 0 && c->longest_wait == 0)
             copy(X, preview, m->mean);
     }
-    if (m->silence > 0 && !at_limit(c, length, m->in_flight[0])) {
+    if (!all_finite(STEWART_REFERENCE, preview)) { /* nothing to follow yet: hold the torque */
+        copy(U, m->torque, torque);
+        copy(U, torque, m->feedforward);
+        fill(6, 0, m->error);
+    } else if (m->silence > 0 && !at_limit(c, length, m->in_flight[0])) {
         held h;
         feed_forward(c, c->parameters, nodes, &h);
         copy(U, h.torque[c->fraction > 0], torque);
@@ -1101,10 +1207,10 @@ int stewart_step(const stewart_config *c, stewart_memory *m, stewart_workspace *
     copy(U, torque, m->torque);
     copy(X, measurement, m->measurement);
     copy(2, weights, m->weights);
-    m->has_started = 1;
+    m->has_started = all_finite(X, m->state);
     m->silence -= m->silence > 0;
     for (int i = 0; i < STEWART_CAUSES; i++)
-        m->counts[i] += (status >> i) & 1;
+        m->counts[i] += m->counts[i] < INT_MAX ? (status >> i) & 1 : 0;
     return status;
 }
 
@@ -1117,7 +1223,7 @@ void stewart_acted(const stewart_config *c, stewart_memory *m, int ago, int numb
                    const real *torques)
 {
     const int length = in_flight_length(c);
-    for (int i = 0; i < number; i++)
-        if (ago + i >= 1 && ago + i <= length)
-            copy(U, torques + U * i, m->in_flight[length - ago - i]);
+    for (int place = 1; number > 0 && place <= length; place++)
+        if (ago <= place && ago > place - number)
+            keep(torques + U * (place - ago), m->in_flight[length - place]);
 }

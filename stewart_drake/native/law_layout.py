@@ -11,6 +11,7 @@ from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
     NUM_PARAMETERS,
     NUM_PLANT_PARAMETERS,
+    NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
 )
@@ -33,6 +34,7 @@ CAUSES: Final = (
     "measurements_frozen",
     "measurements_rejected",
     "saturated_steps",
+    "references_missing",
 )
 """Names of the bits of a status, as of `law.memory.Counts`."""
 
@@ -74,6 +76,7 @@ MEMORY_FIELDS: Final[Fields] = {
     "torque": NUM_TORQUES,
     "feedforward": NUM_TORQUES,
     "weights": 2,
+    "reference": (MAX_QUEUE + 8, NUM_REFERENCE),
 }
 MEMORY_FLAGS: Final = (
     *("has_covariance", "has_gain", "has_started"),

@@ -33,9 +33,10 @@ enum {
     STEWART_MEASUREMENT_MISSING = 8,  /* the model stood in for it, and for the next two */
     STEWART_MEASUREMENT_FROZEN = 16,
     STEWART_MEASUREMENT_REJECTED = 32,
-    STEWART_SATURATED = 64            /* a torque is at the limit */
+    STEWART_SATURATED = 64,           /* a torque is at the limit */
+    STEWART_REFERENCE_MISSING = 128   /* NaN or infinity in the preview: the reference continued */
 };
-#define STEWART_CAUSES 7
+#define STEWART_CAUSES 8
 
 /* What the controller knows; constant. */
 typedef struct {
@@ -78,6 +79,7 @@ typedef struct {
     real torque[STEWART_MOTORS];                   /* the last, as asked for */
     real feedforward[STEWART_MOTORS];              /* and how much of it takes no measurement */
     real weights[2];
+    real reference[STEWART_PREVIEW - 1][STEWART_REFERENCE]; /* the last preview but its first row */
     int has_covariance, has_gain, has_started;
     int outliers; /* in a row that bear each other out */
     int unseen;   /* periods since a measurement was last used */
@@ -86,7 +88,7 @@ typedef struct {
     int counts[STEWART_CAUSES];
 } stewart_memory;
 
-/* Place to compute in, between 40 and 60 kB; keeps nothing from one call to the next. */
+/* Place to compute in, of 68 to 82 kB in double precision; keeps nothing from one call to the next. */
 typedef struct stewart_workspace stewart_workspace;
 
 /* Torques in flight at a sample. */
@@ -95,15 +97,19 @@ int stewart_queue_length(const stewart_config *config);
 /* Instants (s from now) at which the reference must be known for a step; returns how many. */
 int stewart_preview_times(const stewart_config *config, real *times);
 
-/* Before the first step; `queue` has the torques that are under way, the oldest first. */
+/* Before the first step; `queue` has the torques that are under way, the oldest first. A torque that is
+   not finite counts as 0. */
 void stewart_init(const stewart_config *config, stewart_memory *memory, const real *queue);
 
 /* One sample.
 
    measurement: a state; what is lost is NaN.
-   age: of it in periods, 0 where measurements are those of now.
-   preview: the reference at the instants of `stewart_preview_times`, a row each.
-   weights: of errors and of torques.
+   age: of it in periods, 0 where measurements are those of now. A measurement with an age below 0 is
+     lost.
+   preview: the reference at the instants of `stewart_preview_times`, a row each. What is NaN or
+     infinite continues from the rows next to it and from the last preview. At the first sample, without
+     a complete row, the torque is the last one in flight.
+   weights: of errors and of torques. With weights that are not finite the last gain is used.
    torque: what to send, as asked for; the motors' limit stands behind it.
    Returns what went wrong, bits of the enumeration above. */
 int stewart_step(const stewart_config *config, stewart_memory *memory, stewart_workspace *work,
@@ -114,8 +120,8 @@ int stewart_step(const stewart_config *config, stewart_memory *memory, stewart_w
 void stewart_sent(const stewart_config *config, stewart_memory *memory, const real *torque);
 
 /* What has acted, where that may not be what was sent: `number` torques, the newest first, the first
-   in the place of the one computed `ago` >= 1 samples before the next step. What is longer ago than is
-   remembered is of no more use. */
+   in the place of the one computed `ago` >= 1 samples before the next step. Torques that are older than
+   the memory, or not finite, change nothing. */
 void stewart_acted(const stewart_config *config, stewart_memory *memory, int ago, int number,
                    const real *torques);
 

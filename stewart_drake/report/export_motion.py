@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.scenario.signals import NUM_REFERENCE
+from stewart_drake.law.motion import between
 from stewart_drake.scenario.trajectories import evaluate
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ def _refine(
     """Append what is needed after `a`, up to `b`."""
     span = b[0] - a[0]
     off = [
-        np.abs(between(a, b, share) - evaluate(motion, a[0] + share * span)) / size
+        np.abs(between(a[1:], b[1:], span, share) - evaluate(motion, a[0] + share * span)) / size
         for share in _LOOKS
     ]
     if np.max(off) > TOLERANCE and halves > 0:
@@ -63,17 +63,3 @@ def _refine(
         _refine(motion, middle, b, size, found, halves - 1)
     else:
         found.append(b)
-
-
-def between(a: Array, b: Array, share: float) -> Array:
-    """(18,) of the polynomial between two knots (19,), at a share of the way."""
-    h, s = b[0] - a[0], share
-    (p0, v0, a0), (p1, v1, a1) = (row[1:].reshape(3, NUM_REFERENCE // 3) for row in (a, b))
-    v0, v1, a0, a1 = h * v0, h * v1, h * h * a0, h * h * a1
-    c2, d = a0 / 2, p1 - p0 - v0 - a0 / 2
-    e, f = v1 - v0 - a0, a1 - a0
-    c3, c4, c5 = 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2
-    pose = p0 + s * (v0 + s * (c2 + s * (c3 + s * (c4 + s * c5))))
-    rates = v0 + s * (2 * c2 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))
-    accelerations = 2 * c2 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))
-    return np.concatenate([pose, rates / h, accelerations / h**2])

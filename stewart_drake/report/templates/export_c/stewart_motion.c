@@ -21,6 +21,7 @@ static const double knots[KNOTS][1 + STEWART_REFERENCE] = {
 void stewart_reference(double t, real *reference)
 {
     int low = 0, high = KNOTS - 1;
+    t = t > knots[low][0] ? t : knots[low][0]; /* and for NaN */
     t = t < knots[high][0] ? t : knots[high][0];
     while (high - low > 1) {
         int middle = (low + high) / 2;

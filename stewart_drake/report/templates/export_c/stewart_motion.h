@@ -18,7 +18,7 @@ extern const stewart_identity stewart_own_identity;
 /* The words of each fault, with a place for the leg or the duration in s. */
 extern const char *const stewart_faults[STEWART_FAULTS];
 
-/* What is followed, at t >= 0: pose, rates, accelerations. */
+/* The reference at t: pose, rates, accelerations. Before 0 it is that at 0, and for NaN too. */
 void stewart_reference(double t, real *reference);
 
 #endif
