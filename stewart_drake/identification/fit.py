@@ -14,13 +14,14 @@ and the inverse of the last matrix, without damping, is the covariance of p, wha
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.identification.logs import ANGLES, KINDS, NUM_MEASURED, POSE
-from stewart_drake.identification.model import NUM_DYNAMIC, MachineModel
+from stewart_drake.identification.model import NUM_DYNAMIC, DrawnModel, MachineModel
 from stewart_drake.identification.shooting import (
     FIRST,
     NUMBERS,
@@ -28,7 +29,13 @@ from stewart_drake.identification.shooting import (
     integrate,
     plan_steps,
 )
-from stewart_drake.identification.unknowns import DELAY, NUM_UNKNOWNS, OFFSETS, Unknowns
+from stewart_drake.identification.unknowns import (
+    DELAY,
+    GEOMETRY,
+    NUM_UNKNOWNS,
+    OFFSETS,
+    Unknowns,
+)
 from stewart_drake.scenario.signals import NUM_STATE
 
 Array = NDArray[np.float64]
@@ -86,14 +93,19 @@ class Normal(NamedTuple):
     """(k,)."""
 
 
-class Fit(NamedTuple):
+@dataclass(frozen=True)
+class Fit:
     """Where the iterations ended."""
 
     guess: Guess
     residuals: Residuals
-    covariance: Array
-    """(k, k) of the free unknowns."""
+    normal: Normal
     iterations: int
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (k, k) of the free unknowns."""
+        return covariance(self.normal)
 
 
 @dataclass(frozen=True)
@@ -117,9 +129,11 @@ class Problem:
         return sum(int(np.isfinite(one).sum()) for one in values)
 
     def model(self) -> MachineModel:
-        """That evaluates all segments at once."""
+        """Return the model that evaluates all segments at once."""
         gravity = self.segments[0].log.gravity
-        return MachineModel(self.unknowns.mechanism, gravity, len(self.segments))
+        known = not self.unknowns.std[GEOMETRY].any()
+        kind = DrawnModel if known else MachineModel
+        return kind(self.unknowns.mechanism, gravity, len(self.segments))
 
     def measured(self) -> tuple[Array, Array]:
         """Values (m, n, 18) of the segments, NaN where there is none, and their std (n, 18)."""
@@ -263,7 +277,14 @@ def solve(problem: Problem, start: Guess, most: int = _MOST_ITERATIONS) -> Fit:
         residuals, normal = evaluator.normal(guess)
         if gained < ENOUGH:
             break
-    return Fit(guess, residuals, covariance(normal), iterations)
+    return Fit(guess, residuals, normal, iterations)
+
+
+def refined(problem: Problem, fit: Fit, most: int = _MOST_ITERATIONS) -> tuple[Problem, Fit]:
+    """Halve the integration step and fit again until the step no longer matters."""
+    while (halved := finer(problem, fit.guess)) is not None:
+        problem, fit = halved, solve(halved, fit.guess, most)
+    return problem, fit
 
 
 def finer(problem: Problem, guess: Guess) -> Problem | None:

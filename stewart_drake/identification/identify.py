@@ -1,7 +1,7 @@
 """From logs to a machine: all steps, and what is told of them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
@@ -15,10 +15,10 @@ from stewart_drake.identification.fit import (
     Guess,
     Problem,
     chi2_per_value,
-    finer,
     followed,
     misfit,
     nearest,
+    refined,
     solve,
     without,
 )
@@ -29,6 +29,7 @@ from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import (
     DELAY,
     DYNAMIC,
+    GEOMETRY,
     NAMES,
     OFFSETS,
     ONE_SIDED,
@@ -38,6 +39,7 @@ from stewart_drake.identification.unknowns import (
 )
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint
 from stewart_drake.scenario.known import Known
+from stewart_drake.scenario.signals import NUM_STATE
 
 Array = NDArray[np.float64]
 
@@ -51,7 +53,19 @@ _ASTRAY: Final = 1e3
 """chi^2 per value of a segment that is not explained by any machine like this one; drawings that
 are off by a millimetre make some fifty."""
 _COARSE: Final = 0.1
-"""s by which the delay that is begun with may be off."""
+"""s by which the delay that is begun with may be off,"""
+_NEAR: Final = 0.02
+"""s, alike where a scan found it."""
+_GRID: Final = 0.1
+"""s between delays of the scan."""
+_SCANNED: Final = 0.3
+"""s of a segment of the scan, at most."""
+_MOST_SCANNED: Final = 12
+"""Segments of the scan."""
+_FEW_SCANNED: Final = 4
+"""Iterations of the scan at each delay."""
+_STARTS: Final = 3
+"""Delays of the scan that are begun with."""
 
 
 @dataclass(frozen=True)
@@ -195,31 +209,129 @@ def identify(
     told = [log.delay for log in logs if log.delay is not None]
     believed = delay if delay is not None else told[0] if told else USUAL_DELAY
     poses = [start.measured_poses(log, mechanism) for log in logs]
+    inside = [start.well_inside(*pair, mechanism) for pair in zip(logs, poses, strict=True)]
+    logs, poses = [log for log, _ in inside], [own for _, own in inside]
     for log, own in zip(logs, poses, strict=True):
         start.check_poses(log, own)
-    # The longest log has most to say.
-    longest = max(range(len(logs)), key=lambda i: len(logs[i].times))
     unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
-    starts = [(believed, 1.0)]
-    if tolerances.delay > 0:
-        coarse = start.coarse_delay(
-            logs[longest], poses[longest], mechanism, believed, tolerances.delay
-        )
-        # Where the plate was lost, long trajectories lead nowhere; and the coarse delay may err.
-        starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5)]
-    tried = list[_Begun]()
-    for delay_at_first, share in starts:
-        tried.append(_begin(delay_at_first, share, logs, poses, unknowns))
-        if tried[-1].chi2 <= WRONG:
-            break
-    best = min(tried, key=lambda one: one.chi2)
-    whole = best.whole
-    problem, fit = _grown(best)
-    while (halved := finer(problem, fit.guess)) is not None:
-        problem, fit = halved, _solved(halved, fit.guess)
+    best = min(_tried(logs, poses, unknowns), key=lambda one: one.misfit)
+    problem, fit = refined(best.problem, best.fit)
     middle = np.nanmedian(np.vstack(poses), axis=0)
-    left_out = len(whole.segments) - len(problem.segments)
-    return Identification(logs, unknowns, problem, fit, left_out, middle)
+    return Identification(logs, unknowns, problem, fit, best.left_out, middle)
+
+
+class _Start(NamedTuple):
+    """Where iterations begin."""
+
+    values: Array
+    """(NUM_UNKNOWNS,)."""
+    share: float
+    """Length of the segments as a share of the usual one."""
+    late: float
+    """s by which the delay may be longer."""
+
+
+class _Tried(NamedTuple):
+    """Result from one start."""
+
+    problem: Problem
+    fit: Fit
+    left_out: int
+
+    @property
+    def misfit(self) -> float:
+        """chi^2 per value."""
+        return chi2_per_value(self.fit.residuals, self.problem)["all"]
+
+
+def _tried(logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns) -> list[_Tried]:
+    """Return the results from several starts, up to the first that explains the logs."""
+    tried = list[_Tried]()
+    for one in _starts(logs, poses, unknowns):
+        begun = _begin(one, logs, poses, unknowns)
+        problem, fit = _grown(begun)
+        tried.append(_Tried(problem, fit, len(begun.whole.segments) - len(problem.segments)))
+        if tried[-1].misfit <= WRONG:
+            break
+    return tried
+
+
+def _starts(
+    logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns
+) -> Iterator[_Start]:
+    """Yield starts, the most promising first."""
+    believed, std = unknowns.mean[DELAY], unknowns.std[DELAY]
+    if std == 0:
+        yield _Start(unknowns.mean, 1.0, 0.0)
+        return
+    longest = max(range(len(logs)), key=lambda i: len(logs[i].times))
+    log, own = logs[longest], poses[longest]
+    coarse = start.coarse_delay(log, own, unknowns.mechanism, believed, std)
+    if coarse is not None:
+        values = unknowns.mean.copy()
+        values[DELAY] = coarse
+        # Where the plate was lost, long trajectories lead nowhere; and the coarse delay may err.
+        yield _Start(values, 1.0, _COARSE)
+        yield _Start(values, 0.5, _COARSE)
+    for values in scanned(log, own, unknowns):
+        yield _Start(values, 1.0, _NEAR)
+        yield _Start(values, 0.5, _NEAR)
+
+
+def scanned(log: Log, poses: Array, unknowns: Unknowns) -> list[Array]:
+    """Return values of the unknowns with the delays that explain the end of a log best.
+
+    The machine is as drawn here, so that one delay of the grid takes some tenths of a second. Of
+    delays that explain the log equally well the shortest comes first: it explains most of it.
+
+    Raises:
+        ConfigError: the log is too short, or no torque of it shows in the motion.
+    """
+    believed, std = unknowns.mean[DELAY], unknowns.std[DELAY]
+    found = list[_Scanned]()
+    for delay in np.arange(max(0.0, believed - 3 * std), believed + 3 * std, _GRID):
+        try:
+            found += _scan(log, poses, unknowns, delay, float(log.sent[0]) + delay + _NEAR)
+        except ConfigError:
+            if not found:
+                raise
+            break  # nothing is left after longer delays either
+    if not found:
+        return []
+    least = min(one.chi2 for one in found)
+    alike = [one for one in found if one.chi2 <= least * (1 + one.spread)]
+    best = min(alike, key=lambda one: float(one.values[DELAY]))
+    others = sorted(found, key=lambda one: one.chi2)
+    return [best.values, *(one.values for one in others if one is not best)][:_STARTS]
+
+
+class _Scanned(NamedTuple):
+    """What one delay of the grid comes to."""
+
+    chi2: float
+    """Per value."""
+    spread: float
+    """Four relative standard deviations of chi2."""
+    values: Array
+
+
+def _scan(
+    log: Log, poses: Array, unknowns: Unknowns, delay: float, begin: float
+) -> list[_Scanned]:
+    """Fit a machine as drawn to the end of a log from a delay on; empty where none moves so."""
+    std, values = unknowns.std.copy(), unknowns.mean.copy()
+    std[GEOMETRY], values[DELAY] = 0.0, delay
+    length = min(_SCANNED, start.segment_length(log, poses, unknowns.mechanism, delay))
+    segments = start.segments_of(log, begin, length)[-_MOST_SCANNED:]
+    first = [start.first_state(log, poses, int(one.rows[0])) for one in segments]
+    whole = Problem(segments, replace(unknowns, std=std))
+    problem, guess = followed(whole, Guess(values, np.array(first)))
+    if not problem.segments:
+        return []
+    fit = solve(problem, guess, _FEW_SCANNED)
+    spread = 4 * np.sqrt(2 / (problem.count - NUM_STATE * len(problem.segments)))
+    chi2 = chi2_per_value(fit.residuals, problem)["all"]
+    return [_Scanned(chi2, spread, fit.guess.values)]
 
 
 class _Begun(NamedTuple):
@@ -233,27 +345,24 @@ class _Begun(NamedTuple):
 
 
 def _begin(
-    delay: float,
-    share: float,
-    logs: Sequence[Log],
-    poses: Sequence[Array],
-    unknowns: Unknowns,
+    one: _Start, logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns
 ) -> _Begun:
-    """A delay in s and segments of a share of their usual length, and what the nearest say."""
-    segments, states, values = list[Segment](), list[Array](), unknowns.mean.copy()
-    late = _COARSE if unknowns.std[DELAY] > 0 else 0.0
+    """Fit the segments that are nearest to the logs at a start."""
+    segments, states, values = list[Segment](), list[Array](), one.values
+    delay = float(values[DELAY])
     for log, own in zip(logs, poses, strict=True):
-        length = share * start.segment_length(log, own, unknowns.mechanism, delay)
-        parts = start.segments_of(log, float(log.sent[0]) + delay + late, length)
+        length = one.share * start.segment_length(log, own, unknowns.mechanism, delay)
+        parts = start.segments_of(log, float(log.sent[0]) + delay + one.late, length)
         segments += parts
         states += [start.first_state(log, own, int(part.rows[0])) for part in parts]
-    first, values[DELAY] = np.array(states), delay
+    first = np.array(states)
     whole = Problem(segments, unknowns)
     problem, guess = followed(whole, Guess(values, first))
     if not problem.segments:
         return _Begun(np.inf, whole, values, first)
     near, guess = nearest(problem, guess)
-    fit = solve(near, guess, _FEW)
+    near, fit = refined(near, solve(near, guess, _FEW), _FEW)
+    whole = replace(whole, longest_step=near.longest_step)
     chi2 = chi2_per_value(fit.residuals, near)["all"]
     return _Begun(chi2, whole, fit.guess.values, first)
 

@@ -27,7 +27,7 @@ EXPECTED: Final = "a log: signals.nc of simulate, or CSV with time, torque_1 ...
 _MAX_BYTES: Final = 100_000_000
 FINEST: Final = 0.01
 """s between two measurements that are used; of more frequent ones as many are left out."""
-_LEAST_ROWS: Final = 20
+_LEAST_ROWS: Final = 8
 _ANGLE: Final = {"rad": 1.0, "deg": math.pi / 180}
 _LENGTH: Final = {"m": 1.0, "mm": 1e-3}
 _TORQUES: Final = [f"torque_{leg}" for leg in LEGS]
