@@ -171,7 +171,9 @@ class Evaluator:
         r = residuals.measured.transpose(1, 0, 2).reshape(n, -1, 1)
         turned = rows.transpose(0, 2, 1)
         weight = 1 / self.problem.unknowns.std[self.free]
-        normal = Normal(turned @ rows, (turned @ r)[:, :, 0], weight**2, weight * residuals.prior)
+        with np.errstate(all="ignore"):  # a trajectory that grows beyond all bounds
+            joined = turned @ rows, (turned @ r)[:, :, 0]
+        normal = Normal(*joined, weight**2, weight * residuals.prior)
         return residuals, normal
 
     def _evaluate(
@@ -281,14 +283,17 @@ def solve(problem: Problem, start: Guess, most: int = _MOST_ITERATIONS) -> Fit:
 
 
 def refined(problem: Problem, fit: Fit, most: int = _MOST_ITERATIONS) -> tuple[Problem, Fit]:
-    """Halve the integration step and fit again until the step no longer matters."""
-    while (halved := finer(problem, fit.guess)) is not None:
+    """Halve the integration step and fit again until the step matters little beside the misfit."""
+    while True:
+        left = np.sqrt(np.mean(fit.residuals.measured**2))
+        halved = finer(problem, fit.guess, _STEP_ERROR * max(1.0, float(left)))
+        if halved is None:
+            return problem, fit
         problem, fit = halved, solve(halved, fit.guess, most)
-    return problem, fit
 
 
-def finer(problem: Problem, guess: Guess) -> Problem | None:
-    """The problem with half the step, or None where that moves its residuals by next to nothing.
+def finer(problem: Problem, guess: Guess, allowed: float = _STEP_ERROR) -> Problem | None:
+    """The problem with half the step, or None where that moves its residuals by less than allowed.
 
     Coulomb friction turns round within some hundredths of a second, so that what step is fine
     enough depends on the machine.
@@ -297,7 +302,7 @@ def finer(problem: Problem, guess: Guess) -> Problem | None:
     if halved.longest_step < _SHORTEST_STEP:
         return None
     coarse, fine = (Evaluator(one).residuals(guess).measured for one in (problem, halved))
-    return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > _STEP_ERROR else None
+    return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > allowed else None
 
 
 def _moved(guess: Guess, unknown: Array, first: Array, free: NDArray[np.intp]) -> Guess:

@@ -45,6 +45,11 @@ Array = NDArray[np.float64]
 
 WRONG: Final = 1.5
 """chi^2 per value from which on a fit is wrong and its intervals mean nothing."""
+ENOUGH_RESPONSE: Final = 1.0
+"""s of motion after the torques of a log first change; a shorter log is refused if its delay is
+VAGUE."""
+VAGUE: Final = 1e-3
+"""s, least standard deviation of a delay that was not found well."""
 USUAL_DELAY: Final = 0.1
 """s, believed where nobody says anything."""
 _FEW: Final = 15
@@ -64,6 +69,8 @@ _MOST_SCANNED: Final = 12
 """Segments of the scan."""
 _FEW_SCANNED: Final = 4
 """Iterations of the scan at each delay."""
+_RIVAL: Final = 30.0
+"""Times the least chi^2 of the scan, at most, where another delay is tried too."""
 _STARTS: Final = 3
 """Delays of the scan that are begun with."""
 
@@ -214,10 +221,32 @@ def identify(
     for log, own in zip(logs, poses, strict=True):
         start.check_poses(log, own)
     unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
-    best = min(_tried(logs, poses, unknowns), key=lambda one: one.misfit)
+    best = min(_tried(logs, poses, unknowns), key=lambda one: one.rank)
     problem, fit = refined(best.problem, best.fit)
     middle = np.nanmedian(np.vstack(poses), axis=0)
-    return Identification(logs, unknowns, problem, fit, best.left_out, middle)
+    found = Identification(logs, unknowns, problem, fit, best.left_out, middle)
+    if tolerances.delay > 0:
+        _check_response(found)
+    return found
+
+
+def _check_response(found: Identification) -> None:
+    """Refuse logs that end too soon after their torques first change to show the delay.
+
+    Raises:
+        ConfigError: names the length that is missing.
+    """
+    delay, std = found.values[DELAY], found.std[DELAY]
+    lasted = [float(log.times[-1] - max(log.times[0], log.sent[1] + delay)) for log in found.logs]
+    longest = int(np.argmax(lasted))
+    if lasted[longest] >= ENOUGH_RESPONSE or std <= VAGUE:
+        return
+    raise ConfigError(
+        f"{found.logs[longest].name}: got {max(0.0, lasted[longest]):.2g} s of motion after the "
+        f"torques first changed, at the likeliest delay of {delay:.2g} s; expected at least "
+        f"{ENOUGH_RESPONSE:g} s to find the delay to {1e3 * VAGUE:g} ms, or an earlier row with "
+        "the torques that acted before"
+    )
 
 
 class _Start(NamedTuple):
@@ -243,6 +272,19 @@ class _Tried(NamedTuple):
         """chi^2 per value."""
         return chi2_per_value(self.fit.residuals, self.problem)["all"]
 
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Order of preference: an explanation of the logs before none, then the better one."""
+        if self.misfit > WRONG:
+            return True, self.misfit
+        return False, self.delay_std
+
+    @property
+    def delay_std(self) -> float:
+        """Standard deviation of the delay, s; 0 where it is known."""
+        place = np.flatnonzero(self.problem.unknowns.free == DELAY)
+        return float(np.sqrt(np.diag(self.fit.covariance)[place].sum()))
+
 
 def _tried(logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns) -> list[_Tried]:
     """Return the results from several starts, up to the first that explains the logs."""
@@ -251,7 +293,7 @@ def _tried(logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns) -> l
         begun = _begin(one, logs, poses, unknowns)
         problem, fit = _grown(begun)
         tried.append(_Tried(problem, fit, len(begun.whole.segments) - len(problem.segments)))
-        if tried[-1].misfit <= WRONG:
+        if tried[-1].misfit <= WRONG and tried[-1].delay_std <= VAGUE:
             break
     return tried
 
@@ -301,8 +343,9 @@ def scanned(log: Log, poses: Array, unknowns: Unknowns) -> list[Array]:
     least = min(one.chi2 for one in found)
     alike = [one for one in found if one.chi2 <= least * (1 + one.spread)]
     best = min(alike, key=lambda one: float(one.values[DELAY]))
-    others = sorted(found, key=lambda one: one.chi2)
-    return [best.values, *(one.values for one in others if one is not best)][:_STARTS]
+    rivals = [one for one in found if one is not best and one.chi2 <= _RIVAL * least]
+    rivals.sort(key=lambda one: one.chi2)
+    return [one.values for one in (best, *rivals)][:_STARTS]
 
 
 class _Scanned(NamedTuple):
@@ -376,15 +419,15 @@ def _grown(begun: _Begun) -> tuple[Problem, Fit]:
     """
     problem, guess = followed(begun.whole, Guess(begun.values, begun.first))
     if begun.chi2 > WRONG:
-        return problem, _solved(problem, guess)
+        return refined(problem, _solved(problem, guess), _FEW)
     fewest = len(problem.segments) // 2 + 1
-    fit = solve(problem, guess, _FEW)
+    problem, fit = refined(problem, solve(problem, guess, _FEW), _FEW)
     while chi2_per_value(fit.residuals, problem)["all"] > WRONG and len(problem.segments) > fewest:
         off = misfit(fit.residuals, problem)
         if off.max() < _ASTRAY:
             break
-        problem, guess = without(problem, guess, int(off.argmax()))
-        fit = solve(problem, guess, _FEW)
+        problem, guess = without(problem, fit.guess, int(off.argmax()))
+        problem, fit = refined(problem, solve(problem, guess, _FEW), _FEW)
     return problem, fit if fit.iterations < _FEW else solve(problem, fit.guess)
 
 

@@ -39,6 +39,8 @@ _DEGREE: Final = 4
 _GRID: Final = 0.01
 """s between two delays that are tried."""
 _LEAST_WINDOWS: Final = 8
+_LEAST_LEFT: Final = 1.0
+"""s of a log after the longest delay that is tried."""
 _ROOM: Final = 0.2
 """Share of the margin at home below which a pose is too near the edge of the workspace."""
 
@@ -107,6 +109,8 @@ def coarse_delay(
     dynamics = StewartDynamics(mechanism, log.gravity)
     known = np.flatnonzero(np.isfinite(poses).all(axis=1))
     times = log.times[known]
+    if times[-1] - times[0] < believed + 3 * std + _LEAST_LEFT:
+        return None
     half = max(_WINDOW, 4.5 * float(np.median(np.diff(times)))) / 2
     middles = np.arange(times[0] + half, times[-1] - half, _GRID * 10)
     needed = np.empty((len(middles), NUM_TORQUES))
@@ -122,7 +126,7 @@ def coarse_delay(
     weights /= weights.sum()
     delays = np.arange(max(0.0, believed - 3 * std), believed + 3 * std + _GRID / 2, _GRID)
     costs = [_misfit(needed, middles, delay, log, span, weights) for delay in delays]
-    return float(delays[int(np.argmin(costs))]) if np.isfinite(costs).all() else None
+    return float(delays[int(np.argmin(costs))]) if np.isfinite(costs).any() else believed
 
 
 def _misfit(
