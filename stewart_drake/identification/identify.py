@@ -298,9 +298,7 @@ def _tried(logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns) -> l
     return tried
 
 
-def _starts(
-    logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns
-) -> Iterator[_Start]:
+def _starts(logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns) -> Iterator[_Start]:
     """Yield starts, the most promising first."""
     believed, std = unknowns.mean[DELAY], unknowns.std[DELAY]
     if std == 0:
@@ -341,11 +339,36 @@ def scanned(log: Log, poses: Array, unknowns: Unknowns) -> list[Array]:
     if not found:
         return []
     least = min(one.chi2 for one in found)
+    _check_torques_show(log, poses, unknowns, least)
     alike = [one for one in found if one.chi2 <= least * (1 + one.spread)]
     best = min(alike, key=lambda one: float(one.values[DELAY]))
     rivals = [one for one in found if one is not best and one.chi2 <= _RIVAL * least]
     rivals.sort(key=lambda one: one.chi2)
     return [one.values for one in (best, *rivals)][:_STARTS]
+
+
+def _check_torques_show(log: Log, poses: Array, unknowns: Unknowns, least: float) -> None:
+    """Refuse a log that a machine explains on which no change of the torques ever acts.
+
+    Args:
+        log: with poses (n, 6).
+        poses: of its instants.
+        unknowns: before the log.
+        least: chi^2 per value with the best delay.
+
+    Raises:
+        ConfigError: names the length that is missing.
+    """
+    lasted, std = float(log.times[-1] - log.sent[1]), unknowns.std.copy()
+    std[DELAY] = 0.0
+    known = replace(unknowns, std=std)
+    for still in _scan(log, poses, known, lasted + 1.0, float(log.times[0]), _FEW):
+        if still.chi2 <= max(1.0, least) * (1 + still.spread):
+            raise ConfigError(
+                f"{log.name}: got {lasted:.2g} s of motion from the first change of the torques "
+                "on, and none of them shows in it; expected a log that goes on for at least "
+                f"{ENOUGH_RESPONSE:g} s after they act"
+            )
 
 
 class _Scanned(NamedTuple):
@@ -359,7 +382,12 @@ class _Scanned(NamedTuple):
 
 
 def _scan(
-    log: Log, poses: Array, unknowns: Unknowns, delay: float, begin: float
+    log: Log,
+    poses: Array,
+    unknowns: Unknowns,
+    delay: float,
+    begin: float,
+    most: int = _FEW_SCANNED,
 ) -> list[_Scanned]:
     """Fit a machine as drawn to the end of a log from a delay on; empty where none moves so."""
     std, values = unknowns.std.copy(), unknowns.mean.copy()
@@ -371,7 +399,7 @@ def _scan(
     problem, guess = followed(whole, Guess(values, np.array(first)))
     if not problem.segments:
         return []
-    fit = solve(problem, guess, _FEW_SCANNED)
+    fit = solve(problem, guess, most)
     spread = 4 * np.sqrt(2 / (problem.count - NUM_STATE * len(problem.segments)))
     chi2 = chi2_per_value(fit.residuals, problem)["all"]
     return [_Scanned(chi2, spread, fit.guess.values)]
@@ -387,9 +415,7 @@ class _Begun(NamedTuple):
     """(n, 12) states of all n segments, as measured."""
 
 
-def _begin(
-    one: _Start, logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns
-) -> _Begun:
+def _begin(one: _Start, logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns) -> _Begun:
     """Fit the segments that are nearest to the logs at a start."""
     segments, states, values = list[Segment](), list[Array](), one.values
     delay = float(values[DELAY])
