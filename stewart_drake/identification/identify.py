@@ -1,4 +1,4 @@
-"""From logs to a machine: all steps, and what is told of them."""
+"""Identification of a machine from its logs: all steps and the result."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -51,7 +51,7 @@ VAGUE."""
 VAGUE: Final = 1e-3
 """s, least standard deviation of a delay that was not found well."""
 USUAL_DELAY: Final = 0.1
-"""s, believed where nobody says anything."""
+"""Believed delay by default, s."""
 _FEW: Final = 15
 """Iterations over the segments that are looked at first."""
 _ASTRAY: Final = 1e3
@@ -106,7 +106,7 @@ class Identification:
 
     @cached_property
     def values(self) -> Array:
-        """What was found of the unknowns, friction not below zero."""
+        """Values found, friction not below zero."""
         found = self.fit.guess.values.copy()
         for place in ONE_SIDED:
             found[place] = max(0.0, found[place])
@@ -114,7 +114,7 @@ class Identification:
 
     @cached_property
     def covariance(self) -> Array:
-        """Of all unknowns, 0 where they are known; where the fit is wrong what it was before."""
+        """Covariance of all unknowns, 0 where known; the prior's where the fit is wrong."""
         unknowns = self.unknowns
         if not self.right:
             return np.diag(unknowns.std**2)
@@ -134,7 +134,7 @@ class Identification:
         return self.unknowns.machine(self.values if self.right else self.unknowns.mean)
 
     def known(self, mechanism: Mechanism) -> Known:
-        """What a controller of this machine may go by: all but the geometry.
+        """Return what a controller of this machine may use: all but the geometry.
 
         Where the fit is wrong that is the delay alone, as uncertain as before.
 
@@ -163,7 +163,7 @@ class Identification:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` holds: intervals are null where the fit is wrong."""
+        """Content of `summary.json`; intervals are null where the fit is wrong."""
         std = self.std if self.right else np.full(len(self.values), np.nan)
         poses = self.pose_uncertainty
         return {
@@ -372,7 +372,7 @@ def _check_torques_show(log: Log, poses: Array, unknowns: Unknowns, least: float
 
 
 class _Scanned(NamedTuple):
-    """What one delay of the grid comes to."""
+    """Result of the scan at one delay."""
 
     chi2: float
     """Per value."""
@@ -406,7 +406,7 @@ def _scan(
 
 
 class _Begun(NamedTuple):
-    """Where a start leads; chi^2 per value, of the segments that were looked at first."""
+    """Fit of the first segments from one start, with its chi^2 per value."""
 
     chi2: float
     whole: Problem
@@ -473,7 +473,7 @@ def _unknowns(
     tolerances: Tolerances,
     believed: float,
 ) -> Unknowns:
-    """With scales of the logs: the largest torque, and the largest speed of a crank."""
+    """Return the unknowns, scaled by the largest torque and crank speed of the logs."""
     speeds = []
     for log, own in zip(logs, poses, strict=True):
         known = np.isfinite(own).all(axis=1)
