@@ -449,8 +449,8 @@ def find_short(
 
 
 def short() -> str:
-    """Table of short logs: ten seeds by machine, delay and noise."""
-    seeds = range(SHORT_SEED, SHORT_SEED + 10)
+    """Table of short logs: LOGS of the environment by machine, delay and noise."""
+    seeds = range(SHORT_SEED, SHORT_SEED + size("LOGS", 10))
     jobs = Parallel(n_jobs=int(os.environ.get("JOBS", "-1")))
     heads = (
         *("scenario", "delay [s]", "noise", "within 1 ms", "refused", "wrong"),
@@ -460,7 +460,7 @@ def short() -> str:
     for machine, delay, noise in SHORT:
         found = jobs(delayed(find_short)(machine, delay, noise, seed) for seed in seeds)
         rows.append((machine, f"{delay:g}", f"{100 * noise:g} %", *short_cells(found)))
-        print(rows[-1], found, flush=True)
+        print(*rows[-1], flush=True)
         every += found
     rows.append(("all", "", "", *short_cells(every)))
     table = "\n".join(f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *rows))
