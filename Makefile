@@ -21,7 +21,7 @@ PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
 COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null || true
 
 .DEFAULT_GOAL := help
-.PHONY: generate demo docs test slow arm casadi lint format-check types wheel newest bench soak clean help
+.PHONY: generate demo docs test slow arm lint format-check types wheel newest bench soak clean help
 
 demo: $(INSTALLED)  ## the paper's comparison, from rest, on the reference, and with a delay of 0.8 s believed to be 0.6 s
 	$(BIN)/stewart-drake compare paper --out out/demo/rest
@@ -39,20 +39,16 @@ docs: $(DOCS_VENV)/.installed  ## the documentation as a site with search, in ou
 # Each takes a stretch of the files, so that what their tests share is made once, and who is done
 # takes from the other.
 WORKERS := -n logical --maxprocesses 4 --dist worksteal
-test slow arm casadi soak bench: export OMP_NUM_THREADS := 1
-test slow arm casadi soak bench: export OPENBLAS_NUM_THREADS := 1
+test slow arm soak bench: export OMP_NUM_THREADS := 1
+test slow arm soak bench: export OPENBLAS_NUM_THREADS := 1
 # Tests start commands, and each would compile all of the package anew.
-test slow arm casadi soak: export PYTHONDONTWRITEBYTECODE :=
+test slow arm soak: export PYTHONDONTWRITEBYTECODE :=
 
 test: $(INSTALLED)  ## the tests but for the slow ones; ARGS="..." is handed to pytest
 	$(BIN)/pytest $(WORKERS) $(ARGS)
 
 slow: $(INSTALLED)  ## the slow ones: whole commands, documents and processes
 	$(BIN)/pytest $(WORKERS) -m "slow and not soak" $(ARGS)
-
-WITHOUT_C := test_dynamics test_exact_plant test_wrench test_control_law test_estimator test_closed_loop
-casadi: $(INSTALLED)  ## the tests of dynamics, plant and law on CasADi's virtual machine
-	STEWART_NATIVE=0 $(BIN)/pytest $(WORKERS) -m "not soak" $(WITHOUT_C:%=tests/%.py) $(ARGS)
 
 arm: $(INSTALLED)  ## the exported C with arm-none-eabi-gcc and newlib, or why not
 	$(BIN)/pytest -m "not soak" -rs tests/test_export_arm.py $(ARGS)
@@ -82,7 +78,7 @@ bench: $(INSTALLED_BENCH)  ## every script in benchmarks/; QUICK=1: at the least
 		echo "== $$script"; $(BIN)/python $$script || failed="$$failed $$script"; \
 	done; test -z "$$failed" || { echo "failed:$$failed"; exit 1; }
 
-generate: $(INSTALLED)  ## writes the equations in C anew, after a change of theirs, and compiles them
+generate: $(INSTALLED)  ## writes equations.h and models/*.sdf anew, and compiles the core
 	$(BIN)/python -m stewart_drake.dynamics.generate
 	$(BIN)/python -m stewart_drake.native.build
 
@@ -93,8 +89,11 @@ clean:  ## removes builds, caches and the demo's output, keeps .venv and .venv-d
 help:  ## this list
 	@awk 'BEGIN {FS = ":.*  ## "} /^[a-z-]+:.*  ## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
 
-# The C is compiled by the installation; a library that is older than its source is not used.
-$(INSTALLED): pyproject.toml constraints.txt hatch_build.py $(wildcard stewart_drake/native/*.[ch])
+# The installation compiles the core, and first generates what is not committed. A library that is
+# older than its source is refused.
+EQUATIONS := stewart_drake/native/equations.h
+$(INSTALLED): pyproject.toml constraints.txt hatch_build.py \
+		$(filter-out $(EQUATIONS),$(wildcard stewart_drake/native/*.[ch]))
 	@test -n "$(PYTHON)" || { echo "no Python found: set PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "$(PYTHON) is too old: set PYTHON to a Python 3.11 or newer"; exit 1; }

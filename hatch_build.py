@@ -1,7 +1,6 @@
-"""Compiles the dynamics where there is a C compiler; without one the package is pure Python."""
+"""Builds the compiled core: generated text where it is missing, then the library."""
 
 import importlib.util
-import os
 import shutil
 import tempfile
 from pathlib import Path
@@ -10,32 +9,49 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from packaging.tags import sys_tags
 
-BUILD = "stewart_drake/native/build.py"
+GENERATOR = ["casadi==3.8.2", "numpy>=2", "pydantic>=2", "ruamel.yaml>=0.18", "typing-extensions"]
+COMPILER = ["ziglang==0.17.1"]
 
 
-class NativeHook(BuildHookInterface):
+class CoreHook(BuildHookInterface):
     """An editable installation gets the library into the checkout, a wheel into the package."""
 
     folder = None
 
+    @property
+    def build(self) -> Any:
+        """The module native/build.py, loaded by its path."""
+        path = Path(self.root, "stewart_drake/native/build.py")
+        spec = importlib.util.spec_from_file_location("native_build", path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    def dependencies(self) -> list[str]:
+        """Return what the build needs and does not find: the generator's packages, a compiler."""
+        needed = [] if self.build.is_generated() else [*GENERATOR]
+        if self.target_name == "wheel" and self.build.system_compiler() is None:
+            needed += COMPILER
+        return needed
+
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Never fails, but where STEWART_NATIVE=require."""
-        wanted = os.environ.get("STEWART_NATIVE")
-        if wanted == "0":
+        """Generate and compile.
+
+        Raises:
+            RuntimeError: the library cannot be compiled.
+        """
+        build = self.build
+        if not build.is_generated():
+            build.generate()
+        if self.target_name != "wheel":
             return
-        spec = importlib.util.spec_from_file_location("native_build", Path(self.root, BUILD))
-        build = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(build)
         target = build.LIBRARY
         if version != "editable":
             self.folder = tempfile.mkdtemp()
             target = Path(self.folder, build.LIBRARY.name)
         reason = build.compile_library(target)
         if reason is not None:
-            if wanted == "require":
-                raise RuntimeError(f"the dynamics cannot be compiled: {reason}")
-            self.app.display_warning(f"going on without compiled dynamics: {reason}")
-            return
+            raise RuntimeError(f"the core cannot be compiled: {reason}")
         if version != "editable":
             place = build.LIBRARY.relative_to(self.root).as_posix()
             build_data["force_include"][str(target)] = place
@@ -45,6 +61,6 @@ class NativeHook(BuildHookInterface):
         build_data["pure_python"], build_data["tag"] = False, f"py3-none-{platform}"
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
-        """The library is in the wheel."""
+        """Remove the library that is in the wheel now."""
         if self.folder is not None:
             shutil.rmtree(self.folder, ignore_errors=True)

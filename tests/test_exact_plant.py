@@ -18,7 +18,6 @@ from pydrake.systems.primitives import (
     Linearize,
 )
 
-from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import (
     PITCH_LIMIT,
@@ -32,6 +31,7 @@ from stewart_drake.dynamics.workspace import (
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.native.layout import DEAD_CENTRE_SINE
 from stewart_drake.scenario.timing import look_time
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.oracles import relative, size

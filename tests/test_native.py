@@ -1,16 +1,17 @@
-"""The dynamics in C: the numbers of CasADi's virtual machine, the same source, the same results."""
+"""The compiled core: the numbers of CasADi's virtual machine, of the same equations."""
 
 import ctypes
 import functools
 import math
-import os
 import re
 import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -18,21 +19,16 @@ from numpy.typing import NDArray
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.dynamics import generate
-from stewart_drake.dynamics.functions import DynamicsFunctions, compiled_functions, margin_of
-from stewart_drake.dynamics.native_functions import NativeFunctions
+from stewart_drake.dynamics import generate, native_functions
+from stewart_drake.dynamics.native_functions import NativeFunctions, functions_of
 from stewart_drake.dynamics.stewart import plant_parameters
-from stewart_drake.dynamics.virtual_machine import VirtualMachine
-from stewart_drake.dynamics.workspace import margin
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.dynamics.workspace import margin, standing
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native import build, library
 from stewart_drake.native.layout import SIGNATURES
-from stewart_drake.report.document import Document
-from stewart_drake.report.page import Provenance, html
 from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, PAYLOAD
-from tests.backends import switched
 from tests.mechanisms import PAPER, random_mechanism, random_pose
+from tests.virtual_machine import VirtualMachine
 
 Array = NDArray[np.float64]
 NO_PARAMETERS = plant_parameters()
@@ -40,16 +36,6 @@ CLOSE = 1e-13
 """Relative to the largest number of a result; they differ by the order of sums."""
 QUICK = ("accelerations", "energy", "measures", "measures_of_tree", "change", "margin")
 """Functions that the virtual machine builds in a tenth of a second each."""
-
-
-@pytest.fixture(scope="module")
-def native() -> ctypes.CDLL:
-    """The compiled library; where STEWART_NATIVE=require it cannot be missing."""
-    with switched(None):
-        found = library.backend()
-    if found.library is None:
-        pytest.skip(found.reason)
-    return found.library
 
 
 def arguments(rng: np.random.Generator, mechanism: Mechanism) -> dict[str, Array | float]:
@@ -94,13 +80,14 @@ def machine(seed: int) -> VirtualMachine:
 
 
 def assert_equal(
-    library: ctypes.CDLL, seed: int, names: tuple[str, ...] = tuple(SIGNATURES), poses: int = 3
+    seed: int, names: tuple[str, ...] = tuple(SIGNATURES), made: ctypes.CDLL | None = None
 ) -> None:
-    """Native and virtual machine agree on a random machine."""
+    """Core and virtual machine agree on a random machine; `made`: another library than the core."""
     rng, other = np.random.default_rng(seed), machine(seed)
     mechanism = other.mechanism
-    one: DynamicsFunctions = NativeFunctions(mechanism, library)
-    for _ in range(poses):
+    with patch.object(native_functions, "core_library", lambda: made or library.core_library()):
+        one = NativeFunctions(mechanism)
+    for _ in range(3):
         given = arguments(rng, mechanism)
         for name in names:
             values = [given[argument] for argument in SIGNATURES[name].arguments]
@@ -108,23 +95,23 @@ def assert_equal(
             assert difference(found, expected) < CLOSE, (seed, name)
 
 
-def test_native_equals_the_virtual_machine(native) -> None:
+def test_native_equals_the_virtual_machine() -> None:
     """Random machines; `make soak` has a thousand."""
     for seed in range(20):
-        assert_equal(native, seed, QUICK)
+        assert_equal(seed, QUICK)
     for seed in range(4):
-        assert_equal(native, seed)
+        assert_equal(seed)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("part", range(20))
-def test_native_equals_the_virtual_machine_on_a_thousand_machines(native, part: int) -> None:
+def test_native_equals_the_virtual_machine_on_a_thousand_machines(part: int) -> None:
     for seed in range(1000 + 50 * part, 1000 + 50 * (part + 1)):
-        assert_equal(native, seed)
+        assert_equal(seed)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 130])
-def test_predictions_are_those_of_the_virtual_machine(native, steps: int) -> None:
+def test_predictions_are_those_of_the_virtual_machine(steps: int) -> None:
     """Steps shorter than the motion's time constants, so that rounding does not grow."""
     rng = np.random.default_rng(steps)
     torque = PAPER_HOLD + rng.normal(0, 0.01, (steps, 6))
@@ -132,7 +119,7 @@ def test_predictions_are_those_of_the_virtual_machine(native, steps: int) -> Non
     given = state, torque, NO_PARAMETERS, 9.81, rng.uniform(1e-4, 5e-4, steps)
     found, expected = (
         functions.many_steps(steps)(*given)[0].reshape(steps, 12)
-        for functions in (NativeFunctions(PAPER, native), VirtualMachine(PAPER))
+        for functions in (NativeFunctions(PAPER), VirtualMachine(PAPER))
     )
     assert np.abs(expected[-1] - state).max() > 1e-7
     assert np.abs(found - expected).max() < CLOSE * np.abs(expected).max() * max(1, steps / 10)
@@ -141,10 +128,10 @@ def test_predictions_are_those_of_the_virtual_machine(native, steps: int) -> Non
 PAPER_HOLD = sd.StewartDynamics(PAPER).equilibrium_torque(PAPER.home)
 
 
-def test_far_out_of_reach_and_without_numbers_they_agree_too(native) -> None:
+def test_far_out_of_reach_and_without_numbers_they_agree_too() -> None:
     """Where squares are held above zero, and where NaN must stay NaN."""
     rng = np.random.default_rng(5)
-    one, other = NativeFunctions(PAPER, native), VirtualMachine(PAPER)
+    one, other = NativeFunctions(PAPER), VirtualMachine(PAPER)
     for distance in (0.1, 0.3, 1.0, 1e3):
         pose = PAPER.home + rng.normal(0, 1, 6) * ([1.0] * 3 + [distance] * 3)
         rates, torque = rng.normal(0, 1, (2, 6))
@@ -161,26 +148,22 @@ def test_far_out_of_reach_and_without_numbers_they_agree_too(native) -> None:
             assert np.isnan(found).any()
 
 
-@pytest.mark.parametrize("value", ["0", "require"])
-def test_the_margin_is_the_least_of_the_measures(native, value: str) -> None:
-    with switched(value):
-        functions = compiled_functions(PAPER)
-        assert functions.backend == ("casadi" if value == "0" else "native")
-        measures = functions.measures(PAPER.home)[0]
-        least = np.zeros(8)
-        for index in range(8):
-            least[:] = -10.0
-            least[index] = 0.25
-            sign = -1.0 if index == 6 else 1.0
-            expected = sign * measures[index] - 0.25 if index == 6 else measures[index] - 0.25
-            assert functions.margin(PAPER.home, sign, least) == pytest.approx(expected, abs=1e-15)
-            assert margin_of(measures, sign, least) == pytest.approx(expected, abs=1e-15)
-        assert margin(PAPER, PAPER.home) > 0.1
+def test_the_margin_is_the_least_of_the_measures() -> None:
+    functions = functions_of(PAPER)
+    measures = functions.measures(PAPER.home)[0]
+    least = np.zeros(8)
+    for index in range(8):
+        least[:] = -10.0
+        least[index] = 0.25
+        sign = -1.0 if index == 6 else 1.0
+        expected = sign * measures[index] - 0.25 if index == 6 else measures[index] - 0.25
+        assert functions.margin(PAPER.home, sign, least) == pytest.approx(expected, abs=1e-15)
+    assert margin(PAPER, PAPER.home) == standing(PAPER, PAPER.home).margin > 0.1
 
 
-def test_threads_have_buffers_of_their_own(native) -> None:
+def test_threads_have_buffers_of_their_own() -> None:
     """Eight threads on one function, released from Python's lock while they compute."""
-    functions, meeting = NativeFunctions(PAPER, native), threading.Barrier(8)
+    functions, meeting = NativeFunctions(PAPER), threading.Barrier(8)
     expected = {}
     for n in range(8):
         torque = np.full((200, 6), 0.01 * n)
@@ -215,55 +198,89 @@ def made_of(equations: str, folder: Path) -> ctypes.CDLL:
     return ctypes.CDLL(str(target))
 
 
-def test_the_c_is_what_the_equations_are(native, tmp_path: Path) -> None:
+def test_the_c_is_what_the_equations_are(tmp_path: Path) -> None:
     """Word for word; or, as another CasADi writes it, in what it computes."""
     text = generate.equations_in_c()
-    if text != generate.FILE.read_text():
+    if text != build.EQUATIONS.read_text():
         for seed in range(3):
-            assert_equal(made_of(text, tmp_path / f"{seed}"), seed)
-            assert_equal(native, seed)
+            assert_equal(seed, made=made_of(text, tmp_path / f"{seed}"))
+            assert_equal(seed)
 
 
 @pytest.mark.slow
-def test_other_equations_are_told_from_these(native, tmp_path: Path) -> None:
+def test_other_equations_are_told_from_these(tmp_path: Path) -> None:
     """What the tests above would say to a sign that is wrong in one place of each function."""
-    text = generate.FILE.read_text()
-    assert_equal(made_of(text, tmp_path / "same"), 0)
+    text = build.EQUATIONS.read_text()
+    assert_equal(0, made=made_of(text, tmp_path / "same"))
     for name in re.findall(r"static void (\w+)", text):
         start = text.index(f"static void {name}(")
         place = text.index(" + ", start)
         wrong = made_of(f"{text[:place]} - {text[place + 3 :]}", tmp_path / name)
         with pytest.raises(AssertionError):
-            assert_equal(wrong, 0)
+            assert_equal(0, made=wrong)
 
 
-def test_it_is_compiled_without_a_warning(native, tmp_path: Path) -> None:
+def test_it_is_compiled_without_a_warning(tmp_path: Path) -> None:
     strict = ["-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror"]
     command = [*(build.compiler() or ()), *build.FLAGS, "-O1", *strict]
     target = str(tmp_path / "lib.so")
     subprocess.run([*command, "-o", target, *build.SOURCES, "-lm"], check=True)
 
 
-def test_a_library_older_than_its_source_is_not_used(native, monkeypatch) -> None:
-    monkeypatch.setattr(library, "source_hash", lambda: "another")
-    with switched(None):
-        assert library.backend().name == "casadi"
-        assert "older than their source" in str(library.backend())
-        assert compiled_functions(PAPER).backend == "casadi"
-    with switched("require"), pytest.raises(ConfigError, match="older than their source"):
-        library.backend()
+@pytest.fixture
+def unloaded() -> Iterator[None]:
+    """No library is loaded yet, before the test and after it."""
+    library.core_library.cache_clear()
+    yield
+    library.core_library.cache_clear()
 
 
-@pytest.mark.parametrize(
-    ("compiler", "reason"),
-    [("/nowhere/cc", "there is no C compiler"), ("false", "false: it failed")],
-)
-def test_without_a_compiler_that_works_one_line_says_so(
-    monkeypatch, tmp_path: Path, compiler: str, reason: str
+def test_a_library_that_does_not_fit_is_refused_in_one_line(
+    unloaded, monkeypatch, tmp_path: Path, capsys
 ) -> None:
-    monkeypatch.setenv("CC", compiler)
-    assert build.compile_library(tmp_path / "lib.so") == reason
+    damaged = tmp_path / "lib.so"
+    damaged.write_bytes(b"no library")
+    for change, problem in (
+        (("source_hash", lambda: "another"), "is older than its source"),
+        (("LIBRARY", damaged), "cannot be loaded"),
+        (("LIBRARY", tmp_path / "none.so"), "is missing"),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(library, *change)
+            functions_of.cache_clear()
+            assert main(["model", "check", "paper"]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert f"the compiled core {problem}" in error and "native.build" in error
+
+
+def test_the_build_knows_whether_its_generated_text_is_current(monkeypatch, tmp_path: Path) -> None:
+    assert build.is_generated(), "make generate"
+    with monkeypatch.context() as patched:
+        patched.setattr(build, "equations_hash", lambda: "another")
+        assert not build.is_generated()
+    with monkeypatch.context() as patched:
+        patched.setattr(build, "MODELS", tmp_path)
+        (tmp_path / "machine.yaml").touch()
+        assert not build.is_generated()
+        (tmp_path / "machine.sdf").touch()
+        assert build.is_generated()
+
+
+def test_a_compiler_that_fails_is_named(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CC", "false")
+    assert build.compile_library(tmp_path / "lib.so") == "false: it failed"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_compiler_zig_is_taken_and_without_both_one_line_says_so(
+    monkeypatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("CC", "/nowhere/cc")
+    monkeypatch.setattr(build.importlib.util, "find_spec", lambda name: object())
+    assert build.compiler()[:4] == [sys.executable, "-m", "ziglang", "cc"]
+    monkeypatch.setattr(build.importlib.util, "find_spec", lambda name: None)
+    assert "no C compiler found" in build.compile_library(tmp_path / "lib.so")
 
 
 def test_a_compiler_that_complains_is_quoted(monkeypatch, tmp_path: Path) -> None:
@@ -275,52 +292,11 @@ def test_a_compiler_that_complains_is_quoted(monkeypatch, tmp_path: Path) -> Non
     assert said == f"{script}: dynamics.c:1: error: no such thing"
 
 
-# The switch.
-
-
-def test_another_value_of_the_switch_is_refused_in_one_line(capsys) -> None:
-    with switched("1"):
-        assert main(["model", "check", "paper"]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert "STEWART_NATIVE: got '1'; expected 0" in error
-
-
-@pytest.mark.parametrize(("value", "name"), [("0", "casadi"), ("require", "native")])
-def test_the_backend_is_named(native, capsys, value: str, name: str) -> None:
-    with switched(value):
-        assert main(["--version"]) == 0
-        assert f"dynamics: {name}" in capsys.readouterr().out
-        scenario = sd.load_scenario("paper", settings=["duration=0.2"])
-        assert sd.simulate(scenario, margin=False).summary["backend"] == name
-        page = html(Document("Title", "Verdict.", ()), Provenance("command"))
-        assert f"Dynamics: {name}." in page
-
-
-def test_without_a_library_nothing_but_speed_is_missing(native, monkeypatch) -> None:
-    """The same run, with the library gone: what it records differs by rounding."""
-    scenario = sd.load_scenario("paper", settings=["duration=0.5", "plant.kind=exact"])
-    with switched("require"):
-        fast = sd.simulate(scenario, margin=False)
-    monkeypatch.setattr(library, "LIBRARY", Path("/nowhere/lib.so"))
-    with switched(None):
-        slow = sd.simulate(scenario, margin=False)
-    assert (fast.summary["backend"], slow.summary["backend"]) == ("native", "casadi")
-    torques = [result.signals["torque_commanded"].values for result in (fast, slow)]
-    assert np.abs(torques[0] - torques[1]).max() < 1e-7 * np.abs(torques[1]).max()
-
-
 @pytest.mark.slow
-def test_native_dynamics_build_nothing(native) -> None:
-    """No expression of CasADi is made where the library serves."""
+def test_a_run_imports_no_casadi() -> None:
     code = """if True:
-        import casadi, stewart_drake as sd
-        def never(*_): raise AssertionError("an expression was made")
-        casadi.SX.sym = never
+        import sys, stewart_drake as sd
         scenario = sd.load_scenario("paper", settings=["duration=0.1"])
-        assert sd.simulate(scenario, margin=False).summary["backend"] == "native" """
-    subprocess.run([sys.executable, "-c", code], check=True, env=_with("require"))
-
-
-def _with(value: str) -> dict[str, str]:
-    return os.environ | {library.SWITCH: value}
+        assert sd.simulate(scenario, margin=False).status == "completed"
+        assert "casadi" not in sys.modules"""
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -24,7 +24,6 @@ from stewart_drake.loop.experiment import believed_queue, compose_law, control_l
 from stewart_drake.native import library as native_library
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate
-from tests.backends import switched
 from tests.mechanisms import PAPER, random_mechanism
 from tests.test_riccati import riccati_gain
 
@@ -42,11 +41,7 @@ DIRTY = (
 @pytest.fixture(scope="module")
 def library() -> ctypes.CDLL:
     """The compiled one."""
-    with switched(None):
-        found = native_library.backend()
-    if found.library is None:
-        pytest.skip(found.reason)
-    return found.library
+    return native_library.core_library()
 
 
 # The Riccati equation.
@@ -94,7 +89,7 @@ def assert_exact(library: ctypes.CDLL, seed: int) -> None:
         return lqr(*matrices)
 
     expected = reduced_gain(model, Q, R, by_drake)
-    doubling = Doubling(library, len(given[0]))
+    doubling = Doubling(len(given[0]))
     found = reduced_gain(model, Q, R, doubling)
     K, P = doubling(*given)
     exact = exact_gain(*given, P)
@@ -123,7 +118,7 @@ def test_the_cost_of_a_run_is_what_the_solution_says(library, order: int) -> Non
     rng = np.random.default_rng(order)
     A = rng.normal(0, 1.2 / np.sqrt(order), (order, order))
     B, Q, R = rng.normal(0, 1, (order, 6)), np.eye(order), np.diag(rng.uniform(0.5, 2, 6))
-    K, P = Doubling(library, order)(A, B, Q, R)
+    K, P = Doubling(order)(A, B, Q, R)
     x = first = rng.normal(0, 1, order)
     cost = 0.0
     for _ in range(2000):
@@ -137,7 +132,7 @@ def test_the_cost_of_a_run_is_what_the_solution_says(library, order: int) -> Non
 def test_what_has_no_solution_is_a_failure(library) -> None:
     one, nothing = np.eye(12), np.zeros((12, 6))
     B = np.vstack([np.eye(6), np.zeros((6, 6))])
-    doubling = Doubling(library, 12)
+    doubling = Doubling(12)
     for A, b, Q, R in (
         (2 * one, nothing, one, np.eye(6)),  # no torque reaches it
         (2 * one, B, one, np.eye(6)),  # nor half of it
@@ -148,7 +143,7 @@ def test_what_has_no_solution_is_a_failure(library) -> None:
         with pytest.raises(RiccatiError, match="doubling"):
             doubling(A, b, Q, R)
     with pytest.raises(ValueError, match="order: got 25; expected 1 to 24"):
-        Doubling(library, 25)
+        Doubling(25)
 
 
 # Step by step.
@@ -365,11 +360,8 @@ def test_a_part_of_ones_own_is_stepped_in_python(library) -> None:
     wary = replace(settings.parameters, usual=2 * settings.parameters.std)
     observer = replace(law.observer, settings=replace(settings, parameters=wary))
     assert uncovered(replace(law, observer=observer)) == "controller.known"  # C knows one std
-    with switched(None):
-        assert serving(law).backend == "native"
-        assert serving(mine) == (mine, "python (controller.rejoin)")
-    with switched("0"):
-        assert serving(law) == (law, "python (STEWART_NATIVE=0)")
+    assert serving(law).backend == "native"
+    assert serving(mine) == (mine, "python (controller.rejoin)")
 
 
 def test_the_summary_says_which(library) -> None:
@@ -378,8 +370,7 @@ def test_the_summary_says_which(library) -> None:
         ("controller.prediction=linear", "python (controller.prediction)"),
     ):
         scenario = load_scenario("paper", settings=["duration=0.3", setting])
-        with switched(None):
-            summary = sd.simulate(scenario, margin=False).summary
+        summary = sd.simulate(scenario, margin=False).summary
         assert summary["controller_backend"] == expected
         assert json.dumps(summary["controller_backend"])
 

@@ -25,13 +25,11 @@ from stewart_drake.loop.sensor import Sensor, white_noise, white_noises
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.mechanism.geometry import Body
-from stewart_drake.native import library
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.uncertainty import MACHINE, Scales, draw, drawn, scales_of
-from tests.backends import switched
 from tests.mechanisms import PAPER
 
 Array = NDArray[np.float64]
@@ -41,13 +39,6 @@ DIRTY = (
     *(NOISE, "sensor.seed=3", "plant.torque_bias=[.001,.002,0,0,-.001,0]"),
     *("plant.payload_mass=0.2", "plant.joint_damping=0.001"),
 )
-
-
-@pytest.fixture(autouse=True)
-def native() -> None:
-    """Where STEWART_NATIVE=require it cannot be missing."""
-    if library.backend().library is None:
-        pytest.skip(library.backend().reason)
 
 
 def scenario(name: str = "paper", *settings: str, controller: str | None = None) -> Scenario:
@@ -275,12 +266,6 @@ def test_what_it_has_not_runs_in_drake_and_says_so(field: str, settings: list[st
     assert found.loop == f"drake, {field}"
     assert_same(found, expected)
     assert np.array_equal(found.samples, expected.samples, equal_nan=True)
-
-
-def test_without_a_library_it_is_drakes() -> None:
-    one = scenario("paper", "duration=0.2", "plant.accuracy=1e-8")
-    with switched("0"):
-        assert run_in_bulk(one).loop == "drake, casadi (STEWART_NATIVE=0)"
 
 
 def test_where_no_step_is_short_enough_drake_tries(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,16 +10,13 @@ from pydrake.systems.primitives import ConstantVectorSource
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from stewart_drake.dynamics import open_loop
 from stewart_drake.dynamics.native_plant import NativePlant
-from stewart_drake.dynamics.open_loop import Course, Drive, IntegrationError, in_c, integrate
+from stewart_drake.dynamics.open_loop import Drive, IntegrationError, in_c, integrate
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
-from stewart_drake.native import build
 from stewart_drake.native.plant import Ended
 from stewart_drake.scenario.signals import POSE, RATES
-from tests.backends import switched
 from tests.mechanisms import PAPER, random_mechanism
 
 Array = NDArray[np.float64]
@@ -28,15 +25,6 @@ HOLD = StewartDynamics(PAPER).equilibrium_torque(PAPER.home)
 AT_HOME = np.concatenate([PAPER.home, np.zeros(6)])
 PUSH = HOLD + 0.02 * np.abs(HOLD) * [1.0, 0.6, -0.4, 0.8, -0.2, 0.5]
 SWING = Drive(HOLD, 0.05 * HOLD, 9.0, np.arange(6.0))
-
-
-@pytest.fixture(params=["require", "0"], autouse=True)
-def backend(request: pytest.FixtureRequest) -> Any:
-    """Compiled, and scipy's in its place."""
-    if request.param == "require" and build.compiler() is None:
-        pytest.skip("there is no C compiler")
-    with switched(request.param):
-        yield request.param
 
 
 def of_scipy(dynamics: StewartDynamics, drives: list[Drive], times: Array, rtol: float) -> Array:
@@ -166,25 +154,6 @@ def test_a_look_outside_ends_a_run_within_a_step() -> None:
     assert seen.end == pytest.approx(end, abs=1e-5)
 
 
-def test_native_and_scipy_agree(monkeypatch: pytest.MonkeyPatch, backend: str) -> None:
-    if backend == "0":
-        pytest.skip("with the other one")
-    dynamics, drives = falling()
-    times = np.linspace(0, 2, 101)
-    one = integrate(dynamics, AT_HOME, drives, times, 1e-11)
-    other = open_loop._scipy(dynamics, AT_HOME, drives, times, 1e-11, math.inf)
-    assert_same(one, other, 1e-9)
-
-
-def assert_same(one: Course, other: Course, tolerance: float) -> None:
-    assert len(one.times) == len(other.times)
-    assert np.abs(one.states - other.states).max() < tolerance
-    assert one.end == pytest.approx(other.end, abs=tolerance)
-    assert (one.failure is None) == (other.failure is None)
-    if one.failure is not None and other.failure is not None:
-        assert one.failure.reason == other.failure.reason
-
-
 def test_several_looks_at_one_instant_and_at_the_start() -> None:
     found = integrate(HEAVY, AT_HOME, [SWING], [0.0, 0.0, 0.1, 0.1], 1e-9)
     assert np.array_equal(found.states[0], AT_HOME) and np.array_equal(found.states[1], AT_HOME)
@@ -199,10 +168,8 @@ def test_torques_beyond_all_bounds_end_in_an_error() -> None:
         integrate(HEAVY, AT_HOME, [Drive(np.full(6, 1e300))], [0.1])
 
 
-def test_where_there_is_no_number_steps_are_cut_to_a_fifth(backend: str) -> None:
+def test_where_there_is_no_number_steps_are_cut_to_a_fifth() -> None:
     """As scipy does: ln(0.1 / 16 eps) / ln 5 steps of eleven evaluations at the most."""
-    if backend == "0":
-        pytest.skip("those are scipy's own")
     plant = NativePlant(HEAVY, AT_HOME, np.array([0.1]), 1e-9, math.inf)
     ended = plant.call("open_loop", *in_c([Drive(np.full(6, np.nan))]))
     assert ended == Ended.TOO_SHORT_STEPS

@@ -1,30 +1,19 @@
 """Torques stay what they are: step by step, and around the loop.
 
-The record is of CasADi's virtual machine, and so are the comparisons: the dynamics in C round
-otherwise, and the law alone makes more of that with every sample. Around the loop they are compared
-too.
+The record is of the law in Python, on the compiled core. The law in C rounds differently, and the
+law alone amplifies that with every sample, so it is compared around the loop.
 """
-
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
 from stewart_drake.files.resources import shipped
-from stewart_drake.native import library
-from tests.backends import switched
+from tests.backends import stepped_in_python
 from tests.recorded import runs
 
 RECORDED = runs.load()
 FEW = 10
 """Samples; alone, without a plant, the law makes more of any rounding with each further one."""
-
-
-@pytest.fixture(autouse=True)
-def virtual_machine() -> Iterator[None]:
-    """That of the record."""
-    with switched("0"):
-        yield
 
 
 def test_every_scenario_is_recorded_with_every_controller_on_both_plants() -> None:
@@ -38,11 +27,12 @@ QUICK = [row for row in runs.ROWS if row.startswith("paper/") and row.endswith("
 @pytest.mark.parametrize(
     "row", [pytest.param(r, marks=() if r in QUICK else pytest.mark.slow) for r in runs.ROWS]
 )
-def test_torques_are_what_they_were(row: str) -> None:
+def test_torques_are_what_they_were(row: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The law's answers to 1e-12 of the peak torque; to 1e-9 around the loop with its plant.
 
     With other releases or another processor the law's first samples, to 1e-7.
     """
+    stepped_in_python(monkeypatch)
     measurements, torques = RECORDED[row]
     peak = np.abs(torques).max()
     loop = runs.closed_loop(row)
@@ -62,9 +52,6 @@ def test_in_c_the_loop_does_the_same(scenario: str) -> None:
         pytest.skip("recorded with other releases or another processor")
     row = f"{scenario}/predictor_lqi/exact"
     _, torques = RECORDED[row]
-    with switched(None):
-        if library.backend().library is None:
-            pytest.skip(library.backend().reason)
-        _, found = runs.run(runs.closed_loop(row))
+    _, found = runs.run(runs.closed_loop(row))
     assert found.shape == torques.shape
     assert np.abs(found - torques).max() <= 1e-9 * np.abs(torques).max()

@@ -27,7 +27,6 @@ from stewart_drake.loop import bulk
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism import kinematics
-from stewart_drake.native.library import backend
 from stewart_drake.report.page import Provenance, html
 from stewart_drake.report.robustness_document import document
 from stewart_drake.report.robustness_figures import influence_figure
@@ -495,8 +494,6 @@ def test_a_draw_beyond_all_scenarios_is_an_outcome(one: Draw, field: str) -> Non
 def test_the_summary_counts_runs_by_what_ran_them(
     tmp_path: Path, changes: dict[str, Any], loop: str
 ) -> None:
-    if backend().library is None:
-        pytest.skip(backend().reason)
     study = study_robustness(short(**changes), tmp_path, runs=2, workers=1)
     assert study.summary["loops"] == {loop: 2}
     assert document(study).facts["loop"] == f"{loop}: 2"

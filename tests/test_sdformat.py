@@ -92,13 +92,13 @@ def gaps(mechanism: Mechanism, plant: MultibodyPlant, context: Context) -> tuple
 
 
 @pytest.mark.parametrize("name", shipped("mechanism"))
-def test_committed_file_is_what_the_writer_writes(name: str) -> None:
+def test_the_generated_file_is_what_the_writer_writes(name: str) -> None:
     """Up to the last digit, in which platforms may differ."""
     number = re.compile(r"-?\d+(\.\d+)?(e[+-]\d+)?")
-    committed = (MODELS / f"{name}.sdf").read_text()
+    generated = (MODELS / f"{name}.sdf").read_text()
     written = to_sdformat(load_mechanism(name))
-    assert number.sub("#", committed) == number.sub("#", written)
-    values = [[float(n.group()) for n in number.finditer(text)] for text in (committed, written)]
+    assert number.sub("#", generated) == number.sub("#", written)
+    values = [[float(n.group()) for n in number.finditer(text)] for text in (generated, written)]
     np.testing.assert_allclose(*values, rtol=1e-13, atol=1e-15)
 
 

@@ -1,6 +1,5 @@
 """Runs in several threads of one process give, bit for bit, what each gives alone."""
 
-import dataclasses
 import itertools
 import threading
 from collections.abc import Iterable
@@ -11,11 +10,9 @@ import xarray as xr
 from threadpoolctl import OpenBLASController, threadpool_info, threadpool_limits
 
 import stewart_drake as sd
-from stewart_drake.dynamics.compiled import Compiled
-from stewart_drake.dynamics.functions import compiled_functions
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.loop import simulation
 from stewart_drake.loop.experiment import Experiment
-from tests.mechanisms import PAPER
 
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 
@@ -37,7 +34,7 @@ def run(settings: tuple[str, ...]) -> xr.Dataset:
 
 def differing(settings: list[tuple[str, ...]], threads: int) -> list[tuple[str, ...]]:
     """Of the runs, those whose signals are not the same in threads as alone."""
-    compiled_functions.cache_clear()  # so that the threads also compile at the same time
+    functions_of.cache_clear()  # so that the threads also make them at the same time
     with ThreadPoolExecutor(threads) as pool:
         together = list(pool.map(run, settings))
     alone = [run(one) for one in settings]
@@ -89,19 +86,3 @@ def test_linear_algebra_stays_on_one_thread_until_the_last_run_ends(monkeypatch)
 def set_blas_threads(number: int) -> None:
     threadpool_limits(number, user_api="blas")
     OpenBLASController.clear_controlling_thread()
-
-
-def test_a_mechanism_is_compiled_by_one_thread_for_all() -> None:
-    """The threads meet where nothing is compiled yet, and all get the one function."""
-    longer = dataclasses.replace(PAPER, rod_lengths=PAPER.rod_lengths + 1e-5)
-    meeting = threading.Barrier(4)
-
-    functions = compiled_functions(longer)
-
-    def compiled(_: int) -> tuple[Compiled, Compiled]:
-        meeting.wait(10)
-        return functions.many_steps(3), functions.accelerations
-
-    with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(compiled, range(4)))
-    assert all(one == found[0] for one in found)

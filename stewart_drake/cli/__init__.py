@@ -115,9 +115,7 @@ def _root(
     if show_version:
         from importlib.metadata import version
 
-        from stewart_drake.native.library import backend
-
-        typer.echo(f"stewart-drake {version('stewart-drake')}, dynamics: {backend()}")
+        typer.echo(f"stewart-drake {version('stewart-drake')}")
         raise typer.Exit
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())

@@ -22,10 +22,8 @@ from typing import NamedTuple
 import casadi as ca
 
 from stewart_drake.dynamics import equations
-from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers, numbers_of
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers
 from stewart_drake.scenario.signals import (
-    BIAS,
     COULOMB,
     COULOMB_SPEED,
     NUM_PLANT_PARAMETERS,
@@ -41,32 +39,6 @@ class Plate(NamedTuple):
     w: ca.SX
     w_dot: ca.SX
     gravity: ca.SX
-
-
-def residual_derivatives(mechanism: Mechanism, s: dict[str, ca.SX]) -> list[ca.SX]:
-    """dF/d[pose; rates] (6, 12), dF/dparameters (6, 13), M N (6, 6) and B' (6, 6).
-
-    Args:
-        mechanism: the machine.
-        s: symbols, see `equations.symbols`; F is taken at constant accelerations of the pose.
-    """
-    legs, common = numbers_of(mechanism)
-    dF_dx, M = plate_alone(common, s)
-    slips = equations.slip(
-        ca.vertcat(*(crank_rate(leg, common, s) for leg in legs)), s["parameters"]
-    )
-    arms, arm_rates = [], []
-    for number, leg in enumerate(legs):
-        torque, bias = s["torque"][number], s["parameters"][BIAS][number]
-        change, turn, mass, arm, arm_rate = leg_on_plate(
-            leg, common, s, torque, bias, slips[number]
-        )
-        dF_dx += change
-        dF_dx[:3, :] -= turn
-        M += mass
-        arms.append(arm)
-        arm_rates.append(arm_rate)
-    return assembled(dF_dx, M, ca.vertcat(*arms), ca.vertcat(*arm_rates), slips, s)
 
 
 def _plate(s: dict[str, ca.SX]) -> Plate:

@@ -19,9 +19,8 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers, Number, numbers_of
-from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.native.layout import SHAPES
+from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers, Number
+from stewart_drake.native.layout import DEAD_CENTRE_SINE, SHAPES
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,
@@ -31,15 +30,6 @@ from stewart_drake.scenario.signals import (
     PAYLOAD,
     PAYLOAD_POSITION,
 )
-
-STANDARD_GRAVITY = 9.81
-"""m/s^2, along -z of W; Drake's default."""
-
-DEAD_CENTRE_SINE = 0.01
-"""Sine of the crank's angle off dead centre at which a leg counts as out of reach.
-
-At a dead centre pose coordinates are singular: alpha_dot grows like 1 / sine.
-"""
 
 
 class Leg(NamedTuple):
@@ -256,22 +246,6 @@ def angle_rate_map(angles: ca.SX) -> ca.SX:
     return ca.vertcat(
         ca.horzcat(cp * ct, -sp, 0), ca.horzcat(sp * ct, cp, 0), ca.horzcat(-st, 0, 1)
     )
-
-
-def equations_of_motion(
-    mechanism: Mechanism, pose: ca.SX, rates: ca.SX, parameters: ca.SX, gravity: ca.SX
-) -> Motion:
-    """(EOM) of the whole mechanism; `gravity` in m/s^2 along -z, `parameters` as in signals."""
-    legs, common = numbers_of(mechanism)
-    plate = plate_motion(pose, rates, gravity)
-    sums = plate_alone(common, plate, parameters)
-    arms, crank_rates = [], []
-    for leg in legs:
-        added, arm, crank_rate = leg_on_plate(leg, common, plate)
-        sums = sums.plus(added)
-        arms.append(arm)
-        crank_rates.append(crank_rate)
-    return assembled(sums, ca.vertcat(*arms), ca.vertcat(*crank_rates), pose, rates)
 
 
 def plate_motion(pose: ca.SX, rates: ca.SX, gravity: ca.SX) -> PlateMotion:

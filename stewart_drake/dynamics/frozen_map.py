@@ -37,8 +37,6 @@ class FrozenMap:
     With M the plate's mass matrix at home, M accelerations = M map (torque + bias).
     """
 
-    backend = "frozen map"
-
     def __init__(self, mechanism: Mechanism) -> None:
         plate, angles = mechanism.plate, mechanism.home[ANGLES]
         self.map = torque_map(mechanism, mechanism.home)

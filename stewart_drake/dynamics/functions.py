@@ -1,15 +1,10 @@
-"""The functions of a mechanism's dynamics: in C, or on CasADi's virtual machine."""
+"""Interface of the functions of a plant's dynamics."""
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.native.library import backend
-from stewart_drake.scenario.signals import NUM_LEGS
 
 Array = NDArray[np.float64]
 
@@ -23,10 +18,6 @@ class Call(Protocol):
 
 class MotionFunctions(Protocol):
     """Functions of pose, rates, torque, parameters (13,) and gravity (m/s^2) of one plant."""
-
-    @property
-    def backend(self) -> str:
-        """What runs them, for `summary.json`."""
 
     @property
     def accelerations(self) -> Call:
@@ -57,45 +48,3 @@ class MotionFunctions(Protocol):
 
         Steps of the classical Runge-Kutta method.
         """
-
-
-class DynamicsFunctions(MotionFunctions, Protocol):
-    """Those of a mechanism, and where it may be."""
-
-    @property
-    def measures(self) -> Call:
-        """(pose) -> the measures of the workspace (8,), see `dynamics.measures`."""
-
-    @property
-    def measures_of_tree(self) -> Call:
-        """(pose, angles) -> the same with crank angles (6,) that are known."""
-
-    def margin(self, pose: Array, sign: float, least: Array) -> float:
-        """`margin_of` the measures of a pose."""
-
-
-def margin_of(measures: Array, sign: float, least: Array) -> float:
-    """By how much the measures (8,) are above the least (8,) allowed; NaN if one of them is.
-
-    `sign`: the parallel measure's at home.
-    """
-    above = measures - least
-    above[NUM_LEGS] = sign * measures[NUM_LEGS] - least[NUM_LEGS]
-    return float(above.min())
-
-
-@lru_cache(maxsize=64)
-def compiled_functions(mechanism: Mechanism) -> DynamicsFunctions:
-    """The functions of a mechanism, shared by all who ask for it in this process.
-
-    Raises:
-        ConfigError: STEWART_NATIVE asks for what there is not.
-    """
-    library = backend().library
-    if library is None:
-        from stewart_drake.dynamics.virtual_machine import VirtualMachine
-
-        return VirtualMachine(mechanism)
-    from stewart_drake.dynamics.native_functions import NativeFunctions
-
-    return NativeFunctions(mechanism, library)

@@ -3,23 +3,7 @@
 import casadi as ca
 
 from stewart_drake.dynamics import equations
-from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers, numbers_of
-from stewart_drake.mechanism.geometry import Mechanism
-
-
-def measures(mechanism: Mechanism, pose: ca.SX, angles: ca.SX | None = None) -> ca.SX:
-    """(8,): the six sines, the parallel measure, minus the pitch's amount in rad.
-
-    `angles` (6,): of the cranks, where they are known; by inverse kinematics otherwise.
-    """
-    legs, common = numbers_of(mechanism)
-    R_WP = equations.rotation(pose[:3])
-    each = [
-        leg_measures(leg, common, R_WP, pose[3:], None if angles is None else angles[number])
-        for number, leg in enumerate(legs)
-    ]
-    sines, wrenches = zip(*each, strict=True)
-    return assembled(ca.vertcat(*sines), ca.horzcat(*wrenches), pose)
+from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers
 
 
 def leg_measures(

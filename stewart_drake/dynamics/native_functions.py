@@ -1,26 +1,69 @@
-"""The functions of a mechanism's dynamics in C: nothing is built, every machine is data."""
+"""The functions of a mechanism's dynamics, of the compiled core: a mechanism is data."""
 
 import ctypes
-from collections.abc import Sequence
-from functools import partial
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from stewart_drake.dynamics.compiled import Buffered, Buffers
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import SHAPES, SIGNATURES, geometry_of
+from stewart_drake.native.library import core_library
 from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, NUM_STATE, NUM_TORQUES
 
 Array = NDArray[np.float64]
 Shape = tuple[int, ...]
 
 
+class Buffers(NamedTuple):
+    """Where a function reads arguments from and writes results to, and what makes it do so."""
+
+    arguments: list[Array]
+    results: list[Array]
+    evaluate: Callable[[], object]
+    owner: object
+    """`evaluate` points into it without keeping it."""
+
+
+class Buffered(ABC):
+    """A function with fixed places for arguments and results; every thread has its own.
+
+    A matrix argument or result is held by columns, the row order of its transpose. Results are
+    fresh arrays.
+    """
+
+    def __init__(self) -> None:
+        self._own = threading.local()
+
+    def __call__(self, *arguments: ArrayLike) -> Sequence[Array]:
+        """Evaluate; every argument is broadcast to its place."""
+        places, results, evaluate, _ = self.own_buffers()
+        for place, argument in zip(places, arguments, strict=True):
+            place[...] = argument
+        evaluate()
+        return [result.copy() for result in results]
+
+    def own_buffers(self) -> Buffers:
+        """Those of this thread."""
+        try:
+            return self._own.buffers
+        except AttributeError:
+            self._own.buffers = self.buffers()
+            return self._own.buffers
+
+    @abstractmethod
+    def buffers(self) -> Buffers:
+        """Those of one more thread."""
+
+
 class NativeFunction(Buffered):
     """A function of native/packed.c: one buffer with arguments, geometry and results.
 
     Args:
-        library: what holds it.
         name: its name there.
         geometry: of the machine.
         arguments, results: their shapes.
@@ -29,7 +72,6 @@ class NativeFunction(Buffered):
 
     def __init__(
         self,
-        library: ctypes.CDLL,
         name: str,
         geometry: Array,
         arguments: Sequence[Shape],
@@ -37,7 +79,7 @@ class NativeFunction(Buffered):
         first: Sequence[float] = (),
     ) -> None:
         super().__init__()
-        self._call = getattr(library, name)
+        self._call = getattr(core_library(), name)
         self._call.restype = None
         self._fixed = np.array(first, dtype=np.float64), geometry
         self._shapes = arguments, results
@@ -57,12 +99,17 @@ class NativeFunction(Buffered):
 
 
 class NativeFunctions:
-    """`DynamicsFunctions` in C; a mechanism costs nothing but its numbers."""
+    """Functions of `dynamics.functions.MotionFunctions` and measures of the workspace.
 
-    backend = "native"
+    `measures` takes a pose and returns the eight of `dynamics.measures`; `measures_of_tree` takes
+    the crank angles (6,) too, where these are known.
 
-    def __init__(self, mechanism: Mechanism, library: ctypes.CDLL) -> None:
-        self._library, self._geometry = library, geometry_of(mechanism)
+    Raises:
+        ConfigError: there is no compiled core.
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self._geometry = geometry_of(mechanism)
         self._many: dict[int, NativeFunction] = {}
         named = {name: self._function(name) for name in SIGNATURES}
         self.accelerations = named["accelerations"]
@@ -75,7 +122,7 @@ class NativeFunctions:
     def _function(self, name: str) -> NativeFunction:
         signature = SIGNATURES[name]
         arguments = [SHAPES[argument] for argument in signature.arguments]
-        return NativeFunction(self._library, name, self._geometry, arguments, signature.results)
+        return NativeFunction(name, self._geometry, arguments, signature.results)
 
     def own_buffers(self, name: str) -> Buffers:
         """Fresh ones of a function of SIGNATURES, for C that calls it."""
@@ -90,7 +137,10 @@ class NativeFunctions:
         return results[0].copy()
 
     def margin(self, pose: Array, sign: float, least: Array) -> float:
-        """`margin_of` the measures of a pose."""
+        """Return by how much the measures of a pose are above `least` (8,); NaN if one is NaN.
+
+        `sign`: the parallel measure's at home.
+        """
         places, results, evaluate, _ = self._margin.own_buffers()
         places[0][...], places[1][...], places[2][...] = pose, sign, least
         evaluate()
@@ -102,8 +152,16 @@ class NativeFunctions:
         if found is None:
             shapes = (NUM_STATE,), (steps, NUM_TORQUES), (NUM_PLANT_PARAMETERS,), (), (steps,)
             results = [(steps, NUM_STATE)]
-            made = NativeFunction(
-                self._library, "predict", self._geometry, shapes, results, [steps]
-            )
+            made = NativeFunction("predict", self._geometry, shapes, results, [steps])
             found = self._many.setdefault(steps, made)
         return found
+
+
+@lru_cache(maxsize=64)
+def functions_of(mechanism: Mechanism) -> NativeFunctions:
+    """Return the functions of a mechanism, which all of this process share.
+
+    Raises:
+        ConfigError: there is no compiled core.
+    """
+    return NativeFunctions(mechanism)

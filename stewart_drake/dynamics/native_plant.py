@@ -1,17 +1,15 @@
 """The exact plant of native/plant.c: one machine, one run."""
 
-import ctypes
 from ctypes import byref, c_double
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.dynamics.functions import compiled_functions
-from stewart_drake.dynamics.native_functions import NativeFunctions
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import LEAST, home_sign
-from stewart_drake.native.library import backend
+from stewart_drake.native.library import core_library
 from stewart_drake.native.plant import Ended, LooksStruct, MachineStruct, RunStruct
 from stewart_drake.scenario.signals import NUM_STATE
 
@@ -22,8 +20,7 @@ class NativePlant:
     """A plant at t = 0 that one of the functions of plant.c takes to its end.
 
     Args:
-        dynamics: equations of motion, with the true parameters, of a mechanism whose functions are
-            the compiled ones.
+        dynamics: equations of motion, with the true parameters,.
         start: (12,) state.
         times: (n,) s, ascending, where states are wanted; the last one is the end.
         accuracy: error of a step in a coordinate x, in units of 1 + |x|.
@@ -42,8 +39,7 @@ class NativePlant:
         accuracy: float,
         longest_step: float,
     ) -> None:
-        functions = compiled_functions(dynamics.mechanism)
-        assert isinstance(functions, NativeFunctions)
+        functions = functions_of(dynamics.mechanism)
         # Buffers of its own: a controller that is called back may know the same machine.
         change, margin = functions.own_buffers("change"), functions.own_buffers("margin")
         change.arguments[2][...], change.arguments[3][...] = (
@@ -61,11 +57,8 @@ class NativePlant:
 
     def call(self, name: str, *arguments: Any) -> Ended:
         """Run by a function of plant.c with its further arguments."""
-        library = backend().library
-        assert isinstance(library, ctypes.CDLL)
-        function = library[name]
         plant = byref(self.run), byref(self._machine), byref(self._looks)
-        return Ended(function(*plant, *arguments))
+        return Ended(core_library()[name](*plant, *arguments))
 
     @property
     def seen(self) -> int:

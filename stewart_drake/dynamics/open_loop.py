@@ -1,8 +1,8 @@
 """The exact plant alone, under torques that are known beforehand, without Drake.
 
 DOP853, the Runge-Kutta method of order 8 of Dormand and Prince, goes from one change of the torques
-to the next and stops where the plate leaves its workspace (docs/theory.md, section 32). It is that
-of native/plant.c, and where nothing is compiled scipy's, with the same decisions.
+to the next and stops where the plate leaves its workspace (docs/theory.md, section 32). It runs in
+the compiled core, native/plant.c.
 """
 
 import ctypes
@@ -13,10 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.integrate import DOP853
 
-from stewart_drake.dynamics.functions import compiled_functions
-from stewart_drake.dynamics.native_functions import NativeFunctions
 from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose, margin
@@ -26,8 +23,6 @@ from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
 Array = NDArray[np.float64]
 
 _NONE: Final = (0.0,) * NUM_TORQUES
-_SHORTEST: Final = 1e-13
-"""s, relative to the time where that is above 1 s, in which the workspace's edge is found."""
 
 
 class IntegrationError(ArithmeticError):
@@ -108,9 +103,18 @@ def integrate(
     _check(x0, drives, looks, accuracy, longest_step)
     if not margin(dynamics.mechanism, x0[POSE]) > 0:
         raise ValueError(f"start: got pose {x0[POSE]}; expected one in the workspace")
-    functions = compiled_functions(dynamics.mechanism)
-    follow = _native if isinstance(functions, NativeFunctions) else _scipy
-    return follow(dynamics, x0, drives, looks, accuracy, longest_step)
+    plant = NativePlant(dynamics, x0, looks, accuracy, longest_step)
+    ended = plant.call("open_loop", *in_c(drives))
+    if ended == Ended.TOO_SHORT_STEPS:
+        raise IntegrationError(
+            f"no step is short enough at t = {plant.time:.6g} s for an accuracy of {accuracy:g}"
+        )
+    failure = None
+    if ended == Ended.LEFT:
+        failure = diagnose(dynamics.mechanism, plant.time, plant.final[POSE])
+    seen, run = plant.seen, plant.run
+    kept = looks[:seen], plant.states[:seen]
+    return Course(*kept, plant.time, plant.final, failure, run.steps, run.evaluations)
 
 
 def _check(
@@ -135,28 +139,6 @@ def _check(
                 raise ValueError(f"drives: {name}: got shape {shape}; expected {(NUM_TORQUES,)}")
 
 
-def _native(
-    dynamics: StewartDynamics,
-    start: Array,
-    drives: Sequence[Drive],
-    times: Array,
-    accuracy: float,
-    longest_step: float,
-) -> Course:
-    plant = NativePlant(dynamics, start, times, accuracy, longest_step)
-    ended = plant.call("open_loop", *in_c(drives))
-    failure = None
-    if ended == Ended.TOO_SHORT_STEPS:
-        raise IntegrationError(_too_short(plant.time, accuracy))
-    if ended == Ended.LEFT:
-        failure = diagnose(dynamics.mechanism, plant.time, plant.final[POSE])
-    seen, run = plant.seen, plant.run
-    end, final = plant.time, plant.final
-    return Course(
-        times[:seen], plant.states[:seen], end, final, failure, run.steps, run.evaluations
-    )
-
-
 def in_c(drives: Sequence[Drive]) -> tuple[Any, ...]:
     """Drives as the arguments of `open_loop` of plant.c."""
     structs = (DriveStruct * len(drives))()
@@ -166,64 +148,3 @@ def in_c(drives: Sequence[Drive]) -> tuple[Any, ...]:
         struct.frequency = drive.frequency
     starts = (ctypes.c_double * len(drives))(*(drive.start for drive in drives))
     return structs, starts, ctypes.c_long(len(drives))
-
-
-def _too_short(time: float, accuracy: float) -> str:
-    return f"no step is short enough at t = {time:.6g} s for an accuracy of {accuracy:g}"
-
-
-@np.errstate(over="ignore", invalid="ignore")  # the outcome is checked instead
-def _scipy(
-    dynamics: StewartDynamics,
-    start: Array,
-    drives: Sequence[Drive],
-    times: Array,
-    accuracy: float,
-    longest_step: float,
-) -> Course:
-    """The loop of `advance` in plant.c around scipy's steps."""
-    time, x, states, steps, evaluations = 0.0, start, list[Array](), 0, 0
-    failure: Failure | None = None
-    for drive, until in zip(drives, [*(d.start for d in drives[1:]), math.inf], strict=True):
-        end = min(until, float(times[-1]))
-        states += [x] * int(np.sum(times[len(states) :] <= time))
-        if failure is not None or not time < end:
-            break
-
-        def slope(t: float, y: Array, drive: Drive = drive) -> Array:
-            return dynamics.change(y, drive.torque(t))
-
-        limits = {"max_step": longest_step, "rtol": accuracy, "atol": accuracy}
-        solver = DOP853(slope, time, x, end, **limits)
-        while failure is None and solver.status == "running":
-            message, before = solver.step(), time
-            if message is not None:
-                raise IntegrationError(f"{_too_short(time, accuracy)}: {message}")
-            time, x, steps = solver.t, solver.y, steps + 1
-            within = solver.dense_output()
-            looks = times[len(states) :]
-            for t in [*looks[looks <= time], time]:
-                y = within(t)
-                if not margin(dynamics.mechanism, y[POSE]) > 0:
-                    time = _edge(dynamics, within, before, t)
-                    x = within(time)
-                    failure = diagnose(dynamics.mechanism, time, x[POSE])
-                    break
-                before = t
-                if len(states) < len(times) and t == times[len(states)]:
-                    states.append(y)
-        evaluations += solver.nfev
-    kept = np.array(states).reshape(-1, NUM_STATE)
-    return Course(times[: len(kept)], kept, time, x, failure, steps, evaluations)
-
-
-def _edge(dynamics: StewartDynamics, within: object, inside: float, outside: float) -> float:
-    """When the plate is no longer inside, s, by halves."""
-    assert callable(within)
-    while outside - inside > _SHORTEST * max(1.0, outside):
-        middle = inside + (outside - inside) / 2
-        if margin(dynamics.mechanism, within(middle)[POSE]) > 0:
-            inside = middle
-        else:
-            outside = middle
-    return outside

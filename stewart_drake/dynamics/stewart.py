@@ -6,13 +6,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE, STANDARD_GRAVITY
-from stewart_drake.dynamics.functions import MotionFunctions, compiled_functions
+from stewart_drake.dynamics.functions import MotionFunctions
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import standing
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, angle_rate_map
 from stewart_drake.mechanism.torque_map import TorqueMap, torque_map
+from stewart_drake.native.layout import DEAD_CENTRE_SINE, STANDARD_GRAVITY
 from stewart_drake.scenario.signals import (
     ANGLES,
     COULOMB_SPEED,
@@ -154,7 +155,7 @@ class StewartDynamics:
         place = [PLANT_PARAMETERS.index(free[i]) for i in own]
         self._own, self._place = _slice(own), _slice(place)
         self.parameters = self.free_of(self.plant_parameters)
-        self._functions: MotionFunctions = compiled_functions(mechanism)
+        self._functions: MotionFunctions = functions_of(mechanism)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Compiled functions cannot be copied, but made again, or found.

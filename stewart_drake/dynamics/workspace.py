@@ -6,9 +6,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
-from stewart_drake.dynamics.functions import compiled_functions, margin_of
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.native.layout import DEAD_CENTRE_SINE
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ def standing(mechanism: Mechanism, pose: Array, crank_angles: Array | None = Non
     shows as a negative sine; from the pose alone it cannot be seen.
     """
     measures = _measures(mechanism, pose, crank_angles)
-    parallel, least = float(measures[NUM_LEGS]), margin_of(measures, home_sign(mechanism), LEAST)
+    parallel, least = float(measures[NUM_LEGS]), _margin_of(measures, home_sign(mechanism))
     return Standing(measures[:NUM_LEGS], parallel, float(pose[1]), least)
 
 
@@ -64,13 +64,19 @@ def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None)
     """Positive where `standing` is permitted, zero on the boundary, dimensionless; NaN for NaN."""
     sign = home_sign(mechanism)
     if crank_angles is None:
-        return compiled_functions(mechanism).margin(pose, sign, LEAST)
-    return margin_of(_measures(mechanism, pose, crank_angles), sign, LEAST)
+        return functions_of(mechanism).margin(pose, sign, LEAST)
+    return _margin_of(_measures(mechanism, pose, crank_angles), sign)
+
+
+def _margin_of(measures: Array, sign: float) -> float:
+    above = measures - LEAST
+    above[NUM_LEGS] = sign * measures[NUM_LEGS] - LEAST[NUM_LEGS]
+    return float(above.min())
 
 
 def _measures(mechanism: Mechanism, pose: Array, crank_angles: Array | None) -> Array:
     """(8,): the six sines, the parallel measure, minus the pitch's amount in rad."""
-    functions = compiled_functions(mechanism)
+    functions = functions_of(mechanism)
     if crank_angles is None:
         return functions.measures(pose)[0]
     return functions.measures_of_tree(pose, crank_angles)[0]

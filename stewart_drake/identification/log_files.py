@@ -11,13 +11,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from stewart_drake.dynamics.equations import STANDARD_GRAVITY
 from stewart_drake.files.arrayio import load_netcdf
 from stewart_drake.files.csvio import csv_rows, read_columns, read_lines
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import brief, parse_yaml, validate
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.native.layout import STANDARD_GRAVITY
 from stewart_drake.scenario.config import NetworkConfig, Scenario, StateSensorConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE, NUM_TORQUES
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.dynamics import equations
-from stewart_drake.dynamics.compiled import Compiled
+from stewart_drake.dynamics.native_functions import Buffered, Buffers
 from stewart_drake.dynamics.numbers import leg_numbers, numbers_of
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.mechanism.geometry import Mechanism
@@ -71,6 +71,32 @@ class SymbolicLegs(NamedTuple):
     def geometry(self) -> ca.SX:
         """What is free of the legs' numbers (NUM_GEOMETRY,), leg by leg."""
         return ca.vec(self.legs[list(LEG_PLACES), :])
+
+
+class Compiled(Buffered):
+    """A CasADi function behind its buffer interface; a plain call spends twice its time converting.
+
+    Arguments and results are dense.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        super().__init__()
+        self.function = function
+        for i in range(function.n_out()):
+            if function.sparsity_out(i).nnz() != function.numel_out(i):
+                raise ValueError(f"{function.name()}: result {i} is sparse; densify it")
+
+    def buffers(self) -> Buffers:
+        """Return those of CasADi."""
+        function = self.function
+        buffer, evaluate = function.buffer()
+        arguments = [np.zeros(function.size_in(i)[::-1]).squeeze() for i in range(function.n_in())]
+        results = [np.zeros(function.size_out(i)[::-1]).squeeze() for i in range(function.n_out())]
+        for i, argument in enumerate(arguments):
+            buffer.set_arg(i, memoryview(np.atleast_1d(argument)))  # type: ignore[call-arg]
+        for i, result in enumerate(results):
+            buffer.set_res(i, memoryview(np.atleast_1d(result)))  # type: ignore[call-arg]
+        return Buffers(arguments, results, evaluate, buffer)
 
 
 class MachineModel:

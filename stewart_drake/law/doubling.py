@@ -1,10 +1,8 @@
 """The Riccati equation by structure-preserving doubling, in C: see native/riccati.c.
 
-The law in C designs with it. `law.riccati.lqr`, by Drake's solver, is what the law in Python and
-the analyses use, and what this is compared with.
+The law in C designs with it. The law in Python and the analyses use `law.riccati.lqr`, by Drake's
+solver, which is the oracle of this one.
 """
-
-import ctypes
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +19,19 @@ class Doubling:
     """Gain and cost of n states, (n, n) and (n, 6), as `law.riccati.lqr` gives them.
 
     Args:
-        library: the compiled one.
         order: n.
 
     Raises:
         ValueError: more states than it has place for.
     """
 
-    def __init__(self, library: ctypes.CDLL, order: int) -> None:
+    def __init__(self, order: int) -> None:
         if not 0 < order <= MAX_ORDER:
             raise ValueError(f"order: got {order}; expected 1 to {MAX_ORDER}")
         n, m = order, NUM_TORQUES
         arguments, results = [(n, n), (n, m), (n, n), (m, m)], [(m, n), (n, n), (1,)]
         nothing = np.empty(0)
-        self._call = NativeFunction(library, "riccati", nothing, arguments, results, [n])
+        self._call = NativeFunction("riccati", nothing, arguments, results, [n])
 
     def __call__(self, A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
         """K (6, n) and P (n, n).

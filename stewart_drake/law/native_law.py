@@ -42,7 +42,7 @@ from stewart_drake.native.law_layout import (
     check_sizes,
 )
 from stewart_drake.native.layout import geometry_of
-from stewart_drake.native.library import backend
+from stewart_drake.native.library import core_library
 from stewart_drake.scenario.signals import (
     NUM_REFERENCE,
     NUM_STATE,
@@ -288,9 +288,7 @@ AnyMemory = Memory | NativeMemory
 
 def serving(law: PredictiveLqi) -> Serving:
     """The law in C where there is one and it is this one, else the law in Python."""
-    found, field = backend(), uncovered(law)
-    if found.library is None:
-        return Serving(law, f"python ({found.reason})")
+    field = uncovered(law)
     if field is not None:
         return Serving(law, f"python ({field})")
-    return Serving(NativeLqi(law, found.library), "native")
+    return Serving(NativeLqi(law, core_library()), "native")

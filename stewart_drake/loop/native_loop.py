@@ -19,7 +19,6 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.experiment import Experiment, torques_in_flight, true_dynamics
 from stewart_drake.loop.sensor import white_noises
 from stewart_drake.native.law_layout import CAUSES, address
-from stewart_drake.native.library import backend
 from stewart_drake.native.plant import Controller, Ended, LoopStruct
 from stewart_drake.scenario.config import (
     Scenario,
@@ -163,7 +162,6 @@ def uncovered(scenario: Scenario) -> str | None:
     """What of a scenario only Drake's loop has, by its field, or None."""
     sc = scenario
     only_drake = {
-        str(backend()): backend().library is None,
         "plant.kind": sc.plant.kind != "exact",
         "link.kind": not isinstance(sc.link, WireConfig),
         "actuator.kind": not isinstance(sc.actuator, TorqueActuatorConfig),

@@ -19,7 +19,6 @@ from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.experiment import Experiment, waits_at_rest
 from stewart_drake.loop.results import DelaySummary, RunSummary
 from stewart_drake.loop.tuner import AnnTuner, LawTuner
-from stewart_drake.native.library import backend
 from stewart_drake.scenario.config import EncoderSensorConfig
 from stewart_drake.scenario.loading import scenario_to_dict, scenario_yaml
 from stewart_drake.scenario.signals import (
@@ -263,7 +262,7 @@ def summarize(
         },
         "delay": recorder.delay,
         "wall_s": wall,
-        "backend": backend().name,
+        "backend": "native",
         "controller_backend": recorder.controller_backend,
         "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
         "link": plain(sc.assumed_link),

@@ -80,7 +80,7 @@ class RunSummary(TypedDict):
     wall_s: float
     """Time that the run took, s."""
     backend: str
-    """What ran the dynamics: `native`, or `casadi`, its virtual machine."""
+    """What ran the dynamics: always `native`, the compiled core."""
     controller_backend: str
     """What stepped the controller: `native`, `own`, or `python`, and the field that C has not."""
     counts: dict[str, int]

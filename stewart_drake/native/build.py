@@ -1,10 +1,14 @@
-"""`python -m stewart_drake.native.build` compiles the C beside it, as an installation does.
+"""`python -m stewart_drake.native.build` makes the compiled core, as an installation does.
 
-The build hook loads this file by its path, before anything is installed: nothing but Python in it.
+First the text that is generated from the equations and the mechanism files, where it is missing or
+older than its source; then the library. The build hook loads this file by its path before anything
+is installed, so it imports nothing but Python's own modules.
 """
 
 import hashlib
+import importlib.util
 import os
+import platform
 import shlex
 import shutil
 import subprocess
@@ -13,27 +17,57 @@ import tempfile
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent
+ROOT = FOLDER.parents[1]
 LIBRARY = FOLDER / "_dynamics.so"
-# Neither contracted to fused operations nor reordered: the numbers are those of CasADi's virtual
-# machine to the last digits. Without errno and traps, which nobody reads, the compiler can do two
+EQUATIONS = FOLDER / "equations.h"
+MODELS = ROOT / "models"
+GENERATORS = ("equations", "derivatives", "measures", "emit", "numbers", "generate")
+"""Modules of `dynamics` that write equations.h."""
+
+# Neither contracted to fused operations nor reordered: the numbers are those of the equations in
+# CasADi to the last digits. Without errno and traps, which nothing reads, the compiler can do two
 # legs at a time; that changes no number.
 FLAGS = (
     *("-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
     *("-fPIC", "-shared", "-fvisibility=hidden"),
 )
-
-
 SOURCES = sorted(str(path) for path in FOLDER.glob("*.c"))
 
 
 def source_hash() -> str:
-    """Of what the library is compiled from; the library carries it."""
-    sources = sorted(FOLDER.glob("*.[ch]"))
-    return hashlib.sha256(b"\0".join(path.read_bytes() for path in sources)).hexdigest()[:16]
+    """Return the hash of the library's source, which the library carries."""
+    return _hash(sorted(FOLDER.glob("*.[ch]")))
 
 
-def compiler() -> list[str] | None:
-    """The command: CC, or what is there under a usual name; None without any."""
+def equations_hash() -> str:
+    """Return the hash of what writes equations.h, which the file carries."""
+    dynamics = FOLDER.with_name("dynamics")
+    return _hash([*(dynamics / f"{name}.py" for name in GENERATORS), FOLDER / "layout.py"])
+
+
+def _hash(paths: list[Path]) -> str:
+    return hashlib.sha256(b"\0".join(path.read_bytes() for path in paths)).hexdigest()[:16]
+
+
+def is_generated() -> bool:
+    """Check that equations.h is current and that every mechanism has its SDFormat."""
+    if not EQUATIONS.exists() or equations_hash() not in EQUATIONS.read_text().partition("\n")[0]:
+        return False
+    return all(path.with_suffix(".sdf").exists() for path in MODELS.glob("*.yaml"))
+
+
+def generate() -> None:
+    """Write equations.h and models/*.sdf.
+
+    Raises:
+        CalledProcessError: what writes them failed, for want of CasADi for example.
+    """
+    command = [sys.executable, "-m", "stewart_drake.dynamics.generate"]
+    subprocess.run(command, check=True, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)})
+
+
+def system_compiler() -> list[str] | None:
+    """Return the command of CC, or of a usual C compiler; None without one."""
     named = shlex.split(os.environ.get("CC", ""))
     for command in [named] if named else [["cc"], ["gcc"], ["clang"]]:
         if shutil.which(command[0]):
@@ -41,11 +75,25 @@ def compiler() -> list[str] | None:
     return None
 
 
+def compiler() -> list[str] | None:
+    """Return the command of the system's C compiler, else of the package ziglang; None without.
+
+    Zig's builds run with glibc 2.28 and later. Its checks of undefined behaviour, which it has on
+    by default, need a library of their own.
+    """
+    found = system_compiler()
+    if found is None and importlib.util.find_spec("ziglang") is not None:
+        found = [sys.executable, "-m", "ziglang", "cc", "-fno-sanitize=undefined"]
+        if sys.platform == "linux":
+            found += ["-target", f"{platform.machine()}-linux-gnu.2.28"]
+    return found
+
+
 def compile_library(target: Path = LIBRARY) -> str | None:
-    """Compile into a file; in one line why that did not work, or None."""
+    """Compile into a file. Return None, or in one line why that failed."""
     command = compiler()
     if command is None:
-        return "there is no C compiler"
+        return "no C compiler found; install one, or the Python package ziglang"
     try:
         with tempfile.TemporaryDirectory(dir=target.parent) as folder:
             made = Path(folder) / target.name
@@ -62,4 +110,6 @@ def compile_library(target: Path = LIBRARY) -> str | None:
 
 
 if __name__ == "__main__":
+    if not is_generated():
+        generate()
     sys.exit(compile_library())

@@ -16,6 +16,13 @@ from stewart_drake.scenario.signals import (
 
 Array = NDArray[np.float64]
 
+STANDARD_GRAVITY: Final = 9.81
+"""m/s^2, along -z of W; Drake's default."""
+DEAD_CENTRE_SINE: Final = 0.01
+"""Sine of the crank's angle off dead centre at which a leg counts as out of reach.
+
+At a dead centre pose coordinates are singular: alpha_dot grows like 1 / sine.
+"""
 LEG_NUMBERS: Final = 18
 """Crank's and rod's lengths, branch, R_WS by columns (9), p_PQ (3), p_WS (3); each for six legs."""
 COMMON_NUMBERS: Final = 13

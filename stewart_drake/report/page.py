@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 
 from stewart_drake.files.fileio import replacing
 from stewart_drake.files.versions import versions
-from stewart_drake.native.library import backend
 from stewart_drake.report.document import Document
 from stewart_drake.report.style import figure_style, for_dark_too, rounded
 
@@ -36,13 +35,11 @@ class Provenance:
         command: what makes it again, as typed.
         versions: of what it depends on.
         seconds: how long it took, or None.
-        backend: what ran the dynamics.
     """
 
     command: str
     versions: Mapping[str, str] = field(default_factory=versions)
     seconds: float | None = None
-    backend: str = field(default_factory=lambda: backend().name)
 
 
 def html(document: Document, made: Provenance) -> str:

@@ -6,8 +6,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
+from stewart_drake.native.layout import DEAD_CENTRE_SINE
 from stewart_drake.report.document import (
     Block,
     Document,

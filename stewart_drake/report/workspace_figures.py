@@ -14,8 +14,8 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from stewart_drake.dynamics.equations import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, Failure
+from stewart_drake.native.layout import DEAD_CENTRE_SINE
 from stewart_drake.report.style import FACTORS, UNITS, Line, figure_style
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
 from stewart_drake.studies.clearance import ClearanceStudy

@@ -15,20 +15,22 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from pydrake.systems.analysis import Simulator
 from scipy.linalg import expm
 
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.loop.simulation import make_simulator
+from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_understood
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES
 from stewart_drake.scenario.timing import event_time, look_time
-from tests.backends import switched
+from tests.backends import stepped_in_python
 
 Array = NDArray[np.float64]
 FILE = Path(__file__).with_name("torques.npz")
@@ -136,19 +138,17 @@ def made_with() -> str:
     """What rounding depends on: releases, and how libraries round on this processor.
 
     Sines, products and factorisations choose their code by the processor, which need not show in
-    its name: their own last bits are the witness. The backend does not matter: the record is made
-    with CasADi's virtual machine, wherever it is.
+    its name: their own last bits are the witness, and those of the compiled core.
     """
-    releases = [f"{name} {version(name)}" for name in ("drake", "numpy", "scipy", "casadi")]
+    releases = [f"{name} {version(name)}" for name in ("drake", "numpy", "scipy")]
     draw = np.random.default_rng(0).standard_normal
-    A, B, x = draw((18, 18)), draw((18, 6)), ca.SX.sym("x")
-    elementary = ca.Function("f", [x], [ca.vertcat(ca.sin(x), ca.atan2(x, 2), ca.sqrt(2 + x))])
+    A, B, paper = draw((18, 18)), draw((18, 6)), StewartDynamics(load_mechanism("paper"))
     rounded = [
         np.linalg.solve(A, B),
         np.linalg.eigvals(A @ A.T),
         expm(A),
         DiscreteAlgebraicRiccatiEquation(A / 4, B, np.eye(18), np.eye(6)),
-        elementary(np.linspace(-1, 1, 101)[None]).full(),
+        paper.change(np.append(paper.mechanism.home, np.ones(6)), np.ones(6)),
     ]
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in rounded))
     return ", ".join([*releases, digest.hexdigest()[:16]])
@@ -186,5 +186,6 @@ def main(rows: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    with switched("0"):
+    with pytest.MonkeyPatch.context() as patch:
+        stepped_in_python(patch)
         main(sys.argv[1:])
