@@ -30,7 +30,6 @@ from stewart_drake.law.native_law import Serving
 from stewart_drake.law.observers import NoObserver, ParameterObserver
 from stewart_drake.law.predictors import NonlinearPredictor
 from stewart_drake.loop import controller
-from stewart_drake.native.library import backend
 
 RUNS = 6
 REPEATS = 300
@@ -146,7 +145,7 @@ def evaluations() -> list[list[str]]:
     dynamics.accelerations(pose, rates, torque)
     compiled, theta = dynamics._functions.accelerations, plant_parameters(dynamics.parameters)
     calls: dict[str, Callable[[], object]] = {
-        f"the function alone, {backend().name}": compiled.own_buffers().evaluate,
+        "the function alone": compiled.own_buffers().evaluate,
         "with its arguments": lambda: compiled(pose, rates, torque, theta, dynamics.gravity),
         "`StewartDynamics.accelerations`": lambda: dynamics.accelerations(pose, rates, torque),
     }

@@ -1,9 +1,7 @@
 """Runs of `analyze robustness` in C and in Drake, one after the other, machine by machine.
 
-Drake's ends are those at an accuracy of 1e-12; its times are those of the scenario as it stands:
-with the law and the dynamics in C, and, in another process and in turns with the others, with
-Python's law on CasADi's virtual machine. Times are of the processor, all that belongs to a run
-included: what is drawn, the law's parts, the file's text.
+Drake's outcomes are those at an accuracy of 1e-12. Its times are those of the scenario as it
+stands. Times are of the processor and include the draw, the law's parts and the file's text.
 """
 
 import argparse
@@ -11,9 +9,7 @@ import json
 import os
 import time
 from collections.abc import Callable
-from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from typing import Any, Final
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -25,7 +21,6 @@ import stewart_drake as sd
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.native.library import SWITCH, backend
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.robustness import run_draw
@@ -48,24 +43,18 @@ def in_drake(scenario: Scenario, one: Draw) -> sd.SimulationResult:
     return simulate(changed.as_scenario(), truth=changed.machine(), margin=False)
 
 
-def without_c(value: str = "0") -> None:
-    """Of a process that has not made any function yet."""
-    os.environ[SWITCH] = value
-    backend.cache_clear()
-
-
 def seconds_in_drake(scenario: Scenario, one: Draw) -> float:
     """Processor time of a run as a simulation."""
     return timed(lambda: in_drake(scenario, one))[0]
 
 
-def measure(scenario: Scenario, runs: int, seed: int, other: Executor) -> dict[str, str]:
-    """What is claimed, by name; in the process of `other` nothing is compiled."""
+def measure(scenario: Scenario, runs: int, seed: int) -> dict[str, str]:
+    """Measure the rows of the table."""
     exact = replace(scenario, plant=replace(scenario.plant, accuracy=1e-12))
     peak = run_in_bulk(scenario).figures.peak_torque
     scales = scales_of(prepare(scenario), peak)
     same, errors, stops, native, loops = 0, [0.0], [0.0], [], set()
-    drake: dict[str, list[float]] = {"C": [], "Python": []}
+    drake: list[float] = []
     for index in range(runs):
         one = draw(Ranges(), scales, scenario, seed, index)
         seconds, file = timed(lambda one=one: json.loads(run_draw(scenario, one)))
@@ -73,9 +62,7 @@ def measure(scenario: Scenario, runs: int, seed: int, other: Executor) -> dict[s
         native.append(seconds)
         loops.add(found["loop"])
         if index % TIMED == 0:
-            drake["C"].append(seconds_in_drake(scenario, one) / seconds)
-            python = other.submit(seconds_in_drake, scenario, one).result()
-            drake["Python"].append(python / seconds)
+            drake.append(seconds_in_drake(scenario, one) / seconds)
         same += found["status"] == expected.status
         if expected.stopped is None and found["error"] is not None:
             errors.append(abs(found["error"] / expected.accumulated_error - 1))
@@ -88,12 +75,9 @@ def measure(scenario: Scenario, runs: int, seed: int, other: Executor) -> dict[s
         "E_ac, largest relative difference": f"{max(errors):.1e}",
         "instant of leaving, largest difference": f"{max(stops):.1e} s",
         "ms of a run in C": f"{1e3 * np.mean(native):.1f}",
-        **{
-            f"Drake's time over that with law, dynamics in {language}, median (quartiles)": (
-                "{1:.1f} ({0:.1f} to {2:.1f})".format(*np.percentile(ratios, [25, 50, 75]))
-            )
-            for language, ratios in drake.items()
-        },
+        "Drake's time over that, median (quartiles)": (
+            "{1:.1f} ({0:.1f} to {2:.1f})".format(*np.percentile(drake, [25, 50, 75]))
+        ),
         "100 000 runs on two cores": f"{1e5 * np.mean(native) / 7200:.2f} h",
     }
 
@@ -105,8 +89,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=20261)
     given = parser.parse_args()
     scenario = sd.load_scenario("paper", settings=["plant.kind=exact"])
-    with ProcessPoolExecutor(1, get_context("spawn"), without_c) as other:
-        rows = measure(scenario, given.runs, given.seed, other)
+    rows = measure(scenario, given.runs, given.seed)
     write(__file__, "Monte Carlo in C", [table(["what", "value"], list(rows.items()))])
 
 

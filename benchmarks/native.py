@@ -7,9 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields
-from multiprocessing import get_context
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -17,13 +15,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from _page import write
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import Sine
 
 import stewart_drake as sd
-from stewart_drake.dynamics.compiled import Buffered
-from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.law.delay_model import delayed_model
 from stewart_drake.law.doubling import Doubling
 from stewart_drake.law.error_model import linear_model
@@ -32,9 +25,10 @@ from stewart_drake.law.motion import Preview
 from stewart_drake.law.native_law import NativeLqi
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import lqr, reduced_gain
-from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.native.library import core_library
 from stewart_drake.report.export_c import recorded_law
+
+MECHANISM = sd.load_mechanism("paper")
 
 
 def repeated(call: Callable[[], object], number: int) -> float:
