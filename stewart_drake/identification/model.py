@@ -93,9 +93,9 @@ class Compiled(Buffered):
         arguments = [np.zeros(function.size_in(i)[::-1]).squeeze() for i in range(function.n_in())]
         results = [np.zeros(function.size_out(i)[::-1]).squeeze() for i in range(function.n_out())]
         for i, argument in enumerate(arguments):
-            buffer.set_arg(i, memoryview(np.atleast_1d(argument)))  # type: ignore[call-arg]
+            buffer.set_arg(i, memoryview(np.atleast_1d(argument)))  # type: ignore[arg-type, call-arg]
         for i, result in enumerate(results):
-            buffer.set_res(i, memoryview(np.atleast_1d(result)))  # type: ignore[call-arg]
+            buffer.set_res(i, memoryview(np.atleast_1d(result)))  # type: ignore[arg-type, call-arg]
         return Buffers(arguments, results, evaluate, buffer)
 
 
