@@ -303,6 +303,7 @@ def test_summary_is_what_the_signals_say() -> None:
         "measurements_rejected",
         "bad_measurements",
         "saturated_steps",
+        "references_missing",
         "tuner_fallbacks",
     }
     assert run.summary["failure"] is None

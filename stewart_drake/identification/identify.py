@@ -291,10 +291,18 @@ def _tried(logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns) -> l
     tried = list[_Tried]()
     for one in _starts(logs, poses, unknowns):
         begun = _begin(one, logs, poses, unknowns)
-        problem, fit = _grown(begun)
+        grown = _grown(begun)
+        if grown is None:
+            continue
+        problem, fit = grown
         tried.append(_Tried(problem, fit, len(begun.whole.segments) - len(problem.segments)))
         if tried[-1].misfit <= WRONG and tried[-1].delay_std <= VAGUE:
             break
+    if not tried:
+        raise ConfigError(
+            "LOG: got no stretch that the mechanism could have moved through under these torques; "
+            "expected a log of this machine, torques in N m as they were commanded"
+        )
     return tried
 
 
@@ -315,7 +323,7 @@ def _starts(logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns) -> 
         yield _Start(values, 0.5, _COARSE)
     for values in scanned(log, own, unknowns):
         yield _Start(values, 1.0, _NEAR)
-        yield _Start(values, 0.5, _NEAR)
+        yield _Start(values, 0.25, _NEAR)
 
 
 def scanned(log: Log, poses: Array, unknowns: Unknowns) -> list[Array]:
@@ -436,7 +444,7 @@ def _begin(one: _Start, logs: Sequence[Log], poses: Sequence[Array], unknowns: U
     return _Begun(chi2, whole, fit.guess.values, first)
 
 
-def _grown(begun: _Begun) -> tuple[Problem, Fit]:
+def _grown(begun: _Begun) -> tuple[Problem, Fit] | None:
     """The fit of all segments, without those that nothing fits.
 
     Where the nearest segments are explained, and all of them are not, a trajectory may have gone
@@ -444,8 +452,10 @@ def _grown(begun: _Begun) -> tuple[Problem, Fit]:
     is not quite this one can make it is left out then, as long as more than the nearest are left.
     """
     problem, guess = followed(begun.whole, Guess(begun.values, begun.first))
+    if not problem.segments:
+        return None
     if begun.chi2 > WRONG:
-        return refined(problem, _solved(problem, guess), _FEW)
+        return refined(problem, solve(problem, guess), _FEW)
     fewest = len(problem.segments) // 2 + 1
     problem, fit = refined(problem, solve(problem, guess, _FEW), _FEW)
     while chi2_per_value(fit.residuals, problem)["all"] > WRONG and len(problem.segments) > fewest:
@@ -455,15 +465,6 @@ def _grown(begun: _Begun) -> tuple[Problem, Fit]:
         problem, guess = without(problem, fit.guess, int(off.argmax()))
         problem, fit = refined(problem, solve(problem, guess, _FEW), _FEW)
     return problem, fit if fit.iterations < _FEW else solve(problem, fit.guess)
-
-
-def _solved(problem: Problem, guess: Guess) -> Fit:
-    if not problem.segments:
-        raise ConfigError(
-            "LOG: got no stretch that the mechanism could have moved through under these torques; "
-            "expected a log of this machine, torques in N m as they were commanded"
-        )
-    return solve(problem, guess)
 
 
 def _unknowns(

@@ -58,7 +58,7 @@ class Counts(NamedTuple):
 class Memory:
     """What the controller carries from one sample to the next.
 
-    The shapes never change, but that of the gain with the delay that is believed in.
+    The shapes never change, but those of gain and reference with the delay that is believed in.
 
     Attributes:
         in_flight: (n > L, 6) torques, oldest first; the last is the newest. The last L are the
@@ -74,10 +74,10 @@ class Memory:
         counts: see `Counts`.
         plan: (N, 6) torques that were sent last, the first of them the last in flight.
         sent: what the channel remembers.
+        reference: that was followed, NaN before the first sample.
         path: that was planned in flight, or None.
         silence: samples that are still to go on without feedback.
         feedforward: (6,) how much of `torque` rests on no measurement; NaN before the first sample.
-        reference: that was followed, None before the first sample.
     """
 
     in_flight: Array
@@ -91,10 +91,10 @@ class Memory:
     counts: Counts
     plan: Array
     sent: Sent
+    reference: Previewed
     path: Trajectory | None = None
     silence: int = 0
     feedforward: Array = field(default_factory=lambda: np.full(NUM_TORQUES, np.nan))
-    reference: Previewed | None = None
 
     def without_error(self) -> "Memory":
         """The same with nothing integrated."""

@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.scenario.signals import ACCELERATIONS, NUM_COORDINATES, POSE, RATES
+from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
+    NUM_COORDINATES,
+    NUM_REFERENCE,
+    POSE,
+    RATES,
+)
 from stewart_drake.scenario.trajectories import evaluate
 
 Array = NDArray[np.float64]
@@ -70,8 +76,13 @@ class Previewed(NamedTuple):
     times: Array
     reference: Array
 
+    @classmethod
+    def nothing(cls, times: Array) -> "Previewed":
+        """Return one that is not known at any of the instants."""
+        return cls(times, np.full((len(times), NUM_REFERENCE), np.nan))
 
-def completed(given: Previewed, last: Previewed | None, timeline: Timeline) -> Array:
+
+def completed(given: Previewed, last: Previewed, timeline: Timeline) -> Array:
     """Return the reference (p, 18), with numbers for what is NaN or infinite in the given one.
 
     They lie between the rows next to them in time, of this preview or of the last one, or continue
@@ -79,18 +90,16 @@ def completed(given: Previewed, last: Previewed | None, timeline: Timeline) -> A
 
     Args:
         given: for this sample.
-        last: what `completed` returned for the sample before, with its instants, or None.
+        last: what `completed` returned for the sample before, with its instants.
         timeline: period and delay.
     """
     times, preview = given
     finite = np.all(np.isfinite(preview), axis=1)
     if np.all(finite):
         return preview
-    known, rows = times[finite], preview[finite]
-    if last is not None:
-        there = np.all(np.isfinite(last.reference[1:]), axis=1)
-        known = np.append(known, last.times[1:][there] - timeline.period)
-        rows = np.vstack([rows, last.reference[1:][there]])
+    there = np.all(np.isfinite(last.reference[1:]), axis=1)
+    known = np.append(times[finite], last.times[1:][there] - timeline.period)
+    rows = np.vstack([preview[finite], last.reference[1:][there]])
     if not len(known):
         return preview.copy()
     rate = 2 / (timeline.eta + timeline.period)

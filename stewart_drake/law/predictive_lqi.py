@@ -147,6 +147,7 @@ class PredictiveLqi:
             counts=Counts(),
             plan=np.tile(nothing, (self.channel.torques, 1)),
             sent=self.channel.start(),
+            reference=Previewed.nothing(self.preview_times),
             silence=self.silence,
         )
 
@@ -186,11 +187,9 @@ class PredictiveLqi:
         if followed.anew:
             memory = memory.without_error()
         samples = 1 + len(self.predictor.samples(belief.timeline))
-        as_assumed = belief.timeline == self.timeline
-        times = self.preview_times if as_assumed else self.times_for(belief.timeline)
-        given = Previewed(times, followed.motion(times))
-        preview = completed(given, memory.reference, belief.timeline)
-        if preview is not given.reference:  # which spoils the plan as a limit does
+        reference, missing = self._previewed(memory, belief.timeline, followed.motion)
+        preview = reference.reference
+        if missing:  # which spoils the plan as a limit does
             memory = replace(memory, silence=0)
         nodes_end = samples + 2 * (self.predictor.pending(belief.timeline) + 3)
         wanted, nodes = preview[:samples, :NUM_STATE], preview[samples:nodes_end]
@@ -220,15 +219,24 @@ class PredictiveLqi:
                 trouble,
                 "nonfinite_torque" if nonfinite else None,
                 "saturated_steps" if saturated else None,
-                None if preview is given.reference else "references_missing",
+                "references_missing" if missing else None,
             ),
             path=followed.path,
             silence=max(memory.silence - 1, 0),
             feedforward=feedforward,
-            reference=Previewed(times, preview),
+            reference=reference,
             plan=plan,
             sent=self.channel.send(sent, plan, memory.in_flight),
         )
+
+    def _previewed(
+        self, memory: Memory, timeline: Timeline, motion: Motion
+    ) -> tuple[Previewed, bool]:
+        """Return the reference to follow now, and whether something of it was missing."""
+        times = self.preview_times if timeline == self.timeline else self.times_for(timeline)
+        given = Previewed(times, motion(times))
+        reference = completed(given, memory.reference, timeline)
+        return Previewed(times, reference), reference is not given.reference
 
     def _respond(
         self,
