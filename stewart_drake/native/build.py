@@ -63,7 +63,9 @@ def generate() -> None:
         CalledProcessError: what writes them failed, for want of CasADi for example.
     """
     command = [sys.executable, "-m", "stewart_drake.dynamics.generate"]
-    subprocess.run(command, check=True, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    # pip's build environment is itself on PYTHONPATH.
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    subprocess.run(command, check=True, cwd=ROOT, env=os.environ | {"PYTHONPATH": path})
 
 
 def system_compiler() -> list[str] | None:
