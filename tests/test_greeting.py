@@ -296,7 +296,7 @@ def test_a_machine_that_reports_a_period_too_late_is_refused(quiet_machine, monk
     monkeypatch.setattr(Machine, "_message", off)
     with Running(OVER_A_NETWORK, *FROM_REST) as running:
         ready = prepare_session(scenario_of(*FROM_REST), running.address)
-        result = drive(ready, 6.0, say=lambda line: None)
+        result = drive(ready, 6.0, accept_jitter=True, say=lambda line: None)
     assert result.status == "refused" and result.stopped is not None
     assert "acted_from in the machine's datagrams is one period late" in result.stopped.reason
 
@@ -406,7 +406,7 @@ def test_live_and_machine_say_a_loss_in_the_same_words(quiet_machine) -> None:  
     watching = Watching()
     with Running("plant.gravity=true") as running:
         ready = prepare_session(scenario_of(), running.address)
-        result = drive(ready, 6.0, viewer=watching, say=lambda line: None)
+        result = drive(ready, 6.0, viewer=watching, accept_jitter=True, say=lambda line: None)
         machine = running.machine
     assert result.status == "left_workspace" and result.stopped is not None
     why = in_words(machine.reason, machine.before)
@@ -427,7 +427,7 @@ def test_a_machine_that_is_ended_ends_the_run_with_its_words() -> None:
         ends = threading.Timer(2.0, lambda: Machine.stop(machine))
         ends.start()
         began = time.monotonic()
-        result = drive(ready, 8.0, say=said.append)
+        result = drive(ready, 8.0, accept_jitter=True, say=said.append)
         took = time.monotonic() - began
     assert result.status == "lost_machine" and result.stopped is not None
     assert result.stopped.reason == FAULTS[Fault.ENDED] and took < 8

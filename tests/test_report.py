@@ -271,7 +271,14 @@ def test_what_is_not_plain_is_told_at_the_top():
     plain = {"mechanism", "reference", "delay", "plant", "controller", "start"}
     for controller, settings, told in (
         (None, [], {}),
-        (None, ["link.kind=network"], {"link": "a network that loses 5 % of the packets"}),
+        (
+            None,
+            ["link.kind=network", "link.low=0.5", "link.high=0.9"],
+            {
+                "link": "network, packets take 0.5 to 0.9 s, 5 % lost, play-out bound 0.9 s; "
+                "measurements at once"
+            },
+        ),
         (
             "adaptive_lqi",
             ["sensor.kind=encoders", "sensor.samples=5"],
