@@ -1,13 +1,11 @@
 """Machines found from their logs: `python benchmarks/identification.py [section ...]`.
 
 Writes benchmarks/results/identification.md; MACHINES of the environment is their number. Sections:
-ranges, drawing, and short, which writes short_logs.md.
-
-The logs of `ranges` and `drawing` are of the exact plant with a delay that is believed to be 0.8 s
-and is 130 ms longer, logged while `adaptive_lqi` had the measured state: a multisine of 20 s around
-half the paper's amplitude, crank angles in 14 bit at 50 Hz, whose zero within a step is random.
-"With pose" is a pose beside them, off by 0.1 mrad and 20 um, and encoder offsets of 2 mrad nobody
-knows. Times are the CPU's. Those of `short` are of runs that lose the plate after some 1.5 s.
+ranges, drawing. All logs are of the exact plant with a delay that is believed to be 0.8 s and is
+130 ms longer, logged while `adaptive_lqi` had the measured state: a multisine of 20 s around half
+the paper's amplitude, crank angles in 14 bit at 50 Hz, whose zero within a step is random. "With
+pose" is a pose beside them, off by 0.1 mrad and 20 um, and encoder offsets of 2 mrad nobody knows.
+Times are the CPU's.
 
 `ranges` draws machines as `analyze robustness` does; the tolerances of lengths and joints are the
 root mean square of what it draws. `drawing` draws lengths and joints with a standard deviation of
@@ -37,11 +35,10 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 import stewart_drake as sd
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.versions import versions
 from stewart_drake.identification.excitation import fitted_multisine
 from stewart_drake.identification.identify import Identification, identify
-from stewart_drake.identification.log_files import Precision, read_log
+from stewart_drake.identification.log_files import Precision
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import DELAY, DYNAMIC, GEOMETRY, NAMES, OFFSETS
@@ -368,137 +365,17 @@ def next_table(errors: Array) -> str:
     return f"{text}\nFound less truth, mean and largest: {worst}.\n"
 
 
-# ---------------------------------------------------------------- short logs of violent runs
-
-SHORT_SEED = 3000
-SHORT = [
-    (machine, delay, noise)
-    for machine in ("paper", "desktop")
-    for delay in (0.08, 0.8)
-    for noise in (0.0, 1e-3)
-]
-SIZES = {"paper": AMPLITUDE, "desktop": np.array([0.18, 0.12, 0.35, 0.012, 0.012, 0.008])}
-"""Amplitudes of the references' motions, rad and m."""
-ENDS = (1.3, 1.7)
-"""s at which a plate is lost."""
-
-
-def short_run(machine: str, delay: float, noise: float, seed: int) -> SimulationResult:
-    """Lose the plate after some 1.5 s, by an LQR from rest that knows of no delay.
-
-    Payload up to a fifth of the plate, biases of 0.1 to 0.3 mN m of random signs, and the weight
-    of the torques are drawn until the plate is lost within ENDS. Without gravity, since under
-    gravity such a controller loses the plate within 0.3 s.
-
-    Args:
-        machine: a shipped scenario.
-        delay: true one, s.
-        noise: standard deviation as a share of the reference's amplitudes, per second for rates.
-        seed: of the draw.
-    """
-    rng = np.random.default_rng([seed, machine == "paper", round(1e3 * delay), noise > 0])
-    period = load_scenario(machine).controller.period
-    plate = sd.load_mechanism(machine).plate.mass
-    steps, rest = divmod(round(delay / period, 9), 1)
-    std = ",".join(f"{x:.6g}" for x in noise * np.tile(SIZES[machine], 2))
-    while True:
-        payload = 0.2 * plate * rng.uniform()
-        bias = 3e-4 * rng.uniform(0.3, 1, 6) * rng.choice([-1, 1], 6)
-        settings = (
-            *("plant.kind=exact", "plant.gravity=false", "start=rest", "queue=zero", "duration=2"),
-            f"delay.steps={int(steps)}",
-            f"delay.fraction={round(rest, 9):.9g}",
-            f"controller.w_R={10 ** rng.uniform(0, 2):.6g}",
-            f"plant.payload_mass={payload:.6g}",
-            f"plant.torque_bias=[{','.join(f'{x:.6g}' for x in bias)}]",
-            f"sensor.noise_std=[{std}]",
-            f"sensor.seed={seed}",
-        )
-        run = simulate(load_scenario(machine, "lqr", settings), margin=False)
-        if run.stopped is not None and ENDS[0] <= run.stopped.time <= ENDS[1]:
-            return run
-
-
-class ShortFound(NamedTuple):
-    """Delay of a short log."""
-
-    late: float
-    """s, error; NaN where it was refused, or no machine explained the log,"""
-    std: float
-    """s, stated."""
-    refusal: str
-
-
-def find_short(
-    machine: str, delay: float, noise: float, seed: int, end: float = np.inf
-) -> ShortFound:
-    """Identify from signals.nc of a short run, up to `end` in s."""
-    run = short_run(machine, delay, noise, seed)
-    kept = run.signals.isel(time=run.signals.time.values <= end)
-    drawing = sd.load_mechanism(machine)
-    with TemporaryDirectory() as folder:
-        dataclasses.replace(run, signals=kept).save(folder)
-        try:
-            log = read_log(Path(folder) / "signals.nc", drawing, PRECISION)
-            found = identify([log], drawing)
-        except ConfigError as error:
-            return ShortFound(np.nan, np.nan, str(error).partition(": ")[2])
-    if not found.right:
-        return ShortFound(np.nan, np.nan, "no machine explains the log")
-    return ShortFound(float(found.values[DELAY] - delay), float(found.std[DELAY]), "")
-
-
-def short() -> str:
-    """Table of short logs: LOGS of the environment by machine, delay and noise."""
-    seeds = range(SHORT_SEED, SHORT_SEED + size("LOGS", 10))
-    jobs = Parallel(n_jobs=int(os.environ.get("JOBS", "-1")))
-    heads = (
-        *("scenario", "delay [s]", "noise", "within 1 ms", "refused", "wrong"),
-        *("rms error [ms]", "stated [ms], rms", "95 % intervals that hold the truth"),
-    )
-    rows, every = [], list[ShortFound]()
-    for machine, delay, noise in SHORT:
-        found = jobs(delayed(find_short)(machine, delay, noise, seed) for seed in seeds)
-        rows.append((machine, f"{delay:g}", f"{100 * noise:g} %", *short_cells(found)))
-        print(*rows[-1], flush=True)
-        every += found
-    rows.append(("all", "", "", *short_cells(every)))
-    table = "\n".join(f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *rows))
-    refusals = "".join(f"- {one.refusal}\n" for one in every if one.refusal)
-    return f"{table}\n\n{refusals}"
-
-
-def short_cells(found: list[ShortFound]) -> list[str]:
-    """Numbers of a group of logs; wrong is off by more than 1 ms and 2.6 standard deviations."""
-    late, std = (1e3 * np.array(column) for column in list(zip(*found, strict=True))[:2])
-    told = np.isfinite(late)
-    wrong = np.abs(late) > np.maximum(1.0, 2.6 * std)
-    cells = [str(int(np.sum(np.abs(late) <= 1.0))), str(int(np.sum(~told))), str(int(wrong.sum()))]
-    if not told.any():
-        return [*cells, "-", "-", "-"]
-    cells += [f"{np.sqrt(np.mean(one[told] ** 2)):.2g}" for one in (late, std)]
-    inside = np.abs(late) <= 1.96 * std
-    return [*cells, f"{int(inside.sum())} of {int(told.sum())}"]
-
-
 SECTIONS = {"ranges": lambda: machines("ranges"), "drawing": lambda: machines("drawing")}
 
 
 def main() -> None:
     """Write the results of the sections that are asked for, all of them by default."""
     RESULTS.mkdir(parents=True, exist_ok=True)
-    names = sys.argv[1:] or [*SECTIONS, "short"]
+    names = sys.argv[1:] or list(SECTIONS)
+    text = "\n".join(SECTIONS[name]() for name in names)
     made = ", ".join(f"{name} {version}" for name, version in versions().items())
-    long = [name for name in names if name != "short"]
-    others = [name for name in names if name == "short"]
-    for file, title, chosen in (
-        ("identification.md", "Machines from their logs", long),
-        ("short_logs.md", "Delays from short logs of lost runs", others),
-    ):
-        if chosen:
-            text = "\n".join({**SECTIONS, "short": short}[name]() for name in chosen)
-            print(text)
-            (RESULTS / file).write_text(f"# {title}\n\n{made}\n\n{text}")
+    print(text)
+    (RESULTS / "identification.md").write_text(f"# Machines from their logs\n\n{made}\n\n{text}")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
-from benchmarks.identification import SHORT, excitation, find, find_short, short_run
+from benchmarks.identification import excitation, find
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.excitation import fitted_multisine, multisine
@@ -30,21 +30,11 @@ from stewart_drake.identification.judgement import (
     unseen,
     workspace_poses,
 )
-from stewart_drake.identification.log_files import Precision, read_log
+from stewart_drake.identification.log_files import Precision
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
-from stewart_drake.identification.model import (
-    NUM_DYNAMIC,
-    NUM_GEOMETRY,
-    DrawnModel,
-    MachineModel,
-)
+from stewart_drake.identification.model import NUM_DYNAMIC, NUM_GEOMETRY, MachineModel
 from stewart_drake.identification.shooting import Segment, integrate, plan_steps
-from stewart_drake.identification.start import (
-    coarse_delay,
-    measured_poses,
-    segments_of,
-    well_inside,
-)
+from stewart_drake.identification.start import coarse_delay, measured_poses, segments_of
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import (
     DELAY,
@@ -150,21 +140,6 @@ def test_its_derivatives_are_those_of_other_machines():
         unit = np.eye(12)[k]
         slope = difference(lambda h, unit=unit: at(values, state + h * unit), 1e-6)[:6]
         np.testing.assert_allclose(found.state[0][:, k], slope, atol=1e-5 * np.abs(slope).max())
-
-
-def test_the_model_with_drawn_legs_is_the_same():
-    rng, unknowns = np.random.default_rng(6), some_unknowns(PAPER)
-    states = np.tile(np.concatenate([PAPER.home, STILL]), (3, 1))
-    states += 0.05 * rng.standard_normal((3, 12))
-    numbers = unknowns.numbers(unknowns.mean)._replace(parameters=PARAMETERS)
-    at = states, 0.1 * rng.standard_normal((3, 6)), numbers
-    expected = MachineModel(PAPER, 9.81, 3).slopes(*at)
-    found = DrawnModel(PAPER, 9.81, 3).slopes(*at)
-    np.testing.assert_allclose(found.accelerations, expected.accelerations, rtol=1e-9)
-    np.testing.assert_allclose(found.state, expected.state, rtol=1e-8, atol=1e-8)
-    dynamic = expected.numbers[:, :, :NUM_DYNAMIC]
-    np.testing.assert_allclose(found.numbers[:, :, :NUM_DYNAMIC], dynamic, rtol=1e-8, atol=1e-8)
-    assert not found.numbers[:, :, NUM_DYNAMIC:].any()
 
 
 # ---------------------------------------------------------------- trajectories
@@ -493,57 +468,6 @@ def test_segments_hold_all_samples_once(log_and_truth):
     rows = np.concatenate([segment.rows for segment in segments])
     np.testing.assert_array_equal(rows, np.flatnonzero(log.times >= 1.0))
     assert all(log.times[s.rows[-1]] - s.start < 0.9 for s in segments)
-
-
-# ---------------------------------------------------------------- short logs of violent runs
-
-
-FAST = (("paper", 0.8, 1e-3), ("desktop", 0.08, 1e-3))
-
-
-@pytest.mark.parametrize(
-    ("case", "seed"),
-    [
-        pytest.param(case, seed, marks=() if case in FAST and seed == 4000 else pytest.mark.slow)
-        for case in SHORT
-        for seed in (4000, 4001)
-    ],
-)
-def test_the_delay_is_found_in_a_short_log_of_a_lost_run(case, seed):
-    """Some 1.5 s, payload and biases unknown; a delay of 0.8 s leaves a second of response less."""
-    found = find_short(*case, seed)
-    assert found.refusal == "" and abs(found.late) < 1e-3
-    assert abs(found.late) < 4 * found.std
-
-
-@pytest.mark.parametrize(
-    ("end", "named"),
-    [(0.7, "goes on for at least 1 s after they act"), (0.13, "measured values, at 7 instants")],
-)
-def test_a_log_that_ends_too_soon_is_refused(end, named):
-    """The torques act from 0.8 s on."""
-    found = find_short("desktop", 0.8, 1e-3, 4000, end)
-    assert named in found.refusal and "\n" not in found.refusal
-
-
-def test_the_queue_of_a_run_acts_before_its_log(tmp_path):
-    run = short_run("paper", 0.8, 0.0, 4000)
-    run.save(tmp_path)
-    log = read_log(tmp_path / "signals.nc", PAPER, Precision())
-    assert log.sent[0] < -10 and log.sent[1] == 0
-    np.testing.assert_array_equal(log.acting(np.array([0.0, 0.79]), 0.8), np.zeros((2, 6)))
-    assert np.abs(log.acting(np.array([0.81]), 0.8)).max() > 0
-
-
-def test_poses_at_the_edge_of_the_workspace_are_left_out(tmp_path):
-    run = short_run("desktop", 0.08, 0.0, 4000)
-    run.save(tmp_path)
-    drawing = load_mechanism("desktop")
-    log = read_log(tmp_path / "signals.nc", drawing, Precision())
-    poses = measured_poses(log, drawing)
-    kept, inside = well_inside(log, poses, drawing)
-    assert 0 < len(log.times) - len(kept.times) < 10 and kept.times[-1] < log.times[-1]
-    np.testing.assert_array_equal(inside, poses[: len(inside)])
 
 
 # ---------------------------------------------------------------- excitation and files

@@ -14,14 +14,13 @@ and the inverse of the last matrix, without damping, is the covariance of p, wha
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.identification.logs import ANGLES, KINDS, NUM_MEASURED, POSE
-from stewart_drake.identification.model import NUM_DYNAMIC, DrawnModel, MachineModel
+from stewart_drake.identification.model import NUM_DYNAMIC, MachineModel
 from stewart_drake.identification.shooting import (
     FIRST,
     NUMBERS,
@@ -29,13 +28,7 @@ from stewart_drake.identification.shooting import (
     integrate,
     plan_steps,
 )
-from stewart_drake.identification.unknowns import (
-    DELAY,
-    GEOMETRY,
-    NUM_UNKNOWNS,
-    OFFSETS,
-    Unknowns,
-)
+from stewart_drake.identification.unknowns import DELAY, NUM_UNKNOWNS, OFFSETS, Unknowns
 from stewart_drake.scenario.signals import NUM_STATE
 
 Array = NDArray[np.float64]
@@ -93,19 +86,14 @@ class Normal(NamedTuple):
     """(k,)."""
 
 
-@dataclass(frozen=True)
-class Fit:
+class Fit(NamedTuple):
     """Where the iterations ended."""
 
     guess: Guess
     residuals: Residuals
-    normal: Normal
+    covariance: Array
+    """(k, k) of the free unknowns."""
     iterations: int
-
-    @cached_property
-    def covariance(self) -> Array:
-        """Covariance (k, k) of the free unknowns."""
-        return covariance(self.normal)
 
 
 @dataclass(frozen=True)
@@ -129,11 +117,9 @@ class Problem:
         return sum(int(np.isfinite(one).sum()) for one in values)
 
     def model(self) -> MachineModel:
-        """Return the model that evaluates all segments at once."""
+        """That evaluates all segments at once."""
         gravity = self.segments[0].log.gravity
-        known = not self.unknowns.std[GEOMETRY].any()
-        kind = DrawnModel if known else MachineModel
-        return kind(self.unknowns.mechanism, gravity, len(self.segments))
+        return MachineModel(self.unknowns.mechanism, gravity, len(self.segments))
 
     def measured(self) -> tuple[Array, Array]:
         """Values (m, n, 18) of the segments, NaN where there is none, and their std (n, 18)."""
@@ -171,9 +157,7 @@ class Evaluator:
         r = residuals.measured.transpose(1, 0, 2).reshape(n, -1, 1)
         turned = rows.transpose(0, 2, 1)
         weight = 1 / self.problem.unknowns.std[self.free]
-        with np.errstate(all="ignore"):  # a trajectory that grows beyond all bounds
-            joined = turned @ rows, (turned @ r)[:, :, 0]
-        normal = Normal(*joined, weight**2, weight * residuals.prior)
+        normal = Normal(turned @ rows, (turned @ r)[:, :, 0], weight**2, weight * residuals.prior)
         return residuals, normal
 
     def _evaluate(
@@ -279,21 +263,11 @@ def solve(problem: Problem, start: Guess, most: int = _MOST_ITERATIONS) -> Fit:
         residuals, normal = evaluator.normal(guess)
         if gained < ENOUGH:
             break
-    return Fit(guess, residuals, normal, iterations)
+    return Fit(guess, residuals, covariance(normal), iterations)
 
 
-def refined(problem: Problem, fit: Fit, most: int = _MOST_ITERATIONS) -> tuple[Problem, Fit]:
-    """Halve the integration step and fit again until the step matters little beside the misfit."""
-    while True:
-        left = np.sqrt(np.mean(fit.residuals.measured**2))
-        halved = finer(problem, fit.guess, _STEP_ERROR * max(1.0, float(left)))
-        if halved is None:
-            return problem, fit
-        problem, fit = halved, solve(halved, fit.guess, most)
-
-
-def finer(problem: Problem, guess: Guess, allowed: float = _STEP_ERROR) -> Problem | None:
-    """The problem with half the step, or None where that moves its residuals by less than allowed.
+def finer(problem: Problem, guess: Guess) -> Problem | None:
+    """The problem with half the step, or None where that moves its residuals by next to nothing.
 
     Coulomb friction turns round within some hundredths of a second, so that what step is fine
     enough depends on the machine.
@@ -302,7 +276,7 @@ def finer(problem: Problem, guess: Guess, allowed: float = _STEP_ERROR) -> Probl
     if halved.longest_step < _SHORTEST_STEP:
         return None
     coarse, fine = (Evaluator(one).residuals(guess).measured for one in (problem, halved))
-    return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > allowed else None
+    return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > _STEP_ERROR else None
 
 
 def _moved(guess: Guess, unknown: Array, first: Array, free: NDArray[np.intp]) -> Guess:

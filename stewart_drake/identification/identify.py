@@ -1,7 +1,7 @@
-"""Identification of a machine from its logs: all steps and the result."""
+"""From logs to a machine: all steps, and what is told of them."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
@@ -15,10 +15,10 @@ from stewart_drake.identification.fit import (
     Guess,
     Problem,
     chi2_per_value,
+    finer,
     followed,
     misfit,
     nearest,
-    refined,
     solve,
     without,
 )
@@ -29,7 +29,6 @@ from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import (
     DELAY,
     DYNAMIC,
-    GEOMETRY,
     NAMES,
     OFFSETS,
     ONE_SIDED,
@@ -39,40 +38,20 @@ from stewart_drake.identification.unknowns import (
 )
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint
 from stewart_drake.scenario.known import Known
-from stewart_drake.scenario.signals import NUM_STATE
 
 Array = NDArray[np.float64]
 
 WRONG: Final = 1.5
 """chi^2 per value from which on a fit is wrong and its intervals mean nothing."""
-ENOUGH_RESPONSE: Final = 1.0
-"""s of motion after the torques of a log first change; a shorter log is refused if its delay is
-VAGUE."""
-VAGUE: Final = 1e-3
-"""s, least standard deviation of a delay that was not found well."""
 USUAL_DELAY: Final = 0.1
-"""Believed delay by default, s."""
+"""s, believed where nobody says anything."""
 _FEW: Final = 15
 """Iterations over the segments that are looked at first."""
 _ASTRAY: Final = 1e3
 """chi^2 per value of a segment that is not explained by any machine like this one; drawings that
 are off by a millimetre make some fifty."""
 _COARSE: Final = 0.1
-"""s by which the delay that is begun with may be off,"""
-_NEAR: Final = 0.02
-"""s, alike where a scan found it."""
-_GRID: Final = 0.1
-"""s between delays of the scan."""
-_SCANNED: Final = 0.3
-"""s of a segment of the scan, at most."""
-_MOST_SCANNED: Final = 12
-"""Segments of the scan."""
-_FEW_SCANNED: Final = 4
-"""Iterations of the scan at each delay."""
-_RIVAL: Final = 30.0
-"""Times the least chi^2 of the scan, at most, where another delay is tried too."""
-_STARTS: Final = 3
-"""Delays of the scan that are begun with."""
+"""s by which the delay that is begun with may be off."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +85,7 @@ class Identification:
 
     @cached_property
     def values(self) -> Array:
-        """Values found, friction not below zero."""
+        """What was found of the unknowns, friction not below zero."""
         found = self.fit.guess.values.copy()
         for place in ONE_SIDED:
             found[place] = max(0.0, found[place])
@@ -114,7 +93,7 @@ class Identification:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance of all unknowns, 0 where known; the prior's where the fit is wrong."""
+        """Of all unknowns, 0 where they are known; where the fit is wrong what it was before."""
         unknowns = self.unknowns
         if not self.right:
             return np.diag(unknowns.std**2)
@@ -134,7 +113,7 @@ class Identification:
         return self.unknowns.machine(self.values if self.right else self.unknowns.mean)
 
     def known(self, mechanism: Mechanism) -> Known:
-        """Return what a controller of this machine may use: all but the geometry.
+        """What a controller of this machine may go by: all but the geometry.
 
         Where the fit is wrong that is the delay alone, as uncertain as before.
 
@@ -163,7 +142,7 @@ class Identification:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Content of `summary.json`; intervals are null where the fit is wrong."""
+        """What `summary.json` holds: intervals are null where the fit is wrong."""
         std = self.std if self.right else np.full(len(self.values), np.nan)
         poses = self.pose_uncertainty
         return {
@@ -216,205 +195,35 @@ def identify(
     told = [log.delay for log in logs if log.delay is not None]
     believed = delay if delay is not None else told[0] if told else USUAL_DELAY
     poses = [start.measured_poses(log, mechanism) for log in logs]
-    inside = [start.well_inside(*pair, mechanism) for pair in zip(logs, poses, strict=True)]
-    logs, poses = [log for log, _ in inside], [own for _, own in inside]
     for log, own in zip(logs, poses, strict=True):
         start.check_poses(log, own)
-    unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
-    best = min(_tried(logs, poses, unknowns), key=lambda one: one.rank)
-    problem, fit = refined(best.problem, best.fit)
-    middle = np.nanmedian(np.vstack(poses), axis=0)
-    found = Identification(logs, unknowns, problem, fit, best.left_out, middle)
-    if tolerances.delay > 0:
-        _check_response(found)
-    return found
-
-
-def _check_response(found: Identification) -> None:
-    """Refuse logs that end too soon after their torques first change to show the delay.
-
-    Raises:
-        ConfigError: names the length that is missing.
-    """
-    delay, std = found.values[DELAY], found.std[DELAY]
-    lasted = [float(log.times[-1] - max(log.times[0], log.sent[1] + delay)) for log in found.logs]
-    longest = int(np.argmax(lasted))
-    if lasted[longest] >= ENOUGH_RESPONSE or std <= VAGUE:
-        return
-    raise ConfigError(
-        f"{found.logs[longest].name}: got {max(0.0, lasted[longest]):.2g} s of motion after the "
-        f"torques first changed, at the likeliest delay of {delay:.2g} s; expected at least "
-        f"{ENOUGH_RESPONSE:g} s to find the delay to {1e3 * VAGUE:g} ms, or an earlier row with "
-        "the torques that acted before"
-    )
-
-
-class _Start(NamedTuple):
-    """Where iterations begin."""
-
-    values: Array
-    """(NUM_UNKNOWNS,)."""
-    share: float
-    """Length of the segments as a share of the usual one."""
-    late: float
-    """s by which the delay may be longer."""
-
-
-class _Tried(NamedTuple):
-    """Result from one start."""
-
-    problem: Problem
-    fit: Fit
-    left_out: int
-
-    @property
-    def misfit(self) -> float:
-        """chi^2 per value."""
-        return chi2_per_value(self.fit.residuals, self.problem)["all"]
-
-    @property
-    def rank(self) -> tuple[bool, float]:
-        """Order of preference: an explanation of the logs before none, then the better one."""
-        if self.misfit > WRONG:
-            return True, self.misfit
-        return False, self.delay_std
-
-    @property
-    def delay_std(self) -> float:
-        """Standard deviation of the delay, s; 0 where it is known."""
-        place = np.flatnonzero(self.problem.unknowns.free == DELAY)
-        return float(np.sqrt(np.diag(self.fit.covariance)[place].sum()))
-
-
-def _tried(logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns) -> list[_Tried]:
-    """Return the results from several starts, up to the first that explains the logs."""
-    tried = list[_Tried]()
-    for one in _starts(logs, poses, unknowns):
-        begun = _begin(one, logs, poses, unknowns)
-        grown = _grown(begun)
-        if grown is None:
-            continue
-        problem, fit = grown
-        tried.append(_Tried(problem, fit, len(begun.whole.segments) - len(problem.segments)))
-        if tried[-1].misfit <= WRONG and tried[-1].delay_std <= VAGUE:
-            break
-    if not tried:
-        raise ConfigError(
-            "LOG: got no stretch that the mechanism could have moved through under these torques; "
-            "expected a log of this machine, torques in N m as they were commanded"
-        )
-    return tried
-
-
-def _starts(logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns) -> Iterator[_Start]:
-    """Yield starts, the most promising first."""
-    believed, std = unknowns.mean[DELAY], unknowns.std[DELAY]
-    if std == 0:
-        yield _Start(unknowns.mean, 1.0, 0.0)
-        return
+    # The longest log has most to say.
     longest = max(range(len(logs)), key=lambda i: len(logs[i].times))
-    log, own = logs[longest], poses[longest]
-    coarse = start.coarse_delay(log, own, unknowns.mechanism, believed, std)
-    if coarse is not None:
-        values = unknowns.mean.copy()
-        values[DELAY] = coarse
+    unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
+    starts = [(believed, 1.0)]
+    if tolerances.delay > 0:
+        coarse = start.coarse_delay(
+            logs[longest], poses[longest], mechanism, believed, tolerances.delay
+        )
         # Where the plate was lost, long trajectories lead nowhere; and the coarse delay may err.
-        yield _Start(values, 1.0, _COARSE)
-        yield _Start(values, 0.5, _COARSE)
-    for values in scanned(log, own, unknowns):
-        yield _Start(values, 1.0, _NEAR)
-        yield _Start(values, 0.25, _NEAR)
-
-
-def scanned(log: Log, poses: Array, unknowns: Unknowns) -> list[Array]:
-    """Return values of the unknowns with the delays that explain the end of a log best.
-
-    The machine is as drawn here, so that one delay of the grid takes some tenths of a second. Of
-    delays that explain the log equally well the shortest comes first: it explains most of it.
-
-    Raises:
-        ConfigError: the log is too short, or no torque of it shows in the motion.
-    """
-    believed, std = unknowns.mean[DELAY], unknowns.std[DELAY]
-    found = list[_Scanned]()
-    for delay in np.arange(max(0.0, believed - 3 * std), believed + 3 * std, _GRID):
-        try:
-            found += _scan(log, poses, unknowns, delay, float(log.sent[0]) + delay + _NEAR)
-        except ConfigError:
-            if not found:
-                raise
-            break  # nothing is left after longer delays either
-    if not found:
-        return []
-    least = min(one.chi2 for one in found)
-    _check_torques_show(log, poses, unknowns, least)
-    alike = [one for one in found if one.chi2 <= least * (1 + one.spread)]
-    best = min(alike, key=lambda one: float(one.values[DELAY]))
-    rivals = [one for one in found if one is not best and one.chi2 <= _RIVAL * least]
-    rivals.sort(key=lambda one: one.chi2)
-    return [one.values for one in (best, *rivals)][:_STARTS]
-
-
-def _check_torques_show(log: Log, poses: Array, unknowns: Unknowns, least: float) -> None:
-    """Refuse a log that a machine explains on which no change of the torques ever acts.
-
-    Args:
-        log: with poses (n, 6).
-        poses: of its instants.
-        unknowns: before the log.
-        least: chi^2 per value with the best delay.
-
-    Raises:
-        ConfigError: names the length that is missing.
-    """
-    lasted, std = float(log.times[-1] - log.sent[1]), unknowns.std.copy()
-    std[DELAY] = 0.0
-    known = replace(unknowns, std=std)
-    for still in _scan(log, poses, known, lasted + 1.0, float(log.times[0]), _FEW):
-        if still.chi2 <= max(1.0, least) * (1 + still.spread):
-            raise ConfigError(
-                f"{log.name}: got {lasted:.2g} s of motion from the first change of the torques "
-                "on, and none of them shows in it; expected a log that goes on for at least "
-                f"{ENOUGH_RESPONSE:g} s after they act"
-            )
-
-
-class _Scanned(NamedTuple):
-    """Result of the scan at one delay."""
-
-    chi2: float
-    """Per value."""
-    spread: float
-    """Four relative standard deviations of chi2."""
-    values: Array
-
-
-def _scan(
-    log: Log,
-    poses: Array,
-    unknowns: Unknowns,
-    delay: float,
-    begin: float,
-    most: int = _FEW_SCANNED,
-) -> list[_Scanned]:
-    """Fit a machine as drawn to the end of a log from a delay on; empty where none moves so."""
-    std, values = unknowns.std.copy(), unknowns.mean.copy()
-    std[GEOMETRY], values[DELAY] = 0.0, delay
-    length = min(_SCANNED, start.segment_length(log, poses, unknowns.mechanism, delay))
-    segments = start.segments_of(log, begin, length)[-_MOST_SCANNED:]
-    first = [start.first_state(log, poses, int(one.rows[0])) for one in segments]
-    whole = Problem(segments, replace(unknowns, std=std))
-    problem, guess = followed(whole, Guess(values, np.array(first)))
-    if not problem.segments:
-        return []
-    fit = solve(problem, guess, most)
-    spread = 4 * np.sqrt(2 / (problem.count - NUM_STATE * len(problem.segments)))
-    chi2 = chi2_per_value(fit.residuals, problem)["all"]
-    return [_Scanned(chi2, spread, fit.guess.values)]
+        starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5)]
+    tried = list[_Begun]()
+    for delay_at_first, share in starts:
+        tried.append(_begin(delay_at_first, share, logs, poses, unknowns))
+        if tried[-1].chi2 <= WRONG:
+            break
+    best = min(tried, key=lambda one: one.chi2)
+    whole = best.whole
+    problem, fit = _grown(best)
+    while (halved := finer(problem, fit.guess)) is not None:
+        problem, fit = halved, _solved(halved, fit.guess)
+    middle = np.nanmedian(np.vstack(poses), axis=0)
+    left_out = len(whole.segments) - len(problem.segments)
+    return Identification(logs, unknowns, problem, fit, left_out, middle)
 
 
 class _Begun(NamedTuple):
-    """Fit of the first segments from one start, with its chi^2 per value."""
+    """Where a start leads; chi^2 per value, of the segments that were looked at first."""
 
     chi2: float
     whole: Problem
@@ -423,28 +232,33 @@ class _Begun(NamedTuple):
     """(n, 12) states of all n segments, as measured."""
 
 
-def _begin(one: _Start, logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns) -> _Begun:
-    """Fit the segments that are nearest to the logs at a start."""
-    segments, states, values = list[Segment](), list[Array](), one.values
-    delay = float(values[DELAY])
+def _begin(
+    delay: float,
+    share: float,
+    logs: Sequence[Log],
+    poses: Sequence[Array],
+    unknowns: Unknowns,
+) -> _Begun:
+    """A delay in s and segments of a share of their usual length, and what the nearest say."""
+    segments, states, values = list[Segment](), list[Array](), unknowns.mean.copy()
+    late = _COARSE if unknowns.std[DELAY] > 0 else 0.0
     for log, own in zip(logs, poses, strict=True):
-        length = one.share * start.segment_length(log, own, unknowns.mechanism, delay)
-        parts = start.segments_of(log, float(log.sent[0]) + delay + one.late, length)
+        length = share * start.segment_length(log, own, unknowns.mechanism, delay)
+        parts = start.segments_of(log, float(log.sent[0]) + delay + late, length)
         segments += parts
         states += [start.first_state(log, own, int(part.rows[0])) for part in parts]
-    first = np.array(states)
+    first, values[DELAY] = np.array(states), delay
     whole = Problem(segments, unknowns)
     problem, guess = followed(whole, Guess(values, first))
     if not problem.segments:
         return _Begun(np.inf, whole, values, first)
     near, guess = nearest(problem, guess)
-    near, fit = refined(near, solve(near, guess, _FEW), _FEW)
-    whole = replace(whole, longest_step=near.longest_step)
+    fit = solve(near, guess, _FEW)
     chi2 = chi2_per_value(fit.residuals, near)["all"]
     return _Begun(chi2, whole, fit.guess.values, first)
 
 
-def _grown(begun: _Begun) -> tuple[Problem, Fit] | None:
+def _grown(begun: _Begun) -> tuple[Problem, Fit]:
     """The fit of all segments, without those that nothing fits.
 
     Where the nearest segments are explained, and all of them are not, a trajectory may have gone
@@ -452,19 +266,26 @@ def _grown(begun: _Begun) -> tuple[Problem, Fit] | None:
     is not quite this one can make it is left out then, as long as more than the nearest are left.
     """
     problem, guess = followed(begun.whole, Guess(begun.values, begun.first))
-    if not problem.segments:
-        return None
     if begun.chi2 > WRONG:
-        return refined(problem, solve(problem, guess), _FEW)
+        return problem, _solved(problem, guess)
     fewest = len(problem.segments) // 2 + 1
-    problem, fit = refined(problem, solve(problem, guess, _FEW), _FEW)
+    fit = solve(problem, guess, _FEW)
     while chi2_per_value(fit.residuals, problem)["all"] > WRONG and len(problem.segments) > fewest:
         off = misfit(fit.residuals, problem)
         if off.max() < _ASTRAY:
             break
-        problem, guess = without(problem, fit.guess, int(off.argmax()))
-        problem, fit = refined(problem, solve(problem, guess, _FEW), _FEW)
+        problem, guess = without(problem, guess, int(off.argmax()))
+        fit = solve(problem, guess, _FEW)
     return problem, fit if fit.iterations < _FEW else solve(problem, fit.guess)
+
+
+def _solved(problem: Problem, guess: Guess) -> Fit:
+    if not problem.segments:
+        raise ConfigError(
+            "LOG: got no stretch that the mechanism could have moved through under these torques; "
+            "expected a log of this machine, torques in N m as they were commanded"
+        )
+    return solve(problem, guess)
 
 
 def _unknowns(
@@ -474,7 +295,7 @@ def _unknowns(
     tolerances: Tolerances,
     believed: float,
 ) -> Unknowns:
-    """Return the unknowns, scaled by the largest torque and crank speed of the logs."""
+    """With scales of the logs: the largest torque, and the largest speed of a crank."""
     speeds = []
     for log, own in zip(logs, poses, strict=True):
         known = np.isfinite(own).all(axis=1)

@@ -1,13 +1,11 @@
 """Where to begin: poses from what was measured, segments, and their first states."""
 
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import ANGLES, POSE, Log
 from stewart_drake.identification.logs import RATES as MEASURED_RATES
@@ -39,10 +37,6 @@ _DEGREE: Final = 4
 _GRID: Final = 0.01
 """s between two delays that are tried."""
 _LEAST_WINDOWS: Final = 8
-_LEAST_LEFT: Final = 1.0
-"""s of a log after the longest delay that is tried."""
-_ROOM: Final = 0.2
-"""Share of the margin at home below which a pose is too near the edge of the workspace."""
 
 
 def measured_poses(log: Log, mechanism: Mechanism) -> Array:
@@ -68,17 +62,6 @@ def measured_poses(log: Log, mechanism: Mechanism) -> Array:
     return poses
 
 
-def well_inside(log: Log, poses: Array, mechanism: Mechanism) -> tuple[Log, Array]:
-    """Return the log and its poses without the instants near the edge of the workspace.
-
-    A crank angle has no derivative at a dead centre. Fits of the last samples before a loss end in
-    local minima there.
-    """
-    least = _ROOM * margin(mechanism, mechanism.home)
-    kept = ~np.array([margin(mechanism, pose) < least for pose in poses], dtype=bool)
-    return replace(log, times=log.times[kept], values=log.values[kept]), poses[kept]
-
-
 def check_poses(log: Log, poses: Array) -> None:
     """Refuse a log that tells too few whole poses (n, 6) to begin with.
 
@@ -95,10 +78,8 @@ def check_poses(log: Log, poses: Array) -> None:
 
 def coarse_delay(
     log: Log, poses: Array, mechanism: Mechanism, believed: float, std: float
-) -> float | None:
+) -> float:
     """The delay in s with which the torques suit the motion best, to some hundredths of a second.
-
-    None where the log is too short to compare all delays that are thought possible.
 
     Where the true one is further off than a swing of the motion lasts, iterations from a belief end
     elsewhere. A polynomial of degree four through the poses of a window gives pose, rates and
@@ -109,8 +90,6 @@ def coarse_delay(
     dynamics = StewartDynamics(mechanism, log.gravity)
     known = np.flatnonzero(np.isfinite(poses).all(axis=1))
     times = log.times[known]
-    if times[-1] - times[0] < believed + 3 * std + _LEAST_LEFT:
-        return None
     half = max(_WINDOW, 4.5 * float(np.median(np.diff(times)))) / 2
     middles = np.arange(times[0] + half, times[-1] - half, _GRID * 10)
     needed = np.empty((len(middles), NUM_TORQUES))
@@ -165,11 +144,10 @@ def segments_of(log: Log, start: float, length: float) -> list[Segment]:
     """
     rows = np.flatnonzero(log.times >= start - 1e-9)
     few = np.isfinite(log.values[rows]).sum() < 2 * NUM_STATE
-    if few or len(rows) < _LEAST_ROWS or log.times[-1] - log.times[rows[0]] < SHORTEST:
+    if few or len(rows) < 2 * _LEAST_ROWS or log.times[-1] - log.times[rows[0]] < SHORTEST:
         raise ConfigError(
-            f"{log.name}: got measurements up to t = {log.times[-1]:.4g} s; expected at least "
-            f"{SHORTEST:g} s and {_LEAST_ROWS} instants after {start:.4g} s, when the first torque "
-            "of the log acts"
+            f"{log.name}: got measurements up to t = {log.times[-1]:.4g} s, of which those from "
+            f"{start:.4g} s on count, when torques act that are in the log; expected a longer log"
         )
     first, last = log.times[rows[0]], log.times[-1]
     edges = np.linspace(first, last, max(1, round((last - first) / length)) + 1)
