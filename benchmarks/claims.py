@@ -49,7 +49,6 @@ HALF = f"reference.amplitude={(0.5 * AMPLITUDE).tolist()}"
 NETWORK = (*ON, "link.kind=network", "link.low=0.5", "link.high=0.9", "link.playout=0.9")
 ENCODERS = "sensor.kind=encoders"
 OFTEN = "sensor.samples=100"
-NARROW = "controller.prior={torque_bias: 0.003, payload: 0.5, damping: 0.003}"
 IDENTIFIED = "controller.prior={torque_bias: 0.00006, payload: 0.01, damping: 0.00006}"
 
 
@@ -372,24 +371,13 @@ def encoders() -> list[Row]:
     def add(name: str, words: str, *settings: str, drawn: str = "codes") -> None:
         rows.append(Row(name, words, (*settings, ENCODERS), drawn))
 
-    for bits in (None, 20, 17, 14, 12):
-        drawn, code = ("codes", str(bits)) if bits else ("", "null")
-        words, end = f"{bits} bit" if bits else "exact", str(bits or "exact")
-        given = f"sensor.bits={code}"
-        add(f"codes-{end}", f"{words}, one sample", *ON, given, drawn=drawn)
-        if bits not in (20, 17):
-            add(f"rest-codes-{end}", f"from rest, {words}, one sample", given, drawn=drawn)
-        if bits in (17, 14):
-            add(f"narrow-{end}", f"narrow priors, {words}, one sample", *ON, given, NARROW)
-            add(f"identified-{end}", f"priors as identified, {words}", *ON, given, IDENTIFIED)
-    often = (*ON, OFTEN, "sensor.bits=14")
-    plant = (PAYLOAD, "plant.joint_damping=1e-3")
-    add("codes-14-1k", "14 bit, 1 kHz", *often)
-    add("identified-14-1k", "priors as identified, 14 bit, 1 kHz", *often, IDENTIFIED)
-    words = "bias, payload, damping 1e-3 unknown, 14 bit, 1 kHz"
-    add("three-codes-14-1k", words, *often, *plant, drawn="codes bias")
-    add("rest-codes-14-1k", "from rest, 14 bit, 1 kHz", OFTEN, "sensor.bits=14")
-    add("codes-12-1k", "12 bit, 1 kHz", *ON, OFTEN, "sensor.bits=12")
+    add("codes-exact", "exact, one sample", *ON, "sensor.bits=null", drawn="")
+    for bits in (20, 17, 14, 12):
+        add(f"codes-{bits}", f"{bits} bit, one sample", *ON, f"sensor.bits={bits}")
+    fourteen = "sensor.bits=14"
+    add("codes-14-1k", "14 bit, 1 kHz", *ON, OFTEN, fourteen)
+    add("rest-codes-14", "from rest, 14 bit, one sample", fourteen)
+    add("identified-14", "priors as identified, 14 bit", *ON, fourteen, IDENTIFIED)
     return rows
 
 

@@ -1,6 +1,7 @@
 """The scripts of benchmarks/ still find what they measure; their figures are no matter of tests."""
 
 import importlib
+import json
 import os
 import re
 import subprocess
@@ -96,6 +97,18 @@ def test_every_claim_has_a_name_and_settings_that_load(monkeypatch, tmp_path):
     assert len({row.name for row in rows}) == len(rows) > 200
     for row in rows:
         claims.scenario_of(row, claims.SEEDS[0], str(tmp_path))
+
+
+def test_the_table_of_claims_has_all_rows_as_they_are(monkeypatch):
+    claims = script("claims", monkeypatch)
+    data, rows = json.loads(claims.DATA.read_text("utf-8")), claims.chosen_rows([])
+    assert set(data["rows"]) == set(rows) and set(data["studies"]) == set(claims.STUDIES)
+    for name, row in rows.items():
+        found = data["rows"][name]
+        assert found["settings"] == claims.described(row)
+        assert len(found["E_ac"]) == (len(claims.SEEDS) if row.drawn else 1)
+        assert found["E_ac"].count(None) == len(found["lost_at"])
+    assert "\n".join(claims.page(data)) in claims.DATA.with_suffix(".md").read_text("utf-8")
 
 
 def test_a_bias_of_the_claims_has_random_signs(monkeypatch, tmp_path):
