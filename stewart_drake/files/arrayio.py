@@ -116,8 +116,9 @@ def load_netcdf(path: Path, expected: str) -> xr.Dataset:
 
 def write_netcdf(path: Path, data: xr.Dataset) -> None:
     """Write NetCDF by way of a temporary file, so that no half file remains."""
-    # Made in memory: HDF5 ends the process where a disk is full.
-    content: Any = data.to_netcdf(engine="h5netcdf")
+    # Made in memory: HDF5 ends the process where a disk is full. Copied: a view of xarray's buffer
+    # that the traceback of a failed write holds makes Python print a warning when both are freed.
+    content = bytes(data.to_netcdf(engine="h5netcdf"))
     with replacing(path) as partial:
         partial.write_bytes(content)
 
