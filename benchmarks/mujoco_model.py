@@ -16,7 +16,7 @@ from xml.etree import ElementTree as ET
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 import stewart_drake as sd
@@ -24,8 +24,8 @@ from stewart_drake.mechanism.assembly import assemble, joint_state
 from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.native.layout import STANDARD_GRAVITY
 from stewart_drake.scenario.signals import LEGS, POSE, RATES
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 Torque = Callable[[float], Array]
 
 HIGHEST_IMPEDANCE = 0.9999

@@ -14,6 +14,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from stewart_drake.types import Array
+
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import matplotlib.pyplot as plt
@@ -22,7 +24,6 @@ import numpy as np
 from _page import RESULTS, table, write
 from matplotlib.figure import Figure
 from mujoco_model import Closure, MujocoStewart
-from numpy.typing import NDArray
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import Sine
@@ -33,10 +34,8 @@ from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.open_loop import Drive, in_c
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.multibody_stewart import MultibodyStewart
-from stewart_drake.report.style import figure_style, write_figure
+from stewart_drake.reporting.style import figure_style, write_figure
 from stewart_drake.scenario.signals import POSE, RATES
-
-Array = NDArray[np.float64]
 
 ROUNDS, BUDGET = 25, 2.0
 """Repeats of each candidate, and the seconds after which it gets no more (but two at least)."""

@@ -9,11 +9,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from stewart_drake.types import Array
+
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 from _page import table, write
-from numpy.typing import NDArray
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from scipy.linalg import solve_discrete_are
 
@@ -22,8 +23,6 @@ from stewart_drake.law.delay_model import ChainModel, DelayedModel, chain, delay
 from stewart_drake.law.error_model import double_integrators
 from stewart_drake.law.riccati import augmented_gain, full_gain, reduced_gain
 from stewart_drake.mechanism.torque_map import torque_map
-
-Array = NDArray[np.float64]
 
 PERIOD = 0.1
 STEPS = (0, 1, 5, 8, 10, 20, 30)

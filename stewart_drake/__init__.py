@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from stewart_drake.mechanism.files import load_mechanism
     from stewart_drake.mechanism.geometry import Mechanism
     from stewart_drake.mechanism.kinematics import ForwardKinematicsError, UnreachablePoseError
-    from stewart_drake.report.answer import Answer
-    from stewart_drake.report.api import (
+    from stewart_drake.reporting.answer import Answer
+    from stewart_drake.reporting.api import (
         analyze_delay,
         analyze_hautus,
         analyze_link,
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         layout,
         plot,
         replay,
+        report,
         table,
     )
     from stewart_drake.scenario.config import ControllerConfig, PlantConfig, Scenario
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 # Names are imported when first asked for, so that the command answers --help without Drake.
 _MODULES = {
     "AddStewartPlatform": "loop.platforms",
-    "Answer": "report.answer",
+    "Answer": "reporting.answer",
     "ConfigError": "files.errors",
     "ControllerConfig": "scenario.config",
     "DesignedLaw": "loop.law_design",
@@ -49,23 +50,24 @@ _MODULES = {
     "StewartDynamics": "dynamics.stewart",
     "StewartPlatform": "loop.platforms",
     "UnreachablePoseError": "mechanism.kinematics",
-    "analyze_delay": "report.api",
-    "analyze_hautus": "report.api",
-    "analyze_link": "report.api",
-    "analyze_robustness": "report.api",
-    "analyze_workspace": "report.api",
+    "analyze_delay": "reporting.api",
+    "analyze_hautus": "reporting.api",
+    "analyze_link": "reporting.api",
+    "analyze_robustness": "reporting.api",
+    "analyze_workspace": "reporting.api",
     "build_closed_loop": "loop.diagram",
     "compare": "studies.compare",
     "design_law": "loop.law_design",
-    "layout": "report.api",
+    "layout": "reporting.api",
     "linear_models": "loop.state_space",
     "load_mechanism": "mechanism.files",
     "load_scenario": "scenario.loading",
-    "plot": "report.api",
-    "replay": "report.api",
+    "plot": "reporting.api",
+    "replay": "reporting.api",
+    "report": "reporting.api",
     "set_accuracy": "loop.exact",
     "simulate": "loop.simulation",
-    "table": "report.api",
+    "table": "reporting.api",
 }
 
 __all__ = [
@@ -110,8 +112,6 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("stewart-drake")
-    if name == "report":  # a package that can be called
-        return import_module(f"{__name__}.report")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

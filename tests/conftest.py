@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from stewart_drake.report import terminal
+from stewart_drake.reporting import terminal
 from tests.browser import Browser, browser
 
 # A shell that runs the tests in the background lets them ignore Ctrl-C, and the commands that they

@@ -27,7 +27,7 @@ _server.set_forkserver_preload(
         "h5netcdf",
         "matplotlib.pyplot",
         "stewart_drake.cli",
-        "stewart_drake.report.csv_file",
+        "stewart_drake.reporting.csv_file",
         "stewart_drake.studies.robustness",
         "stewart_drake.tuning.dataset",
     ]

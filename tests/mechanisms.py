@@ -3,14 +3,13 @@
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, leg_geometry
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 PAPER = load_mechanism("paper")
 SPREAD = np.array([0.25, 0.25, 0.25, 0.03, 0.03, 0.06])
 """How far random poses lie from home, rad and m."""

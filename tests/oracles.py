@@ -24,7 +24,7 @@ import re
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.math import RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -52,8 +52,7 @@ from stewart_drake.scenario.signals import (
     PAYLOAD_POSITION,
     POSITION,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 NO_PARAMETERS = plant_parameters()
 CLOSURE_TOLERANCE = 1e-14

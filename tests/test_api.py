@@ -2,8 +2,6 @@
 
 import importlib.metadata
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import joblib
@@ -14,8 +12,8 @@ from pydrake.trajectories import FunctionHandleTrajectory
 
 import stewart_drake as sd
 from stewart_drake.files.jsonio import jsonable
-from stewart_drake.report.answer import Answer
-from stewart_drake.report.api import Figures, Replay
+from stewart_drake.reporting.answer import Answer
+from stewart_drake.reporting.api import Figures, Replay
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = ("plant.kind=exact", "duration=0.3")
@@ -48,15 +46,6 @@ class Push(LeafSystem):
 def test_version_and_types_are_told():
     assert sd.__version__ == importlib.metadata.version("stewart-drake")
     assert (Path(sd.__file__).parent / "py.typed").is_file()
-
-
-@pytest.mark.slow
-def test_report_is_there_whatever_was_imported_first():
-    for first in ("import stewart_drake.report.page", "sd.plot", "sd.simulate"):
-        code = f"import stewart_drake as sd; {first}; assert callable(sd.report); sd.report.page"
-        if first.startswith("sd."):
-            code = code.replace("; sd.report.page", "")
-        subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
 def test_figures_of_a_run(run, tmp_path):

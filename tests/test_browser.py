@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import stewart_drake as sd
-from stewart_drake.report.replay import write_replay
+from stewart_drake.reporting.replay import write_replay
 from tests.browser import Browser, needs_chromium
 
 pytestmark = [needs_chromium, pytest.mark.slow]

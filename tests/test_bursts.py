@@ -16,7 +16,6 @@ from stewart_drake.scenario.link import (
     usual_bound,
 )
 
-Array = NDArray[np.float64]
 PERIOD = 0.1
 COUNTED = 400_000
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from stewart_drake.cli import main
@@ -35,9 +34,9 @@ from stewart_drake.mechanism.proportions import proportions
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.clearance import clearance_along, study_clearance
 from stewart_drake.studies.workspace_map import Section, Travel, sections, travel
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
-Array = NDArray[np.float64]
 seeds = st.integers(0, 2**32 - 1)
 seeded = settings(max_examples=25, deadline=None, derandomize=True)
 LEG = ("1", "2", "3", "4", "5", "6")

@@ -305,7 +305,7 @@ def test_a_reader_that_leaves_early_is_no_error():
 
 
 def test_colours_only_where_they_are_wanted(monkeypatch, capsys):
-    from stewart_drake.report import terminal
+    from stewart_drake.reporting import terminal
 
     monkeypatch.setattr(terminal.sys.stdout, "isatty", lambda: True, raising=False)
     for no_color, expected in (("", True), ("1", False)):

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law import cost as cost_module
@@ -37,10 +36,9 @@ from stewart_drake.loop.experiment import assemble, control_law, motion_scale, p
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate, make_reference
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative
-
-Array = NDArray[np.float64]
 
 WEIGHTS = np.array([1.0, 1.0])
 HOME = np.concatenate([PAPER.home, np.zeros(12)])

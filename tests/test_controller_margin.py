@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 
 import stewart_drake as sd
@@ -33,9 +32,8 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.basis import basis
 from stewart_drake.studies.compare import CONTROLLERS
 from stewart_drake.studies.delay_loop import loop_margins
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
-
-Array = NDArray[np.float64]
 
 HOLD = ("reference.kind=hold", "plant.kind=exact")
 """At rest at home nothing changes with time: what is linearised there is the loop."""

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import norm
 
@@ -28,14 +27,13 @@ from stewart_drake.loop.controller_margin import ControllerMargin, controller_ma
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.report.figures import draw_run
+from stewart_drake.reporting.figures import draw_run
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, shown
 from stewart_drake.studies.verdict import loop_verdict
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
-
-Array = NDArray[np.float64]
 
 DT = 0.1
 AMPLITUDES = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])

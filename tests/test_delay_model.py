@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
@@ -19,10 +18,9 @@ from stewart_drake.law.error_model import (
     with_integral,
 )
 from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative
-
-Array = NDArray[np.float64]
 
 STEPS = (0, 1, 2, 8)
 FRACTIONS = (0.0, 0.3, 0.5)

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numpy.typing import NDArray
 
 from stewart_drake.tuner.density import (
     NUM_INPUTS,
@@ -18,8 +17,8 @@ from stewart_drake.tuner.density import (
     densities,
     density,
 )
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 KINDS: tuple[Kind, ...] = ("magnitude", "signed")
 
 

@@ -32,7 +32,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from PIL import Image
 
 import stewart_drake as sd
@@ -52,9 +51,8 @@ from stewart_drake.scenario.loading import load_controller, load_understood, set
 from stewart_drake.scenario.reference_files import read_waypoints
 from stewart_drake.scenario.signals import SIGNALS, exported_ports, ports_of
 from stewart_drake.scenario.trajectories import evaluate, make_reference
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
-
-Array = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "stewart_drake"

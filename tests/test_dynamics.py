@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.mechanism.kinematics import (
@@ -27,6 +26,7 @@ from stewart_drake.scenario.signals import (
     PAYLOAD_POSITION,
     PLANT_PARAMETERS,
 )
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER, SPREAD, random_mechanism, random_pose
 from tests.oracles import (
     PartitionedTree,
@@ -39,7 +39,6 @@ from tests.oracles import (
     size,
 )
 
-Array = NDArray[np.float64]
 State = tuple[StewartDynamics, Array, Array]
 
 AMPLITUDE = np.array([np.pi / 12] * 3 + [0.02, 0.02, 0.08])

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from numpy.polynomial.legendre import leggauss
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -21,10 +20,9 @@ from stewart_drake.mechanism.kinematics import crank_angles_along
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.known import OFFSETS
 from stewart_drake.scenario.signals import PARAMETERS, POSE, RATES
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative
-
-Array = NDArray[np.float64]
 
 DT = 0.1
 MOTION = np.array([0.26, 0.26, 0.26, 0.02, 0.02, 0.08])

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
@@ -16,15 +15,14 @@ from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.encoders import Encoders
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import make_simulator, simulate
-from stewart_drake.report.csv_file import read_signals, signals_csv
+from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import LEGS, POSE
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import make_reference
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
-
-Array = NDArray[np.float64]
 
 ENCODERS = ("plant.kind=exact", "sensor.kind=encoders")
 ON_REFERENCE = (*ENCODERS, "start=on_reference", "queue=reference")

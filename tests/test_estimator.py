@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, lsq_linear
 from scipy.stats import chi2
 
@@ -24,10 +23,9 @@ from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import BIAS, DAMPING, PARAMETER_UNITS, PARAMETERS, PAYLOAD
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import central_difference, relative
-
-Array = NDArray[np.float64]
 
 PERIOD, STEPS, SUBSTEPS = 0.1, 15, 2
 AMPLITUDE = np.array([np.pi / 12] * 3 + [0.02, 0.02, 0.08])

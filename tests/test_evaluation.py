@@ -8,7 +8,7 @@ from scipy import stats
 
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.report.tuner_document import evaluation_document
+from stewart_drake.reporting.tuner_document import evaluation_document
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.tuner.network import Network, save_network
 from stewart_drake.tuning.evaluation import GAINS, TUNER, Evaluation, compare, evaluate

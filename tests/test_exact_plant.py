@@ -4,7 +4,6 @@ import functools
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.systems.analysis import (
     ApplySimulatorConfig,
     Simulator,
@@ -33,10 +32,10 @@ from stewart_drake.loop.multibody_stewart import MultibodyStewart
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import DEAD_CENTRE_SINE
 from stewart_drake.scenario.timing import look_time
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.oracles import relative, size
 
-Array = NDArray[np.float64]
 Scheme = tuple[str, float, float, bool]
 """Integrator, accuracy, largest step in s, error control."""
 

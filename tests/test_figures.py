@@ -12,9 +12,9 @@ from matplotlib.image import imread
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.report import figures
-from stewart_drake.report.figures import comparison_figures, run_figures
-from stewart_drake.report.style import CONTROLLER_LINES
+from stewart_drake.reporting import figures
+from stewart_drake.reporting.figures import comparison_figures, run_figures
+from stewart_drake.reporting.style import CONTROLLER_LINES
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 

@@ -4,7 +4,6 @@ import copy
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 
 import stewart_drake as sd
@@ -16,10 +15,10 @@ from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.scenario.signals import PLANT_PARAMETERS, POSE, RATES
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism
 from tests.test_printed_law import AMPLITUDE, error
 
-Array = NDArray[np.float64]
 FULL = "overlay=paper_plant"
 
 

@@ -29,7 +29,7 @@ import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.report.csv_file import read_signals, signals_csv
+from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.scenario.loading import load_controller, load_scenario
 from stewart_drake.scenario.reference_config import CsvConfig, WaypointsConfig
 from stewart_drake.scenario.reference_files import read_csv, read_waypoints

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import stewart_drake as sd
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -20,9 +19,8 @@ from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
-
-Array = NDArray[np.float64]
 
 DT = 0.1
 AMPLITUDES = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])

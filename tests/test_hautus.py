@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from pydrake.systems.primitives import IsControllable, LinearSystem
 from scipy.linalg import block_diag, expm
 
@@ -13,9 +12,9 @@ from stewart_drake.law.error_model import double_integrators, with_integral
 from stewart_drake.law.hautus import TOLERANCE, cluster, hautus, scaled
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.studies.mode_words import describe, state_labels
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
-Array = NDArray[np.float64]
 PAPER_MODEL = double_integrators(torque_map(PAPER, PAPER.home))
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
@@ -35,8 +34,8 @@ from stewart_drake.tuner.source import (
     weights_of,
 )
 from stewart_drake.tuning.curves import FixedPolicy, Watched, watched_run
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 FOLLOWS = ("plant.kind=exact", "start=on_reference", "queue=reference")
 BLIND = (*FOLLOWS, "controller.estimator=none")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.optimize import minimize_scalar
@@ -21,10 +21,9 @@ from stewart_drake.mechanism.kinematics import (
     leg_geometry,
     rotation,
 )
+from stewart_drake.types import Array
 from tests import singular
 from tests.mechanisms import PAPER, random_mechanism, random_pose
-
-Array = NDArray[np.float64]
 
 seeds = st.integers(0, 2**32 - 1)
 seeded = settings(max_examples=40, deadline=None, derandomize=True)

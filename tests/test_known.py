@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
@@ -23,7 +22,6 @@ from stewart_drake.scenario.known import KNOWABLE, OFFSETS, Known, load_known, s
 from stewart_drake.scenario.signals import DAMPING, PARAMETERS, PAYLOAD, PLANT_PARAMETERS
 from tests.mechanisms import PAPER
 
-Array = NDArray[np.float64]
 NAMES = ("payload_mass", "joint_damping", "coulomb_friction", "delay")
 MEAN = np.array([0.4, 1e-3, 2e-3, 0.73])
 SPREAD = np.array([[3e-2, 0, 0, 0], [1e-4, 2e-4, 0, 0], [0, 1e-4, 1e-4, 0], [0, 0, 0, 1e-3]])

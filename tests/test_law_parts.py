@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 
@@ -37,12 +36,11 @@ from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.types import Array
 from tests.backends import stepped_in_python
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 from tests.test_control_law import HOME, WEIGHTS, Loop, law_of, nominal_queue, sine
-
-Array = NDArray[np.float64]
 
 HEAVY = StewartDynamics(PAPER, gravity=True)
 PLANT = NominalPlant(HEAVY, 2, 0.5, TorqueLimit(2.0))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 import stewart_drake as sd
 from stewart_drake.cli import main
@@ -46,9 +45,9 @@ from stewart_drake.studies.layout_space import (
 from stewart_drake.studies.reach import margins_along
 from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.sizing import size_motors
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
-Array = NDArray[np.float64]
 SPEC = mechanism_spec("paper")
 OWN = Arrangement((5, 0, 1, 2, 3, 4), (-1, 1) * 3, 60.0)
 QUICK = ("plant.kind=exact", "duration=1.5")

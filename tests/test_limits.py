@@ -5,7 +5,6 @@ import math
 import control
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
 import stewart_drake as sd
@@ -33,9 +32,9 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.delay_limits import error_floor, simulated_growth
 from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
-Array = NDArray[np.float64]
 HEAVY = sd.StewartDynamics(PAPER, gravity=True)
 
 

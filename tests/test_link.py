@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 from scipy.integrate import solve_ivp
@@ -19,8 +18,8 @@ from stewart_drake.loop.varying_delay import VaryingDelay
 from stewart_drake.scenario.config import DelayConfig
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import acting, delay_at, torque_delays
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 PERIOD = 0.1
 LONG = ("plant.kind=exact", "start=on_reference", "queue=reference")
 

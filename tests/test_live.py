@@ -36,9 +36,9 @@ from stewart_drake.live.steering import Steering, Way, Wish
 from stewart_drake.loop.experiment import control_law, prepare
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.report.run_document import run_document
-from stewart_drake.report.style import FACTORS
-from stewart_drake.report.viewer import slider_range
+from stewart_drake.reporting.run_document import run_document
+from stewart_drake.reporting.style import FACTORS
+from stewart_drake.reporting.viewer import slider_range
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES

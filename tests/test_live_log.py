@@ -24,7 +24,7 @@ from stewart_drake.live.session import drive, prepare_session
 from stewart_drake.loop import metrics
 from stewart_drake.loop.experiment import control_law, first_queue, prepare
 from stewart_drake.loop.recording import Table
-from stewart_drake.report.csv_file import signals_csv
+from stewart_drake.reporting.csv_file import signals_csv
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
 from tests.copies import status_of

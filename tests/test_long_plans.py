@@ -4,7 +4,6 @@ import time
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.catch_up import MOST_HOLDS, plan_catch_up
@@ -13,8 +12,7 @@ from stewart_drake.law.startup import BLOCK, choose_substeps
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 @pytest.fixture

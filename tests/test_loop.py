@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from numpy.typing import NDArray
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 from scipy.integrate import quad_vec
@@ -27,9 +26,8 @@ from stewart_drake.scenario.signals import LEGS
 from stewart_drake.scenario.trajectories import evaluate, make_reference
 from stewart_drake.studies import delay_limits
 from stewart_drake.studies.delay_limits import study_delay
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
-
-Array = NDArray[np.float64]
 
 GRID = 0.02
 ON_REFERENCE = ("start=on_reference", "queue=reference")

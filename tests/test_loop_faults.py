@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import stewart_drake.law.cost as cost_module
 import stewart_drake.loop.diagram as diagram_module
@@ -21,9 +20,9 @@ from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.types import Array
 from tests.backends import stepped_in_python
 
-Array = NDArray[np.float64]
 Spoil = Callable[[int, Array, dict[int, Array]], Array]
 """From the number of a sample, its measurement and all earlier ones to what is sent."""
 

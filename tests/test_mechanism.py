@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import data_root
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Body, Mechanism
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
-Array = NDArray[np.float64]
 Loader = Callable[[dict[str, Any]], Mechanism]
 FILE = data_root() / "models" / "paper.yaml"
 ABSENT = object()

@@ -15,7 +15,6 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import stewart_drake as sd
 from stewart_drake.cli import main
@@ -27,10 +26,10 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native import build, library
 from stewart_drake.native.layout import SIGNATURES
 from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, PAYLOAD
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.virtual_machine import VirtualMachine
 
-Array = NDArray[np.float64]
 NO_PARAMETERS = plant_parameters()
 CLOSE = 1e-13
 """Relative to the largest number of a result; they differ by the order of sums."""

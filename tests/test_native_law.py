@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import stewart_drake as sd
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -24,10 +23,10 @@ from stewart_drake.loop.experiment import believed_queue, compose_law, control_l
 from stewart_drake.native import library as native_library
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism
 from tests.test_riccati import riccati_gain
 
-Array = NDArray[np.float64]
 Spoil = Callable[[int, Array], Array]
 NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-3,1e-3,1e-3,1e-4,1e-4,1e-4]"
 DIRTY = (

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, LeafSystem
 
@@ -30,9 +29,9 @@ from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.uncertainty import MACHINE, Scales, draw, drawn, scales_of
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
-Array = NDArray[np.float64]
 NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
 FOLLOWS = ("start=on_reference", "queue=reference")
 DIRTY = (

@@ -12,13 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.tuner.network import Network, load_network, save_network
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 ARRAYS = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds")
 
 

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.systems.primitives import ConstantVectorSource
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
@@ -17,9 +16,9 @@ from stewart_drake.dynamics.workspace import margin
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.native.plant import Ended
 from stewart_drake.scenario.signals import POSE, RATES
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism
 
-Array = NDArray[np.float64]
 HEAVY = StewartDynamics(PAPER, parameters=[*[0.01] * 6, 0.5, 0.02])
 HOLD = StewartDynamics(PAPER).equilibrium_torque(PAPER.home)
 AT_HOME = np.concatenate([PAPER.home, np.zeros(6)])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 
@@ -22,8 +21,8 @@ from stewart_drake.loop.experiment import compose_law, prepare
 from stewart_drake.loop.late_measurements import LateMeasurements
 from stewart_drake.loop.playout import PlayoutBuffer
 from stewart_drake.loop.simulation import make_simulator
-from stewart_drake.report.link_document import document
-from stewart_drake.report.page import Provenance, html
+from stewart_drake.reporting.link_document import document
+from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.scenario.config import NetworkConfig, PacketsConfig
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import (
@@ -38,7 +37,6 @@ from stewart_drake.scenario.timing import look_time
 from stewart_drake.studies import link_bound
 from stewart_drake.studies.runs import Outcome
 
-Array = NDArray[np.float64]
 PERIOD = 0.1
 LONG = ("plant.kind=exact", "start=on_reference", "queue=reference")
 NETWORK = ("link.kind=network", "link.low=0.5", "link.high=0.9")

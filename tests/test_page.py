@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import pytest
 from matplotlib.figure import Figure
 
-from stewart_drake.report.document import (
+from stewart_drake.reporting.document import (
     Caution,
     Document,
     Frame,
@@ -21,8 +21,8 @@ from stewart_drake.report.document import (
     Table,
     Values,
 )
-from stewart_drake.report.page import Provenance, command_line, html, write_page
-from stewart_drake.report.style import figure_style, rounded
+from stewart_drake.reporting.page import Provenance, command_line, html, write_page
+from stewart_drake.reporting.style import figure_style, rounded
 
 
 class Outline(HTMLParser):

@@ -7,10 +7,10 @@ import pytest
 from matplotlib.figure import Figure
 
 import stewart_drake as sd
-from stewart_drake.report import hautus_document
-from stewart_drake.report.document import Document, Picture, Section, Table
-from stewart_drake.report.page import Provenance, write_page
-from stewart_drake.report.style import CONTROLLER_LINES, figure_style
+from stewart_drake.reporting import hautus_document
+from stewart_drake.reporting.document import Document, Picture, Section, Table
+from stewart_drake.reporting.page import Provenance, write_page
+from stewart_drake.reporting.style import CONTROLLER_LINES, figure_style
 from stewart_drake.studies.hautus import study_hautus
 from tests.browser import Browser, needs_chromium
 

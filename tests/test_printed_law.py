@@ -9,7 +9,6 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from stewart_drake.law.delay_model import DelayedModel, delayed_model
@@ -19,7 +18,6 @@ from stewart_drake.loop.metrics import accumulated_error
 from stewart_drake.mechanism.torque_map import torque_map
 from tests.mechanisms import PAPER
 
-Array = NDArray[np.float64]
 AMPLITUDE = np.array([math.pi / 12] * 3 + [0.02, 0.02, 0.08])
 PERIOD, STEPS, PARTS = 0.1, 8, 5
 B = torque_map(PAPER, PAPER.home)

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from stewart_drake.cli import main
-from stewart_drake.report import terminal
+from stewart_drake.reporting import terminal
 
 ROOT = Path(__file__).resolve().parents[1]
 STUDY = ["analyze", "robustness", "--runs", "4", "--set", "duration=0.3", "--workers", "1"]
@@ -23,7 +23,9 @@ STUDY = ["analyze", "robustness", "--runs", "4", "--set", "duration=0.3", "--wor
 
 def said_by(script: str, stderr: int | None = subprocess.PIPE) -> str:
     """What a few lines of Python print to stderr."""
-    lines = f"import time\nfrom stewart_drake.report import terminal as t\nt.EVERY = 0.05\n{script}"
+    lines = (
+        f"import time\nfrom stewart_drake.reporting import terminal as t\nt.EVERY = 0.05\n{script}"
+    )
     done = subprocess.run(
         [sys.executable, "-c", lines], stderr=stderr, stdout=subprocess.PIPE, text=True, cwd=ROOT
     )
@@ -63,7 +65,9 @@ def test_quiet_is_quiet(how):
 
 def test_a_closed_stderr_costs_nothing():
     script = "with t.count_bar('runs', False) as show:\n    show(0, 3)\n    time.sleep(0.3)\n"
-    lines = f"import time\nfrom stewart_drake.report import terminal as t\nt.EVERY = 0.05\n{script}"
+    lines = (
+        f"import time\nfrom stewart_drake.reporting import terminal as t\nt.EVERY = 0.05\n{script}"
+    )
     shell = f'{sys.executable} -c "$0" 2>&-'
     done = subprocess.run(
         ["bash", "-c", shell, lines + "print('done')"], capture_output=True, cwd=ROOT
@@ -88,7 +92,7 @@ def test_the_bar_never_counts_to_zero():
     leader, follower = pty.openpty()
     fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     script = (
-        "import time\nfrom stewart_drake.report import terminal as t\n"
+        "import time\nfrom stewart_drake.reporting import terminal as t\n"
         "with t.count_bar('runs', False) as show:\n    show(3, 10)\n    time.sleep(0.3)\n"
         "    show(4, 10)\n    time.sleep(0.3)\n    show(9, 10)\n"
     )

@@ -17,7 +17,7 @@ from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.recording import Table
 from stewart_drake.loop.results import DelaySummary, MarginSummary, RunSummary, StepTimes
 from stewart_drake.loop.sensor import Sensor
-from stewart_drake.report.csv_file import read_signals, signals_csv
+from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.signals import (
     COORDINATE_UNITS,

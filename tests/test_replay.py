@@ -17,8 +17,8 @@ from stewart_drake.loop import scene
 from stewart_drake.loop.lifetime import let_go
 from stewart_drake.loop.multibody_stewart import build_viewer
 from stewart_drake.loop.scene import CRANK_PARTS, crank_paths, pointer, ring
-from stewart_drake.report import replay as replay_module
-from stewart_drake.report.replay import replay_html, write_replay
+from stewart_drake.reporting import replay as replay_module
+from stewart_drake.reporting.replay import replay_html, write_replay
 from stewart_drake.scenario.signals import LEGS
 
 PAPER = sd.load_mechanism("paper")

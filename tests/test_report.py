@@ -16,16 +16,16 @@ from stewart_drake.cli import main
 from stewart_drake.files.yamlio import load_yaml
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
-from stewart_drake.report import collect as collect_module
-from stewart_drake.report import report_document
-from stewart_drake.report.answer import Answer
-from stewart_drake.report.collect import ANALYSES, collect
-from stewart_drake.report.document import Document, Paragraph, Picture, Table
-from stewart_drake.report.page import Provenance
-from stewart_drake.report.page import html as html_of
-from stewart_drake.report.report_document import mean_error
-from stewart_drake.report.run_document import comparison_document
-from stewart_drake.report.words import number, wrap
+from stewart_drake.reporting import collect as collect_module
+from stewart_drake.reporting import report_document
+from stewart_drake.reporting.answer import Answer
+from stewart_drake.reporting.collect import ANALYSES, collect
+from stewart_drake.reporting.document import Document, Paragraph, Picture, Table
+from stewart_drake.reporting.page import Provenance
+from stewart_drake.reporting.page import html as html_of
+from stewart_drake.reporting.report_document import mean_error
+from stewart_drake.reporting.run_document import comparison_document
+from stewart_drake.reporting.words import number, wrap
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from stewart_drake.tuner.network import save_network

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from stewart_drake.cli import main
-from stewart_drake.report.document import Document, Listing, Section
-from stewart_drake.report.page import Provenance, write_page
+from stewart_drake.reporting.document import Document, Listing, Section
+from stewart_drake.reporting.page import Provenance, write_page
 from tests.copies import copied
 
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
@@ -72,7 +72,7 @@ def test_ctrl_c_while_drake_is_loaded_is_one_as_well(monkeypatch):
     def loading(kind):
         raise ImportError("initialization failed") from stop
 
-    monkeypatch.setattr("stewart_drake.report.shipped_table.shipped_table", loading)
+    monkeypatch.setattr("stewart_drake.reporting.shipped_table.shipped_table", loading)
     assert main(["list"]) == 130
     inner = ImportError("initialization failed")
     inner.__cause__, stop = stop, inner  # a module that was loading another

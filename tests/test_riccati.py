@@ -14,10 +14,10 @@ from stewart_drake.law.delay_model import DelayedModel, chain, delayed_model
 from stewart_drake.law.error_model import double_integrators, linear_model
 from stewart_drake.law.riccati import RiccatiError, augmented_gain, full_gain, lqr, reduced_gain
 from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 
-Array = NDArray[np.float64]
 Extended = NDArray[np.longdouble]
 
 STEPS = (0, 1, 5, 8, 10, 20, 30)

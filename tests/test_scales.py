@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -24,11 +23,10 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 from tests.test_riccati import STEPS, UNIT, delayed
-
-Array = NDArray[np.float64]
 
 SIZES = [(0.1, 1e-3), (0.01, 1e-6), (10.0, 1e3), (1.0, 100.0)]
 """Factors of length and mass; the second makes a crank of 1.1 mm and a plate of 4 mg."""

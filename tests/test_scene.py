@@ -13,7 +13,7 @@ from pydrake.geometry import Meshcat, MeshcatParams
 import stewart_drake as sd
 from stewart_drake.loop.scene import Scene, crank_paths, full_color, torque_color, torque_shares
 from stewart_drake.mechanism.kinematics import rotation
-from stewart_drake.report.replay import replay
+from stewart_drake.reporting.replay import replay
 from stewart_drake.scenario.signals import LEGS
 
 PAPER = sd.load_mechanism("paper")

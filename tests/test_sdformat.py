@@ -9,7 +9,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.geometry import Box, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
@@ -23,9 +22,9 @@ from stewart_drake.loop.multibody import add_mechanism, set_pose
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
-Array = NDArray[np.float64]
 MODELS = data_root() / "models"
 LEGS = range(1, 7)
 

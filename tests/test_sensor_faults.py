@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import stewart_drake.loop.diagram as diagram_module
 from stewart_drake.files.errors import ConfigError
@@ -21,10 +20,9 @@ from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_to_dict, scenario_yaml
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.test_control_law import HOME, Loop, law_of, nominal_queue, sine, step
-
-Array = NDArray[np.float64]
 
 CONTROLLERS = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
 SHIPPED = ("paper", "gravity", "desktop", "motion_base")

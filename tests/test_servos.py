@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -37,8 +36,8 @@ from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.scenario.timing import look_time, servo_ticks
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import CONTROLLERS, SERVOS, shown
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 ON = ("start=on_reference", "queue=reference")
 UNKNOWN = (
     "plant.torque_bias=[3e-4, -3e-4, 3e-4, -3e-4, 3e-4, -3e-4]",

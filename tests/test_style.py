@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from stewart_drake.report.page import environment, size
-from stewart_drake.report.style import DARK, figure_style, for_dark_too, plain_log_ticks
+from stewart_drake.reporting.page import environment, size
+from stewart_drake.reporting.style import DARK, figure_style, for_dark_too, plain_log_ticks
 
 
 def luminance(color: str) -> float:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import (
     BasicVector,
@@ -36,10 +35,9 @@ from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate, make_reference
+from stewart_drake.types import Array
 from tests.backends import stepped_in_python
 from tests.mechanisms import PAPER
-
-Array = NDArray[np.float64]
 
 DELAYS = [(steps, fraction) for steps in (0, 1, 8) for fraction in (0.0, 0.3)]
 MOTION = make_reference(load_scenario("paper").reference, 10.0)

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
@@ -23,9 +22,8 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_yaml
 from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.uncertainty import draw, scales_of
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER
-
-Array = NDArray[np.float64]
 
 PLANTS = ["exact", "multibody"]
 WEAK = 0.3

@@ -4,16 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.mechanism.geometry import Link, Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, leg_geometry
 from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
-
-Array = NDArray[np.float64]
 
 
 def with_legs_scaled(mechanism: Mechanism, factor: float) -> Mechanism:

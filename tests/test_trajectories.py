@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
@@ -29,8 +28,7 @@ from stewart_drake.scenario.trajectories import (
     peak_to_peak,
     spread_instants,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 HOME = [0.0, 0.0, 0.0, 0.0, 0.0, 0.38]
 HEADER = "time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]"

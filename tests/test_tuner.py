@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 import stewart_drake as sd
@@ -21,10 +20,9 @@ from stewart_drake.scenario.timing import look_time
 from stewart_drake.tuner.density import NUM_INPUTS, densities
 from stewart_drake.tuner.law import MAX_FACTOR, tune
 from stewart_drake.tuner.network import Network, save_network
+from stewart_drake.types import Array
 from tests.test_network import small_network, torch_twin
 from tests.test_systems import carry_out, ports
-
-Array = NDArray[np.float64]
 
 FIXED = np.array([1.0, 2.0])
 OVERFLOWING = {"b2": [800.0, 0.0]}

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from stewart_drake.cli import main
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -37,10 +36,10 @@ from stewart_drake.studies.singularity import characteristic_length, measure, wr
 from stewart_drake.studies.sizing import size_motors
 from stewart_drake.studies.workspace import study_workspace
 from stewart_drake.studies.workspace_map import last_inside, sections, travel
+from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.singular import parallel_rods, stretched, write_mechanism
 
-Array = NDArray[np.float64]
 seeds = st.integers(0, 2**32 - 1)
 seeded = settings(max_examples=30, deadline=None, derandomize=True)
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
@@ -45,8 +44,7 @@ from stewart_drake.tuning.worth import (
     tuned_run,
     tuners_of,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 # ------------------------------------------------------------------------- conditions
 

@@ -8,7 +8,6 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics import equations
 from stewart_drake.dynamics.measures import assembled, leg_measures
@@ -16,8 +15,7 @@ from stewart_drake.dynamics.numbers import numbers_of
 from stewart_drake.identification.model import Compiled
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_PLANT_PARAMETERS, NUM_STATE, POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _UNROLLED = 64
 """Steps in one piece of a prediction; a piece of n steps takes memory like n^2, 10 GB for 4000."""

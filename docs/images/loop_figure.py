@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 from pydrake.systems.framework import Diagram
 
-from stewart_drake.report.style import figure_style
+from stewart_drake.reporting.style import figure_style
 
 Point = tuple[float, float]
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from stewart_drake.report.style import figure_style
+from stewart_drake.reporting.style import figure_style
 from stewart_drake.scenario.signals import COORDINATES, LEGS, WEIGHTS
 from stewart_drake.tuner.network import Network
 

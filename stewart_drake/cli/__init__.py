@@ -24,7 +24,7 @@ from stewart_drake.cli import (
 from stewart_drake.cli.common import INTERRUPTED, release
 from stewart_drake.cli.examples import add_examples
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.report.terminal import echo
+from stewart_drake.reporting.terminal import echo
 
 _BAD_INPUT: Final = 2
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -125,7 +125,7 @@ def _root(
 def list_shipped() -> None:
     """List the shipped models, scenarios and so on."""
     from stewart_drake.files.resources import KINDS, shipped
-    from stewart_drake.report.shipped_table import shipped_table
+    from stewart_drake.reporting.shipped_table import shipped_table
 
     for kind, heading in KINDS.items():
         if shipped(kind):

@@ -22,11 +22,11 @@ from stewart_drake.cli.common import (
     stopping,
 )
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.report.terminal import count_bar, working
+from stewart_drake.reporting.terminal import count_bar, working
 from stewart_drake.studies.ranges import RANGE_UNITS
 
 if TYPE_CHECKING:
-    from stewart_drake.report.answer import Answer
+    from stewart_drake.reporting.answer import Answer
     from stewart_drake.scenario.config import Scenario
 
 app = typer.Typer(rich_markup_mode=None, help="Tell beforehand what can be controlled, and how.")
@@ -203,8 +203,8 @@ def _answer(
 
     Of these a list or tuple is an option given so many times, None is one that is not.
     """
-    from stewart_drake.report.analyses import analyze
-    from stewart_drake.report.page import command_line
+    from stewart_drake.reporting.analyses import analyze
+    from stewart_drake.reporting.page import command_line
     from stewart_drake.scenario.loading import load_scenario
 
     given = settings or []

@@ -13,11 +13,11 @@ import typer
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
-from stewart_drake.report.terminal import echo
+from stewart_drake.reporting.terminal import echo
 
 if TYPE_CHECKING:
     from stewart_drake.files.resources import Kind
-    from stewart_drake.report.answer import Answer
+    from stewart_drake.reporting.answer import Answer
     from stewart_drake.scenario.config import Scenario
 
 INTERRUPTED: Final = 130
@@ -184,7 +184,7 @@ class Delivery:
 
     def tell(self, line: str) -> None:
         """Print a line, wrapped to a screen."""
-        from stewart_drake.report.words import wrap
+        from stewart_drake.reporting.words import wrap
 
         self.say(wrap(line))
 
@@ -233,7 +233,7 @@ class Delivery:
 
     def answer(self, answer: "Answer", *beside: str, interrupted: bool = False) -> int:
         """Print an answer, write summary.json and the page `beside` what there is; the status."""
-        from stewart_drake.report.answer import PAGE
+        from stewart_drake.reporting.answer import PAGE
 
         self.say(str(answer))
         # No page of an earlier run beside this one's numbers, which come first.

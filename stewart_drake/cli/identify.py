@@ -9,11 +9,11 @@ import typer
 from stewart_drake.cli.common import AsJson, Delivery, Out, Quiet, Settings, refuse
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.tolerances import TOLERANCE_UNITS, Tolerances, read_tolerances
-from stewart_drake.report.terminal import working
+from stewart_drake.reporting.terminal import working
 
 if TYPE_CHECKING:
     from stewart_drake.identification.log_files import Precision
-    from stewart_drake.report.answer import Answer
+    from stewart_drake.reporting.answer import Answer
 
 MECHANISM = "mechanism.yaml"
 KNOWN = "known.yaml"
@@ -134,9 +134,9 @@ def _found(
     from stewart_drake.identification.identify import identify as find
     from stewart_drake.identification.log_files import read_log
     from stewart_drake.mechanism.files import load_mechanism
-    from stewart_drake.report.answer import answer_of
-    from stewart_drake.report.identification_document import document
-    from stewart_drake.report.page import command_line
+    from stewart_drake.reporting.answer import answer_of
+    from stewart_drake.reporting.identification_document import document
+    from stewart_drake.reporting.page import command_line
 
     if mechanism is None:
         raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")
@@ -162,9 +162,9 @@ def _planned(
     from stewart_drake.identification.logs import ANGLES, POSE
     from stewart_drake.identification.plan import plan
     from stewart_drake.loop.experiment import prepare
-    from stewart_drake.report.answer import answer_of
-    from stewart_drake.report.identification_document import plan_document
-    from stewart_drake.report.page import command_line
+    from stewart_drake.reporting.answer import answer_of
+    from stewart_drake.reporting.identification_document import plan_document
+    from stewart_drake.reporting.page import command_line
     from stewart_drake.scenario.loading import load_scenario
 
     std = np.full_like(precision.std, np.inf)

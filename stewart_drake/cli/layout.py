@@ -20,7 +20,7 @@ from stewart_drake.cli.common import (
     stopping,
 )
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.report.terminal import count_bar
+from stewart_drake.reporting.terminal import count_bar
 
 Goal = Annotated[
     str,
@@ -80,8 +80,8 @@ def layout(
     The best few become machine files, beside a page that compares them. With --out the same
     command goes on where it was stopped.
     """
-    from stewart_drake.report.analyses import analyze
-    from stewart_drake.report.page import command_line
+    from stewart_drake.reporting.analyses import analyze
+    from stewart_drake.reporting.page import command_line
     from stewart_drake.scenario.loading import load_scenario
 
     limits, bounds = _limits(limit or ()), _bounds(vary or ())

@@ -22,7 +22,7 @@ from stewart_drake.cli.common import (
     Settings,
 )
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.report.terminal import echo
+from stewart_drake.reporting.terminal import echo
 
 if TYPE_CHECKING:
     from stewart_drake.live.page import PageViewer
@@ -156,7 +156,7 @@ def _show(url: str) -> None:
 
 def _told(delivery: Delivery, result: "SimulationResult") -> int:
     """Write and print what has come of it."""
-    from stewart_drake.report.run_document import run_document
+    from stewart_drake.reporting.run_document import run_document
 
     stopped = result.stopped
     told: Any = result.summary

@@ -14,7 +14,7 @@ from stewart_drake.cli.common import (
     open_meshcat,
 )
 from stewart_drake.files.fileio import replacing
-from stewart_drake.report.terminal import echo
+from stewart_drake.reporting.terminal import echo
 
 app = typer.Typer(rich_markup_mode=None, help="Look at a mechanism.")
 
@@ -51,11 +51,11 @@ def check(
 ) -> None:
     """Check a mechanism and describe it at its home pose, under gravity."""
     from stewart_drake.mechanism.files import load_mechanism
-    from stewart_drake.report.mechanism_document import document
+    from stewart_drake.reporting.mechanism_document import document
     from stewart_drake.studies.mechanism_check import check_mechanism
 
     def draw(folder: Path) -> None:
-        from stewart_drake.report.mechanism_figures import write_mechanism_figure
+        from stewart_drake.reporting.mechanism_figures import write_mechanism_figure
 
         write_mechanism_figure(found.mechanism, folder)
 
@@ -78,7 +78,7 @@ def view(
 ) -> None:
     """Show a mechanism in a browser, with sliders for its pose."""
     from stewart_drake.mechanism.files import load_mechanism
-    from stewart_drake.report.viewer import STOP, PoseViewer
+    from stewart_drake.reporting.viewer import STOP, PoseViewer
 
     delivery = Delivery(out, quiet)
     viewer = PoseViewer(load_mechanism(mechanism), open_meshcat())

@@ -14,7 +14,7 @@ from stewart_drake.cli.common import (
     ScenarioName,
     Settings,
 )
-from stewart_drake.report.terminal import count_bar
+from stewart_drake.reporting.terminal import count_bar
 
 REPLAY = "replay.html"
 
@@ -32,10 +32,10 @@ def report(
     It is run, compared under all shipped controllers, and analysed.
     """
     from stewart_drake.loop.experiment import simulated_machine
-    from stewart_drake.report import report_document
-    from stewart_drake.report.answer import PAGE, Answer
-    from stewart_drake.report.collect import collect
-    from stewart_drake.report.page import Provenance, command_line
+    from stewart_drake.reporting import report_document
+    from stewart_drake.reporting.answer import PAGE, Answer
+    from stewart_drake.reporting.collect import collect
+    from stewart_drake.reporting.page import Provenance, command_line
 
     delivery = Delivery(out, quiet, as_json)
     started, name = time.perf_counter(), Path(scenario).stem
@@ -49,7 +49,7 @@ def report(
 
     def film(folder: Path) -> None:
         nonlocal replay
-        from stewart_drake.report.replay import write_replay
+        from stewart_drake.reporting.replay import write_replay
 
         assert found.run is not None
         mechanism = simulated_machine(found.scenario)

@@ -21,7 +21,7 @@ from stewart_drake.cli.common import (
     open_meshcat,
 )
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.report.terminal import echo, progress_bars
+from stewart_drake.reporting.terminal import echo, progress_bars
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -60,8 +60,8 @@ def simulate(
     from stewart_drake.loop.controller_margin import controller_margin
     from stewart_drake.loop.experiment import prepare
     from stewart_drake.loop.simulation import simulate as run
-    from stewart_drake.report.document import Caution
-    from stewart_drake.report.run_document import run_document
+    from stewart_drake.reporting.document import Caution
+    from stewart_drake.reporting.run_document import run_document
     from stewart_drake.scenario.loading import load_scenario
     from stewart_drake.studies.verdict import Verdict, loop_verdict
 
@@ -86,7 +86,7 @@ def simulate(
     _write_run(delivery, result, experiment.truth, name, csv, replay or meshcat)
     status = delivery.end(result.summary, interrupted=result.status == "interrupted")
     if viewer is not None:
-        from stewart_drake.report.replay import replay as play
+        from stewart_drake.reporting.replay import replay as play
 
         play(result.signals, experiment.truth, viewer)
         if sys.stdin.isatty():
@@ -121,19 +121,19 @@ def _write_run(
     # same run. What is drawn of them comes after that.
     delivery.discard(CSV, REPLAY, *_pictures(RUN_FIGURES))
     if csv:
-        from stewart_drake.report.csv_file import write_csv
+        from stewart_drake.reporting.csv_file import write_csv
 
         write_csv(result.signals, delivery.out / CSV)
     result.save(delivery.out)
     delivery.wrote("summary.json", "signals.nc", *[".csv"] * csv)
 
     def draw(folder: Path) -> list[Path]:
-        from stewart_drake.report.figures import run_figures
+        from stewart_drake.reporting.figures import run_figures
 
         return run_figures(result, folder)
 
     def film(folder: Path) -> None:
-        from stewart_drake.report.replay import write_replay
+        from stewart_drake.reporting.replay import write_replay
 
         write_replay(result, mechanism, folder / REPLAY, name)
 
@@ -156,7 +156,7 @@ def export(
 
     A line per instant; the header names each column's unit.
     """
-    from stewart_drake.report.csv_file import read_signals, signals_csv, write_csv
+    from stewart_drake.reporting.csv_file import read_signals, signals_csv, write_csv
 
     dataset = read_signals(signals)
     if out is None:
@@ -180,7 +180,7 @@ def export_c(
 
     A folder that builds with its own Makefile; its test replays a run of the scenario.
     """
-    from stewart_drake.report.export_c import exported, write
+    from stewart_drake.export.controller import exported, write
     from stewart_drake.scenario.loading import load_scenario
 
     check_writable(out)
@@ -198,13 +198,13 @@ def compare(
 ) -> int:
     """Run the shipped controllers on a scenario, as a table."""
     from stewart_drake.loop.experiment import prepare
-    from stewart_drake.report.run_document import comparison_document
+    from stewart_drake.reporting.run_document import comparison_document
     from stewart_drake.scenario.loading import load_understood
     from stewart_drake.studies import compare as study
     from stewart_drake.studies.verdict import delay_verdict
 
     def draw(folder: Path) -> list[Path]:
-        from stewart_drake.report.figures import comparison_figures
+        from stewart_drake.reporting.figures import comparison_figures
 
         return comparison_figures(results, folder)
 

@@ -22,7 +22,7 @@ from stewart_drake.cli.common import (
     stopping,
 )
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.report.terminal import count_bar, working
+from stewart_drake.reporting.terminal import count_bar, working
 from stewart_drake.scenario.config import Scenario
 
 app = typer.Typer(rich_markup_mode=None, help="Data for the neural tuner, its training, its worth.")
@@ -107,7 +107,7 @@ def dataset(
         number, delivery = DRAWS if draws is None else draws, Delivery(out, quiet, as_json)
         return _curves(family.value, number, seed, settings, workers, scheduler, delivery)
     refuse({"--draws": draws}, "without --family; expected both or neither")
-    from stewart_drake.report.tuner_document import dataset_document
+    from stewart_drake.reporting.tuner_document import dataset_document
     from stewart_drake.tuning.dataset import make_dataset, summarize
 
     base, delivery = _base(scenario, controller, settings), Delivery(out, quiet, as_json)
@@ -158,7 +158,7 @@ def train(
 
     By Levenberg-Marquardt on labels, or, of a family, by regret and by its own runs.
     """
-    from stewart_drake.report.tuner_document import training_document
+    from stewart_drake.reporting.tuner_document import training_document
     from stewart_drake.tuner.network import save_network
     from stewart_drake.tuning.dataset import load_dataset
     from stewart_drake.tuning.training import summarize
@@ -185,7 +185,7 @@ def train(
     delivery.say(training_document(summary).plain())
 
     def draw(folder: Path) -> list[Path]:
-        from stewart_drake.report.training_figures import training_figures
+        from stewart_drake.reporting.training_figures import training_figures
 
         return training_figures(result, folder)
 
@@ -225,7 +225,7 @@ def evaluate(
         )
     if weights and len(weights) > 1:
         raise ConfigError(f"WEIGHTS: got {len(weights)} without --family; expected one")
-    from stewart_drake.report.tuner_document import evaluation_document
+    from stewart_drake.reporting.tuner_document import evaluation_document
     from stewart_drake.tuning.evaluation import evaluate as run
 
     base, delivery = _base(scenario, controller, settings), Delivery(out, quiet, as_json)
@@ -267,7 +267,7 @@ def _curves(
     scheduler: str | None,
     delivery: Delivery,
 ) -> int:
-    from stewart_drake.report.worth_document import curves_document
+    from stewart_drake.reporting.worth_document import curves_document
     from stewart_drake.tuning.curves import make_curves, summarize
 
     assert delivery.out is not None
@@ -298,7 +298,7 @@ def _train_by_regret(
     workers: int | None,
     delivery: Delivery,
 ) -> int:
-    from stewart_drake.report.worth_document import regret_document
+    from stewart_drake.reporting.worth_document import regret_document
     from stewart_drake.tuner.network import save_network
     from stewart_drake.tuning.curves import load_curves
     from stewart_drake.tuning.regret import train_by_regret
@@ -326,8 +326,8 @@ def _worth(
     scheduler: str | None,
     delivery: Delivery,
 ) -> int:
-    from stewart_drake.report.page import Provenance, command_line, write_page
-    from stewart_drake.report.worth_document import worth_document
+    from stewart_drake.reporting.page import Provenance, command_line, write_page
+    from stewart_drake.reporting.worth_document import worth_document
     from stewart_drake.tuning.worth import SHIPPED, weigh
 
     assert delivery.out is not None

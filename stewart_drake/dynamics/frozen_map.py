@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stewart_drake.dynamics.functions import Call
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -27,8 +27,7 @@ from stewart_drake.scenario.signals import (
     POSE,
     RATES,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class FrozenMap:

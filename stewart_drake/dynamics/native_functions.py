@@ -8,14 +8,14 @@ from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import SHAPES, SIGNATURES, geometry_of
 from stewart_drake.native.library import core_library
 from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, NUM_STATE, NUM_TORQUES
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 Shape = tuple[int, ...]
 
 

@@ -4,7 +4,6 @@ from ctypes import byref, c_double
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -12,8 +11,7 @@ from stewart_drake.dynamics.workspace import LEAST, home_sign
 from stewart_drake.native.library import core_library
 from stewart_drake.native.plant import Ended, LooksStruct, MachineStruct, RunStruct
 from stewart_drake.scenario.signals import NUM_STATE
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class NativePlant:

@@ -12,15 +12,14 @@ from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose, margin
 from stewart_drake.native.plant import DriveStruct, Ended
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _NONE: Final = (0.0,) * NUM_TORQUES
 

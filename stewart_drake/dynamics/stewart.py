@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stewart_drake.dynamics.functions import MotionFunctions
 from stewart_drake.dynamics.native_functions import functions_of
@@ -28,8 +28,7 @@ from stewart_drake.scenario.signals import (
     RATES,
     USUAL_COULOMB_SPEED,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Linearization(NamedTuple):

@@ -4,14 +4,12 @@ from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import DEAD_CENTRE_SINE
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 PITCH_LIMIT = np.deg2rad(85.0)
 """Roll and yaw become one rotation at a pitch of 90 degrees."""

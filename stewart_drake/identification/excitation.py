@@ -12,13 +12,11 @@ and falls to rest. a_i makes the peak what is asked for.
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.geometry import Mechanism
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 GRID: Final = 0.02
 """s between two samples of the motion."""

@@ -30,8 +30,7 @@ from stewart_drake.identification.shooting import (
 )
 from stewart_drake.identification.unknowns import DELAY, NUM_UNKNOWNS, OFFSETS, Unknowns
 from stewart_drake.scenario.signals import NUM_STATE
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 MOST_DELAY: Final = 0.1
 """s by which one iteration may change the delay."""

@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification import start
@@ -38,8 +37,7 @@ from stewart_drake.identification.unknowns import (
 )
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint
 from stewart_drake.scenario.known import Known
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 WRONG: Final = 1.5
 """chi^2 per value from which on a fit is wrong and its intervals mean nothing."""

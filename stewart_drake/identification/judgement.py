@@ -16,8 +16,7 @@ from stewart_drake.identification.unknowns import (
 )
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import ANGLES, LEGS, NUM_LEGS, POSITION
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 UNSEEN: Final = 0.8
 """Share of its variance before the log that a direction keeps, if the log does not see it."""

@@ -20,8 +20,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import STANDARD_GRAVITY
 from stewart_drake.scenario.config import NetworkConfig, Scenario, StateSensorConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE, NUM_TORQUES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 EXPECTED: Final = "a log: signals.nc of simulate, or CSV with time, torque_1 ... and angle_1 ..."
 _MAX_BYTES: Final = 100_000_000

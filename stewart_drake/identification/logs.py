@@ -4,11 +4,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 ANGLES: Final = slice(0, NUM_LEGS)
 """Of a log's measurements: crank angles,"""

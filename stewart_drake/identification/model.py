@@ -14,7 +14,6 @@ from typing import Final, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics import equations
 from stewart_drake.dynamics.native_functions import Buffered, Buffers
@@ -22,8 +21,7 @@ from stewart_drake.dynamics.numbers import leg_numbers, numbers_of
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import LEG_NUMBERS, SHAPES
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS, NUM_STATE
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 LEG_PLACES: Final = (0, 1, 12, 13, 14, 15, 16, 17)
 """In a leg's numbers (`native.layout.geometry_of`): crank, rod, plate joint, shaft centre; m."""

@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import PiecewisePolynomial
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -28,8 +27,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.reference_config import CsvConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES, COORDINATE_UNITS, NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 MOTION: Final = "motion.csv"
 _EVERY: Final = 0.02

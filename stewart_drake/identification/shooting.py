@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from stewart_drake.identification.logs import Log
 from stewart_drake.identification.model import NUM_DYNAMIC, NUM_GEOMETRY, MachineModel, Numbers
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _INSTANT: Final = 1e-9
 """s; events closer to each other are one."""

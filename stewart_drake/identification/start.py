@@ -3,7 +3,6 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
@@ -15,8 +14,7 @@ from stewart_drake.mechanism.kinematics import ForwardKinematicsError
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES
 from stewart_drake.scenario.signals import POSE as STATE_POSE
 from stewart_drake.scenario.signals import RATES as STATE_RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 LONGEST: Final = 2.0
 SHORTEST: Final = 0.2

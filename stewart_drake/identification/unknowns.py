@@ -28,8 +28,7 @@ from stewart_drake.scenario.signals import (
     PLANT_PARAMETERS,
     USUAL_COULOMB_SPEED,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 DYNAMIC: Final = slice(0, NUM_DYNAMIC)
 GEOMETRY: Final = slice(NUM_DYNAMIC, NUM_DYNAMIC + NUM_GEOMETRY)

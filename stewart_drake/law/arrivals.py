@@ -13,11 +13,9 @@ period from t = 0 on.
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.timeline import Acting, Timeline
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 INSTANT = 1e-9
 """s; arrivals closer than this are one."""

@@ -4,12 +4,11 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.signals import NUM_STATE
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 THETA = slice(NUM_STATE, None)
 
 

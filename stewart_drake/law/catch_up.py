@@ -17,7 +17,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -34,8 +33,7 @@ from stewart_drake.law.holds import (
 from stewart_drake.law.startup import sizes
 from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
 from stewart_drake.scenario.trajectories import Piece, catch_up, evaluate, through_states
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 DEFAULT_CATCH_UP = 0.3
 """s; when no torque limit says otherwise."""

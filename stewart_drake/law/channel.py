@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.link import NO_LOSSES, BurstChain
 from stewart_drake.scenario.signals import NUM_TORQUES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 SURE: Final = 2.0
 """Times as probable as what was decided is what the law changes its mind for. A change makes it

@@ -4,14 +4,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.delay_model import DelayedModel, delayed_model
 from stewart_drake.law.error_model import ContinuousModel
 from stewart_drake.law.riccati import reduced_gain
 from stewart_drake.law.timeline import Timeline
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from stewart_drake.law.arrivals import INSTANT, Arrivals
@@ -38,8 +37,7 @@ from stewart_drake.law.parameter_filter import (
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Acting
 from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 DIFFERENCE = 1e-3
 """s."""

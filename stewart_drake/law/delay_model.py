@@ -17,13 +17,11 @@ eta0 > 0; the paper always carries it, which adds an unobservable block when eta
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from stewart_drake.law.error_model import ContinuousModel
 from stewart_drake.scenario.delay import Delay
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 @dataclass(frozen=True)

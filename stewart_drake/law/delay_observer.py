@@ -19,7 +19,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from stewart_drake.law.arrivals import Arrivals
@@ -40,8 +39,7 @@ from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_STATE
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 LEAD = 7.0
 """Log of the odds at which the search is over."""

@@ -3,15 +3,11 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from stewart_drake.law.error_model import ContinuousModel, double_integrators, linear_model
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.mechanism.torque_map import TorqueMap
 from stewart_drake.scenario.signals import POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class DesignModel(ABC):

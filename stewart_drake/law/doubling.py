@@ -5,14 +5,12 @@ solver, which is the oracle of this one.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.native_functions import NativeFunction
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.native.law_layout import MAX_ORDER
 from stewart_drake.scenario.signals import NUM_TORQUES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Doubling:

@@ -38,8 +38,7 @@ from stewart_drake.law.parameter_filter import (
 )
 from stewart_drake.scenario.known import OFFSETS
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, POSE
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 GATE = 30.0
 """Squared residual of a leg, in units of its variance, from which it is left out."""

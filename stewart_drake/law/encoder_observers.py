@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.encoder_filter import EncoderFilter
@@ -12,8 +11,7 @@ from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import NoObserver, ParameterObserver, moved, told
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.scenario.signals import POSE
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 @dataclass(frozen=True)

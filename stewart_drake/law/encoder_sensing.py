@@ -34,8 +34,7 @@ from stewart_drake.mechanism.kinematics import (
     crank_angles_along,
 )
 from stewart_drake.scenario.signals import NUM_LEGS, POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 NODES = 3
 """Of a period, at the most."""

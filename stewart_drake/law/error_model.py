@@ -7,11 +7,9 @@ everything that neither error nor torque explains: minus the desired acceleratio
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class ContinuousModel(NamedTuple):

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.holds import (
@@ -24,8 +23,7 @@ from stewart_drake.scenario.signals import (
     POSE,
     RATES,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Held(NamedTuple):

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.scenario.known import OFFSETS, Known
 from stewart_drake.scenario.signals import (
@@ -20,8 +19,7 @@ from stewart_drake.scenario.signals import (
     PLANT_PARAMETERS,
     USUAL_COULOMB_SPEED,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 @dataclass(frozen=True)

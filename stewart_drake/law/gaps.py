@@ -16,7 +16,6 @@ q_v what one step of the model may be off in pose and rates, n of them are off b
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.belief import Belief, Estimate
 from stewart_drake.law.measurement import Measurement
@@ -26,8 +25,7 @@ from stewart_drake.law.parameter_filter import ParameterFilter, Period
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Acting, Timeline
 from stewart_drake.scenario.signals import POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 LONGEST = 10
 """Periods of a gap that are worth the time; after more the filter goes on by itself."""

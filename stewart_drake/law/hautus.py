@@ -15,8 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from stewart_drake.types import Array, Complex
 
 TOLERANCE: Final = 1e-10
 """Singular values below this share of ||[A, B]|| count as zero: rounding leaves some 1e-14."""

@@ -21,14 +21,12 @@ followed as it is.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.scenario.signals import ACCELERATIONS, NUM_TORQUES, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 GAUSS_NODES = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3)
 """Two-point Gauss quadrature on [0, 1], weights 1/2: exact for cubics."""

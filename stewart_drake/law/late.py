@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.measurement import Measurement
@@ -21,8 +20,7 @@ from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import Observer
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Timeline
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,10 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from stewart_drake.law.delay_model import DelayedModel
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from stewart_drake.types import Array, Complex
 
 SLOWEST_POLE: Final = 1e-3
 """1/s; below it a pole is the rounding of a double integrator's zero."""

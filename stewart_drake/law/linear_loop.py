@@ -17,16 +17,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from stewart_drake.law.delay_model import DelayedModel, delayed_model
 from stewart_drake.law.error_model import ContinuousModel
 from stewart_drake.law.limits import closed_loop, first_instability, is_stable
 from stewart_drake.law.riccati import prediction_matrix, reduced_gain
 from stewart_drake.scenario.delay import Delay
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _LONGEST_ERROR: Final = 30
 """Periods; a true delay longer than believed by more than this is not looked at."""

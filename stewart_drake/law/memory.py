@@ -4,15 +4,13 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Sent
 from stewart_drake.law.motion import Previewed
 from stewart_drake.scenario.signals import NUM_TORQUES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Counts(NamedTuple):

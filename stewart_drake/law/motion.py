@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.law.timeline import Timeline
@@ -17,8 +16,8 @@ from stewart_drake.scenario.signals import (
     RATES,
 )
 from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 Motion = Callable[[Array], Array]
 """The reference (p, 18), pose, rates and accelerations, at instants (p,) in s from now; some of
 them may be negative."""

@@ -50,8 +50,7 @@ from stewart_drake.scenario.signals import (
     PARAMETERS,
     WEIGHTS,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _OBSERVERS: Final = (NoObserver, ParameterObserver)
 

@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.timeline import Acting
 from stewart_drake.mechanism.geometry import Mechanism
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 VIGOROUS = 2
 

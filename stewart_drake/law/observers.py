@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.filter_settings import FilterSettings
@@ -13,8 +12,8 @@ from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.parameter_filter import ParameterFilter, Period
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 AnyBelief = TypeVar("AnyBelief", bound=Belief)
 
 

@@ -16,7 +16,6 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 from scipy.special import chdtri
 
@@ -27,8 +26,8 @@ from stewart_drake.law.holds import GAUSS_NODES, cubic
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.sensing import FirstState, Sensing
 from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 OUTLIER = 1e-6
 """Share of the measurements, were all as the filter believes, that are taken for outliers."""
 ITERATIONS = 4

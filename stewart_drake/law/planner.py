@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
@@ -21,8 +20,7 @@ from stewart_drake.law.motion import KnownMotion, Motion
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
 from stewart_drake.scenario.trajectories import Piece, through_states
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 SURPRISE = 0.02
 """Share of the motion by which a prediction is off the reference, when the delay was just found."""

@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Channel, Report, Wire
@@ -42,8 +41,7 @@ from stewart_drake.scenario.signals import (
     POSE,
     RATES,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Response(NamedTuple):

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.delay_model import DelayedModel
@@ -13,8 +12,7 @@ from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.riccati import prediction_matrix
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.signals import POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Ahead(NamedTuple):

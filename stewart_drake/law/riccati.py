@@ -4,13 +4,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 
 from stewart_drake.law.delay_model import DelayedModel, chain
 from stewart_drake.law.hautus import distinct, pbh_margins
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 """What takes and gives what `lqr` does."""
 

@@ -20,13 +20,11 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 MOVED = 1e-3
 """Share of the motion that a pose has to go within a period to have moved."""

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.feedforward import Feedforward
@@ -37,8 +36,7 @@ from stewart_drake.scenario.signals import (
     RATES,
     WEIGHTS,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.holds import cubic
@@ -36,8 +35,7 @@ from stewart_drake.scenario.signals import (
     RATES,
     SETPOINT,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 def crank_mobility(dynamics: StewartDynamics, pose: Array) -> Array:

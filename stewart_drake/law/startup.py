@@ -10,7 +10,6 @@ import math
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -28,8 +27,7 @@ from stewart_drake.scenario.signals import (
     RATES,
 )
 from stewart_drake.scenario.trajectories import evaluate, spread_instants
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 PREDICTION_BUDGET = 2e-5
 """rad, and shares of the reach, by which integrating over the delay may move the predicted pose."""

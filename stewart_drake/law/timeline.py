@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.scenario.delay import Delay
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Acting(NamedTuple):

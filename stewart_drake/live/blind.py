@@ -13,14 +13,12 @@ too long where three standard deviations of a leg are more than the reach that i
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from stewart_drake.law.belief import Estimate
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 LONGEST_GAP: Final = 1.0
 """Longest gap that is ever allowed, s; the gap that is allowed without an estimator."""

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from stewart_drake.dynamics.open_loop import Drive, IntegrationError, integrate
@@ -22,8 +21,7 @@ from stewart_drake.loop.sensor import white_noise
 from stewart_drake.scenario.config import StateSensorConfig
 from stewart_drake.scenario.signals import BIAS, POSE
 from stewart_drake.scenario.timing import look_time
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Body(Protocol):

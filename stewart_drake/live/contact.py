@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.live.endpoint import Address, Endpoint, Session, now
 from stewart_drake.live.protocol import (
@@ -27,8 +26,7 @@ from stewart_drake.live.protocol import (
 )
 from stewart_drake.loop.peer import Identity
 from stewart_drake.scenario.signals import NUM_TORQUES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _TRIPS: Final = 256
 """Round trips that are remembered."""

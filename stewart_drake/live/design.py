@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
@@ -38,8 +37,7 @@ from stewart_drake.scenario.config import (
 from stewart_drake.scenario.link import usual_bound
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _ROOM: Final = 0.25
 """Share of what was seen of the link's jitter by which a round trip may yet be longer."""

@@ -24,7 +24,6 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -39,8 +38,7 @@ from stewart_drake.scenario.signals import (
     RATES,
 )
 from stewart_drake.scenario.trajectories import evaluate, through_states
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 PACE: Final = 4.0
 """1/s, w: a step is done to 5 % after 6.3 / w = 1.6 s."""

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.native_law import AnyMemory
@@ -19,11 +18,10 @@ from stewart_drake.live.rows import RowFile
 from stewart_drake.loop.controller import HELD
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.recording import Record, Table
-from stewart_drake.report.csv_file import columns_of
+from stewart_drake.reporting.csv_file import columns_of
 from stewart_drake.scenario.config import Scenario, StateSensorConfig
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, TUNER_INPUTS, ports_of
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _WAITS: Final = 24
 """Longest wait of a row for the machine's report of what acted then, samples."""
@@ -36,7 +34,7 @@ _KEPT: Final = 96
 class LiveRecord(Record):
     """Writes the signals of a live run to a CSV file, sample by sample.
 
-    The columns are those of `report.csv_file.signals_csv` but for the error, then computing time
+    The columns are those of `reporting.csv_file.signals_csv` but for the error, then computing time
     and delay of the step (`step[s]`, `late[s]`).
 
     Args:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.channel import Packets, Report, Wire
@@ -45,8 +44,7 @@ from stewart_drake.loop.peer import Fault
 from stewart_drake.loop.recording import has_measured
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, PACKETS, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 OFF: Final = 0.08
 """Share of the motion by which a prediction is off the way, so that a new one is planned."""

@@ -15,7 +15,6 @@ from functools import partial
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
@@ -50,8 +49,7 @@ from stewart_drake.scenario.link import (
     torque_delays,
 )
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 DRAWN: Final = 1 << 17
 """Datagrams each way for which times and losses are drawn; then they begin anew, but for a wire,

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.live.protocol import MOST_HISTORY, NEVER, Refusal
 from stewart_drake.scenario.signals import NUM_TORQUES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 MOST_KEPT: Final = 1 << 16
 """Torques that wait at the most; a plan that brings more is refused."""

@@ -21,18 +21,16 @@ from typing import Any, Final, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.loop import Seen
 from stewart_drake.live.steering import Wish
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.report.page import environment
-from stewart_drake.report.style import FACTORS
-from stewart_drake.report.viewer import slider_range
+from stewart_drake.reporting.page import environment
+from stewart_drake.reporting.style import FACTORS
+from stewart_drake.reporting.viewer import slider_range
 from stewart_drake.scenario.signals import COORDINATE_NAMES, NUM_COORDINATES, POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _FRAME: Final = 1 / 30
 """s between two frames."""

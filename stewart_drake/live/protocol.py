@@ -29,8 +29,7 @@ from stewart_drake.loop.peer import (
     in_words,
 )
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, NUM_TORQUES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 VERSION: Final = 2
 MAGIC_MACHINE: Final = b"STWM"

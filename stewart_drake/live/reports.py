@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _ROWS: Final = 8
 """Rows in a row that must be off by a period before it is said."""

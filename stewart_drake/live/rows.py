@@ -15,11 +15,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _WAITING: Final = 4096
 """Rows that may wait for the disk."""

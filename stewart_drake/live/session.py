@@ -9,9 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.connect import call, open_endpoint
@@ -29,8 +26,7 @@ from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LiveSummary, SimulationResult
 from stewart_drake.scenario.config import DelayConfig, NetworkConfig, Scenario, WireConfig
 from stewart_drake.studies.verdict import milliseconds
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 LEAST_MEASURED: Final = 0.9
 """Share of the samples that must have been measured for E_ac and the cost to mean something."""

@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from stewart_drake.live.governor import Blend, Governed, Governor, response
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import Piece, evaluate, through_states
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _KEPT: Final = 3.0
 """s of the past that a way is kept for."""

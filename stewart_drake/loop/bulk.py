@@ -8,7 +8,6 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.dynamics.threads import one_blas_thread
@@ -35,8 +34,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario, StateSensorConfig
 from stewart_drake.scenario.signals import POSE, TUNER_INPUTS, WEIGHTS
 from stewart_drake.tuner.source import Decision
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Ending(NamedTuple):

@@ -14,7 +14,6 @@ from itertools import combinations
 from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Capsule, Cylinder, GeometryId, QueryObject, Role, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
@@ -25,8 +24,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.mechanism.proportions import proportions
 from stewart_drake.scenario.signals import NUM_LEGS
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _AT_REST: Final = np.zeros(6)
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context
 from pydrake.trajectories import Trajectory
@@ -25,9 +24,7 @@ from stewart_drake.scenario.signals import (
     WEIGHTS,
     ports_of,
 )
-
-Array = NDArray[np.float64]
-
+from stewart_drake.types import Array
 
 HELD: Final[dict[str, Callable[[AnyMemory], Array]]] = {
     "torque_commanded": lambda memory: memory.torque,

@@ -18,7 +18,6 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
@@ -40,8 +39,7 @@ from stewart_drake.scenario.signals import (
     RATES,
 )
 from stewart_drake.scenario.trajectories import evaluate
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 INSTANTS: Final = 30
 """Looked at along the reference; 29 steps, a prime, since a round number of them may be in step

@@ -1,7 +1,6 @@
 """The delay between computing a torque and feeling it."""
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
@@ -9,8 +8,7 @@ from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import CARRIED, Carried
 from stewart_drake.scenario.timing import event_time
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Arrived(LeafSystem):

@@ -1,15 +1,13 @@
 """The window of recent samples, and the densities in it, as a Drake system."""
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES
 from stewart_drake.tuner.density import NUM_INPUTS, WINDOW, Kind, density
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class DensityWindow(LeafSystem):

@@ -3,7 +3,6 @@
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
     Context,
@@ -72,9 +71,7 @@ from stewart_drake.scenario.signals import (
 )
 from stewart_drake.tuner.features import DensityFeatures
 from stewart_drake.tuner.source import PaperPolicy
-
-Array = NDArray[np.float64]
-
+from stewart_drake.types import Array
 
 _TOLD: Final = ("density", "reference")
 """What a tuner may ask for beside the state, and the systems whose outputs of their name it is."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
@@ -14,8 +14,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import crank_angles_along
 from stewart_drake.scenario.fault_config import SPIKE
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, NUM_STATE, POSE
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _PHASES: Final = 7
 """Stream of random numbers."""

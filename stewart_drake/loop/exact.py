@@ -3,7 +3,7 @@
 # A Drake class template over scalar types has no static type.
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.systems.analysis import ApplySimulatorConfig, ExtractSimulatorConfig, Simulator
 from pydrake.systems.framework import (
@@ -20,8 +20,6 @@ from stewart_drake.dynamics.workspace import Failure, Limits, Workspace
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE, RATES
 from stewart_drake.scenario.timing import METRIC_PERIOD
-
-Array = NDArray[np.float64]
 
 
 @TemplateSystem.define("ExactPlant_", T_list=(float, AutoDiffXd))

@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.frozen_map import Band, FrozenDynamics
@@ -87,8 +86,7 @@ from stewart_drake.scenario.signals import (
 )
 from stewart_drake.scenario.trajectories import evaluate, make_reference, moved, peak_to_peak
 from stewart_drake.tuner.network import DEFAULT, Network, load_network
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 GENTLE = 3.0
 """Torques up to so many times the reference's are predicted with the usual steps."""

@@ -1,14 +1,12 @@
 """The way of measurements to the controller: they come late, overtake one another, and get lost."""
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.link import newest_measurements
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class LateMeasurements(LeafSystem):

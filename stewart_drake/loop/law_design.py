@@ -5,7 +5,7 @@ import math
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.trajectories import Trajectory
@@ -29,8 +29,7 @@ from stewart_drake.scenario.config import ControllerConfig, Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_STATE, POSE
 from stewart_drake.scenario.trajectories import evaluate, moved
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _HORIZON = 10.0
 """s of a reference without an end that weights and steps are chosen by."""

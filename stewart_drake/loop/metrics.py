@@ -3,11 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.scenario.config import ControllerConfig
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Figures(NamedTuple):

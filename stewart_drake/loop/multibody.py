@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
@@ -39,8 +38,7 @@ from stewart_drake.scenario.signals import (
     NUM_TORQUES,
     POSITION,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 def add_mechanism(

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
@@ -14,8 +14,7 @@ from stewart_drake.loop.platforms import AddStewartPlatform
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.signals import POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class MultibodyStewart(Diagram):

@@ -29,8 +29,7 @@ from stewart_drake.scenario.config import (
 from stewart_drake.scenario.link import releases, torque_delays
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
 from stewart_drake.scenario.timing import event_time, instants, look_time
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 SHARE: Final = 0.1
 """Of the scenario's accuracy, for a step: those of order 8 are long, and a digit costs a sixth."""

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
 from stewart_drake.law.memory import Counts
@@ -12,8 +11,7 @@ from stewart_drake.loop.controller import HELD
 from stewart_drake.loop.sampling import SteppedLaw
 from stewart_drake.loop.varying_delay import declare_constant
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, ports_of
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _KNOWN: Final = ("torque_commanded", "measurement")
 """Signals that a controller has whose inside is not known."""

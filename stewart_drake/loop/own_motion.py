@@ -4,14 +4,12 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import FunctionHandleTrajectory, Trajectory
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.signals import ACCELERATIONS, NUM_COORDINATES, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _REST: Final = 1e-6
 """rad/s or m/s; a trajectory that ends slower than this goes on at rest."""

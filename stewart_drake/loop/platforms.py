@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
@@ -38,8 +38,7 @@ from stewart_drake.scenario.signals import (
     POSE,
     RATES,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _INPUTS: Final = ("torque", "wrench")
 _STATE: Final = "state"

@@ -3,7 +3,6 @@
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.lifetime import weak
@@ -11,8 +10,7 @@ from stewart_drake.loop.sampling import update_every
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_TORQUES, PACKETS
 from stewart_drake.scenario.timing import event_time
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _TOGETHER = 1e-9
 """Of a period; a packet that is so little late is in time."""

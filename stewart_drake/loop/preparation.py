@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.threads import one_blas_thread
@@ -40,8 +39,7 @@ from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.tuner.source import WeightsSource
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
 """What sets the weights of an experiment with such a law, None where they are fixed."""

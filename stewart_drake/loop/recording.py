@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
 from stewart_drake.dynamics.workspace import Failure
@@ -30,8 +29,7 @@ from stewart_drake.scenario.signals import (
     run_signals,
 )
 from stewart_drake.scenario.timing import Instant
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _CHUNK = 1024
 _HELD_BY = ("controller", "density")

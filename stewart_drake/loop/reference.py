@@ -1,15 +1,13 @@
 """The reference as a Drake system."""
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.scenario.signals import NUM_REFERENCE
 from stewart_drake.scenario.trajectories import evaluate
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Reference(LeafSystem):

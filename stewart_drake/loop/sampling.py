@@ -5,8 +5,6 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
@@ -19,8 +17,7 @@ from pydrake.systems.framework import (
 
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.scenario.timing import event_time
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 def update_every(

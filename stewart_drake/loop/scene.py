@@ -20,8 +20,7 @@ from stewart_drake.loop.multibody_stewart import build_viewer
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, rotation
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSE, POSITION
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 CRANK_PARTS: Final = ("arm", "hub")
 """Of the SDFormat model, what takes the torque's colour."""

@@ -11,8 +11,7 @@ from stewart_drake.loop.lifetime import weak
 from stewart_drake.scenario.fault_config import SPIKE
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.timing import event_time
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _EARLY = 1e-9
 """s by which a sample may come before an instant and still be at it."""

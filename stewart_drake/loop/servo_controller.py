@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
 from stewart_drake.law.measurement import Measurement
@@ -12,8 +11,7 @@ from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
 from stewart_drake.loop.controller import HELD
 from stewart_drake.loop.sampling import SteppedLaw
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, ports_of
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class ServoController(SteppedLaw):

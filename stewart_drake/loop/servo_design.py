@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -32,8 +31,7 @@ from stewart_drake.scenario.signals import (
 )
 from stewart_drake.scenario.timing import servo_ticks
 from stewart_drake.scenario.trajectories import catch_up, evaluate, spread_instants
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _PART: Final = 0.005
 """s, about as long as the parts of a period over which servos report mean torques."""

@@ -4,7 +4,6 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
@@ -23,8 +22,7 @@ from stewart_drake.scenario.signals import (
     SETPOINT,
 )
 from stewart_drake.scenario.timing import servo_time
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class ServoState(NamedTuple):

@@ -7,7 +7,6 @@ from traceback import walk_tb
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
@@ -28,8 +27,6 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.timing import instants, look_time
-
-Array = NDArray[np.float64]
 
 _PACKAGE: Final = __name__.partition(".")[0]
 Progress = Callable[[float, float], None]

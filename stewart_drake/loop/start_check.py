@@ -3,13 +3,11 @@
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
 from stewart_drake.loop.lifetime import weak
 from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class StartCheck(LeafSystem):

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.delay_model import chain
@@ -27,8 +26,7 @@ from stewart_drake.loop.experiment import prepare
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES, LEGS, NUM_TORQUES, STATE
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class LinearModels(NamedTuple):

@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
@@ -20,8 +19,7 @@ from stewart_drake.tuner.density import NUM_INPUTS
 from stewart_drake.tuner.law import MAX_FACTOR, tune
 from stewart_drake.tuner.network import Network
 from stewart_drake.tuner.source import TunerMemory, WeightsSource
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class AnnTuner(LeafSystem):

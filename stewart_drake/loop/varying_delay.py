@@ -3,7 +3,6 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.delay_chain import Arrived
@@ -13,8 +12,7 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import TOGETHER, releases
 from stewart_drake.scenario.signals import CARRIED, PACKETS, Carried
 from stewart_drake.scenario.timing import event_time
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _ONCE: Final = 1e9
 """s, the period of an event that comes once: longer than any run."""

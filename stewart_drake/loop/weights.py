@@ -3,7 +3,6 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.delay_observer import DelayObserver
@@ -19,8 +18,6 @@ from stewart_drake.scenario.trajectories import evaluate, spread_instants
 from stewart_drake.tuner.features import DensityFeatures, Features
 from stewart_drake.tuner.health import HealthFeatures
 from stewart_drake.tuner.source import PaperPolicy, RatioPolicy, Rule, WeightsSource
-
-Array = NDArray[np.float64]
 
 RULES: Final = {"parameters": Rule(-1.77, 2.35, 0.41), "none": Rule(-0.82, 1.37, 0.33)}
 """By `controller.estimator`."""

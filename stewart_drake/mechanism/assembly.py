@@ -9,13 +9,11 @@ plate on its own; the joint angles are zero at the mechanism's home pose.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, levers, rotation
 from stewart_drake.scenario.signals import ANGLES, NUM_LEGS, POSITION
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,11 @@ from itertools import combinations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.mechanism.kinematics import LegGeometry, Legs
 from stewart_drake.mechanism.proportions import proportions
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, POSITION
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 LINKS: Final = tuple(f"{kind} {leg}" for kind in ("crank", "rod") for leg in LEGS)
 """Names of the links, in the order of `center_lines`."""

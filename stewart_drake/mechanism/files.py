@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field, PlainValidator
 from pydantic.dataclasses import dataclass
 
@@ -19,8 +18,8 @@ from stewart_drake.mechanism.geometry import Body, Link, Mechanism
 from stewart_drake.mechanism.inertias import bar_inertia, disc_inertia
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.signals import LEGS
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 # Limits far beyond any platform keep squares and products of what a file says finite.

@@ -18,13 +18,12 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism import kinematics
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 RESERVED_NAMES: Final = ("world", "WorldModelInstance", "DefaultModelInstance")
 """Names that SDFormat and Drake keep for themselves."""

@@ -16,9 +16,8 @@ I_z = I_x + I_y for anything flat, m R^2/4 across it.
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 THINNESS: Final = 20.0
 """Length of an estimated crank or rod, in its diameters."""

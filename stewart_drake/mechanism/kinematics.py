@@ -12,11 +12,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 FORWARD_KINEMATICS_TOLERANCE = 1e-13
 """Largest rod-length residual, relative to the rod, at which Newton's method stops."""

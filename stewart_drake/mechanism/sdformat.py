@@ -4,14 +4,12 @@ from collections.abc import Iterable
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.mechanism.assembly import Assembly, assemble
 from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.mechanism.proportions import proportions
 from stewart_drake.scenario.signals import LEGS
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 BASE_COLOR = (0.60, 0.63, 0.67, 1.0)
 MOTOR_COLOR = (0.16, 0.18, 0.21, 1.0)

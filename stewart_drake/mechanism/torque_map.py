@@ -15,13 +15,12 @@ rest. `printed` takes (17)-(18) at their word: d2(angles)/dt2 = I^-1 M.
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, levers, rotation
 from stewart_drake.scenario.signals import ANGLES
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 TorqueMap = Literal["virtual_work", "printed"]
 
 

@@ -3,7 +3,6 @@
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import (
@@ -13,8 +12,7 @@ from stewart_drake.scenario.signals import (
     NUM_STATE,
     NUM_TORQUES,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 STANDARD_GRAVITY: Final = 9.81
 """m/s^2, along -z of W; Drake's default."""

@@ -6,15 +6,13 @@ from typing import Final
 
 import numpy as np
 import pydantic.dataclasses
-from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import replacing
 from stewart_drake.files.yamlio import brief, load_yaml, validate, yaml_text
 from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.signals import COULOMB_SPEED, LEGS, PLANT_PARAMETERS
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 DELAY: Final = "delay"
 """Between computing a torque and feeling it, s."""

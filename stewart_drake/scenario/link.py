@@ -20,8 +20,8 @@ from stewart_drake.scenario.config import (
 )
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.field_types import MOST_PERIODS
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 _FORWARD, _BACK, _SENSOR = range(3)
 """Streams of random numbers of one seed."""
 RARE: Final = 1.5

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
@@ -21,8 +20,7 @@ from stewart_drake.files.yamlio import brief, load_yaml, validate
 from stewart_drake.scenario.field_types import Row, Seconds
 from stewart_drake.scenario.reference_config import WaypointsConfig
 from stewart_drake.scenario.smoothness import roughest
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _ANGLES: Final = ("roll", "pitch", "yaw")
 _COLUMNS: Final = ("time", *_ANGLES, "x", "y", "z")

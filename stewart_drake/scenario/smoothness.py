@@ -3,9 +3,8 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _MAX_KINK: Final = 0.05
 """Of the largest peak to peak of the angles, or of the positions."""

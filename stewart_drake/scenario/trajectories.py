@@ -10,7 +10,7 @@ from functools import singledispatch
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.trajectories import (
     BezierCurve,
     CompositeTrajectory,
@@ -36,8 +36,7 @@ from stewart_drake.scenario.signals import (
     POSITION,
     RATES,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _CONSTANT: Final = 1e-9
 """A coordinate that moves less than this, in rad or beside its largest position in m, is constant:

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.startup import least_torque, reference_torques
@@ -15,8 +14,7 @@ from stewart_drake.loop.experiment import (
     reference_failure,
 )
 from stewart_drake.scenario.config import Scenario
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Basis(NamedTuple):

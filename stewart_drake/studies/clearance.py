@@ -8,15 +8,13 @@ drawing's choice, not the machine's.
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.loop.clearance import ClearanceScene, Pair
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import reach_margins_along
 from stewart_drake.scenario.signals import NUM_COORDINATES
 from stewart_drake.studies.workspace_map import Section, Travel, last_inside
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 EVERY: Final = 3
 """Each so manieth pose of a section, along both sides, is looked at."""

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -23,8 +22,7 @@ from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
 from stewart_drake.studies.delay_map import Cell, delay_map, map_delays
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.verdict import Verdict, pole_in_motion
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 INSTANTS: Final = 62
 """Poles are looked at this often along the reference; 61 steps, a prime, since a round number of

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.delay_model import DelayedModel
 from stewart_drake.law.error_model import double_integrators, linear_model
@@ -25,9 +24,7 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.basis import Basis
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from stewart_drake.types import Array
 
 DELAYS: Final = (0, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 25, 30)
 """Whole periods of delay for which the loop is designed and judged, beside the scenario's own."""

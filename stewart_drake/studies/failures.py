@@ -25,8 +25,8 @@ from scipy.special import ndtri
 from scipy.stats import hypergeom, mannwhitneyu
 
 from stewart_drake.studies.statistics import CONFIDENCE, Interval, holm
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 SIGNIFICANT: Final = 0.05

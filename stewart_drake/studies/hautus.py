@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.primitives import (
     IsControllable,
     IsDetectable,
@@ -35,8 +34,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.mode_words import mode_words, state_labels
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 LONGEST: Final = 30
 """Whole periods of delay up to which the delayed models are tested."""

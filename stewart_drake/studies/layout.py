@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as checked
 from scipy.optimize import Bounds, differential_evolution
@@ -66,8 +65,7 @@ from stewart_drake.studies.layout_space import (
     space_around,
 )
 from stewart_drake.studies.runs import Outcome, outcome_of
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 INSTANTS: Final = 48
 """Of the motion that a trial is looked at, besides those of the largest deflections."""

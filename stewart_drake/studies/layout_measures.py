@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -25,8 +24,7 @@ from stewart_drake.mechanism.kinematics import (
 )
 from stewart_drake.scenario.signals import ACCELERATIONS, ANGLES, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Measure(NamedTuple):

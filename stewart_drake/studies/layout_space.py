@@ -10,7 +10,6 @@ from itertools import product
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import validate
@@ -22,8 +21,7 @@ from stewart_drake.mechanism.files import (
     SixLegs,
     pattern_legs,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 PARAMETERS: Final = (
     "rotation_deg",

@@ -10,8 +10,7 @@ from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.studies.singularity import Measures, characteristic_length, measure
 from stewart_drake.studies.workspace_map import Travel, travel
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 BODIES: Final = ("base", "plate", "crank", "rod")
 

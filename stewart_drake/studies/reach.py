@@ -3,15 +3,13 @@
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.workspace import Failure, diagnose, margin
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.studies.singularity import measure
 from stewart_drake.studies.workspace_map import border, last_inside
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 LARGEST_FACTOR: Final = 3.0
 """Amplitudes are not scaled up by more."""

@@ -26,8 +26,7 @@ from stewart_drake.studies.statistics import (
     wilson_interval,
 )
 from stewart_drake.studies.uncertainty import MACHINE, Draw, Scales
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 QUANTILES: Final = (0.5, 0.75, 0.9, 0.95, 0.99)
 SIGNED: Final = tuple(name for name, one in MACHINE.items() if one.signed)

@@ -14,13 +14,11 @@ do not change with the frame; by rho they do not change with the machine's size 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.workspace import home_sign, standing
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import LegGeometry, leg_geometry
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Measures(NamedTuple):

@@ -3,10 +3,10 @@
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 CONFIDENCE: Final = 0.95
 """Of every interval, unless something else is asked for."""

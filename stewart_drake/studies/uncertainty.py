@@ -14,7 +14,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from stewart_drake.files.yamlio import validate
 from stewart_drake.law.startup import INSTANTS
@@ -25,8 +24,6 @@ from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
 from stewart_drake.scenario.trajectories import spread_instants
 from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.sizing import rms, size_motors
-
-Array = NDArray[np.float64]
 
 Draw = dict[str, Any]
 """What was drawn by name of the quantity, SI units: a number, a tuple of them, or None for nothing.

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.loop.experiment import (
@@ -28,8 +27,7 @@ from stewart_drake.studies.reach import (
 from stewart_drake.studies.singularity import characteristic_length, measure
 from stewart_drake.studies.sizing import Sizing, size_motors
 from stewart_drake.studies.workspace_map import Section, Travel, sections, travel
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from stewart_drake.dynamics.workspace import diagnose, margin
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES
 from stewart_drake.studies.singularity import measure
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 SECTIONS: Final = ((3, 4), (3, 5), (0, 1), (2, 5))
 """Pairs of coordinates: x-y, x-z, roll-pitch, yaw-z; the other four stay as at home."""

@@ -16,11 +16,11 @@ through zero while eps(k) does not, so that (45) as printed has no bound; it is 
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stewart_drake.scenario.signals import TUNER_INPUTS
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 Kind = Literal["magnitude", "signed"]
 
 WINDOW: Final = 31

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.native_law import AnyMemory
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.tuner.density import NUM_INPUTS, WINDOW, Kind, density
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 class Features(Protocol):

@@ -20,7 +20,6 @@ from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.filter_settings import MODEL_ERROR
 from stewart_drake.law.native_law import AnyMemory
@@ -28,8 +27,7 @@ from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE, RATES
 from stewart_drake.tuner.density import WINDOW
 from stewart_drake.tuner.features import log10_within
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 NAMES: Final = (
     "timing_31", "timing_10", "timing_bound", "timing_detectable",

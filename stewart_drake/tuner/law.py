@@ -3,11 +3,9 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.tuner.network import Network
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 MAX_FACTOR: Final = 1.5
 """By which w_Q and w_R change at most from one sample to the next, up or down."""

@@ -16,7 +16,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import pydantic.dataclasses
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import ConfigDict
 from scipy.special import expit
 
@@ -27,8 +27,7 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import brief, validate
 from stewart_drake.scenario.signals import WEIGHTS
 from stewart_drake.tuner.density import NUM_INPUTS
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 DEFAULT: Final = "tuner"
 """The shipped network."""

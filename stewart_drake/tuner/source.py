@@ -10,15 +10,13 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.native_law import AnyMemory
 from stewart_drake.tuner.features import Features, empty_window
 from stewart_drake.tuner.health import PEAK
 from stewart_drake.tuner.law import tune
 from stewart_drake.tuner.network import Network
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 FALL: Final = 0.35
 RISE: Final = 0.15

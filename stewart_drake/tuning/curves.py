@@ -42,8 +42,7 @@ from stewart_drake.tuner.source import (
     WeightsSource,
     weights_of,
 )
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 RATIOS: Final = np.linspace(-4.0, 2.0, 13)
 """log10(w_Q / w_R)."""

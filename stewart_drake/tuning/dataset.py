@@ -15,7 +15,6 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from stewart_drake.files.arrayio import load_netcdf, load_npz, write_netcdf
 from stewart_drake.files.errors import ConfigError
@@ -30,8 +29,7 @@ from stewart_drake.studies.disturbances import draw
 from stewart_drake.studies.jobs import Progress, run_jobs
 from stewart_drake.tuner.density import densities
 from stewart_drake.tuning.grid import SAMPLES, Run, disturbed_runs, paper_runs
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 _NUMBERS: Final = ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_variation")
 _STATUSES: Final = ("completed", "left_workspace", "solver_failed")

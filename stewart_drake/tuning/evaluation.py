@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from stewart_drake.files.errors import ConfigError
@@ -25,8 +24,7 @@ from stewart_drake.studies.runs import Outcome, loops_of, read_outcome, run_scen
 from stewart_drake.studies.uncertainty import Draw
 from stewart_drake.tuner.network import DEFAULT, EXPECTED, MAX_BYTES, load_network
 from stewart_drake.tuning.grid import PAIRS
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 GAINS: Final = {
     f"{q:g} / {r:g}": (q, r)

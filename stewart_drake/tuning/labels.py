@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 Labels = Literal["as_run", "best_in_cell", "best_in_cell_torque"]
 LABELS: Final = ("as_run", "best_in_cell", "best_in_cell_torque")

@@ -29,8 +29,8 @@ from stewart_drake.tuner.network import Network
 from stewart_drake.tuner.source import weights_of
 from stewart_drake.tuning.curves import EVERY, LEAST, RATIOS, WATCHED, Curves, roll_outs
 from stewart_drake.tuning.levenberg import initial_theta, require_torch, unpack
+from stewart_drake.types import Array
 
-Array = NDArray[np.float64]
 FeatureName = Literal["densities", "health"]
 
 HIDDEN: Final = 10

@@ -16,8 +16,7 @@ from stewart_drake.tuner.network import Network
 from stewart_drake.tuning.dataset import data_hash
 from stewart_drake.tuning.labels import Labels, cells, labels
 from stewart_drake.tuning.levenberg import TorchModel, fit, initial_theta, unpack
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 Split = Literal["sample", "run", "cell"]
 SPLITS: Final = ("sample", "run", "cell")

@@ -39,8 +39,7 @@ from stewart_drake.studies.uncertainty import Draw
 from stewart_drake.tuner.network import EXPECTED, MAX_BYTES, load_network
 from stewart_drake.tuner.source import ratio_of
 from stewart_drake.tuning.curves import LEAST, RATIOS, at_ratio, cost, fixed_name
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 SHIPPED: Final = {"T": "health_T", "N2": "health_N2"}
 """Networks by family."""

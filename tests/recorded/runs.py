@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from pydrake.systems.analysis import Simulator
 from scipy.linalg import expm
@@ -30,9 +29,9 @@ from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_understood
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES
 from stewart_drake.scenario.timing import event_time, look_time
+from stewart_drake.types import Array
 from tests.backends import stepped_in_python
 
-Array = NDArray[np.float64]
 FILE = Path(__file__).with_name("torques.npz")
 SAMPLES = 60
 """At the most; a plate that leaves its workspace ends the row."""

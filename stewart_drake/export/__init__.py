@@ -1,0 +1,1 @@
+"""Controllers and motions as C, for a board."""

@@ -1,0 +1,63 @@
+"""A motion as knots between which a polynomial of fifth order is it, for C.
+
+The polynomial has pose, rates and accelerations of the motion at both knots. Between them it is off
+by O(h^6) where the motion is smooth; where it is not, or h is too long, knots come closer.
+"""
+
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from pydrake.trajectories import Trajectory
+
+from stewart_drake.law.motion import between
+from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.types import Array
+
+TOLERANCE: Final = 1e-7
+"""Of what a coordinate, its rate or acceleration is at the most over the motion."""
+LONGEST: Final = 0.5
+"""s between two knots."""
+_HALVES: Final = 16
+"""Of LONGEST, at the most: a motion's jump is not chased any further."""
+_LOOKS: Final = (0.21, 0.5, 0.79)
+"""Shares of the way between two knots at which the polynomial is compared."""
+
+
+def knots(motion: Trajectory, end: float) -> Array:
+    """(n, 19) times and the motion there, so close that the rest follows.
+
+    Args:
+        motion: a trajectory (6, 1), for t >= 0.
+        end: s.
+    """
+    number = max(1, int(np.ceil(end / LONGEST)))
+    coarse = np.linspace(0.0, end, number + 1)
+    rows = [_row(motion, t) for t in coarse]
+    size = np.abs(np.array(rows)[:, 1:]).max(axis=0)
+    size = np.maximum(size, 1e-3 * size.reshape(3, 6).max(axis=1).repeat(6) + 1e-9)
+    found = [rows[0]]
+    for before, after in pairwise(rows):
+        _refine(motion, before, after, size, found, _HALVES)
+    return np.array(found)
+
+
+def _row(motion: Trajectory, time: float) -> Array:
+    return np.append(time, evaluate(motion, time))
+
+
+def _refine(
+    motion: Trajectory, a: Array, b: Array, size: Array, found: list[Array], halves: int
+) -> None:
+    """Append what is needed after `a`, up to `b`."""
+    span = b[0] - a[0]
+    off = [
+        np.abs(between(a[1:], b[1:], span, share) - evaluate(motion, a[0] + share * span)) / size
+        for share in _LOOKS
+    ]
+    if np.max(off) > TOLERANCE and halves > 0:
+        middle = _row(motion, a[0] + span / 2)
+        _refine(motion, a, middle, size, found, halves - 1)
+        _refine(motion, middle, b, size, found, halves - 1)
+    else:
+        found.append(b)

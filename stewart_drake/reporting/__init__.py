@@ -1,0 +1,1 @@
+"""Documents, figures, pages, the replay, CSV, progress."""

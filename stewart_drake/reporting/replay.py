@@ -1,0 +1,155 @@
+"""A finished run shown again in Meshcat, through the SDFormat model, beside its reference."""
+
+import logging
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import xarray as xr
+from pydrake.geometry import Meshcat, MeshcatParams, Rgba
+from pydrake.math import RotationMatrix
+
+from stewart_drake.files.fileio import replacing
+from stewart_drake.files.versions import versions
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.scene import TORQUE_COLORS, Scene, crank_paths, full_color, torque_shares
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import rotation
+from stewart_drake.reporting.page import environment
+from stewart_drake.reporting.words import number
+from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
+from stewart_drake.types import Array
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+
+
+_PATH_COLORS: Final = {"reference": Rgba(0.0, 0.62, 0.45), "plate": Rgba(0.0, 0.45, 0.70)}
+_MAX_FRAMES: Final = 1500
+"""A long run is thinned out to this many frames; Meshcat interpolates between them."""
+
+
+def replay(signals: xr.Dataset, mechanism: Mechanism, meshcat: Meshcat | None = None) -> Meshcat:
+    """Put the animation of a run, of either plant, into Meshcat, with its play bar.
+
+    Args:
+        signals: of a `SimulationResult`; poses and references over time.
+        mechanism: the machine that was run.
+        meshcat: where to; a new one, on any free local port, if None.
+
+    Returns:
+        The Meshcat; `StaticHtml()` of it is a file that plays without a server.
+    """
+    meshcat = meshcat or _quiet_meshcat()
+    scene, shown = Scene(mechanism, meshcat), _thinned(signals)
+    _draw_paths(meshcat, shown)
+    period = _period(shown)
+    meshcat.StartRecording(1 / period, set_visualizations_while_recording=False)
+    frames = zip(shown.time.values, shown.pose.values, shown.reference.values, strict=True)
+    for t, pose, wanted in frames:
+        # Meshcat rounds down to a frame; a hair later, rounding does not lose one.
+        if not scene.show(pose, wanted, t + 1e-3 * period):
+            break
+    meshcat.StopRecording()
+    meshcat.PublishRecording()
+    scene.close()
+    return meshcat
+
+
+def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> str:
+    """A run as one HTML page that plays without a server or a network.
+
+    Args:
+        result: the run.
+        mechanism: the machine that was run.
+        title: what the page is called.
+    """
+    meshcat = replay(result.signals, mechanism)
+    shown = _thinned(result.signals)
+    e = shown.error.values
+    torque = shown.torque_applied.values
+    largest = np.abs(torque).max(axis=1, initial=0.0)
+    full = full_color(largest)
+    outcome = result.status.replace("_", " ")
+    if result.stopped is not None:
+        outcome += f" at {result.stopped.time:.2f} s"
+    else:
+        outcome += f", E_ac {number(result.accumulated_error)} % s"
+    data = {
+        "time": np.round(shown.time.values, 4).tolist(),
+        "position": np.round(1e3 * np.linalg.norm(e[:, POSITION], axis=1), 4).tolist(),
+        "angle": np.round(np.rad2deg(_turns(shown)), 4).tolist(),
+        "share": np.round(torque_shares(torque, full), 3).tolist(),
+        "cranks": crank_paths(mechanism.name),
+    }
+    overlay = _template().render(
+        title=title,
+        outcome=outcome,
+        full=number(full, 2),
+        peak=number(float(largest.max(initial=0.0)), 2),
+        data=data,
+        legs=LEGS,
+        colors=TORQUE_COLORS,
+        drake=versions()["drake"],
+    )
+    page = meshcat.StaticHtml()
+    before, end, after = page.rpartition("</body>")
+    assert end, "Meshcat's page has no body"
+    return f"{before}{overlay}{end}{after}".replace("Drake MeshCat", "Replay", 1)
+
+
+def write_replay(result: SimulationResult, mechanism: Mechanism, path: Path, title: str) -> Path:
+    """Write `replay_html` whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    text = replay_html(result, mechanism, title)
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+    return path
+
+
+def _quiet_meshcat() -> Meshcat:
+    """A Meshcat that nobody visits, so that its address is not told either."""
+    log = logging.getLogger("drake")
+    level = log.level
+    log.setLevel(logging.WARNING)
+    try:
+        return Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    finally:
+        log.setLevel(level)
+
+
+def _thinned(signals: xr.Dataset) -> xr.Dataset:
+    return signals.isel(time=slice(None, None, -(-signals.sizes["time"] // _MAX_FRAMES) or 1))
+
+
+def _period(signals: xr.Dataset) -> float:
+    """s between two frames: the least, because samples may lie between the steps of the grid."""
+    steps = np.diff(signals.time.values)
+    return float(steps.min()) if len(steps) else 1.0
+
+
+def _draw_paths(meshcat: Meshcat, signals: xr.Dataset) -> None:
+    for name, signal in (("reference", "reference"), ("plate", "pose")):
+        path = signals[signal].values[:, POSITION].T
+        if path.shape[1] > 1:
+            meshcat.SetLine(f"/paths/{name}", path, 1.5, _PATH_COLORS[name])
+
+
+def _turns(signals: xr.Dataset) -> Array:
+    """(n,) rad, the angle by which the plate is turned against its reference."""
+    pairs = zip(signals.pose.values, signals.reference.values, strict=True)
+    return np.array(
+        [
+            RotationMatrix(rotation(q[ANGLES]).T @ rotation(p[ANGLES])).ToAngleAxis().angle()
+            for p, q in pairs
+        ]
+    )
+
+
+@lru_cache(maxsize=1)
+def _template() -> "Template":
+    return environment().get_template("replay.html.j2")

@@ -1,0 +1,292 @@
+"""What is told of a scenario: one document that can be shown to somebody else.
+
+How its own run went, the shipped controllers in the manner of the paper's Table II and figures 5, 6
+and 7, what the analyses say beforehand, and the scenario itself.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.reporting.answer import Answer
+from stewart_drake.reporting.collect import ANALYSES, Collected
+from stewart_drake.reporting.document import (
+    Block,
+    Document,
+    Frame,
+    Listing,
+    Paragraph,
+    Picture,
+    Section,
+    Tone,
+)
+from stewart_drake.reporting.figures import draw_comparison, draw_run, has_packets
+from stewart_drake.reporting.run_document import comparison_blocks, run_blocks
+from stewart_drake.reporting.tuner_figures import weights_figure
+from stewart_drake.reporting.words import number, sentence
+from stewart_drake.scenario.config import EncoderSensorConfig, Scenario, ServoActuatorConfig
+from stewart_drake.scenario.link import link_text, number_sent
+from stewart_drake.scenario.loading import scenario_yaml
+from stewart_drake.studies.compare import LABELS, is_papers, label
+
+GOOD: Final = 5.0
+POOR: Final = 25.0
+"""% of peak to peak: mean errors, once torques can act, up to which a run is good, and not bad."""
+FEW_BAD: Final = 0.01
+MANY_BAD: Final = 0.5
+"""Bad measurements per sample up to which a run is good, and not bad."""
+
+_LEVELS: Final[tuple[Tone, ...]] = ("good", "fair", "bad")
+WIDE: Final = "The stated deviation is 1.6 to 2.6 times too large."
+_QUESTIONS: Final = {
+    "delay": "Does the loop bear its delay?",
+    "hautus": "Can the models be controlled and observed?",
+    "workspace": "Does the motion fit the machine?",
+}
+_CAPTIONS: Final = {
+    "states": "The plate's six coordinates.",
+    "errors": "Their errors.",
+    "torques_delay_lqr": "Applied torques of the delay-aware LQR, without integral action.",
+    "torques_delay_lqi": "Applied torques of the delay-aware LQI, with integral action.",
+    "torques_predictor_lqi": "Applied torques of the LQI with nonlinear prediction.",
+    "weights": "The weights that the tuner's network sets online.",
+}
+_PAPER_FIGURES: Final = {
+    "states": "5(a)",
+    "errors": "5(b)",
+    "torques_delay_lqr": "7(a)",
+    "torques_delay_lqi": "7(b)",
+    "weights": "6",
+}
+"""Of the paper, which show the same for its experiment."""
+_RUN_CAPTIONS: Final = {
+    "states": "Where the plate was, and where it should have been.",
+    "errors": "The difference.",
+    "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay.",
+    "delay": f"The delay as it was found, with its band, and its error. {WIDE}",
+    "parameters": "What the controller found out about the plant, which nobody told it.",
+    "weights": "The weights that the tuner set.",
+}
+_PACKETS_BELOW: Final = (
+    " Below: packets that were sent, lost, or late, and periods in which one was played, or the "
+    "buffer was dry."
+)
+_ERROR_IS: Final = (
+    "E_ac is the error in percent of the motion's peak to peak, averaged over the six coordinates "
+    "and accumulated over time."
+)
+_NO_NETWORK: Final = (
+    "There is no network for the tuner here, so that its weights are not shown; stewart-drake "
+    "tune makes one."
+)
+
+
+def document(found: Collected, name: str, replay: str = "") -> Document:
+    """The report.
+
+    Args:
+        found: what it is about.
+        name: of the scenario.
+        replay: the replay's page, to be shown inside, or empty.
+    """
+    text, tone = verdict(found)
+    sections = list(_run_sections(found, replay))
+    if found.comparison:
+        sections.append(_comparison(found))
+    answers = {_QUESTIONS[key]: found.analyses[key] for key in ANALYSES}
+    sections += [_answer(question, answer) for question, answer in answers.items()]
+    sections += [_details(question, answer) for question, answer in answers.items()]
+    text_above = "Every field, in the format of a scenario file: saved as one it runs again."
+    listing = Listing(scenario_yaml(found.scenario))
+    sections.append(Section("The scenario", text_above, listing, folded=True))
+    facts = _facts(found.scenario)
+    return Document(f"Report on the scenario {name}", text, sections, tone, facts)
+
+
+def report_summary(found: Collected) -> dict[str, Any]:
+    """What summary.json holds; each part as the command of its own writes it."""
+    text, tone = verdict(found)
+    return {
+        "verdict": text,
+        "tone": tone,
+        "failure": None if found.failure is None else found.failure._asdict(),
+        "run": None if found.run is None else found.run.summary,
+        "controllers": {name: run.summary for name, run in found.comparison.items()},
+        "tuned": {name: run.summary for name, run in found.tuned.items()},
+        "analyses": {
+            name: {"verdict": a.verdict, "tone": a.document.tone, **a.summary}
+            for name, a in found.analyses.items()
+        },
+    }
+
+
+def verdict(found: Collected) -> tuple[str, Tone]:
+    """Return how the scenario went in a few sentences, and the level of the worst finding."""
+    if found.run is None:
+        return sentence(found.analyses["workspace"].verdict), "bad"
+    run, s = found.run, found.run.summary
+    if run.stopped is not None:
+        return (
+            f"The run ended after {run.stopped.time:.2f} of {run.scenario.duration:g} s: "
+            f"{run.stopped.reason}.{_who_completes(found)}",
+            "bad",
+        )
+    error, floor, mean = s["accumulated_error"], s["delay_floor"], mean_error(run)
+    findings, duration = _findings(run), f"all of {run.scenario.duration:g} s"
+    told = {tone: "; ".join(one for level, one in findings if level == tone) for tone in _LEVELS}
+    text = f"The plate follows its reference for {duration}: E_ac is "
+    if told["bad"]:
+        text = f"Not reliable: {told['bad']}. The run completed {duration}: E_ac is "
+    average = f"{number(mean, 2)} % of peak to peak on average"
+    if floor > 0:
+        text += (
+            f"{number(error)} % s, of which {number(floor)} pass before any torque can act. The "
+            f"rest is {average}."
+        )
+    else:
+        text += f"{number(error)} % s, {average}."
+    if told["fair"]:
+        text += f" Caution: {told['fair']}."
+    return text, max((level for level, _ in findings), key=_LEVELS.index, default="good")
+
+
+def _findings(run: SimulationResult) -> list[tuple[Tone, str]]:
+    """Return what speaks against a completed run, each with its level."""
+    s, found, mean = run.summary, list[tuple[Tone, str]](), mean_error(run)
+    margin, counts = s["controller_margin"], s["counts"]
+    if margin is not None and margin["stable"] is False:
+        growth = f"errors grow {margin['spectral_radius']:.3g} fold per period"
+        found.append(("bad", f"the loop is unstable, {growth}"))
+    samples = number_sent(run.scenario.duration, run.scenario.controller.period)
+    wrong = counts["bad_measurements"]
+    if wrong > FEW_BAD * samples:
+        text = f"{wrong} bad measurements in {samples} samples"
+        found.append(("bad" if wrong > MANY_BAD * samples else "fair", text))
+    failed = sum(counts[name] for name in ("riccati_failures", "unreachable", "nonfinite_torque"))
+    if failed:
+        found.append(("fair", f"{failed} of {samples} samples without a new gain or torque"))
+    if not mean <= GOOD:  # or NaN
+        text = f"a mean error of {number(mean, 2)} % of peak to peak"
+        found.append(("bad" if mean > POOR else "fair", text))
+    if s["warnings"]:
+        found.append(("fair", "see the warnings below"))
+    return found
+
+
+def _who_completes(found: Collected) -> str:
+    """The best of the other controllers that do, in a sentence, or nothing."""
+    done = {
+        name: run.accumulated_error
+        for name, run in found.comparison.items()
+        if run.status == "completed"
+    }
+    if not done:
+        return ""
+    best = min(done, key=lambda name: done[name])
+    return f" {label(best)} completes it, with an E_ac of {number(done[best])} % s."
+
+
+def mean_error(run: SimulationResult) -> float:
+    """% of peak to peak, over the time in which torques can act; NaN if the run ended early."""
+    s, sc = run.summary, run.scenario
+    blind = sc.eta if s["delay_floor"] else 0.0
+    left = sc.duration - blind
+    return float((s["accumulated_error"] - s["delay_floor"]) / left) if left > 0 else np.nan
+
+
+def _run_sections(found: Collected, replay: str) -> Iterator[Section]:
+    if found.run is None:
+        text = "The reference leaves the workspace, so that nothing was simulated."
+        yield Section("The run", text)
+        return
+    if replay:
+        text = "Drag to look around. The ring is where the plate should be."
+        yield Section("Replay", text, Frame(replay))
+    captions = dict(_RUN_CAPTIONS)
+    captions["torques"] += _PACKETS_BELOW if has_packets(found.run) else ""
+    pictures = _pictures(draw_run(found.run), captions)
+    yield Section("The run", _ERROR_IS, *run_blocks(found.run), *pictures)
+
+
+def _comparison(found: Collected) -> Section:
+    captions = dict(_CAPTIONS)
+    parts: list[Block | str] = ["The same scenario under each of the shipped controllers."]
+    parts += comparison_blocks(found.comparison, found.tuned)
+    if is_papers(found.scenario):
+        parts.append(
+            "The paper's numbers are those of its Table II; its delay-aware controllers had the "
+            "tuner."
+        )
+        for name, figure in _PAPER_FIGURES.items():
+            text_below = captions[name][:1].lower() + captions[name][1:]
+            captions[name] = f"As figure {figure} of the paper: {text_below}"
+    figures = draw_comparison(found.comparison)
+    if found.tuned:
+        figures["weights"] = weights_figure({LABELS[n]: run for n, run in found.tuned.items()})
+    elif "weights" not in figures:
+        parts.append(_NO_NETWORK)
+    captions = {name: captions.get(name) or _caption_of(name) for name in figures}
+    return Section("The controllers compared", *parts, *_pictures(figures, captions))
+
+
+def _caption_of(figure: str) -> str:
+    """Of a figure about a controller that is not always among those compared."""
+    what, _, controller = figure.partition("_")
+    if what == "delay":
+        return f"How {label(controller)} found the delay: with its band, and its error. {WIDE}"
+    return f"Applied torques of {label(controller)}."
+
+
+def _answer(question: str, answer: Answer) -> Section:
+    pictures = [one for part in answer.document.sections for one in part.all(Picture)]
+    return Section(question, Paragraph(sentence(answer.verdict), brief=True), *pictures)
+
+
+def _details(question: str, answer: Answer) -> Section:
+    """What the analysis' own document says and tabulates, in one folded section."""
+    parts = [
+        f"{section.heading}. {block.text}" if isinstance(block, Paragraph) else block
+        for section in answer.document.sections
+        for block in section.blocks
+        if not isinstance(block, Picture)
+    ]
+    return Section(f"Details: {question}", *parts, folded=True)
+
+
+def _pictures(figures: Mapping[str, Any], captions: Mapping[str, str]) -> list[Picture]:
+    return [Picture(figure, captions[name]) for name, figure in figures.items()]
+
+
+def _facts(scenario: Scenario) -> dict[str, str]:
+    c, plant = scenario.controller, scenario.plant
+    sent = f"{c.prediction} prediction" if c.command == "torque" else "cranks sent ahead"
+    law = f"{sent}, feedforward {c.feedforward}, estimator {c.estimator}"
+    if c.delay_estimator != "none":
+        law += f", delay estimator {c.delay_estimator}"
+    return {
+        "mechanism": load_mechanism(scenario.mechanism).name,
+        "reference": f"{scenario.reference.kind}, {scenario.duration:g} s",
+        "delay": f"{scenario.eta:.4g} s, {scenario.true_delay.periods:g} periods of {c.period:g} s",
+        "plant": f"{plant.kind}, {'with' if plant.gravity else 'without'} gravity",
+        "controller": law.replace("_", " "),
+        "start": f"{scenario.start.replace('_', ' ')}, torques in flight: {scenario.queue}",
+    } | _unusual(scenario)
+
+
+def _unusual(scenario: Scenario) -> dict[str, str]:
+    """Link, sensor, motors and weights, where they are not those of a plain scenario."""
+    told = {}
+    sensor, motors = scenario.sensor, scenario.actuator
+    if text := link_text(scenario):
+        told["link"] = text
+    if isinstance(sensor, EncoderSensorConfig):
+        fine = "exact" if sensor.bits is None else f"of {sensor.bits} bit"
+        told["sensor"] = f"encoders, {fine}, {sensor.samples} in a period"
+    if isinstance(motors, ServoActuatorConfig):
+        told["motors"] = f"position servos, {motors.bandwidth:g} Hz"
+    if scenario.tuner.kind != "fixed":
+        told["weights"] = {"ann": "set by a network", "rule": "set by a rule"}[scenario.tuner.kind]
+    return told
