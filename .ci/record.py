@@ -30,7 +30,7 @@ CONDITIONS = {
     "network": ("predictor_lqi", NET),
     "network_lossy": ("predictor_lqi", (*NET, "link.loss=0.1", "overlay=dirty")),
     "network_back": ("predictor_lqi", (*NET, "link.return={low: 0.1, high: 0.3}")),
-    "adaptive_wrong": ("predictor_lqi", ("controller.delay_steps=6", "overlay=dirty")),
+    "adaptive_wrong": ("adaptive_lqi", ("controller.delay_steps=6", "overlay=dirty")),
     "adaptive_drift": (
         "adaptive_lqi",
         ("delay.drift=0.005", "start=on_reference", "queue=reference"),
