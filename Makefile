@@ -56,8 +56,9 @@ arm: $(INSTALLED)  ## the exported C with arm-none-eabi-gcc and newlib, or why n
 soak: $(INSTALLED)  ## the endurance runs
 	$(BIN)/pytest $(WORKERS) -m soak -o faulthandler_timeout=0 $(ARGS)
 
-lint: $(INSTALLED)  ## ruff's rules
+lint: $(INSTALLED)  ## ruff's rules, and those of imports between rooms
 	$(BIN)/ruff check .
+	$(BIN)/lint-imports --no-cache --no-logo
 
 format-check: $(INSTALLED)  ## ruff's format, without changing a file
 	$(BIN)/ruff format --check .
