@@ -209,7 +209,7 @@ def friction() -> list[Row]:
 
 def rest() -> list[Row]:
     """Started from rest."""
-    slow, early = "controller.catch_up=1.0", "controller.quiet_start=false"
+    slow, early = "controller.catch_up=1.0", "controller.open_loop_start=false"
     what = "from rest, noise, bias, payload"
     dirty = Row("rest-dirty", what, (PAYLOAD,), "noise bias")
     alike = Row("rest-overlay", "from rest, overlay `dirty`", ("overlay=dirty",), "codes")

@@ -145,7 +145,7 @@ def dirty_runs() -> str:
     rows["from rest, believed 0.6 s, catch-up 1.0 s"] = ("constant", (*believed(0.6), slow))
     rows["on the reference, known"] = ("none", ON_REFERENCE)
     rows["from rest, known, catch-up 1.0 s"] = ("none", (slow,))
-    rows["the same without the quiet start"] = ("none", (slow, "controller.quiet_start=false"))
+    rows["the same without the quiet start"] = ("none", (slow, "controller.open_loop_start=false"))
     for name, (kind, settings) in rows.items():
         cases[name] = [(kind, (*settings, *dirty(seed))) for seed in FRESH_SEEDS]
     return collect(f"Constant, dirty, {SEEDS} seeds", cases)

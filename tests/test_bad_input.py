@@ -80,7 +80,7 @@ SCENARIO_RANGES: dict[str, list[float]] = {
     "controller.packet_repeats": [-1, 101],
     "controller.delay_std": [0, 11.0],
     "controller.delay_max": [0, 11.0],
-    "controller.rejoin": [-0.1, 11.0],
+    "controller.replan": [-0.1, 11.0],
     **{f"controller.prior.{name}": [0, -1.0] for name in ("torque_bias", "payload", "damping")},
     "controller.prior.offsets": [0, -1.0],
     "actuator.torque_limit": [0, -1.0],

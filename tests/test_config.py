@@ -122,8 +122,8 @@ def test_the_defaults_are_the_papers_experiment() -> None:
             "delay_estimator": "none",
             "delay_std": 0.3,
             "delay_max": 1.5,
-            "quiet_start": True,
-            "rejoin": 0.6,
+            "open_loop_start": True,
+            "replan": 0.6,
             "estimate_coulomb": False,
             "prior": dict.fromkeys(["torque_bias", "payload", "damping", "rates", "offsets"]),
             "known": None,
@@ -198,7 +198,7 @@ def test_the_papers_controllers(name: str, integral: bool, delay_steps: int | No
         estimator="none",
         weight_scaling="identity",
         catch_up=0,
-        quiet_start=False,
+        open_loop_start=False,
     )
 
 

@@ -98,7 +98,7 @@ ALONE = (
     *HOLD,
     "controller.estimator=none",
     "controller.catch_up=0",
-    "controller.quiet_start=false",
+    "controller.open_loop_start=false",
 )
 
 

@@ -407,7 +407,7 @@ def test_nothing_is_fed_back_before_the_first_torque_has_acted_for_a_period() ->
     quiet, same = first(noisy), first(noisy, "sensor.seed=1")
     assert np.array_equal(quiet[:9], same[:9]) and np.all(quiet[9] != same[9])
     loud = [
-        first(noisy, seed, "controller.quiet_start=false")
+        first(noisy, seed, "controller.open_loop_start=false")
         for seed in ("sensor.seed=0", "sensor.seed=1")
     ]
     assert np.all(loud[0][0] != loud[1][0])

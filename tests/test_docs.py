@@ -49,6 +49,7 @@ from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.config import ControllerConfig, Scenario
 from stewart_drake.scenario.loading import load_controller, load_understood, setting_choices
 from stewart_drake.scenario.reference_files import read_waypoints
+from stewart_drake.scenario.renames import CONTROLLER
 from stewart_drake.scenario.signals import SIGNALS, exported_ports, ports_of
 from stewart_drake.scenario.trajectories import evaluate, make_reference
 from stewart_drake.types import Array
@@ -150,9 +151,10 @@ def files() -> frozenset[str]:
 
 @functools.cache
 def gone() -> frozenset[str]:
-    """What 0.1 had and 0.2 has not, by docs/upgrading.md."""
+    """What 0.1 and 0.2 had and today's has not, by docs/upgrading.md and the table of renames."""
     table = prose(ROOT / "docs" / "upgrading.md").split("| before | now |")[1]
-    return frozenset(re.findall(r"^\| `(?:stewart_drake\.)?([\w.]+)`", table, re.MULTILINE))
+    modules = re.findall(r"^\| `(?:stewart_drake\.)?([\w.]+)`", table, re.MULTILINE)
+    return frozenset([*modules, *(f"controller.{name}" for name in CONTROLLER)])
 
 
 @functools.cache
@@ -298,6 +300,8 @@ def problem_with(code: str) -> str | None:
         public, _, below = dotted.removeprefix("sd.").partition(".")
         known = public in sd.__all__ and (not below or hasattr(getattr(sd, public), below))
         return None if known or public in ("NAME", "...") else f"sd has no {public}"
+    if dotted in gone():
+        return None
     if re.fullmatch(r"[A-Za-z_]\w*(\.\w+)+", dotted):
         first = dotted.split(".")[0]
         if first not in modules() | {"controller", "sensor", "delay_chain"} and not is_field(first):

@@ -181,7 +181,11 @@ CASES: dict[str, tuple[str, tuple[str, ...], Spoil | None]] = {
     ),
     "late measurements": ("gravity", (*DIRTY, "sensor.delay=0.2"), spoiled),
     "from the reference": (
-        *("paper", ("queue=reference", "start=on_reference", "controller.quiet_start=false"), None),
+        *(
+            "paper",
+            ("queue=reference", "start=on_reference", "controller.open_loop_start=false"),
+            None,
+        ),
     ),
 }
 HAPPENED = {
@@ -351,7 +355,7 @@ def test_a_part_of_ones_own_is_stepped_in_python(library) -> None:
 
     law = law_of()
     mine = replace(law, planner=type("Planner", (), {})())
-    assert uncovered(mine) == "controller.rejoin"
+    assert uncovered(mine) == "controller.replan"
     assert uncovered(Mine(**{name: getattr(law, name) for name in law.__dataclass_fields__})) == (
         "law"
     )
@@ -360,7 +364,7 @@ def test_a_part_of_ones_own_is_stepped_in_python(library) -> None:
     observer = replace(law.observer, settings=replace(settings, parameters=wary))
     assert uncovered(replace(law, observer=observer)) == "controller.known"  # C knows one std
     assert serving(law).backend == "native"
-    assert serving(mine) == (mine, "python (controller.rejoin)")
+    assert serving(mine) == (mine, "python (controller.replan)")
 
 
 def test_the_summary_says_which(library) -> None:

@@ -135,7 +135,7 @@ OTHER: dict[str, Any] = {
     "controller.catch_up": 0.7,
     "controller.delay_std": 0.1,
     "controller.delay_max": 2.5,
-    "controller.rejoin": 0.3,
+    "controller.replan": 0.3,
     "controller.known": "FILE",
     "controller.prior.torque_bias": 1e-4,
     "controller.prior.payload": 0.01,
@@ -263,7 +263,7 @@ NO_EFFECT: dict[str, Callable[[Scenario], bool]] = {
     "controller.prediction": lambda sc: sc.controller.delay_steps == 0,
     "controller.packet_torques": lambda sc: sc.link.kind == "wire",
     "controller.packet_repeats": lambda sc: sc.link.kind == "wire",
-    "controller.quiet_start": lambda sc: sc.start == "on_reference" or _cranks(sc),
+    "controller.open_loop_start": lambda sc: sc.start == "on_reference" or _cranks(sc),
     "controller.integral": lambda sc: _cranks(sc),
 } | {
     f"delay.{name}": lambda sc: sc.link.kind == "network"
@@ -303,7 +303,7 @@ REFUSED = {
         *("controller.prior={torque_bias: 0.1}", "controller.prior={damping: 0.1}"),
     ],
     "controller.delay_estimator=none": [
-        *("controller.rejoin=0.3", "controller.delay_std=0.1", "controller.delay_max=2.0"),
+        *("controller.replan=0.3", "controller.delay_std=0.1", "controller.delay_max=2.0"),
     ],
     "tuner.kind=rule": ["controller.w_Q=2.0", "controller.w_R=2.0"],
     "controller.integral=false": ["controller.integral_weight=2.0"],
@@ -358,8 +358,8 @@ def test_a_comparison_refuses_what_no_row_uses(tmp_path: Path) -> None:
     rows = shown("paper", ("controller.estimate_coulomb=true",))
     assert rows["predictor_lqi"].controller.estimate_coulomb
     assert not rows["delay_lqi"].controller.estimate_coulomb
-    late = ("controller.delay_steps=7", "controller.rejoin=0.3")
-    assert shown("paper", late)["adaptive_lqi"].controller.rejoin == 0.3
+    late = ("controller.delay_steps=7", "controller.replan=0.3")
+    assert shown("paper", late)["adaptive_lqi"].controller.replan == 0.3
     for settings in (late[1:], ("controller.estimator=none", "controller.estimate_coulomb=true")):
         with pytest.raises(ConfigError, match=r"^settings: controller"):
             shown("paper", settings)

@@ -1,4 +1,4 @@
-"""Files of 0.1 mean in 0.2 what docs/upgrading.md says of them."""
+"""Files of 0.1 and 0.2 mean what docs/upgrading.md says of them."""
 
 import dataclasses
 import math
@@ -9,7 +9,8 @@ import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.loading import load_scenario, scenario_to_dict
+from stewart_drake.scenario.renames import CONTROLLER, with_new_names
 
 ALL_FIELDS = """
 mechanism: paper
@@ -72,3 +73,30 @@ def test_a_limit_of_null_is_the_mechanism_s_and_none_is_none(word, limit, plant)
 
 def test_a_fraction_below_1e_9_is_none():
     assert load_scenario("paper", settings=["delay.fraction=1e-10"]).eta == 8 * 0.1
+
+
+@pytest.mark.parametrize("name", CONTROLLER)
+def test_an_old_name_that_a_person_writes_is_refused_with_the_new_one(tmp_path, name):
+    scenario, controller, row = (tmp_path / f"{file}.yaml" for file in ("scenario", "law", "row"))
+    scenario.write_text(f"controller: {{{name}: 1}}\n")
+    controller.write_text(f"{name}: 1\n")
+    row.write_text(f"compare: {{lqr: {{{name}: 1}}}}\n")
+    for given in (
+        {"name_or_path": scenario},
+        {"name_or_path": "paper", "controller": controller},
+        {"name_or_path": row},
+        {"name_or_path": "paper", "settings": [f"controller.{name}=1"]},
+    ):
+        with pytest.raises(ConfigError, match=rf"{name}: .*called .*{CONTROLLER[name]} since") as e:
+            load_scenario(**given)
+        assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize("start", [True, False])
+def test_a_scenario_that_0_2_wrote_is_read_under_the_new_names(start):
+    today = scenario_to_dict(Scenario())
+    today["controller"] |= {"open_loop_start": start, "replan": 0.3}
+    then = today | {"controller": dict(today["controller"])}
+    for old, new in (("quiet_start", "open_loop_start"), ("rejoin", "replan")):
+        then["controller"][old] = then["controller"].pop(new)
+    assert with_new_names(then) == today == with_new_names(today)

@@ -331,6 +331,8 @@ def _explain_unknown(type_: type, error: Any) -> str:
     *above, name = error["loc"]
     place, section = place_of(type_, above)
     known, field = field_names(section), _cut(_dotted((*place, name)), 60)
+    if new := getattr(section, "renamed", {}).get(name):
+        return f"{field}: unknown key; it is called {_dotted((*place, new))} since 0.3"
     union = place_of(type_, above[:-1])[1]
     if kinds(union) and name in field_names(union):  # of another kind, without an effect
         own = ", ".join(other for other in known if other != "kind") or "none but kind"

@@ -19,6 +19,7 @@ from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import STANDARD_GRAVITY
 from stewart_drake.scenario.config import NetworkConfig, Scenario, StateSensorConfig
+from stewart_drake.scenario.renames import with_new_names
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE, NUM_TORQUES
 from stewart_drake.types import Array
 
@@ -176,7 +177,7 @@ def _scenario_of(path: Path, signals: xr.Dataset) -> Scenario:
     data = parse_yaml(text, f"{path}: scenario") if isinstance(text, str) else None
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: says nothing of its scenario; expected {EXPECTED}")
-    return validate(Scenario, data, f"{path}: scenario")
+    return validate(Scenario, with_new_names(data), f"{path}: scenario")
 
 
 def _run_problem(signals: xr.Dataset, scenario: Scenario) -> str | None:

@@ -74,7 +74,7 @@ def uncovered(law: PredictiveLqi) -> str | None:
         "controller.estimator": type(observer) in _OBSERVERS and type(timeline) is Timeline,
         "controller.prior": estimated == PARAMETERS and dynamics.free == PARAMETERS,
         "controller.known": not known,
-        "controller.rejoin": type(law.planner) is NoPlanner,
+        "controller.replan": type(law.planner) is NoPlanner,
         "controller.prediction": type(law.predictor) is NonlinearPredictor,
         "controller.feedforward": type(law.feedforward) is InverseDynamicsFeedforward,
         "controller.model": type(law.model) is MultibodyModel,

@@ -546,7 +546,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         "multibody": MultibodyModel(),
     }
     motors = TorqueLimit(experiment.torque_limit)
-    quiet = c.quiet_start and sc.start == "rest"
+    quiet = c.open_loop_start and sc.start == "rest"
     observer, waits = observers[c.estimator], longest_wait(sc)
     if waits:
         observer = LateObserver(observer, waits)
@@ -570,7 +570,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
             law,
             observer=DelayObserver(settings, delay, timeline.eta, quiet),
             predictor=ArrivalPredictor(),
-            planner=Rejoin(c.rejoin, experiment.scale) if c.rejoin > 0 else NoPlanner(),
+            planner=Rejoin(c.replan, experiment.scale) if c.replan > 0 else NoPlanner(),
             silence=0,  # until the delay is found
         )
     return experiment.own.revised(law)

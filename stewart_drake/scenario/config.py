@@ -6,7 +6,7 @@ here needs a mechanism. `scenario.loading` reads scenarios from files.
 
 import dataclasses
 from dataclasses import field
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -31,6 +31,7 @@ from stewart_drake.scenario.field_types import (
     Weight,
 )
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
+from stewart_drake.scenario.renames import CONTROLLER
 from stewart_drake.scenario.signals import USUAL_COULOMB_SPEED
 from stewart_drake.scenario.timing import (
     METRIC_PERIOD,
@@ -183,10 +184,10 @@ class ControllerConfig:
             in, as `constant`, or as `drifting` with a rate of its own.
         delay_std: of that belief, s.
         delay_max: longest delay that is thought possible, s.
-        quiet_start: whether, from rest, nothing is fed back before a torque of the controller can
+        open_loop_start: whether a start from rest has no feedback before the first own torque can
             have acted.
-        rejoin: with a delay estimator: a plan back onto the reference takes so long, in s, where
-            the prediction is off it, as when the delay was found or has jumped; 0 is none.
+        replan: duration of a plan back onto the reference, s; 0 for none. With a delay estimator,
+            where the prediction is off the reference, as when the delay was found or has jumped.
         estimate_coulomb: whether the estimator also finds the Coulomb friction of the shafts; the
             speed over which it builds up is 0.02 rad/s, or known.
         prior: standard deviations of what is estimated, a section of its own; null all of them.
@@ -197,6 +198,7 @@ class ControllerConfig:
             `sensor.kind` encoders, and a delay that is known.
     """
 
+    renamed: ClassVar = CONTROLLER
     period: Annotated[float, Field(ge=1e-4, le=10)] = 0.1
     integral: bool = True
     delay_steps: Steps | None = None
@@ -217,8 +219,8 @@ class ControllerConfig:
     delay_estimator: Literal["none", "constant", "drifting"] = "none"
     delay_std: Annotated[float, Field(ge=1e-3, le=10)] = 0.3
     delay_max: Annotated[float, Field(gt=0, le=10)] = 1.5
-    quiet_start: bool = True
-    rejoin: Annotated[float, Field(ge=0, le=10)] = 0.6
+    open_loop_start: bool = True
+    replan: Annotated[float, Field(ge=0, le=10)] = 0.6
     estimate_coulomb: bool = False
     prior: PriorConfig = field(default_factory=PriorConfig)
     known: Name | None = None

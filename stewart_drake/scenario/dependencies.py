@@ -28,7 +28,7 @@ class Needs(NamedTuple):
 
 _TORQUE_LAW: Final = (
     *("integral", "integral_weight", "prediction", "model", "weight_scaling", "w_Q", "w_R"),
-    *("packet_torques", "packet_repeats", "quiet_start"),
+    *("packet_torques", "packet_repeats", "open_loop_start"),
 )
 _FILTER: Final = (
     *("estimate_coulomb", "estimate_offsets", "prior.torque_bias", "prior.payload"),
@@ -46,13 +46,13 @@ NEEDS: Final = (
     Needs(_of_controller("prior.rates"), "sensor.kind", ("encoders",)),
     Needs(_of_controller("prior.offsets"), "controller.estimate_offsets", (True,)),
     Needs(
-        _of_controller("delay_std", "delay_max", "rejoin"),
+        _of_controller("delay_std", "delay_max", "replan"),
         "controller.delay_estimator",
         ("constant", "drifting"),
     ),
     Needs(_of_controller("w_Q", "w_R"), "tuner.kind", ("fixed", "ann")),
     Needs(_of_controller(*_TORQUE_LAW), "controller.command", ("torque",)),
-    Needs(_of_controller("catch_up", "quiet_start"), "start", ("rest",)),
+    Needs(_of_controller("catch_up", "open_loop_start"), "start", ("rest",)),
 )
 """Which field needs which value of another one."""
 

@@ -29,6 +29,7 @@ from stewart_drake.loop.preparation import MakeTuner
 from stewart_drake.loop.weights import health_of
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
+from stewart_drake.scenario.renames import with_new_names
 from stewart_drake.studies.disturbances import with_gain
 from stewart_drake.studies.families import FamilyName, base_of, condition, draw_family
 from stewart_drake.studies.jobs import MANIFEST, Progress, read_manifest, run_jobs
@@ -271,7 +272,7 @@ def load_curves(directory: str | Path) -> Curves:
     folder = Path(directory) / "curves"
     manifest = str(folder / MANIFEST)
     said = validate(_Settings, read_manifest(folder, EXPECTED).settings, manifest)
-    base = validate(Scenario, said.scenario, manifest)
+    base = validate(Scenario, with_new_names(said.scenario), manifest)
     paths = sorted(folder.glob("[0-9]*.npz"))
     if [path.stem for path in paths] != [f"{i:05d}" for i in range(len(paths))] or not paths:
         raise ConfigError(f"{folder}: conditions are missing; go on with tune dataset --family")

@@ -1,0 +1,22 @@
+"""Fields of scenarios of 0.2 that have another name today.
+
+A file that a person writes is refused with the new name, see `files.yamlio.validate`. What the
+program wrote is read under today's names.
+"""
+
+from typing import Any, Final
+
+CONTROLLER: Final = {
+    "quiet_start": "open_loop_start",
+    "rejoin": "replan",
+}
+"""Old name -> new name in the section `controller`."""
+
+
+def with_new_names(scenario: dict[str, Any]) -> dict[str, Any]:
+    """Return the data of a scenario that the program wrote, 0.2 included, under today's names."""
+    given = scenario.get("controller")
+    if not isinstance(given, dict):
+        return scenario
+    controller = {CONTROLLER.get(name, name): value for name, value in given.items()}
+    return scenario | {"controller": controller}
