@@ -34,7 +34,7 @@ def outcome(controller: str, *settings: str) -> str:
     """E_ac of a run in % s, or when it was lost."""
     inertia = "controller.model=multibody"
     scenario = sd.load_scenario("table2", controller, (inertia, *settings))
-    run = sd.simulate(scenario, margin=False)
+    run = sd.simulate(scenario, judge_stability=False)
     return f"{run.accumulated_error:.3g}" if run.stopped is None else f"lost {run.stopped.time:.2f}"
 
 

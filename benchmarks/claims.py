@@ -108,7 +108,7 @@ def run(row: Row, seed: int) -> tuple[float | None, float | None]:
             turn = 2 * np.pi * np.random.default_rng(seed).uniform() if row.drawn else 0.0
             force = row.force * np.array([np.cos(turn), np.sin(turn), 0.0])
             push = partial(Push, force, row.span)
-            result = sd.simulate(scenario, disturbance=push, margin=False)
+            result = sd.simulate(scenario, disturbance=push, judge_stability=False)
             stopped, error = result.stopped, result.accumulated_error
         else:
             ending = run_in_bulk(scenario)

@@ -58,7 +58,9 @@ def run(number: int, controller: str, factor: float) -> str:
         f"controller.delay_steps={steps}",
         f"controller.delay_fraction={max(0.0, round(periods - steps, 9))}",
     )
-    result = sd.simulate(sd.load_scenario(name, controller, (*chosen, *believed)), margin=False)
+    result = sd.simulate(
+        sd.load_scenario(name, controller, (*chosen, *believed)), judge_stability=False
+    )
     if result.stopped is not None:
         return f"left at {result.stopped.time:.2f} s"
     worst = result.summary["controller_step_ms"]["worst"]

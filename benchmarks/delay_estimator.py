@@ -79,7 +79,7 @@ def run(kind: str, settings: Sequence[str], scenario: str = "paper") -> Outcome:
     controller.time = CpuTime  # type: ignore[assignment,attr-defined]
     chosen = ("plant.kind=exact", f"controller.delay_estimator={kind}", *settings)
     asked = sd.load_scenario(scenario, settings=chosen)
-    result = simulate(asked, margin=False)
+    result = simulate(asked, judge_stability=False)
     signals = result.signals
     times, delays = signals.time.values, signals.delay_true.values
     if asked.delay.jitter_std > 0:  # what differs from torque to torque is no delay to be found

@@ -77,7 +77,9 @@ def run(settings: Sequence[str], scenario: str, seed: int) -> Outcome:
     state = any(setting == "sensor.kind=state" for setting in settings)
     chosen = (base[0], *settings) if state else (*base, *settings)
     law = in_python if state else None
-    result = simulate(sd.load_scenario(scenario, settings=chosen), law=law, margin=False)
+    result = simulate(
+        sd.load_scenario(scenario, settings=chosen), modify_law=law, judge_stability=False
+    )
     counts = result.summary["counts"]
     bad = (counts[f"measurements_{cause}"] for cause in ("missing", "frozen", "rejected"))
     return Outcome(result.accumulated_error, *bad, result.summary["controller_step_ms"]["median"])

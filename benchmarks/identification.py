@@ -113,7 +113,7 @@ def of_ranges(seed: int, motion: Path, calm: float) -> Truth:
 def calm_torque(motion: Path) -> float:
     """Largest that the undisturbed run commands, N m."""
     scenario = load_scenario("paper", "adaptive_lqi", _settings(motion, late=0.0))
-    return simulate(scenario, margin=False).summary["peak_torque"]
+    return simulate(scenario, judge_stability=False).summary["peak_torque"]
 
 
 def of_drawing(seed: int, motion: Path) -> Truth:
@@ -220,7 +220,7 @@ class Found(NamedTuple):
 def find(kind: str, seed: int, motion: Path, calm: float, poses: bool) -> Found:
     """Draw a machine, log it, find it."""
     truth = of_ranges(seed, motion, calm) if kind == "ranges" else of_drawing(seed, motion)
-    run = simulate(truth.scenario, truth=truth.mechanism, margin=False)
+    run = simulate(truth.scenario, true_mechanism=truth.mechanism, judge_stability=False)
     log, offsets = log_of(run, truth.mechanism, FRESH + seed, poses)
     found, seconds = identified(log, kind, poses)
     true = truth.values.copy()
@@ -269,8 +269,8 @@ def runs_by(
         runs = (
             simulate(
                 load_scenario("paper", "predictor_lqi", (*settings, *start)),
-                truth=truth.mechanism,
-                margin=False,
+                true_mechanism=truth.mechanism,
+                judge_stability=False,
             )
             for start in STARTS.values()
         )

@@ -40,7 +40,7 @@ def timed(call: Callable[[], Any]) -> tuple[float, Any]:
 def in_drake(scenario: Scenario, one: Draw) -> sd.SimulationResult:
     """A run as a simulation."""
     changed = drawn(MACHINE, scenario, sd.load_mechanism(scenario.mechanism), one)
-    return simulate(changed.as_scenario(), truth=changed.machine(), margin=False)
+    return simulate(changed.as_scenario(), true_mechanism=changed.machine(), judge_stability=False)
 
 
 def seconds_in_drake(scenario: Scenario, one: Draw) -> float:

@@ -66,9 +66,9 @@ def run(
     scenario = load_understood("paper", controller, (*EXACT, *servo, *settings))
     result = sd.simulate(
         scenario,
-        truth=None if machine is None else as_built(machine),
+        true_mechanism=None if machine is None else as_built(machine),
         disturbance=PUSH if pushed else None,
-        margin=False,
+        judge_stability=False,
     )
     peak = result.summary["peak_torque_applied"]
     return (np.inf if result.stopped else result.accumulated_error), peak

@@ -41,7 +41,7 @@ def size(share: float) -> str:
 
 def run(row: str, *settings: str) -> sd.SimulationResult:
     """One run of a row of the scenario."""
-    return sd.simulate(load_comparison("table2", BLIND, settings)[row], margin=False)
+    return sd.simulate(load_comparison("table2", BLIND, settings)[row], judge_stability=False)
 
 
 def told(result: sd.SimulationResult) -> str:
@@ -83,7 +83,7 @@ def weights() -> str:
     ]
 
     def one(row: str, settings: tuple[str, ...]) -> sd.SimulationResult:
-        return sd.simulate(sd.load_scenario("table2", row, settings), margin=False)
+        return sd.simulate(sd.load_scenario("table2", row, settings), judge_stability=False)
 
     runs = Parallel(n_jobs=-1)(delayed(one)(*job) for job in jobs)
     rows = []
@@ -130,7 +130,7 @@ def inertia() -> str:
         settings = ("controller.model=paper", f"controller.w_Q={ratio:.6g}")
         scenario = sd.load_scenario("table2", row, settings)
         margin = controller_margin(prepare(scenario))
-        return margin.radius, sd.simulate(scenario, margin=False)
+        return margin.radius, sd.simulate(scenario, judge_stability=False)
 
     rows = []
     for row in ("delay_lqr", "delay_lqi"):
@@ -160,7 +160,7 @@ def exits() -> str:
             runs = Parallel(n_jobs=-1)(
                 delayed(sd.simulate)(
                     sd.load_scenario("table2", row, (*settings, f"controller.w_Q={ratio:.6g}")),
-                    margin=False,
+                    judge_stability=False,
                 )
                 for ratio in HIGH
             )

@@ -38,7 +38,7 @@ def noise(share: float, seed: int = 0) -> tuple[str, str]:
 def run(scenario: str, settings: Sequence[str], controller: str | None = None) -> SimulationResult:
     """One run."""
     asked = sd.load_scenario(scenario, controller=controller, settings=settings)
-    return sd.simulate(asked, margin=False)
+    return sd.simulate(asked, judge_stability=False)
 
 
 def runs(cases: Sequence[tuple[Any, ...]]) -> list[SimulationResult]:

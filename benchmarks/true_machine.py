@@ -68,7 +68,7 @@ def told(settings: Sequence[str], folder: str) -> tuple[str, ...]:
 def run(settings: Sequence[str]) -> float:
     """E_ac of one run, NaN where it does not complete."""
     scenario = sd.load_scenario("paper", "predictor_lqi", ("plant.kind=exact", *settings))
-    return sd.simulate(scenario, margin=False).accumulated_error
+    return sd.simulate(scenario, judge_stability=False).accumulated_error
 
 
 def table(title: str, columns: Sequence[str], rows: dict[str, list[list[Any]]]) -> str:

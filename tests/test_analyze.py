@@ -240,7 +240,7 @@ def test_cells_are_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
         ),
     )
     assert cells[2].error == pytest.approx(
-        sd.simulate(alone, margin=False).accumulated_error, rel=1e-9
+        sd.simulate(alone, judge_stability=False).accumulated_error, rel=1e-9
     )
     assert cells[1].time == pytest.approx(1.04)
     assert math.isnan(cells[1].error)

@@ -127,7 +127,7 @@ def test_studies_state_the_link(
 def test_a_wire_says_that_it_is_one() -> None:
     scenario = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=0.2"))
     assert link_text(scenario) is None
-    assert sd.simulate(scenario, margin=False).summary["link"] == {"kind": "wire"}
+    assert sd.simulate(scenario, judge_stability=False).summary["link"] == {"kind": "wire"}
 
 
 def test_machines_that_are_drawn_keep_the_network() -> None:

@@ -186,7 +186,7 @@ def test_signals_and_data_that_are_none(content, tmp_path, capsys, monkeypatch):
 
 
 def test_signals_cut_off_are_refused(tmp_path, capsys):
-    simulate(load_scenario("paper", settings=EXACT[1::2]), margin=False).save(tmp_path)
+    simulate(load_scenario("paper", settings=EXACT[1::2]), judge_stability=False).save(tmp_path)
     whole = (tmp_path / "signals.nc").read_bytes()
     for keep in (0.1, 0.5, 0.95):
         written(tmp_path / "cut.nc", whole[: int(keep * len(whole))])

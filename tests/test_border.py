@@ -130,9 +130,9 @@ def test_simulate_takes_a_name_or_a_path(tmp_path: Path) -> None:
     text = "duration: 0.1\nplant: {kind: exact}\n"
     path = tmp_path / "short.yaml"
     path.write_text(text)
-    expected = sd.simulate(sd.load_scenario(path), margin=False).signals
+    expected = sd.simulate(sd.load_scenario(path), judge_stability=False).signals
     for given in (path, str(path)):
-        assert sd.simulate(given, margin=False).signals.identical(expected)
+        assert sd.simulate(given, judge_stability=False).signals.identical(expected)
     with pytest.raises(ConfigError, match="papre"):
         sd.simulate("papre")
 

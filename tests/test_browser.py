@@ -17,7 +17,7 @@ SETTINGS = ("plant.kind=exact", "duration=3.0")  # from rest: the plate is far o
 
 @pytest.fixture(scope="module")
 def run() -> sd.SimulationResult:
-    return sd.simulate(sd.load_scenario("paper", settings=SETTINGS), margin=False)
+    return sd.simulate(sd.load_scenario("paper", settings=SETTINGS), judge_stability=False)
 
 
 @pytest.fixture(scope="module")

@@ -62,8 +62,8 @@ def test_a_scenario_is_prepared_once(tmp_path, monkeypatch) -> None:
     assert once.signals.identical(twice.signals)
     saved = xr.load_dataset(tmp_path / "signals.nc")
     assert saved.equals(once.signals)
-    with pytest.raises(TypeError, match="truth: got one with an Experiment"):
-        simulate(experiment, truth=experiment.mechanism)
+    with pytest.raises(TypeError, match="true_mechanism: got one with an Experiment"):
+        simulate(experiment, true_mechanism=experiment.mechanism)
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_the_same_scenario_gives_the_same_bytes(tmp_path):
     for name in ("first", "again"):
         if name == "again":
             time.sleep(1.1)  # what is stamped with the time shows
-        simulate(scenario, margin=False).save(tmp_path / name)
+        simulate(scenario, judge_stability=False).save(tmp_path / name)
     first, again = (tmp_path / name / "signals.nc" for name in ("first", "again"))
     assert first.read_bytes() == again.read_bytes()
 

@@ -20,7 +20,7 @@ BIAS = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
 def run(*settings: str, controller: str | None = None) -> sd.SimulationResult:
     """The paper's scenario with settings."""
     return sd.simulate(
-        sd.load_scenario("paper", controller=controller, settings=settings), margin=False
+        sd.load_scenario("paper", controller=controller, settings=settings), judge_stability=False
     )
 
 
@@ -175,7 +175,7 @@ def test_a_delay_a_little_off_is_survived_from_rest(late: float) -> None:
 
 def test_full_amplitude_under_gravity_on_the_exact_plant() -> None:
     scenario = sd.load_scenario("gravity", settings=(EXACT, "duration=3.0"))
-    assert sd.simulate(scenario, margin=False).accumulated_error <= 0.05
+    assert sd.simulate(scenario, judge_stability=False).accumulated_error <= 0.05
 
 
 def test_a_tuner_that_does_not_exist_is_refused() -> None:

@@ -260,7 +260,7 @@ def test_a_run_tells_the_margin_of_its_loop() -> None:
     down, up = told["gain_margin"]
     assert 0 < down < 1 < up
     assert min(told["delay_margin_s"]) > 0
-    assert sd.simulate(short, margin=False).summary["controller_margin"] is None
+    assert sd.simulate(short, judge_stability=False).summary["controller_margin"] is None
 
 
 def test_the_first_line_is_about_the_loop(

@@ -21,7 +21,7 @@ SHORT = ("--set", "plant.kind=exact", "--set", "duration=0.3")
 @pytest.fixture(scope="module")
 def run() -> sd.SimulationResult:
     settings = ("plant.kind=exact", "duration=0.3", "start=on_reference", "queue=reference")
-    return sd.simulate(sd.load_scenario("paper", settings=settings), margin=False)
+    return sd.simulate(sd.load_scenario("paper", settings=settings), judge_stability=False)
 
 
 def table(text: str) -> dict[str, np.ndarray]:
@@ -68,7 +68,7 @@ def test_a_run_comes_back_as_a_motion(run, tmp_path):
     rates = np.array([reference.EvalDerivative(t)[:, 0] for t in inside])
     assert np.abs(rates - run.signals.rates.values[:-1]).max() < 1e-3
     again = sd.simulate(
-        sd.load_scenario("paper", settings=(*settings, *ON_REFERENCE)), margin=False
+        sd.load_scenario("paper", settings=(*settings, *ON_REFERENCE)), judge_stability=False
     )
     assert again.status == "completed" and again.accumulated_error < 0.01
 
@@ -76,7 +76,9 @@ def test_a_run_comes_back_as_a_motion(run, tmp_path):
 @pytest.mark.parametrize("period", [0.03, 0.01])
 def test_a_log_between_the_grid_comes_back_too(period, tmp_path):
     settings = ("plant.kind=exact", "duration=0.5", f"controller.period={period}", *ON_REFERENCE)
-    signals = sd.simulate(sd.load_scenario("paper", settings=settings), margin=False).signals
+    signals = sd.simulate(
+        sd.load_scenario("paper", settings=settings), judge_stability=False
+    ).signals
     times, poses = read_csv(write_csv(signals, tmp_path / "run.csv"))
     np.testing.assert_allclose(times, signals.time.values, rtol=0, atol=1e-12)
     np.testing.assert_allclose(poses, signals.pose.values, rtol=1e-11, atol=1e-12)

@@ -124,7 +124,7 @@ def test_scenarios_that_do_not_suit_are_refused(settings, said):
 
 def test_rows_are_the_densities_that_the_loop_records():
     scenario = base("delay.steps=1", *NOISE, controller="predictor_lqi")
-    result = simulate(scenario, margin=False)
+    result = simulate(scenario, judge_stability=False)
     own = densities(first_samples(samples_of(result)))
     recorded = result.signals.density.values[::5][:100]
     # The loop reads its sample 5e-15 of the time earlier, and an error is a small difference.

@@ -321,7 +321,7 @@ def test_a_lost_or_impossible_measurement_is_survived() -> None:
 
 def looped(*settings: str, kind: str = "constant") -> SimulationResult:
     chosen = ("plant.kind=exact", f"controller.delay_estimator={kind}", *settings)
-    return simulate(sd.load_scenario("paper", settings=chosen), margin=False)
+    return simulate(sd.load_scenario("paper", settings=chosen), judge_stability=False)
 
 
 ON_REFERENCE = ("start=on_reference", "queue=reference")

@@ -31,7 +31,7 @@ FINE = ("sensor.samples=100",)
 
 @cache
 def run(*settings: str, scenario: str = "paper", controller: str | None = None) -> SimulationResult:
-    return simulate(load_scenario(scenario, controller, settings), margin=False)
+    return simulate(load_scenario(scenario, controller, settings), judge_stability=False)
 
 
 def bad(result: SimulationResult) -> tuple[int, int, int]:
@@ -316,4 +316,4 @@ def test_own_systems_that_measure_the_state_are_refused(role: str) -> None:
 
     scenario = load_scenario("paper", settings=ENCODERS)
     with pytest.raises(ConfigError, match=f"got 'encoders' with a {role} of your own"):
-        simulate(scenario, margin=False, **{role: Own})
+        simulate(scenario, judge_stability=False, **{role: Own})

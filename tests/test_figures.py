@@ -22,7 +22,7 @@ from stewart_drake.studies.compare import CONTROLLERS, LABELS
 @pytest.fixture(scope="module")
 def run():
     settings = ("plant.kind=exact", "duration=1.0", "plant.payload_mass=0.2")
-    return simulate(load_scenario("paper", settings=settings), margin=False)
+    return simulate(load_scenario("paper", settings=settings), judge_stability=False)
 
 
 @pytest.fixture(scope="module")
@@ -91,13 +91,13 @@ def test_figures_of_a_comparison(comparison, drawn):
 
 def test_a_controller_without_estimator_has_no_parameters_to_show(drawn):
     settings = ("plant.kind=exact", "duration=0.1")
-    run_figures(simulate(load_scenario("paper", "lqr", settings), margin=False), "unused")
+    run_figures(simulate(load_scenario("paper", "lqr", settings), judge_stability=False), "unused")
     assert list(drawn) == ["states", "errors", "torques"]
 
 
 def test_packets_are_a_strip_below_the_torques(drawn):
     settings = ("plant.kind=exact", "duration=1.5", "link.kind=network", "link.playout=0.7")
-    result = simulate(load_scenario("paper", settings=settings), margin=False)
+    result = simulate(load_scenario("paper", settings=settings), judge_stability=False)
     run_figures(result, "unused")
     *_, strip = drawn["torques"].axes
     assert len(drawn["torques"].axes) == 7

@@ -128,7 +128,7 @@ def test_the_loop_is_the_one_that_is_written_out_by_hand(
     row: str, integral: bool, share: float
 ) -> None:
     scenario = load_comparison("table2", ("delay_lqr", "delay_lqi"), [FULL])[row]
-    result = sd.simulate(scenario, margin=False)
+    result = sd.simulate(scenario, judge_stability=False)
     assert result.status == "completed" and not any(result.summary["counts"].values())
     by_hand = error(2.3, integral=integral, share=share)
     assert result.accumulated_error == pytest.approx(by_hand, rel=2e-4)
@@ -136,7 +136,7 @@ def test_the_loop_is_the_one_that_is_written_out_by_hand(
 
 def test_what_does_not_know_of_the_delay_passes_the_band() -> None:
     scenario = load_comparison("table2", ("lqr",), [FULL])["lqr"]
-    result = sd.simulate(scenario, margin=False)
+    result = sd.simulate(scenario, judge_stability=False)
     assert result.status == "left_workspace" and result.stopped is not None
     assert "ten times" in result.stopped.reason and result.stopped.leg is None
     error = np.abs(result.signals.error.values[-1]) / (2 * AMPLITUDE)
@@ -153,7 +153,9 @@ def test_it_has_no_limits_but_one_that_is_asked_for() -> None:
 
 def test_the_controllers_of_this_package_follow_there_too() -> None:
     settings = (FULL, "plant.torque_bias=[1e-3,0,0,0,0,-1e-3]")
-    result = sd.simulate(sd.load_scenario("table2", "predictor_lqi", settings), margin=True)
+    result = sd.simulate(
+        sd.load_scenario("table2", "predictor_lqi", settings), judge_stability=True
+    )
     assert result.status == "completed"
     assert 0.5 < result.accumulated_error < 25
     margin = result.summary["controller_margin"]

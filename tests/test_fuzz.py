@@ -267,7 +267,7 @@ def npz_of_a_run() -> bytes:
 def some_signals() -> xr.Dataset:
     """Of a short run."""
     settings = ("plant.kind=exact", "duration=0.1", "start=on_reference", "queue=reference")
-    return sd.simulate(sd.load_scenario("paper", settings=settings), margin=False).signals
+    return sd.simulate(sd.load_scenario("paper", settings=settings), judge_stability=False).signals
 
 
 @lru_cache(maxsize=1)

@@ -98,4 +98,4 @@ def test_half_of_the_measurements_suffice(seed: int) -> None:
     settings = ("plant.kind=exact", "start=on_reference", "queue=reference", "overlay=dirty")
     settings += ("sensor.loss=0.5", f"sensor.seed={seed}")
     scenario = sd.load_scenario("paper", "predictor_lqi", settings)
-    assert simulate(scenario, margin=False).accumulated_error < 3.0
+    assert simulate(scenario, judge_stability=False).accumulated_error < 3.0

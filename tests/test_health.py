@@ -208,7 +208,7 @@ def test_drakes_loop_and_the_one_in_c_have_the_same_weights(tuner: str, tmp_path
     }[tuner]
     one = scenario(*FOLLOWS, *kind, "duration=2", "delay.fraction=0.1", "plant.accuracy=1e-12",
                    "controller.delay_steps=8")  # fmt: skip
-    found, expected = run_in_bulk(one), ending_of(simulate(one, margin=False))
+    found, expected = run_in_bulk(one), ending_of(simulate(one, judge_stability=False))
     assert found.weights[: len(expected.weights)] == pytest.approx(expected.weights, rel=1e-5)
     assert len(np.unique(found.weights[:, 0])) > 3
     assert found.error_so_far == pytest.approx(expected.error_so_far, rel=1e-5)
@@ -219,7 +219,7 @@ def test_a_failing_network_is_counted_in_both_loops(tmp_path: Path) -> None:
     broken = network(weights_of(-1.0), W2=np.full((2, 10), 1e308))
     save_network(broken, tmp_path / "n.json")
     one = scenario(*FOLLOWS, "tuner.kind=ann", f"tuner.weights={tmp_path / 'n.json'}", "duration=1")
-    found, expected = run_in_bulk(one), ending_of(simulate(one, margin=False))
+    found, expected = run_in_bulk(one), ending_of(simulate(one, judge_stability=False))
     assert found.counts["tuner_fallbacks"] == expected.counts["tuner_fallbacks"] > 5
     assert found.weights[:, 0] == pytest.approx(weights_of(-1.0)[0])
 

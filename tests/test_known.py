@@ -257,7 +257,9 @@ def test_what_is_known_is_worth_something(file: Path) -> None:
     save_known(file, dataclasses.replace(KNOWN, mean=np.array([0.4, 1e-3, 5e-4, 0.8])))
     settings = (*ON_REFERENCE, *true, "duration=5")
     told, not_told = (
-        sd.simulate(sd.load_scenario("paper", "predictor_lqi", (*settings, *more)), margin=False)
+        sd.simulate(
+            sd.load_scenario("paper", "predictor_lqi", (*settings, *more)), judge_stability=False
+        )
         for more in ((f"controller.known={file}",), ())
     )
     assert told.status == "completed"

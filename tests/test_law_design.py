@@ -34,7 +34,7 @@ def test_it_is_the_law_of_the_scenario(fraction):
     scenario = sd.load_scenario("paper", settings=settings)
     # As a trajectory too, whose size is its range within the duration.
     motion = make_reference(scenario.reference, scenario.duration)
-    shipped = sd.simulate(scenario, reference=motion, margin=False)
+    shipped = sd.simulate(scenario, reference=motion, judge_stability=False)
 
     law = law_of(scenario)
     builder = DiagramBuilder()

@@ -225,7 +225,7 @@ def test_the_exact_plant_stops_at_every_arrival(course: tuple[str, ...]) -> None
 def test_the_multibody_plant_feels_torques_at_its_nearest_step() -> None:
     settings = ("plant.kind=multibody", "plant.time_step=0.005", "duration=1.3")
     sc = scenario(*settings, "delay.jitter_std=0.02", "log_period=0.005", "delay.steps=2")
-    signals = sd.simulate(sc, margin=False).signals
+    signals = sd.simulate(sc, judge_stability=False).signals
     exact = torque_delays(scenario("duration=1.3", "delay.jitter_std=0.02", "delay.steps=2"))
     arrivals = 0.005 * np.round((0.1 * np.arange(14) + exact) / 0.005)
     applied = signals.torque_applied.values
@@ -238,10 +238,10 @@ def test_the_multibody_plant_feels_torques_at_its_nearest_step() -> None:
 
 
 def test_the_record_shows_the_delay() -> None:
-    signals = sd.simulate(scenario("duration=1", "delay.drift=0.01"), margin=False).signals
+    signals = sd.simulate(scenario("duration=1", "delay.drift=0.01"), judge_stability=False).signals
     sent = np.floor(signals.time.values / 0.1 + 1e-9) * 0.1
     assert signals.delay_true.values == pytest.approx(0.8 + 0.01 * sent, abs=1e-12)
     assert signals.delay_true.attrs["units"] == "s"
-    plain = sd.simulate(scenario("duration=0.3"), margin=False).signals
+    plain = sd.simulate(scenario("duration=0.3"), judge_stability=False).signals
     assert np.all(plain.delay_true.values == 0.8)
     assert np.isnan(plain.packets.values).all()

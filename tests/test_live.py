@@ -255,7 +255,7 @@ def test_an_error_of_which_half_was_measured_is_none(quiet_machine):
 
 def test_the_share_that_was_measured_of_a_simulation_leaves_its_error():
     lossy = ("sensor.loss=0.5", "duration=2", "plant.kind=exact")
-    result = sd.simulate(scenario_of(*lossy), margin=False)
+    result = sd.simulate(scenario_of(*lossy), judge_stability=False)
     missing = result.summary["counts"]["measurements_missing"]
     assert missing > 5 and result.summary["measured_share"] == pytest.approx(1 - missing / 21)
     assert math.isfinite(result.accumulated_error)
@@ -264,7 +264,9 @@ def test_the_share_that_was_measured_of_a_simulation_leaves_its_error():
 def test_a_leg_that_is_silent_leaves_measurements(tmp_path):
     """What is left out of a measurement is counted; the rest is used."""
     encoders = "sensor={kind: encoders, faults: [{kind: missing, leg: 2, from: 0, to: 2}]}"
-    result = sd.simulate(scenario_of(encoders, "duration=1", "plant.kind=exact"), margin=False)
+    result = sd.simulate(
+        scenario_of(encoders, "duration=1", "plant.kind=exact"), judge_stability=False
+    )
     assert result.summary["counts"]["bad_measurements"] >= 10
     assert result.summary["measured_share"] == 1
 

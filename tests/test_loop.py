@@ -40,7 +40,7 @@ def scenario(*settings: str, controller: str | None = None, plant: str = "exact"
 
 @functools.cache
 def result(*settings: str, controller: str | None = None, plant: str = "exact") -> SimulationResult:
-    return simulate(scenario(*settings, controller=controller, plant=plant), margin=False)
+    return simulate(scenario(*settings, controller=controller, plant=plant), judge_stability=False)
 
 
 # What is there.
@@ -122,9 +122,9 @@ def test_applied_torque_is_the_commanded_one_a_delay_ago(
 def test_a_delay_that_is_next_to_whole_is_whole(tiny: float) -> None:
     """A release so near to the next event would come before it, or never."""
     settings = ("duration=2.0", *ON_REFERENCE)
-    run = simulate(scenario(f"delay.fraction={tiny}", *settings), margin=False)
+    run = simulate(scenario(f"delay.fraction={tiny}", *settings), judge_stability=False)
     believed = ("controller.delay_steps=8", f"controller.delay_fraction={tiny}")
-    same = simulate(scenario(*believed, *settings), margin=False)
+    same = simulate(scenario(*believed, *settings), judge_stability=False)
     for other in (run, same):
         assert other.accumulated_error == result(*settings).accumulated_error
     sc = scenario(*settings)
@@ -271,7 +271,7 @@ def test_the_floor_is_that_of_a_plate_which_waits(
     """In the summary of a run and in the analysis of the delay alike; where it falls, none."""
     monkeypatch.setattr(delay_limits, "loop_margins", lambda _: [])  # which take seconds
     sc = scenario("duration=0.3", *settings)
-    floor = simulate(sc, margin=False).summary["delay_floor"]
+    floor = simulate(sc, judge_stability=False).summary["delay_floor"]
     assert (floor > 1) is waits and (floor == 0) is not waits
     assert study_delay(sc, simulations=False).floor_applies is waits
 
@@ -318,7 +318,7 @@ def test_the_same_seed_gives_the_same_bytes(plant: str, tmp_path: Path) -> None:
     def saved(seed: int, folder: str) -> tuple[bytes, xr.Dataset]:
         run = simulate(
             scenario("duration=0.5", *ON_REFERENCE, noise, f"sensor.seed={seed}", plant=plant),
-            margin=False,
+            judge_stability=False,
         )
         run.save(tmp_path / folder)
         return (tmp_path / folder / "signals.nc").read_bytes(), run.signals
@@ -342,7 +342,9 @@ def test_ctrl_c_keeps_what_there_is() -> None:
         if time > 0.31:
             raise KeyboardInterrupt
 
-    run = simulate(scenario("duration=2.0", *ON_REFERENCE), progress=interrupt, margin=False)
+    run = simulate(
+        scenario("duration=2.0", *ON_REFERENCE), progress=interrupt, judge_stability=False
+    )
     assert run.status == "interrupted"
     assert run.signals.time.values == pytest.approx(GRID * np.arange(17), abs=1e-12)
     assert np.isnan(run.accumulated_error)
@@ -359,7 +361,7 @@ def test_what_progress_raises_reaches_the_caller(error: type[Exception]) -> None
             raise mine
 
     with pytest.raises(error) as caught:
-        simulate(scenario("duration=0.2", *ON_REFERENCE), progress=progress, margin=False)
+        simulate(scenario("duration=0.2", *ON_REFERENCE), progress=progress, judge_stability=False)
     assert caught.value is mine
 
 

@@ -56,7 +56,7 @@ def run_with(
             output.SetFromVector(self._sent[k])
 
     monkeypatch.setattr(diagram_module, "Sensor", Faulty)
-    return simulate(scenario() if sc is None else sc, margin=False)
+    return simulate(scenario() if sc is None else sc, judge_stability=False)
 
 
 def check_outcome(run: SimulationResult) -> None:
@@ -156,7 +156,7 @@ def test_gains_that_cannot_be_found(failing, controller, monkeypatch):
     monkeypatch.setattr(diagram_module, "DelayLqiController", started)
     # The paper's controller keeps the plate without a delay only, with or without these faults.
     delay = () if controller == "predictor_lqi" else ("delay.steps=0",)
-    run = simulate(scenario(SMALL, *delay, controller=controller), margin=False)
+    run = simulate(scenario(SMALL, *delay, controller=controller), judge_stability=False)
     assert run.summary["counts"]["riccati_failures"] == len(failing)
     assert run.status == "completed"
     if controller == "predictor_lqi":
@@ -167,11 +167,11 @@ def test_motors_at_their_limit_for_a_second(monkeypatch):
     """From rest, with a limit that the catch-up does not know of: they are at it for long, and the
     plate is caught in the end."""
     sc = scenario("duration=8", "start=rest", "queue=zero", "delay.steps=2", SMALL)
-    free = simulate(sc, margin=False)
+    free = simulate(sc, judge_stability=False)
     limit = free.summary["peak_torque"] / 3
     sc.actuator.torque_limit = limit
     sc.controller.catch_up = 0.3
-    run = simulate(sc, margin=False)
+    run = simulate(sc, judge_stability=False)
     check_outcome(run)
     assert run.summary["counts"]["saturated_steps"] >= 10
     assert run.summary["peak_torque_applied"] == limit < run.summary["peak_torque"]

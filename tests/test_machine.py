@@ -79,7 +79,7 @@ def test_a_run_over_the_socket_is_the_simulated_one(
     period = run.driver.period
     run.greet(3 * period, 60 * period)
     states = np.array(run.drive(samples))
-    result = simulate(scenario, margin=False)
+    result = simulate(scenario, judge_stability=False)
     assert result.status == "completed"
     at = scenario.controller.period * np.arange(samples)
     kept = result.signals.sel(time=at, method="nearest")
@@ -99,7 +99,7 @@ def test_counts_are_those_of_the_simulation() -> None:
     run = Together(scenario, Settings(watchdog=5))
     run.greet(3 * run.driver.period, 60 * run.driver.period)
     run.drive(31)
-    packets = simulate(scenario, margin=False).signals.packets.values[-1]
+    packets = simulate(scenario, judge_stability=False).signals.packets.values[-1]
     played, dry = packets[3:]
     machine = run.machine.summary()
     assert dry > 0

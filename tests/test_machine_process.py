@@ -125,7 +125,7 @@ def states_of(log: Path) -> np.ndarray:
 
 def simulated(samples: int, settings: tuple[str, ...] = SETTINGS) -> np.ndarray:
     """(k, 12) states."""
-    result = simulate(load_scenario("paper", settings=settings), margin=False)
+    result = simulate(load_scenario("paper", settings=settings), judge_stability=False)
     kept = result.signals.sel(time=0.1 * np.arange(samples), method="nearest")
     return np.hstack([kept.pose.values, kept.rates.values])
 

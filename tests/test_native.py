@@ -296,6 +296,6 @@ def test_a_run_imports_no_casadi() -> None:
     code = """if True:
         import sys, stewart_drake as sd
         scenario = sd.load_scenario("paper", settings=["duration=0.1"])
-        assert sd.simulate(scenario, margin=False).status == "completed"
+        assert sd.simulate(scenario, judge_stability=False).status == "completed"
         assert "casadi" not in sys.modules"""
     subprocess.run([sys.executable, "-c", code], check=True)

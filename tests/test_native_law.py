@@ -373,7 +373,7 @@ def test_the_summary_says_which(library) -> None:
         ("controller.prediction=linear", "python (controller.prediction)"),
     ):
         scenario = load_scenario("paper", settings=["duration=0.3", setting])
-        summary = sd.simulate(scenario, margin=False).summary
+        summary = sd.simulate(scenario, judge_stability=False).summary
         assert summary["controller_backend"] == expected
         assert json.dumps(summary["controller_backend"])
 

@@ -98,7 +98,7 @@ IN_PYTHON = {
 
 
 def drake(one: Scenario, truth: sd.Mechanism | None = None) -> Ending:
-    return ending_of(simulate(one, truth=truth, margin=False))
+    return ending_of(simulate(one, true_mechanism=truth, judge_stability=False))
 
 
 def assert_same(found: Ending, expected: Ending) -> None:
@@ -164,7 +164,7 @@ def test_states_torques_and_measurements_are_drakes() -> None:
     wanted = preparation.references[preparation.when.sampled]
     law = InPython(SampledLaw(prepared, preparation.when, wanted).torque)
     course = run_loop(prepared.experiment, preparation.when, law)
-    signals = simulate(one, margin=False).signals
+    signals = simulate(one, judge_stability=False).signals
     assert np.array_equal(signals.time.values, preparation.when.nominal)
     states = np.hstack([signals.pose.values, signals.rates.values])
     assert np.abs(course.states - states).max() < 1e-9

@@ -108,7 +108,9 @@ def test_a_wrench_gives_the_momentum_of_its_impulse():
 def test_disturbing_torque_is_the_same_as_a_bias(plant):
     settings = ("duration=0.3", f"plant.kind={plant}")
     bias = np.array([0.02, -0.01, 0.03, 0.0, 0.01, -0.02])
-    biased = sd.simulate(scenario(*settings, f"plant.torque_bias={bias.tolist()}"), margin=False)
+    biased = sd.simulate(
+        scenario(*settings, f"plant.torque_bias={bias.tolist()}"), judge_stability=False
+    )
     system = ConstantVectorSource(bias)
     with pytest.raises(sd.ConfigError, match="output port 'torque'"):
         sd.simulate(scenario(*settings), disturbance=system)  # its port has another name
@@ -118,15 +120,15 @@ def test_disturbing_torque_is_the_same_as_a_bias(plant):
             super().__init__()
             self.DeclareVectorOutputPort("torque", 6, lambda _, output: output.SetFromVector(bias))
 
-    pushed = sd.simulate(scenario(*settings), disturbance=Pushed, margin=False)
+    pushed = sd.simulate(scenario(*settings), disturbance=Pushed, judge_stability=False)
     np.testing.assert_allclose(pushed.signals.pose, biased.signals.pose, atol=1e-12)
 
 
 @pytest.mark.parametrize("port", ["torque", "wrench"])
 def test_a_disturbance_of_nothing_changes_nothing(port):
     sc = sd.load_scenario("paper", settings=("plant.kind=multibody", "duration=1"))
-    plain = sd.simulate(sc, margin=False)
-    pushed = sd.simulate(sc, disturbance=disturbance(port), margin=False)
+    plain = sd.simulate(sc, judge_stability=False)
+    pushed = sd.simulate(sc, disturbance=disturbance(port), judge_stability=False)
     np.testing.assert_array_equal(pushed.signals.pose, plain.signals.pose)
 
 
@@ -220,9 +222,15 @@ def test_a_mistake_in_a_system_is_an_exception():
         ({"sensor": controller}, "sensor: Constant: got an input port 'measurement'; expected st"),
         ({"link": lambda: Constant((("commanded", 6),))}, "expected an output port 'torque' (6)"),
         ({"tuner": lambda: Constant((("state", 12),))}, "density (18), measurement (12), refer"),
-        ({"law": 3}, "law: got a int; expected a function of the scenario's law"),
-        ({"law": lambda law: None}, "law: got a NoneType from the function; expected a Predict"),
-        ({"law": lambda law: law, "controller": controller}, "law: got one with a controller"),
+        ({"modify_law": 3}, "modify_law: got a int; expected a function of the scenario's law"),
+        (
+            {"modify_law": lambda law: None},
+            "modify_law: got a NoneType from the function; expected a Predict",
+        ),
+        (
+            {"modify_law": lambda law: law, "controller": controller},
+            "modify_law: got one with a controller",
+        ),
         ({"reference": np.zeros(6)}, "reference: got a ndarray; expected a Drake trajectory"),
         (
             {"reference": PiecewisePolynomial(np.zeros((3, 1)))},
@@ -313,13 +321,13 @@ def test_what_a_system_noted_is_still_there_and_a_loop_that_made_its_own_is_not(
 def test_own_reference_is_followed_like_the_same_one_of_a_scenario():
     sc = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=2"))
     same = make_reference(sc.reference, sc.duration)
-    own = sd.simulate(sc, reference=same, margin=False)
+    own = sd.simulate(sc, reference=same, judge_stability=False)
     other = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=2"))
     other.reference.amplitude = [0.0] * 6
-    replaced = sd.simulate(other, reference=same, margin=False)
+    replaced = sd.simulate(other, reference=same, judge_stability=False)
     np.testing.assert_array_equal(own.signals.pose, replaced.signals.pose)
     assert own.summary["own"] == {"reference": "FunctionHandleTrajectory"}
-    shipped = sd.simulate(sc, margin=False)
+    shipped = sd.simulate(sc, judge_stability=False)
     assert shipped.summary["own"] == {}
     # What it is measured by, the range within 2 s, is all that differs.
     scale = np.abs(own.signals.error.values - shipped.signals.error.values).max()

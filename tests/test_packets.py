@@ -72,7 +72,7 @@ def scenario(*more: str, controller: str | None = None) -> sd.Scenario:
 
 
 def run(*more: str) -> sd.SimulationResult:
-    return sd.simulate(scenario(*more), margin=False)
+    return sd.simulate(scenario(*more), judge_stability=False)
 
 
 # The buffer, against every packet looked at for every period.
@@ -257,7 +257,9 @@ def test_a_network_without_losses_is_a_wire(
         f"controller.packet_torques={torques}",
     )
     found, expected = (
-        sd.simulate(scenario("duration=1", *more, controller=controller), margin=False).signals
+        sd.simulate(
+            scenario("duration=1", *more, controller=controller), judge_stability=False
+        ).signals
         for more in (network, delay)
     )
     for name in ("pose", "torque_applied", "torque_commanded", "state_estimate"):
@@ -382,7 +384,7 @@ def test_measurements_that_come_back_over_a_network_are_borne() -> None:
 
 def test_the_multibody_plant_is_held_over_a_network() -> None:
     settings = ("plant.kind=multibody", *NETWORK, "link.loss=0.05", "duration=3")
-    result = sd.simulate(scenario(*settings), margin=False)
+    result = sd.simulate(scenario(*settings), judge_stability=False)
     assert result.status == "completed" and result.accumulated_error < 1
 
 

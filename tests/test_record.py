@@ -42,7 +42,7 @@ def scenario(*settings: str, plant: str = "exact", start: tuple[str, ...] = ON_R
 
 
 def run(*settings: str, plant: str = "exact") -> sd.SimulationResult:
-    return sd.simulate(scenario(*settings, plant=plant), margin=False)
+    return sd.simulate(scenario(*settings, plant=plant), judge_stability=False)
 
 
 # Instants.
@@ -53,7 +53,7 @@ def run(*settings: str, plant: str = "exact") -> sd.SimulationResult:
 def test_no_torque_is_lost(period: float, plant: str) -> None:
     """The law's own torques, taken at its samples, are those of the log."""
     sc = scenario(f"controller.period={period}", "duration=0.3", "delay.steps=3", plant=plant)
-    result = sd.simulate(sc, margin=False)
+    result = sd.simulate(sc, judge_stability=False)
     number = round(0.3 / period) + 1
     at = period * np.arange(number)
     logged = result.signals.sel(time=at, method="nearest")

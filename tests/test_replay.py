@@ -27,7 +27,7 @@ PAPER = sd.load_mechanism("paper")
 @pytest.fixture(scope="module")
 def run() -> sd.SimulationResult:
     settings = ("plant.kind=exact", "duration=0.4", "start=on_reference", "queue=reference")
-    return sd.simulate(sd.load_scenario("paper", settings=settings), margin=False)
+    return sd.simulate(sd.load_scenario("paper", settings=settings), judge_stability=False)
 
 
 def data_of(html: str) -> dict:

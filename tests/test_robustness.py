@@ -431,7 +431,7 @@ def test_the_loop_simulates_the_true_machine(kind: str) -> None:
     legs = replace(PAPER, crank_lengths=1.01 * PAPER.crank_lengths)
     moved = {}
     for name, truth in (("same", None), ("heavy", heavy), ("legs", legs)):
-        result = simulate(scenario, truth=truth, margin=False)
+        result = simulate(scenario, true_mechanism=truth, judge_stability=False)
         moved[name] = result.signals.pose.values
     way = {name: np.abs(pose[-1] - pose[0]).max() for name, pose in moved.items()}
     assert 0.05 < way["heavy"] / way["same"] < 0.2
@@ -584,7 +584,7 @@ def test_nothing_drawn_changes_nothing(tmp_path: Path) -> None:
     study = study_robustness(short(), tmp_path, ranges=ranges, runs=2, workers=1)
     assert told(study.outcomes) == told([study.undisturbed] * 2)
     assert study.undisturbed.error == bulk.run_in_bulk(short()).figures.accumulated_error
-    drake = simulate(short(), margin=False).accumulated_error
+    drake = simulate(short(), judge_stability=False).accumulated_error
     assert study.undisturbed.error == pytest.approx(drake, rel=1e-6)
     assert all(math.isnan(one.error.rho) for one in study.influences())
     document(study).plain()

@@ -75,7 +75,7 @@ def run(
 
         monkeypatch.setattr(experiment_module, "StewartDynamics", dynamics)
         monkeypatch.setattr("stewart_drake.loop.diagram.StewartDynamics", dynamics)
-    result = simulate(sc, margin=False)
+    result = simulate(sc, judge_stability=False)
     return result, result.signals.torque_commanded.values / (m * s**2)
 
 
@@ -145,11 +145,11 @@ def test_a_file_may_describe_a_machine_of_a_few_millimetres(tmp_path: Path) -> N
     assert relative(load_mechanism(path).p_WS, scaled(s, m).p_WS) < 1e-12
     settings = ("plant.kind=exact", "duration=2", *ON)
     sc = load_scenario("paper", None, (f"mechanism={path}", *settings))
-    one = simulate(load_scenario("paper", None, settings), margin=False)
+    one = simulate(load_scenario("paper", None, settings), judge_stability=False)
     for field in ("amplitude", "offset"):
         values = np.array(getattr(sc.reference, field)) * np.repeat([1, s], 3)
         setattr(sc.reference, field, values.tolist())
-    result = simulate(sc, margin=False)
+    result = simulate(sc, judge_stability=False)
     assert result.status == "completed"
     assert result.summary["counts"]["riccati_failures"] == 0
     # A_i is 2 amplitudes, but for rounding in the file all is the same.

@@ -50,7 +50,7 @@ def test_a_live_run_shows_the_plate_the_ring_and_the_torques(kind, meshcat):
         )
 
     scenario = sd.load_scenario("paper", settings=(f"plant.kind={kind}", *MOVING))
-    run = sd.simulate(scenario, meshcat=meshcat, progress=look, margin=False)
+    run = sd.simulate(scenario, meshcat=meshcat, progress=look, judge_stability=False)
     for path in ("/reference/ring", "/reference/pointer"):
         assert meshcat.HasPath(path)
     assert len(looks) == 13
@@ -76,12 +76,12 @@ def test_a_live_run_keeps_to_real_time(meshcat):
         scenario,
         meshcat=meshcat,
         progress=lambda now, _: seen.append((now, time.monotonic())),
-        margin=False,
+        judge_stability=False,
     )
     assert run.status == "completed"
     (start, began), (end, ended) = seen[0], seen[-1]
     assert ended - began > 0.9 * (end - start)
-    unpaced = sd.simulate(scenario, margin=False)
+    unpaced = sd.simulate(scenario, judge_stability=False)
     np.testing.assert_array_equal(unpaced.signals.pose, run.signals.pose)
 
 
@@ -137,7 +137,7 @@ def test_meshcat_goes_with_its_last_user_and_waits_for_no_collection_of_garbage(
     scenario = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=0.06"))
     gc.disable()
     try:
-        run = sd.simulate(scenario, meshcat=made if show == "live" else None, margin=False)
+        run = sd.simulate(scenario, meshcat=made if show == "live" else None, judge_stability=False)
         if show == "replay":
             replay(run.signals, PAPER, made)
         assert listening(port)

@@ -61,7 +61,9 @@ def bad(run: SimulationResult) -> dict[str, int]:
 @pytest.mark.parametrize("kind", COUNT)
 def test_a_second_of_it_is_survived(kind: str, estimator: str, bound: float) -> None:
     """E_ac 0.0271 with the filter (0.0260 undisturbed), 0.0254 without it (0.0254)."""
-    run = simulate(on_reference(f"controller.estimator={estimator}", fault(kind)), margin=False)
+    run = simulate(
+        on_reference(f"controller.estimator={estimator}", fault(kind)), judge_stability=False
+    )
     assert run.status == "completed"
     assert bad(run) == {COUNT[kind]: 10}
     assert run.accumulated_error < bound
@@ -70,17 +72,17 @@ def test_a_second_of_it_is_survived(kind: str, estimator: str, bound: float) -> 
 @pytest.mark.parametrize("size", [0.01, 0.1, 1.0, 1e3])
 def test_spikes_of_all_sizes_are_told_from_motion(size: float) -> None:
     """Also within reach, and ten in a row: they do not bear each other out."""
-    run = simulate(on_reference(fault("spike", size=size)), margin=False)
+    run = simulate(on_reference(fault("spike", size=size)), judge_stability=False)
     assert run.status == "completed"
     assert bad(run) == {"measurements_rejected": 10}
     assert run.accumulated_error < 0.03
 
 
 def test_the_same_under_noise() -> None:
-    well = simulate(on_reference(NOISE), margin=False)
+    well = simulate(on_reference(NOISE), judge_stability=False)
     assert not bad(well)
     for kind, count in COUNT.items():
-        ill = simulate(on_reference(NOISE, fault(kind)), margin=False)
+        ill = simulate(on_reference(NOISE, fault(kind)), judge_stability=False)
         assert ill.status == "completed"
         assert bad(ill) == {count: 10}
         assert ill.accumulated_error < 1.1 * well.accumulated_error
@@ -94,7 +96,8 @@ def test_the_papers_controllers_count_them_too(controller: str) -> None:
     for kind in COUNT:
         far = {"size": 1e3} if kind == "spike" else {}  # without a filter, out of reach only
         run = simulate(
-            on_reference(*slow, fault(kind, 2.0, 2.5, **far), controller=controller), margin=False
+            on_reference(*slow, fault(kind, 2.0, 2.5, **far), controller=controller),
+            judge_stability=False,
         )
         assert run.stopped is None or run.stopped.time > 2.5
         assert bad(run) == {COUNT[kind]: 5}
@@ -103,7 +106,7 @@ def test_the_papers_controllers_count_them_too(controller: str) -> None:
 def test_a_sensor_that_froze_at_rest_is_found_by_the_filter() -> None:
     """Then its pose and rates agree with each other, but not with the torques that act."""
     sc = on_reference("start=rest", "queue=zero", fault("frozen", 0.0, 1.4))
-    run = simulate(sc, margin=False)
+    run = simulate(sc, judge_stability=False)
     assert run.status == "completed"
     # Up to 0.8 s nothing acts; from 0.9 s to 1.3 s the plate moves.
     assert bad(run) == {"measurements_frozen": 5}
@@ -133,7 +136,9 @@ def test_a_sample_of_zeros_is_rejected_and_counted(
                 output.SetFromVector(np.zeros(12))
 
     monkeypatch.setattr(diagram_module, "Sensor", Zero)
-    run = simulate(on_reference(f"controller.estimator={estimator}", "duration=4"), margin=False)
+    run = simulate(
+        on_reference(f"controller.estimator={estimator}", "duration=4"), judge_stability=False
+    )
     assert run.status == "completed"
     assert bad(run) == {"measurements_rejected": 1}
     assert run.accumulated_error < 0.025
@@ -178,12 +183,12 @@ def test_no_shipped_scenario_has_a_bad_measurement(name: str, controller: str) -
     """Also where the controller loses the plate, and where one that is not aware of the delay
     wonders for 0.8 s why the plate does not move."""
     settings = ("plant.kind=exact", "duration=3")
-    assert not bad(simulate(load_scenario(name, controller, settings), margin=False))
+    assert not bad(simulate(load_scenario(name, controller, settings), judge_stability=False))
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_nor_on_the_multibody_plant(name: str) -> None:
-    assert not bad(simulate(load_scenario(name, None, ("duration=1.5",)), margin=False))
+    assert not bad(simulate(load_scenario(name, None, ("duration=1.5",)), judge_stability=False))
 
 
 @pytest.mark.parametrize("estimator", ["parameters", "none"])
@@ -192,7 +197,8 @@ def test_a_plate_at_rest_is_not_frozen(plant: str, estimator: str) -> None:
     """Exactly the same pose and rates, sample for sample."""
     settings = ("reference.kind=hold", "duration=2", f"plant.kind={plant}")
     run = simulate(
-        load_scenario("paper", None, (*settings, f"controller.estimator={estimator}")), margin=False
+        load_scenario("paper", None, (*settings, f"controller.estimator={estimator}")),
+        judge_stability=False,
     )
     assert np.ptp(run.signals.pose.values[::5], axis=0).max() < 1e-12
     assert not bad(run)
@@ -247,7 +253,7 @@ def test_a_loop_with_a_frozen_sensor_can_be_run_twice() -> None:
     sc = on_reference(fault("frozen", 0.5, 1.0), "duration=1.5")
     loop = build_closed_loop(sc)
     assert loop.GetSubsystemByName("sensor").num_discrete_state_groups() == 1
-    one, other = simulate(sc, margin=False), simulate(sc, margin=False)
+    one, other = simulate(sc, judge_stability=False), simulate(sc, judge_stability=False)
     assert np.array_equal(one.signals.pose, other.signals.pose)
 
 

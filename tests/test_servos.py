@@ -509,7 +509,7 @@ def test_another_machine_than_the_one_that_is_known() -> None:
     known = DYNAMICS.mechanism
     longer = replace(known, rod_lengths=known.rod_lengths * 1.002)
     more = (*HOLD, "duration=2", "start=on_reference")
-    result = sd.simulate(scenario(*more), truth=longer)
+    result = sd.simulate(scenario(*more), true_mechanism=longer)
     expected = longer.forward_kinematics(known.crank_angles(HOME))
     assert np.allclose(result.signals.pose.values[-1], expected, atol=1e-6)
     assert abs(expected[5] - HOME[5]) > 5e-4
@@ -575,11 +575,13 @@ def test_systems_for_torques_are_refused_and_laws_may_be_changed() -> None:
         compose_law(prepare(scenario()))
     early = sd.simulate(
         scenario(*ON, "duration=1"),
-        law=lambda law: replace(law, timeline=replace(law.timeline, period=law.timeline.period)),
+        modify_law=lambda law: replace(
+            law, timeline=replace(law.timeline, period=law.timeline.period)
+        ),
     )
     assert early.summary["own"] == {"law": "<lambda>"}
     with pytest.raises(ConfigError, match="expected a ServoPreview"):
-        sd.simulate(scenario(), law=lambda law: law.timeline)
+        sd.simulate(scenario(), modify_law=lambda law: law.timeline)
 
 
 def build_closed_loop_with(experiment: Any, own: Any) -> None:

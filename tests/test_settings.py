@@ -281,7 +281,8 @@ def outcome(name: str, value: Any, chosen: tuple[Any, ...], before: Any) -> str:
     scenario, controller, settings = chosen
     try:
         result = simulate(
-            load_scenario(scenario, controller, (*settings, setting_of(name, value))), margin=False
+            load_scenario(scenario, controller, (*settings, setting_of(name, value))),
+            judge_stability=False,
         )
     except ConfigError as error:
         assert "\n" not in str(error) and name.split(".")[0] in str(error), error
@@ -388,7 +389,7 @@ def test_what_is_accepted_without_an_effect_stands_in_the_docs() -> None:
 def test_every_field_has_an_effect_or_is_refused_or_documented(called: str, files) -> None:
     chosen = SCENARIOS[called]
     scenario = load_scenario(*chosen)
-    before, wrong = simulate(scenario, margin=False).signals, {}
+    before, wrong = simulate(scenario, judge_stability=False).signals, {}
     for name in fields_of(scenario):
         if name.endswith(".kind") and name != "plant.kind":
             continue  # each is another class, whose fields are refused beside it

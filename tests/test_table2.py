@@ -80,7 +80,7 @@ def test_the_integral_weight_scales_its_block_alone() -> None:
 def test_table_two_comes_out(
     rows: dict[str, sd.Scenario], row: str, error: float, within: float
 ) -> None:
-    result = sd.simulate(rows[row], margin=False)
+    result = sd.simulate(rows[row], judge_stability=False)
     assert result.status == "completed"
     assert result.accumulated_error == pytest.approx(error, abs=within)
 
@@ -89,12 +89,12 @@ def test_table_two_comes_out(
 def test_who_does_not_know_of_the_delay_loses_the_plate(
     rows: dict[str, sd.Scenario], row: str
 ) -> None:
-    assert sd.simulate(rows[row], margin=False).status == "left_workspace"
+    assert sd.simulate(rows[row], judge_stability=False).status == "left_workspace"
 
 
 def test_a_multibody_plant_gives_the_same(rows: dict[str, sd.Scenario]) -> None:
     scenario = replace(rows["delay_lqi_200"], plant=PlantConfig(kind="multibody"))
-    result = sd.simulate(scenario, margin=False)
+    result = sd.simulate(scenario, judge_stability=False)
     assert result.accumulated_error == pytest.approx(82, abs=1)
 
 
@@ -114,7 +114,7 @@ def test_the_table_has_paper_printed_and_reproduced_beside_each_other(
     rows: dict[str, sd.Scenario],
 ) -> None:
     names = ("lqr", "delay_lqr", "delay_lqi", "delay_lqi_200")
-    results = {name: sd.simulate(rows[name], margin=False) for name in names}
+    results = {name: sd.simulate(rows[name], judge_stability=False) for name in names}
     table, told = of_the_paper(results)
     found = {row[0]: [str(cell) for cell in row[1:]] for row in table.rows}
     blind = found["LQR, delay-blind"]
@@ -146,7 +146,9 @@ def test_it_is_shown_once_and_every_row_is_in_the_summary(
 def test_other_comparisons_have_no_such_table(short: dict[str, sd.SimulationResult]) -> None:
     assert not table_two_blocks({name: short[name] for name in CONTROLLERS})
     settings = ["duration=0.3", "delay.steps=2"]
-    other = sd.simulate(load_comparison("table2", (), settings)["delay_lqi_sum"], margin=False)
+    other = sd.simulate(
+        load_comparison("table2", (), settings)["delay_lqi_sum"], judge_stability=False
+    )
     assert not table_two_blocks({"delay_lqi_sum": other})
 
 
@@ -160,7 +162,7 @@ def test_more_room_alone_is_not_enough(tmp_path: Path) -> None:
     room = largest_factor(experiment.mechanism, experiment.reference, check_instants(10.0))
     assert room.value > 1.7
     for row in ("lqr", "lqi", "delay_lqr", "delay_lqi", "delay_lqi_200"):
-        assert sd.simulate(rows[row], margin=False).status == "left_workspace", row
+        assert sd.simulate(rows[row], judge_stability=False).status == "left_workspace", row
 
 
 def test_the_papers_model_makes_a_loop_that_grows_whatever_the_weights() -> None:
@@ -176,5 +178,5 @@ def test_nobody_is_lost_before_the_first_torque_and_for_some_time_after() -> Non
     """Theory 33: 0.8 s is when the first torque acts, and it takes time to move a plate."""
     for weight in (1.0, 1e8):
         settings = ("start=rest", f"controller.w_Q={weight}", "controller.model=multibody")
-        result = sd.simulate(sd.load_scenario("paper", "lqi", settings), margin=False)
+        result = sd.simulate(sd.load_scenario("paper", "lqi", settings), judge_stability=False)
         assert result.stopped is not None and result.stopped.time > 1.05

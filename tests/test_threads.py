@@ -29,7 +29,7 @@ def variants(duration: float) -> Iterable[tuple[str, ...]]:
 
 
 def run(settings: tuple[str, ...]) -> xr.Dataset:
-    return sd.simulate(sd.load_scenario("paper", settings=settings), margin=False).signals
+    return sd.simulate(sd.load_scenario("paper", settings=settings), judge_stability=False).signals
 
 
 def differing(settings: list[tuple[str, ...]], threads: int) -> list[tuple[str, ...]]:
@@ -76,9 +76,11 @@ def test_linear_algebra_stays_on_one_thread_until_the_last_run_ends(monkeypatch)
     with ThreadPoolExecutor(2) as pool:
         pool.submit(set_blas_threads, 2).result(10)
         assert blas_threads() == {2}
-        first = pool.submit(simulation.simulate, sd.Scenario(duration=1.0), margin=False)
+        first = pool.submit(simulation.simulate, sd.Scenario(duration=1.0), judge_stability=False)
         assert begun.wait(10)
-        pool.submit(simulation.simulate, sd.Scenario(duration=2.0), margin=False).result(10)
+        pool.submit(simulation.simulate, sd.Scenario(duration=2.0), judge_stability=False).result(
+            10
+        )
         assert seen == [{1}] * 3
         assert blas_threads() == {2}
 

@@ -51,7 +51,9 @@ def paper_with(folder: Path, effort: float | None, masses: float = 1.0) -> str:
 def weak(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SimulationResult]:
     """The paper's experiment with motors of 0.3 N m on both plants."""
     motors = paper_with(tmp_path_factory.mktemp("weak"), WEAK)
-    return {plant: simulate(scenario(motors, plant=plant), margin=False) for plant in PLANTS}
+    return {
+        plant: simulate(scenario(motors, plant=plant), judge_stability=False) for plant in PLANTS
+    }
 
 
 def saturated(run: SimulationResult) -> int:
@@ -92,13 +94,14 @@ def test_applied_is_what_the_limit_lets_through_a_delay_later(
 def test_a_heavy_machine_is_not_held_back_without_a_word(tmp_path: Path, plant: str) -> None:
     """A thousand times the masses take a thousand times the torque, which the motors lack."""
     motors = paper_with(tmp_path, 10.0, masses=1000.0)
-    run = simulate(scenario(motors, "duration=2.5", plant=plant), margin=False)
+    run = simulate(scenario(motors, "duration=2.5", plant=plant), judge_stability=False)
     assert saturated(run) > 10
     assert run.summary["peak_torque_applied"] == 10.0
     free = simulate(
-        scenario(motors, "duration=2.5", "actuator.torque_limit=none", plant=plant), margin=False
+        scenario(motors, "duration=2.5", "actuator.torque_limit=none", plant=plant),
+        judge_stability=False,
     )
-    light = simulate(scenario("duration=2.5", plant=plant), margin=False)
+    light = simulate(scenario("duration=2.5", plant=plant), judge_stability=False)
     assert saturated(free) == saturated(light) == 0
     assert free.summary["peak_torque_applied"] == pytest.approx(655.86, abs=0.01)
     assert free.accumulated_error == pytest.approx(light.accumulated_error, rel=1e-3)
@@ -200,7 +203,7 @@ def test_a_limit_of_the_machine_alone_plans_nothing() -> None:
 
 def test_the_papers_experiment_does_not_feel_its_motors_limit() -> None:
     usual, free = (
-        simulate(scenario(*s), margin=False) for s in ((), ("actuator.torque_limit=none",))
+        simulate(scenario(*s), judge_stability=False) for s in ((), ("actuator.torque_limit=none",))
     )
     assert usual.accumulated_error == free.accumulated_error == pytest.approx(21.047, abs=0.001)
     assert usual.summary["peak_torque"] == usual.summary["peak_torque_applied"]
@@ -218,7 +221,7 @@ def test_torques_in_flight_at_the_start_keep_it_too(tmp_path: Path, queue: str) 
         scenario(
             motors, "plant.gravity=true", f"queue={queue}", "start=on_reference", "duration=1"
         ),
-        margin=False,
+        judge_stability=False,
     )
     assert np.abs(run.signals.torque_applied.values).max() == 0.9
     loop = build_closed_loop(run.scenario)

@@ -30,7 +30,7 @@ ROUGH = (
 
 def run(*settings: str, controller: str = "delay_lqi", **more: object) -> sd.SimulationResult:
     scenario = sd.load_scenario("paper", controller, (*ON_REFERENCE, *settings))
-    return sd.simulate(scenario, margin=False, **more)
+    return sd.simulate(scenario, judge_stability=False, **more)
 
 
 def test_both_plants_go_the_same_way() -> None:
@@ -127,11 +127,11 @@ def machine(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
 def test_the_plant_is_the_machine_that_the_scenario_says(machine: Path, kind: str) -> None:
-    """As with `truth`; the controller knows the other one."""
+    """As with `true_mechanism`; the controller knows the other one."""
     settings = (f"plant.kind={kind}", "duration=0.5")
     found = run(*settings, f"plant.mechanism={machine}")
     truth = dataclasses.replace(PAPER, rod_lengths=PAPER.rod_lengths + 3e-4)
-    expected = run(*settings, truth=truth)
+    expected = run(*settings, true_mechanism=truth)
     assert np.abs(found.signals.pose - expected.signals.pose).max() < 1e-12
     assert np.abs(found.signals.pose - run(*settings).signals.pose).max() > 1e-6
     experiment = prepare(found.scenario)

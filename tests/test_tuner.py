@@ -141,7 +141,9 @@ def at_samples(result: sd.SimulationResult) -> Any:
 @pytest.fixture(scope="module")
 def tuned(tmp_path_factory: pytest.TempPathFactory) -> sd.SimulationResult:
     """The paper's whole experiment with a network."""
-    return sd.simulate(scenario(tmp_path_factory.mktemp("tuned"), small_network()), margin=False)
+    return sd.simulate(
+        scenario(tmp_path_factory.mktemp("tuned"), small_network()), judge_stability=False
+    )
 
 
 def test_the_papers_experiment_completes_with_a_network(tuned: sd.SimulationResult) -> None:
@@ -190,7 +192,9 @@ def test_the_network_in_the_loop_is_the_torch_network(tuned: sd.SimulationResult
 def test_recorded_densities_are_those_of_the_recorded_signals(tmp_path: Path, kind: Any) -> None:
     """On the multibody plant, where the state is the same just before and after an instant."""
     settings = ("plant.kind=multibody", "duration=4.0")
-    result = sd.simulate(scenario(tmp_path, small_network(density=kind), *settings), margin=False)
+    result = sd.simulate(
+        scenario(tmp_path, small_network(density=kind), *settings), judge_stability=False
+    )
     s = at_samples(result)
     rate_error = s.rates.values - s.reference_rates.values
     samples = np.hstack([s.error.values, rate_error, s.torque_commanded.values])
@@ -230,7 +234,7 @@ def subsystems(loop: ClosedLoop) -> set[str]:
 
 def test_fixed_weights_stay_and_a_network_takes_their_place(tmp_path: Path) -> None:
     fixed = scenario(tmp_path, None, "duration=1.0", "controller.w_R=3")
-    result = sd.simulate(fixed, margin=False)
+    result = sd.simulate(fixed, judge_stability=False)
     np.testing.assert_array_equal(result.signals.weights.values, np.tile([1.0, 3.0], (51, 1)))
     assert result.summary["counts"]["tuner_fallbacks"] == 0
     with_network = build_closed_loop(scenario(tmp_path, small_network()))
@@ -248,8 +252,10 @@ def test_fixed_weights_stay_and_a_network_takes_their_place(tmp_path: Path) -> N
 
 def test_a_network_that_fails_is_a_controller_with_fixed_weights(tmp_path: Path) -> None:
     settings = ("duration=2.0", "controller.w_R=1000")  # outside the network's bounds
-    failing = sd.simulate(scenario(tmp_path, small_network(**OVERFLOWING), *settings), margin=False)
-    fixed = sd.simulate(scenario(tmp_path, None, *settings), margin=False)
+    failing = sd.simulate(
+        scenario(tmp_path, small_network(**OVERFLOWING), *settings), judge_stability=False
+    )
+    fixed = sd.simulate(scenario(tmp_path, None, *settings), judge_stability=False)
     # But for the scenario among the attributes.
     assert failing.signals.drop_attrs(deep=False).identical(fixed.signals.drop_attrs(deep=False))
     assert failing.summary["counts"]["tuner_fallbacks"] == 20  # all samples but the first
@@ -267,7 +273,7 @@ def test_missed_measurements_do_not_reach_the_weights(
             output.SetFromVector(np.full(12, np.nan))
 
     monkeypatch.setattr(Sensor, "_measure", lose)
-    result = sd.simulate(scenario(tmp_path, small_network(), "duration=4.5"), margin=False)
+    result = sd.simulate(scenario(tmp_path, small_network(), "duration=4.5"), judge_stability=False)
     assert result.status == "completed"
     counts = result.summary["counts"]
     assert counts["bad_measurements"] == 3 and counts["tuner_fallbacks"] == 0
@@ -285,7 +291,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     saved = []
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         settings = ("duration=2.0", noise, f"sensor.seed={seed}")
-        sd.simulate(scenario(tmp_path, small_network(), *settings), margin=False).save(
+        sd.simulate(scenario(tmp_path, small_network(), *settings), judge_stability=False).save(
             tmp_path / name
         )
         saved.append((tmp_path / name / "signals.nc").read_bytes())

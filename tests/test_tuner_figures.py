@@ -34,7 +34,9 @@ def tuned_scenario(folder: Path, *settings: str) -> sd.Scenario:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> sd.SimulationResult:
-    return sd.simulate(tuned_scenario(tmp_path_factory.mktemp("run"), "duration=2.0"), margin=False)
+    return sd.simulate(
+        tuned_scenario(tmp_path_factory.mktemp("run"), "duration=2.0"), judge_stability=False
+    )
 
 
 def visible_texts(ax: Axes) -> list[Text]:

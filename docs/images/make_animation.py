@@ -105,8 +105,8 @@ def film(name: str) -> list[Image.Image]:
     """A run of a controller; once the plate has left its workspace it stays where it did."""
     settings = ("plant.kind=exact", f"duration={SECONDS}", f"log_period={1 / FRAMES_PER_S}")
     scenario = sd.load_scenario("paper", name, settings)
-    whole = sd.simulate(sd.load_scenario("paper", "predictor_lqi", settings), margin=False)
-    run = sd.simulate(scenario, margin=False)
+    whole = sd.simulate(sd.load_scenario("paper", "predictor_lqi", settings), judge_stability=False)
+    run = sd.simulate(scenario, judge_stability=False)
     studio, font = Studio(sd.load_mechanism("paper")), lettering(15)
     pictures = []
     for time in np.arange(0, SECONDS, 1 / FRAMES_PER_S):

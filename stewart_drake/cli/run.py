@@ -81,7 +81,7 @@ def simulate(
         _await_viewer(viewer)
     name = Path(scenario).stem
     with progress_bars([name], experiment.scenario.duration, quiet) as progress:
-        result = run(experiment, progress=progress[name], meshcat=viewer, margin=margin)
+        result = run(experiment, progress=progress[name], meshcat=viewer, judge_stability=margin)
     delivery.say(run_document(result).plain())
     _write_run(delivery, result, experiment.truth, name, csv, replay or meshcat)
     status = delivery.end(result.summary, interrupted=result.status == "interrupted")

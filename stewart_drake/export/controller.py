@@ -130,7 +130,7 @@ def recorded_law(scenario: Scenario) -> RecordedLqi:
         return found[-1]
 
     exact = replace(scenario, plant=replace(scenario.plant, kind="exact"))
-    result = simulate(exact, law=recorded, margin=False)
+    result = simulate(exact, modify_law=recorded, judge_stability=False)
     if result.failure is not None:
         raise ConfigError(
             f"scenario: {result.failure}; expected one whose run the test can replay to its end"

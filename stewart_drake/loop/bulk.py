@@ -210,7 +210,9 @@ def _ending(
 
 def _in_drake(scenario: Scenario, truth: Mechanism | None, field: str) -> Ending:
     # A log of one's own period need not hold the samples.
-    result = simulate(dataclasses.replace(scenario, log_period=None), truth=truth, margin=False)
+    result = simulate(
+        dataclasses.replace(scenario, log_period=None), true_mechanism=truth, judge_stability=False
+    )
     if result.status == "interrupted":
         raise KeyboardInterrupt
     return ending_of(result, f"drake, {field}")

@@ -121,8 +121,8 @@ def build_closed_loop(
     Args:
         scenario: what to build, or what `prepare` made of it.
         meshcat: where the multibody plant is shown while it is simulated, or None.
-        **own: controller, reference, disturbance, law, sensor, link, tuner of one's own, as of
-            `simulate`.
+        **own: controller, reference, disturbance, modify_law, sensor, link, tuner, true_mechanism,
+            as of `simulate`.
 
     Raises:
         ConfigError: bad input, an unreachable reference.

@@ -182,13 +182,13 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
 
 
 def concrete(
-    scenario: Scenario | Experiment, truth: Mechanism | None = None, **own: Any
+    scenario: Scenario | Experiment, true_mechanism: Mechanism | None = None, **own: Any
 ) -> Experiment:
     """What `prepare` makes of a scenario and of what is the user's own, or an Experiment as it is.
 
     Args:
         scenario: either.
-        truth: see `prepare`.
+        true_mechanism: the machine to simulate, that of the scenario's plant if None.
         **own: see `loop.simulation.simulate`.
 
     Raises:
@@ -196,8 +196,8 @@ def concrete(
         TypeError: something of one's own beside an Experiment, which has its own.
     """
     if not isinstance(scenario, Experiment):
-        return prepare(scenario, truth, take(own))
-    for name, thing in ({"truth": truth} | own).items():
+        return prepare(scenario, true_mechanism, take(own))
+    for name, thing in ({"true_mechanism": true_mechanism} | own).items():
         if thing is not None:
             raise TypeError(f"{name}: got one with an Experiment, which has its own; expected None")
     return scenario

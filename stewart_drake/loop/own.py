@@ -120,8 +120,8 @@ class Own(NamedTuple):
         made, kind = self.law(law), type(law)
         if not isinstance(made, kind):
             raise ConfigError(
-                f"law: got a {type(made).__name__} from the function; expected a {kind.__name__}, "
-                "such as dataclasses.replace(law, ...)"
+                f"modify_law: got a {type(made).__name__} from the function; expected a "
+                f"{kind.__name__}, such as dataclasses.replace(law, ...)"
             )
         return made
 
@@ -143,12 +143,12 @@ def take(given: Mapping[str, Any]) -> Own:
     systems = {role: _make(role, given[role], System) for role in ROLES if role in given}
     for role, system in systems.items():
         _check(role, system)
-    reference, law = given.get("reference"), given.get("law")
+    reference, law = given.get("reference"), given.get("modify_law")
     if law is not None and not callable(law):
         raise ConfigError(
-            f"law: got a {type(law).__name__}; expected a function of the scenario's law"
+            f"modify_law: got a {type(law).__name__}; expected a function of the scenario's law"
         )
-    for other in ("law", "tuner"):
+    for other in ("modify_law", "tuner"):
         if "controller" in systems and other in given:
             raise ConfigError(
                 f"{other}: got one with a controller of your own; expected one of the two"

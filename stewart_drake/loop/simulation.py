@@ -39,14 +39,14 @@ def simulate(
     controller: OwnSystem | None = None,
     reference: OwnReference | None = None,
     disturbance: OwnSystem | None = None,
-    law: OwnLaw | None = None,
+    modify_law: OwnLaw | None = None,
     sensor: OwnSystem | None = None,
     link: OwnSystem | None = None,
     tuner: OwnSystem | None = None,
     progress: Progress | None = None,
     meshcat: Meshcat | None = None,
-    truth: Mechanism | None = None,
-    margin: ControllerMargin | bool = True,
+    true_mechanism: Mechanism | None = None,
+    judge_stability: ControllerMargin | bool = True,
 ) -> SimulationResult:
     """Run a scenario from t = 0 to its duration, or until the plate leaves its workspace.
 
@@ -69,8 +69,8 @@ def simulate(
         disturbance: a Drake system with the output `torque` (6, N m), added at the shafts, or
             `wrench` (6: moment in N m, force in N, in the world, at the plate's COM), or both.
             Nobody is told of it.
-        law: a function that takes the `law.predictive_lqi.PredictiveLqi` that the scenario asks for
-            and returns the one to be used, such as `dataclasses.replace(law, observer=Mine())`.
+        modify_law: a function that takes the scenario's law, a `law.predictive_lqi.PredictiveLqi`,
+            and returns the one to use, such as `dataclasses.replace(law, observer=Mine())`.
         sensor: a Drake system with the input `state` (12) and the output `measurement` (12; NaN is
             lost), read every `controller.period`; the scenario's noise and faults are its affair.
             Neither this nor a controller goes with the scenario's encoders.
@@ -83,14 +83,14 @@ def simulate(
         progress: called every 20 ms of simulated time; what it raises reaches the caller.
         meshcat: where the machine, its reference and the torques are shown live, or None; the run
             then takes at least as long as its duration.
-        truth: the machine to simulate where it is not the one that the controller knows.
-        margin: whether to judge the loop beforehand (`controller_margin`, tenths of a second), for
-            `controller_margin` and `warnings` of the summary; or how it was judged already. Without
-            it, as where many runs are asked for, `controller_margin` is None.
+        true_mechanism: the machine to simulate; by default that of the scenario's plant.
+        judge_stability: whether to judge the loop before the run, in some tenths of a second, for
+            `controller_margin` and `warnings` of the summary; or the `controller_margin` that is
+            known already. With false, for many runs, `controller_margin` of the summary is None.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
-        TypeError: what is no scenario at all, or a truth beside what was prepared with one.
+        TypeError: what is no scenario at all, or a `true_mechanism` beside an `Experiment`.
     """
     if isinstance(scenario, str | Path):
         scenario = load_scenario(scenario)
@@ -103,20 +103,20 @@ def simulate(
     with one_blas_thread:
         experiment = concrete(
             scenario,
-            truth,
+            true_mechanism,
             controller=controller,
             reference=reference,
             disturbance=disturbance,
-            law=law,
+            modify_law=modify_law,
             sensor=sensor,
             link=link,
             tuner=tuner,
         )
-        if isinstance(margin, bool):
-            judgeable = margin and experiment.own.unjudged is None
+        if isinstance(judge_stability, bool):
+            judgeable = judge_stability and experiment.own.unjudged is None
             judged = controller_margin(experiment) if judgeable else None
         else:
-            judged = margin
+            judged = judge_stability
         return _run(experiment, judged, progress, meshcat)
 
 
