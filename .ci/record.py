@@ -43,7 +43,7 @@ CONDITIONS = {
     "coulomb": (
         "predictor_lqi",
         (
-            "controller.estimate_coulomb=true",
+            "controller.estimate=[torque_bias,payload,damping,coulomb]",
             "plant.coulomb_friction=1e-4",
             "start=on_reference",
             "queue=reference",

@@ -43,7 +43,7 @@ BIAS = 3e-4
 """Torque bias of each motor, N m; its sign is drawn."""
 
 ON = ("start=on_reference", "queue=reference")
-NONE = "controller.estimator=none"
+NONE = "controller.estimate=[]"
 PAYLOAD = "plant.payload_mass=0.4"
 HALF = f"reference.amplitude={(0.5 * AMPLITUDE).tolist()}"
 NETWORK = (*ON, "link.kind=network", "link.low=0.5", "link.high=0.9", "link.playout=0.9")
@@ -198,7 +198,7 @@ def friction() -> list[Row]:
         for drawn in ("", "noise"):
             row = Row(f"{name}-{drawn}".strip("-"), words, (*ON, *plant), drawn)
             row = row._replace(words=f"{words}, noise" if drawn else words)
-            look = (*row.settings, "controller.estimate_coulomb=true")
+            look = (*row.settings, "controller.estimate=[torque_bias,payload,damping,coulomb]")
             rows += [
                 row,
                 row._replace(name=f"{row.name}-found", settings=look),

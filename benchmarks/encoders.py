@@ -169,7 +169,10 @@ def _left(settings: Sequence[str], seed: int, instants: Sequence[float]) -> list
     """Largest error in rad of the six offsets at instants, s."""
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], 6)
     offsets = MOUNTED * signs
-    mounted = (f"sensor.offset={offsets.tolist()}", "controller.estimate_offsets=true")
+    mounted = (
+        f"sensor.offset={offsets.tolist()}",
+        "controller.estimate=[torque_bias,payload,damping,offsets]",
+    )
     base = ("plant.kind=exact", "sensor.kind=encoders", f"sensor.seed={seed}", *ON_REFERENCE)
     loop = build_closed_loop(sd.load_scenario("paper", settings=(*base, *mounted, *settings)))
     simulator, found = make_simulator(loop), []
@@ -186,8 +189,8 @@ def offsets() -> str:
     signs = np.random.default_rng(FRESH).choice([-1.0, 1.0], 6)
     mounted = f"sensor.offset={(MOUNTED * signs).tolist()}"
     rows: Rows = {}
-    for name, found in (("not looked for", "false"), ("estimated", "true")):
-        estimate = f"controller.estimate_offsets={found}"
+    for name, found in (("not looked for", ""), ("estimated", ",offsets")):
+        estimate = f"controller.estimate=[torque_bias,payload,damping{found}]"
         rows[f"14 bit, 1 kHz, {name}"] = (*ON_REFERENCE, *FINE, NARROW, mounted, estimate)
     text = collect("Offsets of 0.1 degree, narrow priors", rows)
     instants = (2.0, 5.0, 10.0)

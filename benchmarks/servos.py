@@ -43,7 +43,7 @@ TOLERANCES = {"p_WS": 3e-4, "p_PQ": 3e-4, "crank_lengths": 1e-4, "rod_lengths": 
 MACHINES = range(101, 106)
 SERVOS = ("servo_preview", "servo_feedforward")
 LAWS = ("predictor_lqi", "adaptive_lqi")
-KNOWN = "controller.estimator=none"
+KNOWN = "controller.estimate=[]"
 PUSH = partial(Push, (1.0, 0.0, 0.0), (4.0, np.inf))
 """1 N along x from t = 4 s on."""
 

@@ -24,7 +24,7 @@ from stewart_drake.scenario.signals import PARAMETERS
 EXACT = "plant.kind=exact"
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 PAYLOAD = "plant.payload_mass=0.4"
-NONE = "controller.estimator=none"
+NONE = "controller.estimate=[]"
 COVERAGE_SEEDS = range(7400, 7500)
 AMPLITUDES = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
 

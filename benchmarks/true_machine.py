@@ -47,7 +47,7 @@ PLANTS: dict[str, tuple[str, ...]] = {
 }
 LAWS: dict[str, tuple[str, ...]] = {
     "default": (),
-    "estimate_coulomb": ("controller.estimate_coulomb=true",),
+    "coulomb": ("controller.estimate=[torque_bias,payload,damping,coulomb]",),
 }
 NOISE = "sensor.noise_std=[" + ",".join(f"{1e-3 * a:.10g}" for a in AMPLITUDES) + "]"
 PRIORS = (None, 1e-2, 3e-3, 1e-3, 3e-4)

@@ -37,7 +37,7 @@ ON_REFERENCE = (*EXACT, "start=on_reference", "queue=reference")
 BASES = {
     "as shipped, from rest": EXACT,
     "as shipped, on the reference": ON_REFERENCE,
-    "no estimator, on the reference": (*ON_REFERENCE, "controller.estimator=none"),
+    "no estimator, on the reference": (*ON_REFERENCE, "controller.estimate=[]"),
 }
 DATA = {
     "paper": ("as shipped, from rest", 0),

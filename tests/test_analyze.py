@@ -218,7 +218,7 @@ def test_cells_are_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a short run: one that completes, one that leaves, one that is out of reach."""
     monkeypatch.setattr(delay_map, "FACTORS", (0.5, 1.25))
     monkeypatch.setattr(delay_map, "map_delays", lambda _: [0, 8])
-    scenario = sd.load_scenario("paper", settings=("duration=1.1", "controller.estimator=none"))
+    scenario = sd.load_scenario("paper", settings=("duration=1.1", "controller.estimate=[]"))
     seen: list[tuple[int, int]] = []
     cells, interrupted = delay_map.delay_map(scenario, lambda done, all_: seen.append((done, all_)))
     assert not interrupted
@@ -234,7 +234,7 @@ def test_cells_are_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
         "paper",
         settings=(
             "duration=1.1",
-            "controller.estimator=none",
+            "controller.estimate=[]",
             "plant.kind=exact",
             "reference.amplitude=[0.1308996939, 0.1308996939, 0.1308996939, 0.01, 0.01, 0.04]",
         ),
@@ -253,7 +253,7 @@ def test_ctrl_c_keeps_the_cells_that_are_there(monkeypatch: pytest.MonkeyPatch) 
         raise KeyboardInterrupt
 
     monkeypatch.setattr(delay_map, "run_jobs", interrupted_jobs)
-    scenario = sd.load_scenario("paper", settings=("duration=0.2", "controller.estimator=none"))
+    scenario = sd.load_scenario("paper", settings=("duration=0.2", "controller.estimate=[]"))
     cells, interrupted = delay_map.delay_map(scenario)
     assert interrupted
     assert cells[0].status == "completed"

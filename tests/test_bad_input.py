@@ -106,6 +106,7 @@ SCENARIO_LISTS: dict[str, list[Any]] = {
     "plant.torque_bias": [0.0] * 6,
     "plant.payload_position": [0.0] * 3,
     "controller.prior.rates": [1.0] * 6,
+    "controller.estimate": ["torque_bias", "payload", "damping"],
     "sensor.noise_std": [0.0] * 12,
     "sensor.offset": [0.0] * 6,
 }

@@ -43,7 +43,7 @@ from tests.oracles import relative
 WEIGHTS = np.array([1.0, 1.0])
 HOME = np.concatenate([PAPER.home, np.zeros(12)])
 PLAIN = (
-    "controller.estimator=none",
+    "controller.estimate=[]",
     "controller.feedforward=none",
     "controller.weight_scaling=identity",
 )
@@ -221,7 +221,7 @@ def test_nonlinear_law_is_the_linear_one_where_errors_are_small(
         "reference.kind=hold",
         f"delay.steps={steps}",
         f"delay.fraction={fraction}",
-        "controller.estimator=none",
+        "controller.estimate=[]",
         "controller.feedforward=equilibrium",
     )
     nonlinear = law_of(*settings, substeps=16)
@@ -287,7 +287,7 @@ def test_only_feedforward_makes_the_linear_law_see_a_moving_reference(feedforwar
 @pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (8, 0.0), (3, 0.5), (1, 0.3), (0, 0.3)])
 def test_state_is_predicted_through_the_torques_in_flight(steps: int, fraction: float) -> None:
     """What the gain is designed for at sample k is where the plant is at sample k + mu."""
-    law = law_of(f"delay.steps={steps}", f"delay.fraction={fraction}", "controller.estimator=none")
+    law = law_of(f"delay.steps={steps}", f"delay.fraction={fraction}", "controller.estimate=[]")
     points: list[Array] = []
 
     class Spy(MultibodyModel):
@@ -373,7 +373,7 @@ def test_a_known_reference_is_followed_at_a_high_order_of_the_period(
         law = law_of(
             f"controller.period={period}",
             f"controller.prediction={prediction}",
-            "controller.estimator=none",
+            "controller.estimate=[]",
             "delay.steps=2",
             f"delay.fraction={fraction}",
             substeps=4,
@@ -399,7 +399,7 @@ def test_a_known_reference_is_followed_at_a_high_order_of_the_period(
 @pytest.mark.parametrize("prediction", ["nonlinear", "linear"])
 def test_what_flies_keeps_the_limit_and_saturated_steps_are_counted(prediction: str) -> None:
     """The law asks as if there were no limit, and believes in what that lets through."""
-    law = law_of(f"controller.prediction={prediction}", "controller.estimator=none", limit=0.02)
+    law = law_of(f"controller.prediction={prediction}", "controller.estimate=[]", limit=0.02)
     rng, memory, preview = np.random.default_rng(4), sampled(law), at_home(law)
     unlimited_plant = dataclasses.replace(law.plant, motors=TorqueLimit())
     free = dataclasses.replace(law, plant=unlimited_plant)
@@ -469,7 +469,7 @@ def test_predicted_integral_waits_in_the_same_periods(fraction: float) -> None:
 
 # Bad days.
 
-FILTERS = ["controller.estimator=parameters", "controller.estimator=none"]
+FILTERS = ["controller.estimate=[torque_bias,payload,damping]", "controller.estimate=[]"]
 
 
 @pytest.mark.parametrize("estimator", FILTERS)
@@ -507,7 +507,7 @@ def test_torque_is_finite_whatever_the_sensor_says(
 @pytest.mark.parametrize("steps", [0, 1, 4])
 def test_without_a_measurement_the_state_goes_on_by_the_model(steps: int, fraction: float) -> None:
     """The right torques act in the right periods: the state is the plant's to rounding."""
-    law = law_of(f"delay.steps={steps}", f"delay.fraction={fraction}", "controller.estimator=none")
+    law = law_of(f"delay.steps={steps}", f"delay.fraction={fraction}", "controller.estimate=[]")
     reference = sine(0.5)
     rng = np.random.default_rng(5)
     queue = nominal_queue(law, reference) + 2e-3 * rng.normal(0, 1, (law.timeline.queue_length, 6))
@@ -522,7 +522,7 @@ def test_without_a_measurement_the_state_goes_on_by_the_model(steps: int, fracti
 def test_a_finite_but_absurd_measurement_does_no_lasting_harm(
     channel: int | slice, size: float
 ) -> None:
-    law = law_of("delay.steps=2", "controller.estimator=parameters", limit=1.0)
+    law = law_of("delay.steps=2", "controller.estimate=[torque_bias,payload,damping]", limit=1.0)
     reference = sine(0.3)
 
     def seen(k: int, x: Array) -> Array:
@@ -539,7 +539,7 @@ def test_a_finite_but_absurd_measurement_does_no_lasting_harm(
 
 
 def test_a_plate_out_of_reach_gets_the_feedforward_alone() -> None:
-    law = law_of("controller.estimator=none", "delay.steps=0")
+    law = law_of("controller.estimate=[]", "delay.steps=0")
     preview = at_home(law)
     far = HOME[:12] + np.eye(12)[5] * 0.3
     memory = sampled(law, gain=np.full((6, 18), 1e3), state=far, in_flight=np.zeros((1, 6)))
@@ -581,7 +581,7 @@ def test_a_failed_riccati_equation_keeps_the_last_good_gain(
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
 def test_the_last_good_gain_sees_the_same_errors(fraction: float) -> None:
     """What held torques leave of the rates is no error to it either."""
-    law = law_of("delay.steps=2", f"delay.fraction={fraction}", "controller.estimator=none")
+    law = law_of("delay.steps=2", f"delay.fraction={fraction}", "controller.estimate=[]")
     preview = np.array([sine(1.0)(max(0.0, 0.3 + t)) for t in law.preview_times])
     memory, x = sampled(law), preview[0, :12] + 1e-3
     well = step(law, memory, x, preview)
@@ -594,7 +594,7 @@ def test_the_last_good_gain_sees_the_same_errors(fraction: float) -> None:
 
 @pytest.mark.parametrize("weights", [[np.nan, 1.0], [1.0, 0.0], [-1.0, 1.0], [np.inf, 1.0]])
 def test_bad_weights_keep_the_last_good_gain(weights: list[float]) -> None:
-    law = law_of("delay.steps=2", "controller.estimator=none")
+    law = law_of("delay.steps=2", "controller.estimate=[]")
     good = step(law, sampled(law), HOME[:12], at_home(law))
     after = step(law, good, HOME[:12], at_home(law), np.array(weights))
     assert after.gain is good.gain

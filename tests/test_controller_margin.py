@@ -96,7 +96,7 @@ SHORT_PERIOD = ("controller.period=0.02", "delay.steps=5")
 """Over which the law's own integration of an unstable plant is exact enough."""
 ALONE = (
     *HOLD,
-    "controller.estimator=none",
+    "controller.estimate=[]",
     "controller.catch_up=0",
     "controller.open_loop_start=false",
 )

@@ -424,7 +424,7 @@ def test_the_comparison_shows_it_where_the_delay_is_believed_wrongly() -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    for wrong in ("controller.estimator=none", "controller.prediction=linear"):
+    for wrong in ("controller.estimate=[]", "controller.prediction=linear"):
         with pytest.raises(ConfigError, match=r"controller\.delay_estimator: got 'constant'"):
             looped(wrong)
     with pytest.raises(ConfigError, match=r"controller\.delay_max: got 0\.5 .* believed"):

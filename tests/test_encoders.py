@@ -235,7 +235,13 @@ def test_offsets_are_found() -> None:
     offsets = np.deg2rad(0.1) * np.array([1, -1, 1, 1, -1, -1])
     known = "controller.prior={torque_bias: 0.003, payload: 0.5, damping: 0.003}"
     mounted = f"sensor.offset={offsets.tolist()}"
-    settings = (*ON_REFERENCE, *FINE, known, mounted, "controller.estimate_offsets=true")
+    settings = (
+        *ON_REFERENCE,
+        *FINE,
+        known,
+        mounted,
+        "controller.estimate=[torque_bias,payload,damping,offsets]",
+    )
     loop = build_closed_loop(load_scenario("paper", settings=settings))
     simulator = make_simulator(loop)
     simulator.AdvanceTo(10.0)
@@ -248,7 +254,7 @@ def test_offsets_are_found() -> None:
 
 def test_without_an_estimator_rates_are_differences() -> None:
     """Without a delay, which they would not survive."""
-    settings = ("controller.estimator=none", "delay.steps=0", "controller.period=0.02")
+    settings = ("controller.estimate=[]", "delay.steps=0", "controller.period=0.02")
     result = run(*ON_REFERENCE, "sensor.bits=17", *settings)
     assert result.status == "completed"
     judged = simulate(load_scenario("paper", settings=(*ENCODERS, *settings, "duration=0.1")))
@@ -286,7 +292,10 @@ def test_densities_and_data_sets_are_of_the_estimate() -> None:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        (("controller.estimate_offsets=true",), "estimate_offsets: got true with sensor.kind"),
+        (
+            ("controller.estimate=[torque_bias,payload,damping,offsets]",),
+            "controller.estimate: got offsets with sensor.kind",
+        ),
         (("sensor.faults=[{kind: missing, from: 0, to: 1, leg: 7}]",), "less than or equal to 6"),
         (
             ("sensor.kind=encoders", "sensor.faults=[{kind: frozen, from: 0, to: 1, share: 0.5}]"),

@@ -32,7 +32,7 @@ def newlib() -> None:
 @pytest.mark.parametrize("name", ["paper", "gravity"])
 def test_it_compiles_without_a_warning(name: str, single: bool, tmp_path: Path) -> None:
     """In single precision nothing of the controller is computed in double."""
-    settings = ("controller.estimator=none",) if single else ()
+    settings = ("controller.estimate=[]",) if single else ()
     folder = exported(tmp_path, name, (*settings, "duration=0.5"), single)
     compiler = f"CC={CORTEX_M4 if single else CORTEX_M7}"
     made(folder, " ".join(BESIDE), compiler)  # warnings are errors

@@ -28,7 +28,7 @@ RUNS = {
         *("desktop", ("delay.fraction=0.37", "actuator.torque_limit=0.025", FASTER)),
     ),
     "late measurements": ("motion_base", ("sensor.delay=0.2",)),
-    "without estimator": ("gravity", ("controller.estimator=none",)),
+    "without estimator": ("gravity", ("controller.estimate=[]",)),
 }
 QUICK = ("bad measurements and outliers", "saturation, a fraction of a period")
 BITS = {"bad measurements and outliers": (8, 16, 32), "saturation, a fraction of a period": (64,)}
@@ -139,9 +139,12 @@ def test_a_controller_that_is_off_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_single_precision_without_the_filter_only(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"controller.estimator: got 'parameters' with --single"):
+    with pytest.raises(
+        ConfigError,
+        match=r"controller.estimator: got \['torque_bias', 'payload', 'damping'\] with --single",
+    ):
         exported(tmp_path, "paper", (), single=True)
-    folder = exported(tmp_path, "gravity", ("controller.estimator=none",), single=True)
+    folder = exported(tmp_path, "gravity", ("controller.estimate=[]",), single=True)
     said = made(folder, "test")
     assert "tolerance 1e-02" in said
     error = float(said.split("largest error ")[1].split()[0])
@@ -165,7 +168,7 @@ def test_the_sizes_are_told_and_kept_to(tmp_path: Path) -> None:
     [
         ("paper", ("start=on_reference", "queue=reference")),
         ("paper", ("sensor.delay=0.2", "delay.fraction=0.3")),
-        pytest.param("gravity", ("controller.estimator=none",), marks=pytest.mark.soak),
+        pytest.param("gravity", ("controller.estimate=[]",), marks=pytest.mark.soak),
         pytest.param("gravity", ("delay.steps=0",), marks=pytest.mark.soak),
     ],
     ids=["paper", "late", "without estimator", "no delay"],

@@ -37,7 +37,7 @@ from stewart_drake.tuning.curves import FixedPolicy, Watched, watched_run
 from stewart_drake.types import Array
 
 FOLLOWS = ("plant.kind=exact", "start=on_reference", "queue=reference")
-BLIND = (*FOLLOWS, "controller.estimator=none")
+BLIND = (*FOLLOWS, "controller.estimate=[]")
 
 
 def scenario(*settings: str) -> Scenario:
@@ -260,18 +260,16 @@ def test_predictions_take_a_state_that_is_measured(settings: tuple[str, ...]) ->
 
 
 def test_what_the_rule_is_depends_on_the_estimator() -> None:
-    assert set(weights.RULES) == {"none", "parameters"}
+    assert set(weights.RULES) == {False, True}
     made = []
 
     def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource | None:
         made.append(weights_source(experiment, law))
         return made[-1]
 
-    for estimator in weights.RULES:
-        one = scenario(*FOLLOWS, f"controller.estimator={estimator}", "tuner.kind=rule",
-                       "duration=0.2")  # fmt: skip
-        run_in_bulk(one, tuner=make)
-    assert [one.policy for one in made] == [weights.RULES[e] for e in weights.RULES]
+    for follows in (FOLLOWS, BLIND):
+        run_in_bulk(scenario(*follows, "tuner.kind=rule", "duration=0.2"), tuner=make)
+    assert [one.policy for one in made] == [weights.RULES[True], weights.RULES[False]]
 
 
 @pytest.mark.parametrize(("family", "bound"), [("T", 0.05), ("N2", 0.04)])

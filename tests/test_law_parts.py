@@ -133,9 +133,9 @@ def test_a_measurement_marks_what_is_lost() -> None:
     assert measurement.values[0] == 1.0
 
 
-@pytest.mark.parametrize("observer", ["none", "parameters"])
-def test_who_takes_values_for_those_of_now_refuses_old_ones(observer: str) -> None:
-    law = law_of(f"controller.estimator={observer}", "delay.steps=0")
+@pytest.mark.parametrize("estimate", ["[]", "[torque_bias,payload,damping]"])
+def test_who_takes_values_for_those_of_now_refuses_old_ones(estimate: str) -> None:
+    law = law_of(f"controller.estimate={estimate}", "delay.steps=0")
     old = Measurement.of(HOME[:12], age=0.1)
     memory = law.initial_memory(np.zeros((0, 6)))
     with pytest.raises(ValueError, match=r"got an age of 0\.1 s; expected 0"):
@@ -144,7 +144,7 @@ def test_who_takes_values_for_those_of_now_refuses_old_ones(observer: str) -> No
 
 def test_a_loss_is_told_by_the_mask_alone() -> None:
     """A number in its place is not looked at."""
-    law = law_of("controller.estimator=none", "delay.steps=0")
+    law = law_of("controller.estimate=[]", "delay.steps=0")
     valid = np.ones(12, bool)
     valid[4] = False
     lost = Measurement(HOME[:12] + 1e-3 * np.eye(12)[4], valid)
@@ -470,9 +470,7 @@ def test_the_law_believes_in_the_delay_that_its_observer_believes_in(
     prediction: str, assumed: int
 ) -> None:
     """With torques kept for the longest delay, it is the law that knew it from the start."""
-    known = law_of(
-        "delay.steps=2", "controller.estimator=none", f"controller.prediction={prediction}"
-    )
+    known = law_of("delay.steps=2", "controller.estimate=[]", f"controller.prediction={prediction}")
     reference = sine(0.5)
     queue = nominal_queue(known, reference)
     expected = Loop(known, reference, queue=queue).run(8)
@@ -491,9 +489,7 @@ def test_the_law_believes_in_the_delay_that_its_observer_believes_in(
 @pytest.mark.parametrize(("prediction", "kept"), [("linear", False), ("nonlinear", True)])
 def test_a_gain_for_another_delay_is_used_only_where_it_fits(prediction: str, kept: bool) -> None:
     """The Riccati equation fails at the very sample at which another delay is believed in."""
-    known = law_of(
-        "delay.steps=2", "controller.estimator=none", f"controller.prediction={prediction}"
-    )
+    known = law_of("delay.steps=2", "controller.estimate=[]", f"controller.prediction={prediction}")
     timeline = replace(known.timeline, delay=Delay(3))
     before = replace(known, timeline=timeline)
     law = replace(before, observer=Told(known.timeline))
@@ -513,7 +509,7 @@ def test_a_gain_for_another_delay_is_used_only_where_it_fits(prediction: str, ke
 
 
 def test_a_delay_longer_than_what_is_kept_is_refused() -> None:
-    known = law_of("delay.steps=2", "controller.estimator=none")
+    known = law_of("delay.steps=2", "controller.estimate=[]")
     law = replace(known, observer=Told(replace(known.timeline, delay=Delay(3))))
     with pytest.raises(ValueError, match="2 torques are kept in flight; expected at least the 3"):
         Loop(law, lambda t: HOME).run(1)

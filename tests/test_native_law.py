@@ -173,11 +173,11 @@ CASES: dict[str, tuple[str, tuple[str, ...], Spoil | None]] = {
     "a fraction of a period": ("desktop", ("delay.fraction=0.3",), None),
     "no delay": ("gravity", ("delay.steps=0",), None),
     "less than a period": ("paper", ("delay.steps=0", "delay.fraction=0.5"), None),
-    "without estimator": ("motion_base", ("controller.estimator=none",), None),
+    "without estimator": ("motion_base", ("controller.estimate=[]",), None),
     "saturation": ("paper", (*DIRTY, "actuator.torque_limit=0.03"), None),
     "bad measurements": ("gravity", DIRTY, spoiled),
     "bad measurements without estimator": (
-        *("gravity", (NOISE, "controller.estimator=none"), spoiled),
+        *("gravity", (NOISE, "controller.estimate=[]"), spoiled),
     ),
     "late measurements": ("gravity", (*DIRTY, "sensor.delay=0.2"), spoiled),
     "from the reference": (
@@ -341,7 +341,7 @@ def law_of(*settings: str, controller: str | None = None) -> PredictiveLqi:
         (("controller.period=0.01", "delay.steps=80"), "controller.delay_steps"),
         (("controller.period=0.01", "sensor.delay=0.3"), "sensor.delay"),
         (("link.kind=network",), "link.kind"),
-        (("controller.estimator=none",), None),
+        (("controller.estimate=[]",), None),
         ((), None),
     ],
 )
@@ -369,7 +369,7 @@ def test_a_part_of_ones_own_is_stepped_in_python(library) -> None:
 
 def test_the_summary_says_which(library) -> None:
     for setting, expected in (
-        ("controller.estimator=parameters", "native"),
+        ("controller.estimate=[torque_bias,payload,damping]", "native"),
         ("controller.prediction=linear", "python (controller.prediction)"),
     ):
         scenario = load_scenario("paper", settings=["duration=0.3", setting])

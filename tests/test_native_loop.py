@@ -60,10 +60,10 @@ LOOPS = {
         "paper", "duration=1", "delay.steps=0", "delay.fraction=0.6", "start=on_reference"
     ),
     "blind": scenario("paper", "duration=3", controller="lqi"),
-    "leaves": scenario("paper", "plant.payload_mass=3.0", "controller.estimator=none"),
+    "leaves": scenario("paper", "plant.payload_mass=3.0", "controller.estimate=[]"),
     "linear": scenario("paper", "duration=2", controller="delay_lqr"),
     "printed": scenario(
-        "paper", "duration=1", "controller.model=paper", "controller.estimator=none",
+        "paper", "duration=1", "controller.model=paper", "controller.estimate=[]",
         "start=on_reference", "queue=reference",
     ),
     "adaptive": scenario(

@@ -56,13 +56,15 @@ def bad(run: SimulationResult) -> dict[str, int]:
 
 
 @pytest.mark.parametrize(
-    ("estimator", "bound"), [("parameters", 0.0275), ("none", 0.0255)], ids=["filter", "alone"]
+    ("estimate", "bound"),
+    [("[torque_bias,payload,damping]", 0.0275), ("[]", 0.0255)],
+    ids=["filter", "alone"],
 )
 @pytest.mark.parametrize("kind", COUNT)
-def test_a_second_of_it_is_survived(kind: str, estimator: str, bound: float) -> None:
+def test_a_second_of_it_is_survived(kind: str, estimate: str, bound: float) -> None:
     """E_ac 0.0271 with the filter (0.0260 undisturbed), 0.0254 without it (0.0254)."""
     run = simulate(
-        on_reference(f"controller.estimator={estimator}", fault(kind)), judge_stability=False
+        on_reference(f"controller.estimate={estimate}", fault(kind)), judge_stability=False
     )
     assert run.status == "completed"
     assert bad(run) == {COUNT[kind]: 10}
@@ -114,7 +116,7 @@ def test_a_sensor_that_froze_at_rest_is_found_by_the_filter() -> None:
 
 
 def test_one_stuck_value_is_enough() -> None:
-    law, reference = law_of("delay.steps=2", "controller.estimator=none"), sine(0.5)
+    law, reference = law_of("delay.steps=2", "controller.estimate=[]"), sine(0.5)
     first: list[Array] = []
 
     def stuck(k: int, x: Array) -> Array:
@@ -125,9 +127,9 @@ def test_one_stuck_value_is_enough() -> None:
     assert loop.memory.counts == Counts(measurements_frozen=6)
 
 
-@pytest.mark.parametrize("estimator", ["parameters", "none"])
+@pytest.mark.parametrize("estimate", ["[torque_bias,payload,damping]", "[]"])
 def test_a_sample_of_zeros_is_rejected_and_counted(
-    estimator: str, monkeypatch: pytest.MonkeyPatch
+    estimate: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Zero(Sensor):
         def _measure(self, context: Any, output: Any) -> None:
@@ -137,7 +139,7 @@ def test_a_sample_of_zeros_is_rejected_and_counted(
 
     monkeypatch.setattr(diagram_module, "Sensor", Zero)
     run = simulate(
-        on_reference(f"controller.estimator={estimator}", "duration=4"), judge_stability=False
+        on_reference(f"controller.estimate={estimate}", "duration=4"), judge_stability=False
     )
     assert run.status == "completed"
     assert bad(run) == {"measurements_rejected": 1}
@@ -191,13 +193,13 @@ def test_nor_on_the_multibody_plant(name: str) -> None:
     assert not bad(simulate(load_scenario(name, None, ("duration=1.5",)), judge_stability=False))
 
 
-@pytest.mark.parametrize("estimator", ["parameters", "none"])
+@pytest.mark.parametrize("estimate", ["[torque_bias,payload,damping]", "[]"])
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
-def test_a_plate_at_rest_is_not_frozen(plant: str, estimator: str) -> None:
+def test_a_plate_at_rest_is_not_frozen(plant: str, estimate: str) -> None:
     """Exactly the same pose and rates, sample for sample."""
     settings = ("reference.kind=hold", "duration=2", f"plant.kind={plant}")
     run = simulate(
-        load_scenario("paper", None, (*settings, f"controller.estimator={estimator}")),
+        load_scenario("paper", None, (*settings, f"controller.estimate={estimate}")),
         judge_stability=False,
     )
     assert np.ptp(run.signals.pose.values[::5], axis=0).max() < 1e-12
@@ -207,7 +209,7 @@ def test_a_plate_at_rest_is_not_frozen(plant: str, estimator: str) -> None:
 @pytest.mark.parametrize("std", [1e-3, 1e-9, 1e-15, 1e-17])
 def test_noise_at_rest_is_not_frozen_unless_it_repeats(std: float) -> None:
     """Noise that is lost in the last digit of a pose repeats, and is no noise."""
-    law = law_of("controller.estimator=none", "delay.steps=0")
+    law = law_of("controller.estimate=[]", "delay.steps=0")
     sensing = dataclasses.replace(law.sensing, noise_std=std * np.eye(12)[5])
     law = dataclasses.replace(law, sensing=sensing)
     rng, preview = np.random.default_rng(0), np.tile(HOME, (len(law.preview_times), 1))

@@ -484,8 +484,8 @@ def test_servos_do_not_follow_what_is_no_number() -> None:
         ("servo_preview", (), 28.0),
         ("servo_preview", (*ON, "plant.gravity=true"), 16.0),
         ("servo_feedforward", ON, 0.005),
-        ("servo_feedforward", (*ON, *UNKNOWN, "controller.estimator=none"), 0.05),
-        ("servo_feedforward", (*ON, "plant.gravity=true", "controller.estimator=none"), 0.02),
+        ("servo_feedforward", (*ON, *UNKNOWN, "controller.estimate=[]"), 0.05),
+        ("servo_feedforward", (*ON, "plant.gravity=true", "controller.estimate=[]"), 0.02),
         ("servo_feedforward", (*ON, *UNKNOWN, "plant.gravity=true"), 0.2),
     ],
 )
@@ -546,7 +546,10 @@ def test_a_row_may_have_servos_of_its_own() -> None:
         (("link.kind=network",), "link.kind: got 'network' with controller.command 'cranks'"),
         (("tuner.kind=ann",), "tuner.kind: got 'ann' with controller.command 'cranks'"),
         (
-            ("controller.delay_estimator=constant", "controller.estimator=parameters"),
+            (
+                "controller.delay_estimator=constant",
+                "controller.estimate=[torque_bias,payload,damping]",
+            ),
             "controller.delay_estimator: got 'constant' with controller.command",
         ),
     ],

@@ -299,8 +299,8 @@ def outcome(name: str, value: Any, chosen: tuple[Any, ...], before: Any) -> str:
 
 
 REFUSED = {
-    "controller.estimator=none": [
-        *("controller.estimate_coulomb=true", "controller.prior={payload: 0.1}"),
+    "controller.estimate=[]": [
+        "controller.prior={payload: 0.1}",
         *("controller.prior={torque_bias: 0.1}", "controller.prior={damping: 0.1}"),
     ],
     "controller.delay_estimator=none": [
@@ -309,7 +309,7 @@ REFUSED = {
     "tuner.kind=rule": ["controller.w_Q=2.0", "controller.w_R=2.0"],
     "controller.integral=false": ["controller.integral_weight=2.0"],
     "sensor.kind=state": ["controller.prior={rates: [1, 1, 1, 1, 1, 1]}"],
-    "controller.estimate_offsets=false": ["controller.prior={offsets: 0.1}"],
+    "controller.estimate=[torque_bias,payload,damping]": ["controller.prior={offsets: 0.1}"],
     "start=on_reference": ["controller.catch_up=1.0"],
 }
 
@@ -332,36 +332,39 @@ def test_every_row_of_the_table_names_fields_that_exist() -> None:
 
 
 def test_a_field_of_the_file_may_be_made_useless_by_what_is_laid_over_it(tmp_path: Path) -> None:
-    mine, asked = tmp_path / "mine.yaml", "controller: {estimate_coulomb: true, w_Q: 3.0}\n"
+    mine, asked = tmp_path / "mine.yaml", "controller: {prior: {payload: 0.1}, w_Q: 3.0}\n"
     mine.write_text(asked)
-    assert load_scenario(mine).controller.estimate_coulomb
-    assert not load_scenario(mine, "delay_lqr").controller.estimate_coulomb
+    assert load_scenario(mine).controller.prior.payload == 0.1
+    assert load_scenario(mine, "delay_lqr").controller.prior.payload is None
     assert load_scenario(mine, None, ("tuner.kind=rule",)).controller.w_Q == 1.0
     assert load_scenario(mine, "delay_lqr").controller.w_Q == 3.0
-    with pytest.raises(ConfigError, match=r"^settings: controller\.estimate_coulomb"):
-        load_scenario(mine, "delay_lqr", ("controller.estimate_coulomb=true",))
-    mine.write_text(asked.replace("{", "{estimator: none, "))
-    with pytest.raises(ConfigError, match=r"mine\.yaml: controller\.estimate_coulomb: got true"):
+    with pytest.raises(ConfigError, match=r"^settings: controller\.prior\.payload"):
+        load_scenario(mine, "delay_lqr", ("controller.prior={payload: 0.1}",))
+    mine.write_text(asked.replace("{", "{estimate: [], ", 1))
+    with pytest.raises(ConfigError, match=r"mine\.yaml: controller\.prior\.payload: got 0\.1"):
         load_scenario(mine)
-    assert load_scenario(mine, "predictor_lqi").controller.estimate_coulomb  # which uses it
+    assert load_scenario(mine, "predictor_lqi").controller.prior.payload  # which uses it
 
 
 def test_a_controller_file_is_to_fit_by_itself(tmp_path: Path) -> None:
     own = tmp_path / "own.yaml"
-    own.write_text("estimator: none\nestimate_coulomb: true\n")
-    with pytest.raises(ConfigError, match=r"own\.yaml: controller\.estimate_coulomb: got true"):
+    own.write_text("estimate: []\nprior: {payload: 0.1}\n")
+    with pytest.raises(ConfigError, match=r"own\.yaml: controller\.prior\.payload: got 0\.1"):
         load_scenario("paper", own)
     own.write_text("catch_up: 0.5\n")
     assert load_scenario("table2", own).controller.catch_up is None  # it begins on the reference
 
 
 def test_a_comparison_refuses_what_no_row_uses(tmp_path: Path) -> None:
-    rows = shown("paper", ("controller.estimate_coulomb=true",))
-    assert rows["predictor_lqi"].controller.estimate_coulomb
-    assert not rows["delay_lqi"].controller.estimate_coulomb
+    rows = shown("paper", ("controller.prior={payload: 0.1}",))
+    assert rows["predictor_lqi"].controller.prior.payload == 0.1
+    assert rows["delay_lqi"].controller.prior.payload is None
     late = ("controller.delay_steps=7", "controller.replan=0.3")
     assert shown("paper", late)["adaptive_lqi"].controller.replan == 0.3
-    for settings in (late[1:], ("controller.estimator=none", "controller.estimate_coulomb=true")):
+    for settings in (
+        late[1:],
+        ("controller.estimate=[]", "controller.prior={payload: 0.1}"),
+    ):
         with pytest.raises(ConfigError, match=r"^settings: controller"):
             shown("paper", settings)
     mine = tmp_path / "mine.yaml"

@@ -83,7 +83,7 @@ def test_a_step_in_which_friction_makes_cranks_tremble_is_told() -> None:
 def test_friction_is_found_where_it_is_asked_for(controller: str) -> None:
     """Without it is taken for bias and damping, which it is not, and the run is lost or bad."""
     settings = ("plant.kind=exact", "duration=6", "plant.coulomb_friction=1e-3", *ON_REFERENCE)
-    asked = "controller.estimate_coulomb=true"
+    asked = "controller.estimate=[torque_bias,payload,damping,coulomb]"
     loop = build_closed_loop(sd.load_scenario("paper", controller, (*settings, asked)))
     simulator = make_simulator(loop)
     simulator.AdvanceTo(6.0)
@@ -105,7 +105,7 @@ def test_the_law_sees_a_crank_turn_back() -> None:
         return compose_law(prepare(sd.load_scenario("paper", settings=settings))).plant.substeps
 
     plain = substeps("plant.coulomb_friction=1e-3")  # which nobody told
-    asked = substeps("controller.estimate_coulomb=true")
+    asked = substeps("controller.estimate=[torque_bias,payload,damping,coulomb]")
     reference, state = prepare(sd.load_scenario("paper")).reference, []
     for t in np.linspace(0, 10, 2001):
         pose, rates = reference.value(t)[:, 0], reference.EvalDerivative(t, 1)[:, 0]

@@ -28,12 +28,12 @@ plant: {kind: multibody, gravity: false, time_step: 0.001, accuracy: 1.0e-8, pay
 delay: {steps: 8, fraction: 0.0}
 controller: {period: 0.1, integral: true, delay_steps: null, delay_fraction: null,
   prediction: nonlinear, feedforward: inverse_dynamics, model: multibody, torque_map: virtual_work,
-  estimator: parameters, w_Q: 1.0, w_R: 1.0, weight_scaling: bryson, catch_up: null}
+  w_Q: 1.0, w_R: 1.0, weight_scaling: bryson, catch_up: null}
 actuator: {torque_limit: null}
 sensor: {noise_std: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0], seed: 0}
 tuner: {kind: fixed, weights: null}
 """
-"""Every field of 0.1 with its default."""
+"""Every field of 0.1 with its default, but for `controller.estimator`, which has another name."""
 
 
 @pytest.fixture
@@ -100,3 +100,27 @@ def test_a_scenario_that_0_2_wrote_is_read_under_the_new_names(start):
     for old, new in (("quiet_start", "open_loop_start"), ("rejoin", "replan")):
         then["controller"][old] = then["controller"].pop(new)
     assert with_new_names(then) == today == with_new_names(today)
+
+
+@pytest.mark.parametrize(
+    ("old", "estimate"),
+    [
+        ({"estimator": "none"}, []),
+        ({"estimator": "parameters"}, ["torque_bias", "payload", "damping"]),
+        (
+            {"estimator": "parameters", "estimate_coulomb": True, "estimate_offsets": True},
+            ["torque_bias", "payload", "damping", "coulomb", "offsets"],
+        ),
+    ],
+)
+def test_an_estimator_of_0_2_is_read_as_the_list_of_what_it_finds(old, estimate):
+    assert with_new_names({"controller": old})["controller"] == {"estimate": estimate}
+    settings = ["sensor.kind=encoders", f"controller.estimate={estimate[::-1]}"]
+    read = load_scenario("paper", settings=settings)
+    assert read.controller.estimate == estimate
+
+
+def test_a_part_of_the_estimates_alone_is_refused():
+    for some in ("[payload]", "[coulomb]", "[torque_bias, payload, damping, payload]", "[speed]"):
+        with pytest.raises(ConfigError, match=r"controller\.estimate: got .*; expected \[\], or"):
+            load_scenario("paper", settings=[f"controller.estimate={some}"])

@@ -149,10 +149,10 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     Raises:
         ConfigError: see `recorded_law`; single precision with the estimator.
     """
-    if single and scenario.controller.estimator != "none":
+    if single and scenario.controller.estimate:
         raise ConfigError(
-            f"controller.estimator: got {scenario.controller.estimator!r} with --single; expected "
-            "none, or double precision: the filter's covariance needs it"
+            f"controller.estimate: got {scenario.controller.estimate} with --single; expected "
+            "[], or double precision: the filter's covariance needs it"
         )
     law = recorded_law(scenario)
     suffix = "f" if single else ""

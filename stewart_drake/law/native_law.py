@@ -71,7 +71,7 @@ def uncovered(law: PredictiveLqi) -> str | None:
         "law": type(law) is PredictiveLqi and type(law.plant) is NominalPlant,
         "plant.kind": type(dynamics) is StewartDynamics,
         "controller.delay_estimator": not isinstance(observer, DelayObserver),
-        "controller.estimator": type(observer) in _OBSERVERS and type(timeline) is Timeline,
+        "controller.estimate": type(observer) in _OBSERVERS and type(timeline) is Timeline,
         "controller.prior": estimated == PARAMETERS and dynamics.free == PARAMETERS,
         "controller.known": not known,
         "controller.replan": type(law.planner) is NoPlanner,

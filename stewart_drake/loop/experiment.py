@@ -288,12 +288,9 @@ def limits_of(experiment: Experiment) -> Limits:
 
 def estimated(scenario: Scenario) -> tuple[str, ...]:
     """Names of what the estimator finds, if there is one; the eight of the record first."""
-    c = scenario.controller
-    found = list(PARAMETERS)
-    if c.estimator == "parameters":
-        found += [PLANT_PARAMETERS[COULOMB]] * c.estimate_coulomb
-        found += OFFSETS * c.estimate_offsets
-    return tuple(found)
+    chosen = scenario.controller.estimate
+    coulomb = [PLANT_PARAMETERS[COULOMB]] * ("coulomb" in chosen)
+    return (*PARAMETERS, *coulomb, *OFFSETS * ("offsets" in chosen))
 
 
 def with_motors(mechanism: Mechanism, scenario: Scenario) -> Mechanism:
@@ -528,10 +525,11 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     settings = filter_settings(motion, plate, torque_scale, asked, c.period, parameters)
     encoders = isinstance(sc.sensor, EncoderSensorConfig)
     filters = GapObserver if sc.sensor.loss > 0 else ParameterObserver
-    observers: dict[str, Observer] = {
-        "none": DifferencesObserver() if encoders else NoObserver(),
-        "parameters": EncoderObserver(settings) if encoders else filters(settings),
-    }
+    observer: Observer
+    if c.estimate:
+        observer = EncoderObserver(settings) if encoders else filters(settings)
+    else:
+        observer = DifferencesObserver() if encoders else NoObserver()
     predictors: dict[str, Predictor] = {
         "linear": LinearPredictor(),
         "nonlinear": NonlinearPredictor(),
@@ -547,7 +545,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     }
     motors = TorqueLimit(experiment.torque_limit)
     quiet = c.open_loop_start and sc.start == "rest"
-    observer, waits = observers[c.estimator], longest_wait(sc)
+    waits = longest_wait(sc)
     if waits:
         observer = LateObserver(observer, waits)
     channel = _channel(sc, timeline, waits)

@@ -19,8 +19,8 @@ from stewart_drake.tuner.features import DensityFeatures, Features
 from stewart_drake.tuner.health import HealthFeatures
 from stewart_drake.tuner.source import PaperPolicy, RatioPolicy, Rule, WeightsSource
 
-RULES: Final = {"parameters": Rule(-1.77, 2.35, 0.41), "none": Rule(-0.82, 1.37, 0.33)}
-"""By `controller.estimator`."""
+RULES: Final = {True: Rule(-1.77, 2.35, 0.41), False: Rule(-0.82, 1.37, 0.33)}
+"""Usual rule of a controller with an estimator, and of one without."""
 
 
 def weights_source(experiment: Experiment, law: PredictiveLqi) -> WeightsSource | None:
@@ -32,7 +32,7 @@ def weights_source(experiment: Experiment, law: PredictiveLqi) -> WeightsSource 
     sc, network = experiment.scenario, experiment.network
     c = sc.controller
     if isinstance(sc.tuner, RuleTunerConfig):
-        usual, own = RULES[c.estimator], sc.tuner
+        usual, own = RULES[bool(c.estimate)], sc.tuner
         rule = Rule(
             usual.ratio if own.ratio is None else own.ratio,
             usual.slope if own.slope is None else own.slope,

@@ -263,7 +263,8 @@ def _pictures(figures: Mapping[str, Any], captions: Mapping[str, str]) -> list[P
 def _facts(scenario: Scenario) -> dict[str, str]:
     c, plant = scenario.controller, scenario.plant
     sent = f"{c.prediction} prediction" if c.command == "torque" else "cranks sent ahead"
-    law = f"{sent}, feedforward {c.feedforward}, estimator {c.estimator}"
+    law = f"{sent}, feedforward {c.feedforward}"
+    law += f", estimate of {', '.join(c.estimate)}" if c.estimate else ", no estimator"
     if c.delay_estimator != "none":
         law += f", delay estimator {c.delay_estimator}"
     return {

@@ -8,7 +8,7 @@ import dataclasses
 from dataclasses import field
 from typing import Annotated, Any, ClassVar, Final, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
@@ -150,6 +150,21 @@ class PriorConfig:
     offsets: Positive | None = None
 
 
+ESTIMATED: Final = ["torque_bias", "payload", "damping"]
+"""Parameters that an estimator finds in any case."""
+
+
+def _check_estimate(names: list[str]) -> list[str]:
+    order = [*ESTIMATED, "coulomb", "offsets"]
+    if names and not (len({*names}) == len(names) and {*ESTIMATED} <= {*names} <= {*order}):
+        raise ValueError(f"[], or {', '.join(ESTIMATED)}, and of coulomb, offsets some or none")
+    return sorted(names, key=order.index)
+
+
+Estimate = Annotated[list[str], AfterValidator(_check_estimate)]
+"""Names of what is estimated, in a fixed order."""
+
+
 @dataclass(config=STRICT)
 class ControllerConfig:
     """The controller and what it believes.
@@ -165,8 +180,10 @@ class ControllerConfig:
         feedforward: `none`, `equilibrium` torque, or `inverse_dynamics` of the reference.
         model: behind gain and prediction, `paper` (massless legs) or `multibody`.
         torque_map: of the paper's model, from `virtual_work` or as `printed`.
-        estimator: `none`, or `parameters` (torque bias, payload and damping, see also
-            `estimate_coulomb`).
+        estimate: parameters of the machine that are estimated: `torque_bias`, `payload` and
+            `damping`, with or without `coulomb`, the Coulomb friction of the shafts at the
+            `coulomb_speed` of the calibration, else 0.02 rad/s, and `offsets`, the mounting of
+            encoders, for `sensor.kind` encoders and a known delay; empty for none.
         w_Q: weight of the errors.
         w_R: weight of the torques.
         integral_weight: of the integrals beside the errors, which share w_Q.
@@ -178,8 +195,8 @@ class ControllerConfig:
             one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
         command: what is sent to the motors: a `torque` each, or `cranks`: to servos, crank angles
             and rates of the reference for the instant at which they are reached, and the torque
-            that `feedforward` says. With `cranks` nothing is fed back but what `estimator` finds,
-            and only period, delay, feedforward, estimator and catch_up count.
+            that `feedforward` says. With `cranks` nothing is fed back but what `estimate` finds,
+            and only period, delay, feedforward, estimate and catch_up count.
         delay_estimator: `none`; or the delay is estimated, beginning with the one that is believed
             in, as `constant`, or as `drifting` with a rate of its own.
         delay_std: of that belief, s.
@@ -188,14 +205,10 @@ class ControllerConfig:
             have acted.
         replan: duration of a plan back onto the reference, s; 0 for none. With a delay estimator,
             where the prediction is off the reference, as when the delay was found or has jumped.
-        estimate_coulomb: whether the estimator also finds the Coulomb friction of the shafts; the
-            speed over which it builds up is 0.02 rad/s, or known.
         prior: standard deviations of what is estimated, a section of its own; null all of them.
         known: a file of what is known of the machine (`scenario.known`), as `identify` writes it;
             means and covariance of what is estimated, and the values of what is not. A delay in it
             is believed in where `delay_steps` is null.
-        estimate_offsets: whether the estimator also finds how encoders are mounted; for
-            `sensor.kind` encoders, and a delay that is known.
     """
 
     renamed: ClassVar = CONTROLLER
@@ -207,7 +220,7 @@ class ControllerConfig:
     feedforward: Literal["none", "equilibrium", "inverse_dynamics"] = "inverse_dynamics"
     model: Literal["paper", "multibody"] = "multibody"
     torque_map: Literal["virtual_work", "printed"] = "virtual_work"
-    estimator: Literal["none", "parameters"] = "parameters"
+    estimate: Estimate = field(default_factory=lambda: [*ESTIMATED])
     w_Q: Weight = 1.0
     w_R: Weight = 1.0
     integral_weight: Weight = 1.0
@@ -221,10 +234,8 @@ class ControllerConfig:
     delay_max: Annotated[float, Field(gt=0, le=10)] = 1.5
     open_loop_start: bool = True
     replan: Annotated[float, Field(ge=0, le=10)] = 0.6
-    estimate_coulomb: bool = False
     prior: PriorConfig = field(default_factory=PriorConfig)
     known: Name | None = None
-    estimate_offsets: bool = False
 
 
 @dataclass(config=STRICT)
@@ -619,14 +630,14 @@ class Scenario:
         )
 
     def _offsets_problem(self) -> str | None:
-        if not self.controller.estimate_offsets:
+        if "offsets" not in self.controller.estimate:
             return None
         if self.sensor.kind == "encoders" and self.controller.delay_estimator == "none":
             return None
         return (
-            f"controller.estimate_offsets: got true with sensor.kind {self.sensor.kind!r} and "
-            f"delay_estimator {self.controller.delay_estimator!r}; expected false, or 'encoders' "
-            "and 'none', as offsets are found beside a known delay alone"
+            f"controller.estimate: got offsets with sensor.kind {self.sensor.kind!r} and "
+            f"delay_estimator {self.controller.delay_estimator!r}; expected none, or 'encoders' "
+            "and 'none': offsets are found beside a known delay alone"
         )
 
     def check(self, where: str = "scenario") -> None:
@@ -737,12 +748,12 @@ def _controller_problem(controller: ControllerConfig) -> str | None:
             "least 0.001 s"
         )
     if controller.delay_estimator != "none" and (
-        controller.estimator != "parameters" or controller.prediction != "nonlinear"
+        not controller.estimate or controller.prediction != "nonlinear"
     ):
         return (
-            f"controller.delay_estimator: got {controller.delay_estimator!r} with estimator "
-            f"{controller.estimator!r} and prediction {controller.prediction!r}; expected 'none', "
-            "or estimator 'parameters' and prediction 'nonlinear'"
+            f"controller.delay_estimator: got {controller.delay_estimator!r} with estimate "
+            f"{controller.estimate} and prediction {controller.prediction!r}; expected 'none', "
+            f"or estimate {ESTIMATED} and prediction 'nonlinear'"
         )
     if controller.torque_map == "printed" and controller.model != "paper":
         return (

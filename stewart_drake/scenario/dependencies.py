@@ -18,12 +18,20 @@ class Needs(NamedTuple):
     Attributes:
         fields: names, dotted, as in files.
         other: field that decides whether these have an effect.
-        accepted: values of `other` with which they have.
+        accepted: values of `other` with which they have; of a list, items.
     """
 
     fields: tuple[str, ...]
     other: str
     accepted: tuple[Any, ...]
+
+    def met(self, value: Any) -> bool:
+        """Return whether the fields have an effect beside this value, of which a list has some."""
+        return (
+            not {*value}.isdisjoint(self.accepted)
+            if isinstance(value, list)
+            else value in self.accepted
+        )
 
 
 _TORQUE_LAW: Final = (
@@ -31,8 +39,7 @@ _TORQUE_LAW: Final = (
     *("packet_torques", "packet_repeats", "open_loop_start"),
 )
 _FILTER: Final = (
-    *("estimate_coulomb", "estimate_offsets", "prior.torque_bias", "prior.payload"),
-    *("prior.damping", "prior.rates", "prior.offsets"),
+    *("prior.torque_bias", "prior.payload", "prior.damping", "prior.rates", "prior.offsets"),
 )
 
 
@@ -42,9 +49,9 @@ def _of_controller(*names: str) -> tuple[str, ...]:
 
 NEEDS: Final = (
     Needs(_of_controller("integral_weight"), "controller.integral", (True,)),
-    Needs(_of_controller(*_FILTER), "controller.estimator", ("parameters",)),
+    Needs(_of_controller(*_FILTER), "controller.estimate", ("torque_bias",)),
     Needs(_of_controller("prior.rates"), "sensor.kind", ("encoders",)),
-    Needs(_of_controller("prior.offsets"), "controller.estimate_offsets", (True,)),
+    Needs(_of_controller("prior.offsets"), "controller.estimate", ("offsets",)),
     Needs(
         _of_controller("delay_std", "delay_max", "replan"),
         "controller.delay_estimator",
@@ -81,7 +88,7 @@ def idle_fields(scenario: Scenario) -> list[Idle]:
         place = _place(scenario, row.other)
         assert place is not None  # every section has such a field
         got = getattr(*place)
-        if got in row.accepted:
+        if row.met(got):
             continue
         for field in row.fields:
             owner_and_name = _place(scenario, field)
@@ -133,5 +140,7 @@ def _default(owner: Any, name: str) -> Any:
 
 def _spelled(value: Any) -> str:
     """Return a value as in a file."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_spelled, value))}]"
     words = {"True": "true", "False": "false", "None": "null"}
     return words.get(repr(value), brief(value))

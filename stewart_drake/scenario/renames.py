@@ -7,6 +7,9 @@ program wrote is read under today's names.
 from typing import Any, Final
 
 CONTROLLER: Final = {
+    "estimator": "estimate",
+    "estimate_coulomb": "estimate",
+    "estimate_offsets": "estimate",
     "quiet_start": "open_loop_start",
     "rejoin": "replan",
 }
@@ -19,4 +22,8 @@ def with_new_names(scenario: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(given, dict):
         return scenario
     controller = {CONTROLLER.get(name, name): value for name, value in given.items()}
+    if "estimator" in given:
+        asked = {name: given.get(f"estimate_{name}", False) for name in ("coulomb", "offsets")}
+        chosen = ["torque_bias", "payload", "damping", *(name for name in asked if asked[name])]
+        controller["estimate"] = chosen if given["estimator"] == "parameters" else []
     return scenario | {"controller": controller}

@@ -152,7 +152,7 @@ def shown(scenario_name: str | Path, settings: Iterable[str] = ()) -> dict[str, 
     aware = rows["predictor_lqi"]
     known = aware.delay.constant and believed_delay(aware) == aware.true_delay
     at_once = isinstance(aware.link, WireConfig) and aware.sensor.delay == 0
-    if not known and at_once and not aware.controller.estimate_offsets:
+    if not known and at_once and "offsets" not in aware.controller.estimate:
         further.append(ADAPTIVE)
     if isinstance(
         read_scenario(scenario_name, settings=settings).scenario.actuator, ServoActuatorConfig

@@ -100,7 +100,7 @@ def loop_margins(found: Basis, delays: Iterable[int] = DELAYS) -> list[LoopMargi
     experiment, sc = found.experiment, found.experiment.scenario
     c, pose = sc.controller, evaluate(experiment.reference, 0.0)[POSE]
     plant = linear_model(*true_dynamics(experiment).linearize(pose))
-    known = experiment.nominal if c.estimator == "none" else true_dynamics(experiment)
+    known = true_dynamics(experiment) if c.estimate else experiment.nominal
     predictor = design = linear_model(*known.linearize(pose))
     if c.model == "paper":
         design = double_integrators(torque_map(experiment.mechanism, pose, c.torque_map))

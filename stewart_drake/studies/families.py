@@ -71,7 +71,7 @@ _ON_REFERENCE: Final = ("plant.kind=exact", "start=on_reference", "queue=referen
 FAMILIES: Final[dict[str, Family]] = {
     "T": Family(_ON_REFERENCE, (2e-3, 12e-3), (2e-3, 10e-3), "with the estimator"),
     "N2": Family(
-        (*_ON_REFERENCE, "controller.estimator=none"),
+        (*_ON_REFERENCE, "controller.estimate=[]"),
         (5e-3, 30e-3),
         (3e-3, 15e-3),
         "without an estimator",
