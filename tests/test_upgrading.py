@@ -124,3 +124,6 @@ def test_a_part_of_the_estimates_alone_is_refused():
     for some in ("[payload]", "[coulomb]", "[torque_bias, payload, damping, payload]", "[speed]"):
         with pytest.raises(ConfigError, match=r"controller\.estimate: got .*; expected \[\], or"):
             load_scenario("paper", settings=[f"controller.estimate={some}"])
+    for wrong in ("null", "5", "none", "[5]", "[null]", "{payload: true}"):
+        with pytest.raises(ConfigError, match=r"controller\.estimate(\[0\])?: got .*; expected"):
+            load_scenario("paper", settings=[f"controller.estimate={wrong}"])
