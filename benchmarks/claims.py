@@ -475,7 +475,7 @@ def described(row: Row) -> str:
         parts.append(f"`{row.scenario}`")
     settings = [f"`{one}`" for one in row.settings if one not in ON]
     on = ["on the reference"] if ON[0] in row.settings else []
-    known = ["true numbers in `controller.known`"] if row.known else []
+    known = ["true numbers in `controller.calibration`"] if row.known else []
     force = [f"{row.force:g} N, {row.span[0]:g} to {row.span[1]:g} s"] if row.force else []
     return ", ".join([*on, *parts, *settings, *known, *force])
 

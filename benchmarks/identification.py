@@ -13,8 +13,8 @@ root mean square of what it draws. `drawing` draws lengths and joints with a sta
 
 The next run of each machine is the paper's at full amplitude, its state measured without noise and
 nothing limiting its torques but the motors, of a controller that goes by what was found
-(`mechanism.yaml`, `known.yaml`); beside it one that knows the truth, and one that has the drawing
-and the delay that was found.
+(`mechanism.yaml`, `calibration.yaml`); beside it one that knows the truth, and one that has the
+drawing and the delay that was found.
 """
 
 import dataclasses
@@ -48,8 +48,8 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint
+from stewart_drake.scenario.calibration import KNOWABLE, Calibration, save_calibration
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.known import KNOWABLE, Known, save_known
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COULOMB_SPEED
 from stewart_drake.studies import uncertainty
@@ -242,7 +242,7 @@ def next_runs(truth: Truth, found: Identification, true: Array) -> Array:
     drawn[DELAY] = found.values[DELAY]
     return np.array(
         [
-            runs_by(truth, found.mechanism, found.known),
+            runs_by(truth, found.mechanism, found.calibration),
             runs_by(truth, unknowns.machine(true), lambda m: surely(m, true, KNOWABLE)),
             runs_by(truth, unknowns.mechanism, lambda m: surely(m, drawn, (NAMES[DELAY],))),
         ]
@@ -250,21 +250,21 @@ def next_runs(truth: Truth, found: Identification, true: Array) -> Array:
 
 
 def runs_by(
-    truth: Truth, machine: Mechanism, known: Callable[[Mechanism], Known]
+    truth: Truth, machine: Mechanism, known: Callable[[Mechanism], Calibration]
 ) -> tuple[float, ...]:
     """E_ac by STARTS of a controller that goes by a machine and what is known of it."""
     plant, delay = truth.scenario.plant, truth.scenario.delay
     with TemporaryDirectory() as folder:
-        mechanism, file = Path(folder) / "mechanism.yaml", Path(folder) / "known.yaml"
+        mechanism, file = Path(folder) / "mechanism.yaml", Path(folder) / "calibration.yaml"
         mechanism.write_text(mechanism_yaml(machine))
-        save_known(file, known(load_mechanism(mechanism)))
+        save_calibration(file, known(load_mechanism(mechanism)))
         settings = (
             "plant.kind=exact",
             *(f"plant.{name}={getattr(plant, name)}" for name in PLANT),
             f"delay.steps={delay.steps}",
             f"delay.fraction={delay.fraction}",
             f"mechanism={mechanism}",
-            f"controller.known={file}",
+            f"controller.calibration={file}",
         )
         runs = (
             simulate(
@@ -277,10 +277,10 @@ def runs_by(
         return tuple(run.accumulated_error for run in runs)
 
 
-def surely(machine: Mechanism, values: Array, names: tuple[str, ...]) -> Known:
+def surely(machine: Mechanism, values: Array, names: tuple[str, ...]) -> Calibration:
     """Of the unknowns' values, those of names, without a doubt."""
     mean = values[[NAMES.index(name) for name in names]]
-    return Known(fingerprint(machine), names, mean, np.zeros((len(names), len(names))))
+    return Calibration(fingerprint(machine), names, mean, np.zeros((len(names), len(names))))
 
 
 def identified(log: Log, kind: str, poses: bool) -> tuple[Identification, float]:

@@ -21,7 +21,7 @@ from joblib import Parallel, delayed
 import stewart_drake as sd
 from stewart_drake.files.versions import versions
 from stewart_drake.mechanism.geometry import fingerprint
-from stewart_drake.scenario.known import Known, save_known
+from stewart_drake.scenario.calibration import Calibration, save_calibration
 from stewart_drake.scenario.signals import PLANT_PARAMETERS
 
 AMPLITUDES = np.tile([0.2617993878] * 3 + [0.02, 0.02, 0.08], 2)
@@ -61,8 +61,10 @@ def told(settings: Sequence[str], folder: str) -> tuple[str, ...]:
     truth = np.array(scenario.plant.parameters)
     std = np.array([1e-6] * 6 + [1e-4, 1e-7, 1e-7, 1e-5] + [1e-5] * 3)
     path = Path(folder) / f"{abs(hash(tuple(settings)))}.yaml"
-    save_known(path, Known(fingerprint(mechanism), PLANT_PARAMETERS, truth, np.diag(std**2)))
-    return (f"controller.known={path}",)
+    save_calibration(
+        path, Calibration(fingerprint(mechanism), PLANT_PARAMETERS, truth, np.diag(std**2))
+    )
+    return (f"controller.calibration={path}",)
 
 
 def run(settings: Sequence[str]) -> float:

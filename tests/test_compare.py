@@ -154,7 +154,7 @@ def test_a_rows_own_controller_starts_from_the_files_folder(tmp_path, monkeypatc
         ("{actuator: {foo: 1}}", "actuator.foo: unknown key"),
         ("{actuator: {torque_limit: -1}}", "actuator.torque_limit: got -1; expected a number"),
         ("{actuator: {bandwidth: -3}}", "actuator.bandwidth: got -3"),
-        ("{known: 5}", "known: got 5; expected text"),
+        ("{calibration: 5}", "calibration: got 5; expected text"),
         ("{controller: [./a.yaml]}", "controller: got ['./a.yaml']; expected text"),
     ],
 )

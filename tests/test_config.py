@@ -125,7 +125,7 @@ def test_the_defaults_are_the_papers_experiment() -> None:
             "open_loop_start": True,
             "replan": 0.6,
             "prior": dict.fromkeys(["torque_bias", "payload", "damping", "rates", "offsets"]),
-            "known": None,
+            "calibration": None,
         },
         "link": {"kind": "wire"},
         "actuator": {"kind": "torque", "torque_limit": None},

@@ -17,8 +17,8 @@ from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.parameter_filter import Period
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import crank_angles_along
+from stewart_drake.scenario.calibration import OFFSETS
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.known import OFFSETS
 from stewart_drake.scenario.signals import PARAMETERS, POSE, RATES
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER

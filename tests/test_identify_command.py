@@ -14,7 +14,7 @@ from stewart_drake.identification.log_files import Precision, angle_std, read_lo
 from stewart_drake.identification.logs import ANGLES, POSE
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.reporting.identification_document import file_names
-from stewart_drake.scenario.known import load_known
+from stewart_drake.scenario.calibration import load_calibration
 from tests.mechanisms import PAPER
 
 HEADER = [
@@ -210,7 +210,7 @@ def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
     assert summary["chi2"].keys() == {"pose", "rates", "prior", "all"}
     assert 0.7 < summary["chi2"]["all"] < 1.4
     assert summary["pose_uncertainty"].keys() >= {"angle_rad", "position_m"}
-    known = load_known(tmp_path / "known.yaml")
+    known = load_calibration(tmp_path / "calibration.yaml")
     assert known.value("delay") == summary["delay_s"]
     machine = load_mechanism(tmp_path / "mechanism.yaml")
     assert np.abs(machine.rod_lengths - PAPER.rod_lengths).max() < 1e-3
@@ -219,7 +219,8 @@ def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
     settings = (
         "plant.kind=exact", "plant.mechanism=paper", "delay.steps=9", "delay.fraction=0.3",
         "plant.payload_mass=0.4", "reference.amplitude=[0.13,0.13,0.13,0.01,0.01,0.04]",
-        f"mechanism={tmp_path / 'mechanism.yaml'}", f"controller.known={tmp_path / 'known.yaml'}",
+        f"mechanism={tmp_path / 'mechanism.yaml'}",
+        f"controller.calibration={tmp_path / 'calibration.yaml'}",
     )  # fmt: skip
     words = [word for setting in settings for word in ("--set", setting)]
     assert main(["simulate", "paper", *words, "--out", str(tmp_path / "next"), "--quiet"]) == 0

@@ -10,7 +10,7 @@ import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.delay_chain import DelayChain
 from stewart_drake.mechanism.geometry import fingerprint
-from stewart_drake.scenario.known import Known, save_known
+from stewart_drake.scenario.calibration import Calibration, save_calibration
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import make_reference
 
@@ -83,17 +83,17 @@ def test_repr_and_parts():
 
 
 def test_what_is_known_of_the_machine_is_the_prior_and_not_the_delay(tmp_path):
-    path = tmp_path / "known.yaml"
+    path = tmp_path / "calibration.yaml"
     names, mean = ("payload_mass", "delay"), np.array([0.1, 0.33])
-    save_known(path, Known(fingerprint(PAPER), names, mean, np.diag([1e-4, 1e-4])))
-    law = law_of(sd.load_scenario("paper"), options=sd.ControllerConfig(known=str(path))).law
+    save_calibration(path, Calibration(fingerprint(PAPER), names, mean, np.diag([1e-4, 1e-4])))
+    law = law_of(sd.load_scenario("paper"), options=sd.ControllerConfig(calibration=str(path))).law
     assert law.timeline.eta == pytest.approx(0.8)
     prior = law.observer.settings.parameters
     at = prior.names.index("payload_mass")
     assert prior.prior[at] == 0.1 and prior.std[at] == pytest.approx(0.01)
-    save_known(path, Known("0" * 16, names, mean, np.zeros((2, 2))))
+    save_calibration(path, Calibration("0" * 16, names, mean, np.zeros((2, 2))))
     with pytest.raises(ConfigError, match="of another machine"):
-        law_of(sd.load_scenario("paper"), options=sd.ControllerConfig(known=str(path)))
+        law_of(sd.load_scenario("paper"), options=sd.ControllerConfig(calibration=str(path)))
 
 
 def test_without_a_start_it_begins_on_the_reference():

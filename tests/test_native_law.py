@@ -362,7 +362,7 @@ def test_a_part_of_ones_own_is_stepped_in_python(library) -> None:
     settings = law.observer.settings
     wary = replace(settings.parameters, usual=2 * settings.parameters.std)
     observer = replace(law.observer, settings=replace(settings, parameters=wary))
-    assert uncovered(replace(law, observer=observer)) == "controller.known"  # C knows one std
+    assert uncovered(replace(law, observer=observer)) == "controller.calibration"  # C knows one std
     assert serving(law).backend == "native"
     assert serving(mine) == (mine, "python (controller.replan)")
 

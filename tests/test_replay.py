@@ -89,7 +89,7 @@ def test_the_page_holds_what_the_run_was_like(run):
 
 
 def test_the_angle_of_the_page_is_that_of_one_turn(run):
-    """Known by construction: the plate is turned about z against its reference."""
+    """Calibration by construction: the plate is turned about z against its reference."""
     signals = run.signals.copy(deep=True)
     signals["reference"] = 0 * signals.reference + PAPER.home
     signals["pose"] = signals.reference.copy(deep=True)

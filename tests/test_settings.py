@@ -18,9 +18,9 @@ from stewart_drake.files.schema import spelling
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import fingerprint
+from stewart_drake.scenario.calibration import DELAY, Calibration, save_calibration
 from stewart_drake.scenario.config import PriorConfig, Scenario
 from stewart_drake.scenario.dependencies import NEEDS, idle_fields
-from stewart_drake.scenario.known import DELAY, Known, save_known
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import shown
 
@@ -136,7 +136,7 @@ OTHER: dict[str, Any] = {
     "controller.delay_std": 0.1,
     "controller.delay_max": 2.5,
     "controller.replan": 0.3,
-    "controller.known": "FILE",
+    "controller.calibration": "FILE",
     "controller.prior.torque_bias": 1e-4,
     "controller.prior.payload": 0.01,
     "controller.prior.damping": 1e-5,
@@ -227,11 +227,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Scenario],
             heavier = replace(machine, plate=replace(machine.plate, mass=1.1 * machine.plate.mass))
             path = path.with_suffix(".yaml")
             path.write_text(mechanism_yaml(heavier))
-        elif name == "controller.known":
+        elif name == "controller.calibration":
             names = ("payload_mass", "joint_damping", DELAY)
             mean = np.array([0.1 * machine.plate.mass, 1e-3, 0.05])
             path = path.with_suffix(".yaml")
-            save_known(path, Known(fingerprint(machine), names, mean, 1e-8 * np.eye(3)))
+            save_calibration(path, Calibration(fingerprint(machine), names, mean, 1e-8 * np.eye(3)))
         else:
             given = Path(scenario.reference.file)
             path = path.with_suffix(given.suffix)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from stewart_drake.reporting.answer import Answer
 
 MECHANISM = "mechanism.yaml"
-KNOWN = "known.yaml"
+CALIBRATION = "calibration.yaml"
 SCENARIO = "scenario.yaml"
 
 Tolerance = Annotated[
@@ -73,7 +73,7 @@ def identify(
 ) -> int:
     """Find delay, friction and geometry in a log.
 
-    Even in that of a lost run. Writes mechanism.yaml and known.yaml for simulate, and a page.
+    Even in that of a lost run. Writes mechanism.yaml and calibration.yaml for simulate, and a page.
     A CSV log has the columns time[s], torque_1[N m] to torque_6 as they were commanded,
     angle_1[rad] to angle_6, and where they were measured roll[rad] to z[m].
     """
@@ -180,17 +180,17 @@ def _write_found(answer: "Answer", delivery: Delivery) -> list[str]:
     """What simulate takes."""
     from stewart_drake.files.fileio import replacing
     from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
-    from stewart_drake.scenario.known import save_known
+    from stewart_drake.scenario.calibration import save_calibration
 
     if delivery.out is None:
         return []
-    delivery.discard(MECHANISM, KNOWN)
+    delivery.discard(MECHANISM, CALIBRATION)
     path = delivery.out / MECHANISM
     text = mechanism_yaml(answer.study.mechanism)
     with replacing(path) as partial:
         partial.write_text(text)
-    save_known(delivery.out / KNOWN, answer.study.known(load_mechanism(path)))
-    return [MECHANISM, KNOWN]
+    save_calibration(delivery.out / CALIBRATION, answer.study.calibration(load_mechanism(path)))
+    return [MECHANISM, CALIBRATION]
 
 
 def _write_plan(answer: "Answer", delivery: Delivery) -> list[str]:

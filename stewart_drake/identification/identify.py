@@ -36,7 +36,7 @@ from stewart_drake.identification.unknowns import (
     unknowns_of,
 )
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint
-from stewart_drake.scenario.known import Known
+from stewart_drake.scenario.calibration import Calibration
 from stewart_drake.types import Array
 
 WRONG: Final = 1.5
@@ -110,8 +110,8 @@ class Identification:
         """The machine that was found; as it was drawn where the fit is wrong."""
         return self.unknowns.machine(self.values if self.right else self.unknowns.mean)
 
-    def known(self, mechanism: Mechanism) -> Known:
-        """What a controller of this machine may go by: all but the geometry.
+    def calibration(self, mechanism: Mechanism) -> Calibration:
+        """Return what a controller of this machine may use: all but the geometry.
 
         Where the fit is wrong that is the delay alone, as uncertain as before.
 
@@ -119,7 +119,7 @@ class Identification:
             mechanism: the one that was found, as it was written and read.
         """
         places = np.r_[DYNAMIC, OFFSETS, DELAY] if self.right else np.array([DELAY])
-        return Known(
+        return Calibration(
             fingerprint(mechanism),
             tuple(NAMES[k] for k in places),
             self.values[places],

@@ -36,7 +36,7 @@ from stewart_drake.law.parameter_filter import (
     transitions,
     within_bounds,
 )
-from stewart_drake.scenario.known import OFFSETS
+from stewart_drake.scenario.calibration import OFFSETS
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, POSE
 from stewart_drake.types import Array
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stewart_drake.scenario.known import OFFSETS, Known
+from stewart_drake.scenario.calibration import OFFSETS, Calibration
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,
@@ -73,7 +73,7 @@ class ParameterSet:
         """(n,) of a machine of which nobody knows more."""
         return self.std if self.usual is None else self.usual
 
-    def knowing(self, known: Known) -> "ParameterSet":
+    def knowing(self, known: Calibration) -> "ParameterSet":
         """With what is known of a machine: means, standard deviations, correlations.
 
         What it says nothing of stays, and goes together with nothing. A mean that is beyond a bound

@@ -73,7 +73,7 @@ def uncovered(law: PredictiveLqi) -> str | None:
         "controller.delay_estimator": not isinstance(observer, DelayObserver),
         "controller.estimate": type(observer) in _OBSERVERS and type(timeline) is Timeline,
         "controller.prior": estimated == PARAMETERS and dynamics.free == PARAMETERS,
-        "controller.known": not known,
+        "controller.calibration": not known,
         "controller.replan": type(law.planner) is NoPlanner,
         "controller.prediction": type(law.predictor) is NonlinearPredictor,
         "controller.feedforward": type(law.feedforward) is InverseDynamicsFeedforward,

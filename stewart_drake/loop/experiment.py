@@ -62,6 +62,7 @@ from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint
 from stewart_drake.mechanism.rotors import with_rotors
 from stewart_drake.native.layout import plate_radius
+from stewart_drake.scenario.calibration import DELAY, OFFSETS, Calibration, load_calibration
 from stewart_drake.scenario.config import (
     AnnTunerConfig,
     EncoderSensorConfig,
@@ -72,7 +73,6 @@ from stewart_drake.scenario.config import (
 )
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.field_types import MOST_PERIODS
-from stewart_drake.scenario.known import DELAY, OFFSETS, Known, load_known
 from stewart_drake.scenario.link import BurstChain, in_time, times_under_way
 from stewart_drake.scenario.signals import (
     BIAS,
@@ -121,8 +121,8 @@ class Experiment(NamedTuple):
     """What sets the weights, or None."""
     own: Own = NOTHING
     """What takes the place of the scenario's."""
-    known: Known | None = None
-    """What the controller knows of the machine beside its drawing."""
+    calibration: Calibration | None = None
+    """Parameters of the machine that the controller knows beside its drawing."""
 
     def __repr__(self) -> str:
         return f"Experiment({self.mechanism}, {self.scenario})"
@@ -235,7 +235,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     scenario.check()
     network = network_of(scenario)
     drawn = load_mechanism(scenario.mechanism)
-    known = known_of_machine(scenario, drawn)
+    calibration = calibration_of(scenario, drawn)
     mechanism = with_motors(drawn, scenario)
     if own.reference is None:
         reference = make_reference(scenario.reference, scenario.duration)
@@ -253,12 +253,12 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
         reference=reference,
         peak_to_peak=span,
         nominal=_equations(scenario)(
-            mechanism, scenario.plant.gravity, known_values(known), estimated(scenario)
+            mechanism, scenario.plant.gravity, known_values(calibration), estimated(scenario)
         ),
         start=start,
         network=network,
         own=own,
-        known=known,
+        calibration=calibration,
     )
 
 
@@ -317,34 +317,34 @@ def simulated_machine(scenario: Scenario) -> Mechanism:
     return load_mechanism(path)
 
 
-def known_of(scenario: Scenario) -> Known | None:
-    """What `controller.known` holds.
+def _read_calibration(scenario: Scenario) -> Calibration | None:
+    """Return the content of the file `controller.calibration`, None without one.
 
     Raises:
         ConfigError: one line.
     """
     c = scenario.controller
-    if c.known is None:
+    if c.calibration is None:
         return None
     try:
-        return load_known(c.known)
+        return load_calibration(c.calibration)
     except ConfigError as error:
-        raise ConfigError(f"controller.known: {error}") from None
+        raise ConfigError(f"controller.calibration: {error}") from None
 
 
-def known_of_machine(scenario: Scenario, mechanism: Mechanism) -> Known | None:
-    """`known_of`, of this machine.
+def calibration_of(scenario: Scenario, mechanism: Mechanism) -> Calibration | None:
+    """Return the calibration that the controller uses, checked against its machine.
 
     Raises:
         ConfigError: one line.
     """
-    c, own, known = scenario.controller, fingerprint(mechanism), known_of(scenario)
-    if known is None:
+    c, own, calibration = scenario.controller, fingerprint(mechanism), _read_calibration(scenario)
+    if calibration is None:
         return None
-    if known.mechanism != own:
+    if calibration.mechanism != own:
         raise ConfigError(
-            f"controller.known: got {c.known}, of another machine ({known.mechanism}); expected "
-            f"what is known of {mechanism.name} ({own})"
+            f"controller.calibration: got {c.calibration}, of another machine "
+            f"({calibration.mechanism}); expected one of {mechanism.name} ({own})"
         )
     believed = believed_delay(scenario).eta(c.period)
     if c.delay_estimator != "none" and believed > c.delay_max:
@@ -352,21 +352,21 @@ def known_of_machine(scenario: Scenario, mechanism: Mechanism) -> Known | None:
             f"controller.delay_max: got {c.delay_max:g} s, less than the {believed:g} s that are "
             "believed in; expected as much or more"
         )
-    return known
+    return calibration
 
 
-def known_values(known: Known | None) -> Array:
-    """All parameters of the plant (13,) as the controller takes them before it measures."""
+def known_values(calibration: Calibration | None) -> Array:
+    """Return the parameters of the plant (13,) that the controller assumes at first."""
     values = plant_parameters()
     for i, name in enumerate(PLANT_PARAMETERS):
-        found = None if known is None else known.value(name)
+        found = None if calibration is None else calibration.value(name)
         values[i] = values[i] if found is None else found
     return values
 
 
-def offsets_of(known: Known | None) -> Array:
-    """(6,) rad by which encoders are known to be mounted otherwise."""
-    found = [None if known is None else known.value(name) for name in OFFSETS]
+def offsets_of(calibration: Calibration | None) -> Array:
+    """Return the calibrated mounting offsets (6,) of the encoders, rad."""
+    found = [None if calibration is None else calibration.value(name) for name in OFFSETS]
     return np.array([0.0 if value is None else value for value in found])
 
 
@@ -405,7 +405,7 @@ def believed_delay(scenario: Scenario) -> Delay:
     controller = scenario.controller
     if controller.delay_steps is not None:
         return Delay(controller.delay_steps, controller.delay_fraction or 0.0)
-    known = None if isinstance(scenario.link, NetworkConfig) else known_of(scenario)
+    known = None if isinstance(scenario.link, NetworkConfig) else _read_calibration(scenario)
     if known is not None and (seconds := known.value(DELAY)) is not None:
         return Delay.of(seconds, controller.period)
     return scenario.true_delay
@@ -588,11 +588,11 @@ def estimated_parameters(experiment: Experiment, torque_scale: float) -> Paramet
         plate_radius(machine),
         experiment.nominal.free,
     )
-    if experiment.known is not None:
+    if experiment.calibration is not None:
         try:
-            found = found.knowing(experiment.known)
+            found = found.knowing(experiment.calibration)
         except ValueError as error:
-            raise ConfigError(f"controller.known: {error}") from None
+            raise ConfigError(f"controller.calibration: {error}") from None
     prior = sc.controller.prior
     said = {
         **dict.fromkeys(PARAMETERS[BIAS], prior.torque_bias),
@@ -617,7 +617,7 @@ def _sensing(experiment: Experiment, motion: Array) -> Sensing:
         declared=experiment.start,
         rates_std=motion if rates is None else np.array(rates),
         motion=motion,
-        offset=np.zeros(len(OFFSETS)) if finds_offsets else offsets_of(experiment.known),
+        offset=np.zeros(len(OFFSETS)) if finds_offsets else offsets_of(experiment.calibration),
     )
 
 

@@ -18,9 +18,9 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.experiment import (
     Experiment,
+    calibration_of,
     control_law,
     first_queue,
-    known_of_machine,
 )
 from stewart_drake.loop.own import Own
 from stewart_drake.loop.own_motion import own_motion
@@ -159,7 +159,7 @@ def design_law(
         start=at,
         network=None,
         own=Own(reference=reference),
-        known=known_of_machine(scenario, dynamics.mechanism),
+        calibration=calibration_of(scenario, dynamics.mechanism),
     )
     law, planned, _ = control_law(experiment)
     c = scenario.controller

@@ -104,8 +104,8 @@ class Identity(NamedTuple):
 def identity_of(scenario: Scenario) -> Identity:
     """Return the identity of a scenario's machine as it is drawn.
 
-    Numbers that were identified (`controller.known`) and the simulated machine (`plant.mechanism`)
-    are not part of it.
+    The calibration (`controller.calibration`) and the simulated machine (`plant.mechanism`) are not
+    part of it.
     """
     mechanism, sensor = load_mechanism(scenario.mechanism), scenario.sensor
     period, read = scenario.controller.period, str(sensor.kind)

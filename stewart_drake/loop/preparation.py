@@ -157,7 +157,7 @@ class _Key:
         fields["controller"] |= {"delay_steps": None, "delay_fraction": None}
         machines = scenario.mechanism, scenario.plant.mechanism
         files = [resolve("mechanism", name) for name in machines if name is not None]
-        named = getattr(scenario.reference, "file", None), scenario.controller.known
+        named = getattr(scenario.reference, "file", None), scenario.controller.calibration
         files += [Path(name) for name in named if name is not None]
         self._key = json.dumps(fields, default=str), *(_stamp(file) for file in files)
 

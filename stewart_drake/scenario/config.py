@@ -131,7 +131,7 @@ class DelayConfig:
 class PriorConfig:
     """How far may be off what nobody tells the controller: standard deviations of the estimator.
 
-    null is what `controller.known` says, and without it what machine and motion say. A number
+    null is what `controller.calibration` says, and without it what machine and motion say. A number
     stands before both.
 
     Attributes:
@@ -206,9 +206,9 @@ class ControllerConfig:
         replan: duration of a plan back onto the reference, s; 0 for none. With a delay estimator,
             where the prediction is off the reference, as when the delay was found or has jumped.
         prior: standard deviations of what is estimated, a section of its own; null all of them.
-        known: a file of what is known of the machine (`scenario.known`), as `identify` writes it;
-            means and covariance of what is estimated, and the values of what is not. A delay in it
-            is believed in where `delay_steps` is null.
+        calibration: a file of the machine's parameters with their covariance, as `identify` writes
+            it: means and covariance of what is estimated, and the values of what is not. Its delay
+            is assumed where `delay_steps` is null.
     """
 
     renamed: ClassVar = CONTROLLER
@@ -235,7 +235,7 @@ class ControllerConfig:
     open_loop_start: bool = True
     replan: Annotated[float, Field(ge=0, le=10)] = 0.6
     prior: PriorConfig = field(default_factory=PriorConfig)
-    known: Name | None = None
+    calibration: Name | None = None
 
 
 @dataclass(config=STRICT)
@@ -583,7 +583,7 @@ class Scenario:
                 f"{self.link.kind!r} and a sensor.delay of {self.sensor.delay:g} s; expected "
                 "'none', or a wire and measurements of now"
             )
-        if c.delay_steps is None and c.known is not None:
+        if c.delay_steps is None and c.calibration is not None:
             return None  # what is known may say a delay, see `loop.experiment`
         believed = self.eta
         if c.delay_steps is not None:

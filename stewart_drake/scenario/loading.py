@@ -25,7 +25,7 @@ from stewart_drake.scenario.config import (
 from stewart_drake.scenario.dependencies import Idle, idle_fields, reset
 
 _SETTINGS = "settings"
-_FILES = ("file", "known")
+_FILES = ("file", "calibration")
 """Fields that are always a path; others may be a shipped name."""
 _OVERLAY = "overlay"
 _KINDS = sections(Scenario)
@@ -320,7 +320,7 @@ def _make_paths_absolute(data: dict[str, Any], folder: Path) -> None:
     tie(data, "mechanism")
     tie(data.get("plant", {}), "mechanism")
     for fields in (data.get("controller", {}), *data.get("compare", {}).values()):
-        tie(fields, "known")
+        tie(fields, "calibration")
         tie(fields, "controller")  # of a row of `compare`
     tie(data.get("reference", {}), "file")
     tie(data.get("tuner", {}), "weights")

@@ -12,6 +12,7 @@ CONTROLLER: Final = {
     "estimate_offsets": "estimate",
     "quiet_start": "open_loop_start",
     "rejoin": "replan",
+    "known": "calibration",
 }
 """Old name -> new name in the section `controller`."""
 

@@ -387,7 +387,7 @@ def problem_of(
     """
     for field, value in (
         ("plant.mechanism", scenario.plant.mechanism),
-        ("controller.known", scenario.controller.known),
+        ("controller.calibration", scenario.controller.calibration),
     ):
         if value is not None:
             raise ConfigError(

@@ -17,15 +17,21 @@ from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.experiment import GENTLE, Experiment, believed_delay, compose_law, prepare
 from stewart_drake.mechanism.geometry import Body, fingerprint
+from stewart_drake.scenario.calibration import (
+    KNOWABLE,
+    OFFSETS,
+    Calibration,
+    load_calibration,
+    save_calibration,
+)
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.known import KNOWABLE, OFFSETS, Known, load_known, save_known
 from stewart_drake.scenario.signals import DAMPING, PARAMETERS, PAYLOAD, PLANT_PARAMETERS
 from tests.mechanisms import PAPER
 
 NAMES = ("payload_mass", "joint_damping", "coulomb_friction", "delay")
 MEAN = np.array([0.4, 1e-3, 2e-3, 0.73])
 SPREAD = np.array([[3e-2, 0, 0, 0], [1e-4, 2e-4, 0, 0], [0, 1e-4, 1e-4, 0], [0, 0, 0, 1e-3]])
-KNOWN = Known(fingerprint(PAPER), NAMES, MEAN, SPREAD @ SPREAD.T)
+KNOWN = Calibration(fingerprint(PAPER), NAMES, MEAN, SPREAD @ SPREAD.T)
 ON_REFERENCE = ("plant.kind=exact", "start=on_reference", "queue=reference")
 
 
@@ -39,9 +45,9 @@ def test_a_file_is_read_back_to_the_last_digit(
 ) -> None:
     rng, n, path = np.random.default_rng(seed), len(names), tmp_path_factory.mktemp("k") / "k.yaml"
     spread = rng.normal(0, 1, (n, max(0, n - 1)))  # of less than full rank
-    known = Known("abc", tuple(sorted(names)), rng.uniform(1e-3, 1, n), spread @ spread.T)
-    save_known(path, known)
-    found = load_known(path)
+    known = Calibration("abc", tuple(sorted(names)), rng.uniform(1e-3, 1, n), spread @ spread.T)
+    save_calibration(path, known)
+    found = load_calibration(path)
     assert (found.mechanism, found.names) == (known.mechanism, known.names)
     assert np.array_equal(found.mean, known.mean)
     assert np.array_equal(found.covariance, known.covariance)
@@ -76,12 +82,12 @@ def test_a_wrong_file_is_refused_in_one_line(
         "mean": [0.1, 0.7],
         "covariance": [[1.0, 0.0], [0.0, 1.0]],
     }
-    path = tmp_path / "known.yaml"
+    path = tmp_path / "calibration.yaml"
     path.write_text(yaml_text(right))
-    assert load_known(path).value("delay") == 0.7
+    assert load_calibration(path).value("delay") == 0.7
     path.write_text(yaml_text(right | wrong))
     with pytest.raises(ConfigError, match=message) as refused:
-        load_known(path)
+        load_calibration(path)
     assert str(refused.value).startswith(f"{path}: ")
     assert "\n" not in str(refused.value)
 
@@ -128,7 +134,7 @@ def test_what_is_known_is_the_prior_of_what_is_estimated() -> None:
 
 
 def test_what_is_known_exactly_is_nearly_so() -> None:
-    exactly = Known("abc", ("payload_mass", "delay"), np.array([0.4, 1.0]), np.zeros((2, 2)))
+    exactly = Calibration("abc", ("payload_mass", "delay"), np.array([0.4, 1.0]), np.zeros((2, 2)))
     found = usual().knowing(exactly)
     assert found.std[PAYLOAD] == EXACT * usual().std[PAYLOAD]
     assert np.linalg.eigvalsh(found.covariance).min() > 0
@@ -137,7 +143,7 @@ def test_what_is_known_exactly_is_nearly_so() -> None:
 @pytest.mark.parametrize(("off", "taken"), [(0.9 * CHANCE, True), (1.1 * CHANCE, False)])
 def test_a_mean_is_beyond_a_bound_by_chance_or_refused(off: float, taken: bool) -> None:
     names, std = ("joint_damping",), 1e-4
-    found = Known("abc", names, np.array([-off * std]), np.array([[std**2]]))
+    found = Calibration("abc", names, np.array([-off * std]), np.array([[std**2]]))
     if taken:
         assert usual().knowing(found).prior[DAMPING] == 0.0
         return
@@ -169,8 +175,8 @@ def test_every_parameter_can_be_free() -> None:
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    path = tmp_path / "known.yaml"
-    save_known(path, KNOWN)
+    path = tmp_path / "calibration.yaml"
+    save_calibration(path, KNOWN)
     return path
 
 
@@ -184,7 +190,7 @@ def observer(law: PredictiveLqi) -> ParameterObserver:
 
 
 def test_the_law_begins_with_what_is_known(file: Path) -> None:
-    found = experiment(f"controller.known={file}", "controller.prior={payload: 0.2}")
+    found = experiment(f"controller.calibration={file}", "controller.prior={payload: 0.2}")
     nominal = found.nominal
     known = dict(zip(PLANT_PARAMETERS, nominal.plant_parameters, strict=True))
     assert known["coulomb_friction"] == 2e-3
@@ -201,7 +207,7 @@ def test_the_law_begins_with_what_is_known(file: Path) -> None:
 
 def test_without_a_file_the_law_is_as_machine_and_motion_say() -> None:
     found = experiment()
-    assert found.known is None
+    assert found.calibration is None
     law = compose_law(found)
     prior, torque = observer(law).settings.parameters, law.plant.gentle_torque / GENTLE
     assert not prior.prior.any()
@@ -210,7 +216,7 @@ def test_without_a_file_the_law_is_as_machine_and_motion_say() -> None:
 
 
 def test_a_known_delay_is_believed_where_nothing_else_is_said(file: Path) -> None:
-    known = f"controller.known={file}"
+    known = f"controller.calibration={file}"
     assert believed_delay(experiment(known).scenario) == Delay.of(0.73, 0.1)
     assert believed_delay(experiment(known, "controller.delay_steps=6").scenario) == Delay(6)
     assert believed_delay(experiment().scenario) == Delay(8)
@@ -218,19 +224,23 @@ def test_a_known_delay_is_believed_where_nothing_else_is_said(file: Path) -> Non
 
 def test_a_path_starts_from_the_file_that_says_it(file: Path) -> None:
     scenario, controller = file.parent / "my.yaml", file.parent / "law.yaml"
-    scenario.write_text("controller: {known: known.yaml}\nplant: {mechanism: ./m.yaml}")
-    controller.write_text("known: known.yaml")
+    scenario.write_text("controller: {calibration: calibration.yaml}\nplant: {mechanism: ./m.yaml}")
+    controller.write_text("calibration: calibration.yaml")
     found = sd.load_scenario(scenario)
-    assert found.controller.known == str(file)
+    assert found.controller.calibration == str(file)
     assert found.plant.mechanism == str(file.parent / "m.yaml")
-    assert sd.load_scenario("paper", controller).controller.known == str(file)
+    assert sd.load_scenario("paper", controller).controller.calibration == str(file)
 
 
 @pytest.mark.parametrize(
     ("change", "given", "message"),
     [
-        ({"mechanism": "abc"}, (), "controller.known: got .*, of another machine .abc.; expected"),
-        ({"mean": np.array([99.0, 0, 0, 0.7])}, (), "controller.known: payload_mass: got 99"),
+        (
+            {"mechanism": "abc"},
+            (),
+            "controller.calibration: got .*, of another machine .abc.; expected",
+        ),
+        ({"mean": np.array([99.0, 0, 0, 0.7])}, (), "controller.calibration: payload_mass: got 99"),
         (
             {"mean": np.array([0.1, 0, 0, 1.7])},
             ("controller.delay_estimator=constant",),
@@ -241,26 +251,26 @@ def test_a_path_starts_from_the_file_that_says_it(file: Path) -> None:
 def test_what_cannot_be_used_is_refused_in_one_line(
     file: Path, change: dict[str, Any], given: tuple[str, ...], message: str
 ) -> None:
-    save_known(file, dataclasses.replace(KNOWN, **change))
+    save_calibration(file, dataclasses.replace(KNOWN, **change))
     with pytest.raises(ConfigError, match=message):
-        compose_law(experiment(f"controller.known={file}", *given))
+        compose_law(experiment(f"controller.calibration={file}", *given))
 
 
 def test_a_file_that_is_not_there_names_the_field() -> None:
-    with pytest.raises(ConfigError, match=r"^controller\.known: .*nowhere"):
-        experiment("controller.known=/nowhere/known.yaml")
+    with pytest.raises(ConfigError, match=r"^controller\.calibration: .*nowhere"):
+        experiment("controller.calibration=/nowhere/calibration.yaml")
 
 
 def test_what_is_known_is_worth_something(file: Path) -> None:
     """Friction that the estimator does not have, and parameters that it has to learn otherwise."""
     true = ("plant.payload_mass=0.4", "plant.joint_damping=1e-3", "plant.coulomb_friction=5e-4")
-    save_known(file, dataclasses.replace(KNOWN, mean=np.array([0.4, 1e-3, 5e-4, 0.8])))
+    save_calibration(file, dataclasses.replace(KNOWN, mean=np.array([0.4, 1e-3, 5e-4, 0.8])))
     settings = (*ON_REFERENCE, *true, "duration=5")
     told, not_told = (
         sd.simulate(
             sd.load_scenario("paper", "predictor_lqi", (*settings, *more)), judge_stability=False
         )
-        for more in ((f"controller.known={file}",), ())
+        for more in ((f"controller.calibration={file}",), ())
     )
     assert told.status == "completed"
     assert told.accumulated_error < 0.1

@@ -1,4 +1,4 @@
-"""What is known of a machine beforehand: means and their covariance, as `identify` writes them."""
+"""The calibration of a machine: parameters with their covariance, as `identify` writes them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +24,8 @@ ROUNDING: Final = 1e-9
 
 
 @dataclass(frozen=True)
-class Known:
-    """What is known of one machine.
+class Calibration:
+    """Parameters of one machine, with their covariance.
 
     Attributes:
         mechanism: fingerprint of the machine's numbers, `mechanism.geometry.fingerprint`.
@@ -102,14 +102,14 @@ class _File:
     covariance: list[list[float]]
 
 
-def load_known(path: str | Path) -> Known:
-    """Reads what is known of a machine.
+def load_calibration(path: str | Path) -> Calibration:
+    """Read the calibration of a machine.
 
     Args:
         path: a YAML file with the keys `mechanism`, `names`, `mean`, `covariance`.
 
     Raises:
-        ConfigError: unreadable, or what `Known` refuses; one line, opened by the path.
+        ConfigError: unreadable, or what `Calibration` refuses; one line, opened by the path.
     """
     found = validate(_File, load_yaml(path), str(path))
     n = len(found.names)
@@ -119,7 +119,7 @@ def load_known(path: str | Path) -> Known:
                 f"{path}: covariance: got a row of {len(row)} numbers; expected {n}, as of names"
             )
     try:
-        return Known(
+        return Calibration(
             found.mechanism,
             tuple(found.names),
             np.array(found.mean),
@@ -129,13 +129,13 @@ def load_known(path: str | Path) -> Known:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def save_known(path: str | Path, known: Known) -> None:
-    """Writes a file that `load_known` reads back to the last digit."""
+def save_calibration(path: str | Path, calibration: Calibration) -> None:
+    """Write a file that `load_calibration` reads back to the last digit."""
     data = {
-        "mechanism": known.mechanism,
-        "names": list(known.names),
-        "mean": known.mean.tolist(),
-        "covariance": known.covariance.tolist(),
+        "mechanism": calibration.mechanism,
+        "names": list(calibration.names),
+        "mean": calibration.mean.tolist(),
+        "covariance": calibration.covariance.tolist(),
     }
     with replacing(Path(path)) as partial:
         partial.write_text(yaml_text(data), encoding="utf-8")
