@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.law.channel import Packets
 from stewart_drake.scenario.config import PacketsConfig
-from stewart_drake.scenario.link import (
+from stewart_drake.scenario.packets import (
     BurstChain,
     losses,
     packet_times,

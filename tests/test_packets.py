@@ -25,10 +25,10 @@ from stewart_drake.reporting.link_document import document
 from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.scenario.config import NetworkConfig, PacketsConfig
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.link import (
+from stewart_drake.scenario.link import newest_measurements
+from stewart_drake.scenario.packets import (
     in_time,
     losses,
-    newest_measurements,
     packet_times,
     torque_missing,
     usual_bound,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.scenario.link import NO_LOSSES, BurstChain
+from stewart_drake.scenario.packets import NO_LOSSES, BurstChain
 from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.types import Array
 

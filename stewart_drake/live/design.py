@@ -34,7 +34,7 @@ from stewart_drake.scenario.config import (
     Scenario,
     TorqueActuatorConfig,
 )
-from stewart_drake.scenario.link import usual_bound
+from stewart_drake.scenario.packets import usual_bound
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array

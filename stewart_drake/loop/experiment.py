@@ -73,7 +73,7 @@ from stewart_drake.scenario.config import (
 )
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.field_types import MOST_PERIODS
-from stewart_drake.scenario.link import BurstChain, in_time, times_under_way
+from stewart_drake.scenario.packets import BurstChain, in_time, times_under_way
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,

@@ -364,7 +364,7 @@ class NetworkConfig(PacketsConfig):
     Attributes:
         kind: `network`.
         playout: the bound, s; null is the one that makes late packets as rare as lost ones
-            (`scenario.link.usual_bound`). The controller adds its `packet_repeats` periods.
+            (`scenario.packets.usual_bound`). The controller adds its `packet_repeats` periods.
         dry: what a dry buffer does, `hold` the last torque or put out `zero`.
         back: `return` in files, how measurements come back, with times of its own; null is at once
             and all of them.
@@ -553,7 +553,9 @@ class Scenario:
             low, high = (round(share * eta, 12) for share in ASSUMED_TIMES)
             link = dataclasses.replace(link, low=low, high=high)
         if link.playout is None:
-            from stewart_drake.scenario.link import usual_bound  # numpy, which --help goes without
+            from stewart_drake.scenario.packets import (
+                usual_bound,
+            )  # numpy, which --help goes without
 
             bound = usual_bound(link, c.packet_repeats, c.period)
             link = dataclasses.replace(link, playout=bound)

@@ -17,8 +17,8 @@ import numpy as np
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.config import NetworkConfig, Scenario
-from stewart_drake.scenario.link import in_time, times_under_way, torque_missing, usual_bound
 from stewart_drake.scenario.loading import scenario_to_dict
+from stewart_drake.scenario.packets import in_time, times_under_way, torque_missing, usual_bound
 from stewart_drake.studies.jobs import Progress, finished, run_jobs
 from stewart_drake.studies.runs import read_outcome, run_scenario
 from stewart_drake.studies.statistics import least_share
