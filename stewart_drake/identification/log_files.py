@@ -27,7 +27,8 @@ EXPECTED: Final = "a log: signals.nc of simulate, or CSV with time, torque_1 ...
 _MAX_BYTES: Final = 100_000_000
 FINEST: Final = 0.01
 """s between two measurements that are used; of more frequent ones as many are left out."""
-_LEAST_ROWS: Final = 20
+_LEAST_VALUES: Final = 96
+"""Measured values of a log: six crank angles at 16 instants, or a state at eight."""
 _ANGLE: Final = {"rad": 1.0, "deg": math.pi / 180}
 _LENGTH: Final = {"m": 1.0, "mm": 1e-3}
 _TORQUES: Final = [f"torque_{leg}" for leg in LEGS]
@@ -114,6 +115,7 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
     own = scenario.actuator.torque_limit
     limit = mechanism.effort_limit if own is None else own
     times, values, std = _measured(signals.measurement, scenario, samples, rows)
+    changing = scenario.queue == "reference" or isinstance(scenario.link, NetworkConfig)
     return _checked(
         Log(
             name=str(path),
@@ -124,6 +126,7 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
             std=std,
             gravity=STANDARD_GRAVITY if scenario.plant.gravity else 0.0,
             delay=believed if math.isfinite(believed) else None,
+            before=None if changing else signals.torque_applied.transpose("time", "leg").values[0],
         ),
         path,
     )
@@ -317,8 +320,11 @@ def _checked(log: Log, path: Path) -> Log:
         if log.times[row] - last > FINEST - 1e-6:
             kept.append(int(row))
             last = float(log.times[row])
-    if len(kept) < _LEAST_ROWS:
+    values = log.values[kept]
+    count = int(np.isfinite(values).sum())
+    if count < _LEAST_VALUES:
         raise ConfigError(
-            f"{path}: got measurements at {len(kept)} instants; expected at least {_LEAST_ROWS}"
+            f"{path}: got {count} measured values, at {len(kept)} instants; expected at least "
+            f"{_LEAST_VALUES}"
         )
-    return replace(log, times=log.times[kept], values=log.values[kept])
+    return replace(log, times=log.times[kept], values=values)

@@ -31,6 +31,7 @@ class Log:
         std: (18,) of their errors.
         gravity: m/s^2 along -z.
         delay: s that was believed in, or None.
+        before: torques (6,) that act before the first of these does, or None where unknown.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Log:
     std: Array
     gravity: float
     delay: float | None = None
+    before: Array | None = None
 
     def acting(self, times: Array, delay: float) -> Array:
         """Torques (k, 6) that act at so many instants in s; before any arrived, the first one."""
