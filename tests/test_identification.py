@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
+from benchmarks import short_logs
 from benchmarks.identification import excitation, find
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
@@ -30,9 +31,14 @@ from stewart_drake.identification.judgement import (
     unseen,
     workspace_poses,
 )
-from stewart_drake.identification.log_files import Precision
+from stewart_drake.identification.log_files import Precision, read_log
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
-from stewart_drake.identification.model import NUM_DYNAMIC, NUM_GEOMETRY, MachineModel
+from stewart_drake.identification.model import (
+    NUM_DYNAMIC,
+    NUM_GEOMETRY,
+    DrawnModel,
+    MachineModel,
+)
 from stewart_drake.identification.shooting import Segment, integrate, plan_steps
 from stewart_drake.identification.start import coarse_delay, measured_poses, segments_of
 from stewart_drake.identification.tolerances import Tolerances
@@ -140,6 +146,21 @@ def test_its_derivatives_are_those_of_other_machines():
         unit = np.eye(12)[k]
         slope = difference(lambda h, unit=unit: at(values, state + h * unit), 1e-6)[:6]
         np.testing.assert_allclose(found.state[0][:, k], slope, atol=1e-5 * np.abs(slope).max())
+
+
+def test_the_model_with_drawn_legs_is_the_same():
+    rng, unknowns = np.random.default_rng(6), some_unknowns(PAPER)
+    states = np.tile(np.concatenate([PAPER.home, STILL]), (3, 1))
+    states += 0.05 * rng.standard_normal((3, 12))
+    numbers = unknowns.numbers(unknowns.mean)._replace(parameters=PARAMETERS)
+    at = states, 0.1 * rng.standard_normal((3, 6)), numbers
+    expected = MachineModel(PAPER, 9.81, 3).slopes(*at)
+    found = DrawnModel(PAPER, 9.81, 3).slopes(*at)
+    np.testing.assert_allclose(found.accelerations, expected.accelerations, rtol=1e-9)
+    np.testing.assert_allclose(found.state, expected.state, rtol=1e-8, atol=1e-8)
+    dynamic = expected.numbers[:, :, :NUM_DYNAMIC]
+    np.testing.assert_allclose(found.numbers[:, :, :NUM_DYNAMIC], dynamic, rtol=1e-8, atol=1e-8)
+    assert not found.numbers[:, :, NUM_DYNAMIC:].any()
 
 
 # ---------------------------------------------------------------- trajectories
@@ -468,6 +489,52 @@ def test_segments_hold_all_samples_once(log_and_truth):
     rows = np.concatenate([segment.rows for segment in segments])
     np.testing.assert_array_equal(rows, np.flatnonzero(log.times >= 1.0))
     assert all(log.times[s.rows[-1]] - s.start < 0.9 for s in segments)
+
+
+# ---------------------------------------------------------------- short logs of lost runs
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [4000, 4001])
+@pytest.mark.parametrize("case", short_logs.CASES, ids=str)
+def test_the_delay_is_found_in_a_short_log_of_a_lost_run(case, seed):
+    """Some 1.5 s with unknown payload and biases; the delay is at most 0.9 s."""
+    found = short_logs.find(*case, seed)
+    assert found.refusal == "" and abs(found.late) < 1e-3 and abs(found.late) < 4 * found.std
+
+
+@pytest.fixture(scope="module")
+def short_run_log(tmp_path_factory) -> Log:
+    """The first 1.2 s of a log with a delay of 0.8 s and noise; the queue was empty."""
+    folder = tmp_path_factory.mktemp("short")
+    short_logs.short_run("paper", 0.8, 1e-3, 4000).save(folder)
+    return up_to(read_log(folder / "signals.nc", PAPER, Precision()), 1.2)
+
+
+def up_to(log: Log, end: float) -> Log:
+    kept = log.times <= end + 1e-9
+    return dataclasses.replace(log, times=log.times[kept], values=log.values[kept])
+
+
+def test_the_queue_of_a_run_is_known(short_run_log):
+    np.testing.assert_array_equal(short_run_log.before, np.zeros(6))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [0.7, 0.9])
+def test_a_log_that_ends_before_its_torques_act_is_refused(short_run_log, end):
+    with pytest.raises(
+        ConfigError, match=r"expected one delay.* a log of at least 1\.9 s"
+    ) as caught:
+        identify([up_to(short_run_log, end)], PAPER)
+    assert f"got a log of {end:g} s" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+def test_a_short_log_with_a_delay_out_of_range_is_refused(short_run_log):
+    """The delay is 0.8 s."""
+    with pytest.raises(ConfigError, match=r"explained by no delay.* at least 1\.3 s"):
+        identify([short_run_log], PAPER, Tolerances(delay=0.1))
 
 
 # ---------------------------------------------------------------- excitation and files

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.identification.logs import ANGLES, KINDS, NUM_MEASURED, POSE
-from stewart_drake.identification.model import NUM_DYNAMIC, MachineModel
+from stewart_drake.identification.model import NUM_DYNAMIC, DrawnModel, MachineModel
 from stewart_drake.identification.shooting import (
     FIRST,
     NUMBERS,
@@ -28,7 +28,13 @@ from stewart_drake.identification.shooting import (
     integrate,
     plan_steps,
 )
-from stewart_drake.identification.unknowns import DELAY, NUM_UNKNOWNS, OFFSETS, Unknowns
+from stewart_drake.identification.unknowns import (
+    DELAY,
+    GEOMETRY,
+    NUM_UNKNOWNS,
+    OFFSETS,
+    Unknowns,
+)
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
 
@@ -36,7 +42,7 @@ MOST_DELAY: Final = 0.1
 """s by which one iteration may change the delay."""
 ENOUGH: Final = 0.01
 """Of chi^2; an iteration that gains less is the last."""
-_MOST_ITERATIONS: Final = 60
+MOST_ITERATIONS: Final = 60
 _SLOPES_STEP: Final = 0.02
 """s, of the integration of slopes."""
 _STEP_ERROR: Final = 0.05
@@ -116,9 +122,10 @@ class Problem:
         return sum(int(np.isfinite(one).sum()) for one in values)
 
     def model(self) -> MachineModel:
-        """That evaluates all segments at once."""
+        """Return the model that evaluates all segments at once."""
         gravity = self.segments[0].log.gravity
-        return MachineModel(self.unknowns.mechanism, gravity, len(self.segments))
+        kind = MachineModel if self.unknowns.std[GEOMETRY].any() else DrawnModel
+        return kind(self.unknowns.mechanism, gravity, len(self.segments))
 
     def measured(self) -> tuple[Array, Array]:
         """Values (m, n, 18) of the segments, NaN where there is none, and their std (n, 18)."""
@@ -237,7 +244,7 @@ def _of(problem: Problem, start: Guess, kept: NDArray[np.intp]) -> tuple[Problem
     return replace(problem, segments=segments), Guess(start.values, start.first[kept])
 
 
-def solve(problem: Problem, start: Guess, most: int = _MOST_ITERATIONS) -> Fit:
+def solve(problem: Problem, start: Guess, most: int = MOST_ITERATIONS) -> Fit:
     """The most probable guess, from a start whose trajectories are `followed`.
 
     `most`: iterations; the fit ends where they do, or where they gain nothing.
@@ -265,8 +272,10 @@ def solve(problem: Problem, start: Guess, most: int = _MOST_ITERATIONS) -> Fit:
     return Fit(guess, residuals, covariance(normal), iterations)
 
 
-def finer(problem: Problem, guess: Guess) -> Problem | None:
+def finer(problem: Problem, guess: Guess, beside: float = 1.0) -> Problem | None:
     """The problem with half the step, or None where that moves its residuals by next to nothing.
+
+    That is little beside a misfit of `beside` standard deviations.
 
     Coulomb friction turns round within some hundredths of a second, so that what step is fine
     enough depends on the machine.
@@ -275,7 +284,7 @@ def finer(problem: Problem, guess: Guess) -> Problem | None:
     if halved.longest_step < _SHORTEST_STEP:
         return None
     coarse, fine = (Evaluator(one).residuals(guess).measured for one in (problem, halved))
-    return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > _STEP_ERROR else None
+    return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > _STEP_ERROR * beside else None
 
 
 def _moved(guess: Guess, unknown: Array, first: Array, free: NDArray[np.intp]) -> Guess:

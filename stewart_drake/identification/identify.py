@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification import start
+from stewart_drake.identification import short_logs, start
 from stewart_drake.identification.fit import (
     Fit,
     Guess,
@@ -198,6 +198,11 @@ def identify(
     # The longest log has most to say.
     longest = max(range(len(logs)), key=lambda i: len(logs[i].times))
     unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
+    middle = np.nanmedian(np.vstack(poses), axis=0)
+    lasting = max(float(log.times[-1] - log.times[0]) for log in logs)
+    if tolerances.delay > 0 and lasting < short_logs.length_needed(unknowns):
+        short = short_logs.fit_short(logs, poses, unknowns, WRONG)
+        return Identification(logs, unknowns, short.problem, short.fit, short.left_out, middle)
     starts = [(believed, 1.0)]
     if tolerances.delay > 0:
         coarse = start.coarse_delay(
@@ -215,7 +220,6 @@ def identify(
     problem, fit = _grown(best)
     while (halved := finer(problem, fit.guess)) is not None:
         problem, fit = halved, _solved(halved, fit.guess)
-    middle = np.nanmedian(np.vstack(poses), axis=0)
     left_out = len(whole.segments) - len(problem.segments)
     return Identification(logs, unknowns, problem, fit, left_out, middle)
 

@@ -1,0 +1,141 @@
+"""Delays from short logs of lost runs: `python benchmarks/short_logs.py`, LOGS of them a row.
+
+A controller from rest that knows of no delay loses the plate after some 1.5 s. Payload and biases
+are unknown to `identify`, which has the drawing and the default tolerances.
+"""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from _page import QUICK, size, table, write
+from joblib import Parallel, delayed
+
+import stewart_drake as sd
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.identify import identify
+from stewart_drake.identification.log_files import Precision, read_log
+from stewart_drake.identification.unknowns import DELAY
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.loading import load_scenario
+
+FRESH = int(os.environ.get("FRESH", "6000"))
+"""The first seed; 3000 to 5009 were looked at while this was made."""
+LOGS = size("LOGS", 10)
+CASES = [
+    (machine, delay, noise)
+    for machine in ("paper", "desktop")
+    for delay in (0.08, 0.8)
+    for noise in (0.0, 1e-3)
+]
+"""Scenario, delay in s, and noise as a share of the amplitudes."""
+AMPLITUDES = {
+    "paper": np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08]),
+    "desktop": np.array([0.18, 0.12, 0.35, 0.012, 0.012, 0.008]),
+}
+"""Amplitudes of the references, rad and m."""
+ENDS = (1.3, 1.7)
+"""s between which a plate is lost."""
+HEAD = (
+    *("scenario", "delay [s]", "noise", "within 1 ms", "refused", "wrong"),
+    *("rms error [ms]", "stated, rms [ms]"),
+)
+
+
+def short_run(machine: str, delay: float, noise: float, seed: int) -> SimulationResult:
+    """Lose the plate within ENDS, by an LQR from rest that knows of no delay.
+
+    Payload up to a fifth of the plate, biases of 0.1 to 0.3 mN m of random signs and the weight of
+    the torques are drawn until the plate is lost in time. Without gravity: under it such a
+    controller loses the plate within 0.3 s.
+
+    Args:
+        machine: a shipped scenario.
+        delay: true one, s.
+        noise: standard deviation as a share of the reference's amplitudes, per second for rates.
+        seed: of the draw.
+    """
+    rng = np.random.default_rng([seed, machine == "paper", round(1e3 * delay), noise > 0])
+    period = load_scenario(machine).controller.period
+    plate = sd.load_mechanism(machine).plate.mass
+    steps, rest = divmod(round(delay / period, 9), 1)
+    std = ",".join(f"{x:.6g}" for x in noise * np.tile(AMPLITUDES[machine], 2))
+    while True:
+        payload = 0.2 * plate * rng.uniform()
+        bias = 3e-4 * rng.uniform(0.3, 1, 6) * rng.choice([-1, 1], 6)
+        settings = (
+            *("plant.kind=exact", "plant.gravity=false", "start=rest", "queue=zero", "duration=2"),
+            f"delay.steps={int(steps)}",
+            f"delay.fraction={round(rest, 9):.9g}",
+            f"controller.w_R={10 ** rng.uniform(0, 2):.6g}",
+            f"plant.payload_mass={payload:.6g}",
+            f"plant.torque_bias=[{','.join(f'{x:.6g}' for x in bias)}]",
+            f"sensor.noise_std=[{std}]",
+            f"sensor.seed={seed}",
+        )
+        run = simulate(load_scenario(machine, "lqr", settings), margin=False)
+        if run.stopped is not None and ENDS[0] <= run.stopped.time <= ENDS[1]:
+            return run
+
+
+class Found(NamedTuple):
+    """Delay of a short log."""
+
+    late: float
+    """Error, s; NaN where the log was refused,"""
+    std: float
+    """stated standard deviation, s,"""
+    refusal: str
+    """and why."""
+
+
+def find(machine: str, delay: float, noise: float, seed: int, end: float = np.inf) -> Found:
+    """Identify from the signals of a short run, up to `end` in s."""
+    run, drawing = short_run(machine, delay, noise, seed), sd.load_mechanism(machine)
+    with TemporaryDirectory() as folder:
+        run.save(folder)
+        log = read_log(Path(folder) / "signals.nc", drawing, Precision())
+    kept = log.times <= end
+    log = replace(log, times=log.times[kept], values=log.values[kept])
+    try:
+        found = identify([log], drawing)
+    except ConfigError as error:
+        return Found(np.nan, np.nan, str(error).partition(": ")[2])
+    return Found(float(found.values[DELAY] - delay), float(found.std[DELAY]), "")
+
+
+def row(case: tuple[str, float, float], found: list[Found]) -> list[str]:
+    """Numbers of a case; wrong is off by more than 1 ms and 2.6 standard deviations."""
+    machine, delay, noise = case
+    late, std = (1e3 * np.array([getattr(one, name) for one in found]) for name in ("late", "std"))
+    told = np.isfinite(late)
+    wrong = np.abs(late) > np.maximum(1.0, 2.6 * std)
+    counts = np.abs(late) <= 1.0, ~told, wrong
+    sizes = (
+        f"{np.sqrt(np.mean(one[told] ** 2)):.2g}" if told.any() else "-" for one in (late, std)
+    )
+    numbers = (str(int(one.sum())) for one in counts)
+    return [machine, f"{delay:g}", f"{100 * noise:g} %", *numbers, *sizes]
+
+
+def main() -> None:
+    """Write the table, and why logs were refused."""
+    jobs = Parallel(n_jobs=int(os.environ.get("JOBS", "-1")))
+    rows, refusals = [], list[str]()
+    for case in CASES[:1] if QUICK else CASES:
+        found = jobs(delayed(find)(*case, FRESH + seed) for seed in range(LOGS))
+        rows.append(row(case, found))
+        print(*rows[-1], flush=True)
+        refusals += [f"- {one.refusal}\n" for one in found if one.refusal]
+    write(__file__, "Delays from short logs of lost runs", [table(HEAD, rows), "".join(refusals)])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,242 @@
+"""Fit of logs that are too short for `start.coarse_delay`, by a scan over delays.
+
+At each delay of a grid, a machine as drawn is fitted to short segments by a few iterations. From
+the best of these the machine with free geometry is fitted to segments of full length.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from stewart_drake.dynamics.workspace import margin
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification import start
+from stewart_drake.identification.fit import (
+    MOST_ITERATIONS,
+    Fit,
+    Guess,
+    Problem,
+    chi2_per_value,
+    finer,
+    followed,
+    misfit,
+    solve,
+    without,
+)
+from stewart_drake.identification.logs import Log
+from stewart_drake.identification.shooting import Segment
+from stewart_drake.identification.unknowns import DELAY, GEOMETRY, Unknowns
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.types import Array
+
+Pair = tuple[Log, Array]
+"""A log, and the poses (n, 6) of its instants."""
+
+_RESPONSE: Final = 1.0
+"""s of motion after the longest delay, from which on a log is not short."""
+_ROOM: Final = 0.2
+"""Share of the margin at home below which a pose is too near the edge of the workspace."""
+_LONG_AGO: Final = 1e3
+"""s before the first torque of a log."""
+_GRID: Final = 0.05
+"""s between delays of the scan."""
+_SCANNED: Final = 0.3
+"""Longest segment of the scan, s."""
+_FEW: Final = 4
+"""Iterations of the scan at each delay."""
+_LOST: Final = 1e4
+"""chi^2 per value of a segment that cannot be followed."""
+_ASTRAY: Final = 1e3
+"""chi^2 per value from which on a fit is not refined but tried without its worst segment."""
+_RIVAL: Final = 30.0
+"""Factor of the least chi^2 of the scan, or of 1, up to which other delays are fitted too."""
+_STARTS: Final = 3
+"""Largest number of delays that are fitted with free geometry."""
+_APART: Final = 0.01
+"""Least difference of two such delays, s."""
+_LATE: Final = 0.02
+"""s by which a delay may be longer than at the start of a fit."""
+_STEP: Final = 0.01
+"""Longest integration step at first, s."""
+_MOST: Final = 0.5
+"""Share of the values after the delay that has to be fitted, at least."""
+_CHANGES: Final = 3
+"""Least number of changes of the torques within the segments."""
+_VAGUE: Final = 1e-3
+"""Largest standard deviation of a delay that is accepted, s."""
+
+
+class ShortFit(NamedTuple):
+    """Fit of segments of logs."""
+
+    whole: Problem
+    """All segments."""
+    problem: Problem
+    """The segments that could be followed."""
+    begun: Guess
+    fit: Fit
+
+    @property
+    def delay(self) -> float:
+        """Delay found, s."""
+        return float(self.fit.guess.values[DELAY])
+
+    @property
+    def delay_std(self) -> float:
+        """Standard deviation of the delay, s, the last of the unknowns."""
+        variance: float = self.fit.covariance[-1, -1]
+        return float(np.sqrt(variance))
+
+    @property
+    def left_out(self) -> int:
+        """Number of segments that were not fitted."""
+        return len(self.whole.segments) - len(self.problem.segments)
+
+    @property
+    def share(self) -> float:
+        """Share of the values of all segments that was fitted."""
+        return self.problem.count / self.whole.count
+
+    @property
+    def chi2(self) -> float:
+        """chi^2 per value that was fitted."""
+        return chi2_per_value(self.fit.residuals, self.problem)["all"]
+
+    @property
+    def cost(self) -> float:
+        """chi^2 per value of all segments, `_LOST` for those that could not be followed."""
+        return self.share * self.chi2 + (1 - self.share) * _LOST
+
+    @property
+    def changes(self) -> int:
+        """Number of changes of the torques within the segments that were fitted."""
+        spans = [(s.log.sent[1:] + self.delay, s) for s in self.problem.segments]
+        return sum(int(np.sum((t > s.start) & (t < s.log.times[s.rows[-1]]))) for t, s in spans)
+
+    def explains(self, worst: float) -> bool:
+        """Return whether most values are fitted, with a chi^2 of at most `worst` per value."""
+        return self.chi2 <= worst and self.share > _MOST and self.changes >= _CHANGES
+
+
+def length_needed(unknowns: Unknowns) -> float:
+    """Return the length in s from which on a log is not short."""
+    return float(unknowns.mean[DELAY] + 3 * unknowns.std[DELAY] + _RESPONSE)
+
+
+def fit_short(
+    logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns, worst: float
+) -> ShortFit:
+    """Return the fit with the only delay that explains the logs.
+
+    Args:
+        logs: of one machine.
+        poses: (n, 6) of the instants of each.
+        unknowns: before the logs.
+        worst: largest chi^2 per value of a fit that explains the logs.
+
+    Raises:
+        ConfigError: no delay, or more than one, explains the logs; names the length needed.
+    """
+    pairs = [_inside(*pair, unknowns.mechanism) for pair in zip(logs, poses, strict=True)]
+    fits = [_grown(pairs, unknowns, values) for values in _scanned(pairs, unknowns)]
+    right = [one for one in fits if one and one.explains(worst)]
+    if len(right) == 1 and right[0].delay_std <= _VAGUE:
+        return right[0]
+    told = " and ".join(f"{one.delay:.3g} s (+-{one.delay_std:.1g} s)" for one in right)
+    longest = max(logs, key=lambda log: len(log.times))
+    raise ConfigError(
+        f"{longest.name}: got a log of {longest.times[-1] - longest.times[0]:.3g} s, explained by "
+        f"{'delays of ' + told if told else 'no delay'}; expected one delay, known to "
+        f"{1e3 * _VAGUE:g} ms: a log of at least {length_needed(unknowns):.3g} s (the longest "
+        f"possible delay and {_RESPONSE:g} s of motion), or a narrower --tolerance delay=S"
+    )
+
+
+def _inside(log: Log, poses: Array, mechanism: Mechanism) -> Pair:
+    """Return a log with the torques before it, and without instants near the edge.
+
+    A crank angle has no derivative by the pose at a dead centre. Fits of the last samples before a
+    loss end in local minima there.
+    """
+    least = _ROOM * margin(mechanism, mechanism.home)
+    kept = ~np.array([margin(mechanism, pose) < least for pose in poses], dtype=bool)
+    log = replace(log, times=log.times[kept], values=log.values[kept])
+    if log.before is not None:
+        sent = np.r_[log.sent[0] - _LONG_AGO, log.sent]
+        log = replace(log, sent=sent, torques=np.vstack([log.before, log.torques]))
+    return log, poses[kept]
+
+
+def _scanned(pairs: Sequence[Pair], unknowns: Unknowns) -> list[Array]:
+    """Return values of the unknowns at the delays that explain the logs best."""
+    std, found = unknowns.std.copy(), list[ShortFit]()
+    std[GEOMETRY] = 0.0
+    middle, reach = unknowns.mean[DELAY], 3 * std[DELAY]
+    for delay in np.arange(max(0.0, middle - reach), middle + reach + _GRID / 2, _GRID):
+        values = unknowns.mean.copy()
+        values[DELAY] = delay
+        one = _fitted(pairs, replace(unknowns, std=std), values, _SCANNED, _FEW)
+        found += [one] if one else []
+    found.sort(key=lambda one: one.cost)
+    kept = list[ShortFit]()
+    for one in found:
+        near = one.cost <= _RIVAL * max(1.0, found[0].cost)
+        if near and all(abs(one.delay - other.delay) > _APART for other in kept):
+            kept.append(one)
+    return [one.fit.guess.values for one in kept[:_STARTS]]
+
+
+def _fitted(
+    pairs: Sequence[Pair],
+    unknowns: Unknowns,
+    values: Array,
+    longest: float = np.inf,
+    most: int = MOST_ITERATIONS,
+) -> ShortFit | None:
+    """Return the fit from a start, with segments of `longest` s; None if none can be followed."""
+    segments, first, delay = list[Segment](), list[Array](), float(values[DELAY])
+    for log, poses in pairs:
+        length = start.segment_length(log, poses, unknowns.mechanism, delay)
+        begin = float(log.sent[0]) + delay + _LATE
+        try:
+            parts = start.segments_of(log, begin, min(longest, length))
+        except ConfigError:  # too little of this log is left after the delay
+            continue
+        segments += parts
+        first += [start.first_state(log, poses, int(part.rows[0])) for part in parts]
+    if not segments:
+        return None
+    whole = Problem(segments, unknowns, _STEP)
+    problem, guess = followed(whole, Guess(values, np.array(first)))
+    if not problem.segments:
+        return None
+    try:
+        with np.errstate(all="ignore"):
+            return ShortFit(whole, problem, guess, solve(problem, guess, most))
+    except np.linalg.LinAlgError:  # a trajectory grew beyond all bounds
+        return None
+
+
+def _grown(pairs: Sequence[Pair], unknowns: Unknowns, values: Array) -> ShortFit | None:
+    """Return the fit to segments of full length, with steps that are short enough.
+
+    At most one segment of each log is left out, such as the last before the plate was lost.
+    """
+    one = _fitted(pairs, unknowns, values)
+    if one is None:
+        return None
+    for _ in pairs:
+        if one.chi2 <= _ASTRAY or len(one.problem.segments) == 1:
+            break
+        worst = int(misfit(one.fit.residuals, one.problem).argmax())
+        problem, begun = without(one.problem, one.begun, worst)
+        one = one._replace(problem=problem, begun=begun, fit=solve(problem, begun))
+    while one.chi2 <= _ASTRAY:
+        away = max(1.0, float(np.sqrt(np.mean(one.fit.residuals.measured**2))))
+        problem = finer(one.problem, one.fit.guess, away)
+        if problem is None:
+            break
+        one = one._replace(problem=problem, fit=solve(problem, one.fit.guess))
+    return one
