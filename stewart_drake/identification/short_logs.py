@@ -5,6 +5,7 @@ the best of these the machine with free geometry is fitted to segments of full l
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -74,8 +75,9 @@ class ShortFit(NamedTuple):
     whole: Problem
     """All segments."""
     problem: Problem
-    """The segments that could be followed."""
+    """Segments that were fitted."""
     begun: Guess
+    """Start of the fit."""
     fit: Fit
 
     @property
@@ -125,6 +127,7 @@ def length_needed(unknowns: Unknowns) -> float:
     return float(unknowns.mean[DELAY] + 3 * unknowns.std[DELAY] + _RESPONSE)
 
 
+@np.errstate(all="ignore")
 def fit_short(
     logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns, worst: float
 ) -> ShortFit:
@@ -140,11 +143,15 @@ def fit_short(
         ConfigError: no delay, or more than one, explains the logs; names the length needed.
     """
     pairs = [_inside(*pair, unknowns.mechanism) for pair in zip(logs, poses, strict=True)]
-    fits = [_grown(pairs, unknowns, values) for values in _scanned(pairs, unknowns)]
-    right = [one for one in fits if one and one.explains(worst)]
+    right = list[ShortFit]()
+    for values in _scanned(pairs, unknowns):
+        with suppress(np.linalg.LinAlgError):  # a trajectory grew beyond all bounds
+            one = _grown(pairs, unknowns, values)
+            if one and one.explains(worst) and _apart(one, right):
+                right.append(one)
     if len(right) == 1 and right[0].delay_std <= _VAGUE:
         return right[0]
-    told = " and ".join(f"{one.delay:.3g} s (+-{one.delay_std:.1g} s)" for one in right)
+    told = " and ".join(f"{one.delay:.3g} s (+-{1e3 * one.delay_std:.2g} ms)" for one in right)
     longest = max(logs, key=lambda log: len(log.times))
     raise ConfigError(
         f"{longest.name}: got a log of {longest.times[-1] - longest.times[0]:.3g} s, explained by "
@@ -177,15 +184,20 @@ def _scanned(pairs: Sequence[Pair], unknowns: Unknowns) -> list[Array]:
     for delay in np.arange(max(0.0, middle - reach), middle + reach + _GRID / 2, _GRID):
         values = unknowns.mean.copy()
         values[DELAY] = delay
-        one = _fitted(pairs, replace(unknowns, std=std), values, _SCANNED, _FEW)
-        found += [one] if one else []
+        with suppress(np.linalg.LinAlgError):
+            one = _fitted(pairs, replace(unknowns, std=std), values, _SCANNED, _FEW)
+            found += [one] if one else []
     found.sort(key=lambda one: one.cost)
     kept = list[ShortFit]()
     for one in found:
-        near = one.cost <= _RIVAL * max(1.0, found[0].cost)
-        if near and all(abs(one.delay - other.delay) > _APART for other in kept):
+        if one.cost <= _RIVAL * max(1.0, found[0].cost) and _apart(one, kept):
             kept.append(one)
     return [one.fit.guess.values for one in kept[:_STARTS]]
+
+
+def _apart(one: ShortFit, others: Sequence[ShortFit]) -> bool:
+    """Return whether the delay of a fit differs from those of others."""
+    return all(abs(one.delay - other.delay) > _APART for other in others)
 
 
 def _fitted(
@@ -212,11 +224,7 @@ def _fitted(
     problem, guess = followed(whole, Guess(values, np.array(first)))
     if not problem.segments:
         return None
-    try:
-        with np.errstate(all="ignore"):
-            return ShortFit(whole, problem, guess, solve(problem, guess, most))
-    except np.linalg.LinAlgError:  # a trajectory grew beyond all bounds
-        return None
+    return ShortFit(whole, problem, guess, solve(problem, guess, most))
 
 
 def _grown(pairs: Sequence[Pair], unknowns: Unknowns, values: Array) -> ShortFit | None:
@@ -235,8 +243,8 @@ def _grown(pairs: Sequence[Pair], unknowns: Unknowns, values: Array) -> ShortFit
         one = one._replace(problem=problem, begun=begun, fit=solve(problem, begun))
     while one.chi2 <= _ASTRAY:
         away = max(1.0, float(np.sqrt(np.mean(one.fit.residuals.measured**2))))
-        problem = finer(one.problem, one.fit.guess, away)
-        if problem is None:
+        halved = finer(one.problem, one.fit.guess, away)
+        if halved is None:
             break
-        one = one._replace(problem=problem, fit=solve(problem, one.fit.guess))
+        one = one._replace(problem=halved, fit=solve(halved, one.fit.guess))
     return one
