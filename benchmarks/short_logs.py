@@ -80,7 +80,7 @@ def short_run(machine: str, delay: float, noise: float, seed: int) -> Simulation
             f"sensor.noise_std=[{std}]",
             f"sensor.seed={seed}",
         )
-        run = simulate(load_scenario(machine, "lqr", settings), margin=False)
+        run = simulate(load_scenario(machine, "lqr", settings), judge_stability=False)
         if run.stopped is not None and ENDS[0] <= run.stopped.time <= ENDS[1]:
             return run
 
