@@ -529,13 +529,6 @@ def test_a_log_that_ends_before_its_torques_act_is_refused(short_run_log, end):
     assert f"got a log of {end:g} s" in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.slow
-def test_a_short_log_with_a_delay_out_of_range_is_refused(short_run_log):
-    """The delay is 0.8 s."""
-    with pytest.raises(ConfigError, match=r"explained by no delay.* at least 1\.3 s"):
-        identify([short_run_log], PAPER, Tolerances(delay=0.1))
-
-
 # ---------------------------------------------------------------- excitation and files
 
 
