@@ -290,6 +290,43 @@ def lost(k: int, reference: Array) -> Array:
     return reference
 
 
+def lost_in_a_row(first: int, number: int) -> Spoil:
+    """Whole previews, and later one without its last row."""
+
+    def lose(k: int, reference: Array) -> Array:
+        reference = reference.copy()
+        if first <= k < first + number:
+            reference[:] = np.nan
+        if k == 20:
+            reference[-1] = np.nan
+        return reference
+
+    return lose
+
+
+@pytest.mark.parametrize("case", ["paper", "a fraction of a period", "no delay", "gravity"])
+@pytest.mark.parametrize(("first", "number"), [(0, 1), (0, 3), (1, 5), (2, 5), (0, 10), (8, 10)])
+def test_after_a_gap_the_way_back_is_that_of_python(
+    library, case: str, first: int, number: int
+) -> None:
+    """From rest; the same torques, counts and memory."""
+    name, settings, _ = CASES[case]
+    pair, gaps, peak = Pair(library, name, settings), [], 0.0
+    for k in range(32):
+        gaps.append(pair.step(k, np.zeros(12), None, lost_in_a_row(first, number)))
+        one, other = pair.one, pair.other
+        peak = max(peak, float(np.abs(one.torque).max()))
+        assert one.counts == other.counts, k
+        back, data = one.back, other.data
+        assert (one.gap, back.holds, back.samples) == (
+            data["gap"], data["return_holds"], data["return_samples"]
+        ), k  # fmt: skip
+        if back.holds:
+            assert np.allclose(back.offset, data["offset"], rtol=1e-6, atol=1e-8), k
+    assert max(gaps) <= 1e-8 * peak
+    assert pair.one.counts.references_missing == number + 1
+
+
 @pytest.mark.parametrize("case", ["paper", "a fraction of a period", "no delay", "gravity"])
 @pytest.mark.parametrize("start", ["measured", "unmeasured"])
 def test_a_reference_that_is_missing_is_continued_as_in_python(

@@ -9,6 +9,7 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Sent
 from stewart_drake.law.motion import Previewed
+from stewart_drake.law.return_path import ReturnPath
 from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.types import Array
 
@@ -72,9 +73,12 @@ class Memory:
         counts: see `Counts`.
         plan: (N, 6) torques that were sent last, the first of them the last in flight.
         sent: what the channel remembers.
-        reference: that was followed, NaN before the first sample.
+        reference: that was given, with numbers for what was missing; NaN before there was any.
+        followed: (p, 18) the same with the way back after a gap.
         path: that was planned in flight, or None.
         silence: samples that are still to go on without feedback.
+        gap: whether the last row of the last preview was missing.
+        back: way back since the end of the last gap.
         feedforward: (6,) how much of `torque` rests on no measurement; NaN before the first sample.
     """
 
@@ -90,8 +94,11 @@ class Memory:
     plan: Array
     sent: Sent
     reference: Previewed
+    followed: Array
     path: Trajectory | None = None
     silence: int = 0
+    gap: bool = False
+    back: ReturnPath = field(default_factory=ReturnPath)
     feedforward: Array = field(default_factory=lambda: np.full(NUM_TORQUES, np.nan))
 
     def without_error(self) -> "Memory":

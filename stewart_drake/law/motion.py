@@ -22,6 +22,11 @@ Motion = Callable[[Array], Array]
 """The reference (p, 18), pose, rates and accelerations, at instants (p,) in s from now; some of
 them may be negative."""
 
+FURTHER = 1.25
+"""Times as far as to its rest, a motion that is not known any more has to stay within reach."""
+DOUBLINGS = 6
+"""Of the rate at which a motion that is not known any more comes to rest, at the most."""
+
 
 @dataclass(frozen=True)
 class Preview:
@@ -81,7 +86,9 @@ class Previewed(NamedTuple):
         return cls(times, np.full((len(times), NUM_REFERENCE), np.nan))
 
 
-def completed(given: Previewed, last: Previewed, timeline: Timeline) -> Array:
+def completed(
+    given: Previewed, last: Previewed, timeline: Timeline, reaches: Callable[[Array], bool]
+) -> Array:
     """Return the reference (p, 18), with numbers for what is NaN or infinite in the given one.
 
     They lie between the rows next to them in time, of this preview or of the last one, or continue
@@ -91,6 +98,7 @@ def completed(given: Previewed, last: Previewed, timeline: Timeline) -> Array:
         given: for this sample.
         last: what `completed` returned for the sample before, with its instants.
         timeline: period and delay.
+        reaches: whether a pose (6,) is one that the plate can be in.
     """
     times, preview = given
     finite = np.all(np.isfinite(preview), axis=1)
@@ -109,7 +117,7 @@ def completed(given: Previewed, last: Previewed, timeline: Timeline) -> Array:
         nearest = [int(np.argmin(side)) for side in sides if np.isfinite(side).any()]
         j, k = nearest[0], nearest[-1]
         if j == k:
-            found = _continued(rows[j], -gaps[j], rate)
+            found = _continued(rows[j], -gaps[j], rate, reaches)
         else:
             found = between(rows[j], rows[k], gaps[k] - gaps[j], gaps[j] / (gaps[j] - gaps[k]))
         v, near = preview[i, RATES], [j, k] if j != k else [j]
@@ -121,12 +129,17 @@ def completed(given: Previewed, last: Previewed, timeline: Timeline) -> Array:
     return complete
 
 
-def _continued(row: Array, later: float, w: float) -> Array:
+def _continued(row: Array, later: float, w: float, reaches: Callable[[Array], bool]) -> Array:
     """Return the reference (18,) `later` s after a row, coming to rest with the rate w in 1/s.
 
-    From da/dt = -2 w a - w^2 v, with b = a0 + w v0: v = (v0 + b t) e^(-w t).
+    From da/dt = -2 w a - w^2 v, with b = a0 + w v0: v = (v0 + b t) e^(-w t). It comes to rest
+    (2 v0 + a0 / w) / w away; w doubles until the plate could go FURTHER.
     """
     x, v, a = row[POSE], row[RATES], row[ACCELERATIONS]
+    for _ in range(DOUBLINGS):
+        if reaches(x + FURTHER * (2 * v + a / w) / w):
+            break
+        w = 2 * w
     left, b = np.exp(-w * later), a + w * v
     moved = (v * (1 - left) + b / w * (1 - left * (1 + w * later))) / w
     return np.concatenate([x + moved, left * (v + b * later), left * (a - w * b * later)])
@@ -146,3 +159,11 @@ def between(a: Array, b: Array, h: float, s: float) -> Array:
     rates = v0 + s * (2 * c2 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))
     accelerations = 2 * c2 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))
     return np.concatenate([pose, rates / h, accelerations / h**2])
+
+
+def interpolated(times: Array, reference: Array, time: float) -> Array:
+    """Return the reference (18,) at `time`, between the rows before and after it."""
+    gaps = times - time
+    j = int(np.argmin(np.where(gaps <= 0, -gaps, np.inf)))
+    k = int(np.argmin(np.where(gaps > 0, gaps, np.inf)))
+    return between(reference[j], reference[k], gaps[k] - gaps[j], gaps[j] / (gaps[j] - gaps[k]))

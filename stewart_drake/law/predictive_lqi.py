@@ -19,17 +19,19 @@ from typing import NamedTuple
 import numpy as np
 
 from stewart_drake.law.belief import Belief
+from stewart_drake.law.catch_up import DEFAULT_CATCH_UP
 from stewart_drake.law.channel import Channel, Report, Wire
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
-from stewart_drake.law.motion import Motion, Previewed, completed
+from stewart_drake.law.motion import Motion, Previewed, between, completed, interpolated
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import Observer
 from stewart_drake.law.planner import NoPlanner, Planner
 from stewart_drake.law.predictors import Ahead, Predictor
+from stewart_drake.law.return_path import ReturnPath
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
@@ -61,6 +63,20 @@ class Response(NamedTuple):
     """What went wrong, as the name of a count."""
     feedforward: Array
     """(6,) N m, of the torque."""
+
+
+class Wanted(NamedTuple):
+    """Reference of one sample."""
+
+    reference: Previewed
+    """As it was given, with numbers for what was missing."""
+    followed: Array
+    """(p, 18) the same with the way back onto it."""
+    missing: bool
+    """Whether something was missing in the preview."""
+    gap: bool
+    """Whether its last row was."""
+    back: ReturnPath
 
 
 @dataclass(frozen=True)
@@ -146,6 +162,7 @@ class PredictiveLqi:
             plan=np.tile(nothing, (self.channel.torques, 1)),
             sent=self.channel.start(),
             reference=Previewed.nothing(self.preview_times),
+            followed=Previewed.nothing(self.preview_times).reference,
             silence=self.silence,
         )
 
@@ -185,12 +202,13 @@ class PredictiveLqi:
         if followed.anew:
             memory = memory.without_error()
         samples = 1 + len(self.predictor.samples(belief.timeline))
-        reference, missing = self._previewed(memory, belief.timeline, followed.motion)
-        preview = reference.reference
-        if missing:  # which spoils the plan as a limit does
-            memory = replace(memory, silence=0)
+        given = self._previewed(memory, belief, followed.motion)
+        preview, missing = given.followed, given.missing
         nodes_end = samples + 2 * (self.predictor.pending(belief.timeline) + 3)
         wanted, nodes = preview[:samples, :NUM_STATE], preview[samples:nodes_end]
+        waiting = not np.all(np.isfinite(nodes))
+        if missing and not (given.gap or waiting):  # which spoils the plan as a limit does
+            memory = replace(memory, silence=0)
         if not belief.has_state:  # nothing else to go on with
             belief = belief.at(wanted[0])
         queue = belief.timeline.queue(memory.in_flight)
@@ -220,21 +238,86 @@ class PredictiveLqi:
                 "references_missing" if missing else None,
             ),
             path=followed.path,
-            silence=max(memory.silence - 1, 0),
+            silence=memory.silence if waiting else max(memory.silence - 1, 0),
             feedforward=feedforward,
-            reference=reference,
+            reference=given.reference,
+            followed=given.followed,
+            gap=given.gap,
+            back=given.back,
             plan=plan,
             sent=self.channel.send(sent, plan, memory.in_flight),
         )
 
-    def _previewed(
-        self, memory: Memory, timeline: Timeline, motion: Motion
-    ) -> tuple[Previewed, bool]:
-        """Return the reference to follow now, and whether something of it was missing."""
+    def _previewed(self, memory: Memory, belief: Belief, motion: Motion) -> Wanted:
+        """Return the reference to follow now: the given one, and after a gap the way back onto it.
+
+        Up to the instant at which the next torque begins to act, that is what was followed before.
+        At the first preview ever, and as long as nothing is fed back, it is the predicted motion of
+        the plate, from rest its rest.
+        """
+        timeline = belief.timeline
         times = self.preview_times if timeline == self.timeline else self.times_for(timeline)
-        given = Previewed(times, motion(times))
-        reference = completed(given, memory.reference, timeline)
-        return Previewed(times, reference), reference is not given.reference
+        given, last, h = Previewed(times, motion(times)), memory.reference, timeline.period
+        reference = self._completed(given, last, timeline)
+        missing = reference is not given.reference
+        gap = missing and not np.all(np.isfinite(given.reference[-1]))
+        ended, back = memory.gap and not gap, memory.back.after(h)
+        if not (ended or back.active):
+            return Wanted(Previewed(times, reference), reference, missing, gap, back)
+        acts, known = timeline.eta - 1e-6 * h, bool(np.all(np.isfinite(memory.followed[-1])))
+        early = ended or 2 * back.holds * h >= DEFAULT_CATCH_UP
+        corrected = early and not missing and self._is_quiet(memory)
+        if known and not corrected:
+            before = np.where(times[:, None] < acts, np.nan, reference)
+            followed = Previewed(last.times, memory.followed)
+            way = self._completed(Previewed(times, before), followed, timeline)
+            if ended:  # without a step in what is followed
+                continued = self._completed(Previewed.nothing(times), last, timeline)
+                step = [interpolated(times, r, timeline.eta) for r in (continued, reference)]
+                offset = back.at(0.0, h) + step[0] - step[1]
+                back = ReturnPath.of(offset[:NUM_STATE], timeline)
+        elif belief.has_state:
+            way, state = self._predicted(memory, belief, times)
+            wanted = interpolated(times, reference, timeline.eta)
+            offset = state - wanted[:NUM_STATE]
+            anew = ended or not known
+            back = ReturnPath.of(offset, timeline) if anew else replace(back, offset=offset)
+        else:  # nothing else to go on with
+            return Wanted(Previewed(times, reference), reference, missing, gap, ReturnPath())
+        followed_now = np.array(
+            [
+                way[i] if t < acts else reference[i] + back.at(t - timeline.eta, h)
+                for i, t in enumerate(times)
+            ]
+        )
+        return Wanted(Previewed(times, reference), followed_now, missing, gap, back)
+
+    def _completed(self, given: Previewed, last: Previewed, timeline: Timeline) -> Array:
+        return completed(given, last, timeline, self._reaches)
+
+    def _reaches(self, pose: Array) -> bool:
+        try:
+            self.plant.dynamics.require_reach(pose)
+        except UnreachablePoseError:
+            return False
+        return True
+
+    def _predicted(self, memory: Memory, belief: Belief, times: Array) -> tuple[Array, Array]:
+        """Return the predicted motion (p, 18), and the state (12,) where the next torque acts."""
+        timeline, dynamics, theta = belief.timeline, self.plant.dynamics, belief.parameters
+        acting = timeline.until_next(timeline.queue(memory.in_flight))
+        states = np.vstack([belief.state, self.plant.predict(belief.state, acting, theta)])
+        edges = np.append(0.0, np.cumsum(acting.durations))
+        way = np.tile(np.concatenate([states[-1], np.zeros(NUM_COORDINATES)]), (len(times), 1))
+        for i, torque in enumerate(acting.torques):
+            start, end = (
+                np.append(x, dynamics.accelerations(x[POSE], x[RATES], torque, theta))
+                for x in states[i : i + 2]
+            )
+            h = acting.durations[i]
+            for j in np.flatnonzero((times >= edges[i]) & (times < edges[i + 1])):
+                way[j] = between(start, end, h, (times[j] - edges[i]) / h)
+        return way, states[-1]
 
     def _respond(
         self,
@@ -248,12 +331,17 @@ class PredictiveLqi:
         """What is done, and the belief that it goes by."""
         if not np.all(np.isfinite(nodes)):  # nothing to follow yet: hold the torque
             return belief, self._unregulated(memory.torque, memory, belief, wanted)
-        # A limit spoils the plan: what it takes away is known without a measurement.
-        quiet = memory.silence > 0 and not self.plant.motors.reached(memory.in_flight)
-        if belief.feeds_back and not quiet:
+        if belief.feeds_back and not self._is_quiet(memory):
             return belief, self._feed_back(memory, belief, queue, wanted, nodes, weights)
         guide = belief.assuming(self.plant.dynamics.parameters)
         return guide, self._go_on_alone(memory, guide, wanted, nodes)
+
+    def _is_quiet(self, memory: Memory) -> bool:
+        """Return whether nothing is fed back yet.
+
+        A limit spoils the plan: what it takes away is known without a measurement.
+        """
+        return memory.silence > 0 and not self.plant.motors.reached(memory.in_flight)
 
     def _feed_back(
         self,

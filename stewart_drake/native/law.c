@@ -10,6 +10,7 @@
 #define THETA STEWART_ESTIMATED
 #define ALL STEWART_MEANS
 #define U STEWART_MOTORS
+#define ROW STEWART_REFERENCE
 
 /* law/nominal.py */
 #define VIGOROUS 2
@@ -24,6 +25,11 @@
 #define KNOWN ((real)0.01)
 #define LEARNT ((real)0.3)
 #define PATIENCE 3
+/* law/motion.py */
+#define FURTHER ((real)1.25)
+#define DOUBLINGS 6
+/* law/catch_up.py */
+#define CATCH_UP ((real)0.3)
 /* dynamics/equations.py */
 #define DEAD_CENTRE_SINE ((real)0.01)
 
@@ -804,12 +810,33 @@ static int estimate(const stewart_config *c, stewart_memory *m, const real *y, i
     return fault;
 }
 
-/* ---- the reference: law/motion.py -------------------------------------------------------------- */
+/* law/design_models.py */
+static int is_workable(const stewart_config *c, const real *pose)
+{
+    real measures[STEWART_MEASURES];
+    if (!within_reach(c, pose, 1))
+        return 0;
+    stewart_measures(c->geometry, pose, NULL, measures);
+    for (int i = 0; i < 6; i++)
+        if (measures[i] < DEAD_CENTRE_SINE)
+            return 0;
+    return 1;
+}
+
+/* ---- the reference: law/motion.py, law/return_path.py ------------------------------------------ */
 
 /* The reference `later` s after a row of it (negative: before). It comes to rest with the rate w:
-   da/dt = -2 w a - w^2 v, of accelerations a and rates v. */
-static void continued(const real *from, real later, real w, real *row)
+   da/dt = -2 w a - w^2 v, of accelerations a and rates v. That is (2 v + a / w) / w away; w doubles
+   until the plate could go FURTHER. */
+static void continued(const stewart_config *c, const real *from, real later, real w, real *row)
 {
+    for (int doubled = 0; doubled < DOUBLINGS; doubled++, w *= 2) {
+        real pose[6];
+        for (int i = 0; i < 6; i++)
+            pose[i] = from[i] + FURTHER * (2 * from[6 + i] + from[12 + i] / w) / w;
+        if (is_workable(c, pose))
+            break;
+    }
     real left = REAL(exp)(-w * later);
     for (int i = 0; i < 6; i++) {
         real v = from[6 + i], a = from[12 + i], b = a + w * v;
@@ -850,26 +877,29 @@ static void slopes(const real *const next[2], const real later[2], const real *v
         accelerations[i] = sum[i] / (real)sides;
 }
 
-/* `preview` of the workspace: the given one, in which what is missing of a row lies between the rows
-   next to it in time, of this preview or the last one, or continues one of them. Without any, which is
-   at the start only, it stays missing. The status. */
-static int complete(const stewart_config *c, stewart_memory *m, const real *given,
-                    stewart_workspace *w)
+/* The given preview from `since` s on, in which what is missing of a row lies between the rows next to it
+   in time, of this preview or the last one, or continues one of them. As long as there is none it stays
+   missing. */
+static void complete(const stewart_config *c, int n, const real *times, const real *given, real since,
+                     real last[][ROW], real *preview)
 {
-    enum { R = STEWART_REFERENCE };
-    real times[STEWART_PREVIEW], found[R];
-    const int n = stewart_preview_times(c, times), missing = !all_finite(R * n, given);
+    real found[ROW];
     const real rate = 2 / (((real)c->steps + c->fraction + 1) * c->period);
-    copy(R * n, given, w->preview);
+    for (int i = 0; i < n; i++)
+        if (times[i] < since)
+            fill(ROW, (real)NAN, preview + ROW * i);
+        else
+            copy(ROW, given + ROW * i, preview + ROW * i);
+    const int missing = !all_finite(ROW * n, preview);
     for (int i = 0; missing && i < n; i++) {
         const real *next[2] = {NULL, NULL}; /* before and after */
         real later[2] = {-(real)HUGE_VAL, (real)HUGE_VAL};
         for (int j = 0; j < 2 * n - 1; j++) {
-            int last = j >= n, k = last ? j - n + 1 : j;
-            const real *source = last ? m->reference[k - 1] : given + R * k;
-            real gap = times[k] - times[i] - (last ? c->period : 0);
-            int side = gap > 0;
-            if ((side ? gap < later[1] : gap > later[0]) && all_finite(R, source)) {
+            int earlier = j >= n, k = earlier ? j - n + 1 : j;
+            const real *source = earlier ? last[k - 1] : given + ROW * k;
+            real gap = times[k] - times[i] - (earlier ? c->period : 0);
+            int side = gap > 0, there = earlier || times[k] >= since;
+            if (there && (side ? gap < later[1] : gap > later[0]) && all_finite(ROW, source)) {
                 next[side] = source;
                 later[side] = gap;
             }
@@ -877,18 +907,164 @@ static int complete(const stewart_config *c, stewart_memory *m, const real *give
         if (next[0] && next[1])
             between(next[0], next[1], later[1] - later[0], later[0] / (later[0] - later[1]), found);
         else if (next[0] || next[1])
-            continued(next[!next[0]], -later[!next[0]], rate, found);
+            continued(c, next[!next[0]], -later[!next[0]], rate, found);
         else
             break;
-        real *row = w->preview + R * i;
+        real *row = preview + ROW * i;
         if (all_finite(6, row + 6))
             slopes(next, later, row + 6, c->period / 20, found + 12);
-        for (int k = 0; k < R; k++)
+        for (int k = 0; k < ROW; k++)
             if (!isfinite(row[k]))
                 row[k] = found[k];
     }
-    for (int i = 1; i < n; i++)
-        copy(R, w->preview + R * i, m->reference[i - 1]);
+}
+
+/* An offset from the reference that is zero after some holds: law/return_path.py. */
+typedef struct {
+    real offset[X];
+    int holds;
+} return_path;
+
+/* The offset and its accelerations `time` s later, within the first hold of h s. */
+static void move_offset(return_path *p, real h, real time, real *accelerations)
+{
+    const real n = (real)p->holds;
+    for (int i = 0; i < 6; i++) {
+        real *pose = p->offset + i, *rate = pose + 6, a = -*rate / (n * h);
+        if (p->holds > 1)
+            a -= 6 * (*pose + n * h / 2 * *rate) / (h * h * n * (n + 1));
+        *pose += time * (*rate + time / 2 * a);
+        *rate += time * a;
+        accelerations[i] = a;
+    }
+}
+
+/* Adds the offset `time` s after its beginning to a row of the reference. */
+static void add_offset(return_path p, real h, real time, real *row)
+{
+    real a[6];
+    for (; p.holds > 0 && time > h; p.holds--, time -= h)
+        move_offset(&p, h, h, a);
+    if (p.holds == 0)
+        return;
+    move_offset(&p, h, time, a);
+    for (int i = 0; i < X; i++)
+        row[i] += p.offset[i];
+    for (int i = 0; i < 6; i++)
+        row[X + i] += a[i];
+}
+
+/* The reference at an instant, between the rows before and after it. */
+static void interpolate(int n, const real *times, const real *reference, real time, real *row)
+{
+    int before = 0, after = 0;
+    real earlier = -(real)HUGE_VAL, later = (real)HUGE_VAL;
+    for (int i = 0; i < n; i++) {
+        real gap = times[i] - time;
+        if (gap <= 0 && gap > earlier) {
+            earlier = gap;
+            before = i;
+        } else if (gap > 0 && gap < later) {
+            later = gap;
+            after = i;
+        }
+    }
+    between(reference + ROW * before, reference + ROW * after, later - earlier,
+            earlier / (earlier - later), row);
+}
+
+/* Rows of the predicted motion, and the state where the next torque acts. */
+static void predict_way(const stewart_config *c, const stewart_memory *m, int n, const real *times,
+                        real *way, real *state)
+{
+    const int queue = stewart_queue_length(c);
+    const real *torque = m->in_flight[in_flight_length(c) - queue];
+    const int substeps = substeps_for(c, queue, torque);
+    real ends[2][ROW], begin = 0;
+    belief b;
+    believe(c, m->mean + X, &b);
+    copy(X, m->state, ends[1]);
+    for (int k = 0; k < queue; k++, torque += U) {
+        real h = k == 0 && c->fraction > 0 ? c->fraction * c->period : c->period;
+        copy(X, ends[1], ends[0]);
+        move(&b.plant, torque, h, substeps, ends[1]);
+        for (int end = 0; end < 2; end++)
+            stewart_accelerations(&b.plant, ends[end], ends[end] + 6, torque, ends[end] + X);
+        for (int i = 0; i < n; i++)
+            if (times[i] >= begin && times[i] < begin + h)
+                between(ends[0], ends[1], h, (times[i] - begin) / h, way + ROW * i);
+        begin += h;
+    }
+    for (int i = 0; i < n; i++)
+        if (times[i] < 0 || times[i] >= begin) {
+            copy(X, ends[1], way + ROW * i);
+            fill(6, 0, way + ROW * i + X);
+        }
+    copy(X, ends[1], state);
+}
+
+/* `preview` of the workspace, what is followed: the given reference, and after a gap the way back onto it.
+   The status. law/predictive_lqi.py: _previewed. */
+static int follow(const stewart_config *c, stewart_memory *m, const real *given,
+                  stewart_workspace *w)
+{
+    const real h = c->period, eta = ((real)c->steps + c->fraction) * h, acts = eta - (real)1e-6 * h;
+    real times[STEWART_PREVIEW], wanted[ROW], reached[ROW], a[6], *reference = w->reference;
+    const int n = stewart_preview_times(c, times), missing = !all_finite(ROW * n, given);
+    const int gap = !all_finite(ROW, given + ROW * (n - 1)), ended = m->gap && !gap;
+    const int known = all_finite(ROW, m->followed[n - 2]);
+    return_path p = {{0}, m->return_holds};
+    copy(X, m->offset, p.offset);
+    if (p.holds > 0) {
+        move_offset(&p, h, h, a);
+        p.holds--;
+    } else {
+        m->return_samples -= m->return_samples > 0;
+    }
+    complete(c, n, times, given, -(real)HUGE_VAL, m->reference, reference);
+    copy(ROW * n, reference, w->preview);
+    if (ended || p.holds + m->return_samples > 0) {
+        const int quiet = m->silence > 0 && !at_limit(c, in_flight_length(c), m->in_flight[0]);
+        const int early = ended || 2 * (real)p.holds * h >= CATCH_UP;
+        const int corrected = early && !missing && quiet, predicted = corrected || !known;
+        int returns = 1, holds = (int)REAL(ceil)(CATCH_UP / h - (real)1e-6);
+        if (!predicted) {
+            complete(c, n, times, reference, acts, m->followed, w->preview);
+            if (ended) { /* without a step in what is followed */
+                fill(ROW, 0, reached);
+                add_offset(p, h, 0, reached);
+                complete(c, n, times, given, (real)HUGE_VAL, m->reference, w->way);
+                interpolate(n, times, w->way, eta, wanted);
+                for (int i = 0; i < X; i++)
+                    reached[i] += wanted[i];
+            }
+        } else if (all_finite(X, m->state)) {
+            predict_way(c, m, n, times, w->preview, reached);
+        } else { /* nothing else to go on with */
+            returns = p.holds = m->return_samples = 0;
+        }
+        if (returns && (ended || predicted)) {
+            interpolate(n, times, reference, eta, wanted);
+            for (int i = 0; i < X; i++)
+                p.offset[i] = reached[i] - wanted[i];
+        }
+        if (returns && (ended || !known)) {
+            p.holds = holds > 2 ? holds : 2;
+            m->return_samples = stewart_queue_length(c) + 2;
+        }
+        for (int i = 0; returns && i < n; i++)
+            if (times[i] >= acts) {
+                copy(ROW, reference + ROW * i, w->preview + ROW * i);
+                add_offset(p, h, times[i] - eta, w->preview + ROW * i);
+            }
+    }
+    m->gap = gap;
+    m->return_holds = p.holds;
+    copy(X, p.offset, m->offset);
+    for (int i = 1; i < n; i++) {
+        copy(ROW, reference + ROW * i, m->reference[i - 1]);
+        copy(ROW, w->preview + ROW * i, m->followed[i - 1]);
+    }
     return missing ? STEWART_REFERENCE_MISSING : 0;
 }
 
@@ -913,7 +1089,7 @@ static void feed_forward(const stewart_config *c, const real *theta, const real 
     believe(c, theta, &b);
     for (int k = 0; k < holds; k++) {
         for (int node = 0; node < 2; node++) {
-            const real *r = nodes + STEWART_REFERENCE * (2 * k + node);
+            const real *r = nodes + ROW * (2 * k + node);
             stewart_inverse_dynamics(&b.plant, r, r + 6, r + 12, at[node]);
         }
         for (int i = 0; i < U; i++) {
@@ -940,7 +1116,7 @@ static void predict(const stewart_config *c, const stewart_memory *m, const real
     int substeps = substeps_for(c, stewart_queue_length(c), queue);
     for (int k = 0; k < c->steps; k++) {
         period p = period_of(c, queue + U * k);
-        const real *wanted = preview + STEWART_REFERENCE * (k + 1);
+        const real *wanted = preview + ROW * (k + 1);
         move_period(&b.plant, &p, substeps, a->state);
         int waits = at_limit(c, p.torques, p.torque);
         for (int i = 0; i < 6; i++) {
@@ -951,7 +1127,7 @@ static void predict(const stewart_config *c, const stewart_memory *m, const real
         }
     }
     for (int i = 0; i < X; i++)
-        a->error[i] = a->state[i] - preview[STEWART_REFERENCE * c->steps + i];
+        a->error[i] = a->state[i] - preview[ROW * c->steps + i];
 }
 
 /* Where held torques put pose and rates at the sample whose error is regulated; B of the model. */
@@ -1062,19 +1238,6 @@ static int design(int n, stewart_workspace *w, real *K)
     return 1;
 }
 
-/* law/design_models.py */
-static int is_workable(const stewart_config *c, const real *pose)
-{
-    real measures[STEWART_MEASURES];
-    if (!within_reach(c, pose, 1))
-        return 0;
-    stewart_measures(c->geometry, pose, NULL, measures);
-    for (int i = 0; i < 6; i++)
-        if (measures[i] < DEAD_CENTRE_SINE)
-            return 0;
-    return 1;
-}
-
 /* The gain for where the torque acts, and the error that it multiplies; what went wrong. `use` says
    whether there is a gain, the new one or the last. */
 static int find_gain(const stewart_config *c, const stewart_memory *m, const held *h, ahead *a,
@@ -1159,7 +1322,8 @@ void stewart_init(const stewart_config *c, stewart_memory *m, const real *queue)
     fill(2, (real)NAN, m->weights);
     fill(U, (real)NAN, m->feedforward);
     fill(U * STEWART_MAX_ORDER, (real)NAN, m->gain);
-    fill((STEWART_PREVIEW - 1) * STEWART_REFERENCE, (real)NAN, m->reference[0]);
+    fill((STEWART_PREVIEW - 1) * ROW, (real)NAN, m->reference[0]);
+    fill((STEWART_PREVIEW - 1) * ROW, (real)NAN, m->followed[0]);
     m->silence = c->silence;
 }
 
@@ -1169,17 +1333,18 @@ int stewart_step(const stewart_config *c, stewart_memory *m, stewart_workspace *
 {
     const int length = in_flight_length(c);
     int status = estimate(c, m, measurement, age, w);
-    status |= complete(c, m, preview, w);
+    status |= follow(c, m, preview, w);
     preview = w->preview;
-    if (status & STEWART_REFERENCE_MISSING) /* which spoils the plan as a limit does */
+    const real *nodes = preview + ROW * (1 + c->steps);
+    const int waiting = !all_finite(ROW, nodes);
+    if (status & STEWART_REFERENCE_MISSING && !waiting && !m->gap) /* which spoils the plan as a limit does */
         m->silence = 0;
-    const real *nodes = preview + STEWART_REFERENCE * (1 + c->steps);
     if (!all_finite(X, m->state)) { /* nothing else to go on with */
         copy(X, preview, m->state);
         if (m->behind == 0 && c->longest_wait == 0)
             copy(X, preview, m->mean);
     }
-    if (!all_finite(STEWART_REFERENCE, preview)) { /* nothing to follow yet: hold the torque */
+    if (waiting) { /* nothing to follow yet: hold the torque */
         copy(U, m->torque, torque);
         copy(U, torque, m->feedforward);
         fill(6, 0, m->error);
@@ -1208,7 +1373,7 @@ int stewart_step(const stewart_config *c, stewart_memory *m, stewart_workspace *
     copy(X, measurement, m->measurement);
     copy(2, weights, m->weights);
     m->has_started = all_finite(X, m->state);
-    m->silence -= m->silence > 0;
+    m->silence -= m->silence > 0 && !waiting;
     for (int i = 0; i < STEWART_CAUSES; i++)
         m->counts[i] += m->counts[i] < INT_MAX ? (status >> i) & 1 : 0;
     return status;

@@ -77,10 +77,12 @@ MEMORY_FIELDS: Final[Fields] = {
     "feedforward": NUM_TORQUES,
     "weights": 2,
     "reference": (MAX_QUEUE + 8, NUM_REFERENCE),
+    "followed": (MAX_QUEUE + 8, NUM_REFERENCE),
+    "offset": NUM_STATE,
 }
 MEMORY_FLAGS: Final = (
     *("has_covariance", "has_gain", "has_started"),
-    *("outliers", "unseen", "behind", "silence"),
+    *("outliers", "unseen", "behind", "gap", "return_holds", "return_samples", "silence"),
 )
 
 

@@ -80,15 +80,20 @@ typedef struct {
     real feedforward[STEWART_MOTORS];              /* and how much of it takes no measurement */
     real weights[2];
     real reference[STEWART_PREVIEW - 1][STEWART_REFERENCE]; /* the last preview but its first row */
+    real followed[STEWART_PREVIEW - 1][STEWART_REFERENCE];  /* the same with the way back after a gap */
+    real offset[STEWART_STATES]; /* from the reference where the next torque acts, after a gap in it */
     int has_covariance, has_gain, has_started;
     int outliers; /* in a row that bear each other out */
     int unseen;   /* periods since a measurement was last used */
     int behind;   /* periods since that of `mean` */
+    int gap;      /* whether the last row of the last preview was missing */
+    int return_holds;   /* until the offset is zero */
+    int return_samples; /* further ones at which torques in flight belong to the way back */
     int silence;  /* samples that are still to go on without feedback */
     int counts[STEWART_CAUSES];
 } stewart_memory;
 
-/* Place to compute in: 70 kB for a delay of 8 periods, in double precision. It keeps nothing from one
+/* Place to compute in: 75 kB for a delay of 8 periods, in double precision. It keeps nothing from one
    call to the next. */
 typedef struct stewart_workspace stewart_workspace;
 
@@ -108,8 +113,8 @@ void stewart_init(const stewart_config *config, stewart_memory *memory, const re
    age: of it in periods, 0 where measurements are those of now. A measurement with an age below 0 is
      lost.
    preview: the reference at the instants of `stewart_preview_times`, a row each. What is NaN or
-     infinite continues from the rows next to it and from the last preview. At the first sample, without
-     a complete row, the torque is the last one in flight.
+     infinite continues from the rows next to it and from the last preview; after a gap the law goes
+     back onto the reference. Without a complete row until now, the torque is the last one in flight.
    weights: of errors and of torques. With weights that are not finite the last gain is used.
    torque: what to send, as asked for; the motors' limit stands behind it.
    Returns what went wrong, bits of the enumeration above. */

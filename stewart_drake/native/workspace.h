@@ -34,7 +34,9 @@ struct stewart_workspace {
     real order_Q[STEWART_MAX_ORDER * STEWART_MAX_ORDER];
     real order_B[STEWART_MAX_ORDER * STEWART_MOTORS], R[STEWART_MOTORS * STEWART_MOTORS];
     real K[STEWART_MOTORS * STEWART_MAX_ORDER];
-    real preview[STEWART_PREVIEW * STEWART_REFERENCE]; /* with numbers for what is missing */
+    real reference[STEWART_PREVIEW * STEWART_REFERENCE]; /* with numbers for what is missing */
+    real preview[STEWART_PREVIEW * STEWART_REFERENCE];   /* what is followed */
+    real way[STEWART_PREVIEW * STEWART_REFERENCE];       /* without the given preview */
 };
 
 #endif
