@@ -25,7 +25,7 @@ from stewart_drake.loop.multibody_stewart import MultibodyStewart
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.studies.jobs import run_jobs
-from stewart_drake.tuning.dataset import sample_run
+from stewart_drake.tuning.data import run_condition
 
 Rows = list[list[str]]
 
@@ -119,8 +119,8 @@ def studies() -> Rows:
         for workers in (1, cores):
             with tempfile.TemporaryDirectory() as folder:
                 started = time.perf_counter()
-                jobs = {f"run{k}": (scenario,) for k in range(number)}
-                run_jobs(jobs, sample_run, folder, settings={}, suffix=".npz", workers=workers)
+                jobs = {f"run{k}": (scenario, ((1.0, 1.0),)) for k in range(number)}
+                run_jobs(jobs, run_condition, folder, settings={}, suffix=".npz", workers=workers)
                 walls.append(time.perf_counter() - started)
         efficiency = walls[0] / (cores * walls[1])
         rows.append([str(number), *(f"{wall:.1f}" for wall in walls), f"{efficiency:.0%}"])

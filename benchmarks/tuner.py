@@ -21,13 +21,13 @@ import stewart_drake as sd
 from stewart_drake.reporting.terminal import count_bar
 from stewart_drake.reporting.words import number
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.studies.disturbances import disturbed, draw, with_gain
+from stewart_drake.studies.families import Family, disturbed_family, paper_grid, with_gain
 from stewart_drake.studies.jobs import run_jobs
 from stewart_drake.studies.runs import read_outcome, run_scenario
 from stewart_drake.tuner.network import save_network
-from stewart_drake.tuning.dataset import make_dataset
-from stewart_drake.tuning.evaluation import TUNER, Evaluation, evaluate
+from stewart_drake.tuning.data import make_data
 from stewart_drake.tuning.training import Training, train
+from stewart_drake.tuning.worth import HINDSIGHT, TUNER, Worth, evaluate
 
 WORKERS = 2
 CELLS = 16
@@ -72,13 +72,11 @@ def networks(folder: Path) -> dict[str, Training]:
     data = {}
     for name, (condition, cells) in DATA.items():
         with bar(name) as progress:
-            data[name] = make_dataset(
-                base(condition),
-                folder / slug(name),
-                disturbances=cells,
-                workers=WORKERS,
-                progress=progress,
-            )
+            scenario = base(condition)
+            family = paper_grid(scenario)
+            if cells:
+                family = disturbed_family(scenario, cells, 0, "training")
+            data[name] = make_data(family, folder / slug(name), workers=WORKERS, progress=progress)
     trained = {}
     for name, (source, kind) in NETWORKS.items():
         trained[name] = train(data[source], kind=kind, split="run")
@@ -86,28 +84,30 @@ def networks(folder: Path) -> dict[str, Training]:
     return trained
 
 
-def evaluations(folder: Path) -> dict[str, dict[str, Evaluation]]:
+def unseen(condition: str) -> Family:
+    """Conditions that no network was trained on."""
+    return disturbed_family(base(condition), SCENARIOS, 0, "evaluation")
+
+
+def evaluations(folder: Path) -> dict[str, dict[str, Worth]]:
     """By condition, then by network."""
-    found: dict[str, dict[str, Evaluation]] = {}
+    found: dict[str, dict[str, Worth]] = {}
     for condition in BASES:
         for name in NETWORKS:
             with bar(condition) as progress:
                 found.setdefault(condition, {})[name] = evaluate(
-                    base(condition),
-                    folder / f"{slug(name)}.json",
+                    unseen(condition),
+                    [folder / f"{slug(name)}.json"],
                     folder / f"evaluation-{slug(condition)}",
-                    scenarios=SCENARIOS,
                     workers=WORKERS,
                     progress=progress,
                 )
     return found
 
 
-def beyond(folder: Path, condition: str, grid: Evaluation) -> list[str]:
+def beyond(folder: Path, condition: str, grid: Worth) -> list[str]:
     """What gains outside the grid would add, as lines of text."""
-    cells = [
-        disturbed(base(condition), one) for one in draw(base(condition), SCENARIOS, 0, "evaluation")
-    ]
+    cells = [one.scenario for one in unseen(condition).conditions.values()]
     jobs = {
         f"{number:04d}_ratio{ratio:g}": (with_gain(cell, ratio**0.5, ratio**-0.5),)
         for ratio in BEYOND
@@ -177,11 +177,15 @@ def row(name: str, one: dict[str, Any]) -> list[str]:
     ]
 
 
-def evaluation_section(condition: str, found: dict[str, Evaluation], extra: list[str]) -> str:
+def evaluation_section(condition: str, found: dict[str, Worth], extra: list[str]) -> str:
     """The fixed gains, and each network on the scenarios that it and they complete."""
     first = next(iter(found.values())).summary
     header = ["w_Q / w_R", "failures", "mean E_ac", "95 %", "worst"]
-    lines = [row(name, one) for name, one in first["candidates"].items() if name != TUNER]
+    lines = [
+        row(name, one)
+        for name, one in first["candidates"].items()
+        if name not in (TUNER, HINDSIGHT)
+    ]
     text = [f"## {condition}", "", f"{SCENARIOS} scenarios, {first['common']} in common.", ""]
     text += [table(header, lines)]
     lines = []
@@ -196,7 +200,7 @@ def evaluation_section(condition: str, found: dict[str, Evaluation], extra: list
                 s["best_fixed"],
                 f"{100 * s['improvement']:.1f} % ({low:.1f} to {high:.1f})",
                 f"{100 * s['hindsight']:.1f} %",
-                str(s["fallbacks"]),
+                str(s["fallbacks"][TUNER]),
             ]
         )
     header = [

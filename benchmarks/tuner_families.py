@@ -17,9 +17,10 @@ from _page import RESULTS, size
 
 from stewart_drake.files.versions import versions
 from stewart_drake.scenario.config import AnnTunerConfig, RuleTunerConfig, Scenario
-from stewart_drake.studies.families import FAULTS, base_of, condition, draw_family, fault_of
+from stewart_drake.studies.families import FAULTS, fault_of, faulty_family, with_gain
 from stewart_drake.studies.jobs import run_jobs
-from stewart_drake.tuning.curves import LEAST, at_ratio
+from stewart_drake.tuner.source import weights_of
+from stewart_drake.tuning.data import LEAST
 from stewart_drake.tuning.worth import read_told, tuned_run
 
 CONDITIONS = size("CONDITIONS", 24)
@@ -50,14 +51,14 @@ def candidates() -> dict[str, tuple[tuple[str, ...], object]]:
 def made(scenario: Scenario, how: object) -> Scenario:
     """With a fixed ratio or a tuner."""
     if isinstance(how, float):
-        return at_ratio(scenario, how)
+        return with_gain(scenario, *weights_of(how).tolist())
     return replace(scenario, tuner=how)  # type: ignore[arg-type]
 
 
 def main(folder: Path) -> None:
     """Run all candidates and write the table."""
-    draws = draw_family("T", CONDITIONS, SEED, "evaluation")
-    faults = np.array([fault_of(one) for one in draws])
+    plain = faulty_family("T", CONDITIONS, SEED, "evaluation")
+    faults = np.array([fault_of(one) for one in plain.draws])
     lines = [
         "# What is left for a tuner with the delay estimator on",
         "",
@@ -69,8 +70,8 @@ def main(folder: Path) -> None:
         f"| {' | '.join(['---'] * (4 + len(FAULTS)))} |",
     ]
     for number, (name, (settings, how)) in enumerate(candidates().items()):
-        base = base_of("T", settings)
-        jobs = {f"{i:04d}": (made(condition(base, one), how),) for i, one in enumerate(draws)}
+        family = faulty_family("T", CONDITIONS, SEED, "evaluation", settings)
+        jobs = {key: (made(one.scenario, how),) for key, one in family.conditions.items()}
         told = run_jobs(
             jobs,
             tuned_run,
@@ -80,7 +81,7 @@ def main(folder: Path) -> None:
             workers=WORKERS,
         )
         J = np.array([one.cost[0] for one in told.values()])
-        done = sum(one.completed[0] for one in told.values())
+        done = sum(one.error[0] is not None for one in told.values())
         g = [np.exp(np.mean(np.log(np.maximum(J[faults == f], LEAST)))) for f in FAULTS]
         every = np.exp(np.mean(np.log(np.maximum(J, LEAST))))
         cells = [f"{done}", *(f"{x:.3g}" for x in (every, J.mean(), *g))]

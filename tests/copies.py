@@ -29,7 +29,7 @@ _server.set_forkserver_preload(
         "stewart_drake.cli",
         "stewart_drake.reporting.csv_file",
         "stewart_drake.studies.robustness",
-        "stewart_drake.tuning.dataset",
+        "stewart_drake.tuning.data",
     ]
 )
 

@@ -21,7 +21,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.studies.jobs import MANIFEST, run_jobs
 from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.studies.runs import read_outcome
-from stewart_drake.tuning.dataset import load_dataset, read_run
+from stewart_drake.tuning.data import load_data
 from tests.faults import put, refusal, written
 from tests.mutations import other_npz, sealed
 from tests.test_fuzz import (
@@ -29,6 +29,7 @@ from tests.test_fuzz import (
     RUN_FILE,
     netcdf,
     npz_of_a_run,
+    read_one_run,
     some_data,
     some_signals,
 )
@@ -164,8 +165,8 @@ def test_a_damaged_manifest_is_refused(tmp_path):
 
 
 def test_a_sound_run_of_the_data_set_is_read(tmp_path):
-    run = read_run(written(tmp_path / "run.npz", npz_of_a_run()))
-    assert run["status"] == "completed" and run["samples"].shape == (100, 18)
+    run = read_one_run(written(tmp_path / "run.npz", npz_of_a_run()))
+    assert run["status"] == ["completed"] and run["samples"].shape == (1, 100, 18)
 
 
 def saved(folder: Path, **changes: Any) -> Path:
@@ -178,25 +179,26 @@ def saved(folder: Path, **changes: Any) -> Path:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"samples": np.zeros((3, 18))},
-        {"samples": np.full((100, 18), "text")},
-        {"samples": np.full((100, 18), np.inf)},
-        {"samples": np.full((100, 18), np.nan)},
+        {"samples": np.zeros((1, 3, 18))},
+        {"samples": np.full((1, 100, 18), "text")},
+        {"samples": np.full((1, 100, 18), np.inf)},
+        {"samples": np.full((1, 100, 18), np.nan)},
         {"samples": np.array([{"a": 1}], dtype=object)},
         {"samples": None},
-        {"status": np.array("nonsense")},
-        {"status": np.array("left_workspace")},
-        {"status": np.zeros(())},
-        {"stopped": 1.0},
-        {"accumulated_error": np.nan},
-        {"cost": -1.0},
+        {"status": np.array(["nonsense"])},
+        {"status": np.array(["left_workspace"])},
+        {"status": np.zeros(1)},
+        {"stopped": np.ones(1)},
+        {"accumulated_error": np.full(1, np.nan)},
+        {"cost": np.full(1, -1.0)},
+        {"J": np.full(1, np.nan)},
         {"peak_torque": np.array([1.0, 2.0])},
         {"extra": 1.0},
     ],
     ids=lambda changes: next(iter(changes)),
 )
 def test_a_run_of_another_content_is_refused(changes, tmp_path):
-    refused(read_run, saved(tmp_path, **changes))
+    refused(read_one_run, saved(tmp_path, **changes))
 
 
 def refused(load: Any, path: Path) -> str:
@@ -217,13 +219,13 @@ def test_a_zip_that_grows_is_not_unpacked(tmp_path):
                     member.write(bytes(10_000_000))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     started = time.process_time()
-    assert "too large when unpacked" in refused(read_run, path)
+    assert "too large when unpacked" in refused(read_one_run, path)
     assert time.process_time() - started < 1.0
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
     for number in range(60):
         path.write_bytes(other_npz(RUN_ARRAYS, random.Random(number)))
         try:
-            read_run(path)
+            read_one_run(path)
         except ConfigError as error:
             assert len(str(error).splitlines()) == 1
 
@@ -277,12 +279,12 @@ def test_a_file_that_declares_a_huge_array_is_refused(tmp_path):
         file.dimensions = {"run": 10**6, "sample": 10**6, "input": 18}
         file.create_variable("samples", ("run", "sample", "input"), "f8", chunks=(1, 10, 18))
     assert path.stat().st_size < 100_000
-    assert "MB" in refused(load_dataset, path)
+    assert "MB" in refused(load_data, path)
 
 
 def test_a_data_set_that_is_not_whole_is_refused(tmp_path):
     data, path = some_data(), tmp_path / "dataset.nc"
-    load_dataset(written(path, netcdf(data)))
+    load_data(written(path, netcdf(data)))
     wrong: dict[str, xr.Dataset] = {
         "status": data.drop_vars("status"),
         "a weight": data.assign(weights=-data.weights),
@@ -293,4 +295,4 @@ def test_a_data_set_that_is_not_whole_is_refused(tmp_path):
         "sample": data.isel(input=slice(0, 5)),
     }
     for word, one in wrong.items():
-        assert word in refused(load_dataset, written(path, netcdf(one)))
+        assert word in refused(load_data, written(path, netcdf(one)))

@@ -14,29 +14,42 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.delay_model import delayed_model
 from stewart_drake.law.error_model import linear_model
 from stewart_drake.law.riccati import reduced_gain
-from stewart_drake.loop.bulk import samples_of
+from stewart_drake.loop.bulk import run_in_bulk, samples_of
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.disturbances import disturbed, draw
-from stewart_drake.tuner.density import WINDOW, densities
-from stewart_drake.tuning import dataset as module
-from stewart_drake.tuning import grid
-from stewart_drake.tuning.dataset import (
-    data_hash,
-    first_samples,
-    load_dataset,
-    make_dataset,
-    sample_run,
-)
-from stewart_drake.tuning.grid import (
+from stewart_drake.studies import families
+from stewart_drake.studies.families import (
     DELAYS,
+    DISTURBED,
+    FAMILIES,
+    FAULTS,
     FREQUENCIES,
     PAIRS,
-    disturbed_runs,
-    paper_runs,
+    RATIOS,
+    disturbed_family,
+    fault_of,
+    faulty_family,
+    paper_grid,
+    vary,
+    with_gain,
 )
-from stewart_drake.tuning.labels import cells, labels
+from stewart_drake.tuner.density import WINDOW, densities
+from stewart_drake.tuner.source import ratio_of, weights_of
+from stewart_drake.tuning.data import (
+    LOST,
+    WATCHED,
+    cells,
+    cost,
+    data_hash,
+    load_data,
+    make_data,
+    read_condition,
+    run_condition,
+    watched_run,
+    watching,
+)
+from stewart_drake.tuning.training import curves_of, labels
 
 # The paper's own controller costs little, keeps a small motion in the workspace at some delays and
 # loses it at others.
@@ -53,9 +66,9 @@ def base(*settings, controller="delay_lqi"):
 
 def shrink(patch: pytest.MonkeyPatch) -> None:
     """A grid of two delays, one frequency and three pairs."""
-    patch.setattr(grid, "DELAYS", (0, 3))
-    patch.setattr(grid, "FREQUENCIES", (2.0,))
-    patch.setattr(grid, "PAIRS", ((0.1, 4.0), (1.0, 1.0), (4.0, 0.1)))
+    patch.setattr(families, "DELAYS", (0, 3))
+    patch.setattr(families, "FREQUENCIES", (2.0,))
+    patch.setattr(families, "PAIRS", ((0.1, 4.0), (1.0, 1.0), (4.0, 0.1)))
 
 
 @pytest.fixture(scope="module")
@@ -63,33 +76,33 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("data")
     with pytest.MonkeyPatch.context() as patch:
         shrink(patch)
-        make_dataset(base(), path, workers=1)
+        make_data(paper_grid(base()), path, workers=1)
     return path
 
 
 @pytest.fixture(scope="module")
 def data(folder):
-    return load_dataset(folder)
+    return load_data(folder)
 
 
 # ---------------------------------------------------------------- the grid
 
 
 def test_the_papers_grid_has_180_runs_and_18000_rows():
-    runs = paper_runs(base())
-    assert len(runs) == 9 * len(DELAYS) * len(FREQUENCIES) == 180
-    assert len(runs) * grid.SAMPLES == 18_000
-    for run in runs.values():
-        c, sc = run.scenario.controller, run.scenario
-        assert (c.w_Q, c.w_R) == (run.w_Q, run.w_R)
-        assert sc.delay.steps == run.delay_steps in (0, 5, 10, 20, 30)
-        assert sc.reference.frequency == run.frequency in (0.5, 2, 4, 6)
+    family = paper_grid(base())
+    assert len(family.conditions) * len(family.gains) == 9 * len(DELAYS) * len(FREQUENCIES) == 180
+    assert 180 * family.samples == 18_000
+    assert tuple(family.gains.values()) == PAIRS
+    for one in family.conditions.values():
+        sc = one.scenario
+        assert sc.delay.steps == one.delay_steps in (0, 5, 10, 20, 30)
+        assert sc.reference.frequency == one.frequency in (0.5, 2, 4, 6)
         assert sc.reference.frequency_unit == "rad/s"
-    assert len({(r.w_Q, r.w_R, r.delay_steps, r.frequency) for r in runs.values()}) == 180
+    assert len({(c.delay_steps, c.frequency) for c in family.conditions.values()}) == 20
 
 
 def test_the_grid_varies_nothing_else():
-    one = paper_runs(base())["delay10_frequency4_wQ1_wR1"].scenario
+    one = paper_grid(base()).conditions["delay10_frequency4"].scenario
     plain = base("delay.steps=10", "reference.frequency=4")
     assert dataclasses.asdict(one) == dataclasses.asdict(plain)
 
@@ -116,7 +129,7 @@ def test_nine_pairs_are_seven_gains():
 )
 def test_scenarios_that_do_not_suit_are_refused(settings, said):
     with pytest.raises(ConfigError, match=said):
-        paper_runs(load_scenario("paper", settings=("plant.kind=exact", *settings)))
+        paper_grid(load_scenario("paper", settings=("plant.kind=exact", *settings)))
 
 
 # ---------------------------------------------------------------- the rows
@@ -125,7 +138,7 @@ def test_scenarios_that_do_not_suit_are_refused(settings, said):
 def test_rows_are_the_densities_that_the_loop_records():
     scenario = base("delay.steps=1", *NOISE, controller="predictor_lqi")
     result = simulate(scenario, judge_stability=False)
-    own = densities(first_samples(samples_of(result)))
+    own = densities(samples_of(result)[:100])
     recorded = result.signals.density.values[::5][:100]
     # The loop reads its sample 5e-15 of the time earlier, and an error is a small difference.
     np.testing.assert_allclose(own, recorded, rtol=1e-8, atol=1e-10)  # of densities around 1
@@ -153,13 +166,12 @@ def test_a_run_that_ends_early_keeps_its_rows_empty_and_marked(data):
 def test_a_resumed_data_set_has_the_same_bytes(folder, monkeypatch):
     shrink(monkeypatch)
     before = (folder / "dataset.nc").read_bytes()
-    runs = sorted((folder / "runs").glob("*.npz"))
-    assert len(runs) == 6
+    runs = sorted((folder / "conditions").glob("*.npz"))
+    assert len(runs) == 2
     kept = {path: path.read_bytes() for path in runs}
-    for path in runs[:2]:
-        path.unlink()
+    runs[0].unlink()
     (folder / "dataset.nc").unlink()
-    make_dataset(base(), folder, workers=2)
+    make_data(paper_grid(base()), folder, workers=2)
     assert (folder / "dataset.nc").read_bytes() == before
     assert {path: path.read_bytes() for path in runs} == kept
 
@@ -168,18 +180,21 @@ def test_a_damaged_run_is_named(tmp_path):
     bad = tmp_path / "bad.npz"
     bad.write_bytes(b"PK\x03\x04 not a zip")
     with pytest.raises(ConfigError, match=r"bad\.npz: is damaged"):
-        module.read_run(bad)
+        read_condition(bad, 1)
 
 
 def test_a_missing_or_foreign_file_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="tune dataset"):
-        load_dataset(tmp_path)
+        load_data(tmp_path)
+    (tmp_path / "curves").mkdir()
+    with pytest.raises(ConfigError, match="run the same `tune dataset` again"):
+        load_data(tmp_path)
     (tmp_path / "dataset.nc").write_text("text")
     with pytest.raises(ConfigError, match="cannot be read"):
-        load_dataset(tmp_path)
+        load_data(tmp_path)
     xr.Dataset({"x": ("run", [1.0])}).to_netcdf(tmp_path / "dataset.nc", engine="h5netcdf")
     with pytest.raises(ConfigError, match="is not a data set"):
-        load_dataset(tmp_path)
+        load_data(tmp_path)
 
 
 def test_the_hash_sees_every_value(data):
@@ -249,22 +264,29 @@ def test_cells_differ_in_weights_only(data):
         assert len({float(data.delay_steps[i]) for i in members}) == 1
 
 
-# ---------------------------------------------------------------- disturbed runs
+# ---------------------------------------------------------------- drawn conditions
 
 
-def test_draws_are_reproducible_extendable_and_unlike_those_for_evaluation():
-    scenario = base()
-    few, many = (draw(scenario, n, 5, "training") for n in (3, 6))
-    assert few == many[:3]
-    others = draw(scenario, 6, 5, "evaluation")
-    assert not {d["seed"] for d in many} & {d["seed"] for d in others}
-    assert draw(scenario, 3, 6, "training") != few
+def drawn(family, number, seed, purpose="training"):
+    """Draws of any drawn family."""
+    if family in FAMILIES:
+        return faulty_family(family, number, seed, purpose).draws
+    return disturbed_family(base(), number, seed, purpose).draws
+
+
+@pytest.mark.parametrize("family", ["disturbed", *FAMILIES])
+def test_draws_stay_when_more_are_asked_for_and_purposes_share_none(family):
+    some, others = drawn(family, 6, 5), drawn(family, 6, 5, "evaluation")
+    assert drawn(family, 3, 5) == some[:3]
+    assert not {one["seed"] for one in some} & {one["seed"] for one in others}
+    assert drawn(family, 3, 6) != some[:3]
 
 
 def test_a_disturbance_does_what_it_says():
     scenario = base()
-    one = next(d for d in draw(scenario, 20, 0, "training") if d["noise"] and d["payload_mass"])
-    sc = disturbed(scenario, one)
+    family = disturbed_family(scenario, 20, 0, "training")
+    one = next(d for d in family.draws if d["noise"] and d["payload_mass"])
+    sc = vary(DISTURBED, scenario, one)
     assert sc.delay.steps == one["delay_steps"]
     assert sc.reference.frequency == one["frequency"]
     assert sc.reference.amplitude == pytest.approx(
@@ -273,18 +295,95 @@ def test_a_disturbance_does_what_it_says():
     assert sc.plant.payload_mass == one["payload_mass"]
     expected = one["noise"] * np.tile(sc.reference.amplitude, 2)
     np.testing.assert_allclose(sc.sensor.noise_std, expected, rtol=1e-3)
+    shuffled = dict(sorted(one.items()))
+    assert vary(DISTURBED, scenario, shuffled) == sc, "a file need not keep the order"
     assert scenario.plant.payload_mass == 0, "the scenario itself stays as it was"
-    assert len(disturbed_runs(scenario, [one])) == 9
+    assert len(family.gains) == 9
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_a_draw_has_one_fault_within_its_range(name):
+    family, about = faulty_family(name, 200, 1, "training"), FAMILIES[name]
+    shares = [sum(fault_of(one) == fault for one in family.draws) / 200 for fault in FAULTS]
+    assert all(0.15 < share < 0.35 for share in shares)
+    offsets = [one["fault"][0] for one in family.draws]
+    assert min(offsets) < -0.9 * about.offset[1] and max(offsets) > 0.9 * about.offset[1]
+    for one, condition in zip(family.draws[:40], family.conditions.values(), strict=False):
+        found, kind = condition.scenario, fault_of(one)
+        off = found.eta - one["delay_steps"] * 0.1
+        assert found.controller.delay_steps == one["delay_steps"]
+        assert found.controller.delay_fraction == 0
+        if kind == "offset":
+            assert about.offset[0] - 1e-9 <= abs(off) <= about.offset[1] + 1e-9
+        else:
+            assert off == pytest.approx(0, abs=1e-12)
+        assert (found.delay.jitter_std > 0) == (kind == "jitter")
+        assert found.delay.jitter_std <= about.jitter[1]
+        assert (found.plant.coulomb_friction > 0) == (kind == "friction")
+        noise = found.sensor.noise_std[5] / found.reference.amplitude[5]
+        assert (noise > 1e-3) == (kind == "noise")
+
+
+# ---------------------------------------------------------------- runs and their cost
+
+
+def faulty(name, *settings):
+    """The base of a family with faults."""
+    return faulty_family(name, 0, 0, "training", settings).base
 
 
 def test_a_run_says_how_it_ended():
     scenario = base("delay.steps=8", "reference.frequency=2")
-    with np.load(io.BytesIO(sample_run(scenario)), allow_pickle=False) as file:
-        assert str(file["status"]) in ("completed", "left_workspace")
-        assert file["samples"].shape == (100, 18)
-        first = file["samples"][0]
+    with np.load(io.BytesIO(run_condition(scenario, ((1.0, 1.0),))), allow_pickle=False) as file:
+        assert file["status"][0] in ("completed", "left_workspace")
+        assert file["samples"].shape == (1, 100, 18)
+        first = file["samples"][0, 0]
     # At t = 0 the plate rests at the reference's first pose: only the rates differ.
     assert np.abs(first[:6]).max() == 0 and np.abs(first[6:12]).min() > 0
+
+
+def test_the_cost_of_a_completed_run_is_its_error():
+    ending = run_in_bulk(faulty("N2", "duration=2"))
+    assert cost(ending, 2.0) == pytest.approx(ending.figures.accumulated_error)
+
+
+def at_ratio(scenario, ratio):
+    return with_gain(scenario, *weights_of(ratio).tolist())
+
+
+def test_a_lost_plate_counts_by_when_it_was_lost():
+    lost = at_ratio(faulty("N2", "delay.fraction=0.5", "controller.delay_steps=8"), 1.0)
+    ending = run_in_bulk(lost)
+    assert ending.stopped is not None
+    short = dataclasses.replace(lost, duration=0.02 * int(ending.stopped.time / 0.02))
+    until = run_in_bulk(short).figures.accumulated_error
+    expected = until + LOST * (lost.duration - ending.stopped.time)
+    assert cost(ending, lost.duration) == pytest.approx(expected, rel=1e-2)
+
+
+def test_a_run_that_is_watched_is_the_same():
+    one = at_ratio(faulty("T", "duration=2"), -1.5)
+    plain, (seen, _) = run_in_bulk(one), watched_run(one, watching(*weights_of(-1.5)), 20)
+    assert cost(seen, 2.0) == cost(plain, 2.0)
+    assert ratio_of(plain.weights[3]) == pytest.approx(-1.5)
+
+
+@pytest.mark.slow
+def test_data_of_a_family_go_on_where_they_stopped(tmp_path):
+    family = faulty_family("N2", 10, 3, "training", ("duration=1",))
+    first = make_data(family, tmp_path, workers=1)
+    gone = tmp_path / "conditions" / "00004.npz"
+    kept = gone.read_bytes()
+    gone.write_bytes(b"damaged")
+    again = make_data(family, tmp_path, workers=1)
+    assert first.identical(again) and gone.read_bytes() == kept
+    read = load_data(tmp_path)
+    curves = curves_of(read, "health")
+    assert curves.J.shape == (10, len(RATIOS))
+    assert np.array_equal(curves.J.ravel(), first.J)
+    seen = np.isfinite(curves.features).all(axis=-1)
+    assert seen[:, ::WATCHED, ::2].any()
+    assert not seen[:, 1::WATCHED].any()
 
 
 # ---------------------------------------------------------------- the command
@@ -292,7 +391,7 @@ def test_a_run_says_how_it_ended():
 
 def test_the_command_writes_a_data_set_of_disturbed_runs(tmp_path, capsys, monkeypatch):
     arguments = ["tune", "dataset", "paper", "--controller", "delay_lqi", "--disturbed", "1"]
-    monkeypatch.setattr(grid, "PAIRS", ((1.0, 1.0),))
+    monkeypatch.setattr(families, "PAIRS", ((1.0, 1.0),))
     arguments += [part for setting in SMALL for part in ("--set", setting)]
     assert main([*arguments, "--workers", "1", "--out", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
@@ -300,7 +399,7 @@ def test_the_command_writes_a_data_set_of_disturbed_runs(tmp_path, capsys, monke
     assert "1 runs, 100 rows" in out
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["runs"] == 1 and summary["rows"] == 100
-    assert summary["data_sha256"] == data_hash(load_dataset(tmp_path))
+    assert summary["data_sha256"] == data_hash(load_data(tmp_path))
     assert len(summary["draws"]) == 1
     assert main([*arguments, "--seed", "1", "--out", str(tmp_path)]) == 2
     assert "belongs to other settings" in capsys.readouterr().err

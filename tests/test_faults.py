@@ -19,8 +19,9 @@ import xarray as xr
 
 from stewart_drake.cli import main
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.studies.families import paper_grid
 from stewart_drake.studies.robustness import study_robustness
-from stewart_drake.tuning.dataset import data_hash, load_dataset, make_dataset
+from stewart_drake.tuning.data import data_hash, load_data, make_data
 from tests.copies import duration, killed
 from tests.faults import refusal
 from tests.test_cli import command
@@ -82,15 +83,15 @@ def kill_and_resume(
 def little_dataset(folder: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         shrink(patch)
-        make_dataset(load_scenario("paper", "delay_lqi", LITTLE), folder, workers=1)
+        make_data(paper_grid(load_scenario("paper", "delay_lqi", LITTLE)), folder, workers=1)
 
 
 def kill_dataset(number: int, tmp_path: Path) -> None:
     longest = duration(lambda: little_dataset(tmp_path / "whole"))
     kill_and_resume(
-        little_dataset, tmp_path / "killed", tmp_path / "whole", "runs/*.npz", number, longest
+        little_dataset, tmp_path / "killed", tmp_path / "whole", "conditions/*.npz", number, longest
     )
-    killed_hash, whole_hash = (data_hash(load_dataset(tmp_path / n)) for n in ("killed", "whole"))
+    killed_hash, whole_hash = (data_hash(load_data(tmp_path / n)) for n in ("killed", "whole"))
     assert killed_hash == whole_hash
 
 

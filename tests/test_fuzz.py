@@ -4,6 +4,7 @@ Briefly here; `make soak` goes on for five minutes with fresh seeds. What it fin
 of the tables in test_bad_input.py and test_bad_files.py.
 """
 
+import dataclasses
 import io
 import json
 import random
@@ -27,18 +28,18 @@ from hypothesis import strategies as st
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.jsonio import jsonable
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.scenario.loading import load_controller, load_scenario
 from stewart_drake.scenario.reference_config import CsvConfig, WaypointsConfig
 from stewart_drake.scenario.reference_files import read_csv, read_waypoints
 from stewart_drake.scenario.trajectories import evaluate, make_reference
+from stewart_drake.studies.families import paper_grid
 from stewart_drake.studies.jobs import _check_manifest, settings_hash
 from stewart_drake.studies.runs import read_outcome
 from stewart_drake.tuner.network import load_network, save_network
-from stewart_drake.tuning.dataset import assemble, load_dataset, read_run, summarize
-from stewart_drake.tuning.grid import paper_runs
+from stewart_drake.tuning.data import assemble, data_hash, load_data, read_condition
+from stewart_drake.tuning.training import labels
 from tests.copies import copied
 from tests.faults import yaml_text
 from tests.mutations import (
@@ -226,8 +227,15 @@ def exported(path: Path) -> None:
     assert len({row.count(",") for row in rows}) == 1
 
 
-def summarized(path: Path) -> None:
-    json.dumps(jsonable(summarize(load_dataset(path))))
+def read_one_run(path: Path) -> dict[str, Any]:
+    """The file of a condition with one gain."""
+    return read_condition(path, 1)
+
+
+def labelled(path: Path) -> None:
+    data = load_data(path)
+    data_hash(data)
+    labels(data, "best_in_cell_torque")
 
 
 def resumed(path: Path) -> None:
@@ -251,9 +259,12 @@ RUN_FILE = {
     "outcome": {**OUTCOME, "peak_torque": 0.6, "tuner_fallbacks": 2},
 }
 RUN_ARRAYS = {
-    **{"samples": np.zeros((100, 18)), "status": np.array("completed"), "stopped": np.nan},
-    **dict.fromkeys(("accumulated_error", "cost", "rms_torque", "peak_torque"), 1.0),
-    "torque_variation": 2.0,
+    "samples": np.zeros((1, 100, 18)),
+    "health": np.zeros((1, 100, 18), dtype=np.float32),
+    "status": np.array(["completed"]),
+    "stopped": np.array([np.nan]),
+    **dict.fromkeys(("J", "accumulated_error", "cost", "rms_torque"), np.ones(1)),
+    **dict.fromkeys(("peak_torque", "torque_variation"), np.full(1, 2.0)),
 }
 
 
@@ -276,9 +287,11 @@ def some_data() -> xr.Dataset:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "run.npz"
         path.write_bytes(npz_of_a_run())
-        runs = dict(list(paper_runs(load_scenario("paper", "delay_lqi")).items())[:2])
+        grid = paper_grid(load_scenario("paper", "delay_lqi"))
+        some = dict(list(grid.conditions.items())[:2])
+        family = dataclasses.replace(grid, conditions=some, gains={"wQ1_wR1": (1.0, 1.0)})
         settings = {"data": "paper", "scenario": {}}
-        return assemble(runs, dict.fromkeys(runs, read_run(path)), settings)
+        return assemble(family, dict.fromkeys(some, read_one_run(path)), settings)
 
 
 def netcdf(data: xr.Dataset) -> bytes:
@@ -318,7 +331,7 @@ KINDS: dict[str, Kind] = {
     ),
     "manifest": Kind(resumed, "manifest.json", plain(MANIFEST_FILE), document=MANIFEST_FILE),
     "npz": Kind(
-        read_run, "f.npz", lambda _: npz_of_a_run(), lambda dice: other_npz(RUN_ARRAYS, dice)
+        read_one_run, "f.npz", lambda _: npz_of_a_run(), lambda dice: other_npz(RUN_ARRAYS, dice)
     ),
     "signals": Kind(
         *(exported, "f.nc", lambda _: netcdf(some_signals())),
@@ -326,7 +339,7 @@ KINDS: dict[str, Kind] = {
         briefly=4,
     ),
     "data set": Kind(
-        *(summarized, "f.nc", lambda _: netcdf(some_data())),
+        *(labelled, "f.nc", lambda _: netcdf(some_data())),
         lambda dice: other_netcdf(some_data(), dice),
         briefly=4,
     ),

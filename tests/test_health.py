@@ -16,7 +16,7 @@ from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.loop.weights import health_of, weights_source
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.studies.families import FAMILIES
+from stewart_drake.studies.families import FAMILIES, SAMPLES
 from stewart_drake.tuner.density import WINDOW
 from stewart_drake.tuner.features import HIGHEST, LOWEST, DensityFeatures
 from stewart_drake.tuner.health import NAMES, HealthFeatures, Row
@@ -33,7 +33,7 @@ from stewart_drake.tuner.source import (
     towards,
     weights_of,
 )
-from stewart_drake.tuning.curves import FixedPolicy, Watched, watched_run
+from stewart_drake.tuning.data import FixedPolicy, watched_run, watching
 from stewart_drake.types import Array
 
 FOLLOWS = ("plant.kind=exact", "start=on_reference", "queue=reference")
@@ -46,7 +46,7 @@ def scenario(*settings: str) -> Scenario:
 
 def seen(one: Scenario, ratio: float = -2.0) -> Array:
     """(k, 18) features of a run with a fixed ratio, NaN at every second sample."""
-    return np.asarray(watched_run(one, Watched(ratio))["health"])
+    return np.asarray(watched_run(one, watching(*weights_of(ratio)), round(10 * one.duration))[1])
 
 
 def feature(values: Array, name: str) -> Array:
@@ -129,9 +129,9 @@ def test_features_are_root_mean_squares_over_their_samples() -> None:
 def test_what_is_lost_is_finite_and_bounded() -> None:
     """Also of a run that is being lost, where signals grow without limit."""
     one = scenario("delay.fraction=0.3", "controller.delay_steps=8", *FOLLOWS)
-    run = watched_run(one, Watched(1.0))
-    values = run["health"][np.isfinite(run["health"]).all(axis=1)]
-    assert not run["completed"]
+    ending, found = watched_run(one, watching(*weights_of(1.0)), SAMPLES)
+    values = found[np.isfinite(found).all(axis=1)]
+    assert ending.stopped is not None
     assert len(values) > 5
     assert np.all((values >= LOWEST) & (values <= HIGHEST))
 

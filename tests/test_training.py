@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt training of the tuner's network."""
+"""Training of the tuner's network: by labels with Levenberg-Marquardt, and by regret."""
 
 import json
 from typing import get_args
@@ -10,13 +10,26 @@ import xarray as xr
 from stewart_drake.cli import main, tune
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.signals import TUNER_INPUTS
+from stewart_drake.studies.families import PAIRS, RATIOS
 from stewart_drake.tuner.density import Kind
 from stewart_drake.tuner.network import load_network, save_network
-from stewart_drake.tuning import labels, levenberg, training
-from stewart_drake.tuning.dataset import data_hash
-from stewart_drake.tuning.grid import PAIRS
-from stewart_drake.tuning.levenberg import TorchModel, fit, initial_theta, unpack
-from stewart_drake.tuning.training import summarize, train, training_rows
+from stewart_drake.tuner.source import ratio_of
+from stewart_drake.tuning import training
+from stewart_drake.tuning.data import data_hash
+from stewart_drake.tuning.training import (
+    Curves,
+    RegretTrainer,
+    TorchModel,
+    feature_rows,
+    fit,
+    initial_theta,
+    labelled_rows,
+    split_rows,
+    summarize,
+    train,
+    train_by_regret,
+    unpack,
+)
 
 pytest.importorskip("torch")
 
@@ -162,11 +175,11 @@ def test_the_start_answers_with_the_mean():
 
 
 def test_the_network_is_what_was_trained(trained, data):
-    rows = training_rows(data, "best_in_cell", "magnitude")
+    rows = labelled_rows(data, "best_in_cell", "magnitude")
     network = trained.network
-    answers = np.log(network(rows.densities))
+    answers = np.log(network(rows.inputs))
     theta = np.concatenate([getattr(network, n).ravel() for n in ("W1", "b1", "W2", "b2")])
-    u = (rows.densities - network.input_mean) / network.input_scale
+    u = (rows.inputs - network.input_mean) / network.input_scale
     np.testing.assert_allclose(TorchModel(18, 10).outputs(theta, u), answers, rtol=0, atol=1e-12)
 
 
@@ -206,16 +219,16 @@ def test_labels_as_run_train_the_weights_themselves(data):
 
 
 def test_rows_after_a_failure_are_not_trained_on(data):
-    rows = training_rows(data, "as_run", "magnitude")
-    assert len(rows.densities) == data.sizes["run"] * 100 - 60
+    rows = labelled_rows(data, "as_run", "magnitude")
+    assert len(rows.inputs) == data.sizes["run"] * 100 - 60
     assert (rows.runs == 3).sum() == 40
-    assert np.isfinite(rows.densities).all()
+    assert np.isfinite(rows.inputs).all()
 
 
 @pytest.mark.parametrize(
     ("choices", "known"),
     [
-        (tune.LabelKind, labels.LABELS),
+        (tune.LabelKind, training.LABELS),
         (tune.SplitKind, training.SPLITS),
         (tune.DensityKind, get_args(Kind)),
     ],
@@ -226,8 +239,8 @@ def test_the_command_offers_what_training_knows(choices, known):
 
 @pytest.mark.parametrize("split", training.SPLITS)
 def test_splits_keep_together_what_belongs_together(data, split):
-    rows = training_rows(data, "best_in_cell", "magnitude")
-    mask = training._split(rows, split, rng(0))
+    rows = labelled_rows(data, "best_in_cell", "magnitude")
+    mask = split_rows(rows, split, rng(0))
     assert mask.mean() == pytest.approx(0.7, abs=0.06)
     group = {"sample": np.arange(len(mask)), "run": rows.runs, "cell": rows.cells}[split]
     assert not set(group[mask]) & set(group[~mask])
@@ -246,7 +259,7 @@ def test_fewer_rows_than_numbers_to_find_are_refused(data):
 
 
 def test_without_torch_the_message_tells_the_fix(data, monkeypatch):
-    monkeypatch.setitem(levenberg.__builtins__, "__import__", _no_torch)
+    monkeypatch.setitem(training.__builtins__, "__import__", _no_torch)
     with pytest.raises(ConfigError, match=r"pip install 'stewart-drake\[train\]'"):
         train(data)
 
@@ -255,6 +268,91 @@ def _no_torch(name, *rest, _import=__import__):
     if name == "torch":
         raise ImportError(name)
     return _import(name, *rest)
+
+
+# ---------------------------------------------------------------- by regret
+
+
+def synthetic(number=60, seed=0):
+    """Conditions whose first feature is the ratio at which log J = (r - best)^2 / 2 is least."""
+    random = rng(seed)
+    best = random.uniform(-3, 1, number)
+    features = random.standard_normal((number, len(RATIOS), 8, 18)).astype(np.float32)
+    features[..., 0] = best[:, None, None]
+    return Curves(np.exp((RATIOS - best[:, None]) ** 2 / 2), features)
+
+
+def network_of(one, theta):
+    return one.network(theta, "health", {})
+
+
+def test_the_loss_is_the_regret_between_the_ratios():
+    torch = pytest.importorskip("torch")
+    curves = synthetic()
+    one = RegretTrainer(curves, 0)
+    theta = initial_theta(18, 10, np.array([[0.3, -0.4]]), 5)
+    rows = feature_rows(curves)
+    inputs = (rows.inputs - one.mean) / one.scale
+    found = float(
+        one.loss(*(torch.tensor(a) for a in (theta, inputs, curves.regret[rows.condition])))
+    )
+    y = np.log(network_of(one, theta)(rows.inputs))
+    ratio = (y[:, 0] - y[:, 1]) / np.log(10)
+    within = np.clip(ratio, RATIOS[0], RATIOS[-1])
+    regret = [
+        np.interp(r, RATIOS, curves.regret[i]) for r, i in zip(within, rows.condition, strict=True)
+    ]
+    expected = np.mean(regret) + 0.1 * np.mean((ratio - within) ** 2)
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_network_learns_to_lose_little_where_it_was_not_trained():
+    curves = synthetic(120)
+    one = RegretTrainer(curves, 0)
+    network = network_of(one, one.fit(one.start, [one.rows], 1))
+    fresh = synthetic(80, seed=1)
+    ratio = [ratio_of(w) for w in network(fresh.features[:, 0, 0].astype(float))]
+    lost = np.mean([np.interp(r, RATIOS, g) for r, g in zip(ratio, fresh.regret, strict=True)])
+    assert lost < 0.1 * fresh.regret.mean(axis=0).min()
+    assert network.start == pytest.approx(10 ** (np.array([0.5, -0.5]) * curves.best_ratio))
+    assert np.prod(network(np.zeros(18))) == pytest.approx(1.0)
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_network_by_regret():
+    curves = synthetic(30)
+    found = [(one := RegretTrainer(curves, n)).fit(one.start, [one.rows], 1) for n in (4, 4, 5)]
+    assert np.array_equal(found[0], found[1])
+    assert not np.array_equal(found[0], found[2])
+
+
+def family_data(curves):
+    """A data set of these curves, with the features as densities."""
+    count, ratios, samples, _ = curves.features.shape
+    runs = count * ratios
+    half = np.tile(RATIOS / 2, count)
+    return xr.Dataset(
+        {
+            "density": (("run", "sample", "input"), curves.features.reshape(runs, samples, 18)),
+            "weights": (("run", "weight"), np.column_stack([10**half, 10**-half])),
+            "J": ("run", curves.J.ravel()),
+        },
+        attrs={"settings": json.dumps({"family": "N2"})},
+    )
+
+
+@pytest.mark.parametrize("start", [None, -1.5])
+def test_a_network_begins_where_it_is_asked_to(start, tmp_path):
+    curves = synthetic(30)
+    found = train_by_regret(family_data(curves), tmp_path, features="densities", start=start)
+    expected = curves.best_ratio if start is None else start
+    assert ratio_of(found.network.start) == pytest.approx(expected)
+
+
+def test_data_without_cost_curves_are_refused(data, tmp_path):
+    with pytest.raises(ConfigError, match="has no cost curves"):
+        train_by_regret(data, tmp_path)
 
 
 # ---------------------------------------------------------------- the command

@@ -1,9 +1,10 @@
-"""Tuners: tune dataset, tune train, tune evaluate; with --family the ones trained by regret."""
+"""Tuners: tune dataset, tune train, tune evaluate."""
 
 import time
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
@@ -23,7 +24,10 @@ from stewart_drake.cli.common import (
 )
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.reporting.terminal import count_bar, working
-from stewart_drake.scenario.config import Scenario
+
+if TYPE_CHECKING:
+    from stewart_drake.studies.families import Family as DrawnFamily
+    from stewart_drake.tuning.training import Training
 
 app = typer.Typer(rich_markup_mode=None, help="Data for the neural tuner, its training, its worth.")
 
@@ -32,7 +36,7 @@ Out = Annotated[Path, typer.Option(metavar="DIR", help="Where runs, results and 
 
 
 class LabelKind(StrEnum):
-    """Choices of --labels, those of `tuning.labels.LABELS`."""
+    """Choices of --labels, those of `tuning.training.LABELS`."""
 
     as_run = "as_run"
     best_in_cell = "best_in_cell"
@@ -102,30 +106,24 @@ def dataset(
     The grid has delays, frequencies and weights; a family has faults of timing, friction, noise.
     """
     if family is not None:
-        refuse_with_family(scenario, controller)
         refuse({"--disturbed": disturbed}, "with --family, which has --draws; expected one of them")
-        number, delivery = DRAWS if draws is None else draws, Delivery(out, quiet, as_json)
-        return _curves(family.value, number, seed, settings, workers, scheduler, delivery)
-    refuse({"--draws": draws}, "without --family; expected both or neither")
-    from stewart_drake.reporting.tuner_document import dataset_document
-    from stewart_drake.tuning.dataset import make_dataset, summarize
+        least, name, number = 10, "--draws", DRAWS if draws is None else draws
+    else:
+        refuse({"--draws": draws}, "without --family; expected both or neither")
+        least, name, number = 0, "--disturbed", disturbed or 0
+    if number < least:
+        raise ConfigError(f"{name}: got {number}; expected {least} or more")
+    from stewart_drake.reporting.tuner_document import data_document
+    from stewart_drake.tuning.data import make_data, summarize
 
-    base, delivery = _base(scenario, controller, settings), Delivery(out, quiet, as_json)
-    started = time.perf_counter()
-    with stopping(GO_ON), count_bar("runs", quiet) as progress:
-        data = make_dataset(
-            base,
-            out,
-            disturbances=disturbed or 0,
-            seed=seed,
-            workers=workers,
-            scheduler=scheduler,
-            progress=progress,
-        )
+    conditions = _family(family, scenario, controller, settings, number, seed, "training")
+    delivery, started = Delivery(out, quiet, as_json), time.perf_counter()
+    with stopping(GO_ON), count_bar("conditions", quiet) as progress:
+        data = make_data(conditions, out, workers=workers, scheduler=scheduler, progress=progress)
     summary = summarize(data) | {"wall_s": time.perf_counter() - started}
     delivery.write(summary)
-    delivery.say(dataset_document(data).plain())
-    delivery.wrote("dataset.nc", "runs/")
+    delivery.say(data_document(data, summary).plain())
+    delivery.wrote("dataset.nc", "conditions/")
     return delivery.end(summary)
 
 
@@ -160,36 +158,42 @@ def train(
     """
     from stewart_drake.reporting.tuner_document import training_document
     from stewart_drake.tuner.network import save_network
-    from stewart_drake.tuning.dataset import load_dataset
-    from stewart_drake.tuning.training import summarize
-    from stewart_drake.tuning.training import train as run
+    from stewart_drake.tuning import training
+    from stewart_drake.tuning.data import load_data
 
     if out.suffix != ".json":
         raise ConfigError(f"--out: got {str(out)!r}; expected a file ending in .json")
-    chosen = {"kind": labels, "split": split, "density": density}
-    given: dict[str, Any] = {name: one.value for name, one in chosen.items() if one is not None}
-    delivery = Delivery(out.parent, quiet, as_json)
+    of_labels = {"--labels": labels, "--split": split, "--density": density}
+    of_regret = {"--start": start, "--workers": workers}
     if regret:
-        of_labels = {"--labels": labels, "--split": split, "--density": density}
         refuse(of_labels, "with --regret; expected it without")
-        return _train_by_regret(data, out, seed, start, workers, delivery)
-    refuse({"--start": start, "--workers": workers}, "without --regret; expected it with --regret")
-    read = load_dataset(data)
-    with stopping("nothing written"), working("training", quiet):
-        result = run(read, seed=seed, **given)
-    summary = summarize(result)
+    else:
+        refuse(of_regret, "without --regret; expected it with --regret")
+    delivery, read, runs = Delivery(out.parent, quiet, as_json), load_data(data), out.stem + "-runs"
+    if regret:
+        with stopping(GO_ON), count_bar("own runs", delivery.silent, "training") as progress:
+            result = training.train_by_regret(
+                read,
+                out.with_name(runs),
+                seed=seed,
+                start=start,
+                workers=workers,
+                progress=progress,
+            )
+    else:
+        given = {"kind": labels, "split": split, "density": density}
+        chosen: dict[str, Any] = {name: one.value for name, one in given.items() if one is not None}
+        with stopping("nothing written"), working("training", quiet):
+            result = training.train(read, seed=seed, **chosen)
+    summary = training.summarize(result)
     delivery.discard()
     save_network(result.network, out)
-    delivery.wrote(out.name)
+    delivery.wrote(out.name, *([f"{runs}/"] if regret else []))
     delivery.write(summary)
     delivery.say(training_document(summary).plain())
 
-    def draw(folder: Path) -> list[Path]:
-        from stewart_drake.reporting.training_figures import training_figures
-
-        return training_figures(result, folder)
-
-    delivery.draw("figures", draw)
+    if not regret:
+        delivery.draw("figures", partial(_training_figures, result))
     return delivery.end(summary)
 
 
@@ -217,148 +221,63 @@ def evaluate(
 
     With --family on fresh conditions of a family, where lost plates count.
     """
-    if family is not None:
-        refuse_with_family(scenario, controller)
-        delivery = Delivery(out, quiet, as_json)
-        return _worth(
-            family.value, weights, scenarios, seed, settings, workers, scheduler, delivery
-        )
-    if weights and len(weights) > 1:
-        raise ConfigError(f"WEIGHTS: got {len(weights)} without --family; expected one")
-    from stewart_drake.reporting.tuner_document import evaluation_document
-    from stewart_drake.tuning.evaluation import evaluate as run
-
-    base, delivery = _base(scenario, controller, settings), Delivery(out, quiet, as_json)
-    started = time.perf_counter()
-    with stopping(GO_ON), count_bar("runs", quiet) as progress:
-        result = run(
-            base,
-            weights[0] if weights else None,
-            out,
-            scenarios=scenarios,
-            seed=seed,
-            workers=workers,
-            scheduler=scheduler,
-            progress=progress,
-        )
-    summary = result.summary | {"wall_s": time.perf_counter() - started}
-    delivery.write(summary)
-    delivery.say(evaluation_document(result).plain())
-    delivery.wrote("runs in fixed/ and tuner-*/")
-    return delivery.end(summary)
-
-
-def refuse_with_family(scenario: str, controller: str | None) -> None:
-    """A family says both.
-
-    Raises:
-        ConfigError: another scenario, or a controller.
-    """
-    said = {"SCENARIO": None if scenario == "paper" else scenario, "--controller": controller}
-    refuse(said, "with --family, which says it; expected none")
-
-
-def _curves(
-    family: str,
-    draws: int,
-    seed: int,
-    settings: list[str] | None,
-    workers: int | None,
-    scheduler: str | None,
-    delivery: Delivery,
-) -> int:
-    from stewart_drake.reporting.worth_document import curves_document
-    from stewart_drake.tuning.curves import make_curves, summarize
-
-    assert delivery.out is not None
-    started = time.perf_counter()
-    with stopping(GO_ON), count_bar("conditions", delivery.silent) as progress:
-        curves = make_curves(
-            family,
-            delivery.out,
-            number=draws,
-            seed=seed,
-            settings=tuple(settings or ()),
-            workers=workers,
-            scheduler=scheduler,
-            progress=progress,
-        )
-    summary = summarize(curves) | {"seed": seed, "wall_s": time.perf_counter() - started}
-    delivery.write(summary)
-    delivery.say(curves_document(summary).plain())
-    delivery.wrote("curves/")
-    return delivery.end(summary)
-
-
-def _train_by_regret(
-    data: Path,
-    out: Path,
-    seed: int,
-    start: float | None,
-    workers: int | None,
-    delivery: Delivery,
-) -> int:
-    from stewart_drake.reporting.worth_document import regret_document
-    from stewart_drake.tuner.network import save_network
-    from stewart_drake.tuning.curves import load_curves
-    from stewart_drake.tuning.regret import train_by_regret
-
-    curves, runs = load_curves(data), out.with_name(f"{out.stem}-runs")
-    with stopping(GO_ON), count_bar("own runs", delivery.silent, "training") as progress:
-        result = train_by_regret(
-            curves, runs, seed=seed, start=start, workers=workers, progress=progress
-        )
-    summary = dict(result.network.card) | {"curve": result.curve.tolist()}
-    save_network(result.network, out)
-    delivery.wrote(out.name, f"{runs.name}/")
-    delivery.write(summary)
-    delivery.say(regret_document(summary).plain())
-    return delivery.end(summary)
-
-
-def _worth(
-    family: str,
-    weights: list[str] | None,
-    conditions: int,
-    seed: int,
-    settings: list[str] | None,
-    workers: int | None,
-    scheduler: str | None,
-    delivery: Delivery,
-) -> int:
     from stewart_drake.reporting.page import Provenance, command_line, write_page
     from stewart_drake.reporting.worth_document import worth_document
-    from stewart_drake.tuning.worth import SHIPPED, weigh
+    from stewart_drake.tuning.worth import evaluate as run
 
-    assert delivery.out is not None
-    started = time.perf_counter()
-    networks = weights or [SHIPPED[family]]
-    with stopping(GO_ON), count_bar("conditions", delivery.silent) as progress:
-        worth = weigh(
-            family,
-            networks,
-            delivery.out,
-            conditions=conditions,
-            seed=seed,
-            settings=tuple(settings or ()),
+    if scenarios < 2:
+        raise ConfigError(f"--scenarios: got {scenarios}; expected 2 or more")
+    conditions = _family(family, scenario, controller, settings, scenarios, seed, "evaluation")
+    delivery, started = Delivery(out, quiet, as_json), time.perf_counter()
+    with stopping(GO_ON), count_bar("conditions", quiet) as progress:
+        worth = run(
+            conditions,
+            weights or [],
+            out,
             workers=workers,
             scheduler=scheduler,
             progress=progress,
         )
     seconds = time.perf_counter() - started
-    summary = worth.summary | {"wall_s": seconds}
+    summary, document = worth.summary | {"wall_s": seconds}, worth_document(worth)
     delivery.write(summary)
-    document = worth_document(worth)
     delivery.say(document.plain())
-    options = {"family": family, "scenarios": conditions, "seed": seed}
-    command = command_line("tune", "evaluate", *networks, settings=settings or (), options=options)
-    made = Provenance(command, seconds=seconds)
+    drawn = {"family": family, "scenario": None if family else scenario, "controller": controller}
+    options = {**drawn, "scenarios": scenarios, "seed": seed}
+    words = command_line(
+        "tune", "evaluate", *(weights or []), settings=settings or (), options=options
+    )
+    made = Provenance(words, seconds=seconds)
     delivery.draw("worth.html", lambda folder: [write_page(document, made, folder / "worth.html")])
     return delivery.end(summary)
 
 
-def _base(scenario: str, controller: str | None, settings: list[str] | None) -> Scenario:
-    """The scenario that is varied, on the exact plant unless a setting says otherwise."""
-    from stewart_drake.scenario.loading import load_scenario
+def _training_figures(result: "Training", folder: Path) -> list[Path]:
+    from stewart_drake.reporting.training_figures import training_figures
 
-    return load_scenario(scenario, controller, ("plant.kind=exact", *(settings or ())))
+    return training_figures(result, folder)
+
+
+def _family(
+    family: FamilyName | None,
+    scenario: str,
+    controller: str | None,
+    settings: list[str] | None,
+    number: int,
+    seed: int,
+    purpose: Literal["training", "evaluation"],
+) -> "DrawnFamily":
+    """Draw the conditions that a command names, on the exact plant unless a setting says otherwise.
+
+    Raises:
+        ConfigError: as the families; a scenario or controller beside a family, which has its own.
+    """
+    from stewart_drake.scenario.loading import load_scenario
+    from stewart_drake.studies.families import disturbed_family, faulty_family, paper_grid
+
+    if family is not None:
+        said = {"SCENARIO": None if scenario == "paper" else scenario, "--controller": controller}
+        refuse(said, "with --family, which says it; expected none")
+        return faulty_family(family.value, number, seed, purpose, tuple(settings or ()))
+    base = load_scenario(scenario, controller, ("plant.kind=exact", *(settings or ())))
+    return disturbed_family(base, number, seed, purpose) if number else paper_grid(base)

@@ -1,4 +1,4 @@
-"""What is told of the tuner's data set, training and evaluation."""
+"""Documents on the tuner's data set and training."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,53 +6,59 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from stewart_drake.reporting.document import Block, Document, Paragraph, Section, Table, Values
+from stewart_drake.reporting.document import Block, Document, Section, Table, Values
 from stewart_drake.reporting.words import number
-from stewart_drake.tuning.evaluation import TUNER, Evaluation
-from stewart_drake.tuning.labels import cells
 
 
-def dataset_document(dataset: xr.Dataset) -> Document:
-    """How the runs of each delay and frequency ended; of many cells, all in one line."""
-    valid = int(dataset.valid.sum())
-    size = dataset.sizes["run"] * dataset.sizes["sample"]
-    done = dataset.status.values == "completed"
+def data_document(data: xr.Dataset, summary: Mapping[str, Any]) -> Document:
+    """Return how runs ended: of the grid by delay and frequency, of drawn conditions by gain."""
     verdict = (
-        f"{dataset.sizes['run']} runs, {size} rows of which {valid} valid; {int((~done).sum())} "
-        "runs ended early"
+        f"{summary['runs']} runs, {summary['rows']} rows of which {summary['valid_rows']} valid; "
+        f"{len(summary['failed_runs'])} runs ended early"
     )
     part: Block
-    if (dataset.disturbance.values < 0).all():
-        part = _grid_table(dataset, done)
+    if (data.disturbance.values < 0).all():
+        part = _grid_table(data)
     else:
-        groups = cells(dataset)
-        alive = sum(bool(done[members].any()) for members in groups)
-        text = f"{len(groups)} conditions, in {alive} of them at least one run completed"
-        part = Paragraph(text, brief=True)
+        verdict += (
+            f"; {summary['conditions']} conditions, with the best gain of each g is "
+            f"{number(summary['hindsight'])} % s"
+        )
+        rows = [
+            (name, str(summary["completed"][name]), number(g)) for name, g in summary["g"].items()
+        ]
+        ratios = all(name[0] in "+-" for name in summary["g"])
+        head = "log10 w_Q/w_R" if ratios else "weights"
+        part = Table((head, "completed", "g"), rows, brief=True)
     return Document("Data set of the tuner", verdict, [Section("", part)])
 
 
-def _grid_table(dataset: xr.Dataset, done: np.typing.NDArray[np.bool_]) -> Table:
-    frequencies, rows = np.unique(dataset.frequency.values), []
-    for steps in np.unique(dataset.delay_steps.values):
+def _grid_table(data: xr.Dataset) -> Table:
+    done, delays = data.status.values == "completed", data.delay_steps.values
+    frequencies, rows = np.unique(data.frequency.values), []
+    for steps in np.unique(delays):
         rows.append([str(steps)])
         for frequency in frequencies:
-            here = dataset.delay_steps.values == steps
-            here = done & here & (dataset.frequency.values == frequency)
-            errors = dataset.accumulated_error.values[here]
+            here = done & (delays == steps) & (data.frequency.values == frequency)
+            errors = data.accumulated_error.values[here]
             rows[-1].append(f"{here.sum()}, {number(errors.min(initial=np.inf))}")
     caption = "Completed of nine, and the least E_ac in % s, at a frequency in rad/s of"
     return Table(("delay", *(f"{f:g}" for f in frequencies)), rows, caption, brief=True)
 
 
 def training_document(summary: Mapping[str, Any]) -> Document:
-    """What was trained on what, and the errors."""
+    """Return what was trained on what, and the errors."""
+    entries = _regret(summary) if summary.get("loss") == "regret" else _labels(summary)
+    return Document("Training of the tuner", "", [Section("", Values(entries))])
+
+
+def _labels(summary: Mapping[str, Any]) -> dict[str, str]:
     error, used = summary["rms_error"], summary["rows"]
     correlation = ", ".join(
         f"{name} {number(value, 2)}" for name, value in summary["correlation"].items()
     )
     end = "converged" if summary["converged"] else "stopped"
-    entries = {
+    return {
         "labels": f"{summary['labels']}, split by {summary['split']}, seed {summary['seed']}",
         "rows": f"{used['labelled']} labelled, {used['trained_on']} trained on, "
         f"{used['tested_with']} tested with",
@@ -61,26 +67,13 @@ def training_document(summary: Mapping[str, Any]) -> Document:
         "correlation": f"{correlation} on the test rows",
         "training": f"{end} after {summary['evaluations']} evaluations",
     }
-    return Document("Training of the tuner", "", [Section("", Values(entries))])
 
 
-def evaluation_document(evaluation: Evaluation) -> Document:
-    """Table of the candidates, and the verdict on the tuner."""
-    s, rows = evaluation.summary, []
-    for name in evaluation.candidates:
-        one = s["candidates"][name]
-        low, high = map(number, one["interval"])
-        mark = " *" if name == s["best_fixed"] else ""
-        rows.append((f"{name}{mark}", str(one["failures"]), number(one["mean"]),
-                     f"{low} to {high}", number(one["worst"])))  # fmt: skip
-    low, high = (f"{-100 * x:+.1f}" for x in reversed(s["improvement_interval"]))
-    extra = s["candidates"][TUNER]["failures"] - s["candidates"][s["best_fixed"]]["failures"]
-    text = (
-        f"E_ac in % s over the {s['common']} of {evaluation.error.shape[1]} scenarios that all "
-        f"complete; * best fixed gain. Against it the tuner's mean is "
-        f"{-100 * s['improvement']:+.1f} % (95 %: {low} to {high}), with {extra:+d} failures; that "
-        f"of the best gain of each scenario, picked in hindsight, {-100 * s['hindsight']:+.1f} %."
-    )
-    columns = ("w_Q / w_R", "failures", "mean E_ac", "95 % interval", "worst")
-    section = Section("", Table(columns, rows, brief=True), Paragraph(text, brief=True))
-    return Document("Evaluation of the tuner", "", [section])
+def _regret(summary: Mapping[str, Any]) -> dict[str, str]:
+    held = summary["held_out_J"]
+    return {
+        "conditions": f"{summary['conditions']}, {summary['held_out']} of them held out",
+        "g held out": f"round 1 {number(held['rounds'][0])}, round 2 {number(held['rounds'][1])}, "
+        f"best fixed {number(held['best_fixed'])}, hindsight {number(held['hindsight'])}",
+        "kept": f"round {summary['round']}",
+    }

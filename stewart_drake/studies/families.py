@@ -1,28 +1,29 @@
-"""Two families of conditions under which the weights matter, drawn from a seed.
+"""Families of conditions for a tuner: the paper's grid, disturbed conditions, and two with faults.
 
-Where the timing is as believed and nothing rubs, any weights will do (theory.md, section 23). Half
-of the draws here have a timing fault, an offset of the delay that nobody tells the controller or a
-jitter, a quarter Coulomb friction, a quarter ten times the noise; each has a motion, a bias and a
-payload of its own. Timing faults ask for little feedback, friction for much, by decades.
+A family has a base scenario, conditions that vary it, and the fixed gains that every condition is
+run with. Weights hardly matter where the timing is right and nothing rubs (theory.md, section 23),
+so that in T and N2 each draw has one fault: half of the draws have a timing fault that is unknown
+to the controller (an offset of the delay, or jitter), a quarter Coulomb friction, and a quarter ten
+times the noise. Timing faults ask for little feedback, friction for much.
 """
 
-from typing import Final, Literal, NamedTuple
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
 
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.startup import reference_torque
+from stewart_drake.loop.experiment import prepare
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import SineConfig
-from stewart_drake.studies.disturbances import (
-    Standard,
-    logarithmic,
-    set_amplitude,
-    set_frequency,
-    standard_of,
-)
+from stewart_drake.scenario.timing import METRIC_PERIOD
 from stewart_drake.studies.uncertainty import (
     Draw,
     Model,
@@ -36,53 +37,210 @@ from stewart_drake.studies.uncertainty import (
     drawn,
     seed_noise,
 )
+from stewart_drake.tuner.source import weights_of
 
-FamilyName = Literal["T", "N2"]
+Purpose = Literal["training", "evaluation"]
+"""Draws for training and for evaluation have nothing in common."""
+
+LEVELS: Final = (0.1, 1.0, 4.0)
+PAIRS: Final = tuple(itertools.product(LEVELS, LEVELS))
+"""The nine (w_Q, w_R). The gain depends on w_Q / w_R alone, so that they are seven gains."""
+GAINS: Final = {
+    f"{q:g} / {r:g}": (q, r)
+    for _, (q, r) in sorted({q / r: (q, r) for q, r in reversed(PAIRS)}.items())
+}
+"""The seven gains of the nine pairs by name, the gentlest first: one pair of each ratio."""
+DELAYS: Final = (0, 5, 10, 20, 30)
+FREQUENCIES: Final = (0.5, 2.0, 4.0, 6.0)
+"""rad/s."""
+SAMPLES: Final = 100
+"""Number of samples of each run that are kept, k = 0 ... 99."""
+
+RATIOS: Final = np.linspace(-4.0, 2.0, 13)
+"""log10(w_Q / w_R) of the fixed gains of T and N2."""
 FAULTS: Final = ("offset", "jitter", "friction", "noise")
 LEAST_TORQUE: Final = 0.3
-"""Of the standard torque: what the slowest motions are taken for."""
+"""Least effort of a motion, as a share of the standard torque."""
 NOISE: Final = (1e-4, 1e-3)
 """Share of the amplitudes."""
 NOISY: Final = 10.0
-"""So many times as much where noise is the fault."""
+"""Factor on the noise where noise is the fault."""
 BIAS: Final = 0.02
 FRICTION: Final = 0.05
-"""Shares of the torque that the motion takes, at the most."""
+"""Largest bias and friction, as shares of the torque of the motion."""
 PAYLOAD: Final = 0.1
-"""Share of the plate, added or missing, at the most."""
+"""Largest payload, added or missing, as a share of the plate's mass."""
 
 
-class Family(NamedTuple):
-    """What is drawn, and for which controller.
+FIXED: Final[dict[str, tuple[float, float]]] = {
+    f"{ratio:+.1f}": tuple(weights_of(ratio).tolist()) for ratio in RATIOS
+}
+"""The fixed gains of T and N2 by name."""
+
+
+class Condition(NamedTuple):
+    """One condition of a family; `disturbance` is the number of its draw, -1 for none."""
+
+    scenario: Scenario
+    delay_steps: int
+    frequency: float
+    disturbance: int = -1
+
+
+@dataclass(frozen=True)
+class Family:
+    """Conditions, and the fixed gains that each is run with.
+
+    Attributes:
+        name: `paper`, `disturbed`, or one of FAMILIES.
+        base: scenario that the conditions vary.
+        conditions: by the name of their files.
+        gains: w_Q and w_R by name.
+        seed: of the draws.
+        draws: one per condition; empty for the paper's grid.
+        samples: number of samples that are kept of each run.
+        settings: of the scenario `paper` that make the base, for a family with faults.
+    """
+
+    name: str
+    base: Scenario
+    conditions: dict[str, Condition]
+    gains: dict[str, tuple[float, float]]
+    seed: int = 0
+    draws: list[Draw] = field(default_factory=list)
+    samples: int = SAMPLES
+    settings: tuple[str, ...] = ()
+
+    @property
+    def has_faults(self) -> bool:
+        """Whether the family is one of FAMILIES, whose runs are watched."""
+        return self.name in FAMILIES
+
+
+def with_gain(scenario: Scenario, w_Q: float, w_R: float) -> Scenario:
+    """Return a copy of the scenario with these fixed weights."""
+    return replace(scenario, controller=replace(scenario.controller, w_Q=w_Q, w_R=w_R))
+
+
+# ---------------------------------------------------------------- scales and draws
+
+
+class Standard(NamedTuple):
+    """Scales of the scenario's motion at 1 rad/s and full amplitude."""
+
+    torque: float
+    """Largest torque that it takes, N m."""
+    plate_mass: float
+
+
+def sine_of(scenario: Scenario) -> SineConfig:
+    """Return the scenario's reference, which has a frequency and an amplitude.
+
+    Raises:
+        ConfigError: it is not a sine.
+    """
+    if not isinstance(scenario.reference, SineConfig):
+        raise ConfigError(
+            f"reference.kind: got {scenario.reference.kind!r}; expected 'sine', whose frequency "
+            "and amplitude are varied"
+        )
+    return scenario.reference
+
+
+def standard_of(scenario: Scenario) -> Standard:
+    """Compute the scales that drawn shares refer to.
+
+    Raises:
+        ConfigError: the scenario cannot be prepared, or its reference is not a sine.
+    """
+    slow = replace(sine_of(scenario), frequency=1.0, frequency_unit="rad/s")
+    experiment = prepare(replace(scenario, reference=slow))
+    torque = reference_torque(experiment.nominal, experiment.reference, scenario.duration)
+    return Standard(torque, experiment.mechanism.plate.mass)
+
+
+def logarithmic(low: float, high: float) -> Callable[[Generator, Any], float]:
+    """Return a function that draws a number whose logarithm is uniform."""
+    return lambda rng, _: float(np.exp(rng.uniform(*np.log((low, high)))))
+
+
+def _disturbed_bias(rng: Generator, standard: Standard) -> tuple[float, ...]:
+    return tuple((4e-3 * standard.torque * rng.standard_normal(6)).tolist())
+
+
+def _set_delay(truth: Truth, steps: int) -> None:
+    truth.fields["delay"]["steps"] = steps
+
+
+def _set_believed_delay(truth: Truth, steps: int) -> None:
+    _set_delay(truth, steps)
+    truth.fields["controller"] |= {"delay_steps": steps, "delay_fraction": 0.0}
+
+
+def _set_frequency(truth: Truth, frequency: float) -> None:
+    truth.fields["reference"] |= {"frequency": frequency, "frequency_unit": "rad/s"}
+
+
+def _set_amplitude(truth: Truth, share: float) -> None:
+    reference = truth.fields["reference"]
+    reference["amplitude"] = [share * a for a in reference["amplitude"]]
+
+
+DISTURBED: Final[Model] = {
+    # Whole periods, 0 and 15 included, which the controller knows.
+    "delay_steps": Quantity(lambda rng, _: int(rng.integers(0, 16)), _set_delay),
+    # rad/s of the sine.
+    "frequency": Quantity(logarithmic(0.5, 3.0), _set_frequency),
+    # Share of the scenario's own amplitudes.
+    "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.3, 1.0)), _set_amplitude),
+    # Of each motor; its standard deviation is a share of the standard torque.
+    "torque_bias": Quantity(_disturbed_bias, add_bias, sometimes=True),
+    # kg, up to a tenth of the plate's.
+    "payload_mass": Quantity(
+        lambda rng, standard: float(rng.uniform(0.0, 0.1 * standard.plate_mass)),
+        add_payload, sometimes=True,
+    ),
+    # Standard deviation of pose (rates: per second), share of the amplitudes.
+    "noise": Quantity(logarithmic(1e-4, 3e-3), add_noise, sometimes=True),
+    "seed": Quantity(draw_seed, seed_noise),
+}  # fmt: skip
+"""Quantities of a disturbed condition; the order is that of the random numbers."""
+
+
+class Faults(NamedTuple):
+    """Settings and sizes of a family with faults.
 
     Attributes:
         settings: of the scenario `paper`.
         offset, jitter: least and most, s.
         about: in words.
+        network: shipped network that was trained for it.
     """
 
     settings: tuple[str, ...]
     offset: tuple[float, float]
     jitter: tuple[float, float]
     about: str
+    network: str
 
 
 _ON_REFERENCE: Final = ("plant.kind=exact", "start=on_reference", "queue=reference")
-FAMILIES: Final[dict[str, Family]] = {
-    "T": Family(_ON_REFERENCE, (2e-3, 12e-3), (2e-3, 10e-3), "with the estimator"),
-    "N2": Family(
+FAMILIES: Final[dict[str, Faults]] = {
+    "T": Faults(_ON_REFERENCE, (2e-3, 12e-3), (2e-3, 10e-3), "with the estimator", "health_T"),
+    "N2": Faults(
         (*_ON_REFERENCE, "controller.estimate=[]"),
         (5e-3, 30e-3),
         (3e-3, 15e-3),
         "without an estimator",
+        "health_N2",
     ),
 }
 
 
 class About(NamedTuple):
-    """What a family is drawn with."""
+    """What the quantities of FAULTY are drawn with."""
 
-    family: Family
+    faults: Faults
     standard: Standard
 
 
@@ -91,18 +249,17 @@ def _uniform(low: float, high: float, share: float) -> float:
 
 
 def _draw_bias(rng: Generator, about: About) -> tuple[float, ...]:
-    """Of random size, for the standard motion."""
+    """Draw a bias of random size for the standard motion."""
     size, direction = BIAS * about.standard.torque * rng.uniform(), rng.standard_normal(6)
     return tuple((size * direction / np.sqrt(np.mean(direction**2))).tolist())
 
 
 def _draw_fault(rng: Generator, about: About) -> tuple[float, ...]:
-    """One of FAULTS: offset, jitter, s; friction, N m for the standard motion; noise, times."""
+    """Draw one of FAULTS: offset, jitter in s; friction in N m; factor on the noise."""
     kind, sign, size = int(rng.integers(4)), float(rng.choice([-1.0, 1.0])), rng.uniform()
-    family = about.family
     sizes = (
-        sign * _uniform(*family.offset, size),
-        _uniform(*family.jitter, size),
+        sign * _uniform(*about.faults.offset, size),
+        _uniform(*about.faults.jitter, size),
         FRICTION * about.standard.torque * float(size),
         NOISY,
     )
@@ -110,23 +267,18 @@ def _draw_fault(rng: Generator, about: About) -> tuple[float, ...]:
 
 
 def _effort(truth: Truth) -> float:
-    """Torque of the motion as it is, over that of the standard one."""
+    """Return the torque of the motion as it is, over that of the standard one."""
     base, now = truth.scenario.reference, truth.fields["reference"]
     assert isinstance(base, SineConfig)
     share = max(abs(a / b) for a, b in zip(now["amplitude"], base.amplitude, strict=True) if b != 0)
     return max(LEAST_TORQUE, share * now["frequency"] ** 2)
 
 
-def _bias(truth: Truth, bias: tuple[float, ...]) -> None:
+def _set_bias(truth: Truth, bias: tuple[float, ...]) -> None:
     add_bias(truth, tuple(_effort(truth) * b for b in bias))
 
 
-def _steps(truth: Truth, steps: int) -> None:
-    truth.fields["delay"]["steps"] = steps
-    truth.fields["controller"] |= {"delay_steps": steps, "delay_fraction": 0.0}
-
-
-def _fault(truth: Truth, fault: tuple[float, ...]) -> None:
+def _set_fault(truth: Truth, fault: tuple[float, ...]) -> None:
     offset, jitter, friction, noise = fault
     delay, period = truth.fields["delay"], truth.scenario.controller.period
     late = Delay.of(max(0.0, delay["steps"] * period + offset), period)
@@ -140,60 +292,137 @@ def _seed_jitter(truth: Truth, seed: int) -> None:
     truth.fields["delay"]["seed"] = seed
 
 
-CONDITIONS: Final[Model] = {
-    "delay_steps": Quantity(lambda rng, _: int(rng.integers(4, 13)), _steps),
+FAULTY: Final[Model] = {
+    "delay_steps": Quantity(lambda rng, _: int(rng.integers(4, 13)), _set_believed_delay),
     # rad/s of the sine.
-    "frequency": Quantity(logarithmic(0.5, 2.0), set_frequency),
+    "frequency": Quantity(logarithmic(0.5, 2.0), _set_frequency),
     # Share of the scenario's own amplitudes.
-    "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.5, 1.0)), set_amplitude),
-    "torque_bias": Quantity(_draw_bias, _bias),
+    "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.5, 1.0)), _set_amplitude),
+    "torque_bias": Quantity(_draw_bias, _set_bias),
     # kg.
     "payload": Quantity(
         lambda rng, a: float(PAYLOAD * a.standard.plate_mass * rng.uniform(-1, 1)), add_payload
     ),
     "noise": Quantity(logarithmic(*NOISE), add_noise),
-    "fault": Quantity(_draw_fault, _fault),
+    "fault": Quantity(_draw_fault, _set_fault),
     "seed": Quantity(draw_seed, seed_noise),
     "jitter_seed": Quantity(draw_seed, _seed_jitter),
 }
-"""The order is that of the random numbers."""
-
-
-def base_of(name: str, settings: tuple[str, ...] = ()) -> Scenario:
-    """The scenario that a family varies.
-
-    Args:
-        name: of FAMILIES.
-        settings: further ones.
-    """
-    return load_scenario("paper", None, (*FAMILIES[name].settings, *settings))
-
-
-def draw_family(
-    name: str, number: int, seed: int, purpose: Literal["training", "evaluation"]
-) -> list[Draw]:
-    """So many draws; the first ones stay the same when more are asked for.
-
-    Args:
-        name: of FAMILIES.
-        number: of draws, each with a motion of its own.
-        seed: of all draws.
-        purpose: draws for training and for evaluation have nothing in common.
-    """
-    about = About(FAMILIES[name], standard_of(base_of(name)))
-    stream = 2 * list(FAMILIES).index(name) + (purpose == "evaluation")
-    return [
-        draw_from(CONDITIONS, np.random.default_rng([seed, stream, i]), about)
-        for i in range(number)
-    ]
-
-
-def condition(base: Scenario, one: Draw) -> Scenario:
-    """A copy of a family's scenario with what was drawn."""
-    return drawn(CONDITIONS, base, load_mechanism(base.mechanism), one).as_scenario()
+"""Quantities of a condition of T or N2; the order is that of the random numbers."""
 
 
 def fault_of(one: Draw) -> str:
-    """Which of FAULTS a draw has."""
+    """Return which of FAULTS a draw of FAULTY has."""
     offset, jitter, friction, _ = one["fault"]
     return FAULTS[0 if offset else 1 if jitter else 2 if friction else 3]
+
+
+def _draws(model: Model, about: Any, number: int, seed: int, stream: int) -> list[Draw]:
+    """Draw a model; the first draws stay the same when more are asked for."""
+    return [
+        draw_from(model, np.random.default_rng([seed, stream, i]), about) for i in range(number)
+    ]
+
+
+def vary(model: Model, base: Scenario, one: Draw) -> Scenario:
+    """Return a copy of a scenario with what was drawn, applied in the order of the model."""
+    in_order = {name: one[name] for name in model}
+    return drawn(model, base, load_mechanism(base.mechanism), in_order).as_scenario()
+
+
+# ---------------------------------------------------------------- the families
+
+
+def paper_grid(scenario: Scenario) -> Family:
+    """Return the paper's grid: 5 delays and 4 frequencies, each with 9 pairs of weights.
+
+    Raises:
+        ConfigError: the scenario's reference is not a sine, or it is too short for 100 samples.
+    """
+    _check_samples(scenario)
+    conditions = {
+        f"delay{steps:02d}_frequency{frequency:g}": Condition(
+            replace(
+                scenario,
+                delay=replace(scenario.delay, steps=steps),
+                reference=replace(sine_of(scenario), frequency=frequency, frequency_unit="rad/s"),
+            ),
+            steps,
+            frequency,
+        )
+        for steps, frequency in itertools.product(DELAYS, FREQUENCIES)
+    }
+    return Family("paper", scenario, conditions, _pairs())
+
+
+def disturbed_family(scenario: Scenario, number: int, seed: int, purpose: Purpose) -> Family:
+    """Draw disturbed conditions of a scenario: nine pairs to train on, seven gains to evaluate.
+
+    Args:
+        scenario: base, whose machine and motion give the scales.
+        number: of conditions; the first ones stay the same when more are asked for.
+        seed: of all draws.
+        purpose: see `Purpose`.
+
+    Raises:
+        ConfigError: as `paper_grid` for training, or a disturbed motion leaves the workspace.
+    """
+    for_training = purpose == "training"
+    if for_training:
+        _check_samples(scenario)
+    draws = _draws(DISTURBED, standard_of(scenario), number, seed, 0 if for_training else 1)
+    conditions = {}
+    for i, one in enumerate(draws):
+        condition = vary(DISTURBED, scenario, one)
+        prepare(condition)
+        conditions[f"disturbed{i:04d}"] = Condition(
+            condition, one["delay_steps"], one["frequency"], i
+        )
+    gains = _pairs() if for_training else GAINS
+    return Family("disturbed", scenario, conditions, gains, seed, draws)
+
+
+def faulty_family(
+    name: str, number: int, seed: int, purpose: Purpose, settings: tuple[str, ...] = ()
+) -> Family:
+    """Draw conditions of T or N2, each with a motion and a fault of its own.
+
+    Args:
+        name: of FAMILIES.
+        number: of conditions; the first ones stay the same when more are asked for.
+        seed: of all draws.
+        purpose: see `Purpose`.
+        settings: further ones of the scenario.
+    """
+    faults = FAMILIES[name]
+    base = load_scenario("paper", None, (*faults.settings, *settings))
+    standard = standard_of(load_scenario("paper", None, faults.settings))
+    stream = 2 * list(FAMILIES).index(name) + (purpose == "evaluation")
+    draws = _draws(FAULTY, About(faults, standard), number, seed, stream)
+    conditions = {
+        f"{i:05d}": Condition(vary(FAULTY, base, one), one["delay_steps"], one["frequency"], i)
+        for i, one in enumerate(draws)
+    }
+    samples = round(base.duration / base.controller.period)
+    return Family(name, base, conditions, FIXED, seed, draws, samples, settings)
+
+
+def _pairs() -> dict[str, tuple[float, float]]:
+    return {f"wQ{q:g}_wR{r:g}": (q, r) for q, r in PAIRS}
+
+
+def _check_samples(scenario: Scenario) -> None:
+    """Refuse a scenario that does not give 100 samples on the grid of the record."""
+    sine_of(scenario)
+    every = scenario.controller.period / METRIC_PERIOD
+    if round(every) < 1 or abs(every - round(every)) > 1e-9:
+        raise ConfigError(
+            f"controller.period: got {scenario.controller.period!r}; expected a multiple of "
+            f"{METRIC_PERIOD} s, the grid on which a run is recorded"
+        )
+    least = (SAMPLES - 1) * scenario.controller.period
+    if scenario.duration < least:
+        raise ConfigError(
+            f"duration: got {scenario.duration!r}; expected at least {least:g} s, the {SAMPLES} "
+            "samples of a run"
+        )

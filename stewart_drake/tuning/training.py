@@ -1,32 +1,89 @@
-"""From a data set to a network that the loop can use."""
+"""Train the tuner's network on a data set, by labels or by regret.
 
+theta holds W1 (h, 18), b1 (h,), W2 (2, h), b2 (2,) one after the other, and the network is
+
+    f(theta, u) = W2 sigmoid(W1 u + b1) + b2.
+
+*Labels* say what to answer; f minimises 1/2 sum |f(theta, u_i) - y_i|^2 by Levenberg and Marquardt,
+as in the paper: (J'J + lambda D^2) step = -J' r, which MINPACK solves through QR.
+
+K of (43) depends on w_Q / w_R alone, since P of (44) scales with both. Pairs of one ratio are
+therefore one gain, and (0.1, 0.1), (1, 1) and (4, 4) one answer; a best gain has w_Q w_R = 1.
+
+*Regret* says what an answer costs. With R_i(r) = log J_i(r) - min log J_i along
+r = log10(w_Q / w_R), known at 13 ratios and linear in between, f minimises by Adam
+
+    mean over rows of R_i(r(u; theta)) + OUTSIDE |r - nearest in bounds|^2 + DECAY mean theta^2.
+
+Where any ratio will do, a label is noise, and here nothing is lost. Rows are first those of the
+runs with fixed ratios. A network leads to features that no fixed ratio does: in a second round half
+of the rows are of its own runs. Conditions, and with them motions, that are held out say when to
+stop, and which round was better, in the loop.
+"""
+
+import hashlib
 import json
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
-from typing import Any, Final, Literal
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.versions import versions
+from stewart_drake.files.yamlio import validate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import scenario_to_dict
+from stewart_drake.scenario.renames import with_new_names
+from stewart_drake.studies.families import FAULTY, RATIOS, vary
+from stewart_drake.studies.jobs import Progress, run_jobs
 from stewart_drake.tuner.density import NUM_INPUTS, Kind, densities
-from stewart_drake.tuner.network import Network
-from stewart_drake.tuning.dataset import data_hash
-from stewart_drake.tuning.labels import Labels, cells, labels
-from stewart_drake.tuning.levenberg import TorchModel, fit, initial_theta, unpack
+from stewart_drake.tuner.network import NUM_OUTPUTS, Network
+from stewart_drake.tuner.source import weights_of
+from stewart_drake.tuning.data import (
+    EVERY,
+    LEAST,
+    WATCHED,
+    cells,
+    data_hash,
+    read_condition,
+    roll_out,
+)
 from stewart_drake.types import Array
 
+Labels = Literal["as_run", "best_in_cell", "best_in_cell_torque"]
+LABELS: Final = ("as_run", "best_in_cell", "best_in_cell_torque")
 Split = Literal["sample", "run", "cell"]
 SPLITS: Final = ("sample", "run", "cell")
+FeatureName = Literal["densities", "health"]
+Indices = NDArray[np.intp]
 
 HIDDEN: Final = 10
 TRAIN_SHARE: Final = 0.7
 MAX_ROWS: Final = 6000
-"""Rows that training uses at most, drawn at random: QR of the Jacobian takes all the time."""
+"""Most rows that labels are trained on, drawn at random; QR of the Jacobian takes all the time."""
 EVALUATIONS: Final = 60
-"""Of the residuals, at most."""
+"""Most evaluations of the residuals."""
+
+HELD_OUT: Final = 0.2
+"""Share of the conditions."""
+OWN: Final = 0.5
+"""Share of the conditions trained on that are run with the first round's network."""
+BATCH: Final = 4000
+STEPS: Final = 1500
+PATIENCE: Final = 300
+"""Steps without improvement on the conditions that are held out."""
+LOOK: Final = 25
+"""Steps between two looks at those."""
+RATE: Final = 0.02
+OUTSIDE: Final = 0.1
+DECAY: Final = 1e-4
 
 
 @dataclass(frozen=True)
@@ -35,8 +92,9 @@ class Training:
 
     Attributes:
         network: with its card.
-        curve: (iterations, 2) root mean square errors of training and test rows.
-        targets: (N, 2) of the test rows, as the output layer gives them.
+        curve: one row per step. Labels: root mean square errors of training and test rows. Regret:
+            round, step, regret of the rows trained on and of those held out.
+        targets: (N, 2) labels of the test rows, as the output layer gives them; empty for regret.
         outputs: (N, 2) of the network there.
     """
 
@@ -46,18 +104,202 @@ class Training:
     outputs: Array
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Valid rows of a data set: densities, targets, and the run and cell that each is of."""
+# ---------------------------------------------------------------- the network in torch
 
-    densities: Array
+
+def require_torch() -> Any:
+    """Return the module torch, with one thread.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        import torch
+    except ImportError:
+        raise ConfigError(
+            "tune train: needs torch; install it with pip install 'stewart-drake[train]'"
+        ) from None
+    torch.set_num_threads(1)
+    return torch
+
+
+def unpack(theta: Any, inputs: int, hidden: int) -> tuple[Any, Any, Any, Any]:
+    """Return W1 (h, inputs), b1 (h,), W2 (2, h), b2 (2,) of theta, numpy or torch."""
+    ends = np.cumsum([hidden * inputs, hidden, NUM_OUTPUTS * hidden, NUM_OUTPUTS])
+    W1, b1, W2, b2 = (theta[i:j] for i, j in zip([0, *ends[:-1]], ends, strict=True))
+    return W1.reshape(hidden, inputs), b1, W2.reshape(NUM_OUTPUTS, hidden), b2
+
+
+def initial_theta(inputs: int, hidden: int, targets: Array, seed: int) -> Array:
+    """Draw weights of variance 1 / fan-in; the output bias is the mean of the targets (N, 2)."""
+    rng = np.random.default_rng(seed)
+    first = rng.standard_normal((hidden, inputs)) / np.sqrt(inputs)
+    second = rng.standard_normal((NUM_OUTPUTS, hidden)) / np.sqrt(hidden)
+    return np.concatenate(
+        [first.ravel(), np.zeros(hidden), second.ravel(), targets.mean(axis=0) - second.sum(1) / 2]
+    )
+
+
+def standard(inputs: Array) -> tuple[Array, Array]:
+    """Return mean and spread (18,) of inputs; one that never changes keeps the scale 1."""
+    spread = inputs.std(axis=0)
+    return inputs.mean(axis=0), np.where(spread > 1e-12, spread, 1.0)
+
+
+class TorchModel:
+    """f and its Jacobian by torch, in double precision.
+
+    Args:
+        inputs: number of inputs.
+        hidden: number of hidden neurons.
+
+    Raises:
+        ConfigError: torch is not installed.
+    """
+
+    def __init__(self, inputs: int, hidden: int) -> None:
+        self._torch = torch = require_torch()
+
+        def forward(theta: Any, u: Any) -> Any:
+            W1, b1, W2, b2 = unpack(theta, inputs, hidden)
+            return W2 @ torch.sigmoid(W1 @ u + b1) + b2
+
+        self._forward = torch.func.vmap(forward, in_dims=(None, 0))
+        self._jacobian = torch.func.vmap(torch.func.jacrev(forward), in_dims=(None, 0))
+
+    def _call(self, function: Callable[[Any, Any], Any], theta: Array, u: Array) -> Array:
+        with self._torch.no_grad():
+            tensors = (self._torch.from_numpy(np.ascontiguousarray(x)) for x in (theta, u))
+            return np.asarray(function(*tensors).numpy())
+
+    def outputs(self, theta: Array, u: Array) -> Array:
+        """Return f (N, 2) of inputs u (N, n)."""
+        return self._call(self._forward, theta, u)
+
+    def jacobian(self, theta: Array, u: Array) -> Array:
+        """Return df/dtheta (N, 2, len(theta))."""
+        return self._call(self._jacobian, theta, u)
+
+
+# ---------------------------------------------------------------- by labels
+
+
+class Fit(NamedTuple):
+    """A parameter vector that Levenberg-Marquardt has found.
+
+    Attributes:
+        theta: the parameters.
+        curve: (iterations, 2) root mean square errors of the training and the test rows, from the
+            start on.
+        evaluations: of the residuals.
+        converged: whether MINPACK stopped by itself.
+    """
+
+    theta: Array
+    curve: Array
+    evaluations: int
+    converged: bool
+
+
+def fit(
+    model: TorchModel,
+    theta: Array,
+    train: tuple[Array, Array],
+    test: tuple[Array, Array],
+    evaluations: int,
+) -> Fit:
+    """Minimise the squared errors by Levenberg-Marquardt from `theta` on.
+
+    Args:
+        model: f.
+        theta: where to start.
+        train: standardised inputs (N, n) and targets (N, 2).
+        test: the same, of rows that training does not see; may be empty.
+        evaluations: of the residuals, at most.
+    """
+    curve: list[tuple[float, float]] = []
+
+    def rms(theta: Array, rows: tuple[Array, Array]) -> float:
+        if not len(rows[0]):
+            return float("nan")
+        return float(np.sqrt(np.mean((model.outputs(theta, rows[0]) - rows[1]) ** 2)))
+
+    def residuals(theta: Array) -> Array:
+        return (model.outputs(theta, train[0]) - train[1]).ravel()
+
+    # MINPACK asks for the Jacobian at the start and after each successful step.
+    def jacobian(theta: Array) -> Array:
+        curve.append((rms(theta, train), rms(theta, test)))
+        return model.jacobian(theta, train[0]).reshape(-1, len(theta))
+
+    found = least_squares(
+        residuals, theta, jac=jacobian, method="lm", max_nfev=evaluations, x_scale=1.0
+    )
+    curve.append((rms(found.x, train), rms(found.x, test)))
+    return Fit(found.x, np.array(curve), int(found.nfev), found.status > 0)
+
+
+def labels(data: xr.Dataset, kind: Labels) -> Array:
+    """Return the weights (run, 2) that the rows of each run are labelled with.
+
+    Args:
+        data: as `load_data` returns it.
+        kind: `as_run`, the weights that the run used, as the paper has it; `best_in_cell`, those of
+            least E_ac among the runs of the same delay, frequency and disturbance, w_Q w_R = 1;
+            `best_in_cell_torque`, the same of least E_ac + rms torque, each relative to its least
+            in the cell.
+
+    Returns:
+        w_Q and w_R; NaN where no run of the cell completed, so that nothing is best.
+    """
+    weights = np.array(data.weights.values, dtype=np.float64)
+    if kind == "as_run":
+        return weights
+    result = np.full_like(weights, np.nan)
+    ratios = weights[:, 0] / weights[:, 1]
+    for members in cells(data):
+        costs = np.array(data.accumulated_error.values[members])  # NaN where a run ended early
+        if not np.isfinite(costs).any():
+            continue
+        if kind == "best_in_cell_torque":
+            torque = np.where(np.isfinite(costs), data.rms_torque.values[members], np.nan)
+            costs = costs / np.nanmin(costs) + torque / np.nanmin(torque)
+        root = np.sqrt(ratios[members[np.nanargmin(costs)]])
+        result[members] = root, 1 / root
+    return result
+
+
+class Rows(NamedTuple):
+    """Valid rows of a data set: inputs, targets, and the run and cell that each is of."""
+
+    inputs: Array
     targets: Array
-    runs: NDArray[np.intp]
-    cells: NDArray[np.intp]
+    runs: Indices
+    cells: Indices
+
+
+def labelled_rows(data: xr.Dataset, kind: Labels, density: Kind) -> Rows:
+    """Return the valid rows that have a label, targets as the output layer gives them."""
+    wanted = labels(data, kind)
+    use = data.valid.values & np.all(np.isfinite(wanted), axis=1)[:, np.newaxis]
+    rho = np.array([densities(run, density) for run in data.samples.values])
+    cell = np.empty(data.sizes["run"], dtype=np.intp)
+    for number, members in enumerate(cells(data)):
+        cell[members] = number
+    run = np.nonzero(use)[0]
+    targets = wanted[run] if kind == "as_run" else np.log(wanted[run])
+    return Rows(rho[use], targets, run, cell[run])
+
+
+def split_rows(rows: Rows, split: Split, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Choose the rows to train on, 70 % of the samples, runs or cells."""
+    group = {"sample": np.arange(len(rows.inputs)), "run": rows.runs, "cell": rows.cells}[split]
+    groups = rng.permutation(np.unique(group))
+    return np.isin(group, groups[: round(TRAIN_SHARE * len(groups))])
 
 
 def train(
-    dataset: xr.Dataset,
+    data: xr.Dataset,
     *,
     kind: Labels = "best_in_cell",
     split: Split = "run",
@@ -67,10 +309,10 @@ def train(
     max_rows: int = MAX_ROWS,
     evaluations: int = EVALUATIONS,
 ) -> Training:
-    """Train a network; the same arguments give the same network.
+    """Train a network by labels; the same arguments give the same network.
 
     Args:
-        dataset: as `load_dataset` returns it.
+        data: as `load_data` returns it.
         kind: of labels; with `as_run` the network's outputs are the weights, as the paper has it,
             otherwise their logarithms.
         split: 70 % of what is drawn for training: of samples, as printed, of runs, whose samples
@@ -84,13 +326,12 @@ def train(
     Raises:
         ConfigError: torch is missing, or too few rows are left to train on or to test with.
     """
-    rows = training_rows(dataset, kind, density)
-    rng = np.random.default_rng(seed)
-    in_train = _split(rows, split, rng)
+    rows, rng = labelled_rows(data, kind, density), np.random.default_rng(seed)
+    in_train = split_rows(rows, split, rng)
     chosen = rng.permutation(np.flatnonzero(in_train))[:max_rows]
     if not len(chosen) or in_train.all():
         raise ConfigError(
-            f"data: {len(rows.densities)} labelled rows give nothing to "
+            f"data: {len(rows.inputs)} labelled rows give nothing to "
             f"{'test with' if len(chosen) else 'train on'}; expected more runs that complete"
         )
     theta = initial_theta(NUM_INPUTS, hidden, rows.targets[chosen], seed)
@@ -99,22 +340,14 @@ def train(
             f"data: {len(chosen)} rows to train on cannot tell the {len(theta)} numbers of a "
             f"network with {hidden} hidden neurons; expected more runs that complete"
         )
-    mean, scale = _standard(rows.densities[chosen])
-    u = (rows.densities - mean) / scale
-    model = TorchModel(NUM_INPUTS, hidden)
+    mean, scale = standard(rows.inputs[chosen])
+    u, model = (rows.inputs - mean) / scale, TorchModel(NUM_INPUTS, hidden)
     test = (u[~in_train], rows.targets[~in_train])
-    found = fit(
-        model,
-        theta,
-        (u[chosen], rows.targets[chosen]),
-        test,
-        evaluations,
-    )
-    outputs = model.outputs(found.theta, test[0])
-    weights = unpack(found.theta, NUM_INPUTS, hidden)
+    found = fit(model, theta, (u[chosen], rows.targets[chosen]), test, evaluations)
+    constant = np.sqrt(np.mean((test[1] - rows.targets[chosen].mean(axis=0)) ** 2))
     card = {
-        "data_sha256": data_hash(dataset),
-        "data_made_with": json.loads(dataset.attrs["settings"])["data"],
+        "data_sha256": data_hash(data),
+        "data_made_with": json.loads(data.attrs["settings"])["data"],
         "labels": kind,
         "split": split,
         "seed": seed,
@@ -124,73 +357,332 @@ def train(
         "rms_error": {
             "train": float(found.curve[-1, 0]),
             "test": float(found.curve[-1, 1]),
-            "test_of_a_constant": _constant_error(rows.targets[chosen], test[1]),
+            "test_of_a_constant": float(constant),
         },
         "versions": versions() | {"torch": version("torch")},
     }
-    bounds, output = _bounds(dataset, kind), _output(kind)
-    network = Network(mean, scale, *weights, bounds, output, density, card)
-    return Training(network, found.curve, test[1], outputs)
-
-
-def training_rows(dataset: xr.Dataset, kind: Labels, density: Kind) -> Rows:
-    """The valid rows that have a label, targets as the output layer gives them."""
-    wanted = labels(dataset, kind)
-    use = dataset.valid.values & np.all(np.isfinite(wanted), axis=1)[:, np.newaxis]
-    rho = np.array([densities(run, density) for run in dataset.samples.values])
-    cell = np.empty(dataset.sizes["run"], dtype=np.intp)
-    for number, members in enumerate(cells(dataset)):
-        cell[members] = number
-    run = np.nonzero(use)[0]
-    targets = wanted[run]
-    return Rows(
-        densities=rho[use],
-        targets=targets if _output(kind) == "weights" else np.log(targets),
-        runs=run,
-        cells=cell[run],
+    network = Network(
+        mean,
+        scale,
+        *unpack(found.theta, NUM_INPUTS, hidden),
+        bounds=_bounds(data, kind),
+        output="weights" if kind == "as_run" else "log_weights",
+        density=density,
+        card=card,
     )
+    return Training(network, found.curve, test[1], model.outputs(found.theta, test[0]))
 
 
-def _output(kind: Labels) -> Literal["weights", "log_weights"]:
-    return "weights" if kind == "as_run" else "log_weights"
+def _bounds(data: xr.Dataset, kind: Labels) -> Array:
+    """Return lower and upper bounds of w_Q and w_R, over all that labels could be."""
+    weights = np.asarray(data.weights.values)
+    if kind != "as_run":
+        root = np.sqrt(weights[:, 0] / weights[:, 1])
+        weights = np.column_stack([root, 1 / root])
+    return np.array([weights.min(axis=0), weights.max(axis=0)])
 
 
-def _bounds(dataset: xr.Dataset, kind: Labels) -> Array:
-    """Lower and upper bounds of w_Q and w_R: what the labels could be."""
-    weights = np.asarray(dataset.weights.values)
-    if kind == "as_run":
-        return np.array([weights.min(axis=0), weights.max(axis=0)])
-    root = np.sqrt(weights[:, 0] / weights[:, 1])
-    both = np.column_stack([root, 1 / root])
-    return np.array([both.min(axis=0), both.max(axis=0)])
+# ---------------------------------------------------------------- by regret
 
 
-def _split(rows: Rows, split: Split, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Which rows are for training."""
-    number = len(rows.densities)
-    group = {"sample": np.arange(number), "run": rows.runs, "cell": rows.cells}[split]
-    groups = rng.permutation(np.unique(group))
-    return np.isin(group, groups[: round(TRAIN_SHARE * len(groups))])
+class Curves(NamedTuple):
+    """Cost curves of conditions, and the features of their runs.
+
+    Attributes:
+        J: (n, m) in % s, of m = 13 fixed ratios, or of 1 roll-out.
+        features: (n, m, k, 18) after each of k samples, NaN where they are not known.
+    """
+
+    J: Array
+    features: NDArray[np.float32]
+
+    @property
+    def log_J(self) -> Array:
+        """(n, m) natural logarithm."""
+        return np.log(np.maximum(self.J, LEAST))
+
+    @property
+    def regret(self) -> Array:
+        """(n, m) above the least of each condition."""
+        return self.log_J - self.log_J.min(axis=1, keepdims=True)
+
+    @property
+    def best_ratio(self) -> float:
+        """Fixed ratio of least mean log J."""
+        return float(RATIOS[np.argmin(self.log_J.mean(axis=0))])
 
 
-def _standard(densities: Array) -> tuple[Array, Array]:
-    """Mean and spread (18,); a density that never changes keeps the scale 1."""
-    spread = densities.std(axis=0)
-    return densities.mean(axis=0), np.where(spread > 1e-12, spread, 1.0)
+class FeatureRows(NamedTuple):
+    """Rows to train on: inputs (N, 18), and the number of the condition that each is of."""
+
+    inputs: Array
+    condition: Indices
 
 
-def _constant_error(train: Array, test: Array) -> float:
-    """What answering with the mean of the training targets would have as its error."""
-    return float(np.sqrt(np.mean((test - train.mean(axis=0)) ** 2)))
+def curves_of(data: xr.Dataset, features: FeatureName) -> Curves:
+    """Return the cost curves of a data set.
+
+    Raises:
+        ConfigError: its conditions were not run with the 13 ratios, or without these features.
+    """
+    values = {"densities": "density", "health": "health"}[features]
+    ratios = np.log10(data.weights.values[:, 0] / data.weights.values[:, 1])
+    whole = not len(ratios) % len(RATIOS)
+    if (
+        "J" not in data
+        or values not in data
+        or not whole
+        or not np.allclose(ratios.reshape(-1, len(RATIOS)), RATIOS)
+    ):
+        raise ConfigError(
+            "data: has no cost curves to train by regret; expected what `tune dataset --family` "
+            "has written since version 0.3"
+        )
+    shape = (-1, len(RATIOS))
+    seen = data[values].values.astype(np.float32)
+    return Curves(data.J.values.reshape(shape), seen.reshape(*shape, *seen.shape[1:]))
+
+
+def feature_rows(curves: Curves) -> FeatureRows:
+    """Return every second sample of every watched run."""
+    values = curves.features[:, ::WATCHED, ::EVERY].astype(np.float64)
+    known = np.isfinite(values).all(axis=-1)
+    return FeatureRows(values[known], np.nonzero(known)[0])
+
+
+def train_by_regret(
+    data: xr.Dataset,
+    directory: str | Path,
+    *,
+    features: FeatureName = "health",
+    seed: int = 0,
+    start: float | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Training:
+    """Train a network by regret; the same arguments give the same network.
+
+    Args:
+        data: of a family with faults, as `load_data` returns it.
+        directory: its own runs are kept there, so that a second start goes on.
+        features: inputs of the network; the second round is for `health` alone.
+        seed: of the split, the first theta and the batches.
+        start: log10(w_Q / w_R) at which the network begins in the end, the best fixed one if None.
+        workers, progress: as `run_jobs` takes them.
+
+    Raises:
+        ConfigError: torch is missing, a start that is no ratio, or other data.
+        As `run_jobs`.
+    """
+    if start is not None and not RATIOS[0] <= start <= RATIOS[-1]:
+        raise ConfigError(f"--start: got {start:g}; expected {RATIOS[0]:g} to {RATIOS[-1]:g}")
+    settings = json.loads(data.attrs["settings"])
+    curves = curves_of(data, features)
+    trainer = RegretTrainer(curves, seed)
+    theta = trainer.fit(trainer.start, [trainer.rows], 1)
+    about = {"family": settings["family"], "conditions": len(curves.J)}
+    best = first = trainer.network(theta, features, about)
+    more: dict[str, Any] = {}
+    if features == "health":
+
+        def own_runs(network: Network, chosen: Indices, number: int) -> Curves:
+            folder = Path(directory) / f"round{number}-{_key(network)[:8]}"
+            return roll_outs(settings, data.sizes["sample"], chosen, network, folder, workers,
+                             progress)  # fmt: skip
+
+        held, some = np.flatnonzero(trainer.held), np.flatnonzero(~trainer.held)[:: round(1 / OWN)]
+        chosen = np.sort(np.concatenate([held, some]))
+        own = own_runs(first, chosen, 1)
+        rows = feature_rows(own)
+        both = [trainer.rows, FeatureRows(rows.inputs, chosen[rows.condition])]
+        second = trainer.network(trainer.fit(theta, both, 2), features, about)
+        scores = [
+            float(own.log_J[np.isin(chosen, held)].mean()),
+            float(own_runs(second, held, 2).log_J.mean()),
+        ]
+        best, fixed = (first, second)[int(np.argmin(scores))], curves.log_J[held]
+        more = {
+            "start": curves.best_ratio if start is None else start,
+            "round": 1 + int(np.argmin(scores)),
+            "held_out_J": {
+                "rounds": np.exp(scores).tolist(),
+                "best_fixed": float(np.exp(fixed.mean(axis=0).min())),
+                "hindsight": float(np.exp(fixed.min(axis=1).mean())),
+            },
+        }
+    begin = weights_of(curves.best_ratio if start is None else start)
+    network = replace(best, start=begin, card=dict(best.card) | more)
+    nothing = np.empty((0, NUM_OUTPUTS))
+    return Training(network, np.array(trainer.curve), nothing, nothing)
+
+
+def roll_outs(
+    settings: dict[str, Any],
+    samples: int,
+    chosen: Indices,
+    network: Network,
+    directory: Path,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Curves:
+    """Run some of the conditions with a network, or go on with it.
+
+    Args:
+        settings: of the data set.
+        samples: number of samples of a run.
+        chosen: numbers of the conditions that are run.
+        network: what sets the weights.
+        directory: where the runs are kept.
+        workers, progress: as `run_jobs` takes them.
+    """
+    base = validate(Scenario, with_new_names(settings["scenario"]), "data")
+    draws = settings["draws"]
+    kept = run_jobs(
+        {f"{i:05d}": (vary(FAULTY, base, draws[i]), network, samples) for i in chosen},
+        roll_out,
+        directory,
+        settings={
+            "family": settings["family"],
+            "scenario": scenario_to_dict(base),
+            "network": _key(network),
+        },
+        suffix=".npz",
+        read=partial(read_condition, runs=1, samples=samples),
+        workers=workers,
+        progress=progress,
+    )
+    found = kept.values()
+    return Curves(np.array([one["J"] for one in found]), np.array([one["health"] for one in found]))
+
+
+class RegretTrainer:
+    """What both rounds have in common.
+
+    Args:
+        curves: of the conditions.
+        seed: of the split, the first theta and the batches.
+    """
+
+    def __init__(self, curves: Curves, seed: int) -> None:
+        self._torch, self._curves, self._seed = require_torch(), curves, seed
+        self.rows = feature_rows(curves)
+        number, rng = len(curves.J), np.random.default_rng(seed)
+        self.held = np.zeros(number, dtype=bool)
+        self.held[rng.permutation(number)[: round(HELD_OUT * number)]] = True
+        self.mean, self.scale = standard(self.rows.inputs[~self.held[self.rows.condition]])
+        target = np.log(weights_of(curves.best_ratio))[None, :]
+        self.start = initial_theta(NUM_INPUTS, HIDDEN, target, seed)
+        self.curve: list[tuple[float, float, float, float]] = []
+
+    def fit(self, theta: Array, sources: list[FeatureRows], number: int) -> Array:
+        """Minimise the regret by Adam on batches, as many rows of each source.
+
+        It stops where the conditions that are held out gain no more.
+        """
+        torch = self._torch
+        generator = torch.Generator().manual_seed(1000 * self._seed + number)
+        parts = [self._split(rows) for rows in sources]
+        x = torch.tensor(theta, dtype=torch.float32, requires_grad=True)
+        optimizer = torch.optim.Adam([x], lr=RATE)
+        best, kept, since = np.inf, theta, 0
+        for step in range(STEPS):
+            for group in optimizer.param_groups:
+                group["lr"] = RATE * (0.5 + 0.5 * np.cos(np.pi * step / STEPS)) + 1e-4
+            losses = []
+            for (u, regret), _ in parts:
+                rows = torch.randint(0, len(u), (BATCH // len(parts),), generator=generator)
+                losses.append(self.loss(x, u[rows], regret[rows]))
+            loss = sum(losses) / len(losses) + DECAY * (x**2).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            if (step + 1) % LOOK == 0:
+                with torch.no_grad():
+                    # The last source is of the network's own runs, where there are any.
+                    held = float(self.loss(x, *parts[-1][1]))
+                self.curve.append((float(number), step + 1.0, float(loss.detach()), held))
+                since += LOOK
+                if held < best:
+                    best, kept, since = held, x.detach().numpy().astype(np.float64), 0
+                if since >= PATIENCE:
+                    break
+        return kept
+
+    def _split(self, rows: FeatureRows) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+        """Return standardised inputs and regrets (N, 13), to train on and held out."""
+        held = self.held[rows.condition]
+        regret = self._curves.regret[rows.condition]
+        inputs = (rows.inputs - self.mean) / self.scale
+        parts = [
+            tuple(
+                self._torch.tensor(a[chosen], dtype=self._torch.float32) for a in (inputs, regret)
+            )
+            for chosen in (~held, held)
+        ]
+        return parts[0], parts[1]
+
+    def loss(self, theta: Any, inputs: Any, regret: Any) -> Any:
+        """Compute the mean regret of the ratios that the network answers with."""
+        W1, b1, W2, b2 = unpack(theta, NUM_INPUTS, HIDDEN)
+        y = self._torch.sigmoid(inputs @ W1.T + b1) @ W2.T + b2
+        ratio = (y[:, 0] - y[:, 1]) / np.log(10)
+        low, high, step = RATIOS[0], RATIOS[-1], RATIOS[1] - RATIOS[0]
+        within = ratio.clamp(low, high)
+        place = ((within - low) / step).clamp(max=len(RATIOS) - 1 - 1e-4)
+        left = place.floor().long()
+        share = place - left
+        lower = regret.gather(1, left[:, None])[:, 0]
+        upper = regret.gather(1, left[:, None] + 1)[:, 0]
+        value = (1 - share) * lower + share * upper
+        return value.mean() + OUTSIDE * ((ratio - within) ** 2).mean()
+
+    def network(self, theta: Array, features: FeatureName, about: dict[str, Any]) -> Network:
+        """Return the network of theta with w_Q w_R = 1 at the same ratio."""
+        W1, b1, W2, b2 = unpack(theta, NUM_INPUTS, HIDDEN)
+        half = np.array([[0.5, -0.5], [-0.5, 0.5]])
+        ends = np.array([weights_of(RATIOS[0]), weights_of(RATIOS[-1])])
+        costs = np.maximum(self._curves.J, LEAST).astype("<f8").tobytes()
+        card = about | {
+            "held_out": int(self.held.sum()),
+            "seed": self._seed,
+            "loss": "regret",
+            "costs_sha256": hashlib.sha256(costs).hexdigest(),
+            "versions": versions() | {"torch": version("torch")},
+        }
+        return Network(
+            input_mean=self.mean,
+            input_scale=self.scale,
+            W1=W1,
+            b1=b1,
+            W2=half @ W2,
+            b2=half @ b2,
+            bounds=np.sort(ends, axis=0),
+            output="log_weights",
+            features=features,
+            start=weights_of(self._curves.best_ratio),
+            card=card,
+        )
+
+
+def _key(network: Network) -> str:
+    """Compute SHA-256 of what determines a network's answers."""
+    digest = hashlib.sha256()
+    for name in ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds", "start"):
+        digest.update(np.ascontiguousarray(getattr(network, name), "<f8").tobytes())
+    return digest.hexdigest()
 
 
 def summarize(training: Training) -> dict[str, Any]:
-    """What `summary.json` of a training holds: the card, and the correlation of each output."""
-    y, f = training.targets, training.outputs
+    """Return what `summary.json` of a training holds.
+
+    The card; by labels also the correlation of each output, by regret the curve.
+    """
+    network, y, f = training.network, training.targets, training.outputs
+    if not len(y):
+        return dict(network.card) | {"curve": training.curve.tolist()}
     spread = np.std(y, axis=0) * np.std(f, axis=0)
     covariance = np.mean((y - y.mean(axis=0)) * (f - f.mean(axis=0)), axis=0)
     correlation = np.where(spread > 0, covariance / np.where(spread > 0, spread, 1.0), np.nan)
-    network = training.network
     return {
         **network.card,
         "hidden": network.hidden,

@@ -1,13 +1,18 @@
-"""What a tuner is worth: against every fixed ratio on fresh conditions of a family, none left out.
+"""What a tuner is worth: compared with every fixed gain on conditions that training did not have.
 
-A run that is lost counts by J (`tuning.curves`), so that every candidate is judged on all
-conditions. g is the geometric mean of J, in which every condition weighs alike, m the mean, in
-which bad ones do. The fixed ratio that a tuner is compared with is the best one *of these very
-conditions*, by g and by m; hindsight has the best one of each. Intervals are of a paired bootstrap.
+All candidates run the same conditions, so that differences are paired, and the fixed gain that a
+tuner is compared with is the best one *of these very conditions*. Two measures judge them:
+
+- E_ac, averaged over the conditions that every candidate completes, with failures counted apart;
+- J (`tuning.data`), in which a lost run counts, over all conditions: g is its geometric mean, in
+  which every condition weighs alike, m its mean, in which bad ones do.
+
+Hindsight has the best fixed gain of each condition. Intervals are of a paired bootstrap.
 """
 
 import hashlib
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,40 +22,37 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
+from scipy import stats
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import read_bytes
 from stewart_drake.files.jsonio import load_json, sealed_json
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import validate
-from stewart_drake.loop.bulk import Ending, run_in_bulk
+from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.scenario.config import AnnTunerConfig, RuleTunerConfig, Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_to_dict
-from stewart_drake.studies.families import (
-    FAMILIES,
-    FAULTS,
-    base_of,
-    condition,
-    draw_family,
-    fault_of,
-)
+from stewart_drake.studies.families import FAMILIES, FAULTS, Family, fault_of, with_gain
 from stewart_drake.studies.jobs import Job, Progress, run_jobs
-from stewart_drake.studies.uncertainty import Draw
-from stewart_drake.tuner.network import EXPECTED, MAX_BYTES, load_network
+from stewart_drake.tuner.network import DEFAULT, EXPECTED, MAX_BYTES, load_network
 from stewart_drake.tuner.source import ratio_of
-from stewart_drake.tuning.curves import LEAST, RATIOS, at_ratio, cost, fixed_name
+from stewart_drake.tuning.data import LEAST, Gains, cost
 from stewart_drake.types import Array
 
-SHIPPED: Final = {"T": "health_T", "N2": "health_N2"}
-"""Networks by family."""
+TUNER: Final = "tuner"
+"""The only network of a family without faults."""
 RULE: Final = "rule"
 HINDSIGHT: Final = "hindsight"
+CONFIDENCE: Final = 0.95
 RESAMPLES: Final = 10_000
-ENDS: Final = (2.5, 97.5)
-"""Percent, of an interval."""
+_FIXED: Final = "fixed"
+"""Folder of the runs with fixed gains."""
+_ENDS: Final = (2.5, 97.5)
+"""Percentiles of an interval."""
 _MAX_BYTES: Final = 1_000_000
 
 _Cost = Annotated[float, Field(ge=0)]
+Tuner = AnnTunerConfig | RuleTunerConfig
 
 
 @dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
@@ -59,77 +61,80 @@ class Told:
 
     Attributes:
         cost: J of each in % s.
-        completed: whether each did.
+        error: E_ac of each in % s, None for a run that did not complete.
         ratio: log10(w_Q / w_R) at the samples, of the only run with a tuner, else nothing.
-        fallbacks: samples at which who decides was passed over.
-        loop: what ran the last of them.
+        fallbacks: samples at which the tuner was passed over.
+        loops: what ran each of them, see `loop.bulk.Ending`.
     """
 
     cost: list[_Cost]
-    completed: list[bool]
+    error: list[_Cost | None]
     ratio: list[float]
     fallbacks: Annotated[int, Field(ge=0)]
-    loop: str
+    loops: list[str]
 
 
 class Worth(NamedTuple):
     """What every candidate did under every condition.
 
     Attributes:
-        family: name of it.
-        names: of the candidates: the fixed ratios, then the tuners.
-        draws: n conditions.
+        family: with its conditions.
+        names: of the candidates: the fixed gains, then the tuners.
         cost: (c, n) J in % s.
-        completed: (c, n).
+        error: (c, n) E_ac in % s, NaN for a run that did not complete.
         ratios: by tuner, of each condition log10(w_Q / w_R) at the samples.
         summary: what `summary.json` holds.
     """
 
-    family: str
+    family: Family
     names: tuple[str, ...]
-    draws: list[Draw]
     cost: Array
-    completed: NDArray[np.bool_]
+    error: Array
     ratios: dict[str, list[list[float]]]
     summary: dict[str, Any]
 
+    @property
+    def tuners(self) -> tuple[str, ...]:
+        """Names of the tuners."""
+        return self.names[len(self.family.gains) :]
 
-FIXED: Final = tuple(fixed_name(ratio) for ratio in RATIOS)
-_FIXED: Final = "fixed"
-"""All of these together."""
+
+# ---------------------------------------------------------------- the runs
 
 
-def fixed_runs(scenario: Scenario) -> bytes:
-    """A condition with each of RATIOS, as the bytes of a JSON file."""
-    return _file([run_in_bulk(at_ratio(scenario, ratio)) for ratio in RATIOS], scenario, False)
+def fixed_runs(scenario: Scenario, gains: Gains) -> bytes:
+    """Run a condition with each gain: the bytes of a JSON file."""
+    return _file([with_gain(scenario, *gain) for gain in gains], tuned=False)
 
 
 def tuned_run(scenario: Scenario) -> bytes:
-    """A condition with the scenario's tuner, the same."""
-    return _file([run_in_bulk(scenario)], scenario, True)
+    """Run a condition with the scenario's tuner: the same file of one run."""
+    return _file([scenario], tuned=True)
 
 
-def _file(endings: list[Ending], scenario: Scenario, tuned: bool) -> bytes:
-    last = endings[-1]
-    told = {
-        "cost": [cost(one, scenario.duration) for one in endings],
-        "completed": [one.stopped is None for one in endings],
-        "ratio": [ratio_of(w) for w in last.weights] if tuned else [],
-        "fallbacks": last.counts["tuner_fallbacks"],
-        "loop": last.loop,
-    }
-    return sealed_json(told)
+def _file(scenarios: list[Scenario], *, tuned: bool) -> bytes:
+    endings = [run_in_bulk(one) for one in scenarios]
+    errors = [one.figures.accumulated_error for one in endings]
+    return sealed_json(
+        {
+            "cost": [cost(one, scenarios[0].duration) for one in endings],
+            "error": [error if np.isfinite(error) else None for error in errors],
+            "ratio": [ratio_of(w) for w in endings[-1].weights] if tuned else [],
+            "fallbacks": endings[-1].counts["tuner_fallbacks"],
+            "loops": [one.loop for one in endings],
+        }
+    )
 
 
 def read_told(path: Path, runs: int = 1) -> Told:
-    """The file of a condition, of so many runs.
+    """Read the file of a condition of so many runs.
 
     Raises:
         ConfigError: it is damaged; one line.
     """
-    expected = "the file of one condition of `tune evaluate --family`"
+    expected = "the file of one condition of `tune evaluate`"
     told = validate(Told, load_json(path, _MAX_BYTES, expected, sealed=True), str(path))
-    for name in ("cost", "completed"):
+    for name in ("cost", "error", "loops"):
         if len(getattr(told, name)) != runs:
             raise ConfigError(
                 f"{path}: {name}: got {len(getattr(told, name))} runs; expected {runs}"
@@ -137,142 +142,231 @@ def read_told(path: Path, runs: int = 1) -> Told:
     return told
 
 
-def weigh(
-    family: str,
-    networks: list[str],
+def tuners_of(
+    family: Family, networks: Sequence[str | Path]
+) -> tuple[dict[str, Tuner], dict[str, dict[str, Any]]]:
+    """Return sections by the name of the candidate, and what is known of the networks' files.
+
+    A family with faults has the rule and any number of networks, which are called by their files;
+    another one has one network, called TUNER.
+
+    Raises:
+        ConfigError: no such network, too many, two of one name, or one of another candidate's.
+    """
+    if not family.has_faults and len(networks) > 1:
+        raise ConfigError(f"WEIGHTS: got {len(networks)} without --family; expected one")
+    tuners: dict[str, Tuner] = {RULE: RuleTunerConfig()} if family.has_faults else {}
+    files: dict[str, dict[str, Any]] = {}
+    shipped = FAMILIES[family.name].network if family.has_faults else DEFAULT
+    for one in networks or [shipped]:
+        path = resolve("weights", one)
+        card = dict(load_network(path).card)
+        name = path.stem if family.has_faults else TUNER
+        if name in (*tuners, *family.gains, _FIXED, HINDSIGHT):
+            raise ConfigError(
+                f"weights: got {name!r}, which another candidate is called; expected a file of a "
+                "name of its own"
+            )
+        content = hashlib.sha256(read_bytes(path, MAX_BYTES, EXPECTED)).hexdigest()
+        tuners[name] = AnnTunerConfig(weights=str(path))
+        files[name] = {"file": path.name, "sha256": content, "card": card}
+    return tuners, files
+
+
+def evaluate(
+    family: Family,
+    networks: Sequence[str | Path],
     directory: str | Path,
     *,
-    conditions: int = 120,
-    seed: int = 0,
-    settings: tuple[str, ...] = (),
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> Worth:
-    """Run all candidates under conditions drawn from a seed, or go on with it.
+    """Run all candidates under all conditions, or go on with it.
 
     Args:
-        family: name in `studies.families.FAMILIES`.
-        networks: shipped names or files.
-        directory: the runs are kept in fixed/, rule/ and NAME-HASH/ there.
-        conditions: number to draw, at least 2; those for training are others.
-        seed: of the draws.
-        settings: further ones of the scenario, for all candidates.
+        family: drawn for evaluation.
+        networks: shipped names or files; none for the shipped one of the family.
+        directory: the runs are kept in fixed/, rule/ and NAME-HASH/ there, so that a second network
+            needs its own runs only.
         workers, scheduler, progress: as `run_jobs` takes them.
 
     Raises:
-        As `run_jobs` and `load_network`.
+        As `run_jobs` and `load_network`, and ConfigError for fewer than two conditions.
     """
-    if conditions < 2:
-        raise ConfigError(f"--scenarios: got {conditions}; expected 2 or more")
-    base, directory = base_of(family, settings), Path(directory)
-    draws = draw_family(family, conditions, seed, "evaluation")
-    cells = [condition(base, one) for one in draws]
-    tuners, contents = tuners_of(networks)
-    common = {"family": family, "seed": seed, "scenario": scenario_to_dict(base)}
-    total, done, table = conditions * (1 + len(tuners)), 0, dict[str, list[Told]]()
+    cells = {key: one.scenario for key, one in family.conditions.items()}
+    if len(cells) < 2:
+        raise ConfigError(f"--scenarios: got {len(cells)}; expected 2 or more")
+    tuners, files = tuners_of(family, networks)
+    about = {"family": family.name, "seed": family.seed, "scenario": scenario_to_dict(family.base)}
+    total, table = len(cells) * (1 + len(tuners)), dict[str, list[Told]]()
 
-    def run(name: str, function: Callable[..., bytes], jobs: dict[str, Job], extra: Any) -> None:
-        nonlocal done
+    def run(name: str, function: Callable[..., bytes], jobs: dict[str, Job], runs: int) -> None:
+        done, file = len(table) * len(cells), files.get(name)
 
         def counted(number: int, _: int) -> None:
             if progress is not None:
                 progress(done + number, total)
 
-        content = extra.get("network", "")
         found = run_jobs(
             jobs,
             function,
-            directory / (f"{name}-{content[:8]}" if content else name),
-            settings=common | extra,
-            read=partial(read_told, runs=len(RATIOS) if function is fixed_runs else 1),
+            Path(directory) / (f"{name}-{file['sha256'][:8]}" if file else name),
+            settings=about | ({"network": file["sha256"]} if file else {}),
+            read=partial(read_told, runs=runs),
             workers=workers,
             scheduler=scheduler,
             progress=counted,
         )
-        table[name], done = list(found.values()), done + len(jobs)
+        table[name] = list(found.values())
 
-    run(_FIXED, fixed_runs, {f"{i:04d}": (cell,) for i, cell in enumerate(cells)}, {})
+    gains = tuple(family.gains.values())
+    run(_FIXED, fixed_runs, {key: (cell, gains) for key, cell in cells.items()}, len(gains))
     for name, tuner in tuners.items():
-        jobs = {f"{i:04d}": (replace(cell, tuner=tuner),) for i, cell in enumerate(cells)}
-        run(name, tuned_run, jobs, {"network": contents[name]} if name in contents else {})
-    about = {"family": FAMILIES[family].about, "seed": seed, "networks": contents}
-    nominal = nominal_prices(family, settings, tuners)
-    return judged(family, draws, table, about | {"base": common["scenario"], "nominal": nominal})
+        run(name, tuned_run, {k: (replace(cell, tuner=tuner),) for k, cell in cells.items()}, 1)
+    return judged(family, table, files, nominal_prices(family, tuners))
 
 
-def tuners_of(
-    networks: list[str],
-) -> tuple[dict[str, AnnTunerConfig | RuleTunerConfig], dict[str, str]]:
-    """Sections by the name of the candidate, the rule's first, and SHA-256 of the networks' files.
+def nominal_prices(family: Family, tuners: dict[str, Tuner]) -> dict[str, dict[str, float]]:
+    """Compute E_ac in % s of `paper` as it is, by candidate: on the reference and from rest.
 
-    Raises:
-        ConfigError: no such network, two of one name, or one of another candidate's.
+    Only for a family with faults; of another one the base is what is varied.
     """
-    tuners: dict[str, AnnTunerConfig | RuleTunerConfig] = {RULE: RuleTunerConfig()}
-    contents = {}
-    for one in networks:
-        path = resolve("weights", one)
-        load_network(path)
-        if path.stem in (*tuners, *FIXED, _FIXED, HINDSIGHT):
-            raise ConfigError(
-                f"weights: got {path.stem!r}, which another candidate is called; expected a file "
-                "of a name of its own"
-            )
-        tuners[path.stem] = AnnTunerConfig(weights=str(path))
-        contents[path.stem] = hashlib.sha256(read_bytes(path, MAX_BYTES, EXPECTED)).hexdigest()
-    return tuners, contents
-
-
-def nominal_prices(
-    family: str, settings: tuple[str, ...], tuners: dict[str, Any]
-) -> dict[str, dict[str, float]]:
-    """E_ac in % s of `paper` as it is, by candidate: on the reference and from rest."""
     result: dict[str, dict[str, float]] = {}
+    if not family.has_faults:
+        return result
+    at_rest = (*FAMILIES[family.name].settings, "start=rest", "queue=zero", *family.settings)
     bases = {
-        "on_reference": base_of(family, settings),
-        "from_rest": load_scenario(
-            "paper", None, (*FAMILIES[family].settings, "start=rest", "queue=zero", *settings)
-        ),
+        "on_reference": family.base,
+        "from_rest": load_scenario("paper", None, at_rest),
     }
     for where, base in bases.items():
-        for name, scenario in {
-            "default": base,
-            **{name: replace(base, tuner=tuner) for name, tuner in tuners.items()},
-        }.items():
-            found = run_in_bulk(scenario).figures.accumulated_error
-            result.setdefault(name, {})[where] = found
+        for name, tuner in {"default": base.tuner, **tuners}.items():
+            ending = run_in_bulk(replace(base, tuner=tuner))
+            result.setdefault(name, {})[where] = ending.figures.accumulated_error
     return result
 
 
+# ---------------------------------------------------------------- the statistics
+
+
 def judged(
-    family: str, draws: list[Draw], table: dict[str, list[Told]], about: dict[str, Any]
+    family: Family,
+    table: dict[str, list[Told]],
+    files: dict[str, dict[str, Any]],
+    nominal: dict[str, dict[str, float]],
 ) -> Worth:
-    """What runs say together: `fixed`, then each tuner's."""
-    tuners = [name for name in table if name != _FIXED]
-    rows = [*np.array([one.cost for one in table[_FIXED]]).T]
-    rows += [np.array([one.cost[0] for one in table[name]]) for name in tuners]
-    done = [*np.array([one.completed for one in table[_FIXED]]).T]
-    done += [np.array([one.completed[0] for one in table[name]]) for name in tuners]
-    J, completed, names = np.array(rows), np.array(done), (*FIXED, *tuners)
-    faults = np.array([fault_of(one) for one in draws])
+    """Compare the candidates: the fixed gains, then each tuner."""
+    tuners, names = [name for name in table if name != _FIXED], (*family.gains, *list(table)[1:])
+
+    def rows(name: str) -> Array:
+        found = [np.array([getattr(told, name) for told in table[one]]).T for one in table]
+        return np.vstack(found).astype(np.float64)  # None becomes NaN
+
+    J, error = rows("cost"), rows("error")
+    faults = [fault_of(one) if family.has_faults else "" for one in family.draws]
+    fixed, completed = len(family.gains), np.isfinite(error)
+    by_error = compare(names, fixed, error, family.seed)
+    by_cost = compared(names, fixed, J, completed, np.array(faults), family.seed)
+    candidates = {
+        name: by_error["candidates"].get(name, {}) | one
+        for name, one in by_cost["candidates"].items()
+    }
     summary = {
-        **compared(names, J, completed, faults, about["seed"]),
+        **by_error,
+        **by_cost,
+        "candidates": candidates,
         "fallbacks": {name: sum(one.fallbacks for one in table[name]) for name in tuners},
-        "loops": {name: table[name][0].loop for name in table},
-        **about,
+        "loops": dict(
+            Counter(
+                loop for told in table.values() for one in told for loop in one.loops if loop
+            ).most_common()
+        ),
+        "scenarios": [
+            one | {"E_ac": dict(zip(names, error[:, number], strict=True))}
+            for number, one in enumerate(family.draws)
+        ],
+        "family": FAMILIES[family.name].about if family.has_faults else family.name,
+        "seed": family.seed,
+        "networks": {name: file["sha256"] for name, file in files.items()},
+        "network": list(files.values())[-1],
+        "base": scenario_to_dict(family.base),
+        "nominal": nominal,
     }
     ratios = {name: [one.ratio for one in table[name]] for name in tuners}
-    return Worth(family, names, draws, J, completed, ratios, summary)
+    return Worth(family, names, J, error, ratios, summary)
+
+
+def compare(names: Sequence[str], fixed: int, error: Array, seed: int) -> dict[str, Any]:
+    """Compare E_ac: means with intervals, failures and worst cases; the last row is the tuner.
+
+    Args:
+        names: of the rows.
+        fixed: number of the fixed gains, the first rows.
+        error: (c, n) E_ac in % s, NaN for a failure.
+        seed: of the bootstrap.
+
+    Returns:
+        `candidates`: by name, `failures` (of all conditions), `mean` with `interval` (95 %,
+        Student) and `worst` over the conditions that all complete; `common`, their number;
+        `best_fixed`, of fewest failures, then of least mean; `improvement` of the tuner on it,
+        1 - ratio of the means, with `improvement_interval` (95 %, bootstrap over conditions,
+        paired); `hindsight`, the same for the best gain of each condition, chosen afterwards.
+    """
+    failed = np.isnan(error)
+    common = error[:, ~failed.any(axis=0)]
+    number, failures = common.shape[1], failed.sum(axis=1)
+    some = common if number else np.full((len(names), 1), np.nan)
+    mean, half = some.mean(axis=1), np.full(len(names), np.nan)
+    if number > 1:
+        half = stats.t.ppf((1 + CONFIDENCE) / 2, number - 1) * stats.sem(some, axis=1)
+    best = min(range(fixed), key=lambda i: (failures[i], mean[i]))
+
+    def improvement(tuner: Array, other: Array, axis: int = -1) -> Any:
+        return 1 - tuner.mean(axis=axis) / other.mean(axis=axis)
+
+    sure: Any = (np.nan, np.nan)
+    if number > 1:
+        sure = stats.bootstrap(
+            (common[-1], common[best]),
+            improvement,
+            paired=True,
+            n_resamples=RESAMPLES,
+            confidence_level=CONFIDENCE,
+            method="percentile",
+            random_state=np.random.default_rng(seed),
+        ).confidence_interval
+    return {
+        "candidates": {
+            name: {
+                "failures": int(failures[i]),
+                "mean": mean[i],
+                "interval": [mean[i] - half[i], mean[i] + half[i]],
+                "worst": some[i].max(),
+            }
+            for i, name in enumerate(names)
+        },
+        "common": number,
+        "best_fixed": names[best],
+        "improvement": improvement(some[-1], some[best]),
+        "hindsight": 1 - some[:fixed].min(axis=0).mean() / mean[best],
+        "improvement_interval": list(map(float, sure)),
+    }
 
 
 def compared(
-    names: tuple[str, ...], J: Array, completed: NDArray[np.bool_], faults: Any, seed: int
+    names: Sequence[str],
+    fixed: int,
+    J: Array,
+    completed: NDArray[np.bool_],
+    faults: NDArray[np.str_],
+    seed: int,
 ) -> dict[str, Any]:
-    """g, m and gains of every candidate.
+    """Compare J: g, m and gains of every candidate.
 
     Args:
-        names: of the candidates, the fixed ones first.
+        names: of the candidates.
+        fixed: number of the fixed gains, the first rows.
         J: (c, n) % s.
         completed: (c, n).
         faults: (n,) names of them.
@@ -280,61 +374,61 @@ def compared(
 
     Returns:
         `candidates`: by name g, m and the number `completed`; `best_g` and `best_m`, the names of
-        the fixed ones that are best by each; `gains` of each tuner and of hindsight: `g`, the share
-        by which its g is below that of `best_g`, `m` the same of `best_m`, `rule` of the rule by g,
-        each [value, low, high]; `by_fault`: the first of them for each fault alone.
+        the fixed gains that are best by each; `gains` of each tuner and of hindsight: `g`, the
+        share by which its g is below that of `best_g`, `m` the same of `best_m`, `rule` of the rule
+        by g, each [value, low, high]; `by_fault`: the first of them for each fault alone.
     """
-    log_J, fixed = np.log(np.maximum(J, LEAST)), len(FIXED)
+    log_J = np.log(np.maximum(J, LEAST))
     best_g, best_m = int(log_J[:fixed].mean(1).argmin()), int(J[:fixed].mean(1).argmin())
     rule = names.index(RULE) if RULE in names else best_g
-    picked = log_J[:fixed].argmin(axis=0)
-    every = np.arange(J.shape[1])
-    with_hindsight = {
-        **{name: (J[i], log_J[i], completed[i]) for i, name in enumerate(names)},
-        HINDSIGHT: (J[picked, every], log_J[picked, every], completed[picked, every]),
-    }
+    picked, every = log_J[:fixed].argmin(axis=0), np.arange(J.shape[1])
+    rows, log_rows, done = (
+        dict(zip(names, x, strict=True)) | {HINDSIGHT: x[picked, every]}
+        for x in (J, log_J, completed)
+    )
+    tuners = [name for name in rows if name not in names[:fixed]]
     chosen = np.random.default_rng(seed).integers(J.shape[1], size=(RESAMPLES, J.shape[1]))
-    gains = {
-        name: {
-            "g": _gain_g(log_J_one, log_J[best_g], chosen),
-            "m": _gain_m(J_one, J[best_m], chosen),
-            "rule": _gain_g(log_J_one, log_J[rule], chosen),
-        }
-        for name, (J_one, log_J_one, _) in with_hindsight.items()
-        if name not in FIXED
-    }
     by_fault: dict[str, dict[str, list[float]]] = {}
     for fault in FAULTS:
         here = np.flatnonzero(faults == fault)
-        if not len(here):
-            by_fault[fault] = {}
-            continue
-        some = np.random.default_rng(seed).integers(len(here), size=(RESAMPLES, len(here)))
+        some = np.random.default_rng(seed).integers(max(1, len(here)), size=(RESAMPLES, len(here)))
         by_fault[fault] = {
-            name: _gain_g(with_hindsight[name][1][here], log_J[best_g][here], some)
-            for name in gains
+            name: _gain_g(log_rows[name][here], log_J[best_g][here], some)
+            for name in tuners
+            if len(here)
         }
     return {
         "candidates": {
-            name: {"g": float(np.exp(l.mean())), "m": float(j.mean()), "completed": int(c.sum())}
-            for name, (j, l, c) in with_hindsight.items()
+            name: {
+                "g": float(np.exp(log_rows[name].mean())),
+                "m": float(row.mean()),
+                "completed": int(done[name].sum()),
+            }
+            for name, row in rows.items()
         },
         "conditions": J.shape[1],
         "best_g": names[best_g],
         "best_m": names[best_m],
-        "gains": gains,
+        "gains": {
+            name: {
+                "g": _gain_g(log_rows[name], log_J[best_g], chosen),
+                "m": _gain_m(rows[name], J[best_m], chosen),
+                "rule": _gain_g(log_rows[name], log_J[rule], chosen),
+            }
+            for name in tuners
+        },
         "by_fault": by_fault,
     }
 
 
 def _gain_g(log_J: Array, other: Array, chosen: NDArray[np.intp]) -> list[float]:
-    """1 - g / g of the other, and its interval."""
+    """Return 1 - g / g of the other, and its interval."""
     less = log_J - other
-    ends = 1 - np.exp(np.percentile(less[chosen].mean(axis=1), ENDS[::-1]))
+    ends = 1 - np.exp(np.percentile(less[chosen].mean(axis=1), _ENDS[::-1]))
     return [float(1 - np.exp(less.mean())), *ends.tolist()]
 
 
 def _gain_m(J: Array, other: Array, chosen: NDArray[np.intp]) -> list[float]:
-    """1 - m / m of the other, and its interval."""
+    """Return 1 - m / m of the other, and its interval."""
     ratio = J[chosen].mean(axis=1) / other[chosen].mean(axis=1)
-    return [float(1 - J.mean() / other.mean()), *(1 - np.percentile(ratio, ENDS[::-1])).tolist()]
+    return [float(1 - J.mean() / other.mean()), *(1 - np.percentile(ratio, _ENDS[::-1])).tolist()]
