@@ -6,7 +6,7 @@ here needs a mechanism. `scenario.loading` reads scenarios from files.
 
 import dataclasses
 from dataclasses import field
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -211,7 +211,7 @@ class ControllerConfig:
             is assumed where `delay_steps` is null.
     """
 
-    renamed: ClassVar = CONTROLLER
+    renamed = CONTROLLER  # not annotated: no field
     period: Annotated[float, Field(ge=1e-4, le=10)] = 0.1
     integral: bool = True
     delay_steps: Steps | None = None
