@@ -18,8 +18,14 @@ from stewart_drake.loop.weights import health_of, weights_source
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.families import FAMILIES, SAMPLES
 from stewart_drake.tuner.density import WINDOW
-from stewart_drake.tuner.features import HIGHEST, LOWEST, DensityFeatures
-from stewart_drake.tuner.health import NAMES, HealthFeatures, Row
+from stewart_drake.tuner.features import (
+    HIGHEST,
+    LOWEST,
+    NAMES,
+    DensityFeatures,
+    HealthFeatures,
+    Row,
+)
 from stewart_drake.tuner.network import Network, load_network, save_network
 from stewart_drake.tuner.source import (
     FALL,

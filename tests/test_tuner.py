@@ -18,8 +18,8 @@ from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.loop.tuner import AnnTuner
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.tuner.density import NUM_INPUTS, densities
-from stewart_drake.tuner.law import MAX_FACTOR, tune
 from stewart_drake.tuner.network import Network, save_network
+from stewart_drake.tuner.source import MAX_FACTOR, tune
 from stewart_drake.types import Array
 from tests.test_network import small_network, torch_twin
 from tests.test_systems import carry_out, ports

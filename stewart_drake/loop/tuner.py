@@ -16,9 +16,8 @@ from stewart_drake.loop.lifetime import weak
 from stewart_drake.loop.sampling import Sample, update_every
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, WEIGHTS
 from stewart_drake.tuner.density import NUM_INPUTS
-from stewart_drake.tuner.law import MAX_FACTOR, tune
 from stewart_drake.tuner.network import Network
-from stewart_drake.tuner.source import TunerMemory, WeightsSource
+from stewart_drake.tuner.source import MAX_FACTOR, TunerMemory, WeightsSource, tune
 from stewart_drake.types import Array
 
 
@@ -26,7 +25,7 @@ class AnnTuner(LeafSystem):
     """Sets w_Q and w_R at every sample by a network (III-D), within its bounds and a rate limit.
 
     With w the weights of the last sample, n the count of fallbacks, rho the densities of samples up
-    to k - 1 and `tune` the law (`tuner.law.tune`):
+    to k - 1 and `tune` the law (`tuner.source.tune`):
 
     Initialise: w unknown, n = 0, then the update of k = 0.
     Update:     at k dt   (w, n) <- (w_k, n + fallback_k).

@@ -15,8 +15,7 @@ from stewart_drake.loop.experiment import Experiment, motion_scale
 from stewart_drake.scenario.config import RuleTunerConfig
 from stewart_drake.scenario.signals import RATES
 from stewart_drake.scenario.trajectories import evaluate, spread_instants
-from stewart_drake.tuner.features import DensityFeatures, Features
-from stewart_drake.tuner.health import HealthFeatures
+from stewart_drake.tuner.features import DensityFeatures, Features, HealthFeatures
 from stewart_drake.tuner.source import PaperPolicy, RatioPolicy, Rule, WeightsSource
 
 RULES: Final = {True: Rule(-1.77, 2.35, 0.41), False: Rule(-0.82, 1.37, 0.33)}

@@ -3,7 +3,7 @@
 Weights move along the ratio r = log10(w_Q / w_R), on which alone the gain depends, with
 w_Q w_R = 1. From one sample to the next r falls by FALL at the most and rises by RISE: caution is
 needed at once, and is given up slowly. A network that says where it begins (`Network.start`) is
-limited so; one of the paper's kind moves each weight by a factor, `tuner.law.tune`.
+limited so; one of the paper's kind moves each weight by a factor, `tuner.source.tune`.
 """
 
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 
 from stewart_drake.law.native_law import AnyMemory
-from stewart_drake.tuner.features import Features, empty_window
-from stewart_drake.tuner.health import PEAK
-from stewart_drake.tuner.law import tune
+from stewart_drake.tuner.features import PEAK, Features, empty_window
 from stewart_drake.tuner.network import Network
 from stewart_drake.types import Array
 
+MAX_FACTOR: Final = 1.5
+"""By which w_Q and w_R change at most from one sample to the next, up or down."""
 FALL: Final = 0.35
 RISE: Final = 0.15
 """Decades of w_Q / w_R per sample."""
@@ -65,9 +65,35 @@ def towards(ratio: float, last: Array) -> Array:
     return weights_of(min(max(ratio, now - FALL), now + RISE))
 
 
+def tune(
+    network: Network, densities: Array, last: Array, fixed: Array, factor: float = MAX_FACTOR
+) -> tuple[Array, bool]:
+    """The weights of the next sample: clipped to the network's bounds, then limited in rate.
+
+    Weights are scales, so the rate is a factor: last / factor <= w <= last * factor. The gain,
+    which depends on w_Q / w_R, sees at most its square.
+
+    Args:
+        network: what decides.
+        densities: (18,).
+        last: (2,) weights of the last sample; NaN before the first, which takes `fixed`.
+        fixed: (2,) weights to go back to, at the same rate, where the network's are not finite.
+        factor: above 1.
+
+    Returns:
+        w_Q and w_R (2,), finite and above zero, and whether the network had to be passed over.
+    """
+    if not np.all(np.isfinite(last)):
+        return fixed, False
+    raw = network(densities)
+    usable = bool(np.all(np.isfinite(raw)))
+    goal = np.clip(raw, *network.bounds) if usable else fixed
+    return np.clip(goal, last / factor, last * factor), not usable
+
+
 @dataclass(frozen=True)
 class PaperPolicy:
-    """A network as the paper has it, see `tuner.law.tune`.
+    """A network as the paper has it, see `tuner.source.tune`.
 
     Attributes:
         network: what decides.
@@ -114,7 +140,7 @@ class Rule:
         r = ratio - slope max(0, x - knee),
 
     x = log10(nu + 0.1), nu the largest innovation of the last 31 samples over its floor (root mean
-    square of the twelve values), the feature `surprise_peak` of `tuner.health`.
+    square of the twelve values), the feature `surprise_peak` of `tuner.features`.
 
     Attributes:
         ratio, slope, knee: see above.
