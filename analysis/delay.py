@@ -10,7 +10,7 @@ import stewart_drake as sd
 
 def main(
     scenario: str = "paper", *settings: str, out: str = "out/delay", simulations: bool = True
-) -> sd.Answer:
+) -> sd.AnalysisResult:
     """Print the answer, and write it as a page."""
     answer = sd.analyze_delay(sd.load_scenario(scenario, settings=settings), simulations)
     print(answer)

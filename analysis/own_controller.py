@@ -30,10 +30,10 @@ def main(out: str = "out/own_controller", *settings: str) -> sd.SimulationResult
     scenario = sd.load_scenario("paper", settings=[*fast, *settings])
     dynamics = sd.StewartDynamics(sd.load_mechanism(scenario.mechanism), scenario.plant.gravity)
     result = sd.simulate(scenario, controller=ComputedTorque(dynamics))
-    print(sd.table(result))
+    print(result.table())
     result.save(out)
-    sd.plot(result, out)
-    sd.replay(result, f"{out}/replay.html")
+    result.plot(out)
+    result.replay(f"{out}/replay.html")
     return result
 
 

@@ -10,7 +10,9 @@ import stewart_drake as sd
 STARTS = {"rest": (), "on_reference": ("start=on_reference", "queue=reference")}
 
 
-def main(runs: str = "200", *settings: str, out: str = "out/robustness") -> dict[str, sd.Answer]:
+def main(
+    runs: str = "200", *settings: str, out: str = "out/robustness"
+) -> dict[str, sd.AnalysisResult]:
     """Print the answers, and write them as pages."""
     answers = {}
     for name, start in STARTS.items():

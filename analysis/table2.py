@@ -53,7 +53,7 @@ def ablation(*settings: str) -> str:
 def main(*settings: str, out: str = "out/table2") -> tuple[dict[str, str], str]:
     """Print the table on every plant, and the ablation, and write them."""
     tables = {
-        kind: sd.table(sd.compare("table2", (*plant, *settings))) for kind, plant in PLANTS.items()
+        kind: sd.compare("table2", (*plant, *settings)).table() for kind, plant in PLANTS.items()
     }
     text = "\n\n".join(f"plant.kind {kind}\n{table}" for kind, table in tables.items())
     rows = ablation(*settings)

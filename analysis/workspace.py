@@ -8,7 +8,7 @@ import sys
 import stewart_drake as sd
 
 
-def main(scenario: str = "paper", *settings: str, out: str = "out/workspace") -> sd.Answer:
+def main(scenario: str = "paper", *settings: str, out: str = "out/workspace") -> sd.AnalysisResult:
     """Print the answer, and write it as a page."""
     answer = sd.analyze_workspace(sd.load_scenario(scenario, settings=settings))
     print(answer)

@@ -31,7 +31,7 @@ from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_understood
 from stewart_drake.studies.failures import SIGNIFICANT
-from stewart_drake.studies.robustness import study_robustness
+from stewart_drake.studies.robustness import RobustnessOptions, study_robustness
 
 SEEDS = range(7300, 7320)
 """Seeds of no other benchmark, test or setting of the law."""
@@ -453,7 +453,9 @@ def study(name: str, workers: int) -> dict[str, Any]:
     """Return the outcome of one of STUDIES."""
     scenario = sd.load_scenario("paper", settings=("plant.kind=exact", *STUDIES[name][1]))
     with tempfile.TemporaryDirectory() as folder:
-        found = study_robustness(scenario, folder, runs=STUDY_RUNS, seed=SEEDS[0], workers=workers)
+        found = study_robustness(
+            scenario, folder, RobustnessOptions(runs=STUDY_RUNS, seed=SEEDS[0], workers=workers)
+        )
     separations = found.explanation.singles
     return jsonable(
         {

@@ -12,8 +12,7 @@ from pydrake.trajectories import FunctionHandleTrajectory
 
 import stewart_drake as sd
 from stewart_drake.files.jsonio import jsonable
-from stewart_drake.reporting.answer import Answer
-from stewart_drake.reporting.api import Figures, Replay
+from stewart_drake.reporting.results import Figures, Replay
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = ("plant.kind=exact", "duration=0.3")
@@ -49,7 +48,7 @@ def test_version_and_types_are_told():
 
 
 def test_figures_of_a_run(run, tmp_path):
-    figures = sd.plot(run, tmp_path / "new")
+    figures = run.plot(tmp_path / "new")
     assert {"states", "errors", "torques"} <= set(figures)
     assert {path.stem for path in (tmp_path / "new").iterdir()} == set(figures)
     assert isinstance(figures, Figures) and "states" in repr(figures)
@@ -57,24 +56,24 @@ def test_figures_of_a_run(run, tmp_path):
 
 
 def test_replay_as_a_file_in_a_notebook_or_in_meshcat(run, tmp_path):
-    path = sd.replay(run, tmp_path / "new" / "film.html", title="a film")
+    path = run.replay(tmp_path / "new" / "film.html", title="a film")
     text = path.read_text()
     assert "a film" in text
-    shown = sd.replay(run)
+    shown = run.replay()
     assert isinstance(shown, Replay) and "MB" in repr(shown)
     assert shown._repr_html_().startswith("<iframe srcdoc=")
 
     from pydrake.geometry import Meshcat, MeshcatParams
 
     meshcat = Meshcat(MeshcatParams(host="localhost"))
-    assert sd.replay(run, meshcat=meshcat) is meshcat
+    assert run.replay(meshcat=meshcat) is meshcat
     assert "/reference/ring" in meshcat.StaticHtml() or meshcat.HasPath("/reference/ring")
 
 
 @pytest.mark.slow
 def test_analyses_are_answers_that_can_be_printed_shown_and_saved(tmp_path):
     found = sd.analyze_workspace(sd.load_scenario("paper"))
-    assert isinstance(found, Answer) and "\n" in str(found)
+    assert isinstance(found, sd.AnalysisResult) and "\n" in str(found)
     assert found.verdict in repr(found) and len(repr(found)) < 500
     assert found._repr_html_().startswith("<iframe srcdoc=") and "&lt;html" in found._repr_html_()
     found.save(tmp_path / "new")
@@ -102,9 +101,9 @@ def test_compare_takes_own_controllers_and_disturbances(tmp_path):
     assert float(np.abs(results["nothing"].signals.torque_applied).max()) == 0
     # Pushed down from rest by 1 N for 0.3 s.
     assert float(results["nothing"].signals.rates.sel(coordinate="z")[-1]) < -0.01
-    table = sd.table(results)
+    table = results.table()
     assert "nothing" in table and max(map(len, table.splitlines())) <= 80
-    assert "torques_nothing" in sd.plot(results)
+    assert "torques_nothing" in results.plot()
     assert "nothing: completed" in repr(results)
 
 

@@ -19,7 +19,7 @@ from stewart_drake.files import arrayio
 from stewart_drake.files.arrayio import write_netcdf
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.studies.jobs import MANIFEST, run_jobs
-from stewart_drake.studies.robustness import study_robustness
+from stewart_drake.studies.robustness import RobustnessOptions, study_robustness
 from stewart_drake.studies.runs import read_outcome
 from stewart_drake.tuning.data import load_data
 from tests.faults import put, refusal, written
@@ -103,7 +103,7 @@ def test_what_is_no_run_file(content, tmp_path):
 
 def test_no_file_with_a_changed_digit_is_read_as_sound(tmp_path):
     """Without a checksum 146 of 500 were."""
-    study_robustness(short(), tmp_path, runs=1, workers=1)
+    study_robustness(short(), tmp_path, RobustnessOptions(runs=1, workers=1))
     path, dice = tmp_path / "runs" / "run000000.json", random.Random(0)
     good = path.read_text()
     assert read_outcome(path).status == "completed"
@@ -116,14 +116,14 @@ def test_no_file_with_a_changed_digit_is_read_as_sound(tmp_path):
 
 
 def test_a_run_file_of_0_2_is_done_again_with_a_word(tmp_path, caplog):
-    study_robustness(short(), tmp_path, runs=1, workers=1)
+    study_robustness(short(), tmp_path, RobustnessOptions(runs=1, workers=1))
     path = tmp_path / "runs" / "run000000.json"
     good = path.read_text()
     old = json.loads(good)
     del old["crc32"]
     written(path, json.dumps(old))
     with caplog.at_level(logging.WARNING, "stewart_drake"):
-        study_robustness(short(), tmp_path, runs=1, workers=1)
+        study_robustness(short(), tmp_path, RobustnessOptions(runs=1, workers=1))
     (record,) = caplog.records
     assert "has no checksum" in record.getMessage() and "done again" in record.getMessage()
     assert path.read_text() == good
@@ -131,7 +131,7 @@ def test_a_run_file_of_0_2_is_done_again_with_a_word(tmp_path, caplog):
 
 def test_a_damaged_run_is_done_again_with_a_word(tmp_path, caplog):
     """A run of status null and no reason was a success: "100 % completed"."""
-    study_robustness(short(), tmp_path, runs=3, workers=1)
+    study_robustness(short(), tmp_path, RobustnessOptions(runs=3, workers=1))
     whole = contents(tmp_path)
     runs = tmp_path / "runs"
     good = json.loads((runs / "run000001.json").read_text())
@@ -142,7 +142,7 @@ def test_a_damaged_run_is_done_again_with_a_word(tmp_path, caplog):
     (runs / "run000000.json").unlink()
     os.mkfifo(runs / "run000000.json")
     with caplog.at_level(logging.WARNING, "stewart_drake"):
-        study = study_robustness(short(), tmp_path, runs=3, workers=1)
+        study = study_robustness(short(), tmp_path, RobustnessOptions(runs=3, workers=1))
     assert contents(tmp_path) == whole and len(study.outcomes) == 3
     (record,) = caplog.records
     said = record.getMessage()

@@ -20,7 +20,7 @@ import xarray as xr
 from stewart_drake.cli import main
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.families import paper_grid
-from stewart_drake.studies.robustness import study_robustness
+from stewart_drake.studies.robustness import RobustnessOptions, study_robustness
 from stewart_drake.tuning.data import data_hash, load_data, make_data
 from tests.copies import duration, killed
 from tests.faults import refusal
@@ -101,7 +101,7 @@ def test_a_data_set_survives_kill_9(tmp_path):
 
 
 def little_study(folder: Path) -> None:
-    study_robustness(short(), folder, runs=6, workers=1)
+    study_robustness(short(), folder, RobustnessOptions(runs=6, workers=1))
 
 
 def kill_study(number: int, tmp_path: Path) -> None:

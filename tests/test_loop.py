@@ -25,7 +25,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.scenario.trajectories import evaluate, make_reference
 from stewart_drake.studies import delay_limits
-from stewart_drake.studies.delay_limits import study_delay
+from stewart_drake.studies.delay_limits import DelayOptions, study_delay
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
@@ -273,7 +273,7 @@ def test_the_floor_is_that_of_a_plate_which_waits(
     sc = scenario("duration=0.3", *settings)
     floor = simulate(sc, judge_stability=False).summary["delay_floor"]
     assert (floor > 1) is waits and (floor == 0) is not waits
-    assert study_delay(sc, simulations=False).floor_applies is waits
+    assert study_delay(sc, DelayOptions(simulations=False)).floor_applies is waits
 
 
 def test_summary_is_what_the_signals_say() -> None:

@@ -1,5 +1,10 @@
 """What somebody meets at a prompt: public names, and objects that say in a line what they are."""
 
+import ast
+import inspect
+import runpy
+from pathlib import Path
+
 import pytest
 
 import stewart_drake as sd
@@ -13,6 +18,34 @@ def test_only_public_names_are_listed():
     for name in dir(sd):
         assert getattr(sd, name) is not None
     assert sorted(dir(sd)) == sorted(sd.__all__), "more of them after they were used"
+
+
+def test_type_checkers_see_the_public_names():
+    """`python .ci/public_names.py` writes the file again."""
+    path = Path(__file__).parents[1] / ".ci" / "public_names.py"
+    namespace = runpy.run_path(str(path))
+    written, wanted = (
+        ast.parse(text) for text in (namespace["STUB"].read_text(), namespace["text"]())
+    )
+    assert {ast.unparse(node) for node in written.body} == {ast.unparse(n) for n in wanted.body}
+
+
+@pytest.mark.parametrize("name", ["Answer", "plot", "replay", "table"])
+def test_a_name_of_0_2_leads_to_todays(name):
+    with pytest.raises(AttributeError, match=f"no attribute '{name}'; it is .* now"):
+        getattr(sd, name)
+
+
+def test_an_option_of_0_2_leads_to_todays():
+    with pytest.raises(TypeError, match="analyze_robustness: got beside, an option of 0.2; expected also"):
+        sd.analyze_robustness("paper", beside={})
+
+
+def test_the_signature_of_an_analysis_shows_its_options():
+    shown = inspect.signature(sd.analyze_robustness).parameters
+    assert list(shown)[:2] == ["scenario", "runs"] and shown["runs"].default == 200
+    assert shown["limit"].kind is inspect.Parameter.KEYWORD_ONLY
+    assert "limit: A run above, in % s" in (sd.analyze_robustness.__doc__ or "")
 
 
 def test_a_scenario_tells_what_is_not_as_usual():

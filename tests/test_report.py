@@ -18,12 +18,12 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.reporting import collect as collect_module
 from stewart_drake.reporting import report_document
-from stewart_drake.reporting.answer import Answer
 from stewart_drake.reporting.collect import ANALYSES, collect
 from stewart_drake.reporting.document import Document, Paragraph, Picture, Table
 from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.page import html as html_of
 from stewart_drake.reporting.report_document import mean_error
+from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.reporting.run_document import comparison_document
 from stewart_drake.reporting.words import number, wrap
 from stewart_drake.scenario.loading import load_scenario
@@ -195,7 +195,9 @@ def test_the_mean_error_leaves_out_the_time_in_which_nothing_can_act(summary):
 
 def collect_of(scenario, **changes):
     """What a report is made of, with one run and without the analyses' work."""
-    blank = Answer(None, {}, Document("t", "yes: it is.", [], "good"), Provenance("command"))
+    blank = AnalysisResult(
+        None, {}, Document("t", "yes: it is.", [], "good"), Provenance("command")
+    )
     parts = {
         "scenario": scenario,
         "failure": None,

@@ -34,7 +34,7 @@ from stewart_drake.scenario.config import Scenario, StateSensorConfig
 from stewart_drake.studies import robustness, statistics
 from stewart_drake.studies.failures import auc_interval, explain
 from stewart_drake.studies.ranges import Ranges, read_ranges
-from stewart_drake.studies.robustness import run_draw, study_robustness
+from stewart_drake.studies.robustness import RobustnessOptions, run_draw, study_robustness
 from stewart_drake.studies.robustness_result import RobustnessStudy, factor_values, table
 from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.uncertainty import (
@@ -334,7 +334,7 @@ def test_other_controllers_run_the_same_machines(
     out = tmp_path / "out"
     words = ["analyze", "robustness", "paper", "--controller", "predictor_lqi", "--runs", "2"]
     words += ["--set", "duration=0.2", "--vary", "delay=1", "--out", str(out)]
-    assert main([*words, "--beside", "adaptive_lqi"]) == 0
+    assert main([*words, "--also", "adaptive_lqi"]) == 0
     assert "With adaptive_lqi, on the same machines: 2 of 2" in " ".join(
         capsys.readouterr().out.split()
     )
@@ -494,7 +494,7 @@ def test_a_draw_beyond_all_scenarios_is_an_outcome(one: Draw, field: str) -> Non
 def test_the_summary_counts_runs_by_what_ran_them(
     tmp_path: Path, changes: dict[str, Any], loop: str
 ) -> None:
-    study = study_robustness(short(**changes), tmp_path, runs=2, workers=1)
+    study = study_robustness(short(**changes), tmp_path, RobustnessOptions(runs=2, workers=1))
     assert study.summary["loops"] == {loop: 2}
     assert document(study).facts["loop"] == f"{loop}: 2"
 
@@ -506,7 +506,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RobustnessStudy]:
     folder = tmp_path_factory.mktemp("robustness") / "whole"
-    return folder, study_robustness(short(), folder, runs=4, workers=1)
+    return folder, study_robustness(short(), folder, RobustnessOptions(runs=4, workers=1))
 
 
 def told(outcomes: list[Outcome]) -> list[str]:
@@ -519,23 +519,24 @@ def test_a_resumed_study_equals_an_uninterrupted_one(
     tmp_path: Path, whole: tuple[Path, RobustnessStudy]
 ) -> None:
     folder, study = whole
-    first = study_robustness(short(), tmp_path, runs=2, workers=1)
+    first = study_robustness(short(), tmp_path, RobustnessOptions(runs=2, workers=1))
     assert told(first.outcomes) == told(study.outcomes[:2])
     (tmp_path / "runs" / "run000000.json").unlink()
-    resumed = study_robustness(short(), tmp_path, runs=4, workers=2)
+    resumed = study_robustness(short(), tmp_path, RobustnessOptions(runs=4, workers=2))
     assert contents(tmp_path) == contents(folder)
     assert jsonable(resumed.summary) == jsonable(study.summary)
     with pytest.raises(ConfigError, match="belongs to other settings"):
-        study_robustness(short(), tmp_path, runs=4, seed=1)
+        study_robustness(short(), tmp_path, RobustnessOptions(runs=4, seed=1))
 
 
 @pytest.mark.soak  # as tests/test_jobs.py kills the jobs and tests/test_faults.py a study
 def test_a_killed_study_goes_on(tmp_path: Path, whole: tuple[Path, RobustnessStudy]) -> None:
     folder, _ = whole
     code = (
-        "import sys\nfrom stewart_drake.studies.robustness import study_robustness\n"
+        "import sys\n"
+        "from stewart_drake.studies.robustness import RobustnessOptions, study_robustness\n"
         "from tests.test_robustness import short\n"
-        "study_robustness(short(), sys.argv[1], runs=400, workers=1)\n"
+        "study_robustness(short(), sys.argv[1], RobustnessOptions(runs=400, workers=1))\n"
     )
     process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], cwd=ROOT)
     limit = time.monotonic() + 120
@@ -550,7 +551,7 @@ def test_a_killed_study_goes_on(tmp_path: Path, whole: tuple[Path, RobustnessStu
             path.unlink()
     assert not (tmp_path / "runs.csv").exists()
     time.sleep(1.0)  # its worker ends within half a second, and with it the lock
-    study_robustness(short(), tmp_path, runs=4, workers=1)
+    study_robustness(short(), tmp_path, RobustnessOptions(runs=4, workers=1))
     assert contents(tmp_path) == contents(folder)
 
 
@@ -563,25 +564,27 @@ def test_a_cluster_gives_the_same_study(
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
     ) as cluster:
-        study_robustness(short(), tmp_path, runs=4, scheduler=cluster.scheduler_address)
+        study_robustness(
+            short(), tmp_path, RobustnessOptions(runs=4, scheduler=cluster.scheduler_address)
+        )
     assert contents(tmp_path) == contents(folder)
 
 
 def test_a_damaged_file_is_named_and_made_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    study_robustness(short(), tmp_path, runs=1, workers=1)
+    study_robustness(short(), tmp_path, RobustnessOptions(runs=1, workers=1))
     run = tmp_path / "runs" / "run000000.json"
     whole = run.read_bytes()
     run.write_text('{"outcome": {"status": "completed"}}')
-    study_robustness(short(), tmp_path, runs=1, workers=1)
+    study_robustness(short(), tmp_path, RobustnessOptions(runs=1, workers=1))
     assert run.read_bytes() == whole
     assert "run000000.json" in caplog.text and "done again" in caplog.text
 
 
 def test_nothing_drawn_changes_nothing(tmp_path: Path) -> None:
     ranges = Ranges(**NOTHING, torque_limit=None)
-    study = study_robustness(short(), tmp_path, ranges=ranges, runs=2, workers=1)
+    study = study_robustness(short(), tmp_path, RobustnessOptions(ranges=ranges, runs=2, workers=1))
     assert told(study.outcomes) == told([study.undisturbed] * 2)
     assert study.undisturbed.error == bulk.run_in_bulk(short()).figures.accumulated_error
     drake = simulate(short(), judge_stability=False).accumulated_error
@@ -592,9 +595,9 @@ def test_nothing_drawn_changes_nothing(tmp_path: Path) -> None:
 
 
 def test_bad_numbers_are_refused(tmp_path: Path) -> None:
-    for options, said in (({"runs": 0}, "--runs: got 0"), ({"limit": -1.0}, "--limit: got -1")):
+    for options, said in (({"runs": 0}, "^runs: got 0"), ({"limit": -1.0}, "^limit: got -1")):
         with pytest.raises(ConfigError, match=said):
-            study_robustness(short(), tmp_path, **options)  # type: ignore[arg-type]
+            study_robustness(short(), tmp_path, RobustnessOptions(**options))  # type: ignore[arg-type]
 
 
 def test_scales_of_the_paper() -> None:
@@ -842,7 +845,9 @@ def test_nothing_is_drawn_where_the_undisturbed_run_fails(
 def test_another_controller_that_fails_undisturbed_is_named(tmp_path: Path) -> None:
     lost = replace(short(), plant=replace(short().plant, gravity=True), duration=1.0)
     with pytest.raises(ConfigError, match="robustness with heavy: the undisturbed run fails"):
-        study_robustness(short(), tmp_path, runs=3, workers=1, beside={"heavy": lost})
+        study_robustness(
+            short(), tmp_path, RobustnessOptions(runs=3, workers=1, also={"heavy": lost})
+        )
     assert not list(tmp_path.glob("*/run0*.json"))
 
 

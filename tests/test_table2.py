@@ -130,7 +130,7 @@ def test_it_is_shown_once_and_every_row_is_in_the_summary(
     short: dict[str, sd.SimulationResult],
 ) -> None:
     assert list(short) == [*CONTROLLERS, "delay_lqi_sum", "delay_lqi_200"]
-    text = sd.table(short)
+    text = short.table()
     assert text.count("Table II") == 1 and max(map(len, text.splitlines())) <= 80
     heads = [line for line in text.splitlines() if line.startswith("controller")]
     assert len(heads) == 2 and "as printed" in text

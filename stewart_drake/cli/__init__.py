@@ -12,7 +12,6 @@ import typer
 from stewart_drake.cli import (
     analyze,
     identify,
-    layout,
     live,
     machine,
     model,
@@ -24,6 +23,7 @@ from stewart_drake.cli import (
 from stewart_drake.cli.common import INTERRUPTED, release
 from stewart_drake.cli.examples import add_examples
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.reporting.analyses import RENAMED
 from stewart_drake.reporting.terminal import echo
 
 _BAD_INPUT: Final = 2
@@ -39,9 +39,9 @@ app.command("export-c")(run.export_c)
 app.command()(report.report)
 app.command()(identify.identify)
 app.command()(new.new)
-app.command()(layout.layout)
 app.command()(machine.machine)
 app.command()(live.live)
+analyze.add_analyses(app)
 app.add_typer(model.app, name="model")
 app.add_typer(analyze.app, name="analyze")
 app.add_typer(tune.app, name="tune")
@@ -145,6 +145,9 @@ def _complain(message: str) -> int:
 
 
 def _usage_message(error: Any) -> str:
+    option = getattr(error, "option_name", "").removeprefix("--")
+    if option in RENAMED:
+        return f"--{option}: got an option of 0.2; expected --{RENAMED[option]}"
     if getattr(error, "possibilities", None):
         return f"{error.message}; did you mean {error.possibilities[0]}?"
     message = error.format_message().rstrip(".")

@@ -1,11 +1,15 @@
-"""What an engineer reads before building anything: analyze hautus, delay, link, and so on."""
+"""The commands of `reporting.analyses.ANALYSES`: analyze hautus, delay and so on, and layout."""
 
-from collections.abc import Mapping
+import contextlib
+import inspect
+from collections.abc import Callable, Iterator
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from stewart_drake.cli.common import (
     GO_ON,
@@ -15,201 +19,141 @@ from stewart_drake.cli.common import (
     Out,
     Quiet,
     ScenarioName,
-    Scheduler,
-    Seed,
     Settings,
-    Workers,
+    flags_named,
     stopping,
 )
-from stewart_drake.files.errors import ConfigError
-from stewart_drake.reporting.terminal import count_bar, working
-from stewart_drake.studies.ranges import RANGE_UNITS
+from stewart_drake.reporting.analyses import ANALYSES, analyze, options_of, words_of
+from stewart_drake.reporting.terminal import count_bar
 
 if TYPE_CHECKING:
-    from stewart_drake.reporting.answer import Answer
     from stewart_drake.scenario.config import Scenario
+    from stewart_drake.studies.options import Option
 
 app = typer.Typer(rich_markup_mode=None, help="Tell beforehand what can be controlled, and how.")
 
 
-@app.command()
-def hautus(
-    scenario: ScenarioName = "paper",
-    settings: Settings = None,
-    out: Out = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-) -> int:
-    """Whether every model can be controlled and observed, by mode."""
-    delivery = Delivery(out, quiet, as_json)
-    with working("hautus", quiet):
-        answer = _answer("hautus", delivery, scenario, None, settings)
-    return delivery.answer(answer)
+class _Command(TyperCommand):
+    """Command of an analysis. Its study, which has the options, is imported when it is called."""
+
+    @cached_property
+    def _made(self) -> Any:
+        single = typer.Typer(rich_markup_mode=None, add_completion=False)
+        single.command()(_callback(str(self.name)))
+        return typer.main.get_command(single)
+
+    @property
+    def params(self) -> Any:
+        return self._made.params
+
+    @params.setter
+    def params(self, _: Any) -> None: ...
+
+    @property
+    def callback(self) -> Any:
+        return self._made.callback
+
+    @callback.setter
+    def callback(self, _: Any) -> None: ...
 
 
-@app.command()
-def delay(
-    scenario: ScenarioName = "paper",
-    controller: Controller = None,
-    settings: Settings = None,
-    out: Out = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-) -> int:
-    """How much delay the open loop, and the closed one, can bear."""
-    delivery = Delivery(out, quiet, as_json)
-    with count_bar("simulations", quiet) as progress:
-        answer = _answer("delay", delivery, scenario, controller, settings, progress=progress)
-    return delivery.answer(answer, interrupted=answer.study.interrupted)
+def add_analyses(root: typer.Typer) -> None:
+    """Add the command of every analysis to the family `analyze`, or to the root."""
+    for name, row in ANALYSES.items():
+        group = root if row.alone else app
+        group.command(name, cls=_Command, help=row.help)(lambda: None)
 
 
-@app.command()
-def link(
-    scenario: ScenarioName = "paper",
-    controller: Controller = None,
-    settings: Settings = None,
-    runs: Annotated[int, typer.Option(metavar="N", help="Seeds for each bound and loss.")] = 5,
-    out: Out = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-) -> int:
-    """Which play-out bound suits a network, and what loss it bears.
+def _callback(name: str) -> Callable[..., int]:
+    """Return a function with the parameters that the command line offers for an analysis."""
+    row, options = ANALYSES[name], options_of(name)
+    flags = {_flag(one): one for one in options.described() if one.flag}
 
-    Needs --set link.kind=network or a scenario with a network.
-    """
-    delivery = Delivery(out, quiet, as_json)
-    with count_bar("simulations", quiet) as progress:
-        answer = _answer(
-            "link",
-            delivery,
+    def run(
+        scenario: str,
+        settings: list[str] | None,
+        out: Path | None,
+        quiet: bool,
+        as_json: bool,
+        **typed: Any,
+    ) -> int:
+        from stewart_drake.reporting.page import command_line
+        from stewart_drake.scenario.loading import load_scenario
+
+        given = settings or []
+        fixed = ("plant.kind=exact",) if row.exact else ()
+
+        def load(controller: str | None) -> "Scenario":
+            return load_scenario(scenario, controller, (*fixed, *given))
+
+        controller = typed.pop("controller", None)
+        with flags_named({one.name: f"--{_dashed(flag)}" for flag, one in flags.items()}):
+            chosen = options(**{one.name: _value(one, typed[f], load) for f, one in flags.items()})
+        delivery = Delivery(out, quiet, as_json)
+        words = {_dashed(f): typed[f] for f, one in flags.items() if one.recorded}
+        command = command_line(
+            *words_of(name),
             scenario,
-            controller,
-            settings,
-            typed={"runs": runs},
-            runs=runs,
-            progress=progress,
+            settings=given,
+            options={"controller": controller, **words, "out": out},
         )
-    return delivery.answer(answer, interrupted=answer.study.interrupted)
-
-
-@app.command()
-def workspace(
-    scenario: ScenarioName = "paper",
-    settings: Settings = None,
-    out: Out = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-) -> int:
-    """Whether the motion fits the machine, and what the motors do.
-
-    A motion that does not fit is analysed too. Shown are the reach that each leg has left, how
-    large the motion may be, and torque, speed and power of each motor.
-    """
-    delivery = Delivery(out, quiet, as_json)
-    with working("workspace", quiet):
-        answer = _answer("workspace", delivery, scenario, None, settings)
-    return delivery.answer(answer)
-
-
-Vary = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=VALUE",
-        help="How far off, 0: not at all. Repeatable. "
-        + "; ".join(f"{name}: {unit}" for name, unit in RANGE_UNITS.items())
-        + ". torque_limit takes null too: as the scenario has it.",
-    ),
-]
-
-
-@app.command()
-def robustness(
-    scenario: ScenarioName = "paper",
-    controller: Controller = None,
-    settings: Settings = None,
-    vary: Vary = None,
-    runs: Annotated[int, typer.Option(metavar="N", help="How many machines to draw.")] = 200,
-    seed: Seed = 0,
-    limit: Annotated[
-        float | None, typer.Option(metavar="E_AC", help="A run above, in % s, counts as failed.")
-    ] = None,
-    beside: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="CONTROLLER",
-            help="Run the same machines with this controller too, such as adaptive_lqi, which "
-            "finds the delay. Repeatable.",
-        ),
-    ] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    out: Out = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-) -> int:
-    """Monte Carlo: how often it works, how well, and what matters.
-
-    With --out the same command goes on where it was stopped.
-    """
-    from stewart_drake.studies.ranges import read_ranges
-
-    ranges, others = read_ranges(vary or ()), {Path(name).stem: name for name in beside or ()}
-    if len(others) < len(beside or ()):
-        raise ConfigError(
-            f"--beside: got two of one name, {', '.join(beside or ())}; expected each but once"
-        )
-    delivery = Delivery(out, quiet, as_json)
-    with TemporaryDirectory() as scratch:
-        kept = GO_ON if out else "nothing is kept without --out"
-        given = {"runs": runs, "seed": seed, "limit": limit}
-        with stopping(kept), count_bar("runs", quiet) as progress:
-            answer = _answer(
-                "robustness",
-                delivery,
-                scenario,
-                controller,
-                settings,
-                fixed=("plant.kind=exact",),
-                typed={"vary": vary or (), **given, "beside": beside or ()},
-                beside={key: _load(scenario, name, settings) for key, name in others.items()},
-                directory=out or scratch,
-                ranges=ranges,
-                workers=workers,
-                scheduler=scheduler,
-                progress=progress,
-                **given,
+        with TemporaryDirectory() as scratch, _progress(name, out, quiet) as progress:
+            loaded = load(controller)
+            delivery.tell_link(loaded)
+            found = analyze(
+                name, loaded, chosen, command=command, directory=out or scratch, progress=progress
             )
-    return delivery.answer(answer, "runs.csv", "runs/")
+        files = getattr(found.study, "files", ())
+        return delivery.answer(
+            found, *files, interrupted=getattr(found.study, "interrupted", False)
+        )
+
+    kind = inspect.Parameter.KEYWORD_ONLY
+    shown: dict[str, tuple[Any, Any]] = {"scenario": (ScenarioName, "paper")}
+    shown |= {"controller": (Controller, None)} if row.controller else {}
+    shown |= {"settings": (Settings, None)}
+    shown |= {flag: _typed(one) for flag, one in flags.items()}
+    shown |= {"out": (Out, None), "quiet": (Quiet, False), "as_json": (AsJson, False)}
+    run.__annotations__ = {}
+    run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [inspect.Parameter(k, kind, annotation=a, default=d) for k, (a, d) in shown.items()]
+    )
+    return run
 
 
-def _load(scenario: str, controller: str, settings: list[str] | None) -> "Scenario":
-    from stewart_drake.scenario.loading import load_scenario
+@contextlib.contextmanager
+def _progress(name: str, out: Path | None, quiet: bool) -> Iterator[Any]:
+    """Show what is counted, and say at Ctrl-C what is kept."""
+    row = ANALYSES[name]
+    kept = GO_ON.replace("runs", row.keeps) if out else "nothing is kept without --out"
+    with stopping(kept) if row.keeps else contextlib.nullcontext():
+        first = "preparing" if row.counts else "computing"
+        with count_bar(row.counts or name, quiet, first) as progress:
+            yield progress
 
-    return load_scenario(scenario, controller, ("plant.kind=exact", *(settings or [])))
+
+def _typed(one: "Option") -> tuple[Any, Any]:
+    """Return annotation and default of the command line's parameter."""
+    assert one.flag is not None
+    option = typer.Option(
+        f"--{_dashed(_flag(one))}",
+        metavar=one.flag.metavar,
+        help=one.help + " Repeatable." * bool(one.flag.read),
+    )
+    if one.flag.read:
+        return Annotated[list[str] | None, option], None
+    return Annotated[one.annotation, option], one.default
 
 
-def _answer(
-    name: str,
-    delivery: Delivery,
-    scenario: str,
-    controller: str | None,
-    settings: list[str] | None,
-    *,
-    fixed: tuple[str, ...] = (),
-    typed: Mapping[str, object] | None = None,
-    **options: Any,
-) -> "Answer":
-    """Analyse a scenario; `fixed` are settings below the user's, `typed` further words of theirs.
+def _value(one: "Option", typed: Any, load: Callable[[str], "Scenario"]) -> Any:
+    if one.flag is None or one.flag.read is None:
+        return typed
+    return one.flag.read(typed, load) if typed else one.default
 
-    Of these a list or tuple is an option given so many times, None is one that is not.
-    """
-    from stewart_drake.reporting.analyses import analyze
-    from stewart_drake.reporting.page import command_line
-    from stewart_drake.scenario.loading import load_scenario
 
-    given = settings or []
-    words = {"controller": controller, **(typed or {}), "out": delivery.out}
-    command = command_line("analyze", name, scenario, settings=given, options=words)
-    loaded = load_scenario(scenario, controller, (*fixed, *given))
-    delivery.tell_link(loaded)
-    return analyze(name, loaded, command=command, **options)
+def _flag(one: "Option") -> str:
+    return (one.flag and one.flag.name) or one.name
+
+
+def _dashed(name: str) -> str:
+    return name.replace("_", "-")

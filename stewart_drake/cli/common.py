@@ -17,7 +17,7 @@ from stewart_drake.reporting.terminal import echo
 
 if TYPE_CHECKING:
     from stewart_drake.files.resources import Kind
-    from stewart_drake.reporting.answer import Answer
+    from stewart_drake.reporting.results import AnalysisResult
     from stewart_drake.scenario.config import Scenario
 
 INTERRUPTED: Final = 130
@@ -155,6 +155,16 @@ def refuse(options: Mapping[str, object], why: str) -> None:
 
 
 @contextlib.contextmanager
+def flags_named(flags: Mapping[str, str]) -> Iterator[None]:
+    """In an error, call a field by the option that sets it."""
+    try:
+        yield
+    except ConfigError as error:
+        name, colon, rest = str(error).partition(":")
+        raise ConfigError(f"{flags.get(name, name)}{colon}{rest}") from None
+
+
+@contextlib.contextmanager
 def stopping(text: str) -> Iterator[None]:
     """On Ctrl-C in here the command ends at once, with these words."""
     try:
@@ -231,17 +241,17 @@ class Delivery:
         """To be told at the end."""
         self._written += names
 
-    def answer(self, answer: "Answer", *beside: str, interrupted: bool = False) -> int:
-        """Print an answer, write summary.json and the page `beside` what there is; the status."""
-        from stewart_drake.reporting.answer import PAGE
+    def answer(self, found: "AnalysisResult", *beside: str, interrupted: bool = False) -> int:
+        """Print a result, write summary.json and the page, name the files `beside`; the status."""
+        from stewart_drake.reporting.results import PAGE
 
-        self.say(str(answer))
+        self.say(str(found))
         # No page of an earlier run beside this one's numbers, which come first.
         self.discard(PAGE)
-        self.write(answer.summary)
-        self.draw(PAGE, answer.save_page)
+        self.write(found.summary)
+        self.draw(PAGE, found.write_page)
         self.wrote(*beside)
-        return self.end(answer.summary, interrupted)
+        return self.end(found.summary, interrupted)
 
     def end(self, summary: Mapping[str, Any], interrupted: bool = False) -> int:
         """Tell what was written, print the summary if it is wanted; the exit status."""

@@ -2,6 +2,8 @@
 
 from typing import Any, Final
 
+from stewart_drake.reporting.analyses import ANALYSES, words_of
+
 EXAMPLES: Final = {
     "": (
         "stewart-drake simulate paper --set plant.kind=exact",
@@ -21,24 +23,18 @@ EXAMPLES: Final = {
         "stewart-drake identify out/lqi/signals.nc --mechanism paper --out out/m",
     ),
     "new": ("stewart-drake new mine --torque-limit 6 --delay 0.08",),
-    "layout": (
-        "stewart-drake layout paper --out out/layout",
-        "stewart-drake layout paper --keep crank --keep rod --out out/layout",
-    ),
     "live": ("stewart-drake live --demo --duration 5 --no-browser --out out/live",),
     "machine": ("stewart-drake machine paper --set plant.kind=exact --port 0 --duration 1",),
     "list": ("stewart-drake list",),
     "model check": ("stewart-drake model check paper --out out/paper",),
     "model sdf": ("stewart-drake model sdf paper --out paper.sdf",),
     "model view": ("stewart-drake model view desktop",),
-    "analyze hautus": ("stewart-drake analyze hautus paper --out out/hautus",),
-    "analyze delay": ("stewart-drake analyze delay gravity --out out/delay",),
-    "analyze link": ("stewart-drake analyze link paper --set link.kind=network --out out/link",),
-    "analyze workspace": ("stewart-drake analyze workspace paper --out out/workspace",),
-    "analyze robustness": ("stewart-drake analyze robustness paper --out out/robustness",),
     "tune dataset": ("stewart-drake tune dataset paper --out out/data",),
     "tune train": ("stewart-drake tune train out/data --out out/tuner.json",),
     "tune evaluate": ("stewart-drake tune evaluate --out out/evaluate",),
+} | {
+    " ".join(words_of(name)): tuple(f"stewart-drake {line}" for line in row.examples)
+    for name, row in ANALYSES.items()
 }
 """By the words of the command; each line runs as it stands."""
 

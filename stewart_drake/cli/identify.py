@@ -13,7 +13,7 @@ from stewart_drake.reporting.terminal import working
 
 if TYPE_CHECKING:
     from stewart_drake.identification.log_files import Precision
-    from stewart_drake.reporting.answer import Answer
+    from stewart_drake.reporting.results import AnalysisResult
 
 MECHANISM = "mechanism.yaml"
 CALIBRATION = "calibration.yaml"
@@ -130,13 +130,13 @@ def _found(
     gravity: bool,
     typed: dict[str, Any],
     quiet: bool,
-) -> "Answer":
+) -> "AnalysisResult":
     from stewart_drake.identification.identify import identify as find
     from stewart_drake.identification.log_files import read_log
     from stewart_drake.mechanism.files import load_mechanism
-    from stewart_drake.reporting.answer import answer_of
     from stewart_drake.reporting.identification_document import document
     from stewart_drake.reporting.page import command_line
+    from stewart_drake.reporting.results import analysis_result
 
     if mechanism is None:
         raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")
@@ -145,7 +145,7 @@ def _found(
         read = [read_log(path, machine, precision, gravity) for path in logs]
         words = [*map(str, logs), *(() if gravity else ("--no-gravity",))]
         command = command_line("identify", *words, options={"mechanism": mechanism, **typed})
-        return answer_of(lambda: find(read, machine, tolerances, delay), document, command)
+        return analysis_result(lambda: find(read, machine, tolerances, delay), document, command)
 
 
 def _planned(
@@ -156,15 +156,15 @@ def _planned(
     poses: bool,
     typed: dict[str, Any],
     quiet: bool,
-) -> "Answer":
+) -> "AnalysisResult":
     import numpy as np
 
     from stewart_drake.identification.logs import ANGLES, POSE
     from stewart_drake.identification.plan import plan
     from stewart_drake.loop.experiment import prepare
-    from stewart_drake.reporting.answer import answer_of
     from stewart_drake.reporting.identification_document import plan_document
     from stewart_drake.reporting.page import command_line
+    from stewart_drake.reporting.results import analysis_result
     from stewart_drake.scenario.loading import load_scenario
 
     std = np.full_like(precision.std, np.inf)
@@ -173,10 +173,10 @@ def _planned(
     experiment = prepare(load_scenario(scenario, settings=settings))
     command = command_line("identify", settings=settings, options={"plan": scenario, **typed})
     with working("plan", quiet):
-        return answer_of(lambda: plan(experiment, std, tolerances), plan_document, command)
+        return analysis_result(lambda: plan(experiment, std, tolerances), plan_document, command)
 
 
-def _write_found(answer: "Answer", delivery: Delivery) -> list[str]:
+def _write_found(answer: "AnalysisResult", delivery: Delivery) -> list[str]:
     """What simulate takes."""
     from stewart_drake.files.fileio import replacing
     from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
@@ -193,7 +193,7 @@ def _write_found(answer: "Answer", delivery: Delivery) -> list[str]:
     return [MECHANISM, CALIBRATION]
 
 
-def _write_plan(answer: "Answer", delivery: Delivery) -> list[str]:
+def _write_plan(answer: "AnalysisResult", delivery: Delivery) -> list[str]:
     """The motion, and the scenario that makes the plate do it."""
     from stewart_drake.files.fileio import replacing
     from stewart_drake.identification.plan import MOTION

@@ -1,16 +1,14 @@
 """A machine and a first scenario from a few measurements: new."""
 
-import contextlib
 import re
 import sys
-from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from stewart_drake.cli.common import AsJson, Delivery, Quiet
+from stewart_drake.cli.common import AsJson, Delivery, Quiet, flags_named
 from stewart_drake.files.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -86,7 +84,7 @@ def new(
     delivery = Delivery(folder, quiet, as_json)
     study.check_free(folder)  # before nine questions
     measured = _complete(given, asking=sys.stdin.isatty() and not (quiet or as_json))
-    with _flags_named():
+    with flags_named({name: _flag(name) for name in study.Measurements.__annotations__}):
         measurements = study.Measurements(
             **measured,
             shaft_height=shaft_height,
@@ -143,16 +141,6 @@ def _ask(question: str) -> float:
 
 def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
-
-
-@contextlib.contextmanager
-def _flags_named() -> Iterator[None]:
-    """In an error a measurement is called what the command calls it."""
-    try:
-        yield
-    except ConfigError as error:
-        name, colon, rest = str(error).partition(":")
-        raise ConfigError(_flag(name) + colon + rest) from None
 
 
 def _name_of(folder: Path) -> str:

@@ -33,9 +33,9 @@ def report(
     """
     from stewart_drake.loop.experiment import simulated_machine
     from stewart_drake.reporting import report_document
-    from stewart_drake.reporting.answer import PAGE, Answer
     from stewart_drake.reporting.collect import collect
     from stewart_drake.reporting.page import Provenance, command_line
+    from stewart_drake.reporting.results import PAGE, AnalysisResult
 
     delivery = Delivery(out, quiet, as_json)
     started, name = time.perf_counter(), Path(scenario).stem
@@ -58,7 +58,7 @@ def report(
     def page(folder: Path) -> None:
         document = report_document.document(found, name, replay)
         delivery.say(document.plain())
-        Answer(found, summary, document, made).save_page(folder)
+        AnalysisResult(found, summary, document, made).write_page(folder)
 
     if found.run is not None:
         delivery.draw(REPLAY, film)

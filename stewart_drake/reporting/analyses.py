@@ -1,64 +1,160 @@
-"""The analyses of a scenario, and the search for a machine: what studies it, what is told of it."""
+"""The table of analyses. Command line, `sd.analyze_*` and documentation follow from it.
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, Final, NamedTuple
+What a row names is imported when it is needed, so that the table serves the command's help.
+"""
 
-from stewart_drake.files.schema import plain
-from stewart_drake.reporting import (
-    delay_document,
-    hautus_document,
-    layout_document,
-    link_document,
-    robustness_document,
-    workspace_document,
-)
-from stewart_drake.reporting.answer import Answer, answer_of
-from stewart_drake.reporting.document import Document
-from stewart_drake.scenario.link import link_text
-from stewart_drake.studies.delay_limits import study_delay
-from stewart_drake.studies.hautus import study_hautus
-from stewart_drake.studies.layout import study_layout
-from stewart_drake.studies.link_bound import study_link
-from stewart_drake.studies.robustness import study_robustness
-from stewart_drake.studies.workspace import study_workspace
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from stewart_drake.reporting.results import AnalysisResult
+    from stewart_drake.scenario.config import Scenario
+    from stewart_drake.studies.options import Options
+
+RENAMED: Final = {"beside": "also"}
+"""Options of 0.2 by their names of today."""
 
 
 class Analysis(NamedTuple):
-    """One of them.
+    """One analysis of a scenario.
 
-    `study` is called with the scenario and options; what it returns has a `summary`, plain data.
+    Attributes:
+        study: module in `studies` with the function `study_NAME` and the class `NAMEOptions`.
+        help: of the command.
+        examples: of the command, without the program's name.
+        counts: what its progress counts; nothing where it takes no `progress`.
+        keeps: what of it a folder keeps, so that a stopped study can go on; then the study takes a
+            folder.
+        controller: whether the command takes `--controller`.
+        exact: whether it runs the exact plant unless `--set` says otherwise.
+        alone: whether it is a command of its own, not one of `analyze`.
+        second: argument of the Python function that may be given by position.
     """
 
-    study: Callable[..., Any]
-    document: Callable[[Any], Document]
+    study: str
+    help: str
+    examples: tuple[str, ...]
+    counts: str = ""
+    keeps: str = ""
+    controller: bool = False
+    exact: bool = False
+    alone: bool = False
+    second: str = ""
 
 
 ANALYSES: Final = {
-    "delay": Analysis(study_delay, delay_document.document),
-    "hautus": Analysis(study_hautus, hautus_document.document),
-    "layout": Analysis(study_layout, layout_document.document),
-    "link": Analysis(study_link, link_document.document),
-    "workspace": Analysis(study_workspace, workspace_document.document),
-    "robustness": Analysis(study_robustness, robustness_document.document),
+    "hautus": Analysis(
+        "hautus",
+        "Whether every model can be controlled and observed, by mode.",
+        ("analyze hautus paper --out out/hautus",),
+    ),
+    "delay": Analysis(
+        "delay_limits",
+        "How much delay the open loop, and the closed one, can bear.",
+        ("analyze delay gravity --out out/delay",),
+        counts="simulations",
+        controller=True,
+        second="simulations",
+    ),
+    "link": Analysis(
+        "link_bound",
+        "Which play-out bound suits a network, and what loss it bears.\n\n"
+        "Needs --set link.kind=network or a scenario with a network.",
+        ("analyze link paper --set link.kind=network --out out/link",),
+        counts="simulations",
+        controller=True,
+        second="runs",
+    ),
+    "workspace": Analysis(
+        "workspace",
+        "Whether the motion fits the machine, and what the motors do.\n\n"
+        "A motion that does not fit is analysed too. Shown are the reach that each leg has left, "
+        "how\nlarge the motion may be, and torque, speed and power of each motor.",
+        ("analyze workspace paper --out out/workspace",),
+    ),
+    "robustness": Analysis(
+        "robustness",
+        "Monte Carlo: how often it works, how well, and what matters.\n\n"
+        "With --out the same command goes on where it was stopped.",
+        ("analyze robustness paper --out out/robustness",),
+        counts="runs",
+        keeps="runs",
+        controller=True,
+        exact=True,
+        second="runs",
+    ),
+    "layout": Analysis(
+        "layout",
+        "Search layouts and lengths that suit a motion.\n\n"
+        "The best few become machine files, beside a page that compares them. With --out the same\n"
+        "command goes on where it was stopped.",
+        (
+            "layout paper --out out/layout",
+            "layout paper --keep crank --keep rod --out out/layout",
+        ),
+        counts="searches and runs",
+        keeps="searches",
+        alone=True,
+        second="directory",
+    ),
 }
-"""By the word after `analyze`; `layout` is a command of its own."""
+"""By name. The function `document` of the module NAME_document describes the result."""
 
 
-def analyze(name: str, *subject: Any, command: str, **options: Any) -> Answer:
-    """Study a scenario.
+def words_of(name: str) -> tuple[str, ...]:
+    """Return the words of an analysis' command; joined by `_` they name the Python function."""
+    return (name,) if ANALYSES[name].alone else ("analyze", name)
+
+
+def options_of(name: str) -> "type[Options]":
+    """Return the class of an analysis' options."""
+    from stewart_drake.studies.options import Options
+
+    return getattr(_module(name), f"{name.capitalize()}Options", Options)
+
+
+def analyze(
+    name: str,
+    scenario: "Scenario",
+    options: "Options | None" = None,
+    *,
+    command: str,
+    directory: "str | Path | None" = None,
+    progress: "Callable[[int, int], None] | None" = None,
+) -> "AnalysisResult":
+    """Study a scenario and describe the result.
 
     Args:
         name: of the analysis.
-        subject: the scenario, and what else the study takes by position.
-        command: what does the same again, as typed.
-        options: of the study.
+        scenario: to study.
+        options: of the study; its defaults if None.
+        command: that does the same again, for the page.
+        directory: where the study keeps its runs, if it keeps some.
+        progress: called with the number of finished runs and of all.
     """
-    analysis, scenario = ANALYSES[name], subject[0]
-    found = answer_of(lambda: analysis.study(*subject, **options), analysis.document, command)
+    from dataclasses import replace
+
+    from stewart_drake.files.schema import plain
+    from stewart_drake.reporting.results import analysis_result
+    from stewart_drake.scenario.link import link_text
+
+    row = ANALYSES[name]
+    given: dict[str, Any] = {"directory": directory} if row.keeps else {}
+    if row.counts:
+        given |= {"options": options or options_of(name)(), "progress": progress}
+    study = getattr(_module(name), f"study_{name}")
+    document = import_module(f"stewart_drake.reporting.{name}_document").document
+    found = analysis_result(lambda: study(scenario, **given), document, command)
     facts = {"link": text} if (text := link_text(scenario)) else {}
     return replace(
         found,
         summary=found.summary | {"link": plain(scenario.assumed_link)},
         document=replace(found.document, facts={**facts, **found.document.facts}),
     )
+
+
+def _module(name: str) -> Any:
+    return import_module(f"stewart_drake.studies.{ANALYSES[name].study}")

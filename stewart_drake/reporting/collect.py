@@ -13,9 +13,9 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.loop.experiment import assemble, reference_failure
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.reporting.analyses import analyze
-from stewart_drake.reporting.answer import Answer
+from stewart_drake.reporting.analyses import analyze, options_of
 from stewart_drake.reporting.figures import TORQUE_CONTROLLERS
+from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.scenario.config import AnnTunerConfig, Scenario
 from stewart_drake.scenario.loading import load_understood
 from stewart_drake.studies.compare import shown
@@ -47,7 +47,7 @@ class Collected:
     run: SimulationResult | None = None
     comparison: dict[str, SimulationResult] = field(default_factory=dict)
     tuned: dict[str, SimulationResult] = field(default_factory=dict)
-    analyses: dict[str, Answer] = field(default_factory=dict)
+    analyses: dict[str, AnalysisResult] = field(default_factory=dict)
 
 
 def collect(
@@ -108,7 +108,7 @@ def has_network(scenario: Scenario) -> bool:
 
 def _work(
     scenario: Scenario, scenarios: dict[str, Scenario], progress: Progress | None
-) -> tuple[dict[str, SimulationResult], dict[str, Answer]]:
+) -> tuple[dict[str, SimulationResult], dict[str, AnalysisResult]]:
     """Results by the names of the scenarios, and the analyses by theirs."""
     # The analyses first: they take longest.
     jobs: dict[str, Job] = {name: (name, scenario) for name in ANALYSES}
@@ -125,7 +125,8 @@ def _piece(what: str, scenario: Scenario) -> bytes:
     return pickle.dumps(simulate(scenario) if what == "simulate" else _analyse(what, scenario))
 
 
-def _analyse(name: str, scenario: Scenario) -> Answer:
-    options = {"simulations": False} if name == "delay" else {}
-    found = analyze(name, scenario, command=f"stewart-drake analyze {name}", **options)
+def _analyse(name: str, scenario: Scenario) -> AnalysisResult:
+    given = {"simulations": False} if name == "delay" else {}
+    options = options_of(name)(**given)
+    found = analyze(name, scenario, options, command=f"stewart-drake analyze {name}")
     return replace(found, study=None)  # what no process can send

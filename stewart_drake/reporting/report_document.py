@@ -11,7 +11,6 @@ import numpy as np
 
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.reporting.answer import Answer
 from stewart_drake.reporting.collect import ANALYSES, Collected
 from stewart_drake.reporting.document import (
     Block,
@@ -24,6 +23,7 @@ from stewart_drake.reporting.document import (
     Tone,
 )
 from stewart_drake.reporting.figures import draw_comparison, draw_run, has_packets
+from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.reporting.run_document import comparison_blocks, run_blocks
 from stewart_drake.reporting.tuner_figures import weights_figure
 from stewart_drake.reporting.words import number, sentence
@@ -240,12 +240,12 @@ def _caption_of(figure: str) -> str:
     return f"Applied torques of {label(controller)}."
 
 
-def _answer(question: str, answer: Answer) -> Section:
+def _answer(question: str, answer: AnalysisResult) -> Section:
     pictures = [one for part in answer.document.sections for one in part.all(Picture)]
     return Section(question, Paragraph(sentence(answer.verdict), brief=True), *pictures)
 
 
-def _details(question: str, answer: Answer) -> Section:
+def _details(question: str, answer: AnalysisResult) -> Section:
     """What the analysis' own document says and tabulates, in one folded section."""
     parts = [
         f"{section.heading}. {block.text}" if isinstance(block, Paragraph) else block

@@ -58,13 +58,6 @@ _POLL = 0.1
 """s between two looks at the runs."""
 
 
-class Comparison(dict[str, SimulationResult]):
-    """Results by controller."""
-
-    def __repr__(self) -> str:
-        return f"Comparison({', '.join(f'{name}: {run.status}' for name, run in self.items())})"
-
-
 def compare(
     scenario_name: str | Path,
     settings: Iterable[str] = (),
@@ -73,7 +66,7 @@ def compare(
     controllers: Mapping[str, Callable[[], System]] | None = None,
     reference: OwnReference | None = None,
     disturbance: Callable[[], System] | None = None,
-) -> Comparison:
+) -> dict[str, SimulationResult]:
     """Run every shipped controller on a scenario, and controllers of your own, on all cores.
 
     Ctrl-C ends the runs that have begun, with status `interrupted`, and leaves out the others.
@@ -135,7 +128,7 @@ def compare(
         finally:
             board.stop()
         results = {name: runs.result()[key] for name, key in zip(scenarios, keys, strict=True)}
-    return Comparison({name: one for name, one in results.items() if one is not None})
+    return {name: one for name, one in results.items() if one is not None}
 
 
 def shown(scenario_name: str | Path, settings: Iterable[str] = ()) -> dict[str, Scenario]:
@@ -208,7 +201,7 @@ def is_papers(scenario: Scenario, *, any_size: bool = False) -> bool:
     )
 
 
-def save_comparison(results: dict[str, SimulationResult], directory: str | Path) -> None:
+def save_comparison(results: Mapping[str, SimulationResult], directory: str | Path) -> None:
     """Write NAME.nc of every controller, then summary.json; each file whole or not.
 
     Raises:
@@ -222,7 +215,7 @@ def save_comparison(results: dict[str, SimulationResult], directory: str | Path)
     write_json(folder / "summary.json", comparison_summary(results))
 
 
-def comparison_summary(results: dict[str, SimulationResult]) -> dict[str, Any]:
+def comparison_summary(results: Mapping[str, SimulationResult]) -> dict[str, Any]:
     """Return the content of `summary.json`: each controller's summary by its name."""
     return {"controllers": {name: result.summary for name, result in results.items()}}
 

@@ -2,9 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
+from pydantic import Field
 from threadpoolctl import threadpool_limits
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -21,6 +22,7 @@ from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
 from stewart_drake.studies.delay_map import Cell, delay_map, map_delays
 from stewart_drake.studies.jobs import Progress
+from stewart_drake.studies.options import Options
 from stewart_drake.studies.verdict import Verdict, pole_in_motion
 from stewart_drake.types import Array
 
@@ -153,15 +155,23 @@ class DelayStudy:
         }
 
 
+class DelayOptions(Options):
+    """Options of `study_delay`."""
+
+    simulations: Annotated[
+        bool, Field(description="Whether to simulate over delay and amplitude too, on all cores.")
+    ] = True
+
+
 def study_delay(
-    scenario: Scenario, progress: Progress | None = None, *, simulations: bool = True
+    scenario: Scenario, options: DelayOptions, progress: Progress | None = None
 ) -> DelayStudy:
     """Analyse a scenario's delay.
 
     Args:
-        scenario: what to analyse.
+        scenario: to analyse.
+        options: see `DelayOptions`.
         progress: called for each finished simulation.
-        simulations: whether to simulate over delay and amplitude, which takes longest.
 
     Raises:
         ConfigError: one line. A motion or a home pose outside the workspace is no error, see
@@ -173,7 +183,7 @@ def study_delay(
         poles = _poles(found)
         loops, problem = _loops(found)
         cells, interrupted = (
-            delay_map(scenario, progress) if simulations and not problem else ([], False)
+            delay_map(scenario, progress) if options.simulations and not problem else ([], False)
         )
         wanted = {scenario.true_delay.steps, *map_delays(scenario.true_delay.steps)}
         return DelayStudy(

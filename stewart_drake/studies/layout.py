@@ -12,10 +12,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked
 from scipy.optimize import Bounds, differential_evolution
 
@@ -64,6 +64,7 @@ from stewart_drake.studies.layout_space import (
     own_values,
     space_around,
 )
+from stewart_drake.studies.options import Flag, JobOptions, Seed
 from stewart_drake.studies.runs import Outcome, outcome_of
 from stewart_drake.types import Array
 
@@ -238,6 +239,11 @@ class LayoutStudy:
         return sum(found.evaluations for found in self.searches.values())
 
     @property
+    def files(self) -> list[str]:
+        """Names of what the study leaves in its folder."""
+        return [*(f"{one.name}.yaml" for one in self.layouts), "searches/", "judged/"]
+
+    @property
     def verdict(self) -> str:
         """The answer in a sentence."""
         tried = f"of {self.evaluations} layouts in {len(self.searches)} searches"
@@ -286,20 +292,75 @@ class LayoutStudy:
         }
 
 
+def _number(option: str, form: str, text: str, value: str) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        raise ConfigError(f"--{option}: got {text!r}; expected {form}") from None
+
+
+def _read_limits(texts: list[str], _: object) -> dict[str, float]:
+    found = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        found[name.strip()] = _number("limit", "NAME=VALUE", text, value)
+    return found
+
+
+def _read_bounds(texts: list[str], _: object) -> dict[str, tuple[float, float]]:
+    found = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        low, colon, high = value.partition(":")
+        ends = (low, high if colon else low)
+        first, last = (_number("vary", "NAME=LOW:HIGH or NAME=VALUE", text, end) for end in ends)
+        found[name.strip()] = (first, last)
+    return found
+
+
+class LayoutOptions(JobOptions):
+    """Options of `study_layout`."""
+
+    goal: Annotated[
+        str,
+        Field(
+            description="What should be as good as can be: condition, torque, reach, clearance, "
+            "transmission, plate_joint_deg or crank_joint_deg."
+        ),
+        Flag("NAME"),
+    ] = "condition"
+    limits: Annotated[
+        Mapping[str, float] | None,
+        Field(description="Least (reach, clearance, transmission) or largest value, SI units."),
+        Flag("NAME=VALUE", "limit", _read_limits),
+    ] = None
+    vary: Annotated[
+        Mapping[str, tuple[float, float]] | None,
+        Field(
+            description="Bounds of a number of the machine's pattern, or of crank or rod; one "
+            "value fixes it."
+        ),
+        Flag("NAME=LOW:HIGH", read=_read_bounds),
+    ] = None
+    keep: Annotated[
+        Sequence[str],
+        Field(description="A number that stays as it is, or branches or plate_order."),
+        Flag("NAME", read=lambda texts, _: texts),
+    ] = ()
+    best: Annotated[int, Field(ge=1, description="How many machines to write."), Flag("N")] = 3
+    starts: Annotated[
+        int, Field(ge=1, description="Searches per arrangement of legs."), Flag("N")
+    ] = 1
+    generations: Annotated[int, Field(ge=1, description="Of each search, at most."), Flag("N")] = (
+        100
+    )
+    seed: Seed = 0
+
+
 def study_layout(
     scenario: Scenario,
     directory: str | Path,
-    *,
-    goal: str = "condition",
-    limits: Mapping[str, float] | None = None,
-    vary: Mapping[str, tuple[float, float]] | None = None,
-    keep: Sequence[str] = (),
-    best: int = 3,
-    starts: int = 1,
-    generations: int = 100,
-    seed: int = 0,
-    workers: int | None = None,
-    scheduler: str | None = None,
+    options: LayoutOptions,
     progress: Progress | None = None,
 ) -> LayoutStudy:
     """Search machines for a scenario's motion, or go on with that; the best are written.
@@ -307,23 +368,17 @@ def study_layout(
     Args:
         scenario: its machine, which has a pattern, is what the search begins from.
         directory: machines go there, finished searches below it.
-        goal: of `layout_measures.MEASURES`, what should be as good as can be.
-        limits: least or largest values by measure, SI and degrees; others are as usual.
-        vary: bounds by parameter.
-        keep: parameters and choices that stay as they are.
-        best: how many machines are written.
-        starts: searches per arrangement.
-        generations: of each search, at most.
-        seed: of the searches.
-        workers, scheduler, progress: as `run_jobs` takes them.
+        options: see `LayoutOptions`.
+        progress: as `run_jobs` takes it.
 
     Raises:
         As `run_jobs`, and ConfigError for what does not suit.
     """
-    for name, number in (("best", best), ("starts", starts), ("generations", generations)):
-        if number < 1:
-            raise ConfigError(f"--{name}: got {number}; expected 1 or more")
-    problem, folder = problem_of(scenario, goal, limits or {}, vary or {}, keep), Path(directory)
+    best, starts, generations = options.best, options.starts, options.generations
+    workers, seed, folder = options.workers, options.seed, Path(directory)
+    problem = problem_of(
+        scenario, options.goal, options.limits or {}, options.vary or {}, options.keep
+    )
     settings = problem.summary | {"seed": seed, "generations": generations}
     jobs = {
         f"{arrangement.key}_{start}": (problem, arrangement, seed, start, generations)
@@ -337,7 +392,7 @@ def study_layout(
         settings=settings,
         read=_read_found,
         workers=workers,
-        scheduler=scheduler,
+        scheduler=options.scheduler,
         progress=_part(progress, 0, len(jobs) + best + 1),
     )
     chosen = _best_of(problem, list(searches.values()), best)

@@ -11,15 +11,17 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from tempfile import TemporaryDirectory
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.config import NetworkConfig, Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.packets import in_time, times_under_way, torque_missing, usual_bound
 from stewart_drake.studies.jobs import Progress, finished, run_jobs
+from stewart_drake.studies.options import Flag, Options
 from stewart_drake.studies.runs import read_outcome, run_scenario
 from stewart_drake.studies.statistics import least_share
 
@@ -134,22 +136,29 @@ class LinkStudy:
         }
 
 
-def study_link(scenario: Scenario, runs: int = 5, progress: Progress | None = None) -> LinkStudy:
+class LinkOptions(Options):
+    """Options of `study_link`."""
+
+    runs: Annotated[int, Field(ge=1, description="Seeds for each bound and loss."), Flag("N")] = 5
+
+
+def study_link(
+    scenario: Scenario, options: LinkOptions, progress: Progress | None = None
+) -> LinkStudy:
     """Simulate a scenario on the exact plant over bounds, then over losses.
 
     Args:
         scenario: with a network; its `playout` is not used.
-        runs: seeds of network and sensor, for each bound and each loss.
+        options: see `LinkOptions`.
         progress: called for each finished simulation.
 
     Raises:
-        ConfigError: no network, or no runs.
+        ConfigError: the scenario has no network.
     """
     link = scenario.assumed_link
     if not isinstance(link, NetworkConfig):
         raise ConfigError(f"link.kind: got {link.kind!r}; expected 'network'")
-    if runs < 1:
-        raise ConfigError(f"runs: got {runs}; expected at least 1")
+    runs = options.runs
     period, repeats = scenario.controller.period, scenario.controller.packet_repeats
     base = replace(scenario, link=link, plant=scenario.plant.without_engine)
     losses = sorted({*LOSSES, link.loss})

@@ -1,9 +1,11 @@
 """Monte Carlo study of a scenario: many runs, each with one drawn machine."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
@@ -13,7 +15,8 @@ from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.jobs import Progress, run_jobs, write_atomically
-from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.options import Flag, JobOptions, Seed
+from stewart_drake.studies.ranges import RANGE_UNITS, Ranges, read_ranges
 from stewart_drake.studies.robustness_result import RobustnessStudy, table
 from stewart_drake.studies.runs import (
     Outcome,
@@ -24,17 +27,48 @@ from stewart_drake.studies.runs import (
 from stewart_drake.studies.uncertainty import MACHINE, Draw, draw, drawn, scales_of
 
 
+def _read_also(names: list[str], load: Callable[[str], Scenario]) -> dict[str, Scenario]:
+    others = {Path(name).stem: name for name in names}
+    if len(others) < len(names):
+        raise ConfigError(
+            f"--also: got two of one name, {', '.join(names)}; expected each but once"
+        )
+    return {key: load(name) for key, name in others.items()}
+
+
+class RobustnessOptions(JobOptions):
+    """Options of `study_robustness`."""
+
+    ranges: Annotated[
+        Ranges | None,
+        Field(
+            description="How far off, 0: not at all. "
+            + "; ".join(f"{name}: {unit}" for name, unit in RANGE_UNITS.items())
+            + ". torque_limit takes null too: as the scenario has it."
+        ),
+        Flag("NAME=VALUE", "vary", lambda texts, _: read_ranges(texts)),
+    ] = None
+    runs: Annotated[int, Field(ge=1, description="How many machines to draw."), Flag("N")] = 200
+    seed: Seed = 0
+    limit: Annotated[
+        float | None,
+        Field(gt=0, description="A run above, in % s, counts as failed."),
+        Flag("E_AC"),
+    ] = None
+    also: Annotated[
+        Mapping[str, Scenario] | None,
+        Field(
+            description="Run the same machines with this controller too, such as adaptive_lqi, "
+            "which finds the delay."
+        ),
+        Flag("CONTROLLER", read=_read_also),
+    ] = None
+
+
 def study_robustness(
     scenario: Scenario,
     directory: str | Path,
-    *,
-    ranges: Ranges | None = None,
-    runs: int = 200,
-    seed: int = 0,
-    limit: float | None = None,
-    beside: Mapping[str, Scenario] | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
+    options: RobustnessOptions,
     progress: Progress | None = None,
 ) -> RobustnessStudy:
     """Run a scenario undisturbed and then with drawn machines, or go on with an earlier study.
@@ -44,23 +78,14 @@ def study_robustness(
     Args:
         scenario: to run; draws add to its own disturbances.
         directory: for runs.csv; the runs are kept in runs/. More runs may be asked for later.
-        ranges: of the drawn quantities, the defaults if None.
-        runs: number of draws.
-        seed: of all draws.
-        limit: E_ac in % s above which a completed run counts as failed, or None.
-        beside: by a name that a folder may have, the scenario with other controllers, for the same
-            machines.
-        workers, scheduler, progress: as `run_jobs` takes them.
+        options: see `RobustnessOptions`. Names in `also` become names of folders.
+        progress: as `run_jobs` takes it.
 
     Raises:
-        As `run_jobs`, and ConfigError for a scenario or numbers that do not suit, and for an
-            undisturbed run that does not complete.
+        As `run_jobs`, and ConfigError for a scenario that does not suit, and for an undisturbed run
+            that does not complete.
     """
-    if runs < 1:
-        raise ConfigError(f"--runs: got {runs}; expected 1 or more")
-    if limit is not None and not limit > 0:
-        raise ConfigError(f"--limit: got {limit:g}; expected a positive E_ac in % s")
-    ranges = Ranges() if ranges is None else ranges
+    ranges, seed, also = options.ranges or Ranges(), options.seed, dict(options.also or {})
     experiment, directory = prepare(scenario), Path(directory)
     settings: dict[str, Any] = {
         "scenario": scenario_to_dict(scenario),
@@ -69,28 +94,36 @@ def study_robustness(
     }
     common: dict[str, Any] = {
         "settings": settings,
-        "workers": workers,
-        "scheduler": scheduler,
+        "workers": options.workers,
+        "scheduler": options.scheduler,
         "read": read_outcome,
     }
     undisturbed = _undisturbed(scenario, "", directory / "runs", common)
     alone = {
         name: _undisturbed(other, name, directory / f"runs_{name}", common)
-        for name, other in (beside or {}).items()
+        for name, other in also.items()
     }
     scales = scales_of(experiment, undisturbed.peak_torque)
-    draws = [draw(ranges, scales, scenario, seed, index) for index in range(runs)]
+    draws = [draw(ranges, scales, scenario, seed, index) for index in range(options.runs)]
     jobs = {f"run{i:06d}": (scenario, one) for i, one in enumerate(draws)}
     outcomes = run_jobs(jobs, run_draw, directory / "runs", progress=progress, **common)
     others = {}
-    for name, other in (beside or {}).items():
+    for name, other in also.items():
         common["settings"] = settings | {"scenario": scenario_to_dict(other)}
         again = {key: (other, d) for key, (_, d) in jobs.items()}
         place = directory / f"runs_{name}"
         found = run_jobs(again, run_draw, place, progress=progress, **common)
         others[name] = (alone[name], list(found.values()))
     study = RobustnessStudy(
-        experiment, ranges, scales, seed, limit, undisturbed, draws, list(outcomes.values()), others
+        experiment,
+        ranges,
+        scales,
+        seed,
+        options.limit,
+        undisturbed,
+        draws,
+        list(outcomes.values()),
+        others,
     )
     remove_partials(directory)
     write_atomically(directory / "runs.csv", table(study).encode())

@@ -64,6 +64,11 @@ class RobustnessStudy(NamedTuple):
     """By name of another controller: undisturbed, and on the same draws."""
 
     @property
+    def files(self) -> list[str]:
+        """Names of what the study leaves in its folder."""
+        return ["runs.csv", "runs/"]
+
+    @property
     def others(self) -> "dict[str, RobustnessStudy]":
         """The study as it would be with each of the other controllers."""
         return {

@@ -1,0 +1,144 @@
+# Written by .ci/public_names.py.
+import collections.abc
+import pathlib
+
+import stewart_drake.reporting.results
+import stewart_drake.scenario.config
+import stewart_drake.studies.ranges
+from stewart_drake import law as law
+from stewart_drake import systems as systems
+from stewart_drake.dynamics.stewart import StewartDynamics as StewartDynamics
+from stewart_drake.files.errors import ConfigError as ConfigError
+from stewart_drake.loop.diagram import ClosedLoop as ClosedLoop
+from stewart_drake.loop.diagram import build_closed_loop as build_closed_loop
+from stewart_drake.loop.exact import ExactPlant as ExactPlant
+from stewart_drake.loop.exact import set_accuracy as set_accuracy
+from stewart_drake.loop.law_design import DesignedLaw as DesignedLaw
+from stewart_drake.loop.law_design import design_law as design_law
+from stewart_drake.loop.platforms import AddStewartPlatform as AddStewartPlatform
+from stewart_drake.loop.platforms import StewartPlatform as StewartPlatform
+from stewart_drake.loop.state_space import linear_models as linear_models
+from stewart_drake.mechanism.files import load_mechanism as load_mechanism
+from stewart_drake.mechanism.geometry import Mechanism as Mechanism
+from stewart_drake.mechanism.kinematics import ForwardKinematicsError as ForwardKinematicsError
+from stewart_drake.mechanism.kinematics import UnreachablePoseError as UnreachablePoseError
+from stewart_drake.reporting.api import compare as compare
+from stewart_drake.reporting.api import report as report
+from stewart_drake.reporting.api import simulate as simulate
+from stewart_drake.reporting.results import AnalysisResult as AnalysisResult
+from stewart_drake.reporting.results import ComparisonResult as ComparisonResult
+from stewart_drake.reporting.results import SimulationResult as SimulationResult
+from stewart_drake.scenario.config import ActuatorConfig as ActuatorConfig
+from stewart_drake.scenario.config import ControllerConfig as ControllerConfig
+from stewart_drake.scenario.config import DelayConfig as DelayConfig
+from stewart_drake.scenario.config import EncoderSensorConfig as EncoderSensorConfig
+from stewart_drake.scenario.config import LinkConfig as LinkConfig
+from stewart_drake.scenario.config import NetworkConfig as NetworkConfig
+from stewart_drake.scenario.config import PlantConfig as PlantConfig
+from stewart_drake.scenario.config import Scenario as Scenario
+from stewart_drake.scenario.config import SensorConfig as SensorConfig
+from stewart_drake.scenario.config import ServoActuatorConfig as ServoActuatorConfig
+from stewart_drake.scenario.config import StateSensorConfig as StateSensorConfig
+from stewart_drake.scenario.config import TorqueActuatorConfig as TorqueActuatorConfig
+from stewart_drake.scenario.config import TunerConfig as TunerConfig
+from stewart_drake.scenario.config import WireConfig as WireConfig
+from stewart_drake.scenario.loading import load_scenario as load_scenario
+from stewart_drake.scenario.reference_config import CsvConfig as CsvConfig
+from stewart_drake.scenario.reference_config import HoldConfig as HoldConfig
+from stewart_drake.scenario.reference_config import ReferenceConfig as ReferenceConfig
+from stewart_drake.scenario.reference_config import SineConfig as SineConfig
+from stewart_drake.scenario.reference_config import WaypointsConfig as WaypointsConfig
+
+__version__: str
+__all__ = [
+    "ActuatorConfig",
+    "AddStewartPlatform",
+    "AnalysisResult",
+    "ClosedLoop",
+    "ComparisonResult",
+    "ConfigError",
+    "ControllerConfig",
+    "CsvConfig",
+    "DelayConfig",
+    "DesignedLaw",
+    "EncoderSensorConfig",
+    "ExactPlant",
+    "ForwardKinematicsError",
+    "HoldConfig",
+    "LinkConfig",
+    "Mechanism",
+    "NetworkConfig",
+    "PlantConfig",
+    "ReferenceConfig",
+    "Scenario",
+    "SensorConfig",
+    "ServoActuatorConfig",
+    "SimulationResult",
+    "SineConfig",
+    "StateSensorConfig",
+    "StewartDynamics",
+    "StewartPlatform",
+    "TorqueActuatorConfig",
+    "TunerConfig",
+    "UnreachablePoseError",
+    "WaypointsConfig",
+    "WireConfig",
+    "__version__",
+    "analyze_delay",
+    "analyze_hautus",
+    "analyze_link",
+    "analyze_robustness",
+    "analyze_workspace",
+    "build_closed_loop",
+    "compare",
+    "design_law",
+    "law",
+    "layout",
+    "linear_models",
+    "load_mechanism",
+    "load_scenario",
+    "report",
+    "set_accuracy",
+    "simulate",
+    "systems",
+]
+
+def analyze_delay(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, simulations: bool = True
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def analyze_hautus(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def analyze_link(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, runs: int = 5
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def analyze_robustness(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    runs: int = 200,
+    *,
+    ranges: stewart_drake.studies.ranges.Ranges | None = None,
+    seed: int = 0,
+    limit: float | None = None,
+    also: collections.abc.Mapping[str, stewart_drake.scenario.config.Scenario] | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    directory: str | pathlib.Path | None = None,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def analyze_workspace(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def layout(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    directory: str | pathlib.Path | None = None,
+    *,
+    goal: str = "condition",
+    limits: collections.abc.Mapping[str, float] | None = None,
+    vary: collections.abc.Mapping[str, tuple[float, float]] | None = None,
+    keep: collections.abc.Sequence[str] = (),
+    best: int = 3,
+    starts: int = 1,
+    generations: int = 100,
+    seed: int = 0,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> stewart_drake.reporting.results.AnalysisResult: ...

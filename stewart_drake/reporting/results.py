@@ -1,0 +1,265 @@
+"""Results of runs, comparisons and analyses, with methods that show and save them.
+
+`loop` and `studies` return plain results and may not import this room, so the public functions
+convert theirs to these classes.
+"""
+
+import html as escaping
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from stewart_drake.files.jsonio import write_json
+from stewart_drake.loop import results as loop_results
+from stewart_drake.loop.experiment import simulated_machine
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.studies.compare import save_comparison
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pydrake.geometry import Meshcat
+
+    from stewart_drake.reporting.document import Document
+    from stewart_drake.reporting.page import Provenance
+
+PAGE: Final = "report.html"
+
+
+class Figures(dict[str, "Figure"]):
+    """Figures by name; a notebook shows them."""
+
+    def _repr_html_(self) -> str:
+        from stewart_drake.reporting.page import source
+
+        pictures = (
+            f'<img src="{source(figure)}" alt="{escaping.escape(name)}">'
+            for name, figure in self.items()
+        )
+        return "\n".join(pictures)
+
+    def __repr__(self) -> str:
+        return f"Figures({', '.join(self)})"
+
+
+class Replay:
+    """The animation of a run as HTML; a notebook shows it."""
+
+    def __init__(self, text: str) -> None:
+        self.html = text
+
+    def __repr__(self) -> str:
+        return f"Replay({len(self.html) / 1e6:.1f} MB of HTML)"
+
+    def _repr_html_(self) -> str:
+        return framed(self.html)
+
+
+class SimulationResult(loop_results.SimulationResult):
+    __doc__ = loop_results.SimulationResult.__doc__
+
+    @classmethod
+    def of(cls, result: loop_results.SimulationResult) -> "SimulationResult":
+        """Return a run's result with the methods that show it."""
+        return cls(**vars(result))
+
+    def table(self) -> str:
+        """Return status, errors and torques as text."""
+        from stewart_drake.reporting.run_document import run_document
+
+        return run_document(self).plain()
+
+    def plot(self, directory: str | Path | None = None) -> Figures:
+        """Return figures by name.
+
+        Args:
+            directory: where they are also written, as PNG and SVG; it is made.
+
+        Raises:
+            OSError: the directory cannot be written to.
+        """
+        from stewart_drake.reporting.figures import draw_run
+
+        return _drawn(draw_run(self), directory)
+
+    def replay(
+        self,
+        path: str | Path | None = None,
+        *,
+        meshcat: "Meshcat | None" = None,
+        mechanism: Mechanism | None = None,
+        title: str = "replay",
+    ) -> "Replay | Path | Meshcat":
+        """Show the run in three dimensions: in Meshcat, as a file, or in a notebook.
+
+        Args:
+            path: of the HTML file to write, which plays without a network; its folder is made.
+            meshcat: where it is played instead.
+            mechanism: that was run, by default the scenario's.
+            title: of the page.
+
+        Returns:
+            The path, the Meshcat, or without either what a notebook shows.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        from stewart_drake.reporting.replay import replay, replay_html, write_replay
+
+        machine = simulated_machine(self.scenario) if mechanism is None else mechanism
+        if meshcat is not None:
+            return replay(self.signals, machine, meshcat)
+        if path is None:
+            return Replay(replay_html(self, machine, title))
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        return write_replay(self, machine, Path(path), title)
+
+
+class ComparisonResult(Mapping[str, SimulationResult]):
+    """Runs of a scenario under several controllers, by controller."""
+
+    def __init__(self, runs: Mapping[str, loop_results.SimulationResult]) -> None:
+        self._runs = {name: SimulationResult.of(run) for name, run in runs.items()}
+
+    def __getitem__(self, name: str) -> SimulationResult:
+        return self._runs[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._runs)
+
+    def __len__(self) -> int:
+        return len(self._runs)
+
+    def __repr__(self) -> str:
+        return f"ComparisonResult({', '.join(f'{k}: {run.status}' for k, run in self.items())})"
+
+    def table(self) -> str:
+        """Return a row per controller as text."""
+        from stewart_drake.reporting.run_document import comparison_document
+
+        return comparison_document(self).plain()
+
+    def plot(self, directory: str | Path | None = None) -> Figures:
+        """Return figures by name; see `SimulationResult.plot`."""
+        from stewart_drake.reporting.figures import draw_comparison
+
+        return _drawn(draw_comparison(self), directory)
+
+    def replay(self, directory: str | Path | None = None) -> "dict[str, Replay | Path | Meshcat]":
+        """Return the replay of each run by controller, written as NAME.html into a directory."""
+        return {
+            name: run.replay(None if directory is None else Path(directory) / f"{name}.html")
+            for name, run in self.items()
+        }
+
+    def save(self, directory: str | Path) -> None:
+        """Write NAME.nc of every controller, then summary.json; the directory is made.
+
+        Raises:
+            OSError: the directory cannot be written to.
+        """
+        save_comparison(self, directory)
+
+
+@dataclass(frozen=True, repr=False)
+class AnalysisResult:
+    """Result of an analysis or a report. Printed it is text, in a notebook a page.
+
+    Attributes:
+        study: everything that was found.
+        summary: content of `summary.json`.
+        document: description of the study.
+        made: how it was made.
+    """
+
+    study: Any
+    summary: dict[str, Any]
+    document: "Document"
+    made: "Provenance"
+
+    @property
+    def verdict(self) -> str:
+        """The conclusion in a sentence or two."""
+        return self.document.verdict
+
+    def __repr__(self) -> str:
+        return f"AnalysisResult({self.verdict!r})"
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def _repr_html_(self) -> str:
+        from stewart_drake.reporting.page import html
+
+        return framed(html(self.document, self.made))
+
+    def table(self) -> str:
+        """Return the text that the command prints."""
+        return self.document.plain()
+
+    def plot(self, directory: str | Path | None = None) -> Figures:
+        """Return the figures of the page; see `SimulationResult.plot`."""
+        from stewart_drake.reporting.document import Picture
+
+        pictures = [one for section in self.document.sections for one in section.all(Picture)]
+        return _drawn({f"figure_{k}": one.drawn for k, one in enumerate(pictures, 1)}, directory)
+
+    def write_page(self, directory: Path) -> Path:
+        """Write report.html into a directory and return its path.
+
+        Raises:
+            OSError: the directory cannot be written to.
+        """
+        from stewart_drake.reporting.page import write_page
+
+        return write_page(self.document, self.made, directory / PAGE)
+
+    def save(self, directory: str | Path) -> Path:
+        """Write report.html and summary.json into a directory, which is made.
+
+        Returns:
+            The path of the page.
+
+        Raises:
+            OSError: the directory cannot be written to.
+        """
+        folder = Path(directory)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / "summary.json", self.summary)
+        return self.write_page(folder)
+
+
+def analysis_result(
+    study: Callable[[], Any], document: "Callable[[Any], Document]", command: str
+) -> AnalysisResult:
+    """Do a study and describe its result.
+
+    Args:
+        study: does it; the result has a `summary`, plain data.
+        document: describes the result.
+        command: that does the same again, as typed.
+    """
+    from stewart_drake.reporting.page import Provenance
+
+    started = time.perf_counter()
+    found = study()
+    made = Provenance(command, seconds=time.perf_counter() - started)
+    return AnalysisResult(found, found.summary, document(found), made)
+
+
+def framed(page: str) -> str:
+    """Return a page inside another one, where its scripts reach nothing outside."""
+    return (
+        f'<iframe srcdoc="{escaping.escape(page)}" sandbox="allow-scripts" '
+        'style="width: 100%; height: 600px; border: 0"></iframe>'
+    )
+
+
+def _drawn(figures: "Mapping[str, Figure]", directory: str | Path | None) -> Figures:
+    from stewart_drake.reporting.style import write_figures
+
+    if directory is not None:
+        Path(directory).mkdir(parents=True, exist_ok=True)
+        write_figures(figures, directory)
+    return Figures(figures)
