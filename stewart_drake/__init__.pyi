@@ -9,6 +9,13 @@ from stewart_drake import law as law
 from stewart_drake import systems as systems
 from stewart_drake.dynamics.stewart import StewartDynamics as StewartDynamics
 from stewart_drake.files.errors import ConfigError as ConfigError
+from stewart_drake.functions import check_model as check_model
+from stewart_drake.functions import export as export
+from stewart_drake.functions import export_c as export_c
+from stewart_drake.functions import identify as identify
+from stewart_drake.functions import model_sdf as model_sdf
+from stewart_drake.functions import new as new
+from stewart_drake.functions import plan_identification as plan_identification
 from stewart_drake.loop.diagram import ClosedLoop as ClosedLoop
 from stewart_drake.loop.diagram import build_closed_loop as build_closed_loop
 from stewart_drake.loop.exact import ExactPlant as ExactPlant
@@ -90,13 +97,20 @@ __all__ = [
     "analyze_robustness",
     "analyze_workspace",
     "build_closed_loop",
+    "check_model",
     "compare",
     "design_law",
+    "export",
+    "export_c",
+    "identify",
     "law",
     "layout",
     "linear_models",
     "load_mechanism",
     "load_scenario",
+    "model_sdf",
+    "new",
+    "plan_identification",
     "report",
     "set_accuracy",
     "simulate",

@@ -90,7 +90,10 @@ BAD_ARGUMENTS = [
     (["tune", "train", "nowhere", "--regret", "--split", "run"], "--split: got run with"),
     (["tune", "train", "nowhere", "--regret", "--density", "signed"], "--density: got signed with"),
     (["analyze", "robustness", "--also", "lqi", "--also", "lqi"], "--also: got two of one"),
-    (["analyze", "robustness", "--beside", "lqi"], "--beside: got an option of 0.2; expected --also"),
+    (
+        ["analyze", "robustness", "--beside", "lqi"],
+        "--beside: got an option of 0.2",
+    ),
     (["identify", "--plan", "paper", "--mechanism", "paper"], "--mechanism: got paper with --plan"),
     (["identify", "--plan", "paper", "--delay", "0"], "--delay: got 0.0 with --plan"),
     (["identify", "--plan", "paper", "--no-gravity"], "--gravity: got False with --plan"),

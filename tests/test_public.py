@@ -37,7 +37,7 @@ def test_a_name_of_0_2_leads_to_todays(name):
 
 
 def test_an_option_of_0_2_leads_to_todays():
-    with pytest.raises(TypeError, match="analyze_robustness: got beside, an option of 0.2; expected also"):
+    with pytest.raises(TypeError, match=r"got beside, an option of 0\.2; expected also"):
         sd.analyze_robustness("paper", beside={})
 
 
@@ -76,3 +76,21 @@ def test_machines_and_what_is_made_of_them_fit_a_line_or_two(name):
     assert repr(machine) in repr(prepare(sd.load_scenario(name)))
     for thing in (machine, sd.StewartDynamics(machine), prepare(sd.load_scenario(name))):
         assert len(repr(thing)) < 400 and "\n" not in repr(thing)
+
+
+@pytest.mark.slow
+def test_commands_have_functions(tmp_path):
+    run = sd.simulate(sd.load_scenario("desktop", settings=(*SETTINGS[:1], "duration=3")))
+    run.save(tmp_path)
+    text = sd.export(tmp_path / "signals.nc", tmp_path / "signals.csv")
+    assert text.startswith("time[s],pose_roll[rad]") and (tmp_path / "signals.csv").is_file()
+    found = sd.identify(tmp_path / "signals.nc", "desktop")
+    found.save(tmp_path / "machine")
+    assert {path.name for path in (tmp_path / "machine").iterdir()} == {
+        *("calibration.yaml", "mechanism.yaml", "report.html", "summary.json")
+    }
+    planned = sd.plan_identification("desktop")
+    planned.save(tmp_path / "plan")
+    assert sd.load_scenario(tmp_path / "plan" / "scenario.yaml").mechanism
+    assert any(path.name == "Makefile" for path in sd.export_c("desktop", tmp_path / "board"))
+    assert sd.model_sdf("desktop").startswith("<?xml") and sd.check_model("desktop").summary

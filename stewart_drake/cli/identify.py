@@ -8,16 +8,11 @@ import typer
 
 from stewart_drake.cli.common import AsJson, Delivery, Out, Quiet, Settings, refuse
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification.tolerances import TOLERANCE_UNITS, Tolerances, read_tolerances
+from stewart_drake.identification.tolerances import TOLERANCE_UNITS, read_tolerances
 from stewart_drake.reporting.terminal import working
 
 if TYPE_CHECKING:
     from stewart_drake.identification.log_files import Precision
-    from stewart_drake.reporting.results import AnalysisResult
-
-MECHANISM = "mechanism.yaml"
-CALIBRATION = "calibration.yaml"
-SCENARIO = "scenario.yaml"
 
 Tolerance = Annotated[
     list[str] | None,
@@ -89,17 +84,37 @@ def identify(
     if plan is not None:
         said = {"--mechanism": mechanism, "--delay": delay, "--gravity": gravity}
         refuse(said, "with --plan, whose scenario says it (--set); expected none")
-        delivery, measured = Delivery(out, quiet, as_json), pose_std is not None
-        answer = _planned(plan, settings or [], tolerances, precision, measured, typed, quiet)
-        names = _write_plan(answer, delivery)
     else:
         refuse({"--set": settings}, "without --plan; expected it with --plan")
         if all(path.suffix == ".nc" for path in logs or ()):
             refuse(of_csv, "with logs that say it themselves (.nc); expected it of a CSV log")
-        acted, delivery = gravity is not False, Delivery(out, quiet, as_json)
-        answer = _found(logs or [], mechanism, tolerances, precision, delay, acted, typed, quiet)
-        names = _write_found(answer, delivery)
-    return delivery.answer(answer, *names)
+    delivery = Delivery(out, quiet, as_json)
+    if plan is None and mechanism is None:
+        raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")
+    from stewart_drake import functions
+    from stewart_drake.identification.plan import MOTION
+    from stewart_drake.reporting.page import command_line
+    from stewart_drake.scenario.loading import load_scenario
+
+    chosen: Any = {"tolerances": tolerances, "precision": precision}
+    if plan is not None:
+        loaded = load_scenario(plan, settings=settings or [])
+        chosen["command"] = command_line(
+            "identify", settings=settings or [], options={"plan": plan, **typed}
+        )
+        with working("plan", quiet):
+            found = functions.plan_identification(loaded, poses=pose_std is not None, **chosen)
+        delivery.discard(MOTION, functions.SCENARIO)
+    else:
+        words = [*map(str, logs or []), *(["--no-gravity"] if gravity is False else [])]
+        options = {"mechanism": mechanism, **typed}
+        chosen["command"] = command_line("identify", *words, options=options)
+        with working("identify", quiet):
+            found = functions.identify(
+                logs or [], mechanism or "", delay=delay, gravity=gravity is not False, **chosen
+            )
+        delivery.discard(functions.MECHANISM, functions.CALIBRATION)
+    return delivery.answer(found, *found.write_files(delivery.out))
 
 
 def _precision(bits: int | None, pose_std: str | None) -> "Precision":
@@ -119,91 +134,3 @@ def _precision(bits: int | None, pose_std: str | None) -> "Precision":
             f"--pose-std: got {pose_std!r}; expected two positive numbers, rad and m, as 1e-4,2e-5"
         )
     return precision._replace(pose_angle=angle, pose_position=position)
-
-
-def _found(
-    logs: list[Path],
-    mechanism: str | None,
-    tolerances: Tolerances,
-    precision: "Precision",
-    delay: float | None,
-    gravity: bool,
-    typed: dict[str, Any],
-    quiet: bool,
-) -> "AnalysisResult":
-    from stewart_drake.identification.identify import identify as find
-    from stewart_drake.identification.log_files import read_log
-    from stewart_drake.mechanism.files import load_mechanism
-    from stewart_drake.reporting.identification_document import document
-    from stewart_drake.reporting.page import command_line
-    from stewart_drake.reporting.results import analysis_result
-
-    if mechanism is None:
-        raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")
-    machine = load_mechanism(mechanism)
-    with working("identify", quiet):
-        read = [read_log(path, machine, precision, gravity) for path in logs]
-        words = [*map(str, logs), *(() if gravity else ("--no-gravity",))]
-        command = command_line("identify", *words, options={"mechanism": mechanism, **typed})
-        return analysis_result(lambda: find(read, machine, tolerances, delay), document, command)
-
-
-def _planned(
-    scenario: str,
-    settings: list[str],
-    tolerances: Tolerances,
-    precision: "Precision",
-    poses: bool,
-    typed: dict[str, Any],
-    quiet: bool,
-) -> "AnalysisResult":
-    import numpy as np
-
-    from stewart_drake.identification.logs import ANGLES, POSE
-    from stewart_drake.identification.plan import plan
-    from stewart_drake.loop.experiment import prepare
-    from stewart_drake.reporting.identification_document import plan_document
-    from stewart_drake.reporting.page import command_line
-    from stewart_drake.reporting.results import analysis_result
-    from stewart_drake.scenario.loading import load_scenario
-
-    std = np.full_like(precision.std, np.inf)
-    for part in (ANGLES, POSE) if poses else (ANGLES,):
-        std[part] = precision.std[part]
-    experiment = prepare(load_scenario(scenario, settings=settings))
-    command = command_line("identify", settings=settings, options={"plan": scenario, **typed})
-    with working("plan", quiet):
-        return analysis_result(lambda: plan(experiment, std, tolerances), plan_document, command)
-
-
-def _write_found(answer: "AnalysisResult", delivery: Delivery) -> list[str]:
-    """What simulate takes."""
-    from stewart_drake.files.fileio import replacing
-    from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
-    from stewart_drake.scenario.calibration import save_calibration
-
-    if delivery.out is None:
-        return []
-    delivery.discard(MECHANISM, CALIBRATION)
-    path = delivery.out / MECHANISM
-    text = mechanism_yaml(answer.study.mechanism)
-    with replacing(path) as partial:
-        partial.write_text(text)
-    save_calibration(delivery.out / CALIBRATION, answer.study.calibration(load_mechanism(path)))
-    return [MECHANISM, CALIBRATION]
-
-
-def _write_plan(answer: "AnalysisResult", delivery: Delivery) -> list[str]:
-    """The motion, and the scenario that makes the plate do it."""
-    from stewart_drake.files.fileio import replacing
-    from stewart_drake.identification.plan import MOTION
-    from stewart_drake.scenario.loading import scenario_yaml
-
-    if delivery.out is None:
-        return []
-    delivery.discard(MOTION, SCENARIO)
-    texts = {MOTION: answer.study.motion_csv, SCENARIO: scenario_yaml(answer.study.scenario)}
-    for name, text in texts.items():
-        with replacing(delivery.out / name) as partial:
-            partial.write_text(text)
-    return list(texts)

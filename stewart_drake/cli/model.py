@@ -27,10 +27,9 @@ def sdf(
     ] = None,
 ) -> None:
     """Write a mechanism as SDFormat."""
-    from stewart_drake.mechanism.files import load_mechanism
-    from stewart_drake.mechanism.sdformat import to_sdformat
+    from stewart_drake.functions import model_sdf
 
-    text = to_sdformat(load_mechanism(mechanism))
+    text = model_sdf(mechanism)
     if out is None:
         typer.echo(text, nl=False)
         return
@@ -50,9 +49,8 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Check a mechanism and describe it at its home pose, under gravity."""
-    from stewart_drake.mechanism.files import load_mechanism
+    from stewart_drake.functions import check_model
     from stewart_drake.reporting.mechanism_document import document
-    from stewart_drake.studies.mechanism_check import check_mechanism
 
     def draw(folder: Path) -> None:
         from stewart_drake.reporting.mechanism_figures import write_mechanism_figure
@@ -60,7 +58,7 @@ def check(
         write_mechanism_figure(found.mechanism, folder)
 
     delivery = Delivery(out, quiet, as_json)
-    found = check_mechanism(load_mechanism(mechanism))
+    found = check_model(mechanism)
     delivery.say(document(found).plain())
     delivery.discard("mechanism.png", "mechanism.svg")
     delivery.write(found.summary)

@@ -156,14 +156,14 @@ def export(
 
     A line per instant; the header names each column's unit.
     """
-    from stewart_drake.reporting.csv_file import read_signals, signals_csv, write_csv
+    from stewart_drake import functions
 
-    dataset = read_signals(signals)
+    if out is not None:
+        check_file(out)
+    text = functions.export(signals, out)
     if out is None:
-        typer.echo(signals_csv(dataset), nl=False)
+        typer.echo(text, nl=False)
         return
-    check_file(out)
-    write_csv(dataset, out)
     echo(f"written to {out}")
 
 
@@ -180,12 +180,10 @@ def export_c(
 
     A folder that builds with its own Makefile; its test replays a run of the scenario.
     """
-    from stewart_drake.export.controller import exported, write
-    from stewart_drake.scenario.loading import load_scenario
+    from stewart_drake.functions import export_c as export
 
     check_writable(out)
-    files = exported(load_scenario(scenario, controller, settings or ()), single)
-    write(files, out)
+    files = export(scenario, out, controller, settings or (), single=single)
     echo(f"written to {out}: {len(files)} files; make test replays the run")
 
 

@@ -171,12 +171,18 @@ class AnalysisResult:
         summary: content of `summary.json`.
         document: description of the study.
         made: how it was made.
+        write: writes further files of the study into a folder and returns their names.
     """
 
     study: Any
     summary: dict[str, Any]
     document: "Document"
     made: "Provenance"
+    write: Callable[[Any, Path], list[str]] | None = None
+
+    def write_files(self, folder: Path | None) -> list[str]:
+        """Write the study's own files into a folder, if it has some, and return their names."""
+        return [] if folder is None or self.write is None else self.write(self.study, folder)
 
     @property
     def verdict(self) -> str:
@@ -226,12 +232,16 @@ class AnalysisResult:
         """
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
+        self.write_files(folder)
         write_json(folder / "summary.json", self.summary)
         return self.write_page(folder)
 
 
 def analysis_result(
-    study: Callable[[], Any], document: "Callable[[Any], Document]", command: str
+    study: Callable[[], Any],
+    document: "Callable[[Any], Document]",
+    command: str,
+    write: Callable[[Any, Path], list[str]] | None = None,
 ) -> AnalysisResult:
     """Do a study and describe its result.
 
@@ -239,13 +249,14 @@ def analysis_result(
         study: does it; the result has a `summary`, plain data.
         document: describes the result.
         command: that does the same again, as typed.
+        write: see `AnalysisResult`.
     """
     from stewart_drake.reporting.page import Provenance
 
     started = time.perf_counter()
     found = study()
     made = Provenance(command, seconds=time.perf_counter() - started)
-    return AnalysisResult(found, found.summary, document(found), made)
+    return AnalysisResult(found, found.summary, document(found), made, write)
 
 
 def framed(page: str) -> str:
