@@ -141,7 +141,7 @@ def test_a_controller_that_is_off_is_told(tmp_path: Path) -> None:
 def test_single_precision_without_the_filter_only(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError,
-        match=r"controller.estimator: got \['torque_bias', 'payload', 'damping'\] with --single",
+        match=r"controller.estimate: got \['torque_bias', 'payload', 'damping'\] with --single",
     ):
         exported(tmp_path, "paper", (), single=True)
     folder = exported(tmp_path, "gravity", ("controller.estimate=[]",), single=True)
