@@ -1,4 +1,4 @@
-"""Fit of logs that are too short for `start.coarse_delay`, by a scan over delays.
+"""Fit of logs that are too short for `identification.start.coarse_delay`, by a scan over delays.
 
 At each delay of a grid, a machine as drawn is fitted to short segments by a few iterations. From
 the best of these the machine with free geometry is fitted to segments of full length.
