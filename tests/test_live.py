@@ -4,13 +4,18 @@ import io
 import itertools
 import json
 import math
+import os
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 import urllib.error
 import urllib.request
 from collections import deque
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +34,7 @@ from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.governor import Governor
 from stewart_drake.live.loop import LiveLoop, Nobody, Seen
 from stewart_drake.live.machine import Machine, Settings
-from stewart_drake.live.page import Asked, PageViewer, read_wish
+from stewart_drake.live.page import Asked, PageViewer, _Board, read_wish
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerMessage, MachineFlags
 from stewart_drake.live.session import _queue_advice, check_armed, drive, plans, prepare_session
 from stewart_drake.live.steering import Steering, Way, Wish
@@ -532,6 +537,37 @@ def test_live_goes_on_after_an_answer_or_with_yes(
     assert [line.startswith("error: --yes: not given") for line in lines] == (
         [False] * (answer is not None) + [True] * (status != 0)
     )
+
+
+def test_what_is_no_number_is_null_on_the_page():
+    """JSON has no NaN: a browser's JSON.parse refuses the whole message."""
+    board = _Board()
+    board.put({"error": math.nan, "pose": [1.0, math.inf], "limit": None, "missed": 3})
+    refused = pytest.fail  # called for NaN and Infinity only
+    said = json.loads(board.after(0)[0], parse_constant=refused)
+    assert said == {"error": None, "pose": [1.0, None], "limit": None, "missed": 3}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="PR_SET_PDEATHSIG is Linux's")
+def test_the_machine_of_a_demo_ends_with_a_killed_controller():
+    parent = """
+import subprocess, sys, time
+from stewart_drake.cli.live import _end_with_parent
+child = subprocess.Popen(["sleep", "60"], start_new_session=True, preexec_fn=_end_with_parent())
+print(child.pid, flush=True)
+time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        child = int(process.stdout.readline())
+        process.kill()
+    for _ in range(100):
+        state = Path(f"/proc/{child}/stat")
+        if not state.exists() or " Z " in state.read_text():
+            return
+        time.sleep(0.05)
+    os.kill(child, signal.SIGKILL)
+    pytest.fail("the child is still there 5 s after its parent was killed")
 
 
 @pytest.mark.slow

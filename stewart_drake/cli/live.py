@@ -1,12 +1,13 @@
 """The loop in real time, against a machine over a link: live."""
 
 import contextlib
+import ctypes
 import math
 import signal
 import subprocess
 import sys
 import webbrowser
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -179,6 +180,14 @@ def _told(delivery: Delivery, result: "SimulationResult") -> int:
     return delivery.end(result.summary, result.status == "interrupted") or int(lost)
 
 
+def _end_with_parent() -> Callable[[], None] | None:
+    """Return what a child calls to be terminated when its parent is killed, None without Linux."""
+    if sys.platform != "linux":
+        return None
+    prctl, set_death_signal = ctypes.CDLL(None).prctl, 1
+    return lambda: prctl(set_death_signal, signal.SIGTERM)
+
+
 @contextlib.contextmanager
 def _demo_machine(
     scenario: str, eta: float, controller: str | None, settings: Sequence[str]
@@ -196,6 +205,7 @@ def _demo_machine(
         stdout=subprocess.PIPE,
         text=True,
         start_new_session=True,  # Ctrl-C is for the controller, which stops it
+        preexec_fn=_end_with_parent(),
     )
     try:
         assert process.stdout is not None

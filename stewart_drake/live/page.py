@@ -8,6 +8,7 @@ computer too, do not know it.
 
 import json
 import logging
+import math
 import multiprocessing
 import secrets
 import sys
@@ -154,7 +155,8 @@ class _Board:
 
     def put(self, said: dict[str, Any]) -> None:
         with self.news:
-            self.said, self.number = json.dumps(said), self.number + 1
+            self.said = json.dumps(_finite(said), allow_nan=False)
+            self.number += 1
             self.news.notify_all()
 
     def after(self, number: int) -> tuple[str, int]:
@@ -256,6 +258,15 @@ def _words(seen: Seen) -> dict[str, Any]:
         "byHand": seen.by_hand,
         "limit": seen.limit,
     }
+
+
+def _finite(said: Any) -> Any:
+    """Return the same with null for NaN and infinity, which JSON does not have."""
+    if isinstance(said, dict):
+        return {key: _finite(value) for key, value in said.items()}
+    if isinstance(said, list):
+        return [_finite(value) for value in said]
+    return None if isinstance(said, float) and not math.isfinite(said) else said
 
 
 class _Server(ThreadingHTTPServer):
