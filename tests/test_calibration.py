@@ -68,9 +68,9 @@ def test_a_file_is_read_back_to_the_last_digit(
         ({"covariance": [[1.0, 2.0], [2.0, 1.0]]}, "an eigenvalue of -1, in units"),
         ({"covariance": [[-1.0, 0.0], [0.0, 1.0]]}, "a variance of -1 for payload_mass"),
         ({"covariance": [[0.0, 0.1], [0.1, 1.0]]}, "an eigenvalue of"),
-        ({"covariance": "none"}, "covariance: got 'none'; expected a list"),
+        ({"covariance": "none"}, "covariance: got 'none'; expected a valid array"),
         ({"means": [1.0]}, "means: unknown key; did you mean mean"),
-        ({"mechanism": 3}, "mechanism: got 3; expected text"),
+        ({"mechanism": 3}, "mechanism: got 3; expected a valid string"),
     ],
 )
 def test_a_wrong_file_is_refused_in_one_line(

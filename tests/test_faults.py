@@ -1,11 +1,13 @@
-"""kill -9, dead workers, two processes: nothing finished is lost, nothing is half.
+"""kill -9, a full disk, dead workers: nothing finished is lost, nothing is half.
 
 Instants are drawn from a seed. Work runs in copies of a process, so that a kill costs no imports;
 `make soak` kills dozens of times.
 """
 
+import contextlib
 import json
 import os
+import resource
 import signal
 import subprocess
 import time
@@ -18,14 +20,10 @@ import pytest
 import xarray as xr
 
 from stewart_drake.cli import main
-from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.families import paper_grid
 from stewart_drake.studies.robustness import RobustnessOptions, study_robustness
-from stewart_drake.tuning.data import data_hash, load_data, make_data
-from tests.copies import duration, killed
+from tests.copies import duration, killed, status_of
 from tests.faults import refusal
 from tests.test_cli import command
-from tests.test_dataset import shrink
 from tests.test_robustness import short
 
 KILLS = 1
@@ -78,26 +76,6 @@ def kill_and_resume(
 
 
 # ---------------------------------------------------------------- kill -9
-
-
-def little_dataset(folder: Path) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        shrink(patch)
-        make_data(paper_grid(load_scenario("paper", "delay_lqi", LITTLE)), folder, workers=1)
-
-
-def kill_dataset(number: int, tmp_path: Path) -> None:
-    longest = duration(lambda: little_dataset(tmp_path / "whole"))
-    kill_and_resume(
-        little_dataset, tmp_path / "killed", tmp_path / "whole", "conditions/*.npz", number, longest
-    )
-    killed_hash, whole_hash = (data_hash(load_data(tmp_path / n)) for n in ("killed", "whole"))
-    assert killed_hash == whole_hash
-
-
-@pytest.mark.slow
-def test_a_data_set_survives_kill_9(tmp_path):
-    kill_dataset(KILLS, tmp_path)
 
 
 def little_study(folder: Path) -> None:
@@ -168,9 +146,32 @@ def test_reports_survive_kill_9(tmp_path):
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("kill", [kill_dataset, kill_study, kill_writers])
+@pytest.mark.parametrize("kill", [kill_study, kill_writers])
 def test_many_kills(kill, tmp_path):
     kill(SOAK_KILLS, tmp_path)
+
+
+# ---------------------------------------------------------------- a full disk
+
+
+@pytest.mark.parametrize("largest", [1_000, 20_000, 60_000])
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(largest, tmp_path):
+    """A limit on the sizes of files stands for the disk; it holds in a copy of a process only."""
+
+    def work() -> int:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
+        with said.open("w") as file, contextlib.redirect_stderr(file):
+            return main(["simulate", *EXACT, "--quiet", "--out", str(out)])
+
+    said, out = tmp_path / "said", tmp_path / "out"
+    out.mkdir()
+    assert status_of(work) == 2
+    assert f"File too large: '{out}/" in said.read_text()
+    check_whole(out)
+    assert not list(out.glob(".*.part"))
+    there = {path.name for path in out.iterdir()}
+    assert "states.png" not in there and ("summary.json" in there) <= ("signals.nc" in there)
 
 
 # ---------------------------------------------------------------- workers and neighbours

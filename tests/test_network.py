@@ -162,9 +162,9 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
     "missing": (lambda d: d.pop("b1") and None, ["b1", "missing"]),
     "unknown": (_set("W3", [1.0]), ["W3: unknown key"]),
     "misspelt": (_set("bound", []), ["did you mean bounds?"]),
-    "text": (lambda d: d["b2"].__setitem__(0, "1"), ["b2[0]: got '1'", "a number"]),
-    "truth": (lambda d: d["b2"].__setitem__(0, True), ["b2[0]: got True", "a number"]),
-    "null": (lambda d: d["W1"][3].__setitem__(2, None), ["W1[3][2]: got None", "a number"]),
+    "text": (lambda d: d["b2"].__setitem__(0, "1"), ["b2[0]: got '1'", "a valid number"]),
+    "truth": (lambda d: d["b2"].__setitem__(0, True), ["b2[0]: got True", "a valid number"]),
+    "null": (lambda d: d["W1"][3].__setitem__(2, None), ["W1[3][2]: got None", "a valid number"]),
     "huge whole number": (lambda d: d["b2"].__setitem__(0, 10**400), ["b2[0]", "finite number"]),
     "ragged": (lambda d: d["W1"][3].pop() and None, ["W1: got rows of different lengths"]),
     "one input less": (_set("input_mean", [0.0] * 17), ["input_mean: got shape (17,)", "(18,)"]),
@@ -176,7 +176,7 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
     "bounds the wrong way": (_set("bounds", [[4.0, 4.0], [0.1, 0.1]]), ["bounds: got"]),
     "another output": (_set("output", "ratio"), ["output: got 'ratio'", "log_weights"]),
     "another density": (_set("density", "log"), ["density: got 'log'", "magnitude"]),
-    "no card": (_set("card", None), ["card: got None", "a mapping"]),
+    "no card": (_set("card", None), ["card: got None", "an object"]),
     "a list": (lambda d: [d], ["expected a JSON object"]),
 }
 
@@ -197,11 +197,9 @@ def test_a_wrong_file_is_refused_in_one_line(
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        (b'{"b1": [NaN]}', "NaN is not a number"),
-        (b'{"card": {"x": -Infinity}}', "-Infinity is not a number"),
-        (b'{"card": {"x": 1e999}}', "'1e999' is larger than any float"),
-        (b'{"b1": [1], "b1": [2]}', "key 'b1' given 2 times"),
-        (b'{"card": {"a": 1, "a": 1}}', "key 'a' given 2 times"),
+        (b'{"b1": [NaN]}', "b1[0]: got nan; expected a finite number"),
+        (b'{"b1": [1], "b1": [2]}', "key 'b1' given more than once"),
+        (b'{"card": {"a": 1, "a": 1}}', "key 'a' given more than once"),
         (b"{", "is not readable as JSON"),
         (b"", "is not readable as JSON"),
         (b"[" * 100_000, "is not readable as JSON (nested too deep)"),

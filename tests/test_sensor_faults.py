@@ -277,14 +277,14 @@ def test_faults_in_a_scenario_come_back_as_they_were_written() -> None:
         ("{kind: frozen, from: 5, to: 5}", "[0].to: got 5 s", "more than from, 5 s"),
         ("{kind: gone, from: 1, to: 4}", "[0].kind: got 'gone'", "'frozen', 'missing' or 'spike'"),
         ("{kind: frozen, from: 1, to: 4, leg: 3}", "[0].leg: got 3", "expected null"),
-        ("{kind: frozen, from: 1, to: 4, leg: 7}", "[0].leg: got 7", "of at most 6"),
+        ("{kind: frozen, from: 1, to: 4, leg: 7}", "[0].leg: got 7", "less than or equal to 6"),
         ("{kind: frozen, frm: 1, to: 4}", "[0].frm: unknown key", "sensor.faults[0].from"),
         ("{kind: frozen, to: 4}", "[0].from: is missing", ""),
-        ("{kind: frozen, from: -1, to: 4}", "[0].from: got -1", "of at least 0"),
+        ("{kind: frozen, from: -1, to: 4}", "[0].from: got -1", "greater than or equal to 0"),
         ("{kind: frozen, from: 1, to: .nan}", "[0].to: got nan", "a finite number"),
         ("{kind: missing, from: 1, to: 4, size: 3}", "[0].size: got 3.0", "with kind 'spike'"),
-        ("{kind: spike, from: 1, to: 4, size: 0}", "[0].size: got 0", "above 0"),
-        ("3", "[0]: got 3", "a mapping"),
+        ("{kind: spike, from: 1, to: 4, size: 0}", "[0].size: got 0", "greater than 0"),
+        ("3", "[0]: got 3", "an object"),
     ],
 )
 def test_faults_that_cannot_be_are_one_clear_line(text: str, where: str, expected: str) -> None:

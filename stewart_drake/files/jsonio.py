@@ -1,15 +1,11 @@
-"""JSON, strict to read: one object, every key once, finite numbers, text that is text.
-
-Written whole or not at all, with null for a number that is not finite.
-"""
+"""JSON: one object with every key once, written whole or not at all, NaN and infinity as null."""
 
 import json
-import math
 import re
 import zlib
 from collections import Counter
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 import numpy as np
 
@@ -17,12 +13,11 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import read_bytes, replacing
 from stewart_drake.files.yamlio import brief
 
-_MAX_DEPTH: Final = 50
 _SEAL: Final = re.compile(rb'\{"crc32": "([0-9a-f]{8})", ')
 
 
 def load_json(path: Path, most: int, expected: str, *, sealed: bool = False) -> dict[str, Any]:
-    """Reads one JSON object from a file; nothing in it is executed.
+    """Read one JSON object from a file.
 
     Args:
         path: a UTF-8 file.
@@ -32,9 +27,8 @@ def load_json(path: Path, most: int, expected: str, *, sealed: bool = False) -> 
             not returned.
 
     Raises:
-        ConfigError: the file cannot be read or decoded, is not one object, or holds a key twice, a
-            number that is not finite, half a surrogate pair or something nested deeper than 50
-            levels. One line, opened by the path.
+        ConfigError: the file cannot be read or decoded, is not one object, or holds a key twice.
+            One line, opened by the path.
     """
     raw = read_bytes(path, most, expected)
     if sealed:
@@ -48,13 +42,7 @@ def load_json(path: Path, most: int, expected: str, *, sealed: bool = False) -> 
             raise ConfigError(f"{path}: is damaged, its checksum differs; expected {expected}")
         raw = b"{" + raw
     try:
-        data = json.loads(
-            raw.decode("utf-8"),
-            parse_constant=_no_constant,
-            parse_float=_finite,
-            object_pairs_hook=_unique,
-        )
-        _check(data)
+        data = json.loads(raw.decode("utf-8"), object_pairs_hook=_unique)
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: is not UTF-8 text; expected {expected}") from None
     except (ValueError, RecursionError) as error:
@@ -81,7 +69,7 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def jsonable(data: Any) -> Any:
-    """Plain JSON values: arrays as lists, non-finite numbers as None."""
+    """Return plain JSON values: arrays as lists, non-finite numbers as None."""
     if isinstance(data, dict):
         return {str(key): jsonable(value) for key, value in data.items()}
     if isinstance(data, (list, tuple, np.ndarray)):
@@ -91,34 +79,9 @@ def jsonable(data: Any) -> Any:
     return data.item() if isinstance(data, np.generic) else data
 
 
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not a number that JSON has")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{brief(text)} is larger than any float")
-    return value
-
-
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    for key, number in Counter(key for key, _ in pairs).items():
-        if number > 1:
-            raise ValueError(f"key {brief(key)} given {number} times")
-    return dict(pairs)
-
-
-def _check(data: Any) -> None:
-    """Refuse depth and half surrogate pairs, which whatever writes the data again trips over."""
-    todo = [(data, 1)]
-    while todo:
-        value, depth = todo.pop()
-        if depth > _MAX_DEPTH:
-            raise ValueError("nested too deep")
-        if isinstance(value, dict):
-            todo += [(item, depth + 1) for pair in value.items() for item in pair]
-        elif isinstance(value, list):
-            todo += [(item, depth + 1) for item in value]
-        elif isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
-            raise ValueError(f"{brief(value)} holds half a surrogate pair")
+    data = dict(pairs)
+    if len(data) < len(pairs):
+        twice = next(key for key, number in Counter(key for key, _ in pairs).items() if number > 1)
+        raise ValueError(f"key {brief(twice)} given more than once")
+    return data

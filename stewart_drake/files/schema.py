@@ -4,9 +4,8 @@ Such a section is a union of dataclasses, told apart by their field `kind`.
 """
 
 import dataclasses
-import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 from pydantic import GetCoreSchemaHandler
@@ -53,11 +52,9 @@ def _members(hint: Any) -> dict[str, Any]:
 
 
 def field_names(hint: Any) -> list[str]:
-    """Of a section, or of all its kinds; none where the annotation is of no section."""
-    owners = list(kinds(hint).values()) or [_alternative(hint, _is_section)]
-    return [
-        spelling(owner, name) for owner in owners if owner for name in typing.get_type_hints(owner)
-    ]
+    """Return the names of the fields of a section, or of all its kinds."""
+    owners = list(kinds(hint).values()) or [hint]
+    return [spelling(owner, name) for owner in owners for name in typing.get_type_hints(owner)]
 
 
 def spelling(owner: Any, name: str) -> str:
@@ -76,39 +73,18 @@ def plain(value: Any) -> Any:
     return [plain(one) for one in value] if isinstance(value, list) else value
 
 
-def field_hint(owner: Any, name: str) -> Any:
-    """The annotation of a section's field, with a mark of kinds where it has one; None without."""
-    owner = _alternative(owner, _is_section)  # which may also be null
-    if owner is None:
-        return None
-    names = {spelling(owner, own): own for own in typing.get_type_hints(owner)}
-    own = names.get(name, name)
-    marked = typing.get_type_hints(owner, include_extras=True).get(own)
-    return marked if kinds(marked) else typing.get_type_hints(owner).get(own)
-
-
-def place_of(type_: Any, loc: Sequence[int | str]) -> tuple[tuple[int | str, ...], Any]:
-    """Where pydantic's `loc`, which has kinds in it, is in the file, and the annotation there."""
-    place, hint = list[int | str](), type_
-    for part in loc:
-        if kinds(hint):
-            hint = kinds(hint)[str(part)]
-            continue
-        place.append(part)
-        if isinstance(part, int):  # the items of a list
-            owner = _alternative(hint, lambda a: typing.get_origin(a) is list)
-            hint = typing.get_args(owner)[0] if owner else None
-        else:
-            owner = _alternative(hint, _is_section)
-            hint = field_hint(owner, part) if owner else None
-    return tuple(place), hint
+def dotted_names(hint: Any) -> Iterator[tuple[str, Any]]:
+    """Yield every field below a section, without places in lists: dotted name and owner."""
+    if not _is_section(hint):
+        for argument in typing.get_args(hint):
+            yield from dotted_names(argument)
+        return
+    for name, inner in typing.get_type_hints(hint).items():
+        if inner is not typing.ClassVar:
+            field = spelling(hint, name)
+            yield field, hint
+            yield from ((f"{field}.{below}", owner) for below, owner in dotted_names(inner))
 
 
 def _is_section(hint: Any) -> bool:
     return dataclasses.is_dataclass(hint) or is_typeddict(hint)
-
-
-def _alternative(hint: Any, wanted: Callable[[Any], bool]) -> Any:
-    """The member of the union `hint` that is `wanted`; a plain type is a union of one."""
-    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
-    return next((a for a in (typing.get_args(hint) if union else (hint,)) if wanted(a)), None)

@@ -10,7 +10,6 @@ import functools
 import io
 import json
 import re
-import types
 import typing
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -27,7 +26,7 @@ from ruamel.yaml.representer import RoundTripRepresenter
 
 from stewart_drake.files.errors import ConfigError, resembling
 from stewart_drake.files.fileio import read_bytes
-from stewart_drake.files.schema import field_hint, field_names, kinds, place_of
+from stewart_drake.files.schema import dotted_names
 
 _MAX_BYTES: Final = 100_000
 _MAX_DEPTH: Final = 20
@@ -177,17 +176,16 @@ def validate(type_: type[_T], data: dict[str, Any], where: str) -> _T:
 
     Raises:
         ConfigError: `<where>: <section.field>: got <value>; expected <what is accepted>`, one after
-            the other in one line. Unknown keys, each with the nearest known one, keep the others
-            back, for which they may be the reason.
+            the other in one line, what is accepted in pydantic's words. Unknown keys, each with the
+            nearest known one, keep the others back, for which they may be the reason.
     """
     try:
         # JSON mode is the one in which strict pydantic lets a mapping become a nested dataclass.
         return pydantic.TypeAdapter(type_).validate_json(json.dumps(data))
     except pydantic.ValidationError as caught:
         errors = caught.errors(include_url=False)
-        unknown = [e for e in errors if _is_unknown(e)]
         if errors[0]["type"] != "json_invalid":  # half a surrogate pair is no JSON text
-            raise ConfigError(f"{where}: {_explain_all(type_, unknown or errors)}") from None
+            raise ConfigError(f"{where}: {_explained(type_, data, errors)}") from None
     except (TypeError, ValueError, RecursionError):
         pass
     raise ConfigError(f"{where}: got {brief(data)}; expected plain numbers, text and lists")
@@ -267,88 +265,54 @@ def _cut(text: str, length: int) -> str:
     return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
-_EXPECTED: Final = {
-    "bool_type": "true or false",
-    "dataclass_type": "a mapping",
-    "dict_type": "a mapping",
-    "finite_number": "a finite number",
-    "float_type": "a number",
-    "int_type": "a whole number",
-    "list_type": "a list",
-    "string_type": "text",
-}
-_BOUNDS: Final = {
-    "greater_than": ("above", "gt"),
-    "greater_than_equal": ("of at least", "ge"),
-    "less_than": ("below", "lt"),
-    "less_than_equal": ("of at most", "le"),
-}
+def _explained(type_: type, data: Any, errors: list[Any]) -> str:
+    """Return the first few problems in one line; unknown keys keep the others back."""
+    unknown = [e for e in errors if e["type"] in ("extra_forbidden", "unexpected_keyword_argument")]
+    told = [_explain_unknown(type_, data, error) for error in unknown]
+    told = told or [_explain(data, error) for error in errors]
+    more = [f"and {len(told) - _MOST_PROBLEMS} more"] if len(told) > _MOST_PROBLEMS else []
+    return "; ".join([*told[:_MOST_PROBLEMS], *more])
 
 
-def _is_unknown(error: Any) -> bool:
-    return error["type"] == "extra_forbidden" or error["type"].startswith("unexpected_")
-
-
-def _explain_all(type_: type, errors: list[Any]) -> str:
-    """All that is missing, and the first few of what is wrong."""
-    absent = [error for error in errors if error["type"].startswith("missing")]
-    missing = [_dotted(place_of(type_, error["loc"])[0]) for error in absent]
-    problems = [_explain(type_, error) for error in errors if error not in absent]
-    kept = problems[:_MOST_PROBLEMS]
-    if missing:
-        kept.append(
-            f"{_cut(', '.join(missing), 200)}: {'is' if len(missing) == 1 else 'are'} missing"
-        )
-    if len(problems) > _MOST_PROBLEMS:
-        kept.append(f"and {len(problems) - _MOST_PROBLEMS} more")
-    return "; ".join(kept)
-
-
-def _explain(type_: type, error: Any) -> str:
-    loc: tuple[int | str, ...] = error["loc"]
-    place, hint = place_of(type_, loc)
-    field, value = _dotted(place), error["input"]
-    if _is_unknown(error):
-        return _explain_unknown(type_, error)
+def _explain(data: Any, error: Any) -> str:
+    place, value = _place(data, error["loc"]), error["input"]
+    expected = re.sub(r"^(\w+ should (be|have) |Value error, )| after validation", "", error["msg"])
+    if error["type"].startswith("missing"):
+        return f"{place}.{error['loc'][-1]}: is missing".removeprefix(".")
     if error["type"] == "union_tag_invalid":
-        *others, last = map(repr, kinds(hint))
-        field, value = f"{field}.kind", value["kind"] if isinstance(value, dict) else value
-        expected = f"{', '.join(others)} or {last}" if others else last
-    elif error["type"] in _EXPECTED:
-        expected = _EXPECTED[error["type"]]
-    elif error["type"] in _BOUNDS:
-        words, key = _BOUNDS[error["type"]]
-        expected = f"a number {words} {error['ctx'][key]:.12g}"
-    else:
-        expected = re.sub(r"^(\w+ should (be|have) |Value error, )", "", error["msg"])
-        expected = expected.replace(" after validation", "")
-    if types.NoneType in typing.get_args(hint):
-        expected += ", or null"
-    return f"{field}: got {brief(value)}; expected {expected}"
+        place, value, expected = f"{place}.kind", error["ctx"]["tag"], error["ctx"]["expected_tags"]
+    return f"{place}: got {brief(value)}; expected {expected}"
 
 
-def _explain_unknown(type_: type, error: Any) -> str:
-    *above, name = error["loc"]
-    place, section = place_of(type_, above)
-    known, field = field_names(section), _cut(_dotted((*place, name)), 60)
-    if new := getattr(section, "renamed", {}).get(name):
-        return f"{field}: unknown key; it is called {_dotted((*place, new))} since 0.3"
-    union = place_of(type_, above[:-1])[1]
-    if kinds(union) and name in field_names(union):  # of another kind, without an effect
-        own = ", ".join(other for other in known if other != "kind") or "none but kind"
+def _explain_unknown(type_: type, data: Any, error: Any) -> str:
+    place, known = _place(data, error["loc"]), dict(dotted_names(type_))
+    plain = re.sub(r"\[\d+\]", "", place)
+    above, _, name = plain.rpartition(".")
+    section = place.rpartition(".")[0]
+    if plain in known:
         return (
-            f"{field}: got {brief(error['input'])}, which kind {section.kind!r} does not use; "
-            f"expected only its own fields: {own}"
+            f"{_cut(place, 60)}: got {brief(error['input'])}, which kind {error['loc'][-2]!r} does "
+            "not use; expected a field of that kind"
         )
-    alike = resembling(name, known)
+    beside = [one.rpartition(".")[2] for one in known if one.rpartition(".")[0] == above]
+    owners = (known[f"{above}.{one}".removeprefix(".")] for one in beside)
+    if new := next((o.renamed[name] for o in owners if name in getattr(o, "renamed", ())), None):
+        new = f"{section}.{new}".removeprefix(".")
+        return f"{_cut(place, 60)}: unknown key; it is called {new} since 0.3"
+    alike = [f"{section}.{one}".removeprefix(".") for one in resembling(name, beside)]
     # A field may have been named without its section.
-    deeper = [f"{at}.{name}" for at in known if name in field_names(field_hint(section, at))]
-    meant = alike[0] if alike else deeper[0] if len(deeper) == 1 else None
-    hint = f"did you mean {_dotted((*place, meant))}?" if meant else ""
-    return f"{field}: unknown key; {hint or 'expected one of ' + ', '.join(known)}"
+    deeper = [one for one in known if one.endswith(f".{name}")]
+    meant = alike or (deeper if len(deeper) == 1 else [])
+    hint = f"did you mean {meant[0]}?" if meant else f"expected one of {', '.join(beside)}"
+    return f"{_cut(place, 60)}: unknown key; {hint}"
 
 
-def _dotted(loc: tuple[int | str, ...]) -> str:
-    """`("reference", "poses", 2, 0)` as `reference.poses[2][0]`."""
-    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
-    return "".join(parts).removeprefix(".")
+def _place(data: Any, loc: Iterable[int | str]) -> str:
+    """Return where pydantic's `loc`, which also names kinds, is in the data, as `a.poses[2][0]`."""
+    place = ""
+    for part in loc:
+        if isinstance(part, int) and isinstance(data, list):
+            place, data = f"{place}[{part}]", data[part]
+        elif isinstance(data, dict) and part in data:
+            place, data = f"{place}.{part}", data[part]
+    return place.removeprefix(".")

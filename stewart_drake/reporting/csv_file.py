@@ -95,6 +95,8 @@ def _problem(signals: xr.Dataset) -> str | None:
     # What is no coordinate can be asked for as well, and is an index then.
     if "time" not in signals.coords or signals.time.dims != ("time",):
         return "the coordinate time is missing"
+    if not all(signals.sizes.values()):
+        return "a dimension is empty"
     time = signals.time
     for name, signal in {"time": time, **signals.data_vars}.items():
         if signal.dtype.kind not in "fiu" or " since " in str(signal.attrs.get("units")):

@@ -206,7 +206,7 @@ def read_condition(path: Path, runs: int, samples: int = SAMPLES) -> dict[str, N
     elif (np.isnan(found["stopped"]) != done).any() or (
         np.isnan(found["accumulated_error"]) == done
     ).any():
-        problem = "stopped and E_ac do not go with the status"
+        problem = "stopped and E_ac do not go with the status; expected those of one run"
     elif not there[done].all() or not np.isnan(found["samples"][~there]).all():
         problem = "samples: some are missing; expected all of a run that completed"
     if problem:
