@@ -18,7 +18,7 @@ from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
-from stewart_drake.reporting.identification_document import document, plan_document
+from stewart_drake.reporting.identification import document, plan_document
 from stewart_drake.reporting.results import AnalysisResult, analysis_result
 from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario

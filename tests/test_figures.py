@@ -7,14 +7,13 @@ from xml.etree import ElementTree
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.reporting import figures
 from stewart_drake.reporting.figures import comparison_figures, run_figures
-from stewart_drake.reporting.style import CONTROLLER_LINES
+from stewart_drake.reporting.style import CONTROLLER_LINES, controller_lines
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 
@@ -135,19 +134,6 @@ def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(compar
     assert legend == ["reference", *(LABELS[name] for name in CONTROLLERS), "run ended"]
 
 
-@pytest.mark.slow
-def test_labels_of_small_values_stay_off_the_names_of_the_axes(run, drawn):
-    """A plate that follows to 1e-3 has many digits to be shown."""
-    for size in (3e-6, 8e-6, 3e-5, 2e-4, 5e-3, 0.1):
-        signals = run.signals.copy()
-        signals["error"] = signals.error * 0 + size * np.linspace(-1, 0.2, 51)[:, None]
-        run_figures(dataclasses.replace(run, signals=signals), "unused")
-        drawn["errors"].canvas.draw()
-        for ax in drawn["errors"].axes:
-            name = ax.yaxis.label.get_window_extent().x1
-            assert all(name < text.get_window_extent().x0 for text in ax.get_yticklabels())
-
-
 def test_rounding_does_not_fill_the_axis_of_a_coordinate_that_rests(run, drawn):
     signals = run.signals.copy(deep=True)
     signals["reference"][:, 4] = 0.0
@@ -203,12 +189,12 @@ def test_an_unwritable_directory_is_reported(run, tmp_path):
         run_figures(run, tmp_path / "missing")
 
 
-def test_names_take_as_many_lines_as_they_need() -> None:
-    for number, name in ((3, "short"), (7, "LQI, delay-aware"), (9, "a name that is longer still")):
-        figure = Figure(figsize=(9, 6))
-        ax = figure.subplots()
-        for _ in range(number):
-            ax.plot([0, 1], label=name)
-        figures._with_legend(figure, [ax])
-        box = figure.legends[0].get_window_extent()
-        assert len(figure.legends) == 1 and 0 <= box.x0 < box.x1 <= figure.bbox.x1
+@pytest.mark.parametrize("number", [3, 7, 12])
+def test_any_number_of_controllers_is_told_apart_and_named_on_the_figure(run, drawn, number):
+    names = [*CONTROLLERS, *(f"a controller of my own {k}" for k in range(7))][:number]
+    lines = controller_lines(names)
+    grey = {(line.linestyle, line.marker) for line in lines.values()}
+    assert len(grey) == len(set(lines.values())) == number
+    comparison_figures(dict.fromkeys(names, run), "unused")
+    box = drawn["states"].legends[0].get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= drawn["states"].bbox.x1

@@ -41,7 +41,7 @@ from stewart_drake.live.steering import Steering, Way, Wish
 from stewart_drake.loop.experiment import control_law, prepare
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.reporting.run_document import run_document
+from stewart_drake.reporting.run import run_document
 from stewart_drake.reporting.style import FACTORS
 from stewart_drake.reporting.viewer import slider_range
 from stewart_drake.scenario.loading import load_scenario

@@ -20,7 +20,7 @@ from stewart_drake.files.resources import data_root, shipped
 from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.reporting.mechanism_figures import mechanism_figure
+from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.reporting.viewer import SLIDERS, STOP, PoseViewer, place, slider_range
 from stewart_drake.studies.mechanism_check import check_mechanism
 from tests.mechanisms import PAPER, random_mechanism

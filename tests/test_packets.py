@@ -21,7 +21,7 @@ from stewart_drake.loop.experiment import compose_law, prepare
 from stewart_drake.loop.late_measurements import LateMeasurements
 from stewart_drake.loop.playout import PlayoutBuffer
 from stewart_drake.loop.simulation import make_simulator
-from stewart_drake.reporting.link_document import document
+from stewart_drake.reporting.link import document
 from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.scenario.config import NetworkConfig, PacketsConfig
 from stewart_drake.scenario.delay import Delay

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import stewart_drake as sd
-from stewart_drake.reporting import hautus_document
+from stewart_drake.reporting import hautus as hautus_document
 from stewart_drake.reporting.document import Document, Picture, Section, Table
 from stewart_drake.reporting.page import Provenance, write_page
 from stewart_drake.reporting.style import CONTROLLER_LINES, figure_style

@@ -14,11 +14,11 @@ from stewart_drake.cli import main
 from stewart_drake.cli import run as run_command
 from stewart_drake.reporting import (
     figures,
-    hautus_document,
-    mechanism_figures,
+    hautus,
+    mechanism,
     replay,
-    report_document,
 )
+from stewart_drake.reporting import report as report_document
 from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, LABELS, SERVOS
 
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.3", "--set", "delay.steps=1")
@@ -45,8 +45,8 @@ def names(folder: Path) -> set[str]:
         (("simulate", *EXACT), figures, "draw_run", {"signals.nc"}),
         (("simulate", *EXACT, "--replay"), replay, "replay_html", {"signals.nc", "states.png"}),
         (("compare", *EXACT), figures, "draw_comparison", {f"{name}.nc" for name in CONTROLLERS}),
-        (("analyze", "hautus"), hautus_document, "plant_figure", set()),
-        (("model", "check", "paper"), mechanism_figures, "mechanism_figure", set()),
+        (("analyze", "hautus"), hautus, "plant_figure", set()),
+        (("model", "check", "paper"), mechanism, "mechanism_figure", set()),
     ],
 )
 def test_a_failure_while_drawing_costs_the_figures_only(

@@ -28,8 +28,7 @@ from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism import kinematics
 from stewart_drake.reporting.page import Provenance, html
-from stewart_drake.reporting.robustness_document import document
-from stewart_drake.reporting.robustness_figures import influence_figure
+from stewart_drake.reporting.robustness import document, influence_figure
 from stewart_drake.scenario.config import Scenario, StateSensorConfig
 from stewart_drake.studies import robustness, statistics
 from stewart_drake.studies.failures import auc_interval, explain

@@ -11,7 +11,7 @@ from stewart_drake.loop.controller_margin import controller_margin
 from stewart_drake.loop.experiment import check_instants, compose_law, prepare
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.reporting.document import Paragraph, Table
-from stewart_drake.reporting.table_two import table_two_blocks
+from stewart_drake.reporting.run import table_two_blocks
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.studies.compare import CONTROLLERS, comparison_summary, label

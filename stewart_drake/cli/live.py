@@ -157,7 +157,7 @@ def _show(url: str) -> None:
 
 def _told(delivery: Delivery, result: "SimulationResult") -> int:
     """Write and print what has come of it."""
-    from stewart_drake.reporting.run_document import run_document
+    from stewart_drake.reporting.run import run_document
 
     stopped = result.stopped
     told: Any = result.summary

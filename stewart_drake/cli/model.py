@@ -50,10 +50,10 @@ def check(
 ) -> None:
     """Check a mechanism and describe it at its home pose, under gravity."""
     from stewart_drake.functions import check_model
-    from stewart_drake.reporting.mechanism_document import document
+    from stewart_drake.reporting.mechanism import document
 
     def draw(folder: Path) -> None:
-        from stewart_drake.reporting.mechanism_figures import write_mechanism_figure
+        from stewart_drake.reporting.mechanism import write_mechanism_figure
 
         write_mechanism_figure(found.mechanism, folder)
 

@@ -105,7 +105,7 @@ def new(
 
 def _tell(delivery: Delivery, made: "NewMachine") -> None:
     """The machine at home, the motion, and what the delay does."""
-    from stewart_drake.reporting.mechanism_document import document
+    from stewart_drake.reporting.mechanism import document
     from stewart_drake.studies.verdict import Verdict, loop_verdict
 
     delivery.say(document(made.check).plain())

@@ -32,7 +32,7 @@ def report(
     It is run, compared under all shipped controllers, and analysed.
     """
     from stewart_drake.loop.experiment import simulated_machine
-    from stewart_drake.reporting import report_document
+    from stewart_drake.reporting import report as report_document
     from stewart_drake.reporting.collect import collect
     from stewart_drake.reporting.page import Provenance, command_line
     from stewart_drake.reporting.results import PAGE, AnalysisResult

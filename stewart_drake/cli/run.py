@@ -61,7 +61,7 @@ def simulate(
     from stewart_drake.loop.experiment import prepare
     from stewart_drake.loop.simulation import simulate as run
     from stewart_drake.reporting.document import Caution
-    from stewart_drake.reporting.run_document import run_document
+    from stewart_drake.reporting.run import run_document
     from stewart_drake.scenario.loading import load_scenario
     from stewart_drake.studies.verdict import Verdict, loop_verdict
 
@@ -196,7 +196,7 @@ def compare(
 ) -> int:
     """Run the shipped controllers on a scenario, as a table."""
     from stewart_drake.loop.experiment import prepare
-    from stewart_drake.reporting.run_document import comparison_document
+    from stewart_drake.reporting.run import comparison_document
     from stewart_drake.scenario.loading import load_understood
     from stewart_drake.studies import compare as study
     from stewart_drake.studies.verdict import delay_verdict

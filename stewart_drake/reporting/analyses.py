@@ -101,7 +101,7 @@ ANALYSES: Final = {
         second="directory",
     ),
 }
-"""By name. The function `document` of the module NAME_document describes the result."""
+"""By name. The function `document` of the module NAME describes the result."""
 
 
 def words_of(name: str) -> tuple[str, ...]:
@@ -146,7 +146,7 @@ def analyze(
     if row.counts:
         given |= {"options": options or options_of(name)(), "progress": progress}
     study = getattr(_module(name), f"study_{name}")
-    document = import_module(f"stewart_drake.reporting.{name}_document").document
+    document = import_module(f"stewart_drake.reporting.{name}").document
     found = analysis_result(lambda: study(scenario, **given), document, command)
     facts = {"link": text} if (text := link_text(scenario)) else {}
     return replace(

@@ -57,7 +57,7 @@ def report(
     Raises:
         ConfigError: bad input.
     """
-    from stewart_drake.reporting import report_document
+    from stewart_drake.reporting import report as report_document
     from stewart_drake.reporting.collect import collect
     from stewart_drake.reporting.page import Provenance
     from stewart_drake.reporting.replay import replay_html

@@ -6,13 +6,13 @@ terminal of 80 columns shows the verdict and, of sections that are not folded, t
 """
 
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import zip_longest
+from io import StringIO
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, TypeVar
 
-from stewart_drake.reporting.words import WIDTH, rows, sentence, wrap
+from stewart_drake.reporting.words import WIDTH, number, rows, sentence, wrap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,6 +22,7 @@ Tone = Literal["good", "fair", "bad", "plain"]
 
 _SHORT: Final = 36
 """Characters of a cell that stays on one line of a page."""
+_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True)
@@ -68,18 +69,14 @@ class Values:
         return rows(self.entries)
 
 
-Cell = str | None
-"""None is a cell that the one before it covers too."""
-
-
 @dataclass(frozen=True)
 class Table:
     """A table; its cells are shown as they are, columns of numbers to the right.
 
     Attributes:
         columns: the head, with units.
-        rows: as many cells each as there are columns.
-        caption: what it shows, a sentence.
+        rows: as many cells each as there are columns; a terminal breaks them at "\\n".
+        caption: a sentence above it.
         brief: whether a terminal shows it, or the heads that it has there, None for a column that
             is left out; "\\n" breaks a head.
 
@@ -88,92 +85,90 @@ class Table:
     """
 
     columns: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
+    rows: Sequence[Sequence[str]]
     caption: str = ""
     brief: bool | Sequence[str | None] = False
     kind: ClassVar = "table"
 
     def __post_init__(self) -> None:
-        for number, row in enumerate(self.rows, start=1):
+        for count, row in enumerate(self.rows, start=1):
             if len(row) != len(self.columns):
                 raise ValueError(
-                    f"row {number} has {len(row)} cells; expected {len(self.columns)}, one per "
+                    f"row {count} has {len(row)} cells; expected {len(self.columns)}, one per "
                     "column"
                 )
-
-    def joined(self, row: Sequence[Cell]) -> list[tuple[int, str, int]]:
-        """The cells of a row: its first column, the text, how many columns it covers."""
-        starts = [k for k, cell in enumerate(row) if cell is not None]
-        ends = [*starts[1:], len(row)]
-        return [(k, row[k] or "", end - k) for k, end in zip(starts, ends, strict=True)]
-
-    def _single(self, k: int) -> list[str]:
-        cells = [one for row in self.rows for one in self.joined(row)]
-        return [text for first, text, count in cells if first == k and count == 1]
 
     @cached_property
     def short(self) -> list[bool]:
         """Per column, whether no cell need be broken over lines."""
-        return [all(len(text) <= _SHORT for text in self._single(k)) for k in self._numbers]
+        return [all(len(row[k]) <= _SHORT for row in self.rows) for k in range(len(self.columns))]
 
     @cached_property
     def numeric(self) -> list[bool]:
         """Per column, whether its cells are numbers (or dashes) and are aligned to the right."""
         return [
-            bool(self._single(k)) and all(map(_is_number, self._single(k))) for k in self._numbers
+            bool(self.rows) and all(_is_number(row[k]) for row in self.rows)
+            for k in range(len(self.columns))
         ]
-
-    @property
-    def _numbers(self) -> range:
-        return range(len(self.columns))
 
     def plain(self) -> str:
-        """For a terminal: what is too wide is wrapped, the widest column first."""
-        heads = self.columns if isinstance(self.brief, bool) else self.brief
-        kept = [k for k, head in enumerate(heads) if head is not None]
-        shown = Table([heads[k] or "" for k in kept], [[row[k] for k in kept] for row in self.rows])
-        gap, widths = shown._fitting()
-        right = [self.numeric[k] for k in kept]
-        lines = [wrap(self.caption)] if self.caption else []
-        for row, is_head in [(shown.columns, True), *((row, False) for row in shown.rows)]:
-            columns = []
-            for k, text, count in shown.joined(row):
-                width = sum(widths[k : k + count]) + gap * (count - 1)
-                parts = [p for line in text.split("\n") for p in textwrap.wrap(line, width)]
-                columns.append([(p.rjust if right[k] else p.ljust)(width) for p in parts or [""]])
-                if is_head:  # stands on the line below it
-                    columns[-1].reverse()
-            blanks = [" " * len(column[0]) for column in columns]
-            told = [
-                (" " * gap).join(p or b for p, b in zip(line, blanks, strict=True)).rstrip()
-                for line in zip_longest(*columns)
-            ]
-            lines += reversed(told) if is_head else told
-        return "\n".join(lines)
+        """Return the table for a terminal; what is too wide is wrapped."""
+        from rich.console import Console
+        from rich.table import Table as Grid
+        from rich.text import Text
 
-    def _fitting(self) -> tuple[int, list[int]]:
-        """The gap between columns and their widths, with heads of as few lines as will do."""
-        for gap in (2, 1):
-            for lines in range(1, 6):
-                widths = self._widths(lines)
-                if sum(widths) + gap * (len(widths) - 1) <= WIDTH:
-                    return gap, widths
-        while sum(widths) + len(widths) - 1 > WIDTH:
-            widths[widths.index(max(widths))] -= 1
-        return 1, widths
-
-    def _widths(self, lines: int) -> list[int]:
-        """Of columns that hold their cells, and their heads in so many lines."""
-        widths = [
-            max(map(len, [_broken(head, lines), *self._single(k)]))
-            for k, head in enumerate(self.columns)
+        console = Console(width=WIDTH, file=StringIO(), color_system=None)
+        brief = self.columns if isinstance(self.brief, bool) else self.brief
+        kept = [k for k, head in enumerate(brief) if head is not None]
+        heads = [brief[k] or "" for k in kept]
+        cells = [
+            min(
+                _SHORT,
+                max((len(part) for row in self.rows for part in row[k].split("\n")), default=1),
+            )
+            for k in kept
         ]
+        for gap, most in ((2, WIDTH), (2, 16), (2, 13), (2, 10), (2, 1), (1, 10), (1, 1)):
+            shown = [
+                head
+                if "\n" in head
+                else textwrap.fill(head, max(width, most), break_long_words=False)
+                for head, width in zip(heads, cells, strict=True)
+            ]
+            widths = [
+                max(width, *map(len, head.split("\n")))
+                for head, width in zip(shown, cells, strict=True)
+            ]
+            if sum(widths) + gap * (len(kept) - 1) <= WIDTH:
+                break
+        grid = Grid(box=None, padding=(0, gap, 0, 0), pad_edge=False)
+        for k, head in zip(kept, shown, strict=True):
+            grid.add_column(Text(head), justify="right" if self.numeric[k] else "left")
         for row in self.rows:
-            for k, text, count in self.joined(row):
-                lacking = len(text) - sum(widths[k : k + count]) - (count - 1)
-                for j in range(lacking):
-                    widths[k + j % count] += 1
-        return widths
+            grid.add_row(*(Text(row[k]) for k in kept))
+        with console.capture() as capture:
+            console.print(grid)
+        lines = [line.rstrip() for line in capture.get().splitlines()]
+        return "\n".join([*([wrap(self.caption)] if self.caption else []), *lines])
+
+
+def table(
+    items: Iterable[_Item],
+    columns: Mapping[str, Callable[[_Item], object]],
+    caption: str = "",
+    brief: bool | Sequence[str | None] = False,
+) -> Table:
+    """Return a table with a row per item, and per column how a cell follows from it.
+
+    Floats get three significant digits. Blanks at the end of a head tell it from another one that
+    is shown alike.
+    """
+    rows = [[_text(cell(item)) for cell in columns.values()] for item in items]
+    return Table([head.rstrip(" ") for head in columns], rows, caption, brief)
+
+
+def _text(value: object) -> str:
+    return number(value) if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True)
@@ -271,17 +266,7 @@ class Document:
             ]
             if told and not section.folded:
                 text += "\n".join([f"\n\n{section.heading}" if section.heading else "", *told])
-        return text.strip()
-
-
-def _broken(head: str, lines: int) -> str:
-    """The widest line of a head that is broken as evenly as so many lines allow."""
-    broken = head.split("\n")
-    if len(broken) == 1:
-        widths = range(max(map(len, head.split()), default=1), len(head) + 1)
-        wrapped = (textwrap.wrap(head, width) for width in widths)
-        broken = next((parts for parts in wrapped if len(parts) <= lines), [head])
-    return max(broken, key=len)
+        return text.strip("\n")
 
 
 def _is_number(cell: str) -> bool:

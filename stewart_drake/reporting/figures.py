@@ -3,19 +3,19 @@
 Angles are shown in degrees, positions in mm. A run that ended early ends with a cross at that time.
 """
 
-import math
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting import style
-from stewart_drake.reporting.style import FACTORS, UNITS, figure_style, write_figures
+from stewart_drake.reporting.panels import Curve, Panel, draw
+from stewart_drake.reporting.style import FACTORS, UNITS, Line, figure_style, write_figures
 from stewart_drake.reporting.tuner_figures import shown_until, weights_figure
 from stewart_drake.scenario.config import FixedTunerConfig
 from stewart_drake.scenario.signals import (
@@ -32,29 +32,22 @@ from stewart_drake.studies.compare import label as spoken
 from stewart_drake.types import Array
 
 TORQUE_CONTROLLERS: Final = ("delay_lqr", "delay_lqi", "predictor_lqi")
-"""Those whose torques a comparison shows: they know of the delay."""
+"""Controllers that know of the delay, whose torques a comparison shows."""
 
 _SYMBOLS: Final = dict(zip(COORDINATES, ("roll φ", "pitch θ", "yaw ψ", "x", "y", "z"), strict=True))
 _PARAMETER_UNITS: Final = ("mN m",) * 6 + ("kg", "mN m s/rad")
 _PARAMETER_FACTORS: Final = np.array([1e3] * 6 + [1.0, 1e3])
-_CROSS: Final = "x"
 _STATE_REACH: Final = 0.3
 _ERROR_REACH: Final = 0.5
 """How far a diverging run may widen an axis, as a share of the reference's peak to peak."""
 _LEAST_SIGMAS: Final = 0.02
-"""A parameter's axis shows at least this share of its largest standard deviation to either side:
-the band narrows by orders of magnitude, and the estimate counts."""
+"""A parameter's axis shows at least this share of its largest standard deviation to either side."""
 _LEAST_SPAN: Final = 0.02
-"""A coordinate's axis spans at least this share of the widest motion among those of its unit: where
-the reference rests, rounding is not to fill it."""
-_LEFT: Final = 0.09
-_RIGHT: Final = 0.985
-"""Of a figure's width, where its axes begin and end."""
-_STRIP: Final = 1.6
-_STRIP_FOOT: Final = 0.45
-"""Inches: the strip of packets, and its room for the time axis."""
+"""Least span of a coordinate's axis, as a share of the widest motion among those of its unit."""
 _MARGIN: Final = 0.06
 """Empty share of an axis beyond the data."""
+
+_Runs = Mapping[str, tuple[SimulationResult, Line]]
 
 
 def comparison_figures(
@@ -62,14 +55,7 @@ def comparison_figures(
 ) -> list[Path]:
     """Write states, errors, and torques of each delay-aware controller, as PNG and SVG.
 
-    Of those that find the delay, also how; with the neural tuner, the weights that it set.
-
-    Args:
-        results: by controller, as `compare` returns them.
-        directory: that exists.
-
-    Returns:
-        The paths written; none without results.
+    Controllers that find the delay add a figure of it, the neural tuner one of its weights.
 
     Raises:
         OSError: the directory cannot be written to.
@@ -78,43 +64,31 @@ def comparison_figures(
 
 
 def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure]:
-    """The figures that `comparison_figures` writes, by name; none without results."""
+    """Return the figures that `comparison_figures` writes, by name; none without results."""
     if not results:
         return {}
-    lines = {spoken(name): style.controller_line(name) for name in results}
-    runs = {spoken(name): result for name, result in results.items()}
-    shown = (
-        *TORQUE_CONTROLLERS,
-        ADAPTIVE,
-        *SERVOS,
-        *(name for name in results if name not in LABELS),
-    )
+    lines = style.controller_lines(results)
+    runs = {spoken(name): (result, lines[name]) for name, result in results.items()}
+    own = (name for name in results if name not in LABELS)
+    shown = (*TORQUE_CONTROLLERS, ADAPTIVE, *SERVOS, *own)
     aware = {name: results[name] for name in shown if name in results}
-    with figure_style():
-        figures = {"states": _states(runs, lines), "errors": _errors(runs, lines)}
-        for name, result in aware.items():
-            line = style.controller_line(name)
-            figures[f"torques_{name}"] = _torques(result, spoken(name), line)
-        for name, result in aware.items():
-            if _finds_delay(result):
-                figures[f"delay_{name}"] = _delay(result)
-        tuned = {spoken(n): run for n, run in aware.items() if _is_tuned(run)}
-        if tuned:
+    figures = {"states": _states(runs), "errors": _errors(runs)}
+    for name, result in aware.items():
+        figures[f"torques_{name}"] = _torques(result, spoken(name), lines[name])
+    for name, result in aware.items():
+        if _finds_delay(result):
+            figures[f"delay_{name}"] = _delay(result)
+    tuned = {spoken(name): run for name, run in aware.items() if _is_tuned(run)}
+    if tuned:
+        with figure_style():
             figures["weights"] = weights_figure(tuned)
-        return figures
+    return figures
 
 
 def run_figures(result: SimulationResult, directory: str | Path) -> list[Path]:
     """Write states, errors, torques and, with an estimator, the parameters, as PNG and SVG.
 
-    With the neural tuner, also the weights that it set.
-
-    Args:
-        result: of one run.
-        directory: that exists.
-
-    Returns:
-        The paths written.
+    The neural tuner adds a figure of the weights that it set.
 
     Raises:
         OSError: the directory cannot be written to.
@@ -123,21 +97,21 @@ def run_figures(result: SimulationResult, directory: str | Path) -> list[Path]:
 
 
 def draw_run(result: SimulationResult) -> dict[str, Figure]:
-    """The figures that `run_figures` writes, by name."""
-    runs, lines = {"plate": result}, {"plate": style.RUN}
-    with figure_style():
-        figures = {
-            "states": _states(runs, lines),
-            "errors": _errors(runs, lines),
-            "torques": _torques(result, "applied", style.RUN, commanded=True),
-        }
-        if np.isfinite(result.signals.parameter_std.values).any():
-            figures["parameters"] = _parameters(result)
-        if _finds_delay(result):
-            figures["delay"] = _delay(result)
-        if _is_tuned(result):
+    """Return the figures that `run_figures` writes, by name."""
+    runs = {"plate": (result, style.RUN)}
+    figures = {
+        "states": _states(runs),
+        "errors": _errors(runs),
+        "torques": _torques(result, "applied", style.RUN, commanded=True),
+    }
+    if np.isfinite(result.signals.parameter_std.values).any():
+        figures["parameters"] = _parameters(result)
+    if _finds_delay(result):
+        figures["delay"] = _delay(result)
+    if _is_tuned(result):
+        with figure_style():
             figures["weights"] = weights_figure({"weights that the tuner set": result})
-        return figures
+    return figures
 
 
 def _is_tuned(run: SimulationResult) -> bool:
@@ -148,62 +122,65 @@ def _finds_delay(run: SimulationResult) -> bool:
     return bool(np.isfinite(run.signals.delay_std.values).any())
 
 
-def _states(runs: Mapping[str, SimulationResult], lines: Mapping[str, style.Line]) -> Figure:
-    figure, axes = _grid(runs.values())
-    wanted = max((run.signals for run in runs.values()), key=lambda s: s.sizes["time"])
-    spans = FACTORS * np.array([_span(values) for values in wanted.reference.values.T])
-    least = _LEAST_SPAN * np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
-    for k, ax in enumerate(axes):
-        reference = FACTORS[k] * wanted.reference.values[:, k]
-        ax.plot(wanted.time.values, reference, label="reference", **style.REFERENCE._asdict())
-        data = {label: FACTORS[k] * run.signals.pose.values[:, k] for label, run in runs.items()}
-        _limit(ax, [reference, *_trusted(runs, data)], data, _STATE_REACH * spans[k], least[k])
-        _plot(ax, runs, lines, data)
-        ax.set_ylabel(f"{_SYMBOLS[COORDINATES[k]]}  [{UNITS[k]}]")
-    return _with_legend(figure, axes)
-
-
-def _errors(runs: Mapping[str, SimulationResult], lines: Mapping[str, style.Line]) -> Figure:
-    figure, axes = _grid(runs.values())
-    for k, ax in enumerate(axes):
-        data = {label: FACTORS[k] * run.signals.error.values[:, k] for label, run in runs.items()}
-        motion = FACTORS[k] * max(
-            (_span(run.signals.reference.values[:, k]) for run in runs.values()), default=0.0
-        )
-        _limit(ax, _trusted(runs, data), data, _ERROR_REACH * motion)
-        _plot(ax, runs, lines, data)
-        ax.set_ylabel(f"{_SYMBOLS[COORDINATES[k]]} error  [{UNITS[k]}]")
-    return _with_legend(figure, axes)
-
-
-def _torques(
-    run: SimulationResult, label: str, line: style.Line, commanded: bool = False
-) -> Figure:
-    figure, axes = _grid([run], sharey=True, strip=_STRIP if has_packets(run) else 0.0)
-    steps: dict[str, Any] = {"drawstyle": "steps-post"}
-    for k, ax in enumerate(axes):
-        time = run.signals.time.values
-        if commanded:
-            values = run.signals.torque_commanded.values[:, k]
-            ax.plot(time, values, label="commanded", **steps, **style.COMMANDED._asdict())
-        values = run.signals.torque_applied.values[:, k]
-        _plot(ax, {label: run}, {label: line}, {label: values}, **steps)
-        ax.set_ylabel(f"motor {LEGS[k]}{'' if commanded else ' applied'}  [N m]")
-    if has_packets(run):
-        _packet_strip(figure, run, axes[0].get_xlim())
-    return _with_legend(figure, axes)
-
-
 def has_packets(run: SimulationResult) -> bool:
-    """Whether its torques went over a network."""
+    """Return whether the torques of a run went over a network."""
     return bool(np.isfinite(run.signals.packets.values).any())
 
 
-def _packet_strip(figure: Figure, run: SimulationResult, span: tuple[float, float]) -> None:
-    """A row of ticks for each kind of packet and of period, where its count rises."""
-    height = figure.get_figheight()
-    low = _STRIP_FOOT / height
-    ax = figure.add_axes((_LEFT, low, _RIGHT - _LEFT, (_STRIP - 0.45) / height))
+def _states(runs: _Runs) -> Figure:
+    wanted = max((run.signals for run, _ in runs.values()), key=lambda s: s.sizes["time"])
+    reference = FACTORS * wanted.reference.values
+    spans = _spans(reference)
+    least = _LEAST_SPAN * np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
+    panels = []
+    for k, unit in enumerate(UNITS):
+        poses = [FACTORS[k] * run.signals.pose.values[:, k] for run, _ in runs.values()]
+        core = [reference[:, k], *_trusted(runs, poses)]
+        curve = Curve(wanted.time.values, reference[:, k], "reference", style.REFERENCE)
+        panels.append(
+            Panel(
+                f"{_SYMBOLS[COORDINATES[k]]}  [{unit}]",
+                [curve, *_curves(runs, poses)],
+                xlim=_times(runs),
+                ylim=_limits(core, poses, _STATE_REACH * spans[k], least[k]),
+            )
+        )
+    return draw(panels, 2, down=True)
+
+
+def _errors(runs: _Runs) -> Figure:
+    spans = np.max([_spans(FACTORS * run.signals.reference.values) for run, _ in runs.values()], 0)
+    panels = []
+    for k, unit in enumerate(UNITS):
+        errors = [FACTORS[k] * run.signals.error.values[:, k] for run, _ in runs.values()]
+        panels.append(
+            Panel(
+                f"{_SYMBOLS[COORDINATES[k]]} error  [{unit}]",
+                _curves(runs, errors),
+                xlim=_times(runs),
+                ylim=_limits(_trusted(runs, errors), errors, _ERROR_REACH * spans[k]),
+            )
+        )
+    return draw(panels, 2, down=True)
+
+
+def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = False) -> Figure:
+    runs, signals = {label: (run, line)}, run.signals
+    panels = []
+    for k, leg in enumerate(LEGS):
+        asked = signals.torque_commanded.values[:, k]
+        curves = [Curve(signals.time.values, asked, "commanded", style.COMMANDED, steps=True)]
+        applied = _curves(runs, [signals.torque_applied.values[:, k]], steps=True)
+        name = f"motor {leg}{'' if commanded else ' applied'}  [N m]"
+        panels.append(Panel(name, curves * commanded + applied, xlim=_times(runs)))
+    if has_packets(run):
+        strip = partial(_packet_strip, run=run)
+        panels.append(Panel("", xlim=_times(runs), height=1.15, wide=True, paint=strip))
+    return draw(panels, 2, down=True, sharey=True)
+
+
+def _packet_strip(ax: Axes, run: SimulationResult) -> None:
+    """Draw a row of ticks for each kind of packet and of period, where its count rises."""
     counts = run.signals.packets.values
     rises = np.diff(counts, axis=0, prepend=np.zeros((1, len(PACKETS)))) > 0
     time = run.signals.time.values
@@ -214,157 +191,94 @@ def _packet_strip(figure: Figure, run: SimulationResult, span: tuple[float, floa
         f"{name}  {n:.0f}" if np.isfinite(n) else f"{name}  not known"
         for name, n in zip(PACKETS, counts[-1], strict=True)
     ]
-    ax.set(xlim=span, ylim=(len(PACKETS) - 0.5, -0.5), xlabel="time  [s]")
+    ax.set_ylim(len(PACKETS) - 0.5, -0.5)
     ax.set_yticks(range(len(PACKETS)), labels, fontsize=8)
     ax.grid(visible=False)
 
 
 def _parameters(run: SimulationResult) -> Figure:
-    figure, axes = _grid([run], rows=4)
-    plant, time = run.scenario.plant, run.signals.time.values
-    true = np.array(plant.parameters[:NUM_PARAMETERS])
+    runs, time = {"estimate": (run, style.RUN)}, run.signals.time.values
     true, values, widths = (
         _PARAMETER_FACTORS * data
-        for data in (true, run.signals.parameters.values, 2 * run.signals.parameter_std.values)
+        for data in (
+            np.array(run.scenario.plant.parameters[:NUM_PARAMETERS]),
+            run.signals.parameters.values,
+            2 * run.signals.parameter_std.values,
+        )
     )
-    for k, ax in enumerate(axes):
+    panels = []
+    for k, name in enumerate(PARAMETERS):
         value, width = values[:, k], widths[:, k]
         least = _LEAST_SIGMAS * np.nanmax(width) / 2
-        _limit(ax, [value, np.array([true[k] - least, true[k] + least])], {}, 0.0)
-        ax.axhline(true[k], label="true value", **style.TRUTH._asdict())
-        ax.plot(time, value, label="estimate", **style.RUN._asdict())
-        ax.fill_between(
-            time,
-            value - width,
-            value + width,
-            color=style.RUN.color,
-            alpha=style.BAND_ALPHA,
-            linewidth=0,
-            label="± 2 σ",
+        panels.append(
+            Panel(
+                f"{name.replace('_', ' ')}  [{_PARAMETER_UNITS[k]}]",
+                [
+                    Curve(time, np.full(len(time), true[k]), "true value", style.TRUTH),
+                    Curve(time, value, "estimate", band=(value - width, value + width, "± 2 σ")),
+                ],
+                xlim=_times(runs),
+                ylim=_limits([value, true[k] + np.array([-least, least])], [], 0.0),
+            )
         )
-        name = PARAMETERS[k].replace("_", " ")
-        ax.set_ylabel(f"{name}  [{_PARAMETER_UNITS[k]}]")
-    return _with_legend(figure, axes)
+    return draw(panels, 2, down=True)
 
 
 def _delay(run: SimulationResult) -> Figure:
-    """The delay with its band, and how far that is from the truth."""
-    figure, (whole, fine) = _grid([run], rows=1)
-    steps: dict[str, Any] = {"drawstyle": "steps-post"}
-    signals = run.signals
-    time, true = signals.time.values, signals.delay_true.values
-    value, width = signals.delay_estimate.values, 2 * signals.delay_std.values
-    for ax, origin, factor in ((whole, 0.0, 1.0), (fine, true, 1e3)):
-        ax.plot(
-            time, factor * (true - origin), label="true value", **steps, **style.TRUTH._asdict()
-        )
-        middle = factor * (value - origin)
-        ax.plot(time, middle, label="estimate", **steps, **style.RUN._asdict())
-        ax.fill_between(
-            time,
-            middle - factor * width,
-            middle + factor * width,
-            step="post",
-            color=style.RUN.color,
-            alpha=style.BAND_ALPHA,
-            linewidth=0,
-            label="± 2 σ",
-        )
+    """Draw the delay with its band, and how far that is from the truth."""
+    signals, panels = run.signals, []
+    time, true, width = signals.time.values, signals.delay_true.values, 2 * signals.delay_std.values
     # The band at the end, and an error that is some times as large, can be told apart.
-    last = 1e3 * float(np.nanmin(width))
-    fine.set_ylim(-10 * last, 10 * last)
-    whole.set_ylabel("delay  [s]")
-    fine.set_ylabel("delay minus true one  [ms]")
-    return _with_legend(figure, [whole, fine])
+    last = 1e4 * float(np.nanmin(width))
+    for name, origin, factor, ylim in (
+        ("delay  [s]", 0.0, 1.0, None),
+        ("delay minus true one  [ms]", true, 1e3, (-last, last)),
+    ):
+        low, value, high = (
+            factor * (signals.delay_estimate.values + part * width - origin) for part in (-1, 0, 1)
+        )
+        truth = Curve(time, factor * (true - origin), "true value", style.TRUTH, steps=True)
+        found = Curve(time, value, "estimate", steps=True, band=(low, high, "± 2 σ"))
+        xlim = (0.0, shown_until(run))
+        panels.append(Panel(name, [truth, found], xlim=xlim, ylim=ylim))
+    return draw(panels, 2)
 
 
-def _grid(
-    runs: Iterable[SimulationResult], rows: int = 3, sharey: bool = False, strip: float = 0.0
-) -> tuple[Figure, list[Axes]]:
-    """Two columns of axes over one time axis, filled column by column.
-
-    `strip` is room below them, in inches.
-    """
-    height = 1.5 + 1.8 * rows + strip
-    # Fixed margins, in inches over the height: a layout engine takes most of the drawing time.
-    room = {"left": _LEFT, "right": _RIGHT, "wspace": 0.24, "hspace": 0.12}
-    figure = Figure(figsize=(10, height))
-    figure.subplots_adjust(bottom=(0.5 + strip) / height, top=1 - 0.45 / height, **room)
-    axes = figure.subplots(rows, 2, sharex=True, sharey=sharey, squeeze=False)
-    for ax in axes.ravel():
-        ax.yaxis.set_label_coords(-0.14, 0.5)
-        # More digits than these would run into the label.
-        ax.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True)
-    for ax in axes[-1]:
-        ax.set_xlabel("time  [s]")
-    axes[0, 0].set_xlim(0, max(shown_until(run) for run in runs))
-    return figure, list(axes.T.ravel())
+def _times(runs: _Runs) -> tuple[float, float]:
+    return 0.0, max(shown_until(run) for run, _ in runs.values())
 
 
-_LEGEND_LINE: Final = 0.25
-"""Inches."""
+def _curves(runs: _Runs, data: Iterable[Array], steps: bool = False) -> list[Curve]:
+    curves = []
+    for (label, (run, line)), values in zip(runs.items(), data, strict=True):
+        early = run.stopped is not None and run.status != "interrupted"
+        ended = run.stopped.time if run.stopped is not None and early else None
+        curves.append(Curve(run.signals.time.values, values, label, line, steps, ended=ended))
+    return curves
 
 
-def _with_legend(figure: Figure, axes: list[Axes]) -> Figure:
-    # A run's cross has a line of its own, for which one entry stands.
-    handles, labels = axes[0].get_legend_handles_labels()
-    if any(line.get_marker() == _CROSS for ax in axes for line in ax.lines):
-        handles.append(Line2D([], [], ls="", marker=_CROSS, color="#666666", ms=7, mew=2))
-        labels.append("run ended")
-    for lines in range(1, max(1, len(labels)) + 1):  # as few as keep the names on the figure
-        columns = max(1, math.ceil(len(labels) / lines))
-        legend = figure.legend(handles, labels, loc="upper center", ncols=columns)
-        if legend.get_window_extent().width <= figure.bbox.width or columns == 1:
-            break
-        legend.remove()
-    room = _LEGEND_LINE * (lines - 1) / figure.get_figheight()
-    figure.subplots_adjust(top=figure.subplotpars.top - room)
-    return figure
+def _trusted(runs: _Runs, data: list[Array]) -> list[Array]:
+    """Return the data of runs that completed, or of all where none did."""
+    pairs = zip(runs.values(), data, strict=True)
+    return [values for (run, _), values in pairs if run.status == "completed"] or data
 
 
-def _plot(
-    ax: Axes,
-    runs: Mapping[str, SimulationResult],
-    lines: Mapping[str, style.Line],
-    data: Mapping[str, Array],
-    **how: Any,
-) -> None:
-    for label, run in runs.items():
-        line, values = lines[label], data[label]
-        ax.plot(run.signals.time.values, values, label=label, **line._asdict(), **how)
-        if len(values) and run.stopped is not None and run.status != "interrupted":
-            low, high = ax.get_ylim()
-            end = np.clip(values[-1], low, high)
-            ax.plot(run.stopped.time, end, _CROSS, color=line.color, ms=7, mew=2, clip_on=False)
+def _spans(values: Array) -> Array:
+    return np.ptp(values, axis=0) if len(values) else np.zeros(values.shape[1])
 
 
-def _trusted(runs: Mapping[str, SimulationResult], data: Mapping[str, Array]) -> list[Array]:
-    """Data of the runs that completed, or of all where none did: nothing is to be squashed then."""
-    done = [values for label, values in data.items() if runs[label].status == "completed"]
-    return done or list(data.values())
-
-
-def _finite(parts: Iterable[Array]) -> Array:
-    values = np.concatenate(list(parts))
-    return values[np.isfinite(values)]
-
-
-def _span(values: Array) -> float:
-    return float(np.ptp(values)) if len(values) else 0.0
-
-
-def _limit(
-    ax: Axes, core: list[Array], data: Mapping[str, Array], reach: float, least: float = 0.0
-) -> None:
-    """Limits, `least` apart, that show `core` whole and of all data what is `reach` off it."""
-    inside = _finite(core)
+def _limits(
+    core: Iterable[Array], data: Iterable[Array], reach: float, least: float = 0.0
+) -> tuple[float, float] | None:
+    """Return limits, `least` apart, that show `core` whole and `data` up to `reach` off it."""
+    inside = np.concatenate(list(core))
+    inside = inside[np.isfinite(inside)]
     if not len(inside):
-        return
-    everything = _finite([inside, *data.values()])
+        return None
+    everything = np.concatenate([inside, *data])
+    everything = everything[np.isfinite(everything)]
     low = max(everything.min(), inside.min() - reach)
     high = min(everything.max(), inside.max() + reach)
     widening = max(0.0, least - (high - low)) / 2
-    low, high = low - widening, high + widening
-    margin = _MARGIN * (high - low)
-    if margin > 0:
-        ax.set_ylim(low - margin, high + margin)
+    margin = widening + _MARGIN * (high - low + 2 * widening)
+    return (low - margin, high + margin) if margin > 0 else None

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 
 _PATH_COLORS: Final = {"reference": Rgba(0.0, 0.62, 0.45), "plate": Rgba(0.0, 0.45, 0.70)}
+_VIEWPORT: Final = '<meta name="viewport" content="width=device-width, initial-scale=1">'
 _MAX_FRAMES: Final = 1500
 """A long run is thinned out to this many frames; Meshcat interpolates between them."""
 
@@ -96,7 +97,8 @@ def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> s
     page = meshcat.StaticHtml()
     before, end, after = page.rpartition("</body>")
     assert end, "Meshcat's page has no body"
-    return f"{before}{overlay}{end}{after}".replace("Drake MeshCat", "Replay", 1)
+    whole = f"{before}{overlay}{end}{after}".replace("Drake MeshCat", "Replay", 1)
+    return whole.replace("<head>", f"<head>{_VIEWPORT}", 1)
 
 
 def write_replay(result: SimulationResult, mechanism: Mechanism, path: Path, title: str) -> Path:

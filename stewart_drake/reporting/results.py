@@ -66,7 +66,7 @@ class SimulationResult(loop_results.SimulationResult):
 
     def table(self) -> str:
         """Return status, errors and torques as text."""
-        from stewart_drake.reporting.run_document import run_document
+        from stewart_drake.reporting.run import run_document
 
         return run_document(self).plain()
 
@@ -136,7 +136,7 @@ class ComparisonResult(Mapping[str, SimulationResult]):
 
     def table(self) -> str:
         """Return a row per controller as text."""
-        from stewart_drake.reporting.run_document import comparison_document
+        from stewart_drake.reporting.run import comparison_document
 
         return comparison_document(self).plain()
 

@@ -1,7 +1,8 @@
 """How every figure looks: one line per controller, also told apart in grey print, light or dark."""
 
+import itertools
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -28,6 +29,9 @@ class Line(NamedTuple):
     color: str
     linestyle: Any
     linewidth: float
+    marker: str = ""
+    markevery: Any = None
+    markersize: float = 4.0
 
 
 # Okabe and Ito's colours, which colour-blind readers tell apart.
@@ -38,7 +42,9 @@ CONTROLLER_LINES: Final = {
     "delay_lqi": Line("#0072B2", (0, (3, 1.2)), 1.6),
     "predictor_lqi": Line("#000000", "-", 1.3),
 }
-_OWN_COLORS: Final = ("#CC79A7", "#56B4E9", "#F0E442")
+_COLORS: Final = ("#0072B2", "#D55E00", "#000000", "#009E73", "#9B4F80", "#946800")
+_DASHES: Final = ("-", (0, (5, 1.6)), (0, (1.2, 1.2)), (0, (6, 1.4, 1.2, 1.4)), (0, (9, 2.5)))
+_MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 REFERENCE: Final = Line("#BBBBBB", "-", 4.0)
 RUN: Final = Line("#0072B2", "-", 1.5)
 """A single run."""
@@ -46,7 +52,9 @@ COMMANDED: Final = Line("#D55E00", "--", 1.0)
 TRUTH: Final = Line("#D55E00", "--", 1.2)
 LIMIT: Final = Line("#8A2B0B", "-", 0.9)
 """A limit that something must stay on one side of."""
-WIDTH: Final = 9.0
+MARK: Final = Line("#666666", ":", 1.1)
+"""A place on the horizontal axis."""
+WIDTH: Final = 10.0
 """Inches of the figures of a page."""
 UNITS: Final = ("deg",) * 3 + ("mm",) * 3
 FACTORS: Final = np.array([180 / np.pi] * 3 + [1e3] * 3)
@@ -74,6 +82,8 @@ DARK: Final = {
     "#8a2b0b": "#e8805c",
     "#b00020": "#ff6e7f",
     "#d55e00": "#f08a4b",
+    "#9b4f80": "#d68fbd",
+    "#946800": "#d9a940",
 }
 """What our lines and letters become on a dark page. Any other colour is data and stays."""
 
@@ -107,11 +117,28 @@ _RC: Final[dict[Any, Any]] = {
 }
 
 
-def controller_line(name: str) -> Line:
-    """Of a shipped controller, or of one of the user's own, the same whenever it has this name."""
-    if name in CONTROLLER_LINES:
-        return CONTROLLER_LINES[name]
-    return Line(_OWN_COLORS[sum(name.encode()) % len(_OWN_COLORS)], "-", 1.3)
+def line(k: int, *, marked: bool = True, width: float = 1.5) -> Line:
+    """Return the look of curve k of any number, told apart in grey print by dash and marker.
+
+    `marked` curves have few points, each with a marker; of others only the sixth and later ones
+    have markers, ten along the curve.
+    """
+    rest, dash = divmod(k, len(_DASHES))
+    look = Line(_COLORS[k % len(_COLORS)], _DASHES[dash], width)
+    if marked:
+        return look._replace(marker=_MARKERS[k % len(_MARKERS)])
+    if rest == 0:
+        return look
+    return look._replace(marker=_MARKERS[(rest - 1) % len(_MARKERS)], markevery=(0.01 * dash, 0.1))
+
+
+LEG_LINES: Final = tuple(line(k, marked=False, width=1.4) for k in range(6))
+
+
+def controller_lines(names: Iterable[str]) -> dict[str, Line]:
+    """Return a line per controller: the shipped ones have their own, others get the next ones."""
+    others = (line(k, marked=False, width=1.3) for k in itertools.count(len(_DASHES)))
+    return {name: CONTROLLER_LINES.get(name) or next(others) for name in names}
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""A mechanism drawn from above and from the front, with its legs numbered."""
+"""Document and figure of a mechanism at its home pose, held there under gravity."""
 
 import itertools
 from pathlib import Path
@@ -10,10 +10,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
+from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.reporting.style import Line, figure_style, write_figures
+from stewart_drake.reporting.document import Document, Section, Values
+from stewart_drake.reporting.panels import Panel, draw
+from stewart_drake.reporting.style import Line, write_figures
+from stewart_drake.reporting.words import number
+from stewart_drake.reporting.workspace import travel_text
 from stewart_drake.scenario.signals import LEGS
+from stewart_drake.studies.mechanism_check import MechanismCheck
 from stewart_drake.types import Array
 
 # Told apart by width and darkness too, for grey print.
@@ -26,30 +32,93 @@ _LABEL_GAP: Final = 0.13
 _VIEWS: Final = {"top view": (0, 1), "front view": (0, 2)}
 
 
+def document(check: MechanismCheck) -> Document:
+    """What `model check` prints."""
+    mechanism, measures = check.mechanism, check.measures
+    cranks, rods = _lengths(mechanism.crank_lengths), _lengths(mechanism.rod_lengths)
+    entries = {
+        "name": mechanism.name,
+        "lengths": f"cranks {cranks} mm, rods {rods} mm",
+        "inertias": _inertias(mechanism),
+        "crank angles": _six(np.rad2deg(check.crank_angles), "deg"),
+        "reach margin": _six(1e3 * measures.reach, "mm"),
+        "sine off dead centre": _six(measures.sines, ""),
+        "singularity measure": f"{number(measures.parallel)} (parallel; a simulation stops at "
+        f"{SINGULARITY_LIMIT:g})",
+    }
+    if check.failure is None:
+        limit = mechanism.effort_limit
+        entries |= {
+            "condition number": f"{number(measures.condition)}; 1 mrad of crank error moves the "
+            f"plate by {number(1e3 * measures.play * 1e-3)} mm at most",
+            "torque to hold": _six(check.torque, "N m")
+            + ("" if limit is None else f" (limit {limit:g})"),
+            "open-loop poles": _poles(check.poles),
+            "from home alone": travel_text(check.travel),
+        }
+    return Document(mechanism.name, check.verdict, [Section("", Values(entries))])
+
+
+def _inertias(mechanism: Mechanism) -> str:
+    """Principal moments of what moves, and which of them nobody measured."""
+    parts = []
+    for name, shape in (("plate", "disc"), ("crank", "bar"), ("rod", "bar")):
+        body = getattr(mechanism, name)
+        moments = ", ".join(f"{value:.3g}" for value in body.inertia)
+        note = f" (estimated: uniform {shape})" if body.estimated else ""
+        parts.append(f"{name} {moments}{note}")
+    return "; ".join(parts) + " kg m^2"
+
+
+def _six(values: Array, unit: str) -> str:
+    return (", ".join(number(value) for value in values) + f" {unit}").rstrip()
+
+
+def _lengths(values: Array) -> str:
+    """One number where all are alike."""
+    alike = bool(np.ptp(values) < 1e-12)
+    return ", ".join(number(1e3 * value) for value in (values[:1] if alike else values))
+
+
+def _poles(poles: NDArray[np.complex128]) -> str:
+    """Growing, oscillating and resting ones; a frictionless machine has each with its mirror."""
+    fastest = np.abs(poles).max()
+    grow = [pole.real for pole in poles if pole.real > 1e-6 * fastest]
+    swing = [pole.imag for pole in poles if abs(pole.real) <= 1e-6 * fastest < pole.imag]
+    parts = []
+    if grow:
+        parts.append("unstable " + ", ".join(map(number, grow)) + " /s")
+    if swing:
+        parts.append("oscillating " + ", ".join(map(number, swing)) + " rad/s")
+    return "; ".join(parts) or "all zero"
+
+
 def mechanism_figure(mechanism: Mechanism) -> Figure:
-    """Two views of a mechanism at its home pose; lengths in mm.
+    """Draw two views of a mechanism at its home pose, of the same scale; lengths in mm.
 
     Raises:
         UnreachablePoseError: home is out of reach.
     """
     home = assemble(mechanism, mechanism.home)
     joints = mechanism.home[3:] + mechanism.p_PQ @ home.R_WP.T
-    points = {"shaft": mechanism.p_WS, "tip": home.p_WT, "joint": joints}
-    points = {name: 1e3 * p for name, p in points.items()}
+    points = {"shaft": 1e3 * mechanism.p_WS, "tip": 1e3 * home.p_WT, "joint": 1e3 * joints}
     everything = np.vstack(list(points.values()))
-    height = np.ptp(np.append(everything[:, 2], 0.0))
-    width = np.ptp(everything, axis=0)[:2].max()
-    with figure_style():
-        figure = Figure(figsize=(10, 5.6))
-        grid = figure.add_gridspec(1, 2, left=0.075, right=0.985, bottom=0.1, top=0.88, wspace=0.2)
-        for column, (title, axes) in enumerate(_VIEWS.items()):
-            ax = figure.add_subplot(grid[column])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    half = 0.62 * max((high - low)[:2].max(), high[2] - low[2], abs(high[2]), abs(low[2]))
+    panels = []
+    for name, axes in _VIEWS.items():
+        x, y = (((low[k] + high[k]) / 2 - half, (low[k] + high[k]) / 2 + half) for k in axes)
+
+        def paint(ax: Axes, axes: tuple[int, int] = axes) -> None:
             _view(ax, points, axes, 1e3 * mechanism.home[3:])
-            ax.set_title(title)
-        _frame(figure.axes, everything, max(width, height))
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="upper center", ncols=len(labels))
-        return figure
+
+        label = "xyz"[axes[1]]
+        panels.append(
+            Panel(
+                f"{label}  [mm]", x="x  [mm]", xlim=x, ylim=y, title=name, height=4.05, paint=paint
+            )
+        )
+    return draw(panels, 2)
 
 
 def write_mechanism_figure(mechanism: Mechanism, directory: Path) -> list[Path]:
@@ -93,9 +162,6 @@ def _view(ax: Axes, points: dict[str, Array], axes: tuple[int, int], centre: Arr
     mass = centre[list(axes)]
     ax.plot(*mass, "+", color="#1B1F24", ms=9, mew=1.4, label="plate's centre of mass", zorder=6)
     _number(ax, shaft, seen_from_above)
-    ax.set_aspect("equal")
-    ax.set_xlabel("x  [mm]")
-    ax.set_ylabel("y  [mm]" if seen_from_above else "z  [mm]")
 
 
 def _around(points: Array) -> NDArray[np.intp]:
@@ -119,12 +185,3 @@ def _number(ax: Axes, shaft: Array, seen_from_above: bool) -> None:
                 places[after, 1] -= 0.0 if lowered else gap
     for leg, (x, y) in zip(LEGS, places.tolist(), strict=True):
         ax.text(x, y, str(leg), ha="center", va="center", weight="bold", zorder=7)
-
-
-def _frame(views: list[Axes], everything: Array, size: float) -> None:
-    """The same scale for both views, the machine in the middle of each."""
-    half = 0.62 * size
-    for ax, axes in zip(views, _VIEWS.values(), strict=True):
-        middle = (everything[:, axes].min(axis=0) + everything[:, axes].max(axis=0)) / 2
-        ax.set_xlim(middle[0] - half, middle[0] + half)
-        ax.set_ylim(middle[1] - half, middle[1] + half)

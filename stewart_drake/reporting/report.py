@@ -4,7 +4,6 @@ How its own run went, the shipped controllers in the manner of the paper's Table
 and 7, what the analyses say beforehand, and the scenario itself.
 """
 
-from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +12,6 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.reporting.collect import ANALYSES, Collected
 from stewart_drake.reporting.document import (
-    Block,
     Document,
     Frame,
     Listing,
@@ -23,8 +21,9 @@ from stewart_drake.reporting.document import (
     Tone,
 )
 from stewart_drake.reporting.figures import draw_comparison, draw_run, has_packets
+from stewart_drake.reporting.outline import sections
 from stewart_drake.reporting.results import AnalysisResult
-from stewart_drake.reporting.run_document import comparison_blocks, run_blocks
+from stewart_drake.reporting.run import comparison_blocks, run_blocks
 from stewart_drake.reporting.tuner_figures import weights_figure
 from stewart_drake.reporting.words import number, sentence
 from stewart_drake.scenario.config import EncoderSensorConfig, Scenario, ServoActuatorConfig
@@ -74,14 +73,6 @@ _PACKETS_BELOW: Final = (
     " Below: packets that were sent, lost, or late, and periods in which one was played, or the "
     "buffer was dry."
 )
-_ERROR_IS: Final = (
-    "E_ac is the error in percent of the motion's peak to peak, averaged over the six coordinates "
-    "and accumulated over time."
-)
-_NO_NETWORK: Final = (
-    "There is no network for the tuner here, so that its weights are not shown; stewart-drake "
-    "tune makes one."
-)
 
 
 def document(found: Collected, name: str, replay: str = "") -> Document:
@@ -93,17 +84,24 @@ def document(found: Collected, name: str, replay: str = "") -> Document:
         replay: the replay's page, to be shown inside, or empty.
     """
     text, tone = verdict(found)
-    sections = list(_run_sections(found, replay))
-    if found.comparison:
-        sections.append(_comparison(found))
+    compared, weights = _compared(found)
+    parts = sections(
+        "report",
+        failure=found.failure,
+        replay=replay and Frame(replay),
+        run=found.run and [*run_blocks(found.run), *_run_pictures(found.run)],
+        comparison=found.comparison and comparison_blocks(found.comparison, found.tuned),
+        papers=is_papers(found.scenario),
+        no_weights=not weights,
+        compared=compared,
+    )
     answers = {_QUESTIONS[key]: found.analyses[key] for key in ANALYSES}
-    sections += [_answer(question, answer) for question, answer in answers.items()]
-    sections += [_details(question, answer) for question, answer in answers.items()]
+    parts += [_answer(question, answer) for question, answer in answers.items()]
+    parts += [_details(question, answer) for question, answer in answers.items()]
     text_above = "Every field, in the format of a scenario file: saved as one it runs again."
     listing = Listing(scenario_yaml(found.scenario))
-    sections.append(Section("The scenario", text_above, listing, folded=True))
-    facts = _facts(found.scenario)
-    return Document(f"Report on the scenario {name}", text, sections, tone, facts)
+    parts.append(Section("The scenario", text_above, listing, folded=True))
+    return Document(f"Report on the scenario {name}", text, parts, tone, _facts(found.scenario))
 
 
 def report_summary(found: Collected) -> dict[str, Any]:
@@ -197,39 +195,27 @@ def mean_error(run: SimulationResult) -> float:
     return float((s["accumulated_error"] - s["delay_floor"]) / left) if left > 0 else np.nan
 
 
-def _run_sections(found: Collected, replay: str) -> Iterator[Section]:
-    if found.run is None:
-        text = "The reference leaves the workspace, so that nothing was simulated."
-        yield Section("The run", text)
-        return
-    if replay:
-        text = "Drag to look around. The ring is where the plate should be."
-        yield Section("Replay", text, Frame(replay))
-    captions = dict(_RUN_CAPTIONS)
-    captions["torques"] += _PACKETS_BELOW if has_packets(found.run) else ""
-    pictures = _pictures(draw_run(found.run), captions)
-    yield Section("The run", _ERROR_IS, *run_blocks(found.run), *pictures)
+def _run_pictures(run: SimulationResult) -> list[Picture]:
+    below = {"torques": _PACKETS_BELOW} if has_packets(run) else {}
+    return [
+        Picture(figure, _RUN_CAPTIONS[name] + below.get(name, ""))
+        for name, figure in draw_run(run).items()
+    ]
 
 
-def _comparison(found: Collected) -> Section:
-    captions = dict(_CAPTIONS)
-    parts: list[Block | str] = ["The same scenario under each of the shipped controllers."]
-    parts += comparison_blocks(found.comparison, found.tuned)
-    if is_papers(found.scenario):
-        parts.append(
-            "The paper's numbers are those of its Table II; its delay-aware controllers had the "
-            "tuner."
-        )
-        for name, figure in _PAPER_FIGURES.items():
-            text_below = captions[name][:1].lower() + captions[name][1:]
-            captions[name] = f"As figure {figure} of the paper: {text_below}"
+def _compared(found: Collected) -> tuple[list[Picture], bool]:
+    """Return the figures of the comparison, and whether weights of a tuner are among them."""
     figures = draw_comparison(found.comparison)
     if found.tuned:
         figures["weights"] = weights_figure({LABELS[n]: run for n, run in found.tuned.items()})
-    elif "weights" not in figures:
-        parts.append(_NO_NETWORK)
-    captions = {name: captions.get(name) or _caption_of(name) for name in figures}
-    return Section("The controllers compared", *parts, *_pictures(figures, captions))
+    pictures = []
+    for name, figure in figures.items():
+        caption = _CAPTIONS.get(name) or _caption_of(name)
+        if is_papers(found.scenario) and name in _PAPER_FIGURES:
+            below = caption[:1].lower() + caption[1:]
+            caption = f"As figure {_PAPER_FIGURES[name]} of the paper: {below}"
+        pictures.append(Picture(figure, caption))
+    return pictures, "weights" in figures
 
 
 def _caption_of(figure: str) -> str:
@@ -254,10 +240,6 @@ def _details(question: str, answer: AnalysisResult) -> Section:
         if not isinstance(block, Picture)
     ]
     return Section(f"Details: {question}", *parts, folded=True)
-
-
-def _pictures(figures: Mapping[str, Any], captions: Mapping[str, str]) -> list[Picture]:
-    return [Picture(figure, captions[name]) for name, figure in figures.items()]
 
 
 def _facts(scenario: Scenario) -> dict[str, str]:

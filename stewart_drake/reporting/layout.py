@@ -1,0 +1,123 @@
+"""Document of a search for a layout."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from stewart_drake.reporting.document import Document, Picture, Section, Table, Tone, Values, table
+from stewart_drake.reporting.mechanism import mechanism_figure
+from stewart_drake.reporting.outline import sections
+from stewart_drake.reporting.words import number
+from stewart_drake.studies.layout import INSTANTS, Layout, LayoutStudy
+from stewart_drake.studies.layout_measures import MEASURES
+from stewart_drake.studies.layout_space import PARAMETERS
+
+_RUN: Final = {"completed": "completed", "refused": "does not reach the motion"}
+_TONES: Final[dict[str, Tone]] = {"yes": "good", "partly": "fair"}
+
+
+def document(study: LayoutStudy) -> Document:
+    """Return what was found beside the machine that the search began from."""
+    machines = [study.before, *study.layouts]
+    near = {
+        one.name: f"{one.nearest.pair}, {number(1e3 * one.nearest.distance)} mm at "
+        f"t = {one.nearest.time:.2f} s" + (", they cross" if one.nearest.distance < 0 else "")
+        for one in machines
+        if one.nearest is not None
+    }
+    missed = {one.name: _missed(one.missed) for one in machines if one.missed}
+    parts = sections(
+        "layout",
+        study=study,
+        instants=INSTANTS,
+        compared=_compared(study, machines),
+        near=near and Values(near),
+        missed=missed and Values(missed, brief=False),
+        numbers=_numbers(study, machines),
+        searches=_searches(study),
+    )
+    for one in machines:
+        figure = partial(mechanism_figure, one.mechanism)
+        caption = f"{one.name} at home, from above and from the front."
+        parts.append(Section(one.name, Picture(figure, caption)))
+    facts = {
+        "layouts tried": str(study.evaluations),
+        "goal": MEASURES[study.problem.wish.goal].text,
+        "seed": str(study.seed),
+    }
+    kind = study.problem.scenario.reference.kind
+    title = f"Layouts for a {kind} motion, from {study.before.name}"
+    tone = _TONES.get(study.verdict.split(":")[0], "bad")
+    return Document(title, study.verdict, parts, tone, facts)
+
+
+def _beside(
+    names: Sequence[str],
+    head: str,
+    rows: Sequence[tuple[str, str, Callable[[Layout], str]]],
+    machines: Sequence[Layout],
+    brief: bool = False,
+) -> Table:
+    """Return a table with a column per machine; a row is a name, a text, and its cells."""
+    cells = [(name, text, *map(cell, machines)) for name, text, cell in rows]
+    return Table(("", head, *names), cells, brief=brief)
+
+
+def _compared(study: LayoutStudy, machines: list[Layout]) -> Table:
+    def measured(name: str, one: Layout) -> str:
+        return number(MEASURES[name].factor * one.measures.get(name, np.nan))
+
+    rows: list[tuple[str, str, Callable[[Layout], str]]] = []
+    for name, measure in MEASURES.items():
+        unit = "" if measure.shown == "-" else f" [{measure.shown}]"
+        limit = study.problem.wish.limits.get(name)
+        sign = "≥" if measure.more else "≤"
+        asked = "" if limit is None else f"{sign} {limit * measure.factor:g}"
+        rows.append((name.removesuffix("_deg") + unit, asked, partial(measured, name)))
+    rows += [
+        ("scenario", "", _run),
+        ("E_ac [% s]", "", lambda one: number(one.outcome.error)),
+        ("largest torque [N\u00a0m]", "", lambda one: number(one.outcome.peak_torque)),
+    ]
+    return _beside([one.name for one in machines], "limit", rows, machines, brief=True)
+
+
+def _run(one: Layout) -> str:
+    status, outcome = one.outcome.status, one.outcome
+    if status in _RUN:
+        return _RUN[status]
+    return f"left at {outcome.time:.2f} s" if status == "left_workspace" else status
+
+
+def _missed(shares: dict[str, float]) -> str:
+    return ", ".join(f"{name} by {100 * share:.2g} %" for name, share in shares.items())
+
+
+def _numbers(study: LayoutStudy, machines: list[Layout]) -> Table:
+    def value(k: int, one: Layout) -> str:
+        return f"{one.values[k]:.4g}"
+
+    rows: list[tuple[str, str, Callable[[Layout], str]]] = []
+    for k, name in enumerate(PARAMETERS):
+        low, high = study.problem.space.bounds[name]
+        centred = name == "plate_offset_deg" and study.problem.space.offset_from_centre
+        between = f"{low:g} to {high:g}" + (" from centre" if centred else "")
+        rows.append((name, between if low < high else "kept", partial(value, k)))
+    signs = ("branches", "", lambda one: "".join("-+"[int(b > 0)] for b in one.mechanism.branches))
+    order = ("plate_order", "", lambda one: "".join(map(str, one.order)))
+    return _beside([one.name for one in machines], "between", [*rows, signs, order], machines)
+
+
+def _searches(study: LayoutStudy) -> Table:
+    goal = study.problem.wish.goal
+    return table(
+        study.searches.items(),
+        {
+            "search": lambda one: one[0],
+            "layouts": lambda one: one[1].evaluations,
+            goal: lambda one: number(MEASURES[goal].factor * one[1].measures.get(goal, np.nan)),
+            "limits missed": lambda one: _missed(one[1].missed) or "kept",
+        },
+    )

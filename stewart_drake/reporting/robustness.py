@@ -1,0 +1,478 @@
+"""Document and figures of a robustness study."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from stewart_drake.reporting.document import Document, Table, Tone, table
+from stewart_drake.reporting.outline import sections
+from stewart_drake.reporting.panels import Curve, Panel, draw, limit
+from stewart_drake.reporting.style import LIMIT, RUN, TRUTH
+from stewart_drake.reporting.words import number
+from stewart_drake.studies.failures import Explanation, Pair, Separation
+from stewart_drake.studies.robustness_result import (
+    QUANTILES,
+    Influence,
+    RobustnessStudy,
+    factor_values,
+    factors,
+    unit_of,
+)
+from stewart_drake.studies.statistics import Correlation, Interval, wilson_interval
+from stewart_drake.types import Array
+
+TITLES: Final = {
+    "payload": "payload",
+    "torque_bias": "torque bias, rms",
+    "noise": "noise of the sensor",
+    "torque_limit": "torque limit",
+    "damping": "joint damping",
+    "delay": "delay error",
+    "lengths": "lengths, rms",
+    "anchors": "anchors, rms",
+    "coulomb": "Coulomb friction",
+    "payload_position": "payload's place, rms",
+    "jitter": "jitter of the delay",
+    "loss": "lost on the way",
+}
+SIGNIFICANT: Final = 0.05
+"""Adjusted p-value below which an influence counts as found."""
+_GOOD, _FAIR = 0.99, 0.9
+"""Lower end of the success rate for these tones."""
+_WORST: Final = 10
+"""Runs listed one by one."""
+_NAMED: Final = 3
+"""Quantities, and pairs, that a sentence names."""
+_ABREAST: Final = 4
+"""Panels in a row."""
+_SOFT: Final = "#666666"
+# Of many points, which are a bitmap that a dark page cannot change: readable on both.
+_SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
+
+
+def document(study: RobustnessStudy) -> Document:
+    """Return success rate, quantiles, what matters, failures, and the worst runs."""
+    verdict, tone = _verdict(study)
+    sc, influences = study.experiment.scenario, study.influences()
+    failed = bool(study.failed.any())
+    early = any(one.status != "completed" for one in study.outcomes)
+    context = {
+        "beside": study.beside and _beside_table(study),
+        "quantiles": _quantile_table(study),
+        "distribution_figure": partial(distribution_figure, study),
+        "significant": SIGNIFICANT,
+        "influences": _influence_table(study, influences),
+        "influence_figure": partial(influence_figure, influences),
+        "runs_figure": partial(runs_figure, study),
+        "reasons": failed and _reasons_table(study),
+        "failures": failures_sentence(study.explanation) if failed else "",
+        "failures_tables": failed and failures_tables(study.explanation),
+        "times_figure": failed and early and partial(times_figure, study),
+        "ranges": _range_table(study),
+        "vary": ", ".join(
+            f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}"
+            for name, value in dataclasses.asdict(study.ranges).items()
+        ),
+        "worst": _worst_table(study),
+    }
+    name = study.experiment.mechanism.name
+    facts = {
+        "mechanism": name,
+        "start": f"{sc.start.replace('_', ' ')}, torques in flight: {sc.queue}",
+        "delay": f"{sc.eta:g} s",
+        "runs": f"{len(study.outcomes)}, seed {study.seed}, {sc.plant.kind} plant",
+    }
+    if study.loops:
+        facts["loop"] = ", ".join(f"{loop}: {n}" for loop, n in study.loops.items())
+    parts = sections("robustness", study=study, **context)
+    return Document(f"Robustness of {name}", verdict, parts, tone, facts)
+
+
+def title(factor: str) -> str:
+    """Return a factor in words; |factor| is its size."""
+    name = TITLES[factor.strip("|")]
+    return f"|{name}|" if factor.startswith("|") else name
+
+
+def _verdict(study: RobustnessStudy) -> tuple[str, Tone]:
+    total, kept = len(study.outcomes), int(np.sum(~study.failed))
+    aim = "completed" if study.limit is None else f"completed with E_ac up to {study.limit:g} % s"
+    text = f"{kept} of {total} runs {aim}: {_percent(study.success)}. {_median(study)}"
+    explanation = study.explanation
+    strong = [title(one.factor) for one in explanation.found]
+    aim = "completing" if study.limit is None else "staying within the limit"
+    if strong:
+        text += f" What matters for {aim}: {', '.join(strong[:_NAMED])}."
+    elif explanation.failing and explanation.others:
+        text += f" For {aim} no single quantity matters beyond chance."
+    errors = [one for one in study.influences() if one.error_p < SIGNIFICANT]
+    errors.sort(key=lambda one: -abs(one.error.rho))
+    names = list(dict.fromkeys(title(one.factor.strip("|")) for one in errors))
+    if names:
+        text += f" What matters for E_ac, of those that completed: {', '.join(names[:_NAMED])}."
+    for name, one in study.others.items():
+        n = int(np.sum(~one.failed))
+        text += f" With {name}, on the same machines: {n} of {total}."
+    low = study.success.low
+    return text, "good" if low >= _GOOD else "fair" if low >= _FAIR else "bad"
+
+
+def _percent(share: Interval) -> str:
+    value, low, high = (f"{100 * part:.1f}" for part in (share.value, share.low, share.high))
+    return f"{value} % (95 % interval {low} to {high} %)"
+
+
+def _median(study: RobustnessStudy) -> str:
+    middle = study.quantile(0.5).value
+    if math.isinf(middle):
+        return "Half of the runs or more did not complete."
+    most = study.quantile(0.95).value
+    end = "" if math.isinf(most) else f", 95 % below {number(most)}"
+    return f"Half of all runs stay below E_ac = {number(middle)} % s{end}."
+
+
+def _failed(error: float) -> str:
+    return "failed" if error == math.inf else number(error)
+
+
+def _beside_table(study: RobustnessStudy) -> Table:
+    """Return the same machines under each controller, the scenario's own first."""
+    return table(
+        {"as asked": study, **study.others}.items(),
+        {
+            "controller": lambda one: one[0],
+            "undisturbed, % s": lambda one: one[1].undisturbed.error,
+            "runs kept": lambda one: f"{np.sum(~one[1].failed)} of {len(one[1].outcomes)}",
+            "share": lambda one: _percent(one[1].success),
+            "median, % s": lambda one: _failed(one[1].quantile(0.5).value),
+            "95 %, % s": lambda one: _failed(one[1].quantile(0.95).value),
+        },
+        brief=("controller", "alone", "runs kept", None, "median", "95 %"),
+    )
+
+
+def _quantile_table(study: RobustnessStudy) -> Table:
+    def low(one: Interval) -> str:
+        return "-" if one.low == -math.inf else _failed(one.low)
+
+    return table(
+        [(q, study.quantile(q)) for q in QUANTILES],
+        {
+            "of all runs": lambda one: f"{100 * one[0]:g} %",
+            "E_ac at most, % s": lambda one: _failed(one[1].value),
+            "interval from": lambda one: low(one[1]),
+            "to": lambda one: "failed or unknown" if math.isinf(one[1].high) else one[1].high,
+        },
+        brief=True,
+    )
+
+
+def _influence_table(study: RobustnessStudy, influences: Sequence[Influence]) -> Table:
+    def rho(one: Correlation, p: float) -> str:
+        mark = "* " if p < SIGNIFICANT else ""
+        return "-" if math.isnan(one.rho) else f"{mark}{one.rho:+.2f}"
+
+    def interval(one: Correlation) -> str:
+        return "-" if math.isnan(one.rho) else f"{one.low:+.2f} to {one.high:+.2f}"
+
+    def chance(one: Correlation, p: float) -> str:
+        return "-" if math.isnan(one.rho) else f"{p:.2g}"
+
+    spans = _spans(study)
+    return table(
+        influences,
+        {
+            "quantity": lambda one: title(one.factor),
+            "drawn": lambda one: spans[one.factor],
+            "ρ with E_ac": lambda one: rho(one.error, one.error_p),
+            "interval": lambda one: interval(one.error),
+            "adjusted p": lambda one: chance(one.error, one.error_p),
+            "ρ with failing": lambda one: rho(one.failure, one.failure_p),
+            "interval ": lambda one: interval(one.failure),
+            "adjusted p ": lambda one: chance(one.failure, one.failure_p),
+        },
+        brief=("quantity", "drawn", "with E_ac", None, None, "with failing", None, None),
+    )
+
+
+def _reasons_table(study: RobustnessStudy) -> Table:
+    own = {
+        reason: [one for one in study.outcomes if study.reason_of(one) == reason]
+        for reason in study.reasons
+    }
+
+    def time(reason: str) -> float:
+        times = [one.time for one in own[reason] if math.isfinite(one.time)]
+        return float(np.median(times)) if times else math.nan
+
+    def legs(reason: str) -> str:
+        found = sorted({one.leg for one in own[reason] if one.leg is not None})
+        counts = (f"leg {leg}: {sum(one.leg == leg for one in own[reason])}" for leg in found)
+        return ", ".join(counts) or "-"
+
+    total = len(study.outcomes)
+    return table(
+        study.reasons.items(),
+        {
+            "reason": lambda one: one[0],
+            "runs": lambda one: one[1],
+            "share of all": lambda one: _percent(wilson_interval(one[1], total)),
+            "median time, s": lambda one: time(one[0]),
+            "legs": lambda one: legs(one[0]),
+        },
+        brief=("reason", "runs", None, "median time, s", "legs"),
+    )
+
+
+def failures_sentence(found: Explanation) -> str:
+    """Return what sets failing runs apart, or that nothing does; empty where none or all fail."""
+    if not (found.failing and found.others):
+        return ""
+    total = f"the {found.failing} failing runs from the other {found.others}"
+    if found.found:
+        told = "; ".join(
+            f"{title(one.factor)}, of which {one.failing} of the {found.failing} have the outer "
+            f"third ({_third(one)}) against {one.others} of the {found.others} "
+            f"(AUC {one.auc.value:.2f}, {one.auc.low:.2f} to {one.auc.high:.2f})"
+            for one in found.found[:_NAMED]
+        )
+        text = f"What tells {total}: {told}."
+    else:
+        text = f"No single quantity separates {total}."
+    if found.pairs:
+        told = "; ".join(
+            f"{_where(one)}, {one.failing} of the {found.failing} against {one.others} of "
+            f"the {found.others}"
+            for one in found.pairs[:_NAMED]
+        )
+        text += f" Two together: {told}."
+    elif not found.found:
+        text += " Nor does a pair of them."
+    return text
+
+
+def failures_tables(found: Explanation) -> list[Table]:
+    """Return every quantity asked about, and the pairs that were found."""
+
+    def failing(one: Separation | Pair) -> str:
+        return f"{one.failing} of {found.failing}"
+
+    def others(one: Separation | Pair) -> str:
+        return f"{one.others} of {found.others}"
+
+    singles = table(
+        found.singles,
+        {
+            "quantity": lambda one: title(one.factor),
+            "its outer third": _third,
+            "of failing runs": failing,
+            "of the others": others,
+            "P(failing larger)": lambda one: f"{one.auc.value:.2f}",
+            "interval": lambda one: f"{one.auc.low:.2f} to {one.auc.high:.2f}",
+            "adjusted p": lambda one: f"{one.p:.2g}",
+        },
+        "Failing runs against the others, by Mann and Whitney's rank test; a third of all runs "
+        "would lie in the outer third by chance.",
+    )
+    pairs = table(
+        found.pairs,
+        {
+            "both": _where,
+            "of failing runs": failing,
+            "of the others": others,
+            "adjusted p": lambda one: f"{one.p:.2g}",
+        },
+        "Pairs, cut at their medians, that separate more together than each alone (Fisher's exact "
+        "tests).",
+    )
+    return [singles, pairs] if found.pairs else [singles]
+
+
+def _third(one: Separation) -> str:
+    return f"{'from' if one.larger else 'up to'} {number(one.bound)} {unit_of(one.factor)}"
+
+
+def _where(one: Pair) -> str:
+    a, b = map(title, one.factors)
+    text = f"{one.sides[0]} {a} with {one.sides[1]} {b}"
+    return f"{text}, or just the opposite" if one.opposite else text
+
+
+def _spans(study: RobustnessStudy) -> dict[str, str]:
+    """Return the drawn values of each factor, from least to most; nothing for sizes."""
+    values, told = factor_values(study.draws), factors(study.draws)
+    return {
+        name: f"{_span(float(x.min()), float(x.max()))} {told[name]}" if name in told else ""
+        for name, x in values.items()
+    }
+
+
+def _span(low: float, high: float) -> str:
+    if math.isinf(high):
+        return "no"
+    if low == high:
+        return f"always {number(low)}"
+    decimals = max(0, 1 - math.floor(math.log10(max(abs(low), abs(high)))))
+    return f"{low:.{decimals}f} to {high:.{decimals}f}"
+
+
+def _range_table(study: RobustnessStudy) -> Table:
+    spans = _spans(study)
+    columns = {"quantity": TITLES.__getitem__, "from, to": spans.__getitem__}
+    return table(factors(study.draws), columns)
+
+
+def _worst_table(study: RobustnessStudy) -> Table:
+    values, told = factor_values(study.draws), factors(study.draws)
+    order = np.argsort(np.where(np.isnan(study.errors), np.inf, study.errors), kind="stable")[::-1]
+
+    def outcome(i: int) -> str:
+        one = study.outcomes[i]
+        return number(one.error) if one.status == "completed" else f"ends at {one.time:.2f} s"
+
+    def drawn(name: str, i: int) -> str:
+        return f"{values[name][i]:.3g}"
+
+    columns = {f"{TITLES[name]}, {unit}": partial(drawn, name) for name, unit in told.items()}
+    return table(order[:_WORST].tolist(), {"run": str, "E_ac, % s": outcome, **columns})
+
+
+def distribution_figure(study: RobustnessStudy) -> Figure:
+    """Draw the share of all runs with E_ac at most so large, with its interval."""
+    errors, total = np.sort(study.errors[np.isfinite(study.errors)]), len(study.outcomes)
+    counts = np.arange(1, len(errors) + 1)
+    bounds = [wilson_interval(int(n), total) for n in counts]
+    low, high = (np.array([100 * getattr(b, end) for b in bounds]) for end in ("low", "high"))
+
+    def paint(ax: Axes) -> None:
+        if len(errors) < total:
+            share = 100 * len(errors) / total
+            text = f"{total - len(errors)} of {total} runs did not complete"
+            limit(ax, share, text, below=share > 50)  # where there is room for the words
+        if np.isfinite(study.undisturbed.error):
+            ax.axvline(study.undisturbed.error, label="undisturbed run", **TRUTH._asdict())
+        if study.limit is not None:
+            ax.axvline(study.limit, color=LIMIT.color, ls=":", label="limit")
+
+    band = (low, high, "95 % interval")
+    curve = Curve(errors, 100 * counts / total, "all runs", steps=True, band=band)
+    return draw(
+        [
+            Panel(
+                "share of all runs  [%]",
+                [curve],
+                "accumulated error E_ac  [% s]",
+                xscale="log",
+                ylim=(0, 103),
+                height=2.7,
+                paint=paint,
+            )
+        ]
+    )
+
+
+def influence_figure(influences: Sequence[Influence]) -> Figure:
+    """Draw rank correlations with their intervals; hollow where chance explains them."""
+    shown = {
+        "rank correlation with E_ac, completed runs": [(i.error, i.error_p) for i in influences]
+    }
+    if any(np.isfinite(one.failure.rho) for one in influences):
+        failures = [(one.failure, one.failure_p) for one in influences]
+        shown["rank correlation with failing, all runs"] = failures
+    names = [title(one.factor) for one in influences]
+    panels = [
+        Panel(
+            "",
+            x=label,
+            xlim=(-1, 1),
+            ylim=(len(names) - 0.5, -0.5),
+            height=0.5 + 0.27 * len(names),
+            paint=partial(_dots, found=found, names=names),
+        )
+        for label, found in shown.items()
+    ]
+    return draw(panels, len(panels), sharey=True, room=1.6)
+
+
+def _dots(ax: Axes, found: Sequence[tuple[Correlation, float]], names: Sequence[str]) -> None:
+    ax.axvline(0, color=_SOFT, lw=0.8)
+    for row, (one, p) in enumerate(found):
+        if np.isnan(one.rho):
+            ax.text(0.02, row, "not asked", va="center", fontsize=8, color=_SOFT)
+            continue
+        sure = p < SIGNIFICANT
+        color = RUN.color if sure else _SOFT
+        ax.plot([one.low, one.high], [row, row], color=color, lw=1.8 if sure else 1.0)
+        ax.plot(one.rho, row, "o", ms=6, mec=color, mfc=color if sure else "white")
+    ax.set_xticks((-1, -0.5, 0, 0.5, 1))
+    ax.set_yticks(range(len(names)), names)
+
+
+def runs_figure(study: RobustnessStudy) -> Figure:
+    """Draw E_ac of every run over every drawn quantity, failures in a strip of their own on top."""
+    told, done = factors(study.draws), np.isfinite(study.errors)
+    low, high = _log_range(study.errors[done])
+    strip, top = high * (high / low) ** 0.06, high * (high / low) ** 0.18
+    # Spread over the strip by the number of the run, so that marks do not hide each other.
+    spread = (np.arange(len(done)) * 0.618034) % 1 * 0.8 + 0.1
+    y = np.where(done, study.errors, strip * (top / strip) ** spread)
+    groups = {
+        "success": (done & ~study.failed, "o", _SUCCESS),
+        "above the limit": (done & study.failed, "s", _ABOVE),
+        "did not complete": (~done, "x", _FAILED),
+    }
+
+    def paint(ax: Axes, x: Array) -> None:
+        for label, (some, marker, color) in groups.items():
+            if some.any() or label != "above the limit":
+                edge: Any = {"linewidths": 0.9} if marker == "x" else {"edgecolors": "none"}
+                look: Any = {"s": 11, "marker": marker, "color": color, "alpha": 0.75, **edge}
+                ax.scatter(x[some], y[some], label=label, rasterized=True, **look)
+        ax.axhspan(strip, top, color="#F1EAE6", zorder=0)
+        ax.xaxis.set_major_locator(MaxNLocator(3))  # room between neighbours' labels
+        if not np.isfinite(x).all():
+            ax.text(0.5, 0.5, "none", transform=ax.transAxes, ha="center", color=_SOFT)
+
+    values = factor_values(study.draws)
+    panels = [
+        Panel(
+            "E_ac  [% s]",
+            x=f"{TITLES[name]}  [{unit}]",
+            yscale="log",
+            ylim=(low, top),
+            height=1.9,
+            paint=partial(paint, x=values[name]),
+        )
+        for name, unit in told.items()
+    ]
+    return draw(panels, _ABREAST, sharey=True)
+
+
+def times_figure(study: RobustnessStudy) -> Figure:
+    """Draw when runs ended early."""
+    times = [one.time for one in study.outcomes if one.status != "completed"]
+    end = study.experiment.scenario.duration
+
+    def paint(ax: Axes) -> None:
+        ax.hist(times, bins=np.linspace(0, end, 41).tolist(), color=RUN.color, ec="white", lw=0.5)
+        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+
+    name = "time at which a run ended early  [s]"
+    return draw([Panel("runs", x=name, xlim=(0, end), height=1.6, paint=paint)])
+
+
+def _log_range(errors: Array) -> tuple[float, float]:
+    """Return ends of a logarithmic axis around the errors."""
+    positive = errors[errors > 0]
+    if not len(positive):
+        return 0.1, 10.0
+    low, high = float(positive.min()), float(positive.max())
+    room = max((high / low) ** 0.05, 1.2)
+    return low / room, high * room

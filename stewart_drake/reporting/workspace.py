@@ -1,0 +1,355 @@
+"""Document and figures of a workspace study."""
+
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+
+from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
+from stewart_drake.native.layout import DEAD_CENTRE_SINE
+from stewart_drake.reporting.document import Document, Table, Tone, Values, table
+from stewart_drake.reporting.outline import sections
+from stewart_drake.reporting.panels import Curve, Panel, draw
+from stewart_drake.reporting.style import FACTORS, LEG_LINES, LIMIT, UNITS, figure_style, line
+from stewart_drake.reporting.words import number
+from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
+from stewart_drake.studies.clearance import ClearTravel, Nearest
+from stewart_drake.studies.sizing import Sizing
+from stewart_drake.studies.workspace import WorkspaceStudy
+from stewart_drake.studies.workspace_map import Section, Travel
+from stewart_drake.types import Array
+
+_COORDINATES: Final = tuple(zip(COORDINATE_NAMES, FACTORS, UNITS, strict=True))
+_NEAREST: Final = 8
+"""Number of pairs that are listed even where all of them are apart."""
+_MOTORS: Final = {
+    "peak_torque": "torque peak [N\u00a0m]",
+    "rms_torque": "torque rms [N\u00a0m]",
+    "peak_speed": "speed peak [rad/s]",
+    "rms_speed": "speed rms [rad/s]",
+    "peak_power": "power peak [W]",
+    "least_power": "power least [W]",
+    "rms_power": "power rms [W]",
+}
+_LEVELS: Final = (1, 2, 3, 5, 8, 13, 30, 100)
+"""Levels of the condition number."""
+_CMAP: Final = colormaps["cividis_r"]
+_OUTSIDE: Final = "#F2F2F2"
+_HALO: Final = (withStroke(linewidth=3, foreground="#FFFFFF"),)
+"""Around black lines over colours of any darkness; on a dark page the lines are light."""
+_PATH: Final[dict[str, Any]] = {"color": "#000000", "lw": 1.2, "path_effects": _HALO}
+_HOME: Final[dict[str, Any]] = {**_PATH, "marker": "+", "ls": "", "ms": 9, "mew": 1.5}
+
+
+def document(study: WorkspaceStudy) -> Document:
+    """Return reach and singularity along the reference, motors, and the surroundings of home."""
+    mechanism, summary, factor = study.experiment.mechanism, study.summary, study.factor
+    time, leg, margin = study.worst
+    largest = f"{'' if factor.limited else 'more than '}{factor.told} of this one"
+    clear, sizing, limit = study.clearance, study.sizing, study.torque_limit
+    use = (
+        "" if sizing is None or limit is None else max(m["use_of_limit"] for m in summary["motors"])
+    )
+    context = {
+        "dead_centre": f"{DEAD_CENTRE_SINE:g}",
+        "singular": f"{SINGULARITY_LIMIT:g}",
+        "length": 1e3 * summary["characteristic_length"],
+        "legs": _legs_table(summary["legs"]),
+        "singularity": _singularity(summary),
+        "margins_figure": partial(margins_figure, study),
+        "distances": _distances(study),
+        "nearest": _nearest_table(clear.along.nearest),
+        "clearance_figure": partial(clearance_figure, study),
+        "clear_travel": clear.travel and _clear_table(clear.travel),
+        "motors": sizing and _motors_table(summary["motors"]),
+        "use": use and f"{100 * use:.3g} %",
+        "motors_figure": sizing and partial(motors_figure, sizing, limit),
+        "from_home": study.travel and Values({"from home alone": travel_text(study.travel)}),
+        "travel": study.travel and _travel_table(study.travel),
+        "sections_figure": study.travel and partial(sections_figure, study),
+    }
+    facts = {
+        "mechanism": mechanism.name,
+        "least reach margin": f"{number(1e3 * margin)} mm, leg {leg}, t = {time:.2f} s",
+        "largest amplitude": "-" if np.isnan(factor.value) else largest,
+        "least clearance": _nearest_text(clear.along.least(fixed=False)),
+    }
+    fair = study.home is not None or clear.along.touching
+    tone: Tone = "bad" if study.exit is not None else "fair" if fair else "good"
+    title = f"Workspace of {mechanism.name}, {study.experiment.scenario.reference.kind} reference"
+    parts = sections("workspace", study=study, **context)
+    return Document(title, study.verdict, parts, tone, facts)
+
+
+def travel_text(travel: list[Travel]) -> str:
+    """Return how far each coordinate goes from home alone, in degrees and mm."""
+    return ", ".join(
+        f"{name} {factor * t.low:.3g} to +{factor * t.high:.3g} {unit}"
+        for (name, factor, unit), t in zip(_COORDINATES, travel, strict=True)
+    )
+
+
+def _legs_table(legs: list[dict[str, Any]]) -> Table:
+    return table(
+        legs,
+        {
+            "leg": lambda leg: leg["leg"],
+            "least reach margin [mm]": lambda leg: 1e3 * leg["least_reach_margin"],
+            "at [s]": lambda leg: f"{leg['time']:.2f}",
+            # A dash where the leg does not reach: there is no angle.
+            "least sine off dead centre": lambda leg: (
+                leg["least_sine"] if leg["least_sine"] >= 0 else "-"
+            ),
+            "least transmission": lambda leg: leg["least_transmission"],
+        },
+        brief=True,
+    )
+
+
+def _singularity(summary: dict[str, Any]) -> Values:
+    home = summary["home"]
+    return Values(
+        {
+            "condition": f"home {number(home['condition'])}, "
+            f"worst {number(summary['worst_condition'])} on the reference",
+            "parallel": f"home {number(home['parallel'])}, least "
+            f"{number(summary['least_parallel'])} (a simulation stops at {SINGULARITY_LIMIT:g})",
+        }
+    )
+
+
+def _motors_table(motors: list[dict[str, Any]]) -> Table:
+    def cell(name: str, motor: dict[str, Any]) -> float:
+        return float(motor[name])
+
+    values = {head: partial(cell, name) for name, head in _MOTORS.items()}
+    return table(motors, {"leg": lambda motor: motor["leg"], **values}, brief=True)
+
+
+def _nearest_text(nearest: Nearest | None) -> str:
+    if nearest is None:
+        return "-"
+    crossing = _crossing(nearest)
+    where = f"{nearest.pair}, t = {nearest.time:.2f} s"
+    return f"{number(1e3 * nearest.distance)} mm, {where}{crossing and f', {crossing}'}"
+
+
+def _crossing(nearest: Nearest) -> str:
+    """Return whether two parts cross; the disc of the base is only drawn."""
+    if nearest.distance >= 0:
+        return ""
+    return "crosses the disc as drawn" if "base" in nearest.pair else "they cross"
+
+
+def _distances(study: WorkspaceStudy) -> Values:
+    along = study.clearance.along
+    values = {
+        "links": _nearest_text(along.least(fixed=False)),
+        "motors and posts": _nearest_text(along.stand),
+        "drawn disc of the base": _nearest_text(along.disc),
+    }
+    if along.touching:
+        told = (f"{one.pair} ({1e3 * one.distance:.1f} mm)" for one in along.touching)
+        values["links that cross"] = ", ".join(told)
+    return Values(values)
+
+
+def _nearest_table(nearest: list[Nearest]) -> Table:
+    """Return the pairs that cross, and the nearest of the others."""
+    crossing = sum(one.distance < 0 for one in nearest)
+    return table(
+        nearest[: max(crossing, _NEAREST)],
+        {
+            "parts": lambda one: one.pair,
+            "distance [mm]": lambda one: 1e3 * one.distance,
+            "at [s]": lambda one: f"{one.time:.2f}",
+            "": _crossing,
+        },
+    )
+
+
+def _clear_table(travel: list[ClearTravel]) -> Table:
+    end = "the workspace's end"
+    return table(
+        zip(_COORDINATES, travel, strict=True),
+        {
+            "coordinate": lambda one: one[0][0],
+            "unit": lambda one: one[0][2],
+            "clear from home down": lambda one: f"{one[0][1] * one[1].low:.4g}",
+            "ends at": lambda one: one[1].low_pair or end,
+            "up": lambda one: f"+{one[0][1] * one[1].high:.4g}",
+            "ends at ": lambda one: one[1].high_pair or end,
+        },
+    )
+
+
+def _travel_table(travel: list[Travel]) -> Table:
+    return table(
+        zip(_COORDINATES, travel, strict=True),
+        {
+            "coordinate": lambda one: one[0][0],
+            "unit": lambda one: one[0][2],
+            "from home down": lambda one: f"{one[0][1] * one[1].low:.4g}",
+            "ends because": lambda one: one[1].low_reason,
+            "up": lambda one: f"+{one[0][1] * one[1].high:.4g}",
+            "ends because ": lambda one: one[1].high_reason,
+        },
+    )
+
+
+def _legs(time: Array, values: Array) -> list[Curve]:
+    legs = zip(LEGS, LEG_LINES, values.T, strict=True)
+    return [Curve(time, column, f"leg {leg}", look) for leg, look, column in legs]
+
+
+def margins_figure(study: WorkspaceStudy) -> Figure:
+    """Draw reach, dead centre, parallel singularity and condition along the reference."""
+    margins, left = study.margins, study.exit
+    time, top = margins.time, min(np.nanmax(margins.condition, initial=2.0), 1e4)
+    sines = _legs(time, margins.sines)
+    lowest = float(np.nanmin(margins.sines))
+    inside = [Curve(time, np.where(np.isnan(margins.condition), np.nan, margins.parallel))]
+
+    def shade(ax: Axes) -> None:
+        if left is not None:
+            style: Any = {"color": "#000000", "alpha": 0.07, "lw": 0}
+            ax.axvspan(left.time, time[-1], label="after leaving", **style)
+
+    panels = [
+        ("reach margin  [mm]", _legs(time, 1e3 * margins.reach), {0.0: ""}, None),
+        ("sine off dead centre  [-]", sines, {DEAD_CENTRE_SINE: ""}, (max(-0.05, lowest), 1.05)),
+        ("parallel measure, det W  [-]", inside, {SINGULARITY_LIMIT: ""}, (-0.1, None)),
+        ("condition number of A  [-]", [Curve(time, margins.condition)], {}, (0.95, 1.25 * top)),
+    ]
+    return draw(
+        [
+            Panel(
+                name,
+                curves,
+                limits=limits,
+                xlim=(0, time[-1]),
+                ylim=ylim,
+                yscale="log" if "condition" in name else "linear",
+                height=2.8,
+                paint=shade,
+            )
+            for name, curves, limits, ylim in panels
+        ],
+        2,
+    )
+
+
+def motors_figure(sizing: Sizing, torque_limit: float | None) -> Figure:
+    """Draw torque, speed and power of the six cranks along the reference."""
+    limited = torque_limit is not None and torque_limit < 3 * np.abs(sizing.torque).max()
+    limits = {sign * torque_limit: "" for sign in (-1, 1)} if torque_limit and limited else {}
+    values = {
+        "torque  [N m]": (sizing.torque, limits),
+        "crank speed  [rad/s]": (sizing.speed, {}),
+        "power  [W]": (sizing.power, {}),
+    }
+    ends = (0, sizing.time[-1])
+    return draw(
+        [
+            Panel(name, _legs(sizing.time, data), limits=levels, xlim=ends, height=1.9)
+            for name, (data, levels) in values.items()
+        ]
+    )
+
+
+def clearance_figure(study: WorkspaceStudy) -> Figure:
+    """Draw distances of the nearest parts: along the reference, and over a section."""
+    along, time = study.clearance.along, study.clearance.along.time
+    curves = [
+        Curve(time, 1e3 * along.links, "links", line(0, marked=False)),
+        Curve(time, 1e3 * along.base, "base and motors", line(1, marked=False)),
+    ]
+    whole = (0, time[-1])
+    left = Panel("distance of the nearest  [mm]", curves, limits={0.0: ""}, xlim=whole, height=3.2)
+    if not study.clearance.sections:
+        return draw([left], 2)
+    section, pair = study.clearance.sections[0], study.sections[0]
+    x, y = FACTORS[pair.first] * section.x, FACTORS[pair.second] * section.y
+    distance = 1e3 * section.distance
+    ends = Normalize(np.nanmin(distance), np.nanmax(distance))
+
+    def paint(ax: Axes) -> None:
+        ax.pcolormesh(x, y, distance, cmap=_CMAP, norm=ends, shading="nearest")
+        _home(ax, pair, study.experiment.mechanism.home)
+        ax.set_facecolor(_OUTSIDE)
+
+    right = Panel(_axis(pair.second), x=_axis(pair.first), height=3.2, paint=paint)
+    figure = draw([left, right], 2, edge=1.0)
+    _scale(figure, ends, "nearest links  [mm]")
+    return figure
+
+
+@figure_style()
+def _scale(figure: Figure, norm: Normalize, label: str) -> None:
+    """Draw a scale of colours in the room on the right."""
+    low, high = figure.axes[-1].get_position(), figure.axes[0].get_position()
+    axes = figure.add_axes((0.925, low.y0, 0.018, high.y1 - low.y0))
+    figure.colorbar(ScalarMappable(norm, _CMAP), cax=axes).set_label(label)
+
+
+def _axis(k: int) -> str:
+    return f"{COORDINATE_NAMES[k]}  [{UNITS[k]}]"
+
+
+def _home(ax: Axes, pair: Section, home: Array) -> None:
+    ax.plot(*(FACTORS[k] * home[k] for k in (pair.first, pair.second)), **_HOME)
+    ax.grid(False)
+
+
+def sections_figure(study: WorkspaceStudy) -> Figure:
+    """Draw the condition number over the sections, with the reference projected onto them."""
+    norm = BoundaryNorm(_LEVELS, 256, extend="max")
+    figure = draw(
+        [
+            Panel(
+                _axis(one.second),
+                x=_axis(one.first),
+                xlim=(FACTORS[one.first] * one.x[0], FACTORS[one.first] * one.x[-1]),
+                ylim=(FACTORS[one.second] * one.y[0], FACTORS[one.second] * one.y[-1]),
+                height=3.6,
+                paint=partial(_section, section=one, study=study, norm=norm),
+            )
+            for one in study.sections
+        ],
+        2,
+        edge=1.0,
+        top=0.25,
+    )
+    _scale(figure, norm, "condition number of A  [-], light is good")
+    with figure_style():
+        border = Line2D([], [], color=LIMIT.color, lw=1.8)
+        handles = [border, Line2D([], [], **_PATH), Line2D([], [], **_HOME)]
+        labels = ["border of the workspace", "reference, projected", "home"]
+        figure.legend(handles, labels, loc="upper center", ncols=3)
+    return figure
+
+
+def _section(ax: Axes, section: Section, study: WorkspaceStudy, norm: BoundaryNorm) -> None:
+    pair = section.first, section.second
+    factors = [FACTORS[k] for k in pair]
+    x, y = factors[0] * section.x, factors[1] * section.y
+    # At a dead centre the condition goes like 1 / sine and the sine like the root of the distance:
+    # what is nearly linear there, and so what a grid can be interpolated in, are squares.
+    quality = np.nan_to_num(1 / np.square(section.condition))
+    edges = [0.0, *(1 / np.square(_LEVELS[::-1]))]
+    shades = [_CMAP(norm(1.01 * level)) for level in _LEVELS[::-1]]
+    border = np.sign(section.margin) * np.square(section.margin)
+    ax.contourf(x, y, quality, levels=edges, colors=shades)
+    ax.contourf(x, y, border, levels=[-1e9, 0.0], colors=_OUTSIDE)
+    if (border > 0).any():
+        ax.contour(x, y, border, [0.0], colors=LIMIT.color, linewidths=1.8)
+    poses = study.margins.pose
+    ax.plot(*(f * poses[:, k] for f, k in zip(factors, pair, strict=True)), **_PATH)
+    _home(ax, section, study.experiment.mechanism.home)
