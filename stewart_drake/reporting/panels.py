@@ -11,6 +11,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import ScalarFormatter
 from numpy.typing import ArrayLike
 
 from stewart_drake.reporting.style import (
@@ -166,7 +167,7 @@ def _gap(above: Sequence[Panel], below: Sequence[Panel]) -> float:
 
 
 def _fill(ax: Axes, panel: Panel, last: bool, named: bool) -> None:
-    if panel.xscale == panel.yscale == "linear":
+    if isinstance(ax.yaxis.get_major_formatter(), ScalarFormatter):
         # More digits than these would run into the name of the axis.
         ax.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True)
     for one in panel.curves:
