@@ -140,7 +140,7 @@ def test_cranks_take_the_colour_of_their_torque(replay, run):
     assert np.ptp(grey) < 1e-6
 
 
-@pytest.mark.parametrize(("width", "height"), [(1600, 900), (1000, 700), (375, 640)])
+@pytest.mark.parametrize(("width", "height"), [(1600, 900), (1000, 700), (400, 640)])
 def test_panels_are_whole_and_leave_the_machine_visible_on_any_screen(tab, page, width, height):
     tab.open(page, width, height)
     boxes = tab.evaluate(
@@ -160,6 +160,8 @@ def test_panels_are_whole_and_leave_the_machine_visible_on_any_screen(tab, page,
         for name in ("#run-scale", "#run-ends")
     )
     assert scale["width"] > 100 and ends["height"] > 10
+    bars = tab.evaluate("[...document.querySelectorAll('#run-bars div')].map(e => e.offsetHeight)")
+    assert len(bars) == 6 and min(bars) > 5, "no bars of the motors"
     assert tab.evaluate("document.querySelector('#run-ends').innerText").split()[1] == "0"
     assert "N m" in tab.evaluate("document.querySelector('#run-about').innerText")
 

@@ -155,15 +155,6 @@ def test_where_all_runs_diverge_they_are_shown_whole(comparison, drawn):
         assert 0.43 < ax.get_xlim()[1] < 0.6
 
 
-def test_legends_stay_on_the_figure_and_off_the_axes(comparison, drawn):
-    comparison_figures(comparison, "unused")
-    for figure in drawn.values():
-        figure.canvas.draw()
-        box = figure.legends[0].get_window_extent()
-        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
-        assert box.y0 >= max(ax.get_window_extent().y1 for ax in figure.axes)
-
-
 def test_lines_of_controllers_differ_in_colour_and_in_grey_print():
     for one, other in itertools.combinations(CONTROLLER_LINES.values(), 2):
         assert one.color != other.color

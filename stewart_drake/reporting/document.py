@@ -1,4 +1,4 @@
-"""What is told of a result: made once, shown as a page (`report.page`) and at a terminal.
+"""Documents of results: made once, shown as a page (`reporting.page`) and at a terminal.
 
 A document is a verdict and sections, a section an ordered list of blocks. A page shows all of it; a
 terminal of 80 columns shows the verdict and, of sections that are not folded, the blocks that are
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Tone = Literal["good", "fair", "bad", "plain"]
-"""What a verdict amounts to; shown by a word and a bar, so that grey print tells it too."""
+"""Grade of a verdict; a page shows it by the kind of a bar, in grey print too."""
 
 _SHORT: Final = 36
 """Characters of a cell that stays on one line of a page."""
@@ -34,13 +34,12 @@ class Paragraph:
     kind: ClassVar = "paragraph"
 
     def plain(self) -> str:
-        """For a terminal."""
         return wrap(self.text)
 
 
 @dataclass(frozen=True)
 class Caution:
-    """What a reader should be warned of."""
+    """A warning to the reader."""
 
     text: str
     brief: ClassVar = True
@@ -48,11 +47,9 @@ class Caution:
 
     @property
     def sentence(self) -> str:
-        """For a page."""
         return f"Warning: {sentence(self.text)}"
 
     def plain(self) -> str:
-        """For a terminal."""
         return wrap(f"warning: {self.text}")
 
 
@@ -65,7 +62,6 @@ class Values:
     kind: ClassVar = "values"
 
     def plain(self) -> str:
-        """For a terminal."""
         return rows(self.entries)
 
 
@@ -239,7 +235,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Document:
-    """All that is told.
+    """A verdict and its sections.
 
     Attributes:
         title: what was looked at.
@@ -256,7 +252,7 @@ class Document:
     facts: Mapping[str, str] = field(default_factory=dict)
 
     def plain(self) -> str:
-        """For a terminal: at most 80 columns."""
+        """Return the document for a terminal, in at most 80 columns."""
         text = wrap(self.verdict) if self.verdict else ""
         for section in self.sections:
             told = [

@@ -33,7 +33,7 @@ _VIEWS: Final = {"top view": (0, 1), "front view": (0, 2)}
 
 
 def document(check: MechanismCheck) -> Document:
-    """What `model check` prints."""
+    """Return what `model check` prints."""
     mechanism, measures = check.mechanism, check.measures
     cranks, rods = _lengths(mechanism.crank_lengths), _lengths(mechanism.rod_lengths)
     entries = {
@@ -60,7 +60,7 @@ def document(check: MechanismCheck) -> Document:
 
 
 def _inertias(mechanism: Mechanism) -> str:
-    """Principal moments of what moves, and which of them nobody measured."""
+    """Return principal moments of the moving bodies, and which are estimated."""
     parts = []
     for name, shape in (("plate", "disc"), ("crank", "bar"), ("rod", "bar")):
         body = getattr(mechanism, name)

@@ -1,4 +1,4 @@
-"""What is told of a scenario: one document that can be shown to somebody else.
+"""Document of a scenario, to be shown to somebody else.
 
 How its own run went, the shipped controllers in the manner of the paper's Table II and figures 5, 6
 and 7, what the analyses say beforehand, and the scenario itself.
@@ -41,7 +41,7 @@ MANY_BAD: Final = 0.5
 _LEVELS: Final[tuple[Tone, ...]] = ("good", "fair", "bad")
 WIDE: Final = "The stated deviation is 1.6 to 2.6 times too large."
 _QUESTIONS: Final = {
-    "delay": "Does the loop bear its delay?",
+    "delay": "Is the loop stable with its delay?",
     "hautus": "Can the models be controlled and observed?",
     "workspace": "Does the motion fit the machine?",
 }
@@ -66,7 +66,7 @@ _RUN_CAPTIONS: Final = {
     "errors": "The difference.",
     "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay.",
     "delay": f"The delay as it was found, with its band, and its error. {WIDE}",
-    "parameters": "What the controller found out about the plant, which nobody told it.",
+    "parameters": "Parameters of the plant, as the controller estimates them.",
     "weights": "The weights that the tuner set.",
 }
 _PACKETS_BELOW: Final = (
@@ -105,7 +105,7 @@ def document(found: Collected, name: str, replay: str = "") -> Document:
 
 
 def report_summary(found: Collected) -> dict[str, Any]:
-    """What summary.json holds; each part as the command of its own writes it."""
+    """Return the content of summary.json; each part is as its own command writes it."""
     text, tone = verdict(found)
     return {
         "verdict": text,
@@ -219,7 +219,7 @@ def _compared(found: Collected) -> tuple[list[Picture], bool]:
 
 
 def _caption_of(figure: str) -> str:
-    """Of a figure about a controller that is not always among those compared."""
+    """Return the caption of a figure of a controller that is not always compared."""
     what, _, controller = figure.partition("_")
     if what == "delay":
         return f"How {label(controller)} found the delay: with its band, and its error. {WIDE}"
@@ -232,7 +232,7 @@ def _answer(question: str, answer: AnalysisResult) -> Section:
 
 
 def _details(question: str, answer: AnalysisResult) -> Section:
-    """What the analysis' own document says and tabulates, in one folded section."""
+    """Return texts and tables of an analysis in one folded section."""
     parts = [
         f"{section.heading}. {block.text}" if isinstance(block, Paragraph) else block
         for section in answer.document.sections

@@ -1,4 +1,4 @@
-"""How one run went, several beside each other, and the paper's Table II."""
+"""Documents of a run, of a comparison, and of the paper's Table II."""
 
 import math
 from collections.abc import Mapping
@@ -42,7 +42,7 @@ _NOTE: Final = (
     "Floor: what the delay alone adds to E_ac. Cost: squared errors and their integrals by w_Q, "
     "and squared torques by w_R. N m: the largest torque that was asked for (commanded) and that "
     "acted (applied: within the motors' limit, after the delay; of a run that ends early the last "
-    "ones never acted); total variation (var.) of the commanded ones, which tells trembling. Step: "
+    "ones never acted); total variation (var.) of the commanded ones, which shows trembling. Step: "
     "the controller's computing time, median."
 )
 _TWO_COLUMNS: Final = {
@@ -72,7 +72,7 @@ def run_document(result: SimulationResult) -> Document:
 
 
 def run_blocks(result: SimulationResult) -> list[Block]:
-    """What `run_document` holds."""
+    """Return the blocks of `run_document`."""
     s = result.summary
     step, floor = s["controller_step_ms"], f"delay floor {number(s['delay_floor'])} % s"
     peaks = zip(COORDINATE_NAMES, s["peak_error"], strict=True)
@@ -108,7 +108,7 @@ def comparison_document(results: Mapping[str, SimulationResult]) -> Document:
 def comparison_blocks(
     results: Mapping[str, SimulationResult], tuned: Mapping[str, SimulationResult] | None = None
 ) -> list[Block]:
-    """What `comparison_document` holds; the tuner's runs come after those with fixed weights."""
+    """Return the blocks of `comparison_document`, with the tuner's runs last."""
     table_two = table_two_blocks(results)
     papers = not table_two and any(
         is_papers(result.scenario, any_size=True) for result in results.values()
@@ -169,7 +169,7 @@ def base_of(row: str, scenario: Scenario) -> str:
 
 
 def paper_error(row: str, scenario: Scenario) -> str:
-    """What the paper reports of a row's controller, in % s; a dash where it reports none."""
+    """Return the paper's E_ac of a row's controller in % s, or a dash."""
     name = base_of(row, scenario)
     if name not in PAPER_ERRORS:
         return "-"

@@ -175,30 +175,6 @@ def _power_of_ten(value: float, _: int) -> str:
     return "10" + f"{round(np.log10(value))}".translate(_RAISED)
 
 
-def panels(number: int, height: float, sharey: bool = False) -> tuple[Figure, list[Axes]]:
-    """A row of axes, as wide as a page; height in inches."""
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
-    return figure, list(np.atleast_1d(figure.subplots(1, number, sharey=sharey)))
-
-
-def limit(ax: Axes, level: float, text: str, *, below: bool = False) -> None:
-    """A level that something must stay on one side of, with words on it."""
-    ax.axhline(level, color=LIMIT.color, lw=LIMIT.linewidth)
-    ax.annotate(
-        text,
-        (0.01, level),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, -4 if below else 2.5),
-        textcoords="offset points",
-        ha="left",
-        va="top" if below else "bottom",
-        fontsize=8,
-        color=LIMIT.color,
-        bbox={"fc": "white", "ec": "none", "pad": 0.6},  # a curve may pass behind it
-        zorder=5,
-    )
-
-
 def legend_above(figure: Figure, ax: Axes) -> Figure:
     """The figure with the lines of one of its axes named above all of them."""
     handles, labels = ax.get_legend_handles_labels()
