@@ -6,7 +6,7 @@ from typing import Any, Final
 from stewart_drake.reporting.analyses import ANALYSES, words_of
 
 _PUBLIC: Final = {
-    "functions": "check_model export export_c identify model_sdf new plan_identification",
+    "functions": "check_model export_c export_csv identify model_sdf new plan_identification",
     "dynamics.stewart": "StewartDynamics",
     "files.errors": "ConfigError",
     "loop.diagram": "ClosedLoop build_closed_loop",

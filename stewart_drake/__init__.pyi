@@ -10,8 +10,8 @@ from stewart_drake import systems as systems
 from stewart_drake.dynamics.stewart import StewartDynamics as StewartDynamics
 from stewart_drake.files.errors import ConfigError as ConfigError
 from stewart_drake.functions import check_model as check_model
-from stewart_drake.functions import export as export
 from stewart_drake.functions import export_c as export_c
+from stewart_drake.functions import export_csv as export_csv
 from stewart_drake.functions import identify as identify
 from stewart_drake.functions import model_sdf as model_sdf
 from stewart_drake.functions import new as new
@@ -100,8 +100,8 @@ __all__ = [
     "check_model",
     "compare",
     "design_law",
-    "export",
     "export_c",
+    "export_csv",
     "identify",
     "law",
     "layout",

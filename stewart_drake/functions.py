@@ -120,7 +120,7 @@ def _write_plan(found: Plan, folder: Path) -> list[str]:
     return list(texts)
 
 
-def export(signals: str | Path, out: str | Path | None = None) -> str:
+def export_csv(signals: str | Path, out: str | Path | None = None) -> str:
     """Return saved signals as CSV, a line per instant; units are in the header.
 
     Args:

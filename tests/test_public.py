@@ -82,7 +82,7 @@ def test_machines_and_what_is_made_of_them_fit_a_line_or_two(name):
 def test_commands_have_functions(tmp_path):
     run = sd.simulate(sd.load_scenario("desktop", settings=(*SETTINGS[:1], "duration=3")))
     run.save(tmp_path)
-    text = sd.export(tmp_path / "signals.nc", tmp_path / "signals.csv")
+    text = sd.export_csv(tmp_path / "signals.nc", tmp_path / "signals.csv")
     assert text.startswith("time[s],pose_roll[rad]") and (tmp_path / "signals.csv").is_file()
     found = sd.identify(tmp_path / "signals.nc", "desktop")
     found.save(tmp_path / "machine")

@@ -160,7 +160,7 @@ def export(
 
     if out is not None:
         check_file(out)
-    text = functions.export(signals, out)
+    text = functions.export_csv(signals, out)
     if out is None:
         typer.echo(text, nl=False)
         return
