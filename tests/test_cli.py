@@ -72,8 +72,14 @@ def test_a_scenario_is_prepared_once(tmp_path, monkeypatch) -> None:
         (["simulate", "--set", "plant.knd=exact"], ["plant.knd", "did you mean plant.kind?"]),
         (["simulate", "--set", "gravity=true"], ["gravity: unknown", "mean plant.gravity?"]),
         (["simulate", "--set", "kind=exact"], ["kind: unknown", "expected one of mechanism"]),
-        (["simulate", "--set", "delay.steps=-1"], ["delay.steps", "-1", "at least 0"]),
-        (["simulate", "--set", "controller.period=0"], ["controller.period", "got 0", "at least"]),
+        (
+            ["simulate", "--set", "delay.steps=-1"],
+            ["delay.steps", "-1", "greater than or equal to 0"],
+        ),
+        (
+            ["simulate", "--set", "controller.period=0"],
+            ["controller.period", "got 0", "greater than or equal to"],
+        ),
         (["simulate", "--set", "plant.time_step=0.003"], ["plant.time_step", "0.003", "whole"]),
         (["simulate", "--set", "nonsense"], ["'nonsense'", "section.field=value"]),
         (["simulate", "missing.yaml"], ["missing.yaml", "paper"]),

@@ -194,7 +194,7 @@ def test_a_worker_that_dies_and_a_second_process(tmp_path, capsys):
 
     def wait_for(number: int) -> None:
         limit = time.monotonic() + 120
-        while len(list(tmp_path.glob("runs/*.npz"))) < number:
+        while len(list(tmp_path.glob("conditions/*.npz"))) < number:
             assert time.monotonic() < limit and process.poll() is None
             time.sleep(0.02)
 
@@ -205,4 +205,4 @@ def test_a_worker_that_dies_and_a_second_process(tmp_path, capsys):
     _, err = process.communicate(timeout=60)
     assert process.returncode == 2
     assert err.startswith("error: a worker process was killed") and err.count("\n") == 1
-    assert len(finished_runs(tmp_path, "runs/*.npz")) >= 2
+    assert len(finished_runs(tmp_path, "conditions/*.npz")) >= 2

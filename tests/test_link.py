@@ -162,10 +162,10 @@ def test_jitter_is_white_seeded_and_never_before_its_time() -> None:
 @pytest.mark.parametrize(
     ("setting", "expected"),
     [
-        ("delay.drift=-1", "at least -0.9"),
-        ("delay.swing=-0.1", "at least 0"),
-        ("delay.swing_frequency=0", "above 0"),
-        ("delay.jitter_std=-1e-3", "at least 0"),
+        ("delay.drift=-1", "greater than or equal to -0.9"),
+        ("delay.swing=-0.1", "greater than or equal to 0"),
+        ("delay.swing_frequency=0", "greater than 0"),
+        ("delay.jitter_std=-1e-3", "greater than or equal to 0"),
         ("delay.jump=.nan", "finite"),
     ],
 )
