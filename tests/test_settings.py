@@ -19,7 +19,7 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.calibration import DELAY, Calibration, save_calibration
-from stewart_drake.scenario.config import PriorConfig, Scenario
+from stewart_drake.scenario.config import ESTIMATED, PriorConfig, Scenario
 from stewart_drake.scenario.dependencies import NEEDS, idle_fields
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import shown
@@ -188,6 +188,9 @@ def other_values(owner_hint: Any, name: str, value: Any) -> list[Any]:
         return [OTHER[name]]
     if isinstance(value, bool):
         return [not value]
+    if name == "controller.estimate":
+        some = [*ESTIMATED]
+        return [one for one in ([], [*some, "coulomb"], [*some, "offsets"], some) if one != value]
     words = getattr(owner_hint, "__args__", ())
     return [word for word in words if word != value]
 

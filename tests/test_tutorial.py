@@ -60,7 +60,7 @@ def do(tmp_path, monkeypatch, capsys):
                     assert main(arguments) == 0, arguments
                     out, err = capsys.readouterr()
                     assert err == "", arguments
-                    assert all(len(line) <= 80 for line in out.splitlines()), arguments
+                    assert [line for line in out.splitlines() if len(line) > 80] == [], arguments
                     told[" ".join(arguments)] = out
         return told
 

@@ -256,9 +256,12 @@ class Delivery:
     def end(self, summary: Mapping[str, Any], interrupted: bool = False) -> int:
         """Tell what was written, print the summary if it is wanted; the exit status."""
         from stewart_drake.files.jsonio import jsonable
+        from stewart_drake.reporting.words import WIDTH, wrap
 
         if self.out is not None:
-            self.say(f"written to {self.out}: {', '.join(self._written)}")
+            head, files = f"written to {self.out}:", ", ".join(self._written)
+            short = len(head) + 1 + len(files) <= WIDTH
+            self.say(f"{head} {files}" if short else f"{head}\n{wrap(files, '  ')}")
         if self.as_json:  # NaN as null
             typer.echo(json.dumps(jsonable(summary), indent=2, allow_nan=False))
         return INTERRUPTED if interrupted else 0
