@@ -23,6 +23,7 @@ def text():
             lines.append(f"from stewart_drake.{module} import {name} as {name}")
             continue
         shown = f"def {name}{inspect.signature(getattr(sd, name))}: ..."
+        shown = shown.replace("pathlib._local.", "pathlib.")  # of Python 3.13
         modules |= set(re.findall(r"\b[a-z_.]+(?=\.[A-Z])", shown))
         functions.append(shown)
     lines += [f"from stewart_drake import {name} as {name}" for name in sd._MODULES]
