@@ -7,14 +7,14 @@ from typing import Final
 import numpy as np
 
 from stewart_drake.export.controller import exported, write
-from stewart_drake.files.fileio import replacing
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.identification import identify as identification
 from stewart_drake.identification.log_files import Precision, read_log
 from stewart_drake.identification.logs import ANGLES, POSE
 from stewart_drake.identification.plan import MOTION, Plan, plan
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.loop.experiment import prepare
-from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
+from stewart_drake.mechanism.files import as_mechanism, load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
@@ -22,7 +22,7 @@ from stewart_drake.reporting.identification import document, plan_document
 from stewart_drake.reporting.results import AnalysisResult, analysis_result
 from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import load_scenario, scenario_yaml
+from stewart_drake.scenario.loading import as_scenario, load_scenario, scenario_yaml
 from stewart_drake.studies.mechanism_check import MechanismCheck, check_mechanism
 from stewart_drake.studies.new_machine import Measurements, NewMachine, new_machine
 
@@ -58,7 +58,7 @@ def identify(
         ConfigError: bad input.
     """
     paths = [logs] if isinstance(logs, str | Path) else list(logs)
-    machine = _mechanism(mechanism)
+    machine = as_mechanism(mechanism)
     read = [read_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
     return analysis_result(
         lambda: identification.identify(read, machine, tolerances, delay),
@@ -90,7 +90,7 @@ def plan_identification(
     Raises:
         ConfigError: bad input.
     """
-    loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    loaded = as_scenario(scenario)
     measured = (precision or Precision()).std
     std = np.full_like(measured, np.inf)
     for part in (ANGLES, POSE) if poses else (ANGLES,):
@@ -105,8 +105,7 @@ def plan_identification(
 
 
 def _write_machine(found: identification.Identification, folder: Path) -> list[str]:
-    with replacing(folder / MECHANISM) as partial:
-        partial.write_text(mechanism_yaml(found.mechanism))
+    write_whole(folder / MECHANISM, mechanism_yaml(found.mechanism))
     calibration = found.calibration(load_mechanism(folder / MECHANISM))
     save_calibration(folder / CALIBRATION, calibration)
     return [MECHANISM, CALIBRATION]
@@ -115,8 +114,7 @@ def _write_machine(found: identification.Identification, folder: Path) -> list[s
 def _write_plan(found: Plan, folder: Path) -> list[str]:
     texts = {MOTION: found.motion_csv, SCENARIO: scenario_yaml(found.scenario)}
     for name, text in texts.items():
-        with replacing(folder / name) as partial:
-            partial.write_text(text)
+        write_whole(folder / name, text)
     return list(texts)
 
 
@@ -132,8 +130,7 @@ def export_csv(signals: str | Path, out: str | Path | None = None) -> str:
     """
     text = signals_csv(read_signals(Path(signals)))
     if out is not None:
-        with replacing(Path(out)) as partial:
-            partial.write_text(text, encoding="utf-8")
+        write_whole(Path(out), text)
     return text
 
 
@@ -189,7 +186,7 @@ def check_model(mechanism: Mechanism | str | Path) -> MechanismCheck:
     Raises:
         ConfigError: bad input.
     """
-    return check_mechanism(_mechanism(mechanism))
+    return check_mechanism(as_mechanism(mechanism))
 
 
 def model_sdf(mechanism: Mechanism | str | Path) -> str:
@@ -198,8 +195,4 @@ def model_sdf(mechanism: Mechanism | str | Path) -> str:
     Raises:
         ConfigError: bad input.
     """
-    return to_sdformat(_mechanism(mechanism))
-
-
-def _mechanism(given: Mechanism | str | Path) -> Mechanism:
-    return given if isinstance(given, Mechanism) else load_mechanism(given)
+    return to_sdformat(as_mechanism(mechanism))

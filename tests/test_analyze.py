@@ -22,6 +22,7 @@ from stewart_drake.studies.delay_map import Cell, map_delays, scaled_motion
 from stewart_drake.studies.runs import run_scenario
 from stewart_drake.studies.verdict import delay_verdict
 from tests.mechanisms import PAPER
+from tests.screen import too_long
 
 TOO_FAR = "reference.amplitude=[0.26, 0.26, 0.26, 0.02, 0.02, 0.2]"
 
@@ -72,7 +73,7 @@ def test_hautus_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         assert not extra["drake"]["observable"]
         assert systems[f"minimal chain, mu = {steps}"]["observable"]
     told = capsys.readouterr().out
-    assert max(map(len, told.splitlines()[:-1])) <= 80  # the last one names the directory
+    assert not too_long(told)
     assert "All 30 models are stabilisable and detectable" in told
     assert "stewart-drake analyze hautus paper --out" in page
     assert page.count("<img") == 2
@@ -106,7 +107,7 @@ def test_delay_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         growth = math.exp(limit["delay"] * fastest["fastest_pole"])
         assert growth == pytest.approx(limit["amplification"])
     told = capsys.readouterr().out
-    assert max(map(len, told.splitlines()[:-1])) <= 80  # the last one names the directory
+    assert not too_long(told)
     for part in ("beatable: yes", "1.64 ms longer", "21.0", "left 1.00", "no reach 1.00"):
         assert part in told
     assert page.count("<img") == 3

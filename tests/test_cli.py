@@ -22,6 +22,7 @@ from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
+from tests.screen import too_long
 
 EXACT = ("--set", "plant.kind=exact")
 MULTIBODY = ("--set", "plant.kind=multibody")
@@ -142,7 +143,7 @@ def test_simulate_prints_a_verdict_and_a_table_and_writes_everything(tmp_path, c
     assert err == ""
     assert lines[0].startswith("this loop is stable: linearised along the reference")
     assert "the delay of 0.8 s alone, under any controller, beatable: yes" in " ".join(lines)
-    assert all(len(line) <= 80 for line in lines[:-1])  # the last one names the folder
+    assert not too_long(out)
     for word in ("completed", "E_ac", "floor", "peak error", "torque", "controller step", "wall"):
         assert word in out
     assert files(tmp_path) == RUN_FILES | {"parameters.png", "parameters.svg"}
@@ -185,7 +186,7 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys, monkeyp
     out, err = capsys.readouterr()
     lines = out.splitlines()
     assert err == ""
-    assert all(len(line) <= 80 for line in lines[:-1])
+    assert not too_long(out)
     rows = [next(line for line in lines if line.startswith(LABELS[n])) for n in CONTROLLERS]
     assert "left workspace" in rows[0] and "at 1.36 s, leg 2" in lines[lines.index(rows[0]) + 1]
     assert [row.split()[2] for row in rows] == ["NaN", "NaN", "225", "80", "-"]
@@ -281,7 +282,7 @@ def test_version_and_no_arguments(capsys):
 def test_list_describes_everything_shipped(capsys):
     assert main(["list"]) == 0
     out = capsys.readouterr().out
-    assert all(len(line) <= 80 for line in out.splitlines())
+    assert not too_long(out)
     for kind in KINDS:
         for name in shipped(kind):
             assert any(line.split()[:1] == [name] for line in out.splitlines())

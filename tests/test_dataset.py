@@ -50,6 +50,7 @@ from stewart_drake.tuning.data import (
     watching,
 )
 from stewart_drake.tuning.training import curves_of, labels
+from tests.screen import too_long
 
 # The paper's own controller costs little, keeps a small motion in the workspace at some delays and
 # loses it at others.
@@ -395,7 +396,7 @@ def test_the_command_writes_a_data_set_of_disturbed_runs(tmp_path, capsys, monke
     arguments += [part for setting in SMALL for part in ("--set", setting)]
     assert main([*arguments, "--workers", "1", "--out", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
-    assert err == "" and all(len(line) <= 80 for line in out.splitlines()[:-1])
+    assert err == "" and not too_long(out)
     assert "1 runs, 100 rows" in out
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["runs"] == 1 and summary["rows"] == 100

@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.studies import jobs as module
 from stewart_drake.studies.jobs import (
     MANIFEST,
     finished,
     run_jobs,
     settings_hash,
-    write_atomically,
 )
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -188,14 +188,14 @@ def test_leftovers_are_removed_and_a_full_disk_spoils_nothing(tmp_path, monkeypa
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
     path = tmp_path / "file"
-    write_atomically(path, b"old")
+    write_whole(path, b"old")
 
     def broken(source: Path, target: Path) -> None:
         raise PermissionError("no")
 
     monkeypatch.setattr(module.os, "replace", broken)
     with pytest.raises(PermissionError):
-        write_atomically(path, b"new")
+        write_whole(path, b"new")
     assert path.read_bytes() == b"old" and [p.name for p in tmp_path.iterdir()] == ["file"]
 
 

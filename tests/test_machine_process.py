@@ -315,7 +315,8 @@ def test_either_side_of_a_network_may_stand_still_for_a_second(side: str) -> Non
         "nothing was heard from the controller for 0.7 s: the safe torque (zero) acts"
         in running.said
     )
-    told = r"E_ac +[\d.]+ % s" if survived else "left workspace|lost machine|lost contact"
+    # With a second of ten missing, E_ac is near the share of samples from which it is not given.
+    told = r"E_ac +(none|[\d.]+ % s)," if survived else "left workspace|lost (machine|contact)"
     assert re.search(told, driving.said), driving.lines
 
 

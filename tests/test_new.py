@@ -10,6 +10,7 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.cli import main, new
 from stewart_drake.mechanism.kinematics import leg_geometry
+from tests.screen import too_long
 
 MEASURED: dict[str, Any] = {
     "base-radius": 0.2,
@@ -65,7 +66,7 @@ def test_no_other_height_gives_the_rods_a_better_push(tmp_path: Path) -> None:
 def test_what_it_proposes_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["new", str(tmp_path), *flags(torque_limit=2.0, delay=0.05)]) == 0
     said = capsys.readouterr().out
-    assert said.startswith("yes: ") and all(len(line) <= 80 for line in said.splitlines()[:-2])
+    assert said.startswith("yes: ") and not too_long(said)
     assert "(estimated: uniform disc)" in said and "the motors have 2" in said
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["inertia_estimated"] == ["base", "plate", "crank", "rod"]

@@ -49,6 +49,7 @@ from stewart_drake.studies.uncertainty import (
     scales_of,
 )
 from tests.mechanisms import PAPER
+from tests.screen import too_long
 
 ROOT = Path(__file__).resolve().parents[1]
 SCALES = Scales(4.0, (0.26, 0.26, 0.26, 0.02, 0.02, 0.08), 0.0133, 0.95, 0.11, 0.1, 0.66)
@@ -811,7 +812,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     words += ["--set", "duration=0.2", "--vary", "delay=0", "--vary", "noise=0.002"]
     assert main(words) == 0
     told = capsys.readouterr().out
-    assert max(map(len, told.splitlines()[:-1])) <= 80
+    assert not too_long(told)
     summary = json.loads((out / "summary.json").read_text())
     assert summary["runs"] == 3
     assert summary["ranges"]["noise"] == 0.002

@@ -30,6 +30,7 @@ from stewart_drake.tuning.training import (
     train_by_regret,
     unpack,
 )
+from tests.screen import too_long
 
 pytest.importorskip("torch")
 
@@ -364,7 +365,7 @@ def test_the_command_writes_network_figures_and_summary(tmp_path, capsys):
     out = tmp_path / "new" / "net.json"
     assert main(["tune", "train", str(tmp_path), "--out", str(out), "--split", "cell"]) == 0
     printed, err = capsys.readouterr()
-    assert err == "" and all(len(line) <= 80 for line in printed.splitlines()[:-1])
+    assert err == "" and not too_long(printed)
     assert {path.name for path in out.parent.iterdir()} == {
         "net.json",
         "summary.json",

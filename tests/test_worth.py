@@ -30,6 +30,7 @@ from stewart_drake.tuning.worth import (
     tuned_run,
     tuners_of,
 )
+from tests.screen import too_long
 
 FIXED = tuple(GAINS_OF_FAMILIES)
 NAMES = ("a", "b", TUNER)
@@ -209,7 +210,7 @@ def test_the_command_prints_a_table_and_writes_a_summary(tmp_path, capsys):
     arguments += [part for setting in SMALL for part in ("--set", setting)]
     assert main([*arguments, "--workers", "1", "--out", str(tmp_path / "out")]) == 0
     out, err = capsys.readouterr()
-    assert err == "" and all(len(line) <= 80 for line in out.splitlines()[:-1])
+    assert err == "" and not too_long(out)
     assert "of 2 conditions that all complete" in " ".join(out.split())
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert set(summary["candidates"]) == {*GAINS, TUNER, HINDSIGHT}

@@ -13,7 +13,7 @@ from stewart_drake.cli.common import (
     check_file,
     open_meshcat,
 )
-from stewart_drake.files.fileio import replacing
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.reporting.terminal import echo
 
 app = typer.Typer(rich_markup_mode=None, help="Look at a mechanism.")
@@ -34,8 +34,7 @@ def sdf(
         typer.echo(text, nl=False)
         return
     check_file(out)
-    with replacing(out) as partial:
-        partial.write_text(text)
+    write_whole(out, text)
     echo(f"written to {out}")
 
 
@@ -81,9 +80,7 @@ def view(
     delivery = Delivery(out, quiet)
     viewer = PoseViewer(load_mechanism(mechanism), open_meshcat())
     if out is not None:
-        text = viewer.meshcat.StaticHtml()
-        with replacing(out / "view.html") as partial:
-            partial.write_text(text)
+        write_whole(out / "view.html", viewer.meshcat.StaticHtml())
         delivery.wrote("view.html")
         delivery.end({})
         return

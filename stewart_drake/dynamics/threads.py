@@ -1,24 +1,9 @@
 """What the threads of a process have to agree on."""
 
 import threading
-from functools import cached_property
-from typing import Any, Final, TypeVar
+from typing import Final
 
 from threadpoolctl import OpenBLASController, threadpool_limits
-
-_T_co = TypeVar("_T_co", covariant=True)
-
-BUILDING: Final = threading.RLock()
-"""Held while CasADi expressions are made and compiled: once, whoever else asks meanwhile."""
-
-
-class built_once(cached_property[_T_co]):
-    """A `cached_property` that is made under BUILDING, hence by one thread, for all."""
-
-    def __get__(self, instance: Any, owner: Any = None) -> Any:
-        """The value; later on, Python finds it in the instance without coming here."""
-        with BUILDING:
-            return super().__get__(instance, owner)
 
 
 class _OneBlasThread:

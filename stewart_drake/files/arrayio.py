@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import read_bytes, replacing
+from stewart_drake.files.fileio import read_bytes, write_whole
 
 _MAX_NPZ: Final = 10_000_000
 _MAX_NC: Final = 500_000_000
@@ -83,8 +83,7 @@ def write_netcdf(path: Path, data: xr.Dataset) -> None:
     # Made in memory: HDF5 ends the process where a disk is full. Copied: a view of xarray's buffer
     # that the traceback of a failed write holds makes Python print a warning when both are freed.
     content = bytes(data.to_netcdf(engine="h5netcdf"))
-    with replacing(path) as partial:
-        partial.write_bytes(content)
+    write_whole(path, content)
 
 
 def _brief(error: Exception) -> str:

@@ -72,6 +72,16 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file by `replacing`; text as UTF-8.
+
+    Raises:
+        OSError: see `replacing`.
+    """
+    with replacing(path) as partial:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
 def remove_partials(folder: Path) -> None:
     """Remove the temporary files of writers that were killed, in a folder without other writers."""
     for partial in folder.glob(".*.????????????????.part"):

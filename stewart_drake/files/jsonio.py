@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import read_bytes, replacing
+from stewart_drake.files.fileio import read_bytes, write_whole
 from stewart_drake.files.yamlio import brief
 
 _SEAL: Final = re.compile(rb'\{"crc32": "([0-9a-f]{8})", ')
@@ -63,9 +63,7 @@ def sealed_json(data: dict[str, Any]) -> bytes:
 
 def write_json(path: Path, data: Any) -> None:
     """Write JSON with NaN as null, by way of a temporary file, so that no half file remains."""
-    text = json.dumps(jsonable(data), indent=2, allow_nan=False)
-    with replacing(path) as partial:
-        partial.write_text(text + "\n")
+    write_whole(path, json.dumps(jsonable(data), indent=2, allow_nan=False) + "\n")
 
 
 def jsonable(data: Any) -> Any:

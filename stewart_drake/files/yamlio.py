@@ -269,12 +269,13 @@ def _explained(type_: type, data: Any, errors: list[Any]) -> str:
     """Return the first few problems in one line; unknown keys keep the others back."""
     unknown = [e for e in errors if e["type"] in ("extra_forbidden", "unexpected_keyword_argument")]
     told = [_explain_unknown(type_, data, error) for error in unknown]
-    told = told or [_explain(data, error) for error in errors]
+    told = told or [explain(data, error) for error in errors]
     more = [f"and {len(told) - _MOST_PROBLEMS} more"] if len(told) > _MOST_PROBLEMS else []
     return "; ".join([*told[:_MOST_PROBLEMS], *more])
 
 
-def _explain(data: Any, error: Any) -> str:
+def explain(data: Any, error: Any) -> str:
+    """Return an error of pydantic as `place: got value; expected what is accepted`."""
     place, value = _place(data, error["loc"]), error["input"]
     expected = re.sub(r"^(\w+ should (be|have) |Value error, )| after validation", "", error["msg"])
     if error["type"].startswith("missing"):

@@ -21,13 +21,11 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.law.catch_up import DEFAULT_CATCH_UP
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, POSE, RATES
-
-Array = NDArray[np.float64]
+from stewart_drake.types import Array
 
 
 @dataclass(frozen=True)

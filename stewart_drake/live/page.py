@@ -8,7 +8,6 @@ computer too, do not know it.
 
 import json
 import logging
-import math
 import multiprocessing
 import secrets
 import sys
@@ -24,6 +23,7 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.jsonio import jsonable
 from stewart_drake.live.loop import Seen
 from stewart_drake.live.steering import Wish
 from stewart_drake.mechanism.geometry import Mechanism
@@ -155,7 +155,7 @@ class _Board:
 
     def put(self, said: dict[str, Any]) -> None:
         with self.news:
-            self.said = json.dumps(_finite(said), allow_nan=False)
+            self.said = json.dumps(jsonable(said), allow_nan=False)
             self.number += 1
             self.news.notify_all()
 
@@ -258,15 +258,6 @@ def _words(seen: Seen) -> dict[str, Any]:
         "byHand": seen.by_hand,
         "limit": seen.limit,
     }
-
-
-def _finite(said: Any) -> Any:
-    """Return the same with null for NaN and infinity, which JSON does not have."""
-    if isinstance(said, dict):
-        return {key: _finite(value) for key, value in said.items()}
-    if isinstance(said, list):
-        return [_finite(value) for value in said]
-    return None if isinstance(said, float) and not math.isfinite(said) else said
 
 
 class _Server(ThreadingHTTPServer):

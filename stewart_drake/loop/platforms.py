@@ -29,7 +29,7 @@ from stewart_drake.loop.multibody import (
     add_model,
     set_pose,
 )
-from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.files import as_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.signals import (
@@ -212,7 +212,7 @@ def AddStewartPlatform(
         ConfigError: bad input: a plant that is finalized, or given for kind exact.
         UnreachablePoseError: a start out of reach.
     """
-    machine = mechanism if isinstance(mechanism, Mechanism) else load_mechanism(mechanism)
+    machine = as_mechanism(mechanism)
     config = PlantConfig() if config is None else config
     pose = machine.home if start is None else np.asarray(start, dtype=np.float64)
     if pose.shape != (6,):

@@ -24,7 +24,7 @@ from stewart_drake.law.linear_loop import LinearLoop
 from stewart_drake.loop.controller_margin import controller_margin, loop_at
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.scenario.signals import COORDINATES, LEGS, NUM_TORQUES, STATE
 from stewart_drake.types import Array
 
@@ -83,7 +83,7 @@ def linear_models(scenario: Scenario | str | Path, time: float | None = None) ->
     Raises:
         ConfigError: bad input, an unreachable reference; no time, and a loop that was not judged.
     """
-    loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    loaded = as_scenario(scenario)
     experiment = prepare(loaded)
     if time is None:
         margin = controller_margin(experiment)

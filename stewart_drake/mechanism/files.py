@@ -176,6 +176,11 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism:
     return _of_content(read_yaml(path), path)
 
 
+def as_mechanism(given: Mechanism | str | Path) -> Mechanism:
+    """Return a mechanism as it is, or load it by its shipped name or path."""
+    return given if isinstance(given, Mechanism) else load_mechanism(given)
+
+
 def mechanism_spec(name_or_path: str | Path) -> MechanismSpec:
     """What a mechanism's file says, in its own words.
 

@@ -15,7 +15,7 @@ from stewart_drake.loop.results import SimulationResult as LoopResult
 from stewart_drake.reporting.analyses import ANALYSES, RENAMED, analyze, options_of, words_of
 from stewart_drake.reporting.results import AnalysisResult, ComparisonResult, SimulationResult
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.studies import compare as comparison
 
 P = ParamSpec("P")
@@ -83,7 +83,7 @@ def analysis_function(name: str) -> Callable[..., AnalysisResult]:
         given = signature.bind(*args, **kwargs).arguments
         scenario, directory = given.pop("scenario"), given.pop("directory", None)
         told = "".join(f", {key}={value!r}" for key, value in given.items())
-        loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+        loaded = as_scenario(scenario)
         if row.exact:
             loaded, given = _exact(loaded), _exact(given)
         with TemporaryDirectory() as scratch:

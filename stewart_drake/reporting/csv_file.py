@@ -11,7 +11,7 @@ import xarray as xr
 
 from stewart_drake.files.arrayio import load_netcdf
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import replacing
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.yamlio import brief
 from stewart_drake.scenario.signals import COORDINATE_NAMES, COORDINATES, SIGNALS, Signal
 
@@ -63,9 +63,7 @@ def write_csv(signals: xr.Dataset, path: Path) -> Path:
     Raises:
         OSError: the file cannot be written.
     """
-    text = signals_csv(signals)
-    with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_whole(path, signals_csv(signals))
     return path
 
 

@@ -17,7 +17,7 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from stewart_drake.files.fileio import replacing
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.versions import versions
 from stewart_drake.reporting.document import Document
 from stewart_drake.reporting.style import figure_style, for_dark_too, rounded
@@ -53,9 +53,7 @@ def write_page(document: Document, made: Provenance, path: Path) -> Path:
     Raises:
         OSError: the file cannot be written.
     """
-    text = html(document, made)
-    with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_whole(path, html(document, made))
     return path
 
 

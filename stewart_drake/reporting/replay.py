@@ -10,7 +10,7 @@ import xarray as xr
 from pydrake.geometry import Meshcat, MeshcatParams, Rgba
 from pydrake.math import RotationMatrix
 
-from stewart_drake.files.fileio import replacing
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.versions import versions
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.scene import TORQUE_COLORS, Scene, crank_paths, full_color, torque_shares
@@ -107,9 +107,7 @@ def write_replay(result: SimulationResult, mechanism: Mechanism, path: Path, tit
     Raises:
         OSError: the file cannot be written.
     """
-    text = replay_html(result, mechanism, title)
-    with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_whole(path, replay_html(result, mechanism, title))
     return path
 
 

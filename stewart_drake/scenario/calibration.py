@@ -8,7 +8,7 @@ import numpy as np
 import pydantic.dataclasses
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import replacing
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.yamlio import brief, load_yaml, validate, yaml_text
 from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.signals import COULOMB_SPEED, LEGS, PLANT_PARAMETERS
@@ -137,5 +137,4 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
         "mean": calibration.mean.tolist(),
         "covariance": calibration.covariance.tolist(),
     }
-    with replacing(Path(path)) as partial:
-        partial.write_text(yaml_text(data), encoding="utf-8")
+    write_whole(Path(path), yaml_text(data))

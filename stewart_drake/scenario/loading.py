@@ -58,6 +58,11 @@ def load_scenario(
     return _without_idle(read.scenario)
 
 
+def as_scenario(given: Scenario | str | Path) -> Scenario:
+    """Return a scenario as it is, or load it by its shipped name or path."""
+    return given if isinstance(given, Scenario) else load_scenario(given)
+
+
 def load_understood(
     name_or_path: str | Path,
     controller: str | Path | None = None,

@@ -31,7 +31,7 @@ from pydantic.dataclasses import dataclass
 from typing_extensions import TypeVar
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import remove_partials, replacing
+from stewart_drake.files.fileio import remove_partials, write_whole
 from stewart_drake.files.jsonio import jsonable, load_json
 from stewart_drake.files.yamlio import brief, validate
 from stewart_drake.studies.cluster import on_cluster
@@ -125,7 +125,7 @@ def run_jobs(
         tell(len(found), len(jobs))
         with closing(made):
             for key, data in made:
-                write_atomically(paths[key], data)
+                write_whole(paths[key], data)
                 found[key] = read(paths[key])
                 tell(len(found), len(jobs))
     return {key: found[key] for key in jobs}
@@ -155,16 +155,6 @@ def _kept(paths: Mapping[str, Path], read: Callable[[Path], T]) -> dict[str, T]:
 def settings_hash(settings: Mapping[str, Any]) -> str:
     """SHA-256 over the settings as canonical JSON: keys sorted, numbers by their shortest text."""
     return hashlib.sha256(_canonical(settings).encode()).hexdigest()
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that it is there whole or not at all, also after a loss of power.
-
-    Raises:
-        OSError: it cannot be written; nothing is left behind.
-    """
-    with replacing(path) as partial:
-        partial.write_bytes(data)
 
 
 def _named(key: str, function: Callable[..., bytes], job: Job) -> tuple[str, bytes]:
@@ -202,7 +192,7 @@ def _check_manifest(folder: Path, settings: Mapping[str, Any], suffix: str) -> N
                 "that an earlier start has made"
             )
         text = json.dumps({"hash": settings_hash(settings), "settings": mine}, indent=2)
-        write_atomically(path, (text + "\n").encode())
+        write_whole(path, text + "\n")
         return
     expected = "the manifest of the runs beside it (choose another folder, or delete this one)"
     manifest = read_manifest(folder, expected)

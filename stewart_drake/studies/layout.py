@@ -22,6 +22,7 @@ from scipy.optimize import Bounds, differential_evolution
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.jsonio import load_json, sealed_json
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import validate, yaml_text
@@ -44,7 +45,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.clearance import Nearest, clearance_along
-from stewart_drake.studies.jobs import Progress, run_jobs, write_atomically
+from stewart_drake.studies.jobs import Progress, run_jobs
 from stewart_drake.studies.layout_measures import (
     MEASURES,
     Motion,
@@ -399,7 +400,7 @@ def study_layout(
     texts = {f"layout_{k}": _text(problem, one, f"layout_{k}") for k, one in enumerate(chosen, 1)}
     _remove_more(folder, len(texts))
     for name, text in texts.items():
-        write_atomically(folder / f"{name}.yaml", text.encode())
+        write_whole(folder / f"{name}.yaml", text)
     own = scenario.mechanism
     places = {"before": own} | {name: str((folder / f"{name}.yaml").resolve()) for name in texts}
     judged = run_jobs(

@@ -20,7 +20,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import replacing
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.law.startup import reference_torque
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.experiment import prepare
@@ -282,6 +282,5 @@ def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
             ),
         )
         for path in (machine, scenario):
-            with replacing(folder / path.name) as partial:
-                partial.write_bytes(path.read_bytes())
+            write_whole(folder / path.name, path.read_bytes())
     return made

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.yamlio import brief
+from stewart_drake.files.yamlio import explain
 from stewart_drake.scenario.config import Scenario
 
 
@@ -64,12 +64,7 @@ class Options(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as caught:
-            error = caught.errors(include_url=False)[0]
-            place = ".".join(map(str, error["loc"]))
-            expected = error["msg"].removeprefix("Input should be ")
-            raise ConfigError(
-                f"{place}: got {brief(error['input'])}; expected {expected}"
-            ) from None
+            raise ConfigError(explain(values, caught.errors(include_url=False)[0])) from None
 
     @classmethod
     def described(cls) -> Iterator[Option]:

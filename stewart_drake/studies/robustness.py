@@ -8,13 +8,13 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import remove_partials
+from stewart_drake.files.fileio import remove_partials, write_whole
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.experiment import prepare, simulated_machine
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.studies.jobs import Progress, run_jobs, write_atomically
+from stewart_drake.studies.jobs import Progress, run_jobs
 from stewart_drake.studies.options import Flag, JobOptions, Seed
 from stewart_drake.studies.ranges import RANGE_UNITS, Ranges, read_ranges
 from stewart_drake.studies.robustness_result import RobustnessStudy, table
@@ -126,7 +126,7 @@ def study_robustness(
         others,
     )
     remove_partials(directory)
-    write_atomically(directory / "runs.csv", table(study).encode())
+    write_whole(directory / "runs.csv", table(study))
     return study
 
 

@@ -21,7 +21,7 @@ from pydantic import ConfigDict
 from scipy.special import expit
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import replacing
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.jsonio import load_json
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import brief, validate
@@ -182,8 +182,7 @@ def save_network(network: Network, path: str | Path) -> None:
         text = json.dumps(data | {"card": dict(network.card)}, indent=2, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"card: {error}; expected plain JSON values, null for NaN") from None
-    with replacing(path) as partial:
-        partial.write_text(text + "\n", encoding="utf-8")
+    write_whole(path, text + "\n")
 
 
 def load_network(name_or_path: str | Path) -> Network:
