@@ -1,7 +1,7 @@
 """Write stewart_drake/__init__.pyi, which tells type checkers the public names.
 
-The names come from the table in stewart_drake/__init__.py. The functions of analyses, which are
-made at run time, are written with their signatures.
+The names come from the table in stewart_drake/__init__.py. Functions whose arguments are made of
+options at run time are written with their signatures.
 """
 
 import inspect
@@ -10,20 +10,20 @@ import subprocess
 from pathlib import Path
 
 import stewart_drake as sd
-from stewart_drake.reporting.analyses import ANALYSES, words_of
 
 STUB = Path(sd.__file__).with_name("__init__.pyi")
 
 
 def text():
-    made = {"_".join(words_of(name)) for name in ANALYSES}
     lines, functions, modules = [], [], set()
     for name, module in sorted(sd._HOMES.items(), key=lambda pair: pair[::-1]):
-        if name not in made:
+        value = getattr(sd, name)
+        if not (inspect.isfunction(value) and "__signature__" in vars(value)):
             lines.append(f"from stewart_drake.{module} import {name} as {name}")
             continue
-        shown = f"def {name}{inspect.signature(getattr(sd, name))}: ..."
+        shown = f"def {name}{inspect.signature(value)}: ..."
         shown = shown.replace("pathlib._local.", "pathlib.")  # of Python 3.13
+        shown = re.sub(r"Optional\[(Literal\[.*?\])\]", r"typing.\1 | None", shown)
         modules |= set(re.findall(r"\b[a-z_.]+(?=\.[A-Z])", shown))
         functions.append(shown)
     lines += [f"from stewart_drake import {name} as {name}" for name in sd._MODULES]

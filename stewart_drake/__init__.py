@@ -6,7 +6,9 @@ from typing import Any, Final
 from stewart_drake.reporting.analyses import ANALYSES, words_of
 
 _PUBLIC: Final = {
-    "functions": "check_model export_c export_csv identify model_sdf new plan_identification",
+    "functions": "check_model evaluate_tuner export_c export_csv identify make_tuner_data "
+    "model_sdf new plan_identification run_live run_machine train_tuner view_model",
+    "files.resources": "shipped",
     "dynamics.stewart": "StewartDynamics",
     "files.errors": "ConfigError",
     "loop.diagram": "ClosedLoop build_closed_loop",

@@ -1,6 +1,7 @@
 # Written by .ci/public_names.py.
 import collections.abc
 import pathlib
+import typing
 
 import stewart_drake.reporting.results
 import stewart_drake.scenario.config
@@ -9,6 +10,7 @@ from stewart_drake import law as law
 from stewart_drake import systems as systems
 from stewart_drake.dynamics.stewart import StewartDynamics as StewartDynamics
 from stewart_drake.files.errors import ConfigError as ConfigError
+from stewart_drake.files.resources import shipped as shipped
 from stewart_drake.functions import check_model as check_model
 from stewart_drake.functions import export_c as export_c
 from stewart_drake.functions import export_csv as export_csv
@@ -16,6 +18,9 @@ from stewart_drake.functions import identify as identify
 from stewart_drake.functions import model_sdf as model_sdf
 from stewart_drake.functions import new as new
 from stewart_drake.functions import plan_identification as plan_identification
+from stewart_drake.functions import run_live as run_live
+from stewart_drake.functions import run_machine as run_machine
+from stewart_drake.functions import view_model as view_model
 from stewart_drake.loop.diagram import ClosedLoop as ClosedLoop
 from stewart_drake.loop.diagram import build_closed_loop as build_closed_loop
 from stewart_drake.loop.exact import ExactPlant as ExactPlant
@@ -100,6 +105,7 @@ __all__ = [
     "check_model",
     "compare",
     "design_law",
+    "evaluate_tuner",
     "export_c",
     "export_csv",
     "identify",
@@ -108,15 +114,63 @@ __all__ = [
     "linear_models",
     "load_mechanism",
     "load_scenario",
+    "make_tuner_data",
     "model_sdf",
     "new",
     "plan_identification",
     "report",
+    "run_live",
+    "run_machine",
     "set_accuracy",
+    "shipped",
     "simulate",
     "systems",
+    "train_tuner",
+    "view_model",
 ]
 
+def evaluate_tuner(
+    directory: str | pathlib.Path,
+    networks: collections.abc.Sequence[str | pathlib.Path] = (),
+    scenario: str | pathlib.Path = "paper",
+    controller: str | pathlib.Path | None = None,
+    settings: collections.abc.Iterable[str] = (),
+    *,
+    progress: collections.abc.Callable[[int, int], None] | None = None,
+    command: str = "",
+    family: typing.Literal["T", "N2"] | None = None,
+    seed: int = 0,
+    scenarios: int = 40,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def make_tuner_data(
+    directory: str | pathlib.Path,
+    scenario: str | pathlib.Path = "paper",
+    controller: str | pathlib.Path | None = None,
+    settings: collections.abc.Iterable[str] = (),
+    *,
+    progress: collections.abc.Callable[[int, int], None] | None = None,
+    family: typing.Literal["T", "N2"] | None = None,
+    seed: int = 0,
+    disturbed: int | None = None,
+    draws: int | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def train_tuner(
+    data: str | pathlib.Path,
+    out: str | pathlib.Path,
+    *,
+    progress: collections.abc.Callable[[int, int], None] | None = None,
+    regret: bool = False,
+    start: float | None = None,
+    labels: typing.Literal["as_run", "best_in_cell", "best_in_cell_torque"] | None = None,
+    split: typing.Literal["sample", "run", "cell"] | None = None,
+    density: typing.Literal["magnitude", "signed"] | None = None,
+    seed: int = 0,
+    workers: int | None = None,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
 def analyze_delay(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, simulations: bool = True
 ) -> stewart_drake.reporting.results.AnalysisResult: ...

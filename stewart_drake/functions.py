@@ -1,8 +1,10 @@
-"""Python functions of the commands that make files: identify, new, export, export-c, model."""
+"""Python functions of the commands that are neither a run nor an analysis of a scenario."""
 
-from collections.abc import Iterable, Sequence
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,12 +21,16 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.reporting.identification import document, plan_document
-from stewart_drake.reporting.results import AnalysisResult, analysis_result
+from stewart_drake.reporting.page import Provenance
+from stewart_drake.reporting.results import AnalysisResult, SimulationResult, analysis_result
 from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario, load_scenario, scenario_yaml
+from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.mechanism_check import MechanismCheck, check_mechanism
 from stewart_drake.studies.new_machine import Measurements, NewMachine, new_machine
+from stewart_drake.studies.options import takes
+from stewart_drake.tuning.options import DataOptions, TrainingOptions, WorthOptions
 
 MECHANISM: Final = "mechanism.yaml"
 CALIBRATION: Final = "calibration.yaml"
@@ -196,3 +202,214 @@ def model_sdf(mechanism: Mechanism | str | Path) -> str:
         ConfigError: bad input.
     """
     return to_sdformat(as_mechanism(mechanism))
+
+
+def view_model(mechanism: Mechanism | str | Path) -> None:
+    """Show a mechanism in Meshcat, with sliders for its pose, until Stop is pressed there.
+
+    Raises:
+        ConfigError: bad input.
+    """
+    from pydrake.geometry import Meshcat
+
+    from stewart_drake.reporting.viewer import PoseViewer
+
+    PoseViewer(as_mechanism(mechanism), Meshcat()).run(print)
+
+
+def run_live(
+    scenario: Scenario | str | Path,
+    machine: str,
+    duration: float = math.inf,
+    *,
+    armed: bool = False,
+    accept_jitter: bool = False,
+    max_missing: float | None = None,
+    key: str | Path | None = None,
+    log: str | Path | None = None,
+) -> SimulationResult:
+    """Drive a machine over UDP in real time.
+
+    Args:
+        scenario: or a shipped name or a path.
+        machine: HOST:PORT where it listens.
+        duration: s.
+        armed: whether a machine that is no simulation may be driven.
+        accept_jitter: whether to start where the jitter is more than the loop is stable for.
+        max_missing: s without measurements after which the run ends; by the estimator's
+            uncertainty if None.
+        key: file whose bytes both sides share.
+        log: CSV file that is written as the run goes on.
+
+    Raises:
+        ConfigError: bad input, no such machine, or one that does not begin.
+    """
+    from stewart_drake.live.connect import address_of
+    from stewart_drake.live.endpoint import read_key
+    from stewart_drake.live.session import drive, prepare_session
+
+    secret = None if key is None else read_key(Path(key))
+    ready = prepare_session(as_scenario(scenario), address_of(machine), secret)
+    how: Any = {"armed": armed, "accept_jitter": accept_jitter, "max_missing": max_missing}
+    how["log"] = None if log is None else Path(log)
+    return SimulationResult.of(drive(ready, duration, **how))
+
+
+def run_machine(
+    scenario: Scenario | str | Path,
+    duration: float = math.inf,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 47000,
+    key: str | Path | None = None,
+    **settings: float | str,
+) -> dict[str, Any]:
+    """Simulate a machine in real time, for a controller over UDP; return what happened.
+
+    Args:
+        scenario: or a shipped name or a path; its plant, sensor, delay, link and limits.
+        duration: s of the machine's clock.
+        host: to listen at; beyond loopback with a key.
+        port: UDP.
+        key: file whose bytes both sides share.
+        settings: fields of `stewart_drake.live.machine.Settings`: rate, watchdog, safe, restart.
+
+    Raises:
+        ConfigError: bad input.
+    """
+    from stewart_drake.live.endpoint import Endpoint, read_key
+    from stewart_drake.live.machine import Machine, Settings, check_scenario
+    from stewart_drake.live.protocol import ControllerMessage
+
+    loaded = as_scenario(scenario)
+    check_scenario(loaded)
+    chosen = Settings(**settings)  # type: ignore[arg-type]
+    secret = None if key is None else read_key(Path(key))
+    endpoint = Endpoint(ControllerMessage, host, port, secret)
+    try:
+        running = Machine(prepare(loaded), endpoint, chosen)
+        running.run(duration)
+    finally:
+        endpoint.close()
+    return running.summary()
+
+
+@takes(DataOptions)
+def make_tuner_data(
+    directory: str | Path,
+    scenario: str | Path = "paper",
+    controller: str | Path | None = None,
+    settings: Iterable[str] = (),
+    *,
+    options: DataOptions,
+    progress: Progress | None = None,
+) -> AnalysisResult:
+    """Make the data that a tuner is trained on, or go on with it.
+
+    Args:
+        directory: of dataset.nc and of the runs.
+        scenario: shipped name or path.
+        controller: laid over the scenario's own.
+        settings: as `load_scenario` takes them.
+        progress: called with the number of finished conditions and of all.
+        OPTIONS
+
+    Raises:
+        ConfigError: bad input.
+    """
+    from stewart_drake.reporting.tuner_document import data_document
+    from stewart_drake.tuning.data import make_data, summarize
+
+    family, started = options.conditions(scenario, controller, settings), time.perf_counter()
+    data = make_data(family, directory, progress=progress, **options.jobs)
+    command = f"sd.make_tuner_data({str(directory)!r}, {scenario!r})"
+    return _timed(data, summarize(data), data_document, command, started)
+
+
+@takes(TrainingOptions)
+def train_tuner(
+    data: str | Path,
+    out: str | Path,
+    *,
+    options: TrainingOptions,
+    progress: Progress | None = None,
+) -> AnalysisResult:
+    """Train the tuner's network on a data set; `study.network` of the result is the network.
+
+    Args:
+        data: folder or file of `make_tuner_data`.
+        out: file of the network; with `regret` its own runs are kept beside it.
+        progress: called with the number of the network's finished runs and of all.
+        OPTIONS
+
+    Raises:
+        ConfigError: bad input, or torch is missing.
+    """
+    from stewart_drake.reporting.tuner_document import training_document
+    from stewart_drake.tuner.network import save_network
+    from stewart_drake.tuning import training
+    from stewart_drake.tuning.data import load_data
+
+    options.check()
+    read, out = load_data(data), Path(out)
+
+    given: dict[str, Any]
+    if options.regret:
+        given = options.model_dump(include={"seed", "start", "workers"})
+        runs = out.with_name(f"{out.stem}-runs")
+        found = training.train_by_regret(read, runs, progress=progress, **given)
+    else:
+        given = {"kind": options.labels, "split": options.split, "density": options.density}
+        chosen = {name: one for name, one in given.items() if one is not None}
+        found = training.train(read, seed=options.seed, **chosen)
+    save_network(found.network, out)
+    summary, made = training.summarize(found), f"sd.train_tuner({str(data)!r}, {str(out)!r})"
+    return AnalysisResult(found, summary, training_document(summary), Provenance(made))
+
+
+@takes(WorthOptions)
+def evaluate_tuner(
+    directory: str | Path,
+    networks: Sequence[str | Path] = (),
+    scenario: str | Path = "paper",
+    controller: str | Path | None = None,
+    settings: Iterable[str] = (),
+    *,
+    options: WorthOptions,
+    progress: Progress | None = None,
+    command: str = "",
+) -> AnalysisResult:
+    """Compare a tuner with fixed gains on conditions that training did not have.
+
+    Args:
+        directory: where the runs are kept, so that a second call goes on with them.
+        networks: shipped names or files; none for the shipped one.
+        scenario: shipped name or path.
+        controller: laid over the scenario's own.
+        settings: as `load_scenario` takes them.
+        progress: called with the number of finished conditions and of all.
+        command: that the page names; by default the call of this function.
+        OPTIONS
+
+    Raises:
+        ConfigError: bad input.
+    """
+    from stewart_drake.reporting.worth_document import worth_document
+    from stewart_drake.tuning.worth import evaluate
+
+    family, started = options.conditions(scenario, controller, settings), time.perf_counter()
+    worth = evaluate(family, networks, directory, progress=progress, **options.jobs)
+    command = command or f"sd.evaluate_tuner({str(directory)!r}, {list(networks)!r})"
+    return _timed(worth, worth.summary, lambda worth, _: worth_document(worth), command, started)
+
+
+def _timed(
+    study: Any,
+    summary: dict[str, Any],
+    document: Callable[[Any, dict[str, Any]], Any],
+    command: str,
+    started: float,
+) -> AnalysisResult:
+    seconds = time.perf_counter() - started
+    made = Provenance(command, seconds=seconds)
+    return AnalysisResult(study, summary | {"wall_s": seconds}, document(study, summary), made)

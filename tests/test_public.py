@@ -3,11 +3,14 @@
 import ast
 import inspect
 import runpy
+import socket
+import threading
 from pathlib import Path
 
 import pytest
 
 import stewart_drake as sd
+from stewart_drake.cli.examples import EXAMPLES
 from stewart_drake.loop.experiment import prepare
 
 SETTINGS = ("plant.kind=exact", "duration=0.1")
@@ -76,6 +79,57 @@ def test_machines_and_what_is_made_of_them_fit_a_line_or_two(name):
     assert repr(machine) in repr(prepare(sd.load_scenario(name)))
     for thing in (machine, sd.StewartDynamics(machine), prepare(sd.load_scenario(name))):
         assert len(repr(thing)) < 400 and "\n" not in repr(thing)
+
+
+FUNCTIONS = {
+    "export": "export_csv",
+    "list": "shipped",
+    "live": "run_live",
+    "machine": "run_machine",
+    "model check": "check_model",
+    "model sdf": "model_sdf",
+    "model view": "view_model",
+    "tune dataset": "make_tuner_data",
+    "tune evaluate": "evaluate_tuner",
+    "tune train": "train_tuner",
+}
+"""By command, where the name is not that of the command."""
+
+
+@pytest.mark.parametrize("words", [words for words in EXAMPLES if words])
+def test_every_command_has_a_function(words):
+    name = FUNCTIONS.get(words, words.replace(" ", "_").replace("-", "_"))
+    assert name in sd.__all__
+    documented = (Path(__file__).parents[1] / "docs" / "python.md").read_text()
+    assert f"`sd.{name}`" in documented
+
+
+def test_functions_of_the_tuner_take_its_options(tmp_path):
+    data = sd.make_tuner_data(tmp_path, settings=("duration=10",), disturbed=1, seed=3, workers=1)
+    assert data.summary["conditions"] == 1 and data.summary["seed"] == 3
+    assert "of each g is" in data.table() and (tmp_path / "dataset.nc").is_file()
+    with pytest.raises(sd.ConfigError, match="draws: got 20 without --family"):
+        sd.make_tuner_data(tmp_path, draws=20)
+    with pytest.raises(sd.ConfigError, match="labels: got as_run with --regret"):
+        sd.train_tuner(tmp_path, tmp_path / "net.json", regret=True, labels="as_run")
+    with pytest.raises(TypeError, match="scenarios"):
+        sd.make_tuner_data(tmp_path, scenarios=2)
+
+
+@pytest.mark.slow
+def test_a_machine_and_a_live_run_from_python():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    way = "low: 0.1, high: 0.12, loss: 0"
+    network = f"link={{kind: network, {way}, return: {{{way}}}}}"
+    machine = sd.load_scenario("paper", settings=("plant.kind=exact", network))
+    assert sd.run_machine(machine, 0.1, port=0, safe="hold")["runs"] == 0
+    serve = threading.Thread(target=sd.run_machine, args=(machine,), kwargs={"port": port})
+    serve.daemon = True
+    serve.start()
+    run = sd.run_live("paper", f"127.0.0.1:{port}", 1.0, accept_jitter=True)
+    assert run.summary["live"]["samples"] > 5 and run.table()
 
 
 @pytest.mark.slow

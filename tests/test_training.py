@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from stewart_drake.cli import main, tune
+from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.signals import TUNER_INPUTS
-from stewart_drake.studies.families import PAIRS, RATIOS
+from stewart_drake.studies.families import FAMILIES, PAIRS, RATIOS
 from stewart_drake.tuner.density import Kind
 from stewart_drake.tuner.network import load_network, save_network
 from stewart_drake.tuner.source import ratio_of
 from stewart_drake.tuning import training
 from stewart_drake.tuning.data import data_hash
+from stewart_drake.tuning.options import DataOptions, Split, TrainingOptions
 from stewart_drake.tuning.training import (
     Curves,
     RegretTrainer,
@@ -226,19 +227,15 @@ def test_rows_after_a_failure_are_not_trained_on(data):
     assert np.isfinite(rows.inputs).all()
 
 
-@pytest.mark.parametrize(
-    ("choices", "known"),
-    [
-        (tune.LabelKind, training.LABELS),
-        (tune.SplitKind, training.SPLITS),
-        (tune.DensityKind, get_args(Kind)),
-    ],
-)
-def test_the_command_offers_what_training_knows(choices, known):
-    assert tuple(choices) == known
+def test_the_options_offer_what_there_is():
+    def offered(options, name):
+        return get_args(get_args(options.model_fields[name].annotation)[0])
+
+    assert offered(TrainingOptions, "density") == get_args(Kind)
+    assert offered(DataOptions, "family") == tuple(FAMILIES)
 
 
-@pytest.mark.parametrize("split", training.SPLITS)
+@pytest.mark.parametrize("split", get_args(Split))
 def test_splits_keep_together_what_belongs_together(data, split):
     rows = labelled_rows(data, "best_in_cell", "magnitude")
     mask = split_rows(rows, split, rng(0))

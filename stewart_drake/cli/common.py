@@ -70,11 +70,6 @@ Settings = Annotated[
 Controller = Annotated[
     str | None, typer.Option(metavar="NAME|FILE", help="Laid over the scenario's own.")
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")]
-Workers = Annotated[int | None, typer.Option(metavar="N", help="Processes; all cores by default.")]
-Scheduler = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to run on instead.")
-]
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="For summary, signals, figures.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
@@ -137,31 +132,6 @@ def _remove_empty(directories: list[Path]) -> None:
     with contextlib.suppress(OSError):
         for path in directories:
             path.rmdir()
-
-
-def refuse(options: Mapping[str, object], why: str) -> None:
-    """Refuse what would be ignored; None and an empty list were not given.
-
-    Args:
-        options: by what the command calls them.
-        why: what follows the value, with what is expected.
-
-    Raises:
-        ConfigError: one line, about the first that was given.
-    """
-    for name, value in options.items():
-        if value is not None and value != []:
-            raise ConfigError(f"{name}: got {value} {why}")
-
-
-@contextlib.contextmanager
-def flags_named(flags: Mapping[str, str]) -> Iterator[None]:
-    """In an error, call a field by the option that sets it."""
-    try:
-        yield
-    except ConfigError as error:
-        name, colon, rest = str(error).partition(":")
-        raise ConfigError(f"{flags.get(name, name)}{colon}{rest}") from None
 
 
 @contextlib.contextmanager

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stewart_drake.cli.common import AsJson, Delivery, Out, Quiet, Settings, refuse
+from stewart_drake.cli.common import AsJson, Delivery, Out, Quiet, Settings
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.tolerances import TOLERANCE_UNITS, read_tolerances
 from stewart_drake.reporting.terminal import working
+from stewart_drake.studies.options import refuse
 
 if TYPE_CHECKING:
     from stewart_drake.identification.log_files import Precision

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from stewart_drake.cli.common import AsJson, Delivery, Quiet, flags_named
+from stewart_drake.cli.common import AsJson, Delivery, Quiet
+from stewart_drake.cli.options import flags_named
 from stewart_drake.files.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -3,15 +3,22 @@
 The command line, the Python signature and the command that a page names follow from them.
 """
 
-from collections.abc import Callable, Iterator
+import functools
+import inspect
+import textwrap
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import explain
-from stewart_drake.scenario.config import Scenario
+
+if TYPE_CHECKING:
+    from stewart_drake.scenario.config import Scenario
+
+_R = TypeVar("_R")
 
 
 @dataclass(frozen=True)
@@ -28,7 +35,7 @@ class Flag:
 
     metavar: str | None = None
     name: str = ""
-    read: Callable[[list[str], Callable[[str], Scenario]], Any] | None = None
+    read: "Callable[[list[str], Callable[[str], Scenario]], Any] | None" = None
     recorded: bool = True
 
 
@@ -77,6 +84,62 @@ class Options(BaseModel):
             )
         yield from sorted(found, key=lambda option: not option.recorded)
 
+    @classmethod
+    def parameters(cls) -> list[inspect.Parameter]:
+        """Return the keyword arguments of a Python function with these options."""
+        kind = inspect.Parameter.KEYWORD_ONLY
+        return [
+            inspect.Parameter(one.name, kind, default=one.default, annotation=one.annotation)
+            for one in cls.described()
+        ]
+
+
+def argument_lines(meanings: Mapping[str, str]) -> list[str]:
+    """Return the lines of a docstring's section `Args`."""
+    shown = {"initial_indent": " " * 4, "subsequent_indent": " " * 8}
+    return [
+        line
+        for name, text in meanings.items()
+        for line in textwrap.wrap(f"{name}: {text}", 96, **shown)  # type: ignore[arg-type]
+    ]
+
+
+def takes(kind: type[Options]) -> Callable[[Callable[..., _R]], Callable[..., _R]]:
+    """Return a decorator that replaces the argument `options` of a function by its options."""
+
+    def decorate(function: Callable[..., _R]) -> Callable[..., _R]:
+        own = inspect.signature(function)
+        before = [one for one in own.parameters.values() if one.name != "options"]
+        shown = own.replace(parameters=[*before, *kind.parameters()])
+
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> _R:
+            given = shown.bind(*args, **kwargs).arguments
+            options = kind(**{name: given.pop(name) for name in kind.model_fields if name in given})
+            return function(**given, options=options)
+
+        call.__signature__ = shown  # type: ignore[attr-defined]
+        told = argument_lines({one.name: one.help for one in kind.described()})
+        call.__doc__ = (function.__doc__ or "").replace("    OPTIONS", "\n".join(told).lstrip())
+        return call
+
+    return decorate
+
+
+def refuse(options: Mapping[str, object], why: str) -> None:
+    """Refuse what would be ignored; None and an empty list were not given.
+
+    Args:
+        options: by name.
+        why: what follows the value, with what is expected.
+
+    Raises:
+        ConfigError: one line, about the first that was given.
+    """
+    for name, value in options.items():
+        if value is not None and value != []:
+            raise ConfigError(f"{name}: got {value} {why}")
+
 
 class JobOptions(Options):
     """Options of a study whose runs go to several processes."""
@@ -89,6 +152,11 @@ class JobOptions(Options):
         Field(description="Of a Dask cluster to run on instead."),
         Flag("ADDRESS", recorded=False),
     ] = None
+
+    @property
+    def jobs(self) -> dict[str, Any]:
+        """Return where the runs go, as `run_jobs` takes it."""
+        return {"workers": self.workers, "scheduler": self.scheduler}
 
 
 Seed = Annotated[int, Field(ge=0, description="Of everything that is drawn."), Flag()]

@@ -55,12 +55,9 @@ from stewart_drake.tuning.data import (
     read_condition,
     roll_out,
 )
+from stewart_drake.tuning.options import Labels, Split
 from stewart_drake.types import Array
 
-Labels = Literal["as_run", "best_in_cell", "best_in_cell_torque"]
-LABELS: Final = ("as_run", "best_in_cell", "best_in_cell_torque")
-Split = Literal["sample", "run", "cell"]
-SPLITS: Final = ("sample", "run", "cell")
 FeatureName = Literal["densities", "health"]
 Indices = NDArray[np.intp]
 

@@ -1,0 +1,125 @@
+"""Command-line parameters that follow from the options of a study."""
+
+import contextlib
+import inspect
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.studies.options import Option, Options
+
+if TYPE_CHECKING:
+    from stewart_drake.scenario.config import Scenario
+
+
+class Given:
+    """Options that a command was called with.
+
+    Args:
+        kind: class of the options.
+        typed: values by the option's name on the command line.
+    """
+
+    def __init__(self, kind: type[Options], typed: Mapping[str, Any]) -> None:
+        self._kind, self._typed = kind, typed
+
+    @property
+    def words(self) -> dict[str, Any]:
+        """What was typed, as the command on a page shows it."""
+        return {_dashed(one): self._typed[_name(one)] for one in _offered(self._kind, True)}
+
+    def options(self, load: "Callable[[str], Scenario] | None" = None) -> Any:
+        """Return the options; `load` loads the scenario with another controller.
+
+        Raises:
+            ConfigError: a value that is not accepted.
+        """
+        with self.named():
+            values = {one.name: self._value(one, load) for one in _offered(self._kind)}
+            return self._kind(**{name: value for name, value in values.items() if value is not ...})
+
+    @contextlib.contextmanager
+    def named(self) -> Iterator[None]:
+        """In an error, call a field by the option that sets it."""
+        flags = {one.name: f"--{_dashed(one)}" for one in _offered(self._kind)}
+        with flags_named(flags):
+            yield
+
+    def _value(self, one: Option, load: Any) -> Any:
+        typed = self._typed[_name(one)]
+        if one.flag is None or one.flag.read is None:
+            return typed
+        return one.flag.read(typed, load) if typed else one.default
+
+
+def with_options(
+    kind: type[Options], without: Collection[str] = ()
+) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """Return a decorator that replaces the argument `given` of a command by options.
+
+    Args:
+        kind: class of the options.
+        without: arguments that the command does not offer; they keep their defaults.
+    """
+
+    def decorate(command: Callable[..., int]) -> Callable[..., int]:
+        shown: list[inspect.Parameter] = []
+        for one in inspect.signature(command).parameters.values():
+            if one.name == "given":
+                shown += map(_parameter, _offered(kind))
+            elif one.name not in without:
+                shown.append(one.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+        names = [_name(one) for one in _offered(kind)]
+
+        def run(**typed: Any) -> int:
+            given = Given(kind, {name: typed.pop(name) for name in names})
+            return command(**typed, given=given)
+
+        run.__name__, run.__doc__, run.__annotations__ = command.__name__, command.__doc__, {}
+        run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+        return run
+
+    return decorate
+
+
+@contextlib.contextmanager
+def flags_named(flags: Mapping[str, str]) -> Iterator[None]:
+    """In an error, call a field by the option that sets it."""
+    try:
+        yield
+    except ConfigError as error:
+        name, colon, rest = str(error).partition(":")
+        raise ConfigError(f"{flags.get(name, name)}{colon}{rest}") from None
+
+
+def _offered(kind: type[Options], recorded: bool = False) -> list[Option]:
+    return [one for one in kind.described() if one.flag and (one.recorded or not recorded)]
+
+
+def _parameter(one: Option) -> inspect.Parameter:
+    """Return the command line's parameter."""
+    assert one.flag is not None
+    option = typer.Option(
+        f"--{_dashed(one)}",
+        metavar=one.flag.metavar,
+        help=one.help + " Repeatable." * bool(one.flag.read),
+    )
+    annotation, default = one.annotation, one.default
+    if one.flag.read:
+        annotation, default = list[str] | None, None
+    return inspect.Parameter(
+        _name(one),
+        inspect.Parameter.KEYWORD_ONLY,
+        annotation=Annotated[annotation, option],
+        default=default,
+    )
+
+
+def _name(one: Option) -> str:
+    return (one.flag and one.flag.name) or one.name
+
+
+def _dashed(one: Option) -> str:
+    return _name(one).replace("_", "-")

@@ -1,0 +1,145 @@
+"""Options of data, training and evaluation of a tuner; nothing heavy is imported here."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
+
+from pydantic import Field
+
+from stewart_drake.studies.options import Flag, JobOptions, Options, Seed, refuse
+
+if TYPE_CHECKING:
+    from stewart_drake.studies.families import Family
+
+Labels = Literal["as_run", "best_in_cell", "best_in_cell_torque"]
+Split = Literal["sample", "run", "cell"]
+DRAWS: Final = 384
+
+
+class FamilyOptions(JobOptions):
+    """Options of runs under the conditions of a family."""
+
+    purpose: ClassVar[Literal["training", "evaluation"]]
+    family: Annotated[
+        Literal["T", "N2"] | None,
+        Field(description="Conditions where weights matter: T with the estimator, N2 without."),
+        Flag(),
+    ] = None
+    seed: Seed = 0
+
+    @property
+    def number(self) -> int:
+        """Number of conditions to draw; 0 for the paper's grid."""
+        raise NotImplementedError
+
+    def conditions(
+        self,
+        scenario: str | Path,
+        controller: str | Path | None,
+        settings: Iterable[str],
+    ) -> "Family":
+        """Draw the conditions, on the exact plant unless a setting says otherwise.
+
+        Raises:
+            ConfigError: options that do not go together, or as the families.
+        """
+        from stewart_drake.scenario.loading import load_scenario
+        from stewart_drake.studies.families import disturbed_family, faulty_family, paper_grid
+
+        number = self.number
+        if self.family is not None:
+            said = {
+                "SCENARIO": None if scenario == "paper" else scenario,
+                "--controller": controller,
+            }
+            refuse(said, "with --family, which says it; expected none")
+            return faulty_family(self.family, number, self.seed, self.purpose, tuple(settings))
+        base = load_scenario(scenario, controller, ("plant.kind=exact", *settings))
+        if number == 0:
+            return paper_grid(base)
+        return disturbed_family(base, number, self.seed, self.purpose)
+
+
+class DataOptions(FamilyOptions):
+    """Options of the data that a tuner is trained on."""
+
+    purpose = "training"
+    disturbed: Annotated[
+        int | None,
+        Field(ge=0, description="N drawn conditions instead of the paper's grid."),
+        Flag("N"),
+    ] = None
+    draws: Annotated[
+        int | None,
+        Field(
+            ge=10,
+            description=f"With --family: how many, each with 13 ratios; {DRAWS} by default.",
+        ),
+        Flag("N"),
+    ] = None
+
+    @property
+    def number(self) -> int:
+        if self.family is None:
+            refuse({"draws": self.draws}, "without --family; expected both or neither")
+            return self.disturbed or 0
+        why = "with --family, which has --draws; expected one of them"
+        refuse({"disturbed": self.disturbed}, why)
+        return DRAWS if self.draws is None else self.draws
+
+
+class WorthOptions(FamilyOptions):
+    """Options of the evaluation of a tuner."""
+
+    purpose = "evaluation"
+    scenarios: Annotated[int, Field(ge=2, description="How many to draw."), Flag("N")] = 40
+
+    @property
+    def number(self) -> int:
+        return self.scenarios
+
+
+class TrainingOptions(Options):
+    """Options of the training of a network."""
+
+    regret: Annotated[
+        bool,
+        Field(description="By regret, on data of a --family; else as the paper."),
+        Flag(),
+    ] = False
+    start: Annotated[
+        float | None,
+        Field(description="With --regret: log10 w_Q / w_R at first; else the best."),
+        Flag("RATIO"),
+    ] = None
+    labels: Annotated[
+        Labels | None,
+        Field(description="What the network learns to answer; best_in_cell by default."),
+        Flag(),
+    ] = None
+    split: Annotated[
+        Split | None, Field(description="What 70 % of are trained on; run by default."), Flag()
+    ] = None
+    density: Annotated[
+        Literal["magnitude", "signed"] | None,
+        Field(description="Of (45); magnitude by default."),
+        Flag(),
+    ] = None
+    seed: Seed = 0
+    workers: Annotated[
+        int | None, Field(description="Processes; all cores by default."), Flag("N")
+    ] = None
+
+    def check(self) -> None:
+        """Refuse options of the other loss.
+
+        Raises:
+            ConfigError: there is one.
+        """
+        others: dict[str, object]
+        if self.regret:
+            others = {"labels": self.labels, "split": self.split, "density": self.density}
+            refuse(others, "with --regret; expected it without")
+        else:
+            others = {"start": self.start, "workers": self.workers}
+            refuse(others, "without --regret; expected it with --regret")
