@@ -7,7 +7,6 @@ held in the copy for ever. The one that is copied here has a single thread.
 import contextlib
 import os
 import signal
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import get_context
@@ -84,22 +83,3 @@ def status_of(work: Callable[[], object]) -> int:
         copy.join(PATIENCE)
         assert copy.exitcode is not None, f"no end after {PATIENCE} s"
         return copy.exitcode
-
-
-def killed(work: Callable[[], object], after: float) -> bool:
-    """Run `work` in a copy and kill -9 it after so many s; whether it came to that.
-
-    Raises:
-        AssertionError: it failed before.
-    """
-    with copied(work) as copy:
-        copy.join(after)
-        assert copy.exitcode in (None, 0)
-        return copy.exitcode is None
-
-
-def duration(work: Callable[[], object]) -> float:
-    """s; a kill at any time of it meets the work somewhere, however fast the machine is."""
-    began = time.monotonic()
-    assert status_of(work) == 0
-    return time.monotonic() - began

@@ -52,9 +52,3 @@ def test_table_two_on_three_plants_and_what_its_law_lacks(tmp_path, capsys):
     assert len(lines) == 5 and all(line.count("|") == 4 for line in lines)
     written = (tmp_path / "table2.txt").read_text()
     assert rows in written and capsys.readouterr().out == written
-
-
-def test_every_script_is_run_by_a_test():
-    tests = "".join(path.read_text() for path in Path(__file__).parent.glob("test_*.py"))
-    for path in [*FOLDER.glob("*.py"), *FOLDER.glob("*.ipynb")]:
-        assert f'"{path.stem}"' in tests or path.name in tests, path.name

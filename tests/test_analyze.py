@@ -195,23 +195,6 @@ def test_json_and_quiet(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize(
-    ("arguments", "part"),
-    [
-        (["hautus", "--set", "delay.steps=-1"], "delay.steps"),
-        (["delay", "nowhere"], "nowhere"),
-        (["delay", "--controller", "nobody"], "nobody"),
-    ],
-)
-def test_bad_input_is_one_line(
-    arguments: list[str], part: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["analyze", *arguments]) == 2
-    complaint = capsys.readouterr().err
-    assert part in complaint
-    assert len(complaint.splitlines()) == 1
-
-
 # ------------------------------------------------------------------ the map
 
 

@@ -1,7 +1,6 @@
 """Command lines: what is refused, before anything is computed or written."""
 
 import fcntl
-import json
 import os
 import sys
 from pathlib import Path
@@ -9,9 +8,6 @@ from pathlib import Path
 import pytest
 
 from stewart_drake.cli import main
-from stewart_drake.loop.simulation import simulate
-from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.jobs import settings_hash
 from tests.faults import refusal, tree, written
 
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.1", "--set", "delay.steps=1")
@@ -168,41 +164,6 @@ def test_two_commands_do_not_write_into_one_directory(tmp_path, capsys):
     finally:
         os.close(other)
     assert main(["model", "check", "paper", "--quiet", "--out", str(tmp_path)]) == 0
-
-
-@pytest.mark.parametrize("words", [["tune", "dataset"], ["tune", "evaluate", "--scenarios", "2"]])
-def test_runs_of_other_settings_keep_their_summary(words, tmp_path, capsys):
-    runs = tmp_path / ("conditions" if words[1] == "dataset" else "fixed")
-    runs.mkdir()
-    written(runs / "manifest.json", json.dumps({"hash": settings_hash({}), "settings": {}}))
-    written(tmp_path / "summary.json", "of those runs")
-    assert "other settings" in refusal([*words, "--out", str(tmp_path)], capsys)
-    assert (tmp_path / "summary.json").read_text() == "of those runs"
-
-
-@pytest.mark.parametrize("content", [b"", b"hello", b"\x89HDF\r\n\x1a\n" + b"0" * 64, bytes(4096)])
-def test_signals_and_data_that_are_none(content, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    written(tmp_path / "mine.nc", content)
-    before = tree(tmp_path)
-    assert "mine.nc" in refusal(["export", "mine.nc"], capsys)
-    assert "mine.nc" in refusal(["tune", "train", "mine.nc", "--out", "new/net.json"], capsys)
-    assert tree(tmp_path) == before
-
-
-def test_signals_cut_off_are_refused(tmp_path, capsys):
-    simulate(load_scenario("paper", settings=EXACT[1::2]), judge_stability=False).save(tmp_path)
-    whole = (tmp_path / "signals.nc").read_bytes()
-    for keep in (0.1, 0.5, 0.95):
-        written(tmp_path / "cut.nc", whole[: int(keep * len(whole))])
-        assert "cut.nc" in refusal(["export", str(tmp_path / "cut.nc")], capsys)
-
-
-def test_a_folder_in_the_place_of_a_file_is_named(tmp_path, capsys):
-    (tmp_path / "summary.json").mkdir()
-    assert main(["model", "check", "paper", "--quiet", "--out", str(tmp_path)]) == 2
-    err = capsys.readouterr().err
-    assert "summary.json" in err and err.count("\n") == 1
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")

@@ -145,17 +145,3 @@ def test_every_field_with_a_range_is_there():
 def test_another_unit_is_noticed(setting, said):
     with pytest.raises(ConfigError, match=said):
         load_scenario("paper", settings=[setting])
-
-
-def test_a_mechanism_in_millimetres_or_grams_is_noticed(tmp_path):
-    for edits, said in [
-        ({"home": [0, 0, 0, 0, 0, 380]}, "home"),
-        ({"crank.length": 110.0}, "rod.length"),
-        ({"pattern.base_radius": 220.0}, "out of reach"),
-        ({"home": [0, 15, 0, 0, 0, 0.38]}, "home: got a pitch of 15 rad"),
-    ]:
-        document = PAPER
-        for name, value in edits.items():
-            document = put(document, name, value)
-        path = written(tmp_path / "mine.yaml", yaml_text(document))
-        assert said in complaint(load_mechanism, path)

@@ -63,15 +63,6 @@ def test_what_scripts_send_to_workers_can_be_read_there(monkeypatch, tmp_path):
         assert done.returncode == 0, f"{name}: {done.stderr}"
 
 
-def test_every_script_shares_one_place_for_its_page_and_one_way_to_be_quick():
-    """`make bench QUICK=1` runs all of them at the least size, and overwrites no result."""
-    for path in FOLDER.glob("[a-z]*.py"):
-        text = path.read_text(encoding="utf-8")
-        assert "RESULTS =" not in text, f"{path.name}: takes RESULTS of _page.py"
-        for name in ("SEEDS", "MACHINES", "KILLS", "RUNS"):
-            assert f'environ.get("{name}"' not in text, f"{path.name}: takes size() of _page.py"
-
-
 def test_every_part_of_a_step_is_timed(monkeypatch):
     """By the law in Python; of the two ways to observe, each estimator has one."""
     steps = script("controller_step", monkeypatch)
@@ -109,29 +100,3 @@ def test_the_table_of_claims_has_all_rows_as_they_are(monkeypatch):
         assert len(found["E_ac"]) == (len(claims.SEEDS) if row.drawn else 1)
         assert found["E_ac"].count(None) == len(found["lost_at"])
     assert "\n".join(claims.page(data)) in claims.DATA.with_suffix(".md").read_text("utf-8")
-
-
-def test_a_bias_of_the_claims_has_random_signs(monkeypatch, tmp_path):
-    claims = script("claims", monkeypatch)
-    row = claims.chosen_rows(["bias-noise"])["bias-noise"]
-    scenarios = [claims.scenario_of(row, seed, str(tmp_path)) for seed in claims.SEEDS]
-    biases = {tuple(scenario.plant.torque_bias) for scenario in scenarios}
-    assert len(biases) > 10 and all(abs(b) == 3e-4 for bias in biases for b in bias)
-    assert len({scenario.sensor.seed for scenario in scenarios}) == len(claims.SEEDS) == 20
-
-
-def test_a_row_counts_lost_runs(monkeypatch):
-    claims = script("claims", monkeypatch)
-    found = {"E_ac": [1.0, None, 3.0], "lost_at": [1.234]}
-    assert claims.numbers(found) == ["3", "3", "2", "1.4", "3", "1, from 1.23 s on"]
-    found = {"E_ac": [None, None, 3.0], "lost_at": [2.0, 1.5]}
-    assert claims.numbers(found) == ["3", "lost", "3", "-", "3", "2, from 1.50 s on"]
-
-
-def test_a_push_of_the_claims_moves_the_plate(monkeypatch):
-    claims = script("claims", monkeypatch)
-    short = (*claims.ON, "duration=1.5")
-    calm = claims.Row("calm", "", short)
-    pushed = claims.Row("pushed", "", short, force=0.05, span=(0.5, 9.0))
-    (clean, _), (moved, _) = claims.run(calm, 0), claims.run(pushed, 0)
-    assert moved > 10 * clean

@@ -63,11 +63,6 @@ def test_parameters_of_the_machine_are_checked(parameters) -> None:
         sd.StewartDynamics(PAPER, parameters=parameters)
 
 
-def test_gravity_is_a_switch_or_a_number() -> None:
-    found = [sd.StewartDynamics(PAPER, gravity=g).gravity for g in (True, False, 1, 0, 1.62)]
-    assert found == [9.81, 0.0, 1.0, 0.0, 1.62]
-
-
 @pytest.mark.parametrize("wrong", [[0, 0, 0.18], 0.38, np.zeros((2, 6)), []])
 def test_a_pose_has_six_coordinates(wrong) -> None:
     for method in (PAPER.crank_angles, PAPER.reach_margins, PAPER.jacobian):
@@ -77,11 +72,6 @@ def test_a_pose_has_six_coordinates(wrong) -> None:
         PAPER.forward_kinematics(wrong)
     with pytest.raises(ValueError, match=r"^guess: got shape"):
         PAPER.forward_kinematics(REST, wrong)
-
-
-def test_a_pose_may_be_a_list() -> None:
-    np.testing.assert_array_equal(PAPER.crank_angles(HOME.tolist()), PAPER.crank_angles(HOME))
-    np.testing.assert_array_equal(PAPER.jacobian(list(HOME)), PAPER.jacobian(HOME))
 
 
 # Copies.

@@ -73,19 +73,7 @@ def test_a_scenario_is_prepared_once(tmp_path, monkeypatch) -> None:
         (["simulate", "--set", "plant.knd=exact"], ["plant.knd", "did you mean plant.kind?"]),
         (["simulate", "--set", "gravity=true"], ["gravity: unknown", "mean plant.gravity?"]),
         (["simulate", "--set", "kind=exact"], ["kind: unknown", "expected one of mechanism"]),
-        (
-            ["simulate", "--set", "delay.steps=-1"],
-            ["delay.steps", "-1", "greater than or equal to 0"],
-        ),
-        (
-            ["simulate", "--set", "controller.period=0"],
-            ["controller.period", "got 0", "greater than or equal to"],
-        ),
-        (["simulate", "--set", "plant.time_step=0.003"], ["plant.time_step", "0.003", "whole"]),
-        (["simulate", "--set", "nonsense"], ["'nonsense'", "section.field=value"]),
         (["simulate", "missing.yaml"], ["missing.yaml", "paper"]),
-        (["simulate", "papper"], ["papper", "paper"]),
-        (["simulate", "--controller", "lqj"], ["lqj", "lqi"]),
         (["simulate", "--controller", "./lqi"], ["lqi", "no file"]),
         (
             ["simulate", "--set", "reference.amplitude=[0.3, 0.3, 0.3, 0.2, 0.2, 0.3]"],
@@ -93,20 +81,11 @@ def test_a_scenario_is_prepared_once(tmp_path, monkeypatch) -> None:
         ),
         (
             ["simulate", "--set", "reference.offset=[0, 0, 0, 0, 0, 380]"],
-            [
-                "reference",
-                "t = 0.00 s",
-                "begins at x, y, z = 0, 0, 380000 mm",
-                "home is at 0, 0, 380",
-            ],
+            ["reference", "begins at x, y, z = 0, 0, 380000 mm", "home is at 0, 0, 380"],
         ),
         (["simulate", "--contoller", "lqi"], ["--contoller", "did you mean --controller?"]),
-        (["simulate", "--out"], ["--out", "requires"]),
-        (["simulate", "paper", "twice"], ["twice"]),
         (["compare", "--set", "delay.steps=-1"], ["delay.steps", "-1"]),
-        (["compar"], ["compar"]),
         (["model"], ["Missing command"]),
-        (["model", "check", "papr"], ["papr", "paper"]),
     ],
 )
 def test_bad_input_is_refused_in_one_line(arguments, said, capsys):
@@ -116,21 +95,6 @@ def test_bad_input_is_refused_in_one_line(arguments, said, capsys):
     assert err.startswith("error: ") and err.count("\n") == 1 and err.endswith("\n")
     for words in said:
         assert words in err
-
-
-@pytest.mark.parametrize("name", ["simulate", "compare"])
-def test_an_unwritable_directory_is_refused_before_the_run(name, tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    assert main([name, "--out", str(tmp_path / "file" / "folder")]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1
-    assert "--out" in err and "expected a directory that can be written" in err
-
-
-def test_sdf_is_not_written_over_a_directory(tmp_path, capsys):
-    assert main(["model", "sdf", "paper", "--out", str(tmp_path)]) == 2
-    assert "expected a file" in capsys.readouterr().err
-    assert not files(tmp_path)
 
 
 # ---------------------------------------------------------------- simulate and compare
@@ -259,6 +223,14 @@ def test_ctrl_c_in_compare_reaches_the_processes_in_an_orderly_way(tmp_path):
 
 
 # ---------------------------------------------------------------- the rest
+
+
+def test_a_process_says_the_same(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("duration: 2021-05-30")
+    done = subprocess.run(command("simulate", str(path)), capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"error: {path}: duration: got '2021-05-30'; expected a valid number\n"
 
 
 def test_help_comes_without_drake():

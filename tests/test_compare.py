@@ -81,11 +81,6 @@ def test_one_core_needs_no_processes_and_ctrl_c_keeps_what_there_is(monkeypatch)
     assert all(0 < time < 5 and error >= 0 for _, time, error in seen)
 
 
-def test_bad_input_is_refused_before_anything_runs():
-    with pytest.raises(ConfigError, match=r"delay\.steps"):
-        compare("paper", ("delay.steps=-1",))
-
-
 def test_a_refused_controller_is_named(monkeypatch):
     monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
     # Under gravity the plate has fallen out of its workspace before the first torque arrives.

@@ -398,21 +398,7 @@ BAD_FILES = {
         ["reference.pose: unknown key", "reference.poses?"],
     ),
     "unknown start": ("start: now", ["start: got 'now'", "'rest' or 'on_reference'"]),
-    "no duration": ("duration: 0", ["duration: got 0", "greater than 0"]),
-    "negative delay": ("delay: {steps: -1}", ["delay.steps: got -1"]),
-    "whole fraction": ("delay: {fraction: 1.0}", ["delay.fraction: got 1.0", "less than 1"]),
-    "no period": ("controller: {period: 0}", ["controller.period: got 0"]),
-    "negative step": ("plant: {time_step: -0.001}", ["plant.time_step: got -0.001"]),
-    "coarse accuracy": ("plant: {accuracy: 0.1}", ["plant.accuracy: got 0.1", "0.01"]),
     "fine accuracy": ("plant: {accuracy: 1e-13}", ["plant.accuracy: got 1e-13", "0.000000000001"]),
-    "negative payload": ("plant: {payload_mass: -1}", ["plant.payload_mass: got -1"]),
-    "negative damping": ("plant: {joint_damping: -1}", ["plant.joint_damping: got -1"]),
-    "no w_Q": ("controller: {w_Q: 0}", ["controller.w_Q: got 0", "greater than 0"]),
-    "negative w_R": ("controller: {w_R: -2}", ["controller.w_R: got -2", "greater than 0"]),
-    "no torque": ("actuator: {torque_limit: 0}", ["actuator.torque_limit: got 0"]),
-    "negative blend": ("controller: {catch_up: -1}", ["controller.catch_up: got -1"]),
-    "negative seed": ("sensor: {seed: -1}", ["sensor.seed: got -1"]),
-    "no frequency": ("reference: {frequency: 0}", ["reference.frequency: got 0"]),
     "unknown unit": ("reference: {frequency_unit: rpm}", ["frequency_unit: got 'rpm'", "'Hz'"]),
     "no mechanism": ("mechanism: ''", ["mechanism: got ''"]),
     "foreign field": (
@@ -451,7 +437,6 @@ BAD_FILES = {
         "controller: {delay_fraction: 0.5}",
         ["controller.delay_fraction: got 0.5", "delay_steps"],
     ),
-    "a blend too short": ("controller: {catch_up: 1e-9}", ["controller.catch_up: got 1e-09"]),
     "a map of no model": (
         "controller: {torque_map: printed}",
         ["controller.torque_map: got 'printed'", "model 'paper'"],
@@ -682,41 +667,9 @@ def test_a_scenario_survives_json_and_yaml(scenario: Scenario, tmp_path: Path) -
 KEYS = st.sampled_from(
     ["duration", "delay", "steps", "reference", "kind", "offset", "controller", "period", "x"]
 )
-VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=7) | st.dictionaries(KEYS, inner, max_size=4),
-    max_leaves=10,
-)
 YAML_LIKE = st.text(
     alphabet="abdeurtions:0123456789.[]{}-,&*!<>|%?#'\"\\\n\t ~\0\u2028é", max_size=60
 )
-
-
-def loads_or_is_refused(path: Path) -> None:
-    try:
-        assert isinstance(load_scenario(path), Scenario)
-    except ConfigError as error:
-        assert len(str(error).splitlines()) == 1
-
-
-@settings(
-    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-@given(text=YAML_LIKE | st.binary(max_size=40))
-def test_any_text_is_a_scenario_or_is_refused(text: str | bytes, tmp_path: Path) -> None:
-    path = tmp_path / "any.yaml"
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    loads_or_is_refused(path)
-
-
-@settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-@given(data=st.dictionaries(KEYS, VALUES, max_size=5))
-def test_any_mapping_is_a_scenario_or_is_refused(data: dict[str, object], tmp_path: Path) -> None:
-    path = tmp_path / "any.yaml"
-    path.write_text(json.dumps(data))  # JSON is YAML
-    loads_or_is_refused(path)
 
 
 @settings(max_examples=200, deadline=None)

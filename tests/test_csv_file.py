@@ -5,7 +5,6 @@ import io
 
 import numpy as np
 import pytest
-import xarray as xr
 
 import stewart_drake as sd
 from stewart_drake.cli import main
@@ -126,21 +125,3 @@ def test_files_need_a_place(option, capsys):
     assert main(["simulate", *SHORT, option]) == 2
     out, err = capsys.readouterr()
     assert out == "" and option in err and "--out" in err
-
-
-def test_signals_without_their_times_are_refused(run, tmp_path, capsys):
-    """A dimension alone would be counted 0, 1, 2, as if that were seconds."""
-    run.signals.drop_vars("time").to_netcdf(tmp_path / "index.nc", engine="h5netcdf")
-    assert main(["export", str(tmp_path / "index.nc")]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1 and "the coordinate time is missing" in err
-
-
-def test_what_is_no_signals_file_is_refused_in_one_line(tmp_path, capsys):
-    (tmp_path / "text.nc").write_text("time,pose\n")
-    xr.Dataset({"a": ("x", [1.0])}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
-    for name in ("missing.nc", "text.nc", "other.nc", "."):
-        assert main(["export", str(tmp_path / name)]) == 2
-        out, err = capsys.readouterr()
-        assert out == "" and err.startswith("error: signals: ") and err.count("\n") == 1
-        assert "expected" in err

@@ -32,11 +32,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import stewart_drake as sd
 from stewart_drake.files import resources
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import load_yaml
 from stewart_drake.law.delay_model import chain, delayed_model
 from stewart_drake.law.error_model import double_integrators, linear_model
@@ -313,11 +311,6 @@ def problem_with(code: str) -> str | None:
     return None
 
 
-def test_the_documents_exist() -> None:
-    pages = {"docs/theory.md", "docs/errata.md", "docs/architecture.md", "docs/howto/results.md"}
-    assert {document(path) for path in DOCS} >= pages | {"README.md", "docs/upgrading.md"}
-
-
 @pytest.mark.parametrize("path", DOCS, ids=document)
 def test_what_is_named_exists(path: Path) -> None:
     codes = set(CODE.findall(prose(path)))
@@ -414,57 +407,6 @@ def test_names_of_0_1_that_are_gone_are_gone() -> None:
         assert name.rpartition(".")[2] not in dir(ClosedLoop)
 
 
-@pytest.mark.parametrize(
-    ("code", "wrong"),
-    [
-        ("law.riccati.lqr", False),
-        ("law.riccati.lqrr", True),
-        ("law.nothing", True),
-        ("plant.gravity: false", False),
-        ("plant.gravitas", True),
-        ("plant.torque", False),
-        ("sensor.torque", True),
-        ("dynamics.stewart.StewartDynamics.predict", False),
-        ("law.nominal.NominalPlant.substeps", False),
-        ("scenario/signals.py", False),
-        ("law/", False),
-        ("law/nothing.py", True),
-        ("tests/test_docs.py::test_the_documents_exist", False),
-        ("tests/test_docs.py::test_nothing", True),
-        ("tests/test_none.py::test_nothing", True),
-        ("GetSubsystemByName", False),
-        ("no_such_name", True),
-        ("scipy.linalg.nothing", False),
-        ("legs", False),
-        ("sd.simulate", False),
-        ("sd.simulat", True),
-        ("sd.StewartDynamics.linearize", False),
-        ("sd.StewartDynamics.linearise", True),
-        ("stewart-drake analyze delay", False),
-        ("stewart-drake analyse delay", True),
-        ("analyze delays", True),
-        ("simulate --csv", False),
-        ("simulate --cvs", True),
-        ("--also CONTROLLER", False),
-        ("--alsos CONTROLLER", True),
-        ("--set tuner.kind=ann", False),
-        ("--set tuna.kind=ann", True),
-        ("make test", False),
-        ("make tests", True),
-        ("python benchmarks/tracking.py", False),
-        ("python benchmarks/trakcing.py", True),
-        ("python -m tests.recorded.runs", False),
-        ("python -m tests.recorded.walks", True),
-        ("out/demo/", False),
-        ("out/nowhere/page.html", True),
-        ("stewart_drake/native/law.c", False),
-        ("stewart_drake/native/lore.c", True),
-    ],
-)
-def test_the_check_of_names_finds_what_is_wrong(code: str, wrong: bool) -> None:
-    assert (problem_with(code) is not None) is wrong
-
-
 # ------------------------------------------------------------------ code blocks
 
 
@@ -543,17 +485,6 @@ def test_commands_parse(block: Block) -> None:
         load(scenario, *overlay)
 
 
-@pytest.mark.parametrize(
-    "line",
-    ["simulatee", "simulate --no-such-option", "simulate nowhere", "simulate --set plant.x=1"],
-)
-def test_a_wrong_command_is_found(line: str) -> None:
-    block = Block(ROOT / "README.md", 1, "sh", f"$ OMP_NUM_THREADS=1 stewart-drake {line}  # text")
-    with pytest.raises(Exception, match=r"(?i)no such|expected") as caught:
-        test_commands_parse(block)
-    assert isinstance(caught.value, ConfigError) or "No such" in str(caught.value)
-
-
 # ------------------------------------------------------------------ the picture of the loop
 
 
@@ -578,14 +509,6 @@ def test_architecture_shows_the_loop_as_it_is() -> None:
     assert preview % 18 == 0
     exported = {diagram.get_output_port(i).get_name() for i in range(diagram.num_output_ports())}
     assert all(f"`{name}`" in text for name in exported)
-
-
-def test_the_readme_s_animation_moves_and_is_small() -> None:
-    path = ROOT / "docs" / "images" / "delay.gif"
-    assert path.stat().st_size < 1e6
-    with Image.open(path) as picture:
-        assert picture.n_frames == 70 and picture.info["duration"] == 100
-        assert picture.info["loop"] == 0  # for ever
 
 
 def test_the_citation_is_of_this_version() -> None:
@@ -687,14 +610,6 @@ def quoted(path: Path) -> Iterator[tuple[str, str, str]]:
 def test_figures_of_a_row_are_those_of_the_table_of_claims(path: Path) -> None:
     problems = {problem_with_claim(*one) for one in quoted(path)} - {None}
     assert not problems, "\n".join(sorted(map(str, problems)))
-
-
-def test_the_documents_quote_the_table_of_claims() -> None:
-    pages = ("README.md", "docs/figures.md", "docs/limits.md", "docs/theory.md")
-    assert all(len(list(quoted(ROOT / page))) > 3 for page in pages)
-    _, *others = claims()
-    assert problem_with_claim("no-such-row", "median", "1")
-    assert problem_with_claim(others[0], "median", "1234.5")
 
 
 def port_rows(text: str) -> dict[str, tuple[str, str]]:

@@ -82,12 +82,6 @@ def angles_at(times: Array) -> Array:
     return np.array([PAPER.crank_angles(reference.value(t)[:, 0]) for t in times])
 
 
-def test_topology() -> None:
-    encoders = Encoders(PAPER, 14, 7, np.zeros(6), 0, 0.1)
-    assert encoders.GetInputPort("state").size() == 12
-    assert encoders.GetOutputPort("measurement").size() == 42
-
-
 @pytest.mark.parametrize("samples", [1, 4, 100])
 def test_exact_encoders_say_where_the_cranks_were(samples: int) -> None:
     first, later = seen([0.0, 0.7], None, samples, np.full(6, 0.01), 0, 0.1)

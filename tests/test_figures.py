@@ -1,7 +1,6 @@
 """Figures: which there are, what they show, that they are whole and always the same."""
 
 import dataclasses
-import itertools
 from xml.etree import ElementTree
 
 import matplotlib.pyplot as plt
@@ -13,7 +12,7 @@ from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.reporting import figures
 from stewart_drake.reporting.figures import comparison_figures, run_figures
-from stewart_drake.reporting.style import CONTROLLER_LINES, controller_lines
+from stewart_drake.reporting.style import controller_lines
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 
@@ -155,13 +154,6 @@ def test_where_all_runs_diverge_they_are_shown_whole(comparison, drawn):
         assert 0.43 < ax.get_xlim()[1] < 0.6
 
 
-def test_lines_of_controllers_differ_in_colour_and_in_grey_print():
-    for one, other in itertools.combinations(CONTROLLER_LINES.values(), 2):
-        assert one.color != other.color
-        assert one.linestyle != other.linestyle
-    assert tuple(CONTROLLER_LINES) == CONTROLLERS
-
-
 def test_a_run_stopped_before_its_first_sample_can_be_drawn(run, drawn):
     nothing = dataclasses.replace(
         run,
@@ -173,11 +165,6 @@ def test_a_run_stopped_before_its_first_sample_can_be_drawn(run, drawn):
     drawn["states"].draw_without_rendering()
     assert list(drawn) == ["states", "errors", "torques"]
     assert comparison_figures({}, "unused") == []
-
-
-def test_an_unwritable_directory_is_reported(run, tmp_path):
-    with pytest.raises(OSError):
-        run_figures(run, tmp_path / "missing")
 
 
 @pytest.mark.parametrize("number", [3, 7, 12])

@@ -1,6 +1,7 @@
-"""Random files: a loader returns the thing itself or raises a one-line ConfigError."""
+"""Wrong and random files: a loader returns the thing itself or raises a one-line ConfigError."""
 
 import json
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,8 +21,7 @@ from stewart_drake.scenario.trajectories import evaluate, make_reference
 from stewart_drake.studies.runs import read_outcome
 from stewart_drake.tuner.network import load_network, save_network
 from stewart_drake.tuning.data import load_data
-from tests.faults import yaml_text
-from tests.test_bad_files import SAMPLES, WAYPOINTS
+from tests.faults import complaint, written, yaml_text
 from tests.test_bad_input import PAPER
 from tests.test_damaged_files import (
     RUN_FILE,
@@ -42,6 +42,9 @@ VALUES = st.recursive(
     lambda inner: st.lists(inner, max_size=7) | st.dictionaries(st.text(max_size=5), inner),
     max_leaves=8,
 )
+HEADER = "time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]"
+SAMPLES = "\n".join([HEADER, *(f"{k / 10},0,0,0,0,0,0.38" for k in range(6))]) + "\n"
+WAYPOINTS = "times: [0.0, 1.0]\nposes: [[0, 0, 0, 0, 0, 0.38], [0, 0, 0, 0, 0, 0.4]]\n"
 SCENARIO = {
     "duration": 1.0,
     "reference": {"kind": "sine", "amplitude": [0.1] * 6, "offset": [0.0] * 6, "frequency": 1.0},
@@ -176,3 +179,42 @@ def test_a_random_file_loads_or_is_refused(name, tmp_path):
 @pytest.mark.parametrize("name", LOADERS)
 def test_two_thousand_random_files_of_each_kind(name, tmp_path):
     fuzz(name, tmp_path, examples=2000, number=1)
+
+
+OTHERS: dict[str, bytes] = {
+    "empty": b"",
+    "binary": bytes(range(256)) * 4,
+    "a pickle": pickle.dumps(json.dumps),
+    "too large": b"#" * 60_000_000,
+    "html": b"<!doctype html><html><body>404</body></html>",
+    "a list": b"[1, 2]",
+}
+
+
+@pytest.mark.parametrize(
+    "kind", ["scenario", "controller", "mechanism", "waypoints", "csv", "network"]
+)
+@pytest.mark.parametrize("content", OTHERS)
+def test_what_is_no_such_file(content, kind, tmp_path):
+    load, name, _ = LOADERS[kind]
+    complaint(load, written(tmp_path / name, OTHERS[content]))
+
+
+YAML_THAT_ACTS = [
+    "!!python/object/apply:os.system ['touch {mark}']",
+    "!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path ['{mark}']]",
+    "!!python/name:os.system ''",
+    "!<tag:yaml.org,2002:python/object/new:subprocess.check_call> [[touch, {mark}]]",
+    "%TAG ! tag:yaml.org,2002:python/\n---\n!object/apply:os.system ['touch {mark}']",
+    "{{=1:1}}",
+]
+
+
+@pytest.mark.parametrize("kind", ["scenario", "waypoints"])
+def test_yaml_executes_nothing(kind, tmp_path):
+    load, name, _ = LOADERS[kind]
+    mark = tmp_path / "mark"
+    for text in YAML_THAT_ACTS:
+        for whole in (text, f"duration: {text}", f"- {text}", f"? {text}\n: 1"):
+            complaint(load, written(tmp_path / name, whole.replace("{mark}", str(mark))))
+            assert not mark.exists()

@@ -249,11 +249,6 @@ def test_a_file_says_features_and_start(tmp_path: Path) -> None:
     assert np.array_equal(found.start, weights_of(-2.0))  # type: ignore[arg-type]
 
 
-def test_the_shipped_network_of_the_paper_has_densities_and_no_start() -> None:
-    found = load_network("tuner")
-    assert (found.features, found.start) == ("densities", None)
-
-
 def test_a_start_outside_the_bounds_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"start: got .*; expected \(w_Q, w_R\) within bounds"):
         network(np.array([1e3, 1e-3]))

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import write_whole
 from stewart_drake.studies import jobs as module
 from stewart_drake.studies.jobs import (
     MANIFEST,
@@ -184,19 +183,6 @@ def test_leftovers_are_removed_and_a_full_disk_spoils_nothing(tmp_path, monkeypa
     assert not list(tmp_path.glob(".*.part"))
     monkeypatch.undo()
     assert len(run_jobs(numbered(2), text, tmp_path, settings=SETTINGS, workers=1)) == 2
-
-
-def test_a_file_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
-    path = tmp_path / "file"
-    write_whole(path, b"old")
-
-    def broken(source: Path, target: Path) -> None:
-        raise PermissionError("no")
-
-    monkeypatch.setattr(module.os, "replace", broken)
-    with pytest.raises(PermissionError):
-        write_whole(path, b"new")
-    assert path.read_bytes() == b"old" and [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_killed_worker_costs_the_jobs_in_flight_only(tmp_path):

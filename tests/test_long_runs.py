@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
 
-from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
@@ -85,22 +84,6 @@ def test_a_prediction_over_many_periods_takes_little_memory():
 def test_a_thousand_runs_leave_nothing_behind():
     """A leak of one context or one compiled function per run would be above."""
     assert growth_per_run(runs=1000, warm_up=100) < 0.02 * MB
-
-
-@pytest.mark.soak
-@needs_proc
-def test_mechanisms_come_and_go():
-    """Functions are compiled for each mechanism and kept for the last ones only."""
-    import dataclasses
-
-    sizes = []
-    for number in range(300):
-        longer = PAPER.rod_lengths + 1e-6 * number
-        dynamics = StewartDynamics(dataclasses.replace(PAPER, rod_lengths=longer), gravity=False)
-        dynamics.inverse_dynamics(PAPER.home, np.zeros(6), np.zeros(6))
-        sizes.append(memory())
-    # The caches hold 64 mechanisms.
-    assert sizes[-1] - sizes[150] < 20 * MB
 
 
 def follow(kind: str, duration: float, *settings: str) -> list[tuple[float, float, float, float]]:

@@ -1,6 +1,5 @@
 """The machine as a process, in real time: signals, suspensions, kills; and both ends in C."""
 
-import ast
 import json
 import os
 import random
@@ -258,37 +257,6 @@ def test_ctrl_c_ends_it_with_one_summary() -> None:
 
 
 @pytest.mark.slow
-def test_a_suspended_machine_goes_on_and_says_so(folder: Path) -> None:
-    with machine() as (running, port):
-        with process(c_controller(folder, port)) as driving:
-            running.until("the run began")
-            time.sleep(0.5)
-            running.popen.send_signal(signal.SIGSTOP)
-            time.sleep(1.2)
-            running.popen.send_signal(signal.SIGCONT)
-            line = running.until("stood still")
-            assert driving.end() in (0, 1)
-        assert running.end(signal.SIGINT) == 130
-    assert 0.8 < float(line.split("stood still for ")[1].split()[0]) < 2.5
-    assert sum("stood still" in line for line in running.lines) == 1
-
-
-@pytest.mark.slow
-def test_a_suspended_controller_is_survived_or_stopped(folder: Path) -> None:
-    with machine("--watchdog", "0.5") as (running, port):
-        with process(c_controller(folder, port)) as driving:
-            running.until("the run began")
-            time.sleep(0.7)
-            driving.popen.send_signal(signal.SIGSTOP)
-            running.until("acts$")
-            time.sleep(0.3)
-            driving.popen.send_signal(signal.SIGCONT)
-            assert driving.end() in (0, 1)
-        assert running.end(signal.SIGINT) == 130
-    assert "for 0.5 s: the safe torque (zero) acts" in running.said
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("side", ["controller", "machine"])
 def test_either_side_of_a_network_may_stand_still_for_a_second(side: str) -> None:
     """Told in one line by whoever stood still; the machine is at its safe torque within the time
@@ -353,18 +321,6 @@ def test_killed_twenty_times(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_machine_ends_the_controller_with_the_reason(folder: Path) -> None:
-    with (
-        machine("--watchdog", "0.3") as (running, port),
-        process(c_controller(folder, port)) as driving,
-    ):
-        running.until("the run began")
-        running.popen.kill()
-        assert driving.end() == 1
-    assert "the machine has fallen silent after" in driving.lines[-2]
-
-
-@pytest.mark.slow
 def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_successor(
     folder: Path,
 ) -> None:
@@ -426,57 +382,4 @@ def test_wrong_commands_are_one_line(capfd: pytest.CaptureFixture[str], tmp_path
     busy.close()
 
 
-@pytest.mark.slow
-def test_a_slower_clock_is_told(folder: Path) -> None:
-    """At half the rate 1 s of the machine takes two; its datagrams say so."""
-    with machine("--rate", "0.5") as (running, port):
-        started = time.monotonic()
-        with process(c_controller(folder, port, "seconds=1")) as driving:
-            running.until("the run began")
-            began = time.monotonic()
-            assert driving.end() == 0, driving.lines
-        assert 1.6 < time.monotonic() - began < 3.0
-        assert began - started < 10
-        assert running.end(signal.SIGINT) == 130
-    assert "completed after 10 samples, 0 of them without" in driving.lines[-2]
-
-
 # ---------------------------------------------------------------- clocks
-
-WALL = {"time", "time_ns", "localtime", "gmtime", "ctime", "asctime", "strftime", "clock_gettime"}
-"""Of the module `time`: what follows a clock that somebody sets, or may."""
-WALL_IN_C = r"gettimeofday|CLOCK_(?!MONOTONIC)|[^_a-z](time|localtime|gmtime)\("
-
-
-def wall_clocks(source: str) -> list[str]:
-    """What a module asks a clock for that can be set."""
-    tree = ast.parse(source)
-    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import)]
-    aliases = {a.asname or a.name for node in imports for a in node.names if a.name == "time"}
-    found = [a.name for node in imports for a in node.names if a.name.startswith("datetime")]
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom):
-            names = {a.name for a in node.names}
-            found += ["datetime"] * (node.module == "datetime")
-            found += sorted(names & WALL) if node.module == "time" else []
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-            found += [node.attr] * (node.value.id in aliases and node.attr in WALL)
-    return found
-
-
-def test_no_clock_that_can_be_set_is_looked_at() -> None:
-    """Every time is of the monotonic clock, on either side, in Python and in C."""
-    import stewart_drake
-    from stewart_drake.native.build import FOLDER
-
-    assert wall_clocks("import time as clock\nclock.time()") == ["time"]
-    assert wall_clocks("from datetime import datetime\nfrom time import time_ns") != []
-    assert wall_clocks("import time\ntime.monotonic_ns(), time.perf_counter()") == []
-    assert re.search(WALL_IN_C, " x = time(NULL)") and re.search(WALL_IN_C, "CLOCK_REALTIME")
-    room = Path(stewart_drake.__file__).parent
-    modules = [*(room / "live").glob("*.py"), room / "cli" / "live.py", room / "cli" / "machine.py"]
-    assert len(modules) > 10
-    for path in modules:
-        assert wall_clocks(path.read_text("utf-8")) == [], path
-    for path in (*export_c.TEMPLATES.glob("*.[ch]"), *FOLDER.glob("*.[ch]")):
-        assert not re.search(WALL_IN_C, path.read_text("utf-8")), path

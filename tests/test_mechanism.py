@@ -68,22 +68,14 @@ def third_leg(**changes: Any) -> dict[str, Any]:
 
 # edits, how the message names field and value, what it says is allowed
 INVALID = [
-    ({"crank.length": -0.11}, "crank.length: got -0.11", "a positive number, or a list of six"),
-    ({"crank.length": 0}, "crank.length: got 0", "positive"),
     ({"rod.length": "long"}, "rod.length: got 'long'", "positive"),
-    ({"rod.length": True}, "rod.length: got True", "positive"),
-    ({"rod.length": 10**400}, "rod.length: got 1000", "positive"),
     ({"rod.length": [0.4] * 5}, "rod.length: got [0.4, 0.4, 0.4, 0.4, 0.4]", "list of six"),
     ({"rod.length": [-0.4] + [0.4] * 5}, "rod.length: got [-0.4, 0.4,", "positive"),
     ({"rod.length": 0.11}, "rod.length: got 0.11 m for leg 1", "longer than its crank"),
     ({"rod.length": [0.404] * 5 + [0.1]}, "rod.length: got 0.1 m for leg 6", "longer than its"),
     ({"crank.mass": -0.04}, "crank.mass: got -0.04 kg", "positive"),
     ({"rod.mass": 0}, "rod.mass: got 0 kg", "positive"),
-    ({"plate.mass": 0}, "plate.mass: got 0 kg", "positive"),
-    ({"plate.mass": -4.0}, "plate.mass: got -4.0", "equal to 0"),
     ({"plate.mass": "4 kg"}, "plate.mass: got '4 kg'", "number"),
-    ({"plate.mass": float("inf")}, "plate.mass: got inf", "finite"),
-    ({"base.mass": -7.0}, "base.mass: got -7.0", "equal to 0"),
     ({"plate.inertia": [0, 30e-4, 30e-4]}, "plate.inertia: got [0, 0.003, 0.003]", "positive"),
     ({"rod.inertia": [-1e-6, 1e-4, 1e-4]}, "rod.inertia: got [-1e-06, 0.0001,", "positive"),
     ({"rod.inertia": [1e-6, 1e-4]}, "rod.inertia: got [1e-06, 0.0001]", "3 items"),
@@ -93,9 +85,7 @@ INVALID = [
         "at most the sum of the other two",
     ),
     ({"base.inertia": [1.0, 1.0, 3.0]}, "base.inertia: got [1, 1, 3]", "sum of the other two"),
-    ({"rod.center": 1.2}, "rod.center: got 1.2", "between 0 and 1"),
     ({"motor.effort_limit": 0}, "motor.effort_limit: got 0 N m", "positive torque or null"),
-    ({"motor.effort_limit": -10.0}, "motor.effort_limit: got -10 N m", "positive torque or null"),
     ({"pattern.branches": [-1, 1, -1, 0, -1, 1]}, "pattern.branches[3]: got 0", "-1 or 1"),
     ({"pattern.branches": [2, 1, -1, 1, -1, 1]}, "pattern.branches[0]: got 2", "-1 or 1"),
     ({"pattern.branches": [1] * 5}, "pattern.branches: got [1, 1, 1, 1, 1]", "6 items"),
@@ -105,9 +95,6 @@ INVALID = [
         "each of 0 to 5 once",
     ),
     ({"pattern.plate_order": [6, 0, 1, 2, 3, 4]}, "pattern.plate_order[0]: got 6", "equal to 5"),
-    ({"pattern.base_radius": -0.22}, "pattern.base_radius: got -0.22", "equal to 0.000001"),
-    ({"pattern.plate_radius": 0}, "pattern.plate_radius: got 0", "equal to 0.000001"),
-    ({"pattern.rotation_deg": float("nan")}, "pattern.rotation_deg: got nan", "finite"),
     (
         {"home": [0, 0, 0, 0, 0, 0.6]},
         "home: got [0, 0, 0, 0, 0, 0.6], out of reach: all legs short by ",
@@ -157,6 +144,10 @@ def test_invalid_fields_are_refused_in_one_line(
     [
         ({"plat": 1}, "plat: unknown key; did you mean plate?"),
         ({"crank.lenght": 1}, "crank.lenght: unknown key; did you mean crank.length?"),
+        (
+            {"pattern.plat_radius": 1},
+            "pattern.plat_radius: unknown key; did you mean pattern.plate_radius?",
+        ),
         (third_leg(shft=[0]), "legs[2].shft: unknown key; did you mean legs[2].shaft?"),
         ({"rod": ABSENT}, "rod: is missing"),
         ({"crank.mass": ABSENT}, "crank.mass: is missing"),
@@ -187,11 +178,6 @@ def test_all_impossible_bodies_are_told_at_once(load: Loader) -> None:
     assert "\n" not in message
     for problem in ("base.inertia: got [1, 1, 3]", "crank.mass: got 0 kg", "rod.inertia: got [0,"):
         assert problem in message
-
-
-def test_many_problems_are_cut_short(load: Loader) -> None:
-    with pytest.raises(ConfigError, match=r"home\[0\]: .*; and 1 more$"):
-        load(paper_with({"home": ["a"] * 6}))
 
 
 # ------------------------------------------------------------------ moments that nobody measured
@@ -432,10 +418,3 @@ def test_optional_fields_have_defaults(load: Loader) -> None:
     assert mechanism.base.mass == 0
     assert load(paper_with({"motor.effort_limit": None})).effort_limit is None
     assert load(paper_with({"rod.center": 0.25})).rod.center == 0.25
-
-
-def test_an_unknown_key_of_a_section_that_may_be_null_is_told(tmp_path) -> None:
-    path = tmp_path / "machine.yaml"
-    path.write_text(FILE.read_text().replace("plate_offset_deg", "ate_offset_deg"))
-    with pytest.raises(ConfigError, match=r"pattern\.ate_offset_deg: unknown key; did you mean"):
-        load_mechanism(path)

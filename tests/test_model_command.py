@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from pydrake.geometry import Meshcat
 
 from stewart_drake.cli import main
@@ -23,7 +22,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.reporting.viewer import SLIDERS, STOP, PoseViewer, place, slider_range
 from stewart_drake.studies.mechanism_check import check_mechanism
-from tests.mechanisms import PAPER, random_mechanism
+from tests.mechanisms import PAPER
 from tests.screen import too_long
 from tests.singular import parallel_rods, stretched, write_mechanism
 
@@ -101,26 +100,6 @@ def test_motors_that_cannot_hold_the_plate_are_told() -> None:
 
 
 # ------------------------------------------------------------------ the drawing
-
-
-@pytest.mark.parametrize("seed", range(-3, 5))
-def test_the_numbers_of_the_legs_can_be_read(seed: int) -> None:
-    """No number covers another one; each view has all six; for any machine."""
-    mechanism = (
-        load_mechanism(shipped("mechanism")[seed])
-        if seed < 0
-        else random_mechanism(np.random.default_rng(seed))
-    )
-    figure = mechanism_figure(mechanism)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    for ax in figure.axes:
-        numbers = [text for text in ax.texts if text.get_text()]
-        assert sorted(text.get_text() for text in numbers) == list("123456")
-        boxes = [text.get_window_extent(canvas.get_renderer()) for text in numbers]
-        for i, box in enumerate(boxes):
-            assert ax.bbox.contains(box.x0, box.y0) and ax.bbox.contains(box.x1, box.y1)
-            assert not any(box.overlaps(other) for other in boxes[:i])
 
 
 def test_the_drawing_shows_cranks_and_rods_where_they_are() -> None:

@@ -151,13 +151,6 @@ def test_many_drawn_machines_end_as_in_drake(part: int) -> None:
     assert_drawn(range(4 + 20 * part, 24 + 20 * part), 10.0)
 
 
-def test_cases_are_what_they_are_named_for() -> None:
-    found = {name: run_in_bulk(LOOPS[name]) for name in ("leaves", "limited", "blind")}
-    assert found["leaves"].status == "left_workspace"
-    assert found["limited"].counts["saturated_steps"] > 0
-    assert found["blind"].status == "left_workspace"
-
-
 def test_states_torques_and_measurements_are_drakes() -> None:
     one = LOOPS["late"]
     preparation = preparation_of(one)

@@ -33,10 +33,6 @@ def run(name: str) -> Done:
     return Done(names, shown)
 
 
-def test_these_are_all():
-    assert {path.name for path in FOLDER.glob("*.ipynb")} == set(NOTEBOOKS)
-
-
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_outputs_are_not_committed(name):
     cells = json.loads((FOLDER / name).read_text(encoding="utf-8"))["cells"]

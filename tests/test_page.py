@@ -121,23 +121,6 @@ def test_names_from_files_are_text_and_not_markup() -> None:
     assert "stewart-drake analyze hautus 'a b'" in outline.words
 
 
-def test_numbers_are_aligned_and_long_words_are_broken() -> None:
-    cells = [cell["class"] or "" for cell in Outline(page()).all("td")][:3]
-    assert [("n" in c.split(), "s" in c.split()) for c in cells] == [
-        (False, True),
-        (True, True),
-        (False, False),
-    ]
-
-
-@pytest.mark.parametrize(
-    ("cells", "numeric"),
-    [(["1", "-2.5", "∞"], True), (["1", "yes"], False), ([], False), (["±3", "≤ 4", ""], True)],
-)
-def test_a_column_of_numbers_is_told_from_one_of_words(cells: list[str], numeric: bool) -> None:
-    assert Table(("x",), [(cell,) for cell in cells]).numeric == [numeric]
-
-
 def test_a_row_of_another_length_is_refused() -> None:
     with pytest.raises(ValueError, match="row 2 has 1 cells; expected 2"):
         Table(("a", "b"), [("1", "2"), ("3",)])
@@ -206,18 +189,6 @@ def test_the_same_page_gives_the_same_bytes(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0.html", "1.html"]
 
 
-def test_a_page_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(OSError):
-        write_page(document(), MADE, tmp_path / "nowhere" / "report.html")
-    assert not list(tmp_path.iterdir())
-
-
-def test_few_sections_need_no_contents_and_no_time_is_no_line() -> None:
-    text = html(document(sections=[Section("One")]), Provenance("x", {"drake": "1.51"}))
-    assert "<nav" not in text
-    assert "Computed in" not in text
-
-
 def test_command_lines_are_quoted_for_a_shell() -> None:
     line = command_line(
         "analyze",
@@ -230,17 +201,3 @@ def test_command_lines_are_quoted_for_a_shell() -> None:
         "stewart-drake analyze delay 'my file.yaml' --set delay.steps=4 "
         "--set 'reference.amplitude=[1, 2]' --out out"
     )
-
-
-def test_figures_are_whole_and_nothing_is_painted_behind_them() -> None:
-    one, other = embedded(html(document(), MADE))
-    assert ElementTree.tostring(one) == ElementTree.tostring(other)
-    space = "{http://www.w3.org/2000/svg}"
-    assert one.tag == f"{space}svg" and one.findall(f".//{space}path")
-    backs = [
-        group.find(f"{space}path")
-        for group in one.iter(f"{space}g")
-        if group.get("id") in ("patch_1", "patch_2")
-    ]
-    assert len(backs) == 2
-    assert all(back is not None and "fill: none" in str(back.get("style")) for back in backs)

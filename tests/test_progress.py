@@ -1,24 +1,13 @@
 """How far a command has got: bars on a terminal, plain lines elsewhere."""
 
-import contextlib
-import fcntl
-import os
-import pty
 import re
-import struct
 import subprocess
 import sys
-import termios
-import time
 from pathlib import Path
 
 import pytest
 
-from stewart_drake.cli import main
-from stewart_drake.reporting import terminal
-
 ROOT = Path(__file__).resolve().parents[1]
-STUDY = ["analyze", "robustness", "--runs", "4", "--set", "duration=0.3", "--workers", "1"]
 
 
 def said_by(script: str, stderr: int | None = subprocess.PIPE) -> str:
@@ -73,56 +62,3 @@ def test_a_closed_stderr_costs_nothing():
         ["bash", "-c", shell, lines + "print('done')"], capture_output=True, cwd=ROOT
     )
     assert (done.returncode, done.stdout) == (0, b"done\n")
-
-
-@pytest.mark.slow
-def test_a_long_command_speaks_when_its_output_goes_to_a_file(tmp_path, monkeypatch):
-    """Which it did not for as long as it took."""
-    monkeypatch.setattr(terminal, "EVERY", 0.01)
-    with (tmp_path / "said").open("w") as said, contextlib.redirect_stderr(said):
-        assert main([*STUDY, "--out", str(tmp_path / "new")]) == 0
-    lines = (tmp_path / "said").read_text().splitlines()
-    # What is prepared may be ready before the first line is due.
-    assert re.match("runs: (preparing|0 of 4)", lines[0]) and " of 4" in "".join(lines[1:])
-    assert all(line.startswith("runs: ") for line in lines)
-
-
-def test_the_bar_never_counts_to_zero():
-    """It starts without a number, then has the right one at once, and the time that is left."""
-    leader, follower = pty.openpty()
-    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-    script = (
-        "import time\nfrom stewart_drake.reporting import terminal as t\n"
-        "with t.count_bar('runs', False) as show:\n    show(3, 10)\n    time.sleep(0.3)\n"
-        "    show(4, 10)\n    time.sleep(0.3)\n    show(9, 10)\n"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", script],
-        stderr=follower,
-        cwd=ROOT,
-        env={**os.environ, "TERM": "xterm"},
-    )
-    os.close(follower)
-    said, limit = b"", time.monotonic() + 60
-    while time.monotonic() < limit:
-        try:
-            said += os.read(leader, 4096)
-        except OSError:  # its other end is closed
-            break
-    os.close(leader)
-    assert process.wait(10) == 0
-    text = said.decode()
-    assert not re.search(r"of 0\b|\b0 of", text) and "preparing" in text, text
-    assert "3 of 10" in text and re.search(r"4 of 10, about \d s left", text), text
-
-
-def test_durations_are_short():
-    seconds = (0.4, 59, 89, 100, 3600, 7200)
-    assert [terminal._duration(s) for s in seconds] == [
-        "0 s",
-        "59 s",
-        "89 s",
-        "2 min",
-        "60 min",
-        "2.0 h",
-    ]

@@ -290,7 +290,3 @@ def test_a_table_grows_without_being_copied() -> None:
     assert len(table) == 10_000 and table.columns(slice(0, 2)).shape == (10_000, 2)
     np.testing.assert_array_equal(table.column(0), np.arange(10_000.0))
     assert table.columns(slice(0, 3)).flags.c_contiguous
-
-
-def test_an_empty_table_has_its_columns() -> None:
-    assert len(Table(5)) == 0 and Table(5).columns(slice(1, 4)).shape == (0, 3)

@@ -2,9 +2,7 @@
 
 import dataclasses
 import json
-import logging
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +14,9 @@ from stewart_drake.files.resources import shipped
 from stewart_drake.loop import scene
 from stewart_drake.loop.lifetime import let_go
 from stewart_drake.loop.multibody_stewart import build_viewer
-from stewart_drake.loop.scene import CRANK_PARTS, crank_paths, pointer, ring
+from stewart_drake.loop.scene import CRANK_PARTS, crank_paths
 from stewart_drake.reporting import replay as replay_module
-from stewart_drake.reporting.replay import replay_html, write_replay
+from stewart_drake.reporting.replay import replay_html
 from stewart_drake.scenario.signals import LEGS
 
 PAPER = sd.load_mechanism("paper")
@@ -114,43 +112,8 @@ def test_runs_of_one_instant_or_none_can_be_shown(run):
         assert len(data_of(replay_html(short, PAPER, "short"))["time"]) == rows
 
 
-def test_a_run_with_one_instant_of_torque_has_colours(run):
-    """The usual torque is none at all: the largest takes the full colour."""
-    signals = run.signals.copy(deep=True)
-    signals["torque_applied"] = 0 * signals.torque_applied
-    signals.torque_applied.values[-1, 2] = -0.5
-    data = data_of(replay_html(dataclasses.replace(run, signals=signals), PAPER, "a blow"))
-    assert data["share"][-1] == [0, 0, -1, 0, 0, 0] and not np.any(data["share"][:-1])
-
-
-def test_a_long_run_is_thinned_out(run, monkeypatch):
-    monkeypatch.setattr(replay_module, "_MAX_FRAMES", 7)
-    data = data_of(replay_html(run, PAPER, "long"))
-    assert 5 <= len(data["time"]) <= 7
-    assert np.allclose(np.diff(data["time"]), data["time"][1])
-
-
 def test_a_run_that_ends_outside_is_shown_up_to_there(run):
     signals = run.signals.copy(deep=True)
     signals.pose.values[-3:, 5] += 1.0
     outside = dataclasses.replace(run, signals=signals)
     assert "off by" in replay_html(outside, PAPER, "outside")
-
-
-def test_writing_is_whole_or_not_at_all_and_says_nothing(run, tmp_path, caplog, capfd):
-    with caplog.at_level(logging.INFO):
-        path = write_replay(run, PAPER, tmp_path / "replay.html", "run")
-    assert [file.name for file in tmp_path.iterdir()] == ["replay.html"]
-    assert path.stat().st_size < 8e6, "somebody may want to send it"
-    assert not caplog.records and capfd.readouterr() == ("", "")
-    with pytest.raises(OSError):
-        write_replay(run, PAPER, Path(tmp_path / "missing" / "replay.html"), "run")
-
-
-def test_the_ring_is_a_closed_surface_around_the_plate():
-    for vertices, faces in (ring(0.1), pointer(0.1)):
-        edges = np.sort(np.hstack([faces[[0, 1]], faces[[1, 2]], faces[[2, 0]]]), axis=0)
-        _, counts = np.unique(edges, axis=1, return_counts=True)
-        assert (counts == 2).all(), "every edge belongs to two triangles"
-        assert np.hypot(*vertices[:2]).min() > 0.1, "the plate stays visible"
-        assert set(np.unique(faces)) == set(range(vertices.shape[1]))

@@ -10,9 +10,6 @@ from pathlib import Path
 import pytest
 
 from stewart_drake.cli import main
-from stewart_drake.reporting.document import Document, Listing, Section
-from stewart_drake.reporting.page import Provenance, write_page
-from tests.copies import copied
 
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
 
@@ -42,27 +39,6 @@ def test_ctrl_c_ends_it_with_nothing_written(tmp_path):
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130 and "Traceback" not in err
     assert os.listdir(tmp_path) == []
-
-
-@pytest.mark.slow
-def test_kill_9_leaves_no_half_page(tmp_path):
-    """Killed at some moment while pages of several MB are written over and over."""
-    document = Document("t", "v", [Section("s", Listing("x" * 20_000_000))])
-
-    def work() -> None:
-        while True:
-            write_page(document, Provenance("c"), tmp_path / "report.html")
-
-    for wait in (0.0, 0.013, 0.037, 0.071):
-        before = time.time()
-        with copied(work) as copy:
-            while copy.is_alive() and not any(
-                path.stat().st_mtime > before for path in tmp_path.glob("report.html")
-            ):
-                time.sleep(0.001)
-            time.sleep(wait)
-            assert copy.is_alive()
-        assert (tmp_path / "report.html").read_text().rstrip().endswith("</html>")
 
 
 def test_ctrl_c_while_drake_is_loaded_is_one_as_well(monkeypatch):

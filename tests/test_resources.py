@@ -8,14 +8,6 @@ from stewart_drake.files import resources
 from stewart_drake.files.errors import ConfigError
 
 
-def test_the_shipped_names_of_each_kind() -> None:
-    assert "paper" in resources.shipped("mechanism")
-    assert {"gravity", "paper"} <= set(resources.shipped("scenario"))
-    assert {"delay_lqi", "delay_lqr", "lqi", "lqr", "predictor_lqi"} <= set(
-        resources.shipped("controller")
-    )
-
-
 @pytest.mark.parametrize("kind", ["mechanism", "scenario", "controller", "weights"])
 def test_every_shipped_name_resolves_to_a_file(kind: resources.Kind) -> None:
     for name in resources.shipped(kind):

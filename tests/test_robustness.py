@@ -4,11 +4,6 @@ import csv
 import functools
 import json
 import math
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -529,32 +524,6 @@ def test_a_resumed_study_equals_an_uninterrupted_one(
         study_robustness(short(), tmp_path, RobustnessOptions(runs=4, seed=1))
 
 
-@pytest.mark.soak  # as tests/test_jobs.py kills the jobs and tests/test_faults.py a study
-def test_a_killed_study_goes_on(tmp_path: Path, whole: tuple[Path, RobustnessStudy]) -> None:
-    folder, _ = whole
-    code = (
-        "import sys\n"
-        "from stewart_drake.studies.robustness import RobustnessOptions, study_robustness\n"
-        "from tests.test_robustness import short\n"
-        "study_robustness(short(), sys.argv[1], RobustnessOptions(runs=400, workers=1))\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], cwd=ROOT)
-    limit = time.monotonic() + 120
-    while len(list(tmp_path.glob("runs/run*.json"))) < 3:
-        assert time.monotonic() < limit
-        assert process.poll() is None
-        time.sleep(0.02)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    for path in tmp_path.glob("runs/run*.json"):
-        if int(path.stem[3:]) >= 4:
-            path.unlink()
-    assert not (tmp_path / "runs.csv").exists()
-    time.sleep(1.0)  # its worker ends within half a second, and with it the lock
-    study_robustness(short(), tmp_path, RobustnessOptions(runs=4, workers=1))
-    assert contents(tmp_path) == contents(folder)
-
-
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_study(
     tmp_path: Path, whole: tuple[Path, RobustnessStudy]
@@ -568,18 +537,6 @@ def test_a_cluster_gives_the_same_study(
             short(), tmp_path, RobustnessOptions(runs=4, scheduler=cluster.scheduler_address)
         )
     assert contents(tmp_path) == contents(folder)
-
-
-def test_a_damaged_file_is_named_and_made_again(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    study_robustness(short(), tmp_path, RobustnessOptions(runs=1, workers=1))
-    run = tmp_path / "runs" / "run000000.json"
-    whole = run.read_bytes()
-    run.write_text('{"outcome": {"status": "completed"}}')
-    study_robustness(short(), tmp_path, RobustnessOptions(runs=1, workers=1))
-    assert run.read_bytes() == whole
-    assert "run000000.json" in caplog.text and "done again" in caplog.text
 
 
 def test_nothing_drawn_changes_nothing(tmp_path: Path) -> None:
@@ -860,10 +817,3 @@ def test_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) ->
     assert "finished runs are kept" in capsys.readouterr().err
     assert main(["analyze", "robustness"]) == 130
     assert "nothing is kept without --out" in capsys.readouterr().err
-
-
-def test_draws_survive_pickling() -> None:
-    import pickle
-
-    one = draw(Ranges(), SCALES, short(), 0, 0)
-    assert pickle.loads(pickle.dumps(one)) == one

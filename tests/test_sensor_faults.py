@@ -14,14 +14,12 @@ from stewart_drake.law.memory import Counts
 from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.parameter_filter import PATIENCE
 from stewart_drake.law.sensing import StateSensing
-from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_to_dict, scenario_yaml
 from stewart_drake.types import Array
-from tests.mechanisms import PAPER
 from tests.test_control_law import HOME, Loop, law_of, nominal_queue, sine, step
 
 CONTROLLERS = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
@@ -251,14 +249,6 @@ def test_the_sensors_faults_by_hand() -> None:
     assert Sensor(np.zeros(12), 0, 0.1).CreateDefaultContext().num_total_states() == 0
 
 
-def test_a_loop_with_a_frozen_sensor_can_be_run_twice() -> None:
-    sc = on_reference(fault("frozen", 0.5, 1.0), "duration=1.5")
-    loop = build_closed_loop(sc)
-    assert loop.GetSubsystemByName("sensor").num_discrete_state_groups() == 1
-    one, other = simulate(sc, judge_stability=False), simulate(sc, judge_stability=False)
-    assert np.array_equal(one.signals.pose, other.signals.pose)
-
-
 def test_faults_in_a_scenario_come_back_as_they_were_written() -> None:
     given = [{"kind": "frozen", "from": 4.0, "to": 5.0}, {"kind": "spike", "from": 1.0, "to": 2.0}]
     sc = load_scenario("paper")
@@ -319,14 +309,6 @@ def seven(observer: Any) -> FilterSettings:
     columns = {f.name: getattr(known, f.name) for f in dataclasses.fields(known)}
     fewer = {name: column[:7] for name, column in columns.items() if column is not None}
     return dataclasses.replace(observer.settings, parameters=dataclasses.replace(known, **fewer))
-
-
-def test_a_measurement_of_a_wrong_shape_is_an_exception() -> None:
-    law = law_of("delay.steps=2")
-    memory = law.initial_memory(np.zeros((2, 6)))
-    preview = np.tile(HOME, (len(law.preview_times), 1))
-    with pytest.raises(ValueError):
-        step(law, memory, np.append(PAPER.home, np.zeros(5)), preview)
 
 
 def test_the_causes_are_counted_apart() -> None:

@@ -1,15 +1,12 @@
 """Figures on light and dark pages, and round numbers on logarithmic axes."""
 
-import io
 import re
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from stewart_drake.reporting.page import environment, size
-from stewart_drake.reporting.style import DARK, figure_style, for_dark_too, plain_log_ticks
+from stewart_drake.reporting.style import DARK, figure_style, plain_log_ticks
 
 
 def luminance(color: str) -> float:
@@ -33,31 +30,6 @@ def test_what_is_read_on_white_is_read_on_dark_and_what_is_faint_stays_so(color)
         assert dark >= 3
     elif light < 1.3:
         assert dark < 1.5
-
-
-def test_the_paper_of_figures_is_that_of_pages():
-    source = environment().loader.get_source(environment(), "page.html.j2")[0]
-    assert re.findall(r"--paper: (#\w+)", source) == ["#fff", DARK["#ffffff"]]
-
-
-def test_colours_of_data_are_not_changed():
-    with figure_style():
-        figure = Figure(figsize=(3, 2))
-        figure.subplots().fill_between([0, 1], [1, 2], color="#00224e")
-    svg = for_dark_too(figure_bytes(figure))
-    ElementTree.fromstring(svg)
-    rules = re.search(rb"<style>@media\(prefers-color-scheme:dark\)(.*?)</style>", svg)
-    assert rules and b"#00224e" not in rules[1] and b"#000000" in rules[1]
-
-
-def figure_bytes(figure: Figure) -> bytes:
-    data = io.BytesIO()
-    figure.savefig(data, format="svg")
-    return data.getvalue()
-
-
-def test_a_picture_knows_its_size():
-    assert size(Figure(figsize=(10, 6.9))) == (960, 662)
 
 
 @pytest.mark.parametrize(("low", "high"), [(19.5, 37), (0.4, 300), (8, 12), (20, 55), (1e-3, 2e-3)])

@@ -53,11 +53,6 @@ def test_a_row_that_does_not_fit_is_refused_in_one_line(compare: str, message: s
     assert message in str(refused.value) and "\n" not in str(refused.value)
 
 
-def test_a_bad_row_is_found_when_the_scenario_is_read() -> None:
-    with pytest.raises(sd.ConfigError, match=r"compare\.lqr: w_Q: got -1"):
-        sd.load_scenario("paper", settings=["compare={lqr: {w_Q: -1}}"])
-
-
 def test_the_integral_weight_scales_its_block_alone() -> None:
     def blocks(weight: float) -> np.ndarray:
         settings = [f"controller.integral_weight={weight}"]

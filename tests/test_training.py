@@ -371,18 +371,3 @@ def test_the_command_writes_network_figures_and_summary(tmp_path, capsys):
     summary = json.loads((out.parent / "summary.json").read_text())
     assert summary["rows"]["trained_on"] <= training.MAX_ROWS
     assert load_network(out).card["split"] == "cell"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["nowhere"], "tune dataset"),
-        (["nowhere", "--out", "net.txt"], "expected a file ending in .json"),
-        (["nowhere", "--labels", "best"], "--labels"),
-    ],
-)
-def test_bad_input_is_refused_in_one_line(arguments, said, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["tune", "train", *arguments]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1 and said in err

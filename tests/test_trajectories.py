@@ -363,30 +363,6 @@ def test_a_measured_motion_with_noise_and_uneven_steps_is_accepted(
     assert abs(evaluate(trajectory, 2.25)[5] - 0.46) < 0.01
 
 
-def test_what_is_no_csv_file_is_refused(tmp_path: Path) -> None:
-    binary = tmp_path / "binary.csv"
-    binary.write_bytes(b"\xff\xfe\x00")
-    for path in (binary, tmp_path, tmp_path / "none.csv"):
-        with pytest.raises(ConfigError, match=f"^{path}: "):
-            make_reference(CsvConfig(file=str(path)), 10.0)
-
-
-@given(text=st.text(alphabet='0123456789.,-enaif"\n\r\0 ', max_size=200) | st.binary(max_size=60))
-@settings(max_examples=200, deadline=None)
-def test_any_samples_are_a_reference_or_are_refused(
-    text: str | bytes, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    path = tmp_path_factory.getbasetemp() / "any.csv"
-    body = text if isinstance(text, bytes) else text.encode()
-    path.write_bytes(HEADER.encode() + b"\n" + body)
-    try:
-        trajectory = make_reference(CsvConfig(file=str(path)), 10.0)
-    except ConfigError as error:
-        assert len(str(error).splitlines()) == 1
-    else:
-        assert np.isfinite(evaluate(trajectory, 0.1)).all()
-
-
 # Peak to peak
 
 

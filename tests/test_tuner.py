@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context
 
 import stewart_drake as sd
 from stewart_drake.loop.density import DensityWindow
@@ -286,18 +286,6 @@ def test_missed_measurements_do_not_reach_the_weights(
     np.testing.assert_allclose(s.density.values, densities(samples), rtol=1e-6)
 
 
-def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
-    noise = f"sensor.noise_std=[{', '.join(['1e-4'] * 12)}]"
-    saved = []
-    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
-        settings = ("duration=2.0", noise, f"sensor.seed={seed}")
-        sd.simulate(scenario(tmp_path, small_network(), *settings), judge_stability=False).save(
-            tmp_path / name
-        )
-        saved.append((tmp_path / name / "signals.nc").read_bytes())
-    assert saved[0] == saved[1] != saved[2]
-
-
 def test_a_loop_can_be_run_twice(tmp_path: Path) -> None:
     """State lives in the Context, not in the systems."""
     loop = build_closed_loop(scenario(tmp_path, small_network()))
@@ -308,16 +296,3 @@ def test_a_loop_can_be_run_twice(tmp_path: Path) -> None:
         ends.append(loop.GetOutputPort("weights_used").Eval(simulator.get_context()))
     np.testing.assert_array_equal(ends[0], ends[1])
     assert np.any(ends[0] != 1.0)
-
-
-@pytest.mark.parametrize("weights", ["no_such_network", "./none.json"])
-def test_a_network_that_is_not_there_is_refused(weights: str) -> None:
-    settings = ["tuner.kind=ann", f"tuner.weights={weights}"]
-    with pytest.raises(sd.ConfigError, match=r"^tuner\.weights: "):
-        sd.simulate(sd.load_scenario("paper", settings=settings))
-
-
-def test_systems_are_leaf_systems_without_continuous_state() -> None:
-    for system in (DensityWindow(0.1), AnnTuner(small_network(), FIXED, 0.1)):
-        assert isinstance(system, LeafSystem)
-        assert system.CreateDefaultContext().num_continuous_states() == 0

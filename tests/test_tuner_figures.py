@@ -60,46 +60,7 @@ def test_the_loop_is_drawn_as_it_is_built(tmp_path: Path, kind: str, tuner: str)
     assert sorted(sizes) == sorted(connections.values())
 
 
-def test_a_block_without_a_place_is_named() -> None:
-    from pydrake.systems.framework import DiagramBuilder
-    from pydrake.systems.primitives import Integrator
-
-    builder = DiagramBuilder()
-    builder.AddNamedSystem("surprise", Integrator(1))
-    with pytest.raises(ValueError, match="block 'surprise'"):
-        loop_figure(builder.Build())
-
-
 # ------------------------------------------------------------------ the network
-
-
-@pytest.mark.parametrize("hidden", [1, 10, 25])
-def test_the_network_is_drawn_link_by_link(hidden: int) -> None:
-    network = small_network(hidden)
-    figure = network_figure(network)
-    (ax,) = figure.axes
-    links = [
-        line for line in ax.lines if len(line.get_xdata()) == 2 and line.get_marker() == "None"
-    ]
-    weights = np.concatenate([network.W1.ravel(), network.W2.ravel()])
-    assert len(links) == len(weights)
-    shares = np.concatenate(
-        [(np.abs(W) / np.abs(W).max()).ravel() for W in (network.W1, network.W2)]
-    )
-    widths = np.array([line.get_linewidth() for line in links])
-    np.testing.assert_allclose(widths, 0.2 + 2.2 * shares)
-    dashed = np.array([line.get_linestyle() != "-" for line in links])
-    np.testing.assert_array_equal(dashed, weights < 0)
-    neurons = [len(line.get_xdata()) for line in ax.lines if line.get_marker() == "o"]
-    assert neurons == [18, hidden, 2]
-
-
-def test_the_network_says_what_it_is() -> None:
-    for output, name in (("weights", "w_Q"), ("log_weights", "ln w_Q")):
-        (ax,) = network_figure(small_network(output=output, density="signed")).axes
-        texts = {text.get_text() for text in ax.texts}
-        assert name in texts and "ρ of torque 6" in texts
-        assert any("signed" in text for text in texts)
 
 
 def test_a_shipped_network_is_listed_with_what_it_is(
@@ -144,16 +105,6 @@ def test_a_run_that_ended_early_has_a_cross_and_a_short_axis(run: sd.SimulationR
     assert [line.get_xdata()[0] for line in crosses] == [0.5, 0.5]
     assert [ax.get_xlim()[1] for ax in figure.axes[:2]] == [2.0, pytest.approx(0.55)]
     assert "run ended" in [text.get_text() for text in figure.legends[0].get_texts()]
-
-
-def test_a_run_stopped_before_its_first_sample_can_be_drawn(run: sd.SimulationResult) -> None:
-    nothing = dataclasses.replace(
-        run,
-        status="interrupted",
-        stopped=Failure(0.0, None, np.nan, "interrupted"),
-        signals=run.signals.isel(time=slice(0, 0)),
-    )
-    weights_figure({"nothing": nothing}).draw_without_rendering()
 
 
 @pytest.mark.slow

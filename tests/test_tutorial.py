@@ -25,18 +25,6 @@ IDENTIFICATION, _, _AFTER = _REST.partition("\n## ")
 OTHERS = f"{BEFORE}\n## {_AFTER}"
 
 
-def test_the_names_of_saved_files_are_told_in_the_text():
-    names = [name for _, name, _ in FENCE.findall(TEXT) if name]
-    assert len(names) == 4 and all(f"*{name}*" in TEXT for name in names)
-
-
-def test_the_two_parts_are_all_of_it():
-    assert FENCE.findall(IDENTIFICATION)
-    assert sorted(FENCE.findall(IDENTIFICATION) + FENCE.findall(OTHERS)) == sorted(
-        FENCE.findall(TEXT)
-    )
-
-
 @pytest.fixture
 def do(tmp_path, monkeypatch, capsys):
     """Does what a part of it says, in an empty folder; returns what each command printed."""
