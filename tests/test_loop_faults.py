@@ -76,7 +76,7 @@ def share_of_swing(run: SimulationResult, last: float) -> float:
 
 
 @pytest.mark.parametrize(
-    ("places", "value"), zip(PLACES, (np.nan, np.inf, -np.inf, np.nan), strict=True)
+    ("places", "value"), list(zip(PLACES, (np.nan, np.inf, -np.inf, np.nan), strict=True))
 )
 def test_measurements_that_are_no_numbers(places, value, monkeypatch):
     """The model stands in for them."""
