@@ -7,7 +7,6 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.experiment import compose_law, prepare
 from stewart_drake.loop.preparation import preparation_of
 from stewart_drake.mechanism.files import load_mechanism
@@ -54,43 +53,6 @@ def test_what_runs_have_in_common_knows_the_times() -> None:
     one, other = (network(f"delay.steps={n}", "link.playout=0.9") for n in (4, 8))
     assert preparation_of(one) is preparation_of(one)
     assert preparation_of(one) is not preparation_of(other)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (("delay.steps=0",), "link.low: got null with a delay that is 0; expected link.low and"),
-        (("delay.drift=0.01",), "link.low: got null with a delay that is not constant; expected"),
-        (("delay.jitter_std=0.001",), "link.low: got null with a delay that is not constant"),
-        (("link.low=0.5",), "link.high: got null with distribution 'uniform'; expected a number"),
-        (("link.high=0.5",), "link.low: got null with distribution 'uniform'; expected a number"),
-        (("link.return={loss: 0.1}",), "link.return.low: got null with distribution 'uniform'"),
-        (("link.median=0.6",), "link.median: got 0.6 with distribution 'uniform'; expected null"),
-        (("link.sigma=0.2",), "link.sigma: got 0.2 with distribution 'uniform'; expected null"),
-        (
-            ("link.low=0.5", "link.high=0.9", "link.sigma=0.2"),
-            "link.sigma: got 0.2 with distribution 'uniform'; expected null",
-        ),
-        (
-            ("link.distribution=lognormal", "link.median=1", "link.sigma=0.2", "link.low=0.5"),
-            "link.low: got 0.5 with distribution 'lognormal'; expected null",
-        ),
-        (
-            ("link.return={low: 0, high: 1, median: 0.5}",),
-            "link.return.median: got 0.5 with distribution 'uniform'; expected null",
-        ),
-        (
-            ("controller.delay_steps=6",),
-            "controller.delay_steps: got 6 with link.kind 'network'; expected null, as the",
-        ),
-    ],
-)
-def test_what_cannot_be_or_would_be_ignored_is_refused(
-    settings: tuple[str, ...], message: str
-) -> None:
-    with pytest.raises(ConfigError) as caught:
-        network(*settings)
-    assert message in str(caught.value) and len(str(caught.value).splitlines()) == 1
 
 
 def test_a_controller_without_a_delay_may_drive_a_network() -> None:

@@ -520,6 +520,100 @@ def test_a_bad_controller_is_refused_in_one_line(
             assert part in message
 
 
+NETWORK = "link.kind=network"
+TOGETHER = [
+    (NETWORK, "delay.steps=0", "link.low: got null with a delay that is 0; expected link.low and"),
+    (NETWORK, "delay.drift=0.01", "link.low: got null with a delay that is not constant; expected"),
+    (NETWORK, "delay.jitter_std=0.001", "link.low: got null with a delay that is not constant"),
+    (NETWORK, "link.low=0.5", "link.high: got null with distribution 'uniform'; expected a number"),
+    (NETWORK, "link.high=0.5", "link.low: got null with distribution 'uniform'; expected a number"),
+    (NETWORK, "link.return={loss: 0.1}", "link.return.low: got null with distribution 'uniform'"),
+    (NETWORK, "link.median=0.6", "link.median: got 0.6 with distribution 'uniform'; expected null"),
+    (NETWORK, "link.sigma=0.2", "link.sigma: got 0.2 with distribution 'uniform'; expected null"),
+    (
+        *(NETWORK, "link.low=0.5", "link.high=0.9", "link.sigma=0.2"),
+        "link.sigma: got 0.2 with distribution 'uniform'; expected null",
+    ),
+    (
+        *(NETWORK, "link.distribution=lognormal", "link.median=1", "link.sigma=0.2"),
+        *("link.low=0.5", "link.low: got 0.5 with distribution 'lognormal'; expected null"),
+    ),
+    (
+        *(NETWORK, "link.return={low: 0, high: 1, median: 0.5}"),
+        "link.return.median: got 0.5 with distribution 'uniform'; expected null",
+    ),
+    (
+        *(NETWORK, "controller.delay_steps=6"),
+        "controller.delay_steps: got 6 with link.kind 'network'; expected null, as the",
+    ),
+    (
+        *(NETWORK, "link.low=0.9", "link.high=0.5"),
+        "link.low: got 0.9 s; expected at most high, 0.5 s",
+    ),
+    (NETWORK, "link.distribution=lognormal", "link.median: got null"),
+    (NETWORK, "link.return={low: 2, high: 1}", "link.return.low: got 2 s; expected at most high"),
+    (
+        *("plant.kind=paper", "plant.gravity=true"),
+        "plant.gravity: got True with plant.kind 'paper'; expected False",
+    ),
+    ("plant.kind=paper", "plant.payload_mass=0.1", "plant.payload_mass: got 0.1"),
+    ("plant.kind=paper", "plant.joint_damping=1e-3", "plant.joint_damping: got 0.001"),
+    ("plant.kind=paper", "plant.coulomb_friction=1e-3", "plant.coulomb_friction: got 0.001"),
+    ("plant.kind=paper", "sensor.kind=encoders", "sensor.kind: got 'encoders'"),
+    ("plant.kind=multibody", "log_period=0.0015", "whole number of plant.time_step"),
+    ("plant.kind=exact", "duration=1000", "log_period=1e-4", "at least 0.0002 s"),
+    (
+        "controller.estimate=[torque_bias,payload,damping,offsets]",
+        "controller.estimate: got offsets with sensor.kind",
+    ),
+    (
+        *("sensor.kind=encoders", "sensor.faults=[{kind: frozen, from: 0, to: 1, share: 0.5}]"),
+        "sensor.faults[0].share: got 0.5 with kind 'frozen'",
+    ),
+    ("sensor.kind=encoders", "sensor.samples=7", "sensor.samples: got 7"),
+    (
+        "actuator.torque_limit=nonsense",
+        "'nonsense'; expected a number above 0 and of at most 1e6, none for no limit",
+    ),
+    ("actuator.torque_limit=[1]", "[1]; expected a number above 0 and of at most 1e6"),
+    ("compare={lqr: {w_Q: -1}}", "compare.lqr: w_Q"),
+    ("compare={lqr: {colour: red}}", "compare.lqr: colour"),
+    ("compare={lqr: 3}", "compare"),
+]
+"""Settings of `paper` that do not go together, and what the one line says of them."""
+
+
+@pytest.mark.parametrize("row", TOGETHER, ids=lambda row: " ".join(row[:-1])[:60])
+def test_settings_that_do_not_go_together_are_refused_in_one_line(row: tuple[str, ...]) -> None:
+    *settings, said = row
+    with pytest.raises(ConfigError) as caught:
+        load_scenario("paper", settings=settings)
+    assert said in one_line(caught)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{kind: frozen, from: 5, to: 4}", "[0].to: got 4 s; expected more than from, 5 s"),
+        ("{kind: frozen, from: 5, to: 5}", "[0].to: got 5 s; expected more than from, 5 s"),
+        ("{kind: gone, from: 1, to: 4}", "[0].kind: got 'gone'"),
+        ("{kind: frozen, from: 1, to: 4, leg: 3}", "[0].leg: got 3"),
+        ("{kind: frozen, from: 1, to: 4, leg: 7}", "[0].leg: got 7"),
+        ("{kind: frozen, frm: 1, to: 4}", "[0].frm: unknown key; did you mean sensor.faults[0].fr"),
+        ("{kind: frozen, to: 4}", "[0].from: is missing"),
+        ("{kind: frozen, from: -1, to: 4}", "[0].from: got -1"),
+        ("{kind: frozen, from: 1, to: .nan}", "[0].to: got nan; expected a finite number"),
+        ("{kind: missing, from: 1, to: 4, size: 3}", "[0].size: got 3.0"),
+        ("{kind: spike, from: 1, to: 4, size: 0}", "[0].size: got 0"),
+        ("3", "[0]: got 3; expected an object"),
+    ],
+)
+def test_faults_of_a_sensor_that_cannot_be_are_refused_in_one_line(text: str, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_scenario("paper", settings=[f"sensor.faults=[{text}]"])
+    assert f"sensor.faults{said}" in one_line(caught)
+
+
 def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
     binary = tmp_path / "binary.yaml"
     binary.write_bytes(b"duration: 1\nmechanism: \xff\xfe")

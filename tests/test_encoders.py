@@ -283,27 +283,6 @@ def test_densities_and_data_sets_are_of_the_estimate() -> None:
     assert tuned.summary["counts"]["tuner_fallbacks"] == 0
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        (
-            ("controller.estimate=[torque_bias,payload,damping,offsets]",),
-            "controller.estimate: got offsets with sensor.kind",
-        ),
-        (("sensor.faults=[{kind: missing, from: 0, to: 1, leg: 7}]",), "less than or equal to 6"),
-        (
-            ("sensor.kind=encoders", "sensor.faults=[{kind: frozen, from: 0, to: 1, share: 0.5}]"),
-            "sensor.faults[0].share: got 0.5 with kind 'frozen'",
-        ),
-        (("sensor.kind=encoders", "sensor.samples=7"), "sensor.samples: got 7"),
-    ],
-)
-def test_what_is_refused(settings: tuple[str, ...], said: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        load_scenario("paper", settings=settings)
-    assert said in str(error.value) or "leg" in str(error.value)
-
-
 @pytest.mark.parametrize("role", ["controller", "sensor"])
 def test_own_systems_that_measure_the_state_are_refused(role: str) -> None:
     class Own(LeafSystem):

@@ -164,22 +164,6 @@ def test_the_controllers_of_this_package_follow_there_too() -> None:
     np.testing.assert_allclose(found[:6], [1e-3, 0, 0, 0, 0, -1e-3], atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("plant.gravity=true", "plant.gravity: got True with plant.kind 'paper'; expected False"),
-        ("plant.payload_mass=0.1", "plant.payload_mass: got 0.1"),
-        ("plant.joint_damping=1e-3", "plant.joint_damping: got 0.001"),
-        ("plant.coulomb_friction=1e-3", "plant.coulomb_friction: got 0.001"),
-        ("sensor.kind=encoders", "sensor.kind: got 'encoders'"),
-    ],
-)
-def test_what_has_no_place_in_a_map_is_refused(setting: str, message: str) -> None:
-    with pytest.raises(sd.ConfigError) as refused:
-        sd.load_scenario("paper", settings=["plant.kind=paper", setting])
-    assert message in str(refused.value) and "\n" not in str(refused.value)
-
-
 def test_it_is_no_machine_for_a_diagram() -> None:
     with pytest.raises(sd.ConfigError, match=r"plant\.kind: got 'paper'"):
         sd.AddStewartPlatform(DiagramBuilder(), "paper", PlantConfig(kind="paper"))

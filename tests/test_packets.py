@@ -389,24 +389,6 @@ def test_the_multibody_plant_is_held_over_a_network() -> None:
     assert result.status == "completed" and result.accumulated_error < 1
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (("link.low=0.9", "link.high=0.5"), "link.low: got 0.9 s; expected at most high, 0.5 s"),
-        (("link.distribution=lognormal",), "link.median: got null"),
-        (("link.loss=1",), "link.loss: got 1; expected"),
-        (("link.burst=0",), "link.burst: got 0; expected"),
-        (("link.return={low: 2, high: 1}",), "link.return.low: got 2 s; expected at most high"),
-        (("sensor.loss=1.5",), "sensor.loss: got 1.5; expected"),
-        (("controller.packet_torques=0",), "controller.packet_torques: got 0; expected"),
-    ],
-)
-def test_out_of_range_is_one_line(changes: tuple[str, ...], message: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        scenario("link.kind=network", *changes)
-    assert message in str(caught.value) and len(str(caught.value).splitlines()) == 1
-
-
 def test_the_bound_is_a_whole_number_of_a_multibody_plants_steps() -> None:
     multibody = (*NETWORK, "plant.kind=multibody")
     assert scenario(*multibody, "link.playout=0.653").true_delay.fraction == pytest.approx(0.53)

@@ -10,7 +10,6 @@ import pytest
 import xarray as xr
 
 import stewart_drake as sd
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.loop.controller import HELD
 from stewart_drake.loop.diagram import build_closed_loop
@@ -108,24 +107,6 @@ def test_a_data_set_needs_the_samples_whatever_the_log() -> None:
     both = [dataclasses.replace(sc, log_period=period) for period in (None, 0.05)]
     rows = [run_condition(one, ((1.0, 1.0),)) for one in both]
     assert rows[0] == rows[1]
-
-
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        (("log_period=0",), "log_period"),
-        (("log_period=-0.1",), "log_period"),
-        (("log_period=often",), "log_period"),
-        (("log_period=.nan",), "log_period"),
-        (("plant.kind=multibody", "log_period=0.0015"), "whole number of plant.time_step"),
-        (("duration=1000", "log_period=1e-4"), "at least 0.0002 s"),
-    ],
-)
-def test_periods_that_do_not_fit_are_refused(settings: tuple[str, ...], said: str) -> None:
-    with pytest.raises(ConfigError, match=said) as refused:
-        sd.load_scenario("paper", settings=("plant.kind=exact", *settings))
-    assert "\n" not in str(refused.value) and "log_period" in str(refused.value)
-    assert "expected" in str(refused.value)
 
 
 def test_the_last_instant_is_the_end_once() -> None:

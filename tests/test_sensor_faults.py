@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import stewart_drake.loop.diagram as diagram_module
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import parse_yaml
 from stewart_drake.law.filter_settings import FilterSettings
 from stewart_drake.law.memory import Counts
@@ -258,31 +257,6 @@ def test_faults_in_a_scenario_come_back_as_they_were_written() -> None:
     assert scenario_to_dict(sc)["sensor"]["faults"] == given
     assert parse_yaml(scenario_yaml(sc), "text")["sensor"]["faults"] == given
     assert dataclasses.asdict(sc)["sensor"]["faults"] == given
-
-
-@pytest.mark.parametrize(
-    ("text", "where", "expected"),
-    [
-        ("{kind: frozen, from: 5, to: 4}", "[0].to: got 4 s", "more than from, 5 s"),
-        ("{kind: frozen, from: 5, to: 5}", "[0].to: got 5 s", "more than from, 5 s"),
-        ("{kind: gone, from: 1, to: 4}", "[0].kind: got 'gone'", "'frozen', 'missing' or 'spike'"),
-        ("{kind: frozen, from: 1, to: 4, leg: 3}", "[0].leg: got 3", "expected null"),
-        ("{kind: frozen, from: 1, to: 4, leg: 7}", "[0].leg: got 7", "less than or equal to 6"),
-        ("{kind: frozen, frm: 1, to: 4}", "[0].frm: unknown key", "sensor.faults[0].from"),
-        ("{kind: frozen, to: 4}", "[0].from: is missing", ""),
-        ("{kind: frozen, from: -1, to: 4}", "[0].from: got -1", "greater than or equal to 0"),
-        ("{kind: frozen, from: 1, to: .nan}", "[0].to: got nan", "a finite number"),
-        ("{kind: missing, from: 1, to: 4, size: 3}", "[0].size: got 3.0", "with kind 'spike'"),
-        ("{kind: spike, from: 1, to: 4, size: 0}", "[0].size: got 0", "greater than 0"),
-        ("3", "[0]: got 3", "an object"),
-    ],
-)
-def test_faults_that_cannot_be_are_one_clear_line(text: str, where: str, expected: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        load_scenario("paper", None, (f"sensor.faults=[{text}]",))
-    assert f"sensor.faults{where}" in str(caught.value)
-    assert expected in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 # What is a mistake in a program reaches its author.

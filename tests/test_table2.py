@@ -40,17 +40,13 @@ def test_rows_are_the_controllers_and_what_the_scenario_adds(rows: dict[str, sd.
 @pytest.mark.parametrize(
     ("compare", "message"),
     [
-        ("{lqr: {w_Q: -1}}", "compare.lqr: w_Q"),
-        ("{lqr: {colour: red}}", "compare.lqr: colour"),
         ("{mine: {}}", "mine"),
-        ("{lqr: 3}", "compare"),
         ("{lqr: {torque_map: printed, model: multibody}}", "compare.lqr: controller.torque_map"),
     ],
 )
 def test_a_row_that_does_not_fit_is_refused_in_one_line(compare: str, message: str) -> None:
-    with pytest.raises(sd.ConfigError) as refused:
+    with pytest.raises(sd.ConfigError, match=rf"^[^\n]*{message}[^\n]*$"):
         load_comparison("paper", CONTROLLERS, [f"compare={compare}"])
-    assert message in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_the_integral_weight_scales_its_block_alone() -> None:
