@@ -20,7 +20,6 @@ from stewart_drake.loop.experiment import assemble, prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
-from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from tests.screen import too_long
 
@@ -129,17 +128,6 @@ def test_json_is_all_there_is_on_stdout(capsys):
 def test_quiet_prints_nothing(capsys):
     assert main(["simulate", "--controller", "lqr", *SHORT, "--quiet"]) == 0
     assert capsys.readouterr() == ("", "")
-
-
-def test_the_same_scenario_gives_the_same_bytes(tmp_path):
-    noise = f"sensor.noise_std={[1e-5] * 12}"
-    scenario = load_scenario("paper", "lqi", ("plant.kind=exact", "duration=0.5", noise))
-    for name in ("first", "again"):
-        if name == "again":
-            time.sleep(1.1)  # what is stamped with the time shows
-        simulate(scenario, judge_stability=False).save(tmp_path / name)
-    first, again = (tmp_path / name / "signals.nc" for name in ("first", "again"))
-    assert first.read_bytes() == again.read_bytes()
 
 
 def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys, monkeypatch):

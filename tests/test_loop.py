@@ -2,12 +2,12 @@
 
 import functools
 import json
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 from scipy.integrate import quad_vec
 
@@ -16,7 +16,6 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop import metrics
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.experiment import prepare
-from stewart_drake.loop.multibody import add_mechanism, set_pose
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
@@ -132,15 +131,6 @@ def test_a_delay_that_is_next_to_whole_is_whole(tiny: float) -> None:
     assert sc.delay.fraction == 0.0
     sc.delay.fraction = 1e-9
     assert sc.delay.fraction == 1e-9
-
-
-def test_torque_is_limited_before_the_chain() -> None:
-    run = result("duration=1.2", "actuator.torque_limit=0.5", "delay.steps=2")
-    assert run.summary["peak_torque_applied"] <= 0.5
-    assert np.abs(run.signals.torque_applied.values).max() <= 0.5
-    limited = result("duration=0.6", "delay.steps=2", "actuator.torque_limit=0.004", *ON_REFERENCE)
-    assert np.abs(limited.signals.torque_applied.values).max() == 0.004
-    assert limited.summary["counts"]["saturated_steps"] > 0
 
 
 # How it begins.
@@ -323,7 +313,9 @@ def test_the_same_seed_gives_the_same_bytes(plant: str, tmp_path: Path) -> None:
         run.save(tmp_path / folder)
         return (tmp_path / folder / "signals.nc").read_bytes(), run.signals
 
-    one, again, other = saved(1, "one"), saved(1, "again"), saved(2, "other")
+    one, other = saved(1, "one"), saved(2, "other")
+    time.sleep(1.1)  # what is stamped with the time shows
+    again = saved(1, "again")
     assert one[0] == again[0]
     assert one[1].identical(again[1])
     assert not np.array_equal(one[1].torque_commanded, other[1].torque_commanded)
@@ -424,26 +416,6 @@ def test_a_run_with_a_delay_that_is_no_whole_number_of_periods() -> None:
         assert run.status == "completed"
         assert run.accumulated_error < 0.03
         assert run.summary["counts"]["riccati_failures"] == 0
-
-
-def test_joints_of_an_exact_run_fit_the_sdformat_model() -> None:
-    """Its poses, put into the multibody model: the loops are closed to rounding."""
-    run = result("duration=10.0")
-    plant = MultibodyPlant(0.0)
-    add_mechanism(plant, PAPER)
-    context = plant.CreateDefaultContext()
-    pairs = [
-        (plant.GetFrameByName(f"rod_end_{leg}"), plant.GetFrameByName(f"plate_joint_{leg}"))
-        for leg in LEGS
-    ]
-    worst = 0.0
-    for pose, rates in zip(run.signals.pose.values, run.signals.rates.values, strict=True):
-        set_pose(plant, context, PAPER, pose, rates)
-        gaps = [plant.CalcPointsPositions(context, a, np.zeros(3), b) for a, b in pairs]
-        worst = max(worst, float(np.abs(gaps).max()))
-    assert run.status == "completed"
-    assert len(run.signals.time) == 501
-    assert worst < 1e-12
 
 
 def test_only_a_leg_is_short_by_millimetres() -> None:

@@ -284,15 +284,3 @@ def test_missed_measurements_do_not_reach_the_weights(
     samples = np.hstack([s.error.values, rate_error, s.torque_commanded.values])
     samples[list(missed), :12] = np.nan
     np.testing.assert_allclose(s.density.values, densities(samples), rtol=1e-6)
-
-
-def test_a_loop_can_be_run_twice(tmp_path: Path) -> None:
-    """State lives in the Context, not in the systems."""
-    loop = build_closed_loop(scenario(tmp_path, small_network()))
-    ends = []
-    for _ in range(2):
-        simulator = make_simulator(loop)
-        simulator.AdvanceTo(0.75)
-        ends.append(loop.GetOutputPort("weights_used").Eval(simulator.get_context()))
-    np.testing.assert_array_equal(ends[0], ends[1])
-    assert np.any(ends[0] != 1.0)

@@ -1,13 +1,10 @@
 """Files of 0.1 and 0.2 mean what docs/upgrading.md says of them."""
 
 import dataclasses
-import math
 
 import pytest
 
-import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.experiment import prepare
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_to_dict
 from stewart_drake.scenario.renames import CONTROLLER, with_new_names
@@ -61,14 +58,6 @@ def test_fields_of_another_kind_are_read_as_null_and_refused_otherwise(old, sect
     with pytest.raises(ConfigError, match=f"{field}.*expected") as refused:
         old(f"{section}, {field}: 2.0}}")
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize(("word", "limit"), [("null", 10.0), ("none", math.inf), ("0.3", 0.3)])
-@pytest.mark.parametrize("plant", ["exact", "multibody"])
-def test_a_limit_of_null_is_the_mechanism_s_and_none_is_none(word, limit, plant):
-    assert sd.load_mechanism("paper").effort_limit == 10.0
-    settings = [f"plant.kind={plant}", f"actuator.torque_limit={word}"]
-    assert prepare(load_scenario("paper", settings=settings)).torque_limit == limit
 
 
 def test_a_fraction_below_1e_9_is_none():
