@@ -351,25 +351,3 @@ def test_limits_that_nothing_keeps_are_told_and_no_machine_is_written(
     assert told.startswith("no: of ") and "the nearest misses" in told and "clearance by" in told
     assert not list(tmp_path.glob("*.yaml"))
     assert json.loads((tmp_path / "summary.json").read_text())["layouts"] == []
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["--goal", "beauty"], "--goal: got beauty"),
-        (["--limit", "beauty=1"], "--limit: got beauty"),
-        (["--limit", "reach"], "--limit: got 'reach'"),
-        (["--limit", "reach=nan"], "--limit reach: got nan"),
-        (["--vary", "crank=a:b"], "--vary: got 'crank=a:b'"),
-        (["--best", "0"], "--best: got 0"),
-        (["--starts", "0"], "--starts: got 0"),
-        (["--generations", "0"], "--generations: got 0"),
-        (["--set", "plant.mechanism=desktop"], "plant.mechanism: got desktop"),
-    ],
-)
-def test_bad_words_are_one_line(
-    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([*SMALL, *words]) == 2
-    error = capsys.readouterr().err
-    assert told in error and error.count("\n") == 1

@@ -65,18 +65,6 @@ def enlarged(tab: Browser) -> bool:
     return tab.evaluate("document.querySelector('.figure:popover-open') !== null")
 
 
-@pytest.mark.slow
-def test_the_hautus_page_is_short_on_a_telephone(tab, hautus):
-    tab.open(hautus, NARROW, 800)
-    assert tab.evaluate("document.documentElement.scrollHeight") < 3000
-    assert tab.evaluate("document.documentElement.scrollWidth") == NARROW
-    assert tab.errors == [] and tab.requests == []
-    tab.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
-    rows = tab.evaluate("[...document.querySelectorAll('tr')].map(row => row.offsetHeight)")
-    assert max(rows) < 200, "a row that is nearly empty"
-    assert tab.evaluate("document.documentElement.scrollWidth") == NARROW
-
-
 @pytest.mark.parametrize("width", [NARROW, 1280])
 def test_a_figure_is_enlarged_and_put_back_by_hand_and_by_keys(tab, small, width):
     tab.open(small, width, 800)

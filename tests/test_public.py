@@ -132,8 +132,5 @@ def test_commands_have_functions(tmp_path):
     assert {path.name for path in (tmp_path / "machine").iterdir()} == {
         *("calibration.yaml", "mechanism.yaml", "report.html", "summary.json")
     }
-    planned = sd.plan_identification("desktop")
-    planned.save(tmp_path / "plan")
-    assert sd.load_scenario(tmp_path / "plan" / "scenario.yaml").mechanism
     assert any(path.name == "Makefile" for path in sd.export_c("desktop", tmp_path / "board"))
     assert sd.model_sdf("desktop").startswith("<?xml") and sd.check_model("desktop").summary

@@ -53,6 +53,7 @@ def test_a_failure_while_drawing_costs_the_figures_only(
     arguments, module, name, kept, tmp_path, monkeypatch, capsys
 ) -> None:
     monkeypatch.setattr(joblib, "cpu_count", lambda: 1)  # so that no process has to start
+    monkeypatch.setattr("stewart_drake.studies.hautus.LONGEST", 2)
     monkeypatch.setattr(module, name, broken(tmp_path))
     assert main([*arguments, "--quiet", "--out", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
@@ -96,7 +97,7 @@ def test_nothing_of_an_earlier_comparison_stays_beside_new_results(tmp_path, mon
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("redirection", ["2>&-", "<&- >&- 2>&-", "| true"])
+@pytest.mark.parametrize("redirection", ["2>&-", "<&- >&- 2>&-"])
 def test_a_closed_stream_costs_its_text_only(redirection: str, tmp_path) -> None:
     """From a shell, whose choice of a backend for figures counts for nothing."""
     arguments = " ".join(("simulate", *EXACT, "--out", str(tmp_path)))
