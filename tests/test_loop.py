@@ -45,33 +45,6 @@ def result(*settings: str, controller: str | None = None, plant: str = "exact") 
 # What is there.
 
 
-@pytest.mark.parametrize("plant", ["exact", "multibody"])
-def test_closed_loop_has_named_ports_and_systems(plant: str) -> None:
-    loop = build_closed_loop(scenario(plant=plant))
-    sizes = {
-        "state": 12,
-        "reference": 18,
-        "torque_applied": 6,
-        "torque_commanded": 6,
-        "integral": 6,
-        "weights_used": 2,
-        "parameters": 8,
-        "parameter_std": 8,
-        "density": 18,
-        "measurement": 12,
-        "state_estimate": 12,
-        "delay_estimate": 1,
-        "delay_std": 1,
-        "delay_true": 1,
-        "packets": 5,
-    }
-    found = [loop.get_output_port(i) for i in range(loop.num_output_ports())]
-    assert {port.get_name(): port.size() for port in found} == sizes
-    assert loop.num_input_ports() == 0
-    names = "reference sensor weights controller saturation delay_chain torque_bias plant density"
-    assert {system.get_name() for system in loop.GetSystems()} == set(names.split())
-
-
 def test_log_is_on_the_metrics_grid_with_named_coordinates() -> None:
     run = result("duration=0.93", *ON_REFERENCE)
     expected = [*(GRID * np.arange(47)), 0.93]
