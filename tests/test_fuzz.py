@@ -149,7 +149,7 @@ LOADERS: dict[str, tuple[Callable[[Path], Any], str, Any]] = {
 
 
 def fuzz(name: str, folder: Path, examples: int, number: int | None = None) -> None:
-    """Try so many files of one kind; with a number as seed, else with the project's usual ones."""
+    """Load random files of one kind; `number` is the seed, None the usual one."""
     load, file, contents = LOADERS[name]
     path = folder / file
 

@@ -99,7 +99,7 @@ def test_nothing_of_an_earlier_comparison_stays_beside_new_results(tmp_path, mon
 @pytest.mark.slow
 @pytest.mark.parametrize("redirection", ["2>&-", "<&- >&- 2>&-"])
 def test_a_closed_stream_costs_its_text_only(redirection: str, tmp_path) -> None:
-    """From a shell, whose choice of a backend for figures counts for nothing."""
+    """Run `simulate` from a shell that also asks for a backend that does not exist."""
     arguments = " ".join(("simulate", *EXACT, "--out", str(tmp_path)))
     line = f'"$0" -m stewart_drake {arguments} {redirection}'
     done = subprocess.run(
