@@ -18,8 +18,8 @@ import numpy as np
 from _page import table, write
 
 import stewart_drake as sd
+from stewart_drake.reporting.document import number
 from stewart_drake.reporting.terminal import count_bar
-from stewart_drake.reporting.words import number
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.families import Family, disturbed_family, paper_grid, with_gain
 from stewart_drake.studies.jobs import run_jobs

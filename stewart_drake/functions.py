@@ -317,7 +317,7 @@ def make_tuner_data(
     Raises:
         ConfigError: bad input.
     """
-    from stewart_drake.reporting.tuner_document import data_document
+    from stewart_drake.reporting.tuner import data_document
     from stewart_drake.tuning.data import make_data, summarize
 
     family, started = options.conditions(scenario, controller, settings), time.perf_counter()
@@ -345,7 +345,7 @@ def train_tuner(
     Raises:
         ConfigError: bad input, or torch is missing.
     """
-    from stewart_drake.reporting.tuner_document import training_document
+    from stewart_drake.reporting.tuner import training_document
     from stewart_drake.tuner.network import save_network
     from stewart_drake.tuning import training
     from stewart_drake.tuning.data import load_data
@@ -394,7 +394,7 @@ def evaluate_tuner(
     Raises:
         ConfigError: bad input.
     """
-    from stewart_drake.reporting.worth_document import worth_document
+    from stewart_drake.reporting.tuner import worth_document
     from stewart_drake.tuning.worth import evaluate
 
     family, started = options.conditions(scenario, controller, settings), time.perf_counter()

@@ -19,13 +19,12 @@ from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.reporting import collect as collect_module
 from stewart_drake.reporting import report as report_document
 from stewart_drake.reporting.collect import ANALYSES, collect
-from stewart_drake.reporting.document import Document, Paragraph, Picture, Table
+from stewart_drake.reporting.document import Document, Paragraph, Picture, Table, number, wrap
 from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.page import html as html_of
 from stewart_drake.reporting.report import mean_error
 from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.reporting.run import comparison_document
-from stewart_drake.reporting.words import number, wrap
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from stewart_drake.tuner.network import save_network

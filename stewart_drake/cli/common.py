@@ -164,7 +164,7 @@ class Delivery:
 
     def tell(self, line: str) -> None:
         """Print a line, wrapped to a screen."""
-        from stewart_drake.reporting.words import wrap
+        from stewart_drake.reporting.document import wrap
 
         self.say(wrap(line))
 
@@ -226,7 +226,7 @@ class Delivery:
     def end(self, summary: Mapping[str, Any], interrupted: bool = False) -> int:
         """Tell what was written, print the summary if it is wanted; the exit status."""
         from stewart_drake.files.jsonio import jsonable
-        from stewart_drake.reporting.words import WIDTH, wrap
+        from stewart_drake.reporting.document import WIDTH, wrap
 
         if self.out is not None:
             head, files = f"written to {self.out}:", ", ".join(self._written)

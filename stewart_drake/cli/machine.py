@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stewart_drake.cli.common import AsJson, Controller, Delivery, Quiet, ScenarioName, Settings
-from stewart_drake.reporting.words import wrap
+from stewart_drake.reporting.document import wrap
 
 if TYPE_CHECKING:
     from stewart_drake.live.machine import Machine

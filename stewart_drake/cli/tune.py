@@ -149,6 +149,6 @@ def evaluate(
 
 
 def _training_figures(training: "Training", folder: Path) -> list[Path]:
-    from stewart_drake.reporting.training_figures import training_figures
+    from stewart_drake.reporting.tuner import training_figures
 
     return training_figures(training, folder)

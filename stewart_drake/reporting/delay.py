@@ -10,15 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from stewart_drake.law.servos import mean_inertia
-from stewart_drake.loop.controller_margin import ControllerMargin
-from stewart_drake.reporting.document import Document, Table, Tone, Values, table
-from stewart_drake.reporting.outline import sections
+from stewart_drake.reporting.document import Document, Table, Tone, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import DATA_INK, DATA_PAPER, line
-from stewart_drake.reporting.words import capital, number
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.studies.delay_limits import DelayStudy
-from stewart_drake.studies.delay_loop import LoopMargins
 from stewart_drake.studies.delay_map import Cell
 from stewart_drake.studies.verdict import HARDLY, NO, loop_verdict, milliseconds
 
@@ -33,157 +29,50 @@ _CELL_WORDS: Final = {"out_of_reach": "out of reach", "left_workspace": "leaves 
 
 def document(study: DelayStudy) -> Document:
     """Return poles, limits, margins and simulations."""
-    (verdict, tone), tables = _verdict(study), _tables(study)
-    sc, c = study.basis.experiment.scenario, study.basis.experiment.scenario.controller
-    context = {
-        "limits": study.poles and tables["limits"],
-        "growths": study.poles and study.growths and tables["growths"],
-        "floors": tables["floors"],
-        "growth_figure": study.poles and partial(growth_figure, study),
-        "floor": study.floors[sc.true_delay.steps],
-        "margins": _margins(study.loop),
-        "loops": study.loops and _loop_table(study.loops),
-        "loop_figure": any(one.radius < 1 for one in study.loops) and partial(loop_figure, study),
-        "servos": _servos_table(study),
-        "cells": study.cells and _map_table(study),
-        "failed": any(cell.status != "completed" for cell in study.cells),
-        "map_figure": study.cells and partial(map_figure, study),
-    }
-    facts = {
-        "mechanism": study.basis.experiment.mechanism.name,
-        "gravity": "yes" if sc.plant.gravity else "no",
-        "delay": f"{study.eta:.4g} s: μ = {sc.true_delay.steps} periods of {c.period:g} s, "
-        f"fraction {sc.true_delay.fraction:g}",
-        "controller": f"model {c.model}, prediction {c.prediction}, weights {c.weight_scaling}, "
-        f"w_Q = {c.w_Q:g}, w_R = {c.w_R:g}",
-        "start": f"{sc.start.replace('_', ' ')}, torques in flight: {sc.queue}",
-    }
-    parts = sections("delay", study=study, **context)
-    return Document("Is this loop stable with its delay?", verdict, parts, tone, facts)
-
-
-def _verdict(study: DelayStudy) -> tuple[str, Tone]:
-    obstacles = " ".join(study.basis.obstacles)
-    if study.verdict is None:
-        return f"{obstacles} There is no motion along which a delay could be judged.", "bad"
-    loop, tone = study.controller, _TONES[study.verdict.beatable]
-    sentences = [*study.basis.obstacles]
-    if loop is not None:
-        sentences.append(f"{capital(loop_verdict(loop))}.{_knowledge(loop)}")
-        if loop.stable is False:
-            tone = "bad"
-        elif tone == "good" and (loop.problem or loop.delay_margin < FRAGILE * study.eta):
-            tone = "fair"
-    sentences.append(capital(str(study.verdict)) + ".")
-    return " ".join(sentences), "bad" if obstacles else tone
-
-
-def _knowledge(loop: ControllerMargin) -> str:
-    """Return how well the delay of a stable loop must be known."""
-    if not loop.stable or loop.eta == 0 or not math.isfinite(loop.delay_margin):
-        return ""
-    return f" The delay must be known to {number(100 * loop.delay_margin / loop.eta, 2)} %."
-
-
-def _tables(study: DelayStudy) -> dict[str, Table]:
-    limits = table(
-        study.limits,
-        {
-            "tolerable growth": lambda one: f"{one[0]:g}",
-            "largest delay  [s]": lambda one: f"{one[1]:.3g}" if one[1] < math.inf else "any",
-            "set at t  [s]": lambda one: f"{one[2]:.2f}" if one[1] < math.inf else "-",
-        },
-        brief=True,
+    loop, verdict, own = study.loop, study.verdict, study.controller
+    known = own if own and own.stable and math.isfinite(own.delay_margin) else None
+    stiffness = mean_inertia(study.basis.experiment.nominal) * (2 * math.pi * _BANDWIDTH) ** 2
+    steps = study.basis.experiment.scenario.true_delay.steps
+    return from_template(
+        "delay",
+        _tone(study),
+        study=study,
+        sc=study.basis.experiment.scenario,
+        inf=math.inf,
+        eta=partial(_eta, study),
+        gains=_gains,
+        milliseconds=milliseconds,
+        spoken=own and loop_verdict(own),
+        growth=verdict and verdict.amplification,
+        bandwidth=_BANDWIDTH,
+        gives_way=1.0 / stiffness,
+        known=known and milliseconds(known.delay_margin),
+        limits=study.poles and study.limits,
+        growths=study.poles and study.growths,
+        floors=sorted(study.floors.items()),
+        growth_figure=study.poles and partial(growth_figure, study),
+        floor=study.floors[steps],
+        margins=loop if loop is not None and loop.radius < 1 else None,
+        loops=study.loops,
+        loop_figure=any(one.radius < 1 for one in study.loops) and partial(loop_figure, study),
+        cells=study.cells and _map_table(study),
+        failed=any(cell.status != "completed" for cell in study.cells),
+        map_figure=study.cells and partial(map_figure, study),
     )
-    growths = table(
-        study.growths,
-        {
-            "t  [s]": lambda one: f"{one.time:.2f}",
-            "over  [s]": lambda one: f"{one.seconds:.3g}",
-            "e^(pη)": lambda one: one.expected,
-            "simulated growth": lambda one: one.simulated,
-        },
-    )
-    floors = table(
-        sorted(study.floors.items()),
-        {
-            "μ": lambda one: one[0],
-            "delay  [s]": lambda one: f"{_eta(study, one[0]):.4g}",
-            "floor of E_ac  [% s]": lambda one: f"{one[1]:.2f}",
-        },
-    )
-    return {"limits": limits, "growths": growths, "floors": floors}
+
+
+def _tone(study: DelayStudy) -> Tone:
+    loop = study.controller
+    if study.verdict is None or study.basis.obstacles or (loop and loop.stable is False):
+        return "bad"
+    tone = _TONES[study.verdict.beatable]
+    fragile = loop and (loop.problem or loop.delay_margin < FRAGILE * study.eta)
+    return "fair" if tone == "good" and fragile else tone
 
 
 def _eta(study: DelayStudy, steps: int) -> float:
     sc = study.basis.experiment.scenario
     return Delay(steps, sc.true_delay.fraction).eta(sc.controller.period)
-
-
-def _margins(loop: LoopMargins | None) -> Values | None:
-    if loop is None or loop.radius >= 1:
-        return None
-    motor = loop.motor and (
-        f"; one motor {_gains(loop.motor.gain_down, loop.motor.gain_up)}, "
-        f"phase {number(loop.motor.phase)} deg"
-    )
-    return Values(
-        {
-            "sensitivity": f"peak of S {number(loop.S.value)} at {number(loop.S.frequency)} rad/s, "
-            f"of T {number(loop.T.value)} at {number(loop.T.frequency)} rad/s",
-            "gain margin": f"all motors {_gains(loop.gain_down, loop.gain_up)}{motor or ''}",
-            "delay margin": f"{milliseconds(loop.later)} longer, "
-            f"{milliseconds(loop.earlier)} shorter",
-        }
-    )
-
-
-def _loop_table(loops: tuple[LoopMargins, ...]) -> Table:
-    def gains(m: LoopMargins) -> str:
-        return _gains(m.gain_down, m.gain_up) if m.radius < 1 else "unstable"
-
-    def of_motor(m: LoopMargins) -> str:
-        return _gains(m.motor.gain_down, m.motor.gain_up) if m.motor else "-"
-
-    return table(
-        loops,
-        {
-            "μ": lambda m: m.steps,
-            "spectral radius": lambda m: f"{m.radius:.4f}",
-            "max |S|": lambda m: m.S.value,
-            "max |T|": lambda m: m.T.value,
-            "gain, all motors": gains,
-            "gain, one motor": of_motor,
-            "phase, one motor  [deg]": lambda m: m.motor.phase if m.motor else "-",
-            "delay longer by  [ms]": lambda m: 1e3 * m.later if m.radius < 1 else "-",
-            "shorter by  [ms]": lambda m: 1e3 * m.earlier if m.radius < 1 else "-",
-        },
-    )
-
-
-def _servos_table(study: DelayStudy) -> Table:
-    loop, verdict = study.controller, study.verdict
-    stiffness = mean_inertia(study.basis.experiment.nominal) * (2 * math.pi * _BANDWIDTH) ** 2
-    knows = loop is not None and loop.stable and math.isfinite(loop.delay_margin)
-    growth = "-" if verdict is None else f"{number(verdict.amplification)} fold"
-    errors = f"stable up to {milliseconds(loop.delay_margin)}" if loop and knows else ""
-    rows = [
-        ("growth of an error before it is answered", growth, "hardly any: answered within a ms"),
-        (
-            "an unknown torque of 1 mN m at a shaft",
-            "is found, and answered a delay later",
-            f"leaves {number(1.0 / stiffness)} mrad at the crank",
-        ),
-        (
-            "an error of the delay",
-            errors or "the delay must be estimated",
-            "never unstable; late by the error",
-        ),
-        ("a plate that is not where its cranks say", "is measured and corrected", "is not noticed"),
-        ("a push on the plate", "is answered a delay later", "gives way as stiffness allows"),
-        ("needs", "a measured plate, nothing at the machine", "a fast loop at each motor"),
-    ]
-    return Table(("", "torques across the delay", "servos at the motors"), rows)
 
 
 def _map_table(study: DelayStudy) -> Table:
@@ -203,8 +92,10 @@ def _cell_word(cell: Cell) -> str:
     return word if math.isnan(cell.time) else f"{word} {cell.time:.2f}"
 
 
-def _gains(down: float, up: float) -> str:
-    return f"{down:.3f} to {up:.3f}" if math.isfinite(up) else f"{down:.3f} to ∞"
+def _gains(loop: Any) -> str:
+    """Return the range of gains of a loop, or of one of its motors."""
+    up = f"{loop.gain_up:.3f}" if math.isfinite(loop.gain_up) else "∞"
+    return f"{loop.gain_down:.3f} to {up}"
 
 
 def growth_figure(study: DelayStudy) -> Figure:

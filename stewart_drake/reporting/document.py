@@ -3,26 +3,87 @@
 A document is a verdict and sections, a section an ordered list of blocks. A page shows all of it; a
 terminal of 80 columns shows the verdict and, of sections that are not folded, the blocks that are
 `brief`.
+
+Its words are a template, templates/NAME.md.j2, of parts with empty lines between them. Jinja fills
+in each part by itself, so that no value can change the structure; a part that comes out empty is
+left out, and numbers get three significant digits.
+
+    ! Title                  begins the document; paragraphs are its verdict, values its facts
+    # Heading                begins a section, #- a folded one
+    text                     is a paragraph of a page
+    > text                   is a paragraph of a page and of a terminal
+    = name :: value          is a value with its name
+    @name caption            is what the context has by this name: blocks, or what draws a figure;
+                             a paragraph where that is True
+      | head :: cell         below it is a column of a table of all `it` in the named items
+      | head :: brief :: cell    with the head at a terminal, where - leaves the column out
+      | @other               has the columns of another table
+    text
+      + cell :: cell         below it are head and rows of a table
+      = name :: value        below it is a value of the named item, `it`
+
+A terminal shows a table or a paragraph of `@>name`. No line of a head is broken at a ~, a blank.
 """
 
+import math
+import re
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from io import StringIO
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, TypeVar
-
-from stewart_drake.reporting.words import WIDTH, number, rows, sentence, wrap
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple, TypeVar
 
 if TYPE_CHECKING:
+    from jinja2 import Environment, Template
     from matplotlib.figure import Figure
 
 Tone = Literal["good", "fair", "bad", "plain"]
 """Grade of a verdict; a page shows it by the kind of a bar, in grey print too."""
 
+WIDTH: Final = 80
+_NO_BREAK: Final = "\N{NO-BREAK SPACE}"
+_TOGETHER: Final = (
+    r"(?<=\d) (?=(?:%|mm|ms|s|N|mN|kg|deg)(?!\w))|(?<=N) (?=m\b)|(?<=\d %) (?=s\b)|(?<=beatable:) "
+)
+"""Spaces at which no line is broken: before a unit and in it."""
 _SHORT: Final = 36
 """Characters of a cell that stays on one line of a page."""
-_Item = TypeVar("_Item")
+
+
+def wrap(text: str, first: str = "", rest: str = "  ") -> str:
+    """One paragraph of at most WIDTH columns, its first line and the others opened as given."""
+    together = re.sub(_TOGETHER, _NO_BREAK, text)
+    filled = textwrap.fill(
+        together, WIDTH, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
+    )
+    return filled.replace(_NO_BREAK, " ")
+
+
+def rows(entries: Mapping[str, str]) -> str:
+    """Names and texts in two columns, long texts wrapped."""
+    indent = " " * (max(map(len, entries)) + 2)
+    return "\n".join(wrap(text, name.ljust(len(indent)), indent) for name, text in entries.items())
+
+
+def number(value: float, digits: int = 3) -> str:
+    """So many significant digits; a dash where there is no number."""
+    if not math.isfinite(value):
+        return "-"
+    if value != 0 and not 1e-4 <= abs(value) < 1e5:
+        return f"{value:.0e}"
+    decimals = digits - 1 - math.floor(math.log10(abs(value))) if value else 0
+    return f"{value:.{max(0, decimals)}f}"
+
+
+def capital(text: str) -> str:
+    """With a capital letter."""
+    return text[:1].upper() + text[1:]
+
+
+def sentence(text: str) -> str:
+    """With a capital letter and a full stop."""
+    return capital(text).removesuffix(".") + "."
 
 
 @dataclass(frozen=True)
@@ -148,25 +209,6 @@ class Table:
         return "\n".join([*([wrap(self.caption)] if self.caption else []), *lines])
 
 
-def table(
-    items: Iterable[_Item],
-    columns: Mapping[str, Callable[[_Item], object]],
-    caption: str = "",
-    brief: bool | Sequence[str | None] = False,
-) -> Table:
-    """Return a table with a row per item, and per column how a cell follows from it.
-
-    Floats get three significant digits. Blanks at the end of a head tell it from another one that
-    is shown alike.
-    """
-    rows = [[_text(cell(item)) for cell in columns.values()] for item in items]
-    return Table([head.rstrip(" ") for head in columns], rows, caption, brief)
-
-
-def _text(value: object) -> str:
-    return number(value) if isinstance(value, float) else str(value)
-
-
 @dataclass(frozen=True)
 class Picture:
     """A figure and the sentence under it, for a page.
@@ -247,7 +289,7 @@ class Document:
 
     title: str
     verdict: str
-    sections: Sequence[Section]
+    sections: list[Section]
     tone: Tone = "plain"
     facts: Mapping[str, str] = field(default_factory=dict)
 
@@ -268,3 +310,108 @@ class Document:
 def _is_number(cell: str) -> bool:
     text = cell.strip()
     return text in ("", "-", "–", "∞", "NaN") or text.lstrip("+-−<>≤≥±* ")[:1].isdigit()
+
+
+def from_template(name: str, tone: Tone = "plain", **context: Any) -> Document:
+    """Return the document that a template makes of its context."""
+    top, *others = sections(name, **context)
+    verdict = " ".join(part.text for part in top.all(Paragraph))
+    facts = {key: text for one in top.all(Values) for key, text in one.entries.items()}
+    return Document(top.heading, verdict, others, tone, facts)
+
+
+def sections(name: str, **context: Any) -> list[Section]:
+    """Return the sections of a template, without those all of whose named blocks are missing."""
+    found = []
+    for heading, folded, parts in _template(name):
+        named = [bool(context[part.name]) for part in parts if part.name]
+        if any(named) or not named:
+            blocks = [block for part in parts for block in _blocks(part, context)]
+            found.append(Section(heading.render(context), *blocks, folded=folded))
+    return found
+
+
+class _Part(NamedTuple):
+    """A part of a template; `rows` are the pieces between :: of lines that begin with `kind`."""
+
+    mark: str
+    name: str
+    text: "Template"
+    kind: str
+    rows: "list[list[Template]]"
+
+
+def _blocks(part: _Part, context: Mapping[str, Any]) -> Iterator[Block]:
+    value: Any = context[part.name] if part.name else None
+    if part.name and not value:
+        return
+    text = " ".join(part.text.render(context).split())
+    if part.kind == "|":
+        yield _table(part, text, value, context)
+    elif part.kind == "=":
+        told = ([one.render(context, it=value).strip() for one in row] for row in part.rows)
+        if entries := {name: text for name, text in told if text}:
+            yield Values(entries)
+    elif part.kind == "+":
+        head, *rows = [[one.render(context).strip() for one in row] for row in part.rows]
+        yield Table(head, rows, text)
+    elif not part.name:
+        if text:
+            yield Paragraph(text, part.mark == ">")
+    else:
+        for one in value if isinstance(value, list | tuple) else [value]:
+            if one is True:
+                yield Paragraph(text, part.mark == "@>")
+            elif callable(one):
+                yield Picture(one, text)
+            else:
+                yield replace(one, caption=text) if text and isinstance(one, Table) else one
+
+
+def _table(part: _Part, caption: str, items: Any, context: Mapping[str, Any]) -> Table:
+    heads = [[one.render(context).replace("~", _NO_BREAK) for one in row[:-1]] for row in part.rows]
+    rows = [[row[-1].render(context, it=item).strip() for row in part.rows] for item in items]
+    brief: bool | list[str | None] = part.mark == "@>"
+    if any(len(names) > 1 for names in heads):
+        brief = [None if names[-1] == "-" else names[-1] for names in heads]
+    return Table([names[0] for names in heads], rows, caption, brief)
+
+
+@cache
+def _template(name: str) -> "list[tuple[Template, bool, list[_Part]]]":
+    """Return headings, whether they are folded, and the parts below them."""
+    environment = _environment()
+    assert environment.loader is not None
+    found: list[tuple[Template, bool, list[_Part]]] = []
+    columns: dict[str, list[list[Template]]] = {}
+    source, *_ = environment.loader.get_source(environment, f"{name}.md.j2")
+    for part in re.split(r"\n\s*\n", source.strip()):
+        opening, *lines = re.split(r"\n *(?=[|=+] )", f"\n{part}")
+        ((mark, named, text),) = re.findall(r"^(#-?|[!>]|@>?|)(\w*)(.*)", " ".join(opening.split()))
+        if "@" not in mark:
+            named, text = "", named + text
+        template = environment.from_string(text.strip())
+        if mark in ("!", "#", "#-"):
+            found.append((template, mark == "#-", []))
+            continue
+        rows = [re.sub(r"\s*\n\s*", " ", line[2:]).split(" :: ") for line in lines]
+        pieces = [[environment.from_string(piece) for piece in row] for row in rows]
+        if rows and rows[0][0].startswith("@"):
+            pieces = columns[rows[0][0]]
+        columns[f"@{named}"] = pieces
+        found[-1][2].append(_Part(mark, named, template, lines[0][0] if lines else "", pieces))
+    return found
+
+
+@cache
+def _environment() -> "Environment":
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    def shown(value: object) -> object:
+        return number(value) if isinstance(value, float) else value
+
+    found = Environment(
+        loader=PackageLoader("stewart_drake.reporting"), undefined=StrictUndefined, finalize=shown
+    )
+    found.filters |= {"number": number, "capital": capital}
+    return found

@@ -6,7 +6,7 @@ Angles are shown in degrees, positions in mm. A run that ended early ends with a
 from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting import style
 from stewart_drake.reporting.panels import Curve, Panel, draw
-from stewart_drake.reporting.style import FACTORS, UNITS, Line, figure_style, write_figures
-from stewart_drake.reporting.tuner_figures import shown_until, weights_figure
+from stewart_drake.reporting.style import FACTORS, UNITS, Line, write_figures
 from stewart_drake.scenario.config import FixedTunerConfig
 from stewart_drake.scenario.signals import (
     ANGLES,
@@ -26,6 +25,7 @@ from stewart_drake.scenario.signals import (
     PACKETS,
     PARAMETERS,
     POSITION,
+    WEIGHTS,
 )
 from stewart_drake.studies.compare import ADAPTIVE, LABELS, SERVOS
 from stewart_drake.studies.compare import label as spoken
@@ -46,6 +46,10 @@ _LEAST_SPAN: Final = 0.02
 """Least span of a coordinate's axis, as a share of the widest motion among those of its unit."""
 _MARGIN: Final = 0.06
 """Empty share of an axis beyond the data."""
+
+_AFTER_END: Final = 1.1
+"""The time axis of a run that ended early goes on for this factor."""
+_FIXED: Final = Line("#888888", ":", 1.2)
 
 _Runs = Mapping[str, tuple[SimulationResult, Line]]
 
@@ -80,8 +84,7 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
             figures[f"delay_{name}"] = _delay(result)
     tuned = {spoken(name): run for name, run in aware.items() if _is_tuned(run)}
     if tuned:
-        with figure_style():
-            figures["weights"] = weights_figure(tuned)
+        figures["weights"] = weights_figure(tuned)
     return figures
 
 
@@ -109,8 +112,7 @@ def draw_run(result: SimulationResult) -> dict[str, Figure]:
     if _finds_delay(result):
         figures["delay"] = _delay(result)
     if _is_tuned(result):
-        with figure_style():
-            figures["weights"] = weights_figure({"weights that the tuner set": result})
+        figures["weights"] = weights_figure({"weights that the tuner set": result})
     return figures
 
 
@@ -242,6 +244,37 @@ def _delay(run: SimulationResult) -> Figure:
         xlim = (0.0, shown_until(run))
         panels.append(Panel(name, [truth, found], xlim=xlim, ylim=ylim))
     return draw(panels, 2)
+
+
+def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
+    """Draw w_Q, w_R and below them their ratio, on which alone the gain depends, a run per column.
+
+    Args:
+        runs: by what each column is called; at least one.
+    """
+    above, below = list[Panel](), list[Panel]()
+    for title, run in runs.items():
+        weights, c, end = run.signals.weights.values, run.scenario.controller, shown_until(run)
+        ratio, fixed = weights[:, 0] / weights[:, 1], c.w_Q / c.w_R
+        first, other = (
+            _curves({name: (run, look)}, [data], True)[0]
+            for name, look, data in (
+                (WEIGHTS[0], style.RUN, weights[:, 0]),
+                ("", Line("#000000", "-", 1.3), ratio),
+            )
+        )
+        second = Curve(first.x, weights[:, 1], WEIGHTS[1], style.COMMANDED, steps=True)
+        constant = Curve((0, end), (fixed, fixed), "fixed weights", _FIXED)
+        how: dict[str, Any] = {"xlim": (0, end), "yscale": "log" if len(weights) else "linear"}
+        above.append(Panel("weight", [first, second], title=title, **how))
+        below.append(Panel("w_Q / w_R", [other, constant], **how))
+    return draw([*above, *below], len(runs), sharey="row")
+
+
+def shown_until(run: SimulationResult) -> float:
+    """Return where the time axis of a run ends, in s."""
+    end = run.scenario.duration
+    return end if run.stopped is None else min(end, _AFTER_END * run.stopped.time) or end
 
 
 def _times(runs: _Runs) -> tuple[float, float]:

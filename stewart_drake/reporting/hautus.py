@@ -1,6 +1,6 @@
 """Document and figures of a Hautus analysis."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import groupby
 from typing import Final
@@ -8,12 +8,9 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from stewart_drake.law.hautus import Mode
-from stewart_drake.reporting.document import Document, Paragraph, Table, Tone, table
-from stewart_drake.reporting.outline import sections
+from stewart_drake.reporting.document import Document, Paragraph, Table, capital, from_template
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import Line, line
-from stewart_drake.reporting.words import capital
 from stewart_drake.studies.hautus import QUESTIONS, HautusStudy, System
 
 _CHAINS: Final = ("minimal chain", "paper's chain", "chain under gravity")
@@ -23,61 +20,40 @@ _SMALLEST: Final = 1e-18
 
 def document(study: HautusStudy) -> Document:
     """Return the models that matter, what fails, and folded, every model and mode."""
-    verdict, tone = _verdict(study)
-    sc, found = study.basis.experiment.scenario, study.basis
+    sc = study.basis.experiment.scenario
     chains = [system for name in _CHAINS for system in study.family(name)]
     shown = [s for name in _CHAINS for s in _landmarks(study.family(name), sc.true_delay.steps)]
     error_model = study.family("error model")
     plants = [*error_model, *study.family("plant")]
-    noted = [system for system in study.systems if system.note]
-    modes = [
-        (system.name, test, mode)
-        for system in study.systems
-        for test, outcome in (("input", system.reach), ("output", system.view))
-        for mode in outcome.modes
-    ]
-    context = {
-        "chains": chains and _models_table(shown),
-        "chains_fail": _deficiencies(chains),
-        "chain_figure": chains and partial(chain_figure, study),
-        "plants": plants and _models_table([*error_model, *_typical_plants(study)]),
-        "plants_fail": _deficiencies(plants),
-        "plant_figure": plants and partial(plant_figure, study),
-        "skipped": study.skipped and _skipped(study),
-        "noted": noted,
-        "notes": noted and _notes(noted),
-        "modes": _modes_table(modes),
-        "systems": _systems_table(study.systems),
-    }
-    facts = {
-        "mechanism": found.experiment.mechanism.name,
-        "period, delay": f"{sc.controller.period:g} s, μ = {sc.true_delay.steps}, "
-        f"fraction {sc.true_delay.fraction:g}",
-        "units of the states": f"[{', '.join(f'{value:.3g}' for value in found.motion)}] "
-        "rad and m, these per s, these times s",
-        "unit of the torques": f"{found.torque:.3g} N m",
-    }
-    parts = sections("hautus", study=study, **context)
-    return Document("Controllability and observability", verdict, parts, tone, facts)
-
-
-def _verdict(study: HautusStudy) -> tuple[str, Tone]:
-    obstacles = " ".join(study.basis.obstacles)
-    bad = [
+    useless = [
         s.name for s in study.systems if not (s.answers["stabilizable"] and s.answers["detectable"])
     ]
-    if bad:
-        more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
-        return f"{obstacles} No controller can be designed for: {bad[0]}{more}.".strip(), "bad"
-    if not study.systems:
-        return f"{obstacles} There is no pose at which a model exists.".strip(), "bad"
-    least = min(study.systems, key=lambda s: s.margins["stabilizable"])
-    text = (
-        f"All {len(study.systems)} models are stabilisable and detectable; the least margin is "
-        f"{least.margins['stabilizable']:.1e} ({least.name}), the tolerance "
-        f"{least.reach.tolerance:.0e}."
+    skipped: dict[str, list[str]] = {}
+    for name, reason in study.skipped:
+        skipped.setdefault(reason, []).append(name)
+    return from_template(
+        "hautus",
+        "bad" if useless or not study.systems or study.basis.obstacles else "good",
+        study=study,
+        sc=sc,
+        useless=useless,
+        least=min(study.systems, key=lambda s: s.margins["stabilizable"], default=None),
+        chains=chains and shown,
+        chains_fail=_deficiencies(chains),
+        chain_figure=chains and partial(chain_figure, study),
+        plants=plants and [*error_model, *_typical_plants(study)],
+        plants_fail=_deficiencies(plants),
+        plant_figure=plants and partial(plant_figure, study),
+        skipped=skipped.items(),
+        noted=[system for system in study.systems if system.note],
+        modes=[
+            (system.name, test, mode)
+            for system in study.systems
+            for test, outcome in (("input", system.reach), ("output", system.view))
+            for mode in outcome.modes
+        ],
+        systems=_systems_table(study.systems),
     )
-    return f"{obstacles} {text}".strip(), "bad" if obstacles else "good"
 
 
 def _typical_plants(study: HautusStudy) -> list[System]:
@@ -113,77 +89,13 @@ def _deficiencies(systems: Sequence[System]) -> list[Paragraph]:
     return found
 
 
-def _skipped(study: HautusStudy) -> Table:
-    reasons: dict[str, list[str]] = {}
-    for name, reason in study.skipped:
-        reasons.setdefault(reason, []).append(name)
-    columns = {"reason": lambda one: one[0], "models": lambda one: "; ".join(one[1])}
-    return table(reasons.items(), columns, brief=True)
-
-
-def _notes(noted: Iterable[System]) -> Table:
-    return table(
-        noted,
-        {
-            "model": lambda one: one.name,
-            "controllability margin": lambda one: f"{one.reach.margin:.1e}",
-            "observability margin": lambda one: f"{one.view.margin:.1e}",
-            "note": lambda one: one.note,
-        },
-    )
-
-
-def _models_table(systems: Iterable[System]) -> Table:
-    """Return the two questions about all modes, or what holds of those that do not decay."""
-
-    def answer(one: System, word: str, lasting: str) -> str:
-        if one.answers[word]:
-            return "yes"
-        return lasting if one.answers[lasting] else "no"
-
-    return table(
-        systems,
-        {
-            "model": lambda one: one.name,
-            "n": lambda one: one.n,
-            "controllable": lambda one: answer(one, "controllable", "stabilizable"),
-            "margin": lambda one: f"{one.margins['controllable']:.1e}",
-            "observable": lambda one: answer(one, "observable", "detectable"),
-            "margin ": lambda one: f"{one.margins['observable']:.1e}",
-        },
-        brief=True,
-    )
-
-
-def _systems_table(systems: Iterable[System]) -> Table:
-    def cell(word: str, one: System) -> str:
-        return f"{_yes(one.answers[word])}, {one.margins[word]:.1e}"
-
-    answers = {f"{word}, margin": partial(cell, word) for word in QUESTIONS}
-    return table(systems, {"model": lambda one: one.name, "n": lambda one: one.n, **answers})
-
-
-def _modes_table(modes: Iterable[tuple[str, str, Mode]]) -> Table:
-    def value(mode: Mode) -> str:
-        imaginary = f" ± {mode.eigenvalue.imag:.4g}j" if mode.eigenvalue.imag else ""
-        return f"{mode.eigenvalue.real:.4g}{imaginary}"
-
-    return table(
-        modes,
-        {
-            "model": lambda one: one[0],
-            "test": lambda one: one[1],
-            "eigenvalue": lambda one: value(one[2]),
-            "multiplicity": lambda one: one[2].multiplicity,
-            "decays": lambda one: _yes(one[2].decays),
-            "margin": lambda one: f"{one[2].margin:.1e}",
-            "deficient": lambda one: one[2].directions.shape[1],
-        },
-    )
-
-
-def _yes(answer: bool) -> str:
-    return "yes" if answer else "no"
+def _systems_table(systems: Sequence[System]) -> Table:
+    rows = [
+        [one.name, str(one.n)]
+        + [f"{'yes' if one.answers[w] else 'no'}, {one.margins[w]:.1e}" for w in QUESTIONS]
+        for one in systems
+    ]
+    return Table(["model", "n", *(f"{word}, margin" for word in QUESTIONS)], rows)
 
 
 def chain_figure(study: HautusStudy) -> Figure:

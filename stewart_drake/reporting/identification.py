@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from stewart_drake.identification.identify import WRONG, Identification
-from stewart_drake.identification.judgement import PoseUncertainty
 from stewart_drake.identification.logs import KINDS, Log
 from stewart_drake.identification.plan import MOTION, Plan
 from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NAMES
@@ -17,17 +16,13 @@ from stewart_drake.identification.unknowns import UNITS as SI_UNITS
 from stewart_drake.reporting.document import (
     Caution,
     Document,
-    Paragraph,
     Picture,
     Table,
-    Tone,
-    Values,
-    table,
+    from_template,
+    number,
 )
-from stewart_drake.reporting.outline import sections
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import FACTORS, LEG_LINES, UNITS
-from stewart_drake.reporting.words import number
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
 from stewart_drake.types import Array
 
@@ -49,34 +44,28 @@ _OF_KIND: Final = {
 
 def document(found: Identification) -> Document:
     """Return the fit, what was found, what was not."""
-    delay = f"{1e3 * found.values[DELAY]:.6g}"
-    chi2 = number(found.chi2["all"])
-    if found.right:
-        interval = number(1e3 * found.std[DELAY], 2)
-        if "e" not in interval:  # as many decimals as the interval has
-            delay = f"{1e3 * found.values[DELAY]:.{len(interval.partition('.')[2])}f}"
-        text = (
-            f"The delay is {delay} ± {interval} ms; the machine that was found explains the log "
-            f"(chi²/n {chi2})."
-        )
-    else:
-        text = (
-            f"No machine within these tolerances explains the log (chi²/n {chi2}, above {WRONG}): "
-            f"the values are guesses, among them a delay of {delay} ms, and have no intervals."
-        )
-    cautions = [Caution(one) for one in _cautions(found)]
-    names = file_names(found.logs)
-    parts = sections(
+    interval = number(1e3 * found.std[DELAY], 2)
+    digits = len(interval.partition(".")[2])
+    exact = f"{1e3 * found.values[DELAY]:.6g}"
+    cautions, names = [Caution(one) for one in _cautions(found)], file_names(found.logs)
+    right = found.right
+    return from_template(
         "identification",
+        "bad" if not right else "fair" if cautions else "good",
+        right=right,
+        delay=f"{1e3 * found.values[DELAY]:.{digits}f}" if right and "e" not in interval else exact,
+        interval=interval,
+        wrong=WRONG,
+        logs=names,
+        mechanism=found.unknowns.mechanism.name,
+        segments=len(found.problem.segments),
         cautions=cautions,
         found=_table(found, geometry=False),
         geometry=_table(found, geometry=True),
-        unseen=_unseen(found.unseen),
-        chi2=table(
-            found.chi2.items(),
-            {"of": lambda one: one[0], "chi²/n": lambda one: one[1]},
-            brief=True,
-        ),
+        unseen=found.unseen[0] > 0,
+        directions=found.unseen,
+        chi2=found.chi2,
+        fits=found.chi2.items(),
         residuals=[
             Picture(
                 partial(residual_figure, found, i),
@@ -84,36 +73,33 @@ def document(found: Identification) -> Document:
             )
             for i, name in enumerate(names)
         ],
-        **(_poses(found.pose_uncertainty) if found.right else {"poses": None, "no_poses": None}),
+        poses=found.pose_uncertainty if right else None,
+        outside=right and found.pose_uncertainty is None,
+        pair=_pair,
     )
-    facts = {
-        "logs": ", ".join(names),
-        "mechanism": found.unknowns.mechanism.name,
-        "segments": str(len(found.problem.segments)),
-    }
-    tone: Tone = "bad" if not found.right else "fair" if cautions else "good"
-    return Document("A machine from its log", text, parts, tone, facts)
 
 
 def plan_document(plan: Plan) -> Document:
     """Return the motion, and what its log will tell."""
     std = plan.std
-    text = (
-        f"A log of this motion will tell the delay to ± {number(1e3 * std[DELAY], 2)} ms and poses "
-        f"to {number(1e3 * plan.pose_uncertainty.position[1], 2)} mm."
-    )
     free = [k for k in plan.unknowns.free if not _of_geometry(k)]
-    parts = sections(
+    return from_template(
         "identification_plan",
         plan=plan,
+        delay=number(1e3 * std[DELAY], 2),
         file=MOTION,
         motion=partial(motion_figure, plan),
         found=_unknowns(free, {"now ±": plan.unknowns.std, "after ±": std}, brief=True),
-        unseen=_unseen(plan.unseen),
-        **_poses(plan.pose_uncertainty),
+        unseen=plan.unseen[0] > 0,
+        directions=plan.unseen,
+        poses=plan.pose_uncertainty,
+        pair=_pair,
     )
-    facts = {"mechanism": plan.unknowns.mechanism.name, "duration": f"{plan.times[-1]:g} s"}
-    return Document("An experiment that tells much", text, parts, "plain", facts)
+
+
+def _pair(values: tuple[float, float], unit: str) -> str:
+    middle, worst = (number(1e3 * value, 2) for value in values)
+    return f"{middle} {unit}, at worst {worst} {unit}"
 
 
 def file_names(logs: Sequence[Log]) -> list[str]:
@@ -155,44 +141,12 @@ def _table(found: Identification, geometry: bool) -> Table:
 
 def _unknowns(free: Sequence[int], columns: dict[str, Array], brief: bool) -> Table:
     """Return name and unit of each unknown, and columns of its numbers."""
-
-    def cell(values: Array, k: int) -> str:
-        return number(_UNITS[SI_UNITS[k]][1] * values[k], 4)
-
-    names = {
-        "unknown": lambda k: NAMES[k].replace("_", " "),
-        "unit": lambda k: _UNITS[SI_UNITS[k]][0],
-    }
-    cells = {head: partial(cell, values) for head, values in columns.items()}
-    return table(free, {**names, **cells}, brief=brief)
-
-
-def _poses(poses: PoseUncertainty | None) -> dict[str, Any]:
-    if poses is None:
-        reason = (
-            "No figures: the pose in the middle of the motion, measured with the drawn machine, is "
-            "outside the workspace of the machine that was found."
-        )
-        return {"poses": None, "no_poses": Paragraph(reason, brief=True)}
-
-    def told(pair: tuple[float, float], unit: str) -> str:
-        middle, worst = (number(1e3 * value, 2) for value in pair)
-        return f"{middle} {unit}, at worst {worst} {unit}"
-
-    values = {
-        "position": told(poses.position, "mm"),
-        "angles": told(poses.angle, "mrad"),
-        "position, from the middle": told(poses.position_beside, "mm"),
-        "angles, from the middle": told(poses.angle_beside, "mrad"),
-    }
-    return {"poses": Values(values), "no_poses": None}
-
-
-def _unseen(directions: tuple[int, list[str]]) -> Paragraph | None:
-    count, names = directions
-    plural = "direction is" if count == 1 else "directions are"
-    text = f"{count} {plural} about as uncertain as before: {'; '.join(names)}."
-    return Paragraph(text, brief=True) if count else None
+    rows = []
+    for k in free:
+        unit, factor = _UNITS[SI_UNITS[k]]
+        numbers = [number(factor * values[k], 4) for values in columns.values()]
+        rows.append((NAMES[k].replace("_", " "), unit, *numbers))
+    return Table(("unknown", "unit", *columns), rows, brief=brief)
 
 
 def residual_figure(found: Identification, log: int) -> Figure:

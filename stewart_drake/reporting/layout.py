@@ -6,10 +6,17 @@ from typing import Final
 
 import numpy as np
 
-from stewart_drake.reporting.document import Document, Picture, Section, Table, Tone, Values, table
+from stewart_drake.reporting.document import (
+    Document,
+    Picture,
+    Section,
+    Table,
+    Tone,
+    Values,
+    from_template,
+    number,
+)
 from stewart_drake.reporting.mechanism import mechanism_figure
-from stewart_drake.reporting.outline import sections
-from stewart_drake.reporting.words import number
 from stewart_drake.studies.layout import INSTANTS, Layout, LayoutStudy
 from stewart_drake.studies.layout_measures import MEASURES
 from stewart_drake.studies.layout_space import PARAMETERS
@@ -21,6 +28,7 @@ _TONES: Final[dict[str, Tone]] = {"yes": "good", "partly": "fair"}
 def document(study: LayoutStudy) -> Document:
     """Return what was found beside the machine that the search began from."""
     machines = [study.before, *study.layouts]
+    goal = study.problem.wish.goal
     near = {
         one.name: f"{one.nearest.pair}, {number(1e3 * one.nearest.distance)} mm at "
         f"t = {one.nearest.time:.2f} s" + (", they cross" if one.nearest.distance < 0 else "")
@@ -28,29 +36,26 @@ def document(study: LayoutStudy) -> Document:
         if one.nearest is not None
     }
     missed = {one.name: _missed(one.missed) for one in machines if one.missed}
-    parts = sections(
+    found = from_template(
         "layout",
+        _TONES.get(study.verdict.split(":")[0], "bad"),
         study=study,
         instants=INSTANTS,
+        goal=MEASURES[goal].text,
+        goal_name=goal,
         compared=_compared(study, machines),
-        near=near and Values(near),
-        missed=missed and Values(missed, brief=False),
+        near=Values(near) if near else None,
+        missed=Values(missed, brief=False) if missed else None,
         numbers=_numbers(study, machines),
-        searches=_searches(study),
+        searches=study.searches.items(),
+        reached=lambda one: MEASURES[goal].factor * one.measures.get(goal, np.nan),
+        told=_missed,
     )
     for one in machines:
         figure = partial(mechanism_figure, one.mechanism)
         caption = f"{one.name} at home, from above and from the front."
-        parts.append(Section(one.name, Picture(figure, caption)))
-    facts = {
-        "layouts tried": str(study.evaluations),
-        "goal": MEASURES[study.problem.wish.goal].text,
-        "seed": str(study.seed),
-    }
-    kind = study.problem.scenario.reference.kind
-    title = f"Layouts for a {kind} motion, from {study.before.name}"
-    tone = _TONES.get(study.verdict.split(":")[0], "bad")
-    return Document(title, study.verdict, parts, tone, facts)
+        found.sections.append(Section(one.name, Picture(figure, caption)))
+    return found
 
 
 def _beside(
@@ -108,16 +113,3 @@ def _numbers(study: LayoutStudy, machines: list[Layout]) -> Table:
     signs = ("branches", "", lambda one: "".join("-+"[int(b > 0)] for b in one.mechanism.branches))
     order = ("plate_order", "", lambda one: "".join(map(str, one.order)))
     return _beside([one.name for one in machines], "between", [*rows, signs, order], machines)
-
-
-def _searches(study: LayoutStudy) -> Table:
-    goal = study.problem.wish.goal
-    return table(
-        study.searches.items(),
-        {
-            "search": lambda one: one[0],
-            "layouts": lambda one: one[1].evaluations,
-            goal: lambda one: number(MEASURES[goal].factor * one[1].measures.get(goal, np.nan)),
-            "limits missed": lambda one: _missed(one[1].missed) or "kept",
-        },
-    )

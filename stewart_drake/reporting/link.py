@@ -7,11 +7,9 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from stewart_drake.reporting.document import Document, Tone, table
-from stewart_drake.reporting.outline import sections
+from stewart_drake.reporting.document import Document, from_template
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import Line, line
-from stewart_drake.reporting.words import number
 from stewart_drake.studies.link_bound import Cell, LinkStudy
 from stewart_drake.studies.statistics import CONFIDENCE
 
@@ -23,66 +21,23 @@ def _mean(cell: Cell) -> float:
     return float(np.mean(cell.errors)) if cell.errors else math.nan
 
 
-_COLUMNS: Final = {
-    "bound [s]": lambda cell: f"{cell.bound:.3g}",
-    "lost": lambda cell: f"{100 * cell.loss:.3g} %",
-    "late": lambda cell: f"{100 * cell.late:.3g} %",
-    "missing": lambda cell: f"{100 * cell.missing:.3g} %",
-    "completed": lambda cell: f"{len(cell.errors)} of {cell.runs}",
-    "E_ac [% s]": _mean,
-    "worst [% s]": lambda cell: max(cell.errors, default=math.nan),
-    "no worse": lambda cell: f">= {100 * cell.no_worse:.0f} %" if cell.runs else "-",
-}
-
-
 def document(study: LinkStudy) -> Document:
     """Return bounds, then losses at the best of them."""
-    verdict, tone = _verdict(study)
-    parts = sections(
+    best, checked = study.best, study.checked
+    own = best is not None and all(one is None or one.completed == 1 for one in (best, checked))
+    return from_template(
         "link",
+        "good" if own else "bad",
         study=study,
+        mean=_mean,
+        most=lambda cell: max(cell.errors, default=math.nan),
+        assured=_ASSURED,
+        wanted=math.ceil(math.log(1 - CONFIDENCE) / math.log(_ASSURED)),
         left_out=" and ".join(f"{bound:g} s" for bound in study.left_out),
-        bounds=table(study.bounds, _COLUMNS, brief=True),
-        losses=study.losses and table(study.losses, _COLUMNS, brief=True),
+        bounds=study.bounds,
+        losses=study.losses,
         figure=partial(bound_figure, study),
     )
-    facts = {"play-out without a bound given": f"{study.usual:.3g} s"}
-    return Document("Which play-out bound suits this network?", verdict, parts, tone, facts)
-
-
-def _verdict(study: LinkStudy) -> tuple[str, Tone]:
-    best = study.best
-    if best is None:
-        return "No run completed, at any bound.", "bad"
-    late = f"{100 * best.late:.3g} % of the packets are late"
-    text = (
-        f"A bound of {best.bound:.3g} s is the best of those tried: E_ac is {number(_mean(best))} "
-        f"% s, {late}. Default play-out bound for this scenario: {study.usual:.3g} s."
-    )
-    if study.losses:
-        survived = study.survivable
-        text += (
-            " At the best bound no loss is survived in every run."
-            if math.isnan(survived)
-            else f" At the best bound every run completed up to a loss of {100 * survived:.3g} %."
-        )
-    checked = study.checked
-    if checked is not None and checked.runs:
-        text += f" {_assured(checked)}"
-    own = best.completed == 1 and (checked is None or checked.completed == 1)
-    return text, "good" if own else "bad"
-
-
-def _assured(cell: Cell) -> str:
-    """Return what new seeds at the best bound say of all runs."""
-    share = f"With 95 % confidence at least {100 * cell.no_worse:.0f} % of all runs"
-    if len(cell.errors) < cell.runs:
-        return f"Of {cell.runs} new runs {len(cell.errors)} completed. {share} complete."
-    text = f"{share} have at most {number(max(cell.errors))} % s, the worst of {cell.runs} new runs"
-    if cell.no_worse >= _ASSURED:
-        return f"{text}."
-    wanted = math.ceil(math.log(1 - CONFIDENCE) / math.log(_ASSURED))
-    return f"{text}; --runs {wanted} would make it {100 * _ASSURED:.0f} %."
 
 
 def bound_figure(study: LinkStudy) -> Figure:

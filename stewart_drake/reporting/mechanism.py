@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.reporting.document import Document, Section, Values
+from stewart_drake.reporting.document import Document, Section, Values, number
 from stewart_drake.reporting.panels import Panel, draw
 from stewart_drake.reporting.style import Line, write_figures
-from stewart_drake.reporting.words import number
 from stewart_drake.reporting.workspace import travel_text
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.studies.mechanism_check import MechanismCheck

@@ -99,13 +99,14 @@ def draw(
     columns: int = 1,
     *,
     down: bool = False,
-    sharey: bool = False,
+    sharey: bool | Literal["row"] = False,
     room: float = _LEFT,
     edge: float = _RIGHT,
     top: float = 0.0,
 ) -> Figure:
     """Draw panels in rows, or column by column with `down`, below a legend of all their curves.
 
+    `sharey` gives all panels, or those of a row, the same vertical axis.
     `room` is for the labels of the vertical axis on the left, `edge` is kept free on the right and
     `top` above, in inches.
     """
@@ -114,12 +115,13 @@ def draw(
     rows = math.ceil(len(grid) / columns)
     spots = [divmod(k, rows)[::-1] if down else divmod(k, columns) for k in range(len(grid))]
     spots += [(rows + k, 0) for k in range(len(placed) - len(grid))]
-    alike = sharey and len({one.y for one in grid}) == 1
-    figure = Figure(figsize=(WIDTH, 1.0))
+    alike = sharey == "row" or (sharey and len({one.y for one in grid}) == 1)
+    figure, first = Figure(figsize=(WIDTH, 1.0)), dict[int, Axes]()
     for one, (row, column) in zip(placed, spots, strict=True):
-        first = figure.axes[0] if figure.axes else None
-        sharex = first if one.x == grid[0].x and not one.wide else None
-        ax = figure.add_subplot(sharex=sharex, sharey=first if sharey and not one.wide else None)
+        sharex = (one.x, one.xlim, one.wide) == (grid[0].x, grid[0].xlim, False)
+        same_y = first.get(row if sharey == "row" else 0) if sharey and not one.wide else None
+        ax = figure.add_subplot(sharex=first.get(0) if sharex else None, sharey=same_y)
+        first.setdefault(row, ax)
         below = [p.x for p, (r, c) in zip(placed, spots, strict=True)
                  if r > row and c == column and not p.wide]  # fmt: skip
         _fill(ax, one, last=one.x not in below, named=column == 0 or not alike)

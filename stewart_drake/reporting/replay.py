@@ -16,8 +16,8 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.scene import TORQUE_COLORS, Scene, crank_paths, full_color, torque_shares
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import rotation
+from stewart_drake.reporting.document import number
 from stewart_drake.reporting.page import environment
-from stewart_drake.reporting.words import number
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
 from stewart_drake.types import Array
 

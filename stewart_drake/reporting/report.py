@@ -19,13 +19,13 @@ from stewart_drake.reporting.document import (
     Picture,
     Section,
     Tone,
+    number,
+    sections,
+    sentence,
 )
-from stewart_drake.reporting.figures import draw_comparison, draw_run, has_packets
-from stewart_drake.reporting.outline import sections
+from stewart_drake.reporting.figures import draw_comparison, draw_run, has_packets, weights_figure
 from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.reporting.run import comparison_blocks, run_blocks
-from stewart_drake.reporting.tuner_figures import weights_figure
-from stewart_drake.reporting.words import number, sentence
 from stewart_drake.scenario.config import EncoderSensorConfig, Scenario, ServoActuatorConfig
 from stewart_drake.scenario.link import link_text, number_sent
 from stewart_drake.scenario.loading import scenario_yaml

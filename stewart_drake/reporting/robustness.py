@@ -11,12 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from stewart_drake.reporting.document import Document, Table, Tone, table
-from stewart_drake.reporting.outline import sections
+from stewart_drake.reporting.document import Document, Table, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw, limit
 from stewart_drake.reporting.style import LIMIT, RUN, TRUTH
-from stewart_drake.reporting.words import number
-from stewart_drake.studies.failures import Explanation, Pair, Separation
+from stewart_drake.studies.failures import Pair, Separation
 from stewart_drake.studies.robustness_result import (
     QUANTILES,
     Influence,
@@ -59,40 +57,48 @@ _SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
 
 def document(study: RobustnessStudy) -> Document:
     """Return success rate, quantiles, what matters, failures, and the worst runs."""
-    verdict, tone = _verdict(study)
-    sc, influences = study.experiment.scenario, study.influences()
+    influences, found, low = study.influences(), study.explanation, study.success.low
     failed = bool(study.failed.any())
     early = any(one.status != "completed" for one in study.outcomes)
-    context = {
-        "beside": study.beside and _beside_table(study),
-        "quantiles": _quantile_table(study),
-        "distribution_figure": partial(distribution_figure, study),
-        "significant": SIGNIFICANT,
-        "influences": _influence_table(study, influences),
-        "influence_figure": partial(influence_figure, influences),
-        "runs_figure": partial(runs_figure, study),
-        "reasons": failed and _reasons_table(study),
-        "failures": failures_sentence(study.explanation) if failed else "",
-        "failures_tables": failed and failures_tables(study.explanation),
-        "times_figure": failed and early and partial(times_figure, study),
-        "ranges": _range_table(study),
-        "vary": ", ".join(
+    errors = [one for one in influences if one.error_p < SIGNIFICANT]
+    errors.sort(key=lambda one: -abs(one.error.rho))
+    return from_template(
+        "robustness",
+        "good" if low >= _GOOD else "fair" if low >= _FAIR else "bad",
+        study=study,
+        sc=study.experiment.scenario,
+        found=found,
+        inf=math.inf,
+        significant=SIGNIFICANT,
+        named=_NAMED,
+        title=title,
+        percent=_percent,
+        ended=_failed,
+        third=_third,
+        where=_where,
+        spans=_spans(study),
+        titles=TITLES,
+        kept=lambda one: int(np.sum(~one.failed)),
+        strong=[title(one.factor) for one in found.found],
+        for_error=list(dict.fromkeys(title(one.factor.strip("|")) for one in errors)),
+        beside=study.beside and list({"as asked": study, **study.others}.items()),
+        quantiles=[(q, study.quantile(q)) for q in QUANTILES],
+        distribution_figure=partial(distribution_figure, study),
+        influences=influences,
+        influence_figure=partial(influence_figure, influences),
+        runs_figure=partial(runs_figure, study),
+        reasons=failed and [_reason(study, *one) for one in study.reasons.items()],
+        compared=failed and found.failing and found.others,
+        singles=failed and found.singles,
+        pairs=failed and found.pairs,
+        times_figure=failed and early and partial(times_figure, study),
+        ranges=list(factors(study.draws)),
+        vary=", ".join(
             f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}"
             for name, value in dataclasses.asdict(study.ranges).items()
         ),
-        "worst": _worst_table(study),
-    }
-    name = study.experiment.mechanism.name
-    facts = {
-        "mechanism": name,
-        "start": f"{sc.start.replace('_', ' ')}, torques in flight: {sc.queue}",
-        "delay": f"{sc.eta:g} s",
-        "runs": f"{len(study.outcomes)}, seed {study.seed}, {sc.plant.kind} plant",
-    }
-    if study.loops:
-        facts["loop"] = ", ".join(f"{loop}: {n}" for loop, n in study.loops.items())
-    parts = sections("robustness", study=study, **context)
-    return Document(f"Robustness of {name}", verdict, parts, tone, facts)
+        worst=_worst_table(study),
+    )
 
 
 def title(factor: str) -> str:
@@ -101,198 +107,27 @@ def title(factor: str) -> str:
     return f"|{name}|" if factor.startswith("|") else name
 
 
-def _verdict(study: RobustnessStudy) -> tuple[str, Tone]:
-    total, kept = len(study.outcomes), int(np.sum(~study.failed))
-    aim = "completed" if study.limit is None else f"completed with E_ac up to {study.limit:g} % s"
-    text = f"{kept} of {total} runs {aim}: {_percent(study.success)}. {_median(study)}"
-    explanation = study.explanation
-    strong = [title(one.factor) for one in explanation.found]
-    aim = "completing" if study.limit is None else "staying within the limit"
-    if strong:
-        text += f" What matters for {aim}: {', '.join(strong[:_NAMED])}."
-    elif explanation.failing and explanation.others:
-        text += f" For {aim} no single quantity matters beyond chance."
-    errors = [one for one in study.influences() if one.error_p < SIGNIFICANT]
-    errors.sort(key=lambda one: -abs(one.error.rho))
-    names = list(dict.fromkeys(title(one.factor.strip("|")) for one in errors))
-    if names:
-        text += f" What matters for E_ac, of those that completed: {', '.join(names[:_NAMED])}."
-    for name, one in study.others.items():
-        n = int(np.sum(~one.failed))
-        text += f" With {name}, on the same machines: {n} of {total}."
-    low = study.success.low
-    return text, "good" if low >= _GOOD else "fair" if low >= _FAIR else "bad"
-
-
 def _percent(share: Interval) -> str:
     value, low, high = (f"{100 * part:.1f}" for part in (share.value, share.low, share.high))
     return f"{value} % (95 % interval {low} to {high} %)"
-
-
-def _median(study: RobustnessStudy) -> str:
-    middle = study.quantile(0.5).value
-    if math.isinf(middle):
-        return "Half of the runs or more did not complete."
-    most = study.quantile(0.95).value
-    end = "" if math.isinf(most) else f", 95 % below {number(most)}"
-    return f"Half of all runs stay below E_ac = {number(middle)} % s{end}."
 
 
 def _failed(error: float) -> str:
     return "failed" if error == math.inf else number(error)
 
 
-def _beside_table(study: RobustnessStudy) -> Table:
-    """Return the same machines under each controller, the scenario's own first."""
-    return table(
-        {"as asked": study, **study.others}.items(),
-        {
-            "controller": lambda one: one[0],
-            "undisturbed, % s": lambda one: one[1].undisturbed.error,
-            "runs kept": lambda one: f"{np.sum(~one[1].failed)} of {len(one[1].outcomes)}",
-            "share": lambda one: _percent(one[1].success),
-            "median, % s": lambda one: _failed(one[1].quantile(0.5).value),
-            "95 %, % s": lambda one: _failed(one[1].quantile(0.95).value),
-        },
-        brief=("controller", "alone", "runs kept", None, "median", "95 %"),
-    )
-
-
-def _quantile_table(study: RobustnessStudy) -> Table:
-    def low(one: Interval) -> str:
-        return "-" if one.low == -math.inf else _failed(one.low)
-
-    return table(
-        [(q, study.quantile(q)) for q in QUANTILES],
-        {
-            "of all runs": lambda one: f"{100 * one[0]:g} %",
-            "E_ac at most, % s": lambda one: _failed(one[1].value),
-            "interval from": lambda one: low(one[1]),
-            "to": lambda one: "failed or unknown" if math.isinf(one[1].high) else one[1].high,
-        },
-        brief=True,
-    )
-
-
-def _influence_table(study: RobustnessStudy, influences: Sequence[Influence]) -> Table:
-    def rho(one: Correlation, p: float) -> str:
-        mark = "* " if p < SIGNIFICANT else ""
-        return "-" if math.isnan(one.rho) else f"{mark}{one.rho:+.2f}"
-
-    def interval(one: Correlation) -> str:
-        return "-" if math.isnan(one.rho) else f"{one.low:+.2f} to {one.high:+.2f}"
-
-    def chance(one: Correlation, p: float) -> str:
-        return "-" if math.isnan(one.rho) else f"{p:.2g}"
-
-    spans = _spans(study)
-    return table(
-        influences,
-        {
-            "quantity": lambda one: title(one.factor),
-            "drawn": lambda one: spans[one.factor],
-            "ρ with E_ac": lambda one: rho(one.error, one.error_p),
-            "interval": lambda one: interval(one.error),
-            "adjusted p": lambda one: chance(one.error, one.error_p),
-            "ρ with failing": lambda one: rho(one.failure, one.failure_p),
-            "interval ": lambda one: interval(one.failure),
-            "adjusted p ": lambda one: chance(one.failure, one.failure_p),
-        },
-        brief=("quantity", "drawn", "with E_ac", None, None, "with failing", None, None),
-    )
-
-
-def _reasons_table(study: RobustnessStudy) -> Table:
-    own = {
-        reason: [one for one in study.outcomes if study.reason_of(one) == reason]
-        for reason in study.reasons
+def _reason(study: RobustnessStudy, reason: str, runs: int) -> dict[str, Any]:
+    """Return how often, when and at which legs runs failed for a reason."""
+    own = [one for one in study.outcomes if study.reason_of(one) == reason]
+    times = [one.time for one in own if math.isfinite(one.time)]
+    legs = sorted(one.leg for one in own if one.leg is not None)
+    return {
+        "reason": reason,
+        "runs": runs,
+        "share": wilson_interval(runs, len(study.outcomes)),
+        "time": float(np.median(times)) if times else math.nan,
+        "legs": {leg: legs.count(leg) for leg in legs},
     }
-
-    def time(reason: str) -> float:
-        times = [one.time for one in own[reason] if math.isfinite(one.time)]
-        return float(np.median(times)) if times else math.nan
-
-    def legs(reason: str) -> str:
-        found = sorted({one.leg for one in own[reason] if one.leg is not None})
-        counts = (f"leg {leg}: {sum(one.leg == leg for one in own[reason])}" for leg in found)
-        return ", ".join(counts) or "-"
-
-    total = len(study.outcomes)
-    return table(
-        study.reasons.items(),
-        {
-            "reason": lambda one: one[0],
-            "runs": lambda one: one[1],
-            "share of all": lambda one: _percent(wilson_interval(one[1], total)),
-            "median time, s": lambda one: time(one[0]),
-            "legs": lambda one: legs(one[0]),
-        },
-        brief=("reason", "runs", None, "median time, s", "legs"),
-    )
-
-
-def failures_sentence(found: Explanation) -> str:
-    """Return what sets failing runs apart, or that nothing does; empty where none or all fail."""
-    if not (found.failing and found.others):
-        return ""
-    total = f"the {found.failing} failing runs from the other {found.others}"
-    if found.found:
-        told = "; ".join(
-            f"{title(one.factor)}, of which {one.failing} of the {found.failing} have the outer "
-            f"third ({_third(one)}) against {one.others} of the {found.others} "
-            f"(AUC {one.auc.value:.2f}, {one.auc.low:.2f} to {one.auc.high:.2f})"
-            for one in found.found[:_NAMED]
-        )
-        text = f"What tells {total}: {told}."
-    else:
-        text = f"No single quantity separates {total}."
-    if found.pairs:
-        told = "; ".join(
-            f"{_where(one)}, {one.failing} of the {found.failing} against {one.others} of "
-            f"the {found.others}"
-            for one in found.pairs[:_NAMED]
-        )
-        text += f" Two together: {told}."
-    elif not found.found:
-        text += " Nor does a pair of them."
-    return text
-
-
-def failures_tables(found: Explanation) -> list[Table]:
-    """Return every quantity asked about, and the pairs that were found."""
-
-    def failing(one: Separation | Pair) -> str:
-        return f"{one.failing} of {found.failing}"
-
-    def others(one: Separation | Pair) -> str:
-        return f"{one.others} of {found.others}"
-
-    singles = table(
-        found.singles,
-        {
-            "quantity": lambda one: title(one.factor),
-            "its outer third": _third,
-            "of failing runs": failing,
-            "of the others": others,
-            "P(failing larger)": lambda one: f"{one.auc.value:.2f}",
-            "interval": lambda one: f"{one.auc.low:.2f} to {one.auc.high:.2f}",
-            "adjusted p": lambda one: f"{one.p:.2g}",
-        },
-        "Failing runs against the others, by Mann and Whitney's rank test; a third of all runs "
-        "would lie in the outer third by chance.",
-    )
-    pairs = table(
-        found.pairs,
-        {
-            "both": _where,
-            "of failing runs": failing,
-            "of the others": others,
-            "adjusted p": lambda one: f"{one.p:.2g}",
-        },
-        "Pairs, cut at their medians, that separate more together than each alone (Fisher's exact "
-        "tests).",
-    )
-    return [singles, pairs] if found.pairs else [singles]
 
 
 def _third(one: Separation) -> str:
@@ -323,12 +158,6 @@ def _span(low: float, high: float) -> str:
     return f"{low:.{decimals}f} to {high:.{decimals}f}"
 
 
-def _range_table(study: RobustnessStudy) -> Table:
-    spans = _spans(study)
-    columns = {"quantity": TITLES.__getitem__, "from, to": spans.__getitem__}
-    return table(factors(study.draws), columns)
-
-
 def _worst_table(study: RobustnessStudy) -> Table:
     values, told = factor_values(study.draws), factors(study.draws)
     order = np.argsort(np.where(np.isnan(study.errors), np.inf, study.errors), kind="stable")[::-1]
@@ -340,8 +169,9 @@ def _worst_table(study: RobustnessStudy) -> Table:
     def drawn(name: str, i: int) -> str:
         return f"{values[name][i]:.3g}"
 
-    columns = {f"{TITLES[name]}, {unit}": partial(drawn, name) for name, unit in told.items()}
-    return table(order[:_WORST].tolist(), {"run": str, "E_ac, % s": outcome, **columns})
+    heads = ("run", "E_ac, % s", *(f"{TITLES[name]}, {unit}" for name, unit in told.items()))
+    shown = order[:_WORST].tolist()
+    return Table(heads, [(str(i), outcome(i), *(drawn(name, i) for name in told)) for i in shown])
 
 
 def distribution_figure(study: RobustnessStudy) -> Figure:

@@ -15,8 +15,8 @@ from stewart_drake.reporting.document import (
     Section,
     Table,
     Values,
+    number,
 )
-from stewart_drake.reporting.words import number
 from stewart_drake.scenario.config import ControllerConfig, Scenario
 from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from stewart_drake.files.resources import Kind, resolve, shipped
-from stewart_drake.reporting.words import rows
+from stewart_drake.reporting.document import rows
 from stewart_drake.tuner.density import NUM_INPUTS
 from stewart_drake.tuner.network import NUM_OUTPUTS, load_network
 

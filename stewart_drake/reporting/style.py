@@ -9,7 +9,6 @@ from typing import Any, Final, NamedTuple
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import (
@@ -173,13 +172,6 @@ def powers_of_ten(axis: Axis) -> None:
 
 def _power_of_ten(value: float, _: int) -> str:
     return "10" + f"{round(np.log10(value))}".translate(_RAISED)
-
-
-def legend_above(figure: Figure, ax: Axes) -> Figure:
-    """The figure with the lines of one of its axes named above all of them."""
-    handles, labels = ax.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=max(1, len(labels)))
-    return figure
 
 
 def write_figures(figures: Mapping[str, Figure], directory: str | Path) -> list[Path]:

@@ -14,13 +14,11 @@ from matplotlib.patheffects import withStroke
 
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.native.layout import DEAD_CENTRE_SINE
-from stewart_drake.reporting.document import Document, Table, Tone, Values, table
-from stewart_drake.reporting.outline import sections
+from stewart_drake.reporting.document import Document, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import FACTORS, LEG_LINES, LIMIT, UNITS, figure_style, line
-from stewart_drake.reporting.words import number
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
-from stewart_drake.studies.clearance import ClearTravel, Nearest
+from stewart_drake.studies.clearance import Nearest
 from stewart_drake.studies.sizing import Sizing
 from stewart_drake.studies.workspace import WorkspaceStudy
 from stewart_drake.studies.workspace_map import Section, Travel
@@ -29,15 +27,6 @@ from stewart_drake.types import Array
 _COORDINATES: Final = tuple(zip(COORDINATE_NAMES, FACTORS, UNITS, strict=True))
 _NEAREST: Final = 8
 """Number of pairs that are listed even where all of them are apart."""
-_MOTORS: Final = {
-    "peak_torque": "torque peak [N\u00a0m]",
-    "rms_torque": "torque rms [N\u00a0m]",
-    "peak_speed": "speed peak [rad/s]",
-    "rms_speed": "speed rms [rad/s]",
-    "peak_power": "power peak [W]",
-    "least_power": "power least [W]",
-    "rms_power": "power rms [W]",
-}
 _LEVELS: Final = (1, 2, 3, 5, 8, 13, 30, 100)
 """Levels of the condition number."""
 _CMAP: Final = colormaps["cividis_r"]
@@ -50,42 +39,35 @@ _HOME: Final[dict[str, Any]] = {**_PATH, "marker": "+", "ls": "", "ms": 9, "mew"
 
 def document(study: WorkspaceStudy) -> Document:
     """Return reach and singularity along the reference, motors, and the surroundings of home."""
-    mechanism, summary, factor = study.experiment.mechanism, study.summary, study.factor
-    time, leg, margin = study.worst
-    largest = f"{'' if factor.limited else 'more than '}{factor.told} of this one"
-    clear, sizing, limit = study.clearance, study.sizing, study.torque_limit
-    use = (
-        "" if sizing is None or limit is None else max(m["use_of_limit"] for m in summary["motors"])
+    summary, sizing, limit = study.summary, study.sizing, study.torque_limit
+    along, travelled = study.clearance.along, study.clearance.travel
+    limited = sizing is not None and limit is not None
+    crossing = sum(one.distance < 0 for one in along.nearest)
+    fair = study.home is not None or along.touching
+    return from_template(
+        "workspace",
+        "bad" if study.exit is not None else "fair" if fair else "good",
+        study=study,
+        summary=summary,
+        along=along,
+        said=_nearest_text,
+        crossing=_crossing,
+        largest=not np.isnan(study.factor.value) and study.factor,
+        dead_centre=DEAD_CENTRE_SINE,
+        singular=SINGULARITY_LIMIT,
+        length=1e3 * summary["characteristic_length"],
+        legs=summary["legs"],
+        margins_figure=partial(margins_figure, study),
+        nearest=along.nearest[: max(crossing, _NEAREST)],
+        clearance_figure=partial(clearance_figure, study),
+        clear_travel=travelled and list(zip(_COORDINATES, travelled, strict=True)),
+        motors=sizing and summary["motors"],
+        use=limited and 100 * max(m["use_of_limit"] for m in summary["motors"]),
+        motors_figure=sizing and partial(motors_figure, sizing, limit),
+        from_home=study.travel and travel_text(study.travel),
+        travel=study.travel and list(zip(_COORDINATES, study.travel, strict=True)),
+        sections_figure=study.travel and partial(sections_figure, study),
     )
-    context = {
-        "dead_centre": f"{DEAD_CENTRE_SINE:g}",
-        "singular": f"{SINGULARITY_LIMIT:g}",
-        "length": 1e3 * summary["characteristic_length"],
-        "legs": _legs_table(summary["legs"]),
-        "singularity": _singularity(summary),
-        "margins_figure": partial(margins_figure, study),
-        "distances": _distances(study),
-        "nearest": _nearest_table(clear.along.nearest),
-        "clearance_figure": partial(clearance_figure, study),
-        "clear_travel": clear.travel and _clear_table(clear.travel),
-        "motors": sizing and _motors_table(summary["motors"]),
-        "use": use and f"{100 * use:.3g} %",
-        "motors_figure": sizing and partial(motors_figure, sizing, limit),
-        "from_home": study.travel and Values({"from home alone": travel_text(study.travel)}),
-        "travel": study.travel and _travel_table(study.travel),
-        "sections_figure": study.travel and partial(sections_figure, study),
-    }
-    facts = {
-        "mechanism": mechanism.name,
-        "least reach margin": f"{number(1e3 * margin)} mm, leg {leg}, t = {time:.2f} s",
-        "largest amplitude": "-" if np.isnan(factor.value) else largest,
-        "least clearance": _nearest_text(clear.along.least(fixed=False)),
-    }
-    fair = study.home is not None or clear.along.touching
-    tone: Tone = "bad" if study.exit is not None else "fair" if fair else "good"
-    title = f"Workspace of {mechanism.name}, {study.experiment.scenario.reference.kind} reference"
-    parts = sections("workspace", study=study, **context)
-    return Document(title, study.verdict, parts, tone, facts)
 
 
 def travel_text(travel: list[Travel]) -> str:
@@ -94,43 +76,6 @@ def travel_text(travel: list[Travel]) -> str:
         f"{name} {factor * t.low:.3g} to +{factor * t.high:.3g} {unit}"
         for (name, factor, unit), t in zip(_COORDINATES, travel, strict=True)
     )
-
-
-def _legs_table(legs: list[dict[str, Any]]) -> Table:
-    return table(
-        legs,
-        {
-            "leg": lambda leg: leg["leg"],
-            "least reach margin [mm]": lambda leg: 1e3 * leg["least_reach_margin"],
-            "at [s]": lambda leg: f"{leg['time']:.2f}",
-            # A dash where the leg does not reach: there is no angle.
-            "least sine off dead centre": lambda leg: (
-                leg["least_sine"] if leg["least_sine"] >= 0 else "-"
-            ),
-            "least transmission": lambda leg: leg["least_transmission"],
-        },
-        brief=True,
-    )
-
-
-def _singularity(summary: dict[str, Any]) -> Values:
-    home = summary["home"]
-    return Values(
-        {
-            "condition": f"home {number(home['condition'])}, "
-            f"worst {number(summary['worst_condition'])} on the reference",
-            "parallel": f"home {number(home['parallel'])}, least "
-            f"{number(summary['least_parallel'])} (a simulation stops at {SINGULARITY_LIMIT:g})",
-        }
-    )
-
-
-def _motors_table(motors: list[dict[str, Any]]) -> Table:
-    def cell(name: str, motor: dict[str, Any]) -> float:
-        return float(motor[name])
-
-    values = {head: partial(cell, name) for name, head in _MOTORS.items()}
-    return table(motors, {"leg": lambda motor: motor["leg"], **values}, brief=True)
 
 
 def _nearest_text(nearest: Nearest | None) -> str:
@@ -146,62 +91,6 @@ def _crossing(nearest: Nearest) -> str:
     if nearest.distance >= 0:
         return ""
     return "crosses the disc as drawn" if "base" in nearest.pair else "they cross"
-
-
-def _distances(study: WorkspaceStudy) -> Values:
-    along = study.clearance.along
-    values = {
-        "links": _nearest_text(along.least(fixed=False)),
-        "motors and posts": _nearest_text(along.stand),
-        "drawn disc of the base": _nearest_text(along.disc),
-    }
-    if along.touching:
-        told = (f"{one.pair} ({1e3 * one.distance:.1f} mm)" for one in along.touching)
-        values["links that cross"] = ", ".join(told)
-    return Values(values)
-
-
-def _nearest_table(nearest: list[Nearest]) -> Table:
-    """Return the pairs that cross, and the nearest of the others."""
-    crossing = sum(one.distance < 0 for one in nearest)
-    return table(
-        nearest[: max(crossing, _NEAREST)],
-        {
-            "parts": lambda one: one.pair,
-            "distance [mm]": lambda one: 1e3 * one.distance,
-            "at [s]": lambda one: f"{one.time:.2f}",
-            "": _crossing,
-        },
-    )
-
-
-def _clear_table(travel: list[ClearTravel]) -> Table:
-    end = "the workspace's end"
-    return table(
-        zip(_COORDINATES, travel, strict=True),
-        {
-            "coordinate": lambda one: one[0][0],
-            "unit": lambda one: one[0][2],
-            "clear from home down": lambda one: f"{one[0][1] * one[1].low:.4g}",
-            "ends at": lambda one: one[1].low_pair or end,
-            "up": lambda one: f"+{one[0][1] * one[1].high:.4g}",
-            "ends at ": lambda one: one[1].high_pair or end,
-        },
-    )
-
-
-def _travel_table(travel: list[Travel]) -> Table:
-    return table(
-        zip(_COORDINATES, travel, strict=True),
-        {
-            "coordinate": lambda one: one[0][0],
-            "unit": lambda one: one[0][2],
-            "from home down": lambda one: f"{one[0][1] * one[1].low:.4g}",
-            "ends because": lambda one: one[1].low_reason,
-            "up": lambda one: f"+{one[0][1] * one[1].high:.4g}",
-            "ends because ": lambda one: one[1].high_reason,
-        },
-    )
 
 
 def _legs(time: Array, values: Array) -> list[Curve]:
