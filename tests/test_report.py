@@ -16,13 +16,11 @@ from stewart_drake.cli import main
 from stewart_drake.files.yamlio import load_yaml
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
-from stewart_drake.reporting import collect as collect_module
 from stewart_drake.reporting import report as report_document
-from stewart_drake.reporting.collect import ANALYSES, collect
 from stewart_drake.reporting.document import Document, Paragraph, Picture, Table, number, wrap
 from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.page import html as html_of
-from stewart_drake.reporting.report import mean_error
+from stewart_drake.reporting.report import ANALYSES, collect, mean_error
 from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.reporting.run import comparison_document
 from stewart_drake.scenario.loading import load_scenario
@@ -193,7 +191,7 @@ def collect_of(scenario, **changes):
         "run": changes.get("run") or simulate(scenario),
         "analyses": dict.fromkeys(ANALYSES, blank),
     }
-    return collect_module.Collected(**(parts | changes))
+    return report_document.Collected(**(parts | changes))
 
 
 def test_a_run_that_ends_early_is_told_at_once():
@@ -289,9 +287,9 @@ def test_what_is_not_plain_is_told_at_the_top():
 def test_a_motion_out_of_reach_gets_a_report_without_runs(tmp_path, capsys, monkeypatch):
     def only_workspace(scenario, scenarios, progress):
         assert not scenarios
-        return {}, dict.fromkeys(ANALYSES, collect_module._analyse("workspace", scenario))
+        return {}, dict.fromkeys(ANALYSES, report_document._analyse("workspace", scenario))
 
-    monkeypatch.setattr(collect_module, "_work", only_workspace)
+    monkeypatch.setattr(report_document, "_work", only_workspace)
     amplitude = "reference.amplitude=[0.3, 0.3, 0.3, 0.2, 0.2, 0.3]"
     arguments = ["report", "paper", "--set", amplitude, "--out", str(tmp_path)]
     assert main(arguments) == 0
@@ -310,9 +308,9 @@ def test_the_tuners_runs_are_there_where_there_is_a_network(monkeypatch, tmp_pat
         jobs.update(scenarios)
         return dict.fromkeys(scenarios), dict.fromkeys(ANALYSES)
 
-    monkeypatch.setattr(collect_module, "_work", kept)
+    monkeypatch.setattr(report_document, "_work", kept)
     for there in (False, True):
-        monkeypatch.setattr(collect_module, "has_network", lambda scenario, t=there: t)
+        monkeypatch.setattr(report_document, "has_network", lambda scenario, t=there: t)
         jobs.clear()
         found = collect("paper", ["plant.kind=exact"])
         tuned = {name: sc for name, sc in jobs.items() if name.startswith("tuned-")}
@@ -323,15 +321,15 @@ def test_the_tuners_runs_are_there_where_there_is_a_network(monkeypatch, tmp_pat
     mine = tmp_path / "mine.yaml"
     mine.write_text("controller: {feedforward: none}")
     collect(mine)
-    assert jobs[collect_module._OWN].controller.feedforward == "none"
+    assert jobs[report_document._OWN].controller.feedforward == "none"
     own = tmp_path / "own.yaml"
     own.write_text("w_R: 2.0")
     found = collect("paper", EXACT, controller=own)
-    assert found.scenario == jobs[collect_module._OWN] == load_scenario("paper", own, EXACT)
+    assert found.scenario == jobs[report_document._OWN] == load_scenario("paper", own, EXACT)
     assert collect("paper", EXACT, controller="lqi").scenario == jobs["lqi"]
     # One that is asked for is run, beside the comparison, which stays.
     collect(mine, controller="servo_preview")
-    assert jobs[collect_module._OWN].controller.command == "cranks"
+    assert jobs[report_document._OWN].controller.command == "cranks"
 
 
 def test_a_row_of_the_comparison_may_have_any_name(monkeypatch, tmp_path):
@@ -342,7 +340,7 @@ def test_a_row_of_the_comparison_may_have_any_name(monkeypatch, tmp_path):
             path.write_bytes(pickle.dumps(path.name))
         return paths
 
-    monkeypatch.setattr(collect_module, "run_jobs", done)
+    monkeypatch.setattr(report_document, "run_jobs", done)
     mine = tmp_path / "mine.yaml"
     mine.write_text("compare: {delay: {controller: lqi, w_R: 2.0}, run it: {controller: lqi}}")
     found = collect(mine, EXACT)

@@ -48,7 +48,7 @@ def test_ctrl_c_while_drake_is_loaded_is_one_as_well(monkeypatch):
     def loading(kind):
         raise ImportError("initialization failed") from stop
 
-    monkeypatch.setattr("stewart_drake.reporting.shipped_table.shipped_table", loading)
+    monkeypatch.setattr("stewart_drake.reporting.terminal.shipped_table", loading)
     assert main(["list"]) == 130
     inner = ImportError("initialization failed")
     inner.__cause__, stop = stop, inner  # a module that was loading another

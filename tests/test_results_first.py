@@ -65,7 +65,7 @@ def test_a_failure_while_drawing_costs_the_figures_only(
 
 def test_a_report_that_cannot_be_drawn_leaves_its_numbers(tmp_path, monkeypatch, capsys) -> None:
     found = type("Found", (), {"run": None, "analyses": {}, "comparison": {}})()
-    monkeypatch.setattr("stewart_drake.reporting.collect.collect", lambda *_: found)
+    monkeypatch.setattr("stewart_drake.reporting.report.collect", lambda *_: found)
     monkeypatch.setattr(report_document, "report_summary", lambda _: {"all": 1})
     monkeypatch.setattr(report_document, "document", broken(tmp_path))
     assert main(["report", "--quiet", "--out", str(tmp_path)]) == 0

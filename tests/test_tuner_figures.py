@@ -15,7 +15,7 @@ from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files import resources
 from stewart_drake.reporting import figures
 from stewart_drake.reporting.figures import comparison_figures, run_figures, weights_figure
-from stewart_drake.reporting.shipped_table import shipped_table
+from stewart_drake.reporting.terminal import shipped_table
 from stewart_drake.tuner.network import save_network
 from tests.test_network import small_network
 

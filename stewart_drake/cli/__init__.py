@@ -125,7 +125,7 @@ def _root(
 def list_shipped() -> None:
     """List the shipped models, scenarios and so on."""
     from stewart_drake.files.resources import KINDS, shipped
-    from stewart_drake.reporting.shipped_table import shipped_table
+    from stewart_drake.reporting.terminal import shipped_table
 
     for kind, heading in KINDS.items():
         if shipped(kind):

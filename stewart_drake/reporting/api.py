@@ -52,15 +52,15 @@ def report(
     Args:
         scenario: a shipped name or a path.
         settings: as `load_scenario` takes them.
-        controller: laid over the scenario's own, see `reporting.collect.collect`.
+        controller: laid over the scenario's own, see `reporting.report.collect`.
 
     Raises:
         ConfigError: bad input.
     """
     from stewart_drake.reporting import report as report_document
-    from stewart_drake.reporting.collect import collect
     from stewart_drake.reporting.page import Provenance
     from stewart_drake.reporting.replay import replay_html
+    from stewart_drake.reporting.report import collect
 
     settings = tuple(settings)
     found = collect(scenario, settings, controller=controller)

@@ -106,7 +106,8 @@ def draw(
 ) -> Figure:
     """Draw panels in rows, or column by column with `down`, below a legend of all their curves.
 
-    `sharey` gives all panels, or those of a row, the same vertical axis.
+    Panels share a horizontal axis of the same name. `sharey` gives all panels the same vertical
+    axis; with "row" those of a row, while each has its own horizontal one.
     `room` is for the labels of the vertical axis on the left, `edge` is kept free on the right and
     `top` above, in inches.
     """
@@ -118,7 +119,7 @@ def draw(
     alike = sharey == "row" or (sharey and len({one.y for one in grid}) == 1)
     figure, first = Figure(figsize=(WIDTH, 1.0)), dict[int, Axes]()
     for one, (row, column) in zip(placed, spots, strict=True):
-        sharex = (one.x, one.xlim, one.wide) == (grid[0].x, grid[0].xlim, False)
+        sharex = sharey != "row" and one.x == grid[0].x and not one.wide
         same_y = first.get(row if sharey == "row" else 0) if sharey and not one.wide else None
         ax = figure.add_subplot(sharex=first.get(0) if sharex else None, sharey=same_y)
         first.setdefault(row, ax)

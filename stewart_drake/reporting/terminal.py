@@ -1,4 +1,4 @@
-"""What the command shows on a terminal: coloured text, and how far it has got.
+"""What the command shows on a terminal: coloured text, lists, and how far it has got.
 
 On a terminal that is a bar per running simulation, in a log a line every ten seconds."""
 
@@ -10,12 +10,17 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import typer
 
+from stewart_drake.reporting.document import rows
+
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
+
+    from stewart_drake.files.resources import Kind
 
 _COLORS: Final = {
     "green": r"\bcompleted\b|(?<=beatable: )yes|(?<=loop is )stable",
@@ -40,6 +45,28 @@ def echo(text: str, *, error: bool = False) -> None:
 
 def _styled(color: str, match: re.Match[str]) -> str:
     return typer.style(match[0], fg=color)
+
+
+def shipped_table(kind: "Kind") -> str:
+    """Return the shipped files of a kind, each with the first sentence of its opening comment."""
+    from stewart_drake.files.resources import resolve, shipped
+
+    return rows({f"  {name}": _description(resolve(kind, name)) for name in shipped(kind)})
+
+
+def _description(path: Path) -> str:
+    if path.suffix == ".json":  # which has no comments
+        from stewart_drake.tuner.network import NUM_INPUTS, NUM_OUTPUTS, load_network
+
+        network = load_network(path)
+        low, high = network.bounds.min(), network.bounds.max()
+        return (
+            f"A network of {NUM_INPUTS} densities ({network.density}), {network.hidden} hidden "
+            f"neurons and {NUM_OUTPUTS} weights from {low:g} to {high:g}"
+        )
+    comment = re.match(r"(#.*\n)*", path.read_text(encoding="utf-8"))
+    text = " ".join(line.strip("# ") for line in comment[0].splitlines()) if comment else ""
+    return text.partition(". ")[0].rstrip(".")
 
 
 @contextmanager
