@@ -63,7 +63,7 @@ def report(
     from stewart_drake.reporting.report import collect
 
     settings = tuple(settings)
-    found = collect(scenario, settings, controller=controller)
+    found = report_document.collect(scenario, settings, controller=controller)
     film = ""
     if found.run is not None:
         film = replay_html(found.run, simulated_machine(found.scenario), Path(scenario).stem)

@@ -283,7 +283,8 @@ def _nominal(worth: Worth) -> Table:
 
 
 def _lines(worth: Worth) -> dict[str, Line]:
-    return {name: line(k, marked=False) for k, name in enumerate(worth.tuners)}
+    # Every second look: the best fixed gain is a solid line.
+    return {name: line(2 * k + 1, marked=False) for k, name in enumerate(worth.tuners)}
 
 
 def _ratios(worth: Worth) -> Array:
