@@ -15,7 +15,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from _page import table, write
+from _page import QUICK, size, table, write
 
 import stewart_drake as sd
 from stewart_drake.reporting.document import number
@@ -30,9 +30,9 @@ from stewart_drake.tuning.training import Training, train
 from stewart_drake.tuning.worth import HINDSIGHT, TUNER, Worth, evaluate
 
 WORKERS = 2
-CELLS = 16
-SCENARIOS = 20
-EXACT = ("plant.kind=exact",)
+CELLS = size("CELLS", 16)
+SCENARIOS = size("SCENARIOS", 20, least=2)
+EXACT = ("plant.kind=exact", *(["duration=2"] if QUICK else []))
 ON_REFERENCE = (*EXACT, "start=on_reference", "queue=reference")
 BASES = {
     "as shipped, from rest": EXACT,

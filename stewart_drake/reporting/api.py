@@ -60,7 +60,6 @@ def report(
     from stewart_drake.reporting import report as report_document
     from stewart_drake.reporting.page import Provenance
     from stewart_drake.reporting.replay import replay_html
-    from stewart_drake.reporting.report import collect
 
     settings = tuple(settings)
     found = report_document.collect(scenario, settings, controller=controller)
