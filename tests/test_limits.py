@@ -14,7 +14,8 @@ from stewart_drake.law.error_model import (
     double_integrators,
     linear_model,
 )
-from stewart_drake.law.limits import (
+from stewart_drake.law.riccati import augmented_gain
+from stewart_drake.law.stability import (
     amplification,
     closed_loop,
     fastest_pole,
@@ -25,7 +26,6 @@ from stewart_drake.law.limits import (
     sensitivity,
     spectral_radius,
 )
-from stewart_drake.law.riccati import augmented_gain
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.trajectories import evaluate

@@ -7,8 +7,7 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.error_model import ContinuousModel
-from stewart_drake.law.limits import loop_gain, sensitivity, spectral_radius
-from stewart_drake.law.linear_loop import LinearLoop
+from stewart_drake.law.stability import LinearLoop, loop_gain, sensitivity, spectral_radius
 from stewart_drake.loop.controller_margin import controller_margin, loop_at
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.state_space import state_spaces

@@ -23,9 +23,9 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification.log_files import Precision, read_log
+from stewart_drake.identification.logs import Precision, read_log
 from stewart_drake.law.belief import Estimate
-from stewart_drake.law.linear_loop import Margins
+from stewart_drake.law.stability import Margins
 from stewart_drake.live.blind import stays_within_reach
 from stewart_drake.live.connect import address_of, await_free, call, open_endpoint
 from stewart_drake.live.contact import Contact, Link

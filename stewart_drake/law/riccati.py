@@ -6,8 +6,11 @@ from dataclasses import replace
 import numpy as np
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 
-from stewart_drake.law.delay_model import DelayedModel, chain
+from stewart_drake.law.delay_model import DelayedModel, chain, delayed_model
+from stewart_drake.law.error_model import ContinuousModel
 from stewart_drake.law.hautus import distinct, pbh_margins
+from stewart_drake.law.stability import is_stable
+from stewart_drake.scenario.delay import Delay
 from stewart_drake.types import Array
 
 Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
@@ -53,10 +56,10 @@ def lqr(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
         raise RiccatiError("Riccati equation: R + B'PB is singular") from None
     if not (np.all(np.isfinite(P)) and np.all(np.isfinite(K))):
         raise RiccatiError("Riccati equation: Drake's solver returned NaN; rescale Q and R")
-    with np.errstate(over="ignore", invalid="ignore"):  # which is no solution either
+    with np.errstate(over="ignore", invalid="ignore"):  # refused below
         closed = A - B @ K
         residual, size = np.linalg.norm(Q + A.T @ P @ closed - P), np.linalg.norm(P)
-        solved = residual <= RESIDUAL * size < np.inf and is_contracting(closed)
+        solved = residual <= RESIDUAL * size < np.inf and is_stable(closed, edge=0.0)
     if not solved:
         raise RiccatiError("Riccati equation: Drake's solver did not solve it; rescale Q and R")
     return K, P
@@ -137,17 +140,32 @@ def augmented_gain(model: DelayedModel, Q: Array, R: Array) -> Array:
     return reduced_gain(model, Q, R) @ prediction_matrix(model)
 
 
-def is_contracting(A: Array) -> bool:
-    """Whether all |lambda| < 1: a power of norm below 1 proves it, at a quarter of their cost."""
-    power = A
-    for _ in range(10):
-        size = np.linalg.norm(power)
-        if size < 1:
-            return True
-        if size > 1e12:
-            break
-        power = power @ power
-    return bool(np.abs(np.linalg.eigvals(A)).max() < 1)
+def law_gain(
+    design: ContinuousModel,
+    predictor: ContinuousModel,
+    period: float,
+    delay: Delay,
+    weights: tuple[Array, Array],
+) -> Array:
+    """Return K P (m, n + m L): the gain of one model on the prediction of another.
+
+    Args:
+        design: model of the gain.
+        predictor: model of the prediction.
+        period: s.
+        delay: that the law believes in.
+        weights: Q (p, p) and R (m, m); a Q of twice the outputs includes the integral.
+
+    Raises:
+        RiccatiError: see `lqr`.
+    """
+    Q, R = weights
+    integral = len(Q) > len(design.C)
+    designed, predicted = (
+        delayed_model(model, period, delay.steps, delay.fraction, integral=integral)
+        for model in (design, predictor)
+    )
+    return reduced_gain(designed, Q, R) @ prediction_matrix(predicted)
 
 
 def _check(A: Array, B: Array, Q: Array, R: Array) -> None:

@@ -1,15 +1,14 @@
-"""Whether this controller on this plant is stable along the reference, and with what margins.
+"""Stability and margins of a scenario's controller on its plant along the reference.
 
-At instants along the reference law and plant are linearised there and the loop is judged as if
-reference and plant stood still in that state of motion ("frozen"): `law.linear_loop`. The plant
-is the true one, with its payload, friction, dimensions and delay; the law is as it is, with the
-delay it believes in, its model, prediction and the weights it starts with. What this leaves out:
+Law and plant are linearised at instants along the reference, and each loop is judged as if that
+state of motion lasted ("frozen"): `law.stability`. The plant is the true one, with its payload,
+friction, dimensions and delay. The law has the delay it believes in, its model, its prediction and
+its initial weights. Left out are
 
-- the estimator: a law that has one is judged with torque bias, payload, friction, and the delay if
-  it estimates that, already found;
-  how the estimate gets there, and what the filter adds to the loop, is no part of it;
-- a tuner, which would change the weights on the way; torque limits; the catch-up from rest;
-- that reference and gain change while an error lives.
+- the estimator: a law with one is judged as if it had found torque bias, payload, friction and, if
+  it estimates that, the delay;
+- the tuner, torque limits and the catch-up from rest;
+- the change of reference and gain during the life of an error.
 """
 
 import math
@@ -24,11 +23,18 @@ from stewart_drake.dynamics.workspace import margin
 from stewart_drake.law.delay_observer import DelayObserver
 from stewart_drake.law.encoder_observers import DifferencesObserver
 from stewart_drake.law.error_model import ContinuousModel, linear_model
-from stewart_drake.law.limits import amplification, fastest_pole, is_stable, spectral_radius
-from stewart_drake.law.linear_loop import LinearLoop, Margins, law_gain, worst_margins
 from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.riccati import RiccatiError
+from stewart_drake.law.riccati import RiccatiError, law_gain
+from stewart_drake.law.stability import (
+    LinearLoop,
+    Margins,
+    amplification,
+    fastest_pole,
+    is_stable,
+    spectral_radius,
+    worst_margins,
+)
 from stewart_drake.loop.experiment import Experiment, compose_law, longest_wait, true_dynamics
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.scenario.config import NetworkConfig
@@ -42,12 +48,13 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 INSTANTS: Final = 30
-"""Looked at along the reference; 29 steps, a prime, since a round number of them may be in step
-with the motion. Twice as many change the margins of the shipped scenarios by less than a tenth."""
+"""Number of instants along the reference. A round number of steps may be in step with the motion,
+so there are 29, a prime. Twice as many change the margins of the shipped scenarios by less than a
+tenth."""
 _COSTLY: Final = 150
-"""Rows of a loop above which it is looked at less often: an eigenvalue problem takes rows^3."""
+"""Rows of a loop above which fewer instants are judged: an eigenvalue problem costs rows^3."""
 _LARGEST: Final = 330
-"""Rows of a loop above which it is not judged: fifty periods of delay, seconds."""
+"""Rows of a loop above which it is not judged: fifty periods of delay."""
 _FEWEST: Final = 6
 _UNJUDGED: Final = Margins(*[math.nan] * 4)
 
@@ -59,17 +66,16 @@ class ControllerMargin:
     Attributes:
         period: of the controller, s.
         eta: true total delay, s.
-        radius: largest spectral radius of the loop, the factor by which what remains of an error is
-            multiplied each period; NaN where `problem` says why the loop was not judged.
-        time: s, when it is there.
+        radius: largest spectral radius, the factor on an error per period; NaN with a `problem`.
+        time: of that radius, s.
         margins: the least of each kind; NaN with a `problem`.
-        pole: fastest unstable pole of the open loop, 1/s, 0 without one.
-        pole_time: s, when it is there.
-        estimated: whether an estimator was taken to have found what nobody told the controller.
-        delay_found: whether that is true of the delay too.
-        tuned: whether a tuner will change the weights.
+        pole: fastest unstable pole of the open loop, 1/s; 0 without one.
+        pole_time: of that pole, s.
+        estimated: whether an estimator is assumed to have found the unknown parameters.
+        delay_found: whether it is assumed to have found the delay too.
+        tuned: whether a tuner changes the weights.
         problem: why the loop was not judged, or empty.
-        loops: that were judged, in the order of time, evenly over `span` s; none with a `problem`.
+        loops: the judged ones in the order of time, evenly over `span`; none with a `problem`.
         span: s.
     """
 
@@ -90,25 +96,25 @@ class ControllerMargin:
 
     @property
     def stable(self) -> bool | None:
-        """None where the loop was not judged."""
+        """Whether the loop is stable; None if it was not judged."""
         return None if self.problem else self.radius < 1
 
     @property
     def delay_margin(self) -> float:
-        """s, error of the delay that is borne in either direction."""
+        """Error of the delay in s, of either sign, for which the loop is stable."""
         return min(self.margins.shorter, self.margins.longer)
 
     @property
     def growth(self) -> float:
-        """e^(pole eta) of an error of the prediction, infinite where that overflows."""
+        """Growth e^(pole eta) of an error of the prediction, infinite on overflow."""
         return amplification(self.pole, self.eta)
 
     def growth_in_steps(self, step: float) -> float:
-        """Most that an error grows over any stretch of the motion, moved in steps of so many s.
+        """Return the largest growth of an error over any stretch of the motion, for a step in s.
 
-        The plant is moved by semi-implicit Euler (`law.delay_model.sample_in_steps`), and each
-        loop's spectral radius counted for the periods until the next one: above 1 this only where
-        some loop is unstable with that step. Infinite where it overflows.
+        The plant moves by semi-implicit Euler (`law.delay_model.sample_in_steps`). Each loop's
+        spectral radius counts for the periods until the next loop, so that the growth exceeds 1
+        only if some loop is unstable with that step. It is infinite on overflow.
         """
         if step not in self._growths:
             self._growths[step] = self._growth_in_steps(step)
@@ -127,7 +133,7 @@ class ControllerMargin:
 
     @property
     def summary(self) -> MarginSummary:
-        """What `summary.json` holds; a margin without a limit is infinite, null in the file."""
+        """Content of `summary.json`; a margin without a limit is infinite, in the file null."""
         m = self.margins
         return {
             "stable": self.stable,
@@ -141,12 +147,14 @@ class ControllerMargin:
 def controller_margin(experiment: Experiment, until: float | None = None) -> ControllerMargin:
     """Judge a scenario's loop along its reference, up to `until` in s, by default its duration.
 
-    Costs 0.2 s for a delay of ten periods.
+    Takes 0.2 s for a delay of ten periods.
     """
     sc = experiment.scenario
     end = sc.duration if until is None else until
     if sc.controller.command != "torque":
-        return _at_the_machine(experiment, end)
+        # The loops of servos are checked where the servos are made.
+        problem = "servos close theirs at the machine, and nothing is fed back across the delay"
+        return ControllerMargin(sc.controller.period, sc.eta, problem=problem, span=end)
     truth, law = true_dynamics(experiment), _law_at_last(experiment)
     times = np.linspace(0.0, end, INSTANTS)
     poses = [evaluate(experiment.reference, t)[POSE] for t in times]
@@ -197,44 +205,31 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
     )
 
 
-def _at_the_machine(experiment: Experiment, end: float) -> ControllerMargin:
-    """Of servos: no error waits for the delay to pass, and there is no loop across it to judge.
-
-    That their own loops are stable along the reference is checked where they are made.
-    """
-    return ControllerMargin(
-        period=experiment.scenario.controller.period,
-        eta=experiment.scenario.eta,
-        problem="servos close theirs at the machine, and nothing is fed back across the delay",
-        span=end,
-    )
-
-
 def _order(radii: list[float]) -> list[int]:
-    """Of the loops in the search for the least margin: the likely worst first, most then pass it.
+    """Return the order of the loops in the search for the least margin.
 
-    That is an end of their order by radius; the rest are shuffled, since along a smooth motion they
-    may bear less and less, and each would be searched for anew.
+    The likely worst come first, the ends of the order by radius. The rest are shuffled: margins
+    that fall steadily along the motion would be searched for one by one.
     """
     first, *between, last = (int(i) for i in np.argsort(radii)[::-1])
     return [first, last, *(int(i) for i in np.random.default_rng(0).permutation(between))]
 
 
 def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> ContinuousModel:
-    """The plant about the moving reference at `time` in s, under the torque that follows it."""
+    """Return the plant about the moving reference at `time` in s, under its inverse dynamics."""
     x = evaluate(experiment.reference, time)
     torque = truth.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
     return linear_model(*truth.derivatives(x[POSE], x[RATES], torque)[:2])
 
 
 def loop_at(experiment: Experiment, time: float) -> LinearLoop:
-    """The loop of a scenario about its reference at `time` in s."""
+    """Return the loop of a scenario about its reference at `time` in s."""
     truth, law = true_dynamics(experiment), _law_at_last(experiment)
     return _loops(experiment, truth, law, np.array([time]))[0]
 
 
 def _law_at_last(experiment: Experiment) -> PredictiveLqi:
-    """The law, with the true delay where it estimates that."""
+    """Return the law, with the true delay if it estimates that."""
     law = compose_law(experiment)
     if not isinstance(law.observer, DelayObserver):
         return law
@@ -248,7 +243,7 @@ def _loops(
     states = 12 + 6 * integrates
     gain = np.zeros((NUM_TORQUES, states + NUM_TORQUES * law.timeline.queue_length))
     for t in times:
-        # Without a new gain the law goes on with its last one, and before the first with none.
+        # Without a new gain the law keeps its last one, and has none before the first.
         with suppress(RiccatiError, np.linalg.LinAlgError, ArithmeticError):
             gain = _gain(experiment, truth, law, t)
         plant = true_model(experiment, truth, t)
@@ -261,12 +256,12 @@ def _estimates(law: PredictiveLqi) -> bool:
 
 
 def _gain(experiment: Experiment, truth: StewartDynamics, law: PredictiveLqi, time: float) -> Array:
-    """`law_gain` of a law about the reference at `time`."""
+    """Return `law_gain` of a law about the reference at `time` in s."""
     plant, timeline, c = law.plant, law.timeline, experiment.scenario.controller
     known = plant.dynamics
     theta = known.free_of(truth.plant_parameters) if _estimates(law) else known.parameters
     x = evaluate(experiment.reference, time)
-    # The torques in flight are those that move the true plant, the model's is the feedforward.
+    # The torques in flight move the true plant; the model's torque is the feedforward.
     acting = truth.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
     forward = law.feedforward.at(x, plant.dynamics, theta)
     design = law.model.about(x, forward, theta, plant)

@@ -1,4 +1,4 @@
-"""How much delay a scenario can bear: open loop, closed loop, and in simulations."""
+"""Limits of a scenario's delay: open loop, closed loop, and simulations."""
 
 import math
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from threadpoolctl import threadpool_limits
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import diagnose
-from stewart_drake.law.limits import amplification, fastest_pole, largest_delay
 from stewart_drake.law.riccati import RiccatiError
+from stewart_drake.law.stability import amplification, fastest_pole, largest_delay
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.experiment import waits_at_rest
 from stewart_drake.loop.metrics import delay_floor
@@ -27,38 +27,37 @@ from stewart_drake.studies.verdict import Verdict, pole_in_motion
 from stewart_drake.types import Array
 
 INSTANTS: Final = 62
-"""Poles are looked at this often along the reference; 61 steps, a prime, since a round number of
-them may be in step with the motion."""
+"""Number of poles along the reference, in 61 steps: a round number may be in step with it."""
 TOLERABLE: Final = (2.0, 10.0, 100.0, 1000.0)
 """Growths of prediction errors for which the largest delay is given."""
 _CHECKS: Final = 5
-"""Poses at which growth is also simulated."""
+"""Number of poses at which growth is simulated."""
 _LARGEST_GROWTH: Final = 1e5
-"""Growth that a simulation can show: rounding must not grow to what is measured."""
+"""Growth above which rounding errors would show in a simulation."""
 _PERTURBATION: Final = 1e-5
-"""Of the usual motion, what a perturbation has grown to in the end."""
+"""Final size of a perturbation, as a share of the usual motion."""
 _STEP: Final = 1e-3
-"""s, of the Runge-Kutta method in it."""
+"""Step of the Runge-Kutta method, s."""
 
 
 class PolePoint(NamedTuple):
-    """The open loop at one instant of the reference."""
+    """Fastest unstable poles at one instant of the reference, 1/s; 0 without one."""
 
     time: float
     """s."""
     moving: float
-    """Fastest unstable pole, 1/s, linearised about the moving reference; 0 without one."""
+    """Linearised about the moving reference."""
     held: float
-    """The same with the plate held still at that pose."""
+    """With the plate held still at that pose."""
 
 
 class Growth(NamedTuple):
-    """A perturbation of the plate held still, along its fastest mode, in a simulation."""
+    """Simulated perturbation of the plate held still, along its fastest mode."""
 
     time: float
-    """s, along the reference."""
+    """Of the pose, s."""
     seconds: float
-    """How long it grew."""
+    """Duration of the growth."""
     expected: float
     """e^(p seconds)."""
     simulated: float
@@ -66,20 +65,20 @@ class Growth(NamedTuple):
 
 @dataclass(frozen=True)
 class DelayStudy:
-    """Everything there is to say about the delay.
+    """Result of the analysis of the delay.
 
     Attributes:
-        basis: what was analysed.
-        controller: the scenario's own loop at its worst along the reference, as far as that can be
-            followed; None where it has no first instant.
+        basis: of the analysis.
+        controller: the scenario's loop along the reference, as far as that can be followed; None if
+            it cannot be followed at all.
         eta: total delay, s.
         poles: along the reference, as far as it can be followed.
-        growths: e^(p eta) checked by simulation; none where nothing grows.
+        growths: simulated checks of e^(p eta); none if nothing grows.
         floors: E_ac in % s of a plate that waits at rest, by whole periods of delay.
         loops: the closed loop by delay; empty with a reason in `loop_problem`.
-        loop_problem: why there is no closed loop to judge, or empty.
+        loop_problem: why the closed loop was not judged, or empty.
         cells: simulations by delay and amplitude.
-        interrupted: whether Ctrl-C ended those early.
+        interrupted: whether Ctrl-C ended the simulations early.
     """
 
     basis: Basis
@@ -95,7 +94,7 @@ class DelayStudy:
 
     @property
     def verdict(self) -> Verdict | None:
-        """Whether the delay alone can be beaten; None where the motion has no first instant."""
+        """Verdict on the delay alone; None if the reference cannot be followed at all."""
         if not self.poles:
             return None
         worst = max(self.poles, key=lambda point: point.moving)
@@ -103,18 +102,18 @@ class DelayStudy:
 
     @property
     def loop(self) -> LoopMargins | None:
-        """The closed loop at the scenario's own delay."""
+        """Closed loop at the scenario's delay."""
         own = self.basis.experiment.scenario.true_delay.steps
         return next((loop for loop in self.loops if loop.steps == own), None)
 
     @property
     def floor_applies(self) -> bool:
-        """Whether the scenario waits at rest, as the floor supposes."""
+        """Whether the scenario waits at rest, an assumption of the floor."""
         return waits_at_rest(self.basis.experiment.scenario)
 
     @property
     def limits(self) -> list[tuple[float, float, float]]:
-        """Tolerable growth, largest delay in s, and when on the reference it is the least, s."""
+        """Tolerable growths, largest delays in s, and the time in s of the fastest pole."""
         if not self.poles:
             return []
         worst = max(self.poles, key=lambda point: point.moving)
@@ -122,7 +121,7 @@ class DelayStudy:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What summary.json holds."""
+        """Content of `summary.json`."""
         own = self.basis.experiment.scenario.true_delay.steps
         return {
             "eta": self.eta,
@@ -166,16 +165,11 @@ class DelayOptions(Options):
 def study_delay(
     scenario: Scenario, options: DelayOptions, progress: Progress | None = None
 ) -> DelayStudy:
-    """Analyse a scenario's delay.
-
-    Args:
-        scenario: to analyse.
-        options: see `DelayOptions`.
-        progress: called for each finished simulation.
+    """Analyse a scenario's delay; `progress` is called for each finished simulation.
 
     Raises:
-        ConfigError: one line. A motion or a home pose outside the workspace is no error, see
-            `Basis.obstacles`.
+        ConfigError: one line. A motion or a home pose outside the workspace is reported in
+            `Basis.obstacles` instead.
     """
     with threadpool_limits(limits=1):
         found = basis(scenario)
@@ -203,7 +197,7 @@ def study_delay(
 
 
 def error_floor(found: Basis, eta: float) -> float:
-    """E_ac in % s that a plate at rest at the first pose collects in `eta` s without any torque."""
+    """Return E_ac in % s of a plate at rest at the first pose after `eta` s without any torque."""
     reference, duration = found.experiment.reference, found.experiment.scenario.duration
     time: Array = np.linspace(0.0, min(eta, duration), 2001, dtype=np.float64)
     poses = np.array([reference.value(t)[:, 0] for t in time])
@@ -213,10 +207,10 @@ def error_floor(found: Basis, eta: float) -> float:
 def simulated_growth(
     dynamics: StewartDynamics, pose: Array, seconds: float, size: float
 ) -> tuple[float, float]:
-    """e^(p seconds), and what becomes of a perturbation of the plate held still at a pose (6,).
+    """Return e^(p seconds), and the growth of a perturbation of a plate held still at a pose (6,).
 
-    It starts along the mode of the fastest pole p, so small that it ends at about `size` (rad, m),
-    and the nonlinear equations are integrated with the torque that holds the plate.
+    It starts along the mode of the fastest pole p, so small that it ends at about `size` (rad, m).
+    The nonlinear equations are integrated with the torque that holds the plate.
     """
     torque = dynamics.equilibrium_torque(pose)
     values, vectors = np.linalg.eig(dynamics.linearize(pose, torque=torque)[0])

@@ -1,4 +1,4 @@
-"""What the delayed LQI loop of a scenario bears, for every delay: peaks, gain, phase, delay."""
+"""Margins of a scenario's delayed LQI loop over the delay: peaks, gain, phase, delay."""
 
 import math
 from collections.abc import Iterable
@@ -9,15 +9,17 @@ import numpy as np
 
 from stewart_drake.law.delay_model import DelayedModel
 from stewart_drake.law.error_model import double_integrators, linear_model
-from stewart_drake.law.limits import (
+from stewart_drake.law.riccati import law_gain
+from stewart_drake.law.stability import (
+    LinearLoop,
     Peak,
     frequency_grid,
     loop_gain,
     peaks,
     sensitivity,
     spectral_radius,
+    worst_margins,
 )
-from stewart_drake.law.linear_loop import LinearLoop, law_gain, worst_margins
 from stewart_drake.loop.experiment import believed_delay, quadratic_cost, true_dynamics
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.delay import Delay
@@ -27,15 +29,15 @@ from stewart_drake.studies.basis import Basis
 from stewart_drake.types import Array
 
 DELAYS: Final = (0, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 25, 30)
-"""Whole periods of delay for which the loop is designed and judged, beside the scenario's own."""
+"""Delays in periods for which the loop is judged; the scenario's is added."""
 _POINTS: Final = 800
-"""Frequencies at which a motor's loop is handed to python-control, beside some low ones."""
+"""Number of frequencies of a motor's loop for python-control, without some low ones."""
 _BEYOND: Final = 1.1
-"""The grid goes on to so many Nyquist frequencies, so that a crossing right there is seen."""
+"""End of the grid in Nyquist frequencies, for a crossing right at Nyquist's."""
 
 
 class MotorMargins(NamedTuple):
-    """One motor's loop cut while the other five stay closed; of all six the worst."""
+    """Worst margins of the six loops that are cut at one motor."""
 
     gain_up: float
     """Factor by which the motor may be stronger, > 1."""
@@ -47,15 +49,15 @@ class MotorMargins(NamedTuple):
 
 @dataclass(frozen=True)
 class LoopMargins:
-    """The loop of one delay.
+    """Margins of the loop of one delay.
 
     Attributes:
         steps: mu.
-        radius: spectral radius of the closed loop, 1 or more where it is unstable.
+        radius: spectral radius of the closed loop.
         S, T: peaks of sensitivity and complementary sensitivity at the motors.
-        gain_up, gain_down: factors by which all motors together may be stronger, weaker.
-        motor: the classical margins, one motor at a time; None where it is unstable.
-        later, earlier: s, by which the true delay may exceed, or fall short of, the one believed.
+        gain_up, gain_down: factors on the torques of all motors.
+        motor: classical margins of one motor at a time; None if the loop is unstable.
+        later, earlier: errors of the believed delay, s.
     """
 
     steps: int
@@ -70,7 +72,6 @@ class LoopMargins:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Plain data."""
         return {
             "mu": self.steps,
             "spectral_radius": self.radius,
@@ -87,14 +88,13 @@ class LoopMargins:
 
 
 def loop_margins(found: Basis, delays: Iterable[int] = DELAYS) -> list[LoopMargins]:
-    """The loop linearised at the reference's first pose, held still, over the delay.
+    """Judge the loop over the delay, linearised at the reference's first pose, held still.
 
-    For some delays mu, the scenario's own among them. Designed as the scenario's controller is
-    (model, prediction, weights, what it believes of the delay), closed around the true plant. The
-    feedforward has no part in it; an estimator is taken to have found payload and friction.
+    The law is designed as the scenario's controller (model, prediction, weights, believed delay)
+    and closed around the true plant. An estimator is assumed to have found payload and friction.
 
     Raises:
-        RiccatiError: there is no gain.
+        RiccatiError: the Riccati equation has no solution.
         numpy.linalg.LinAlgError: no torques hold the plate at that pose.
     """
     experiment, sc = found.experiment, found.experiment.scenario
@@ -135,7 +135,7 @@ def _judge(loop: LinearLoop) -> LoopMargins:
 
 
 def _motor_margins(plant: DelayedModel, K: Array, period: float) -> MotorMargins:
-    """Worst margins of six single loops, by python-control from their frequency responses.
+    """Return the worst margins of six single loops, from their frequency responses.
 
     With the other five closed, the loop of motor i is L_i = 1 / S_ii - 1.
     """

@@ -1,4 +1,4 @@
-"""What is told before anything is simulated: of this loop first, then of its delay alone."""
+"""Verdicts before a simulation: stability of this loop, then its delay alone."""
 
 import math
 from dataclasses import dataclass
@@ -6,14 +6,11 @@ from typing import Final, Literal
 
 import numpy as np
 
-from stewart_drake.law.limits import amplification, fastest_pole
-from stewart_drake.loop.controller_margin import ControllerMargin, true_model
+from stewart_drake.law.stability import amplification, fastest_pole
+from stewart_drake.loop.controller_margin import INSTANTS, ControllerMargin, true_model
 from stewart_drake.loop.experiment import Experiment, true_dynamics
 from stewart_drake.loop.results import MarginSummary
 
-INSTANTS: Final = 30
-"""Poles are looked at this often along the reference; 29 steps, a prime, since a round number of
-them may be in step with the motion."""
 HARDLY: Final = 10.0
 NO: Final = 1e3
 """Growth of prediction errors from which a delay is hardly, or not, beatable."""
@@ -21,12 +18,12 @@ NO: Final = 1e3
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the delay does to an error of the prediction, whatever the controller.
+    """Growth of an error of the prediction over the delay, under any controller.
 
     Attributes:
         eta: true total delay, s.
-        pole: fastest unstable pole of the open loop along the reference, 1/s, 0 without one.
-        time: s, when it is there.
+        pole: fastest unstable pole of the open loop along the reference, 1/s; 0 without one.
+        time: of that pole, s.
     """
 
     eta: float
@@ -35,12 +32,11 @@ class Verdict:
 
     @property
     def amplification(self) -> float:
-        """e^(pole eta), infinite where that overflows."""
+        """Growth e^(pole eta), infinite on overflow."""
         return amplification(self.pole, self.eta)
 
     @property
     def beatable(self) -> Literal["yes", "hardly", "no"]:
-        """The answer in one word."""
         if self.amplification > NO:
             return "no"
         return "hardly" if self.amplification >= HARDLY else "yes"
@@ -58,7 +54,7 @@ class Verdict:
 
 
 def loop_verdict(loop: ControllerMargin) -> str:
-    """Whether this controller on this plant is stable, and by how much, in one sentence."""
+    """Return one sentence: stability and margins of this controller on this plant."""
     if loop.problem:
         return f"this loop is not judged: {loop.problem}"
     where = "linearised along the reference"
@@ -77,7 +73,7 @@ def loop_verdict(loop: ControllerMargin) -> str:
 
 
 def loop_word(margin: MarginSummary | None) -> str:
-    """The same in a few words, of `controller_margin` in a run's summary."""
+    """Return a few words on `controller_margin` in a run's summary."""
     if margin is None or margin["stable"] is None:
         return "not judged"
     if not margin["stable"]:
@@ -94,20 +90,17 @@ def delay_verdict(experiment: Experiment) -> Verdict:
 
 
 def pole_in_motion(experiment: Experiment, time: float) -> float:
-    """Fastest pole of the true plant, 1/s, 0 without a growing one, about the moving reference.
-
-    `time` in s; the torque is the one that follows the reference then.
-    """
+    """Return the fastest pole of `true_model`, 1/s, 0 if nothing grows; `time` in s."""
     return fastest_pole(true_model(experiment, true_dynamics(experiment), time).A)
 
 
 def milliseconds(seconds: float) -> str:
-    """Three digits of a time; `any time` where it is not limited."""
+    """Return a time in three digits, or `any time` if it is infinite."""
     return f"{1e3 * seconds:.3g} ms" if math.isfinite(seconds) else "any time"
 
 
 def _left_out(loop: ControllerMargin) -> str:
-    """What the judgement supposes, where there is something to suppose."""
+    """Return the assumptions of the judgement, in brackets."""
     supposed = []
     if loop.estimated:
         found = "payload, friction and delay" if loop.delay_found else "payload and friction"
@@ -118,7 +111,7 @@ def _left_out(loop: ControllerMargin) -> str:
 
 
 def _power(exponent: float) -> str:
-    """e^exponent in two digits, also where it overflows: 55, 3.1e10, 2.0e1353."""
+    """Return e^exponent in two digits, also on overflow: 55, 3.1e10, 2.0e1353."""
     decades = exponent / math.log(10)
     if decades < 4:
         return f"{math.exp(exponent):.0f}"
