@@ -1,8 +1,8 @@
-"""Many independent runs, in parallel on this machine or a Dask cluster, each kept once it is done.
+"""Many independent runs, in parallel on this machine or a Dask cluster, resumable at any time.
 
-A job is a named call of a function that returns the bytes of a file. Whatever stops the others,
-Ctrl-C, kill -9, a dead worker, a full disk, loses only the jobs in flight: the next start in the
-same folder does what is missing. Only this process writes, so workers need no common file system.
+A job is a named call of a function that returns the bytes of a file. Ctrl-C, kill -9, a dead worker
+or a full disk lose only the jobs in flight. The next start in the same folder does what is missing.
+Only this process writes, so workers need no common file system.
 """
 
 import fcntl
@@ -37,10 +37,10 @@ from stewart_drake.files.yamlio import brief, validate
 from stewart_drake.studies.cluster import on_cluster
 
 MANIFEST: Final = "manifest.json"
-"""The settings that all jobs of a folder share, and their hash."""
+"""File of the settings that all jobs of a folder share, and of their hash."""
 
 Job = tuple[Any, ...]
-"""Arguments of one call; they are pickled."""
+"""Arguments of one call, pickled."""
 Progress = Callable[[int, int], None]
 """Called with the number of finished jobs and of all jobs."""
 
@@ -50,7 +50,7 @@ _LOCK: Final = ".lock"
 _MAX_MANIFEST: Final = 10_000_000
 _KEY: Final = re.compile(r"[A-Za-z0-9_+-][A-Za-z0-9_.+-]{0,199}")
 _WATCH: Final = 0.5
-"""s between two looks of a worker whether the process that started it is still there."""
+"""Time between two checks of a worker for the process that started it, s."""
 _log: Final = logging.getLogger("stewart_drake")
 
 
@@ -74,28 +74,28 @@ def run_jobs(
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, T]:
-    """Call `function(*jobs[key])` for every key whose file is not there yet, or is damaged.
+    """Call `function(*jobs[key])` for every key whose file is missing or damaged.
 
     Ctrl-C stops the jobs in flight and raises KeyboardInterrupt; `function` must let it through.
 
     Args:
         jobs: by key; a key is a file name without its suffix, of letters, digits and `_.+-`.
-        function: of a module, so that workers can import it. The same arguments must give the same
-            bytes if a resumed folder shall equal an uninterrupted one. A job that cannot be sent to
-            a process of this machine, such as one with a script's own class of a Drake system, runs
-            in this process.
-        folder: where KEY + suffix go; made if there is none.
-        settings: what all jobs depend on, plain data. A folder that was begun with others is
-            refused.
+        function: of a module, so that workers can import it. Equal arguments must give equal bytes
+            if a resumed folder shall equal an uninterrupted one. A job that cannot be sent to
+            another process, such as one with a script's own class of a Drake system, runs in this
+            one.
+        folder: of the files KEY + suffix; made if it is missing.
+        settings: of all jobs, plain data; a folder of other settings is refused.
         suffix: of the files.
-        read: reads a file. Where it raises ConfigError for a file of an earlier start, that job is
+        read: reads a file. If it raises ConfigError for a file of an earlier start, that job is
             done again, with a warning of one line from the package's logger.
-        workers: processes on this machine, with one numerical thread each; all cores by default.
-        scheduler: address of a Dask scheduler, whose workers are used instead.
+        workers: number of processes on this machine, each with one numerical thread; all cores by
+            default.
+        scheduler: address of a Dask scheduler whose workers are used instead.
         progress: called at the start and for each finished job.
 
     Returns:
-        What `read` makes of the file of every job, by default its path, in the order of `jobs`.
+        The result of `read` for the file of every job, by default its path, in the order of `jobs`.
 
     Raises:
         ConfigError: the folder belongs to other settings or another process is working in it; the
@@ -132,7 +132,7 @@ def run_jobs(
 
 
 def finished(jobs: Mapping[str, Job], folder: str | Path, suffix: str = ".json") -> dict[str, Path]:
-    """The files that are there already, in the order of `jobs`."""
+    """Return the existing files, in the order of `jobs`."""
     paths = {key: Path(folder) / f"{key}{suffix}" for key in jobs}
     return {key: path for key, path in paths.items() if path.exists()}
 
@@ -153,12 +153,12 @@ def _kept(paths: Mapping[str, Path], read: Callable[[Path], T]) -> dict[str, T]:
 
 
 def settings_hash(settings: Mapping[str, Any]) -> str:
-    """SHA-256 over the settings as canonical JSON: keys sorted, numbers by their shortest text."""
+    """Return the SHA-256 of the settings as JSON with sorted keys."""
     return hashlib.sha256(_canonical(settings).encode()).hexdigest()
 
 
 def _named(key: str, function: Callable[..., bytes], job: Job) -> tuple[str, bytes]:
-    """Call a job, and name it in its exception."""
+    """Call a job; an exception names it."""
     try:
         return key, function(*job)
     except ConfigError as error:
@@ -194,7 +194,7 @@ def _check_manifest(folder: Path, settings: Mapping[str, Any], suffix: str) -> N
         text = json.dumps({"hash": settings_hash(settings), "settings": mine}, indent=2)
         write_whole(path, text + "\n")
         return
-    expected = "the manifest of the runs beside it (choose another folder, or delete this one)"
+    expected = "the manifest of the runs in its folder (choose another folder, or delete this one)"
     manifest = read_manifest(folder, expected)
     if manifest.hash != settings_hash(settings):
         raise ConfigError(
@@ -221,7 +221,7 @@ def _canonical(settings: Mapping[str, Any]) -> str:
 
 
 def _difference(theirs: Any, mine: Any, name: str = "") -> str:
-    """The first field in which two sets of plain settings differ."""
+    """Return the first field in which two sets of plain settings differ."""
     if isinstance(theirs, dict) and isinstance(mine, dict):
         for key in sorted(theirs.keys() | mine.keys()):
             if theirs.get(key) != mine.get(key):
@@ -236,8 +236,10 @@ class _Unsent(NamedTuple):
     reason: str
 
 
+# cloudpickle sends a class of a script or notebook by its contents. One that derives from a class
+# of pydrake cannot be made again from them; in an executor's own reading that ends the worker.
 def _pack(call: Callable[[], Any]) -> bytes | str:
-    """A call as bytes, or why that cannot be."""
+    """Return a call as bytes, or the reason why it cannot be sent."""
     try:
         packed: bytes = cloudpickle.dumps(call)
     except Exception as error:
@@ -245,8 +247,6 @@ def _pack(call: Callable[[], Any]) -> bytes | str:
     return packed
 
 
-# cloudpickle sends a class of a script or notebook by its contents. One that derives from a class
-# of pydrake cannot be made again from them; in an executor's own reading that ends the worker.
 def _call_packed(number: int, packed: bytes | str) -> tuple[str, bytes] | _Unsent:
     """Call in a worker what was packed."""
     if isinstance(packed, str):
@@ -267,10 +267,6 @@ def _call_packed(number: int, packed: bytes | str) -> tuple[str, bytes] | _Unsen
         raise
 
 
-# Ctrl-C is for this process. Workers inherit the signal mask of the thread that starts them, and
-# the threads of the executor that of the thread that starts the executor; in a worker the signal
-# would break imports in the middle. The resource tracker comes first, because some Pythons
-# unblock the signal when they start it.
 def _on_this_machine(
     workers: int | None, calls: Sequence[Callable[[], tuple[str, bytes]]]
 ) -> Generator[tuple[str, bytes]]:
@@ -286,15 +282,10 @@ def _on_this_machine(
     with backend, warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=UserWarning, module="joblib")
         parallel = joblib.Parallel(n_jobs=number, batch_size=1, return_as="generator_unordered")
-        with _silent_trackers():
-            resource_tracker.ensure_running()
-            mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
-                outcomes = parallel(
-                    joblib.delayed(_call_packed)(i, _pack(call)) for i, call in enumerate(calls)
-                )
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        with _left_alone():
+            outcomes = parallel(
+                joblib.delayed(_call_packed)(i, _pack(call)) for i, call in enumerate(calls)
+            )
         try:
             with closing(outcomes):
                 for outcome in outcomes:
@@ -311,24 +302,28 @@ def _on_this_machine(
 
 
 @contextmanager
-def _silent_trackers() -> Iterator[None]:
-    """Silence the resource trackers of processes that are started here.
+def _left_alone() -> Iterator[None]:
+    """Start processes that Ctrl-C does not reach, and resource trackers that print nothing.
 
-    They clear what a killed worker leaves, and would add warnings to our one line.
+    A process inherits the signal mask of the thread that starts it, and a thread likewise; Ctrl-C
+    would break the imports of a worker in the middle. The tracker comes first, because some Pythons
+    unblock the signal when they start it. It clears what a killed worker leaves, with warnings.
     """
-    before = os.environ.get("PYTHONWARNINGS")
-    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [before, "ignore:resource_tracker"]))
+    warned = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [warned, "ignore:resource_tracker"]))
+    resource_tracker.ensure_running()
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        if before is None:
-            del os.environ["PYTHONWARNINGS"]
-        else:
-            os.environ["PYTHONWARNINGS"] = before
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        del os.environ["PYTHONWARNINGS"]
+        if warned is not None:
+            os.environ["PYTHONWARNINGS"] = warned
 
 
 def _end_with(parent: int) -> None:
-    """Let a worker process end with the one that started it, which kill -9 gives no time to."""
+    """Let a worker process end with the one that started it, even after kill -9."""
 
     def watch() -> None:
         while os.getppid() == parent:
