@@ -37,10 +37,9 @@ from joblib import Parallel, delayed
 
 import stewart_drake as sd
 from stewart_drake.files.versions import versions
-from stewart_drake.identification.excitation import fitted_multisine
 from stewart_drake.identification.identify import Identification, identify
-from stewart_drake.identification.log_files import Precision
-from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
+from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log, Precision
+from stewart_drake.identification.plan import fitted_multisine
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import DELAY, DYNAMIC, GEOMETRY, NAMES, OFFSETS
 from stewart_drake.loop.experiment import prepare

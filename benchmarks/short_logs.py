@@ -20,7 +20,7 @@ from joblib import Parallel, delayed
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.identify import identify
-from stewart_drake.identification.log_files import Precision, read_log
+from stewart_drake.identification.logs import Precision, read_log
 from stewart_drake.identification.unknowns import DELAY
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate

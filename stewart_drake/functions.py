@@ -11,8 +11,7 @@ import numpy as np
 from stewart_drake.export.controller import exported, write
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.identification import identify as identification
-from stewart_drake.identification.log_files import Precision, read_log
-from stewart_drake.identification.logs import ANGLES, POSE
+from stewart_drake.identification.logs import ANGLES, POSE, Precision, read_log
 from stewart_drake.identification.plan import MOTION, Plan, plan
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.loop.experiment import prepare

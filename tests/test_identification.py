@@ -12,7 +12,6 @@ from benchmarks import short_logs
 from benchmarks.identification import excitation, find
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification.excitation import fitted_multisine, multisine
 from stewart_drake.identification.fit import (
     ENOUGH,
     Evaluator,
@@ -31,14 +30,14 @@ from stewart_drake.identification.judgement import (
     unseen,
     workspace_poses,
 )
-from stewart_drake.identification.log_files import Precision, read_log
-from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
+from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log, Precision, read_log
 from stewart_drake.identification.model import (
     NUM_DYNAMIC,
     NUM_GEOMETRY,
     DrawnModel,
     MachineModel,
 )
+from stewart_drake.identification.plan import fitted_multisine, multisine
 from stewart_drake.identification.shooting import Segment, integrate, plan_steps
 from stewart_drake.identification.start import coarse_delay, measured_poses, segments_of
 from stewart_drake.identification.tolerances import Tolerances

@@ -10,8 +10,7 @@ import xarray as xr
 
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification.log_files import Precision, angle_std, read_log
-from stewart_drake.identification.logs import ANGLES, POSE
+from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.reporting.identification import file_names
 from stewart_drake.scenario.calibration import load_calibration

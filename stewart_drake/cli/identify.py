@@ -13,7 +13,7 @@ from stewart_drake.reporting.terminal import working
 from stewart_drake.studies.options import refuse
 
 if TYPE_CHECKING:
-    from stewart_drake.identification.log_files import Precision
+    from stewart_drake.identification.logs import Precision
 
 Tolerance = Annotated[
     list[str] | None,
@@ -119,7 +119,7 @@ def identify(
 
 
 def _precision(bits: int | None, pose_std: str | None) -> "Precision":
-    from stewart_drake.identification.log_files import Precision, angle_std
+    from stewart_drake.identification.logs import Precision, angle_std
 
     if bits is not None and not 1 <= bits <= 52:
         raise ConfigError(f"--bits: got {bits}; expected 1 to 52")

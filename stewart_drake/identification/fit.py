@@ -5,12 +5,12 @@ Minimised over the unknowns p and the first state x_i of every segment is
     chi^2 = sum |(y - h(x(t); p)) / sigma|^2 + |(p - p_0) / sigma_0|^2,
 
 measurements and what was known before. A step solves J'J d = -J'r with J'J + lambda diag(J'J) in
-the place of J'J. A first state meets the measurements of its own segment only, J'J is an arrow,
+the place of J'J. A first state meets the measurements of one segment only, J'J is an arrow,
 
     J'J = [N_pp, N_pi; N_ip, N_ii],   d_i = -N_ii^-1 (g_i + N_ip d_p),
     (N_pp - sum N_pi N_ii^-1 N_ip) d_p = -(g_p - sum N_pi N_ii^-1 g_i),
 
-and the inverse of the last matrix, without damping, is the covariance of p, whatever the x_i are.
+and the inverse of the last matrix, without damping, is the covariance of p for any x_i.
 """
 
 from dataclasses import dataclass, replace
@@ -39,22 +39,25 @@ from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
 
 MOST_DELAY: Final = 0.1
-"""s by which one iteration may change the delay."""
+"""Largest change of the delay in one iteration, s."""
 ENOUGH: Final = 0.01
-"""Of chi^2; an iteration that gains less is the last."""
+"""Gain of chi^2 below which an iteration is the last."""
 MOST_ITERATIONS: Final = 60
+ASTRAY: Final = 1e3
+"""chi^2 per value of a segment that no similar machine explains; a drawing that is off by a
+millimetre leaves some fifty."""
 _SLOPES_STEP: Final = 0.02
-"""s, of the integration of slopes."""
+"""Step of the integration of slopes, s."""
 _STEP_ERROR: Final = 0.05
-"""Standard deviations of a measurement by which integration may be off, root mean square."""
+"""Root-mean-square error of the integration in standard deviations of a measurement."""
 _SHORTEST_STEP: Final = 1e-3
 """s."""
 _DAMPING: Final = (1e-3, 1e-9, 1e12)
-"""At first, least, and where no step helps any more."""
+"""First, least and largest."""
 
 
 class Guess(NamedTuple):
-    """Values of all that is sought."""
+    """Values of the unknowns and of the first states."""
 
     values: Array
     """(NUM_UNKNOWNS,)."""
@@ -63,16 +66,16 @@ class Guess(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """How well a guess explains the logs."""
+    """Residuals of a guess."""
 
     measured: Array
-    """(m, n, 18) of n segments in standard deviations, 0 where nothing was measured."""
+    """(m, n, 18) of n segments in standard deviations, 0 for missing measurements."""
     prior: Array
     """(free unknowns,)."""
 
     @property
     def chi2(self) -> float:
-        """Infinite for a trajectory that ran away."""
+        """Sum of squares, infinite for a diverged trajectory."""
         with np.errstate(over="ignore"):
             total = float(np.sum(self.measured**2) + np.sum(self.prior**2))
         return total if np.isfinite(total) else np.inf
@@ -92,7 +95,7 @@ class Normal(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Where the iterations ended."""
+    """End of the iterations."""
 
     guess: Guess
     residuals: Residuals
@@ -103,13 +106,7 @@ class Fit(NamedTuple):
 
 @dataclass(frozen=True)
 class Problem:
-    """Segments of logs, and what is not known.
-
-    Attributes:
-        segments: of logs under the same gravity.
-        unknowns: what is known beforehand.
-        longest_step: of the trajectories' integration, s.
-    """
+    """Segments of logs under the same gravity, unknowns, and the longest integration step in s."""
 
     segments: list[Segment]
     unknowns: Unknowns
@@ -128,7 +125,7 @@ class Problem:
         return kind(self.unknowns.mechanism, gravity, len(self.segments))
 
     def measured(self) -> tuple[Array, Array]:
-        """Values (m, n, 18) of the segments, NaN where there is none, and their std (n, 18)."""
+        """Return values (m, n, 18) of the segments, NaN for missing ones, and their std (n, 18)."""
         longest = max(len(s.rows) for s in self.segments)
         values = np.full((longest, len(self.segments), NUM_MEASURED), np.nan)
         for i, s in enumerate(self.segments):
@@ -145,14 +142,13 @@ class Evaluator:
         self.free = problem.unknowns.free
 
     def residuals(self, guess: Guess) -> Residuals:
-        """Of a guess."""
         return self._evaluate(guess, self.problem.longest_step)[0]
 
     def normal(self, guess: Guess) -> tuple[Residuals, Normal]:
-        """The same, and the normal equations there.
+        """Return the residuals and the normal equations of a guess.
 
-        Where trajectories need short steps, their slopes do with long ones: what a slope is off
-        moves the minimum by that share of a standard deviation, and costs ten times as much.
+        Slopes are integrated with longer steps than trajectories: they cost ten times as much, and
+        their error moves the minimum by that share of a standard deviation only.
         """
         residuals = self.residuals(guess)
         slopes_step = max(self.problem.longest_step, _SLOPES_STEP)
@@ -169,7 +165,7 @@ class Evaluator:
     def _evaluate(
         self, guess: Guess, longest_step: float, sensitive: bool = False
     ) -> tuple[Residuals, Array]:
-        """Residuals and, of m samples of n segments, J (m, n, 18, columns)."""
+        """Return the residuals and J (m, n, 18, columns) at m samples of n segments."""
         unknowns, free = self.problem.unknowns, self.free
         numbers = unknowns.numbers(guess.values)
         plan = plan_steps(self.problem.segments, guess.values[DELAY], longest_step)
@@ -201,7 +197,7 @@ class Evaluator:
         return Residuals(residual, prior), J
 
     def _columns(self, slopes: Array, offsets: Array) -> Array:
-        """From the columns of S to those of free unknowns and first state."""
+        """Return the columns of S as those of free unknowns and first state."""
         rows = slopes.shape[:-1]
         whole = np.empty((*rows, NUM_UNKNOWNS))
         whole[..., : OFFSETS.start] = slopes[..., NUMBERS]
@@ -211,29 +207,24 @@ class Evaluator:
 
 
 def followed(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
-    """Without the segments whose first trajectory runs out of the workspace."""
+    """Return a problem without the segments whose first trajectory leaves the workspace."""
     measured = Evaluator(problem).residuals(start).measured
     with np.errstate(over="ignore"):
         return _of(problem, start, np.flatnonzero(np.isfinite(np.sum(measured**2, axis=(0, 2)))))
 
 
 def nearest(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
-    """The half of the segments whose first trajectories are nearest to what was measured.
+    """Return the half of the segments whose first trajectories are nearest to the measurements.
 
-    The others, such as the last one before a plate was lost, would pull all unknowns to wherever
-    their own trajectory gets shorter; with what these say they are near, too.
+    The others, such as the last one before a plate was lost, would pull all unknowns towards
+    shorter trajectories. From the values of the nearest they start near, too.
     """
     away = misfit(Evaluator(problem).residuals(start), problem)
     return _of(problem, start, np.sort(np.argsort(away)[: (len(away) + 1) // 2]))
 
 
-def without(problem: Problem, start: Guess, segment: int) -> tuple[Problem, Guess]:
-    """The others."""
-    return _of(problem, start, np.delete(np.arange(len(problem.segments)), segment))
-
-
 def misfit(residuals: Residuals, problem: Problem) -> Array:
-    """chi^2 per value (n,) of each segment."""
+    """Return chi^2 per value (n,) of each segment."""
     values, _ = problem.measured()
     squares = np.sum(residuals.measured**2, axis=(0, 2))
     return np.asarray(squares / np.isfinite(values).sum(axis=(0, 2)))
@@ -245,10 +236,7 @@ def _of(problem: Problem, start: Guess, kept: NDArray[np.intp]) -> tuple[Problem
 
 
 def solve(problem: Problem, start: Guess, most: int = MOST_ITERATIONS) -> Fit:
-    """The most probable guess, from a start whose trajectories are `followed`.
-
-    `most`: iterations; the fit ends where they do, or where they gain nothing.
-    """
+    """Return the most probable guess after at most `most` iterations from a `followed` start."""
     evaluator = Evaluator(problem)
     guess, damping = start, _DAMPING[0]
     residuals, normal = evaluator.normal(guess)
@@ -272,19 +260,54 @@ def solve(problem: Problem, start: Guess, most: int = MOST_ITERATIONS) -> Fit:
     return Fit(guess, residuals, covariance(normal), iterations)
 
 
-def finer(problem: Problem, guess: Guess, beside: float = 1.0) -> Problem | None:
-    """The problem with half the step, or None where that moves its residuals by next to nothing.
+class Solution(NamedTuple):
+    """Fit of segments of logs, without those that were left out."""
 
-    That is little beside a misfit of `beside` standard deviations.
+    whole: Problem
+    """All segments."""
+    problem: Problem
+    """Segments that were fitted."""
+    begun: Guess
+    """Start of the fit."""
+    fit: Fit
 
-    Coulomb friction turns round within some hundredths of a second, so that what step is fine
-    enough depends on the machine.
+    @property
+    def left_out(self) -> int:
+        """Number of segments that were not fitted."""
+        return len(self.whole.segments) - len(self.problem.segments)
+
+    @property
+    def chi2(self) -> float:
+        """chi^2 per value that was fitted."""
+        return chi2_per_value(self.fit.residuals, self.problem)["all"]
+
+    @property
+    def misfit(self) -> Array:
+        """chi^2 per value (n,) of each segment that was fitted."""
+        return misfit(self.fit.residuals, self.problem)
+
+    def without_worst(self, most: int = MOST_ITERATIONS) -> "Solution":
+        """Return the fit from the same start without the segment of the largest misfit."""
+        kept = np.delete(np.arange(len(self.problem.segments)), self.misfit.argmax())
+        problem, begun = _of(self.problem, self.begun, kept)
+        return Solution(self.whole, problem, begun, solve(problem, begun, most))
+
+    def refitted(self, problem: Problem) -> "Solution":
+        """Return the fit of a problem with other steps, from the end of this fit."""
+        return self._replace(problem=problem, fit=solve(problem, self.fit.guess))
+
+
+def finer(problem: Problem, guess: Guess, residual: float = 1.0) -> Problem | None:
+    """Return the problem with half the step, or None if that hardly changes its residuals.
+
+    The change is compared with `residual` standard deviations. How fine is enough depends
+    on the machine: Coulomb friction turns round within some hundredths of a second.
     """
     halved = replace(problem, longest_step=problem.longest_step / 2)
     if halved.longest_step < _SHORTEST_STEP:
         return None
     coarse, fine = (Evaluator(one).residuals(guess).measured for one in (problem, halved))
-    return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > _STEP_ERROR * beside else None
+    return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > _STEP_ERROR * residual else None
 
 
 def _moved(guess: Guess, unknown: Array, first: Array, free: NDArray[np.intp]) -> Guess:
@@ -296,7 +319,7 @@ def _moved(guess: Guess, unknown: Array, first: Array, free: NDArray[np.intp]) -
 
 
 def _step(normal: Normal, damping: float) -> tuple[Array, Array]:
-    """Changes of the free unknowns (k,) and of the first states (n, 12)."""
+    """Return the changes of the free unknowns (k,) and of the first states (n, 12)."""
     k = len(normal.of_prior)
     whole, g = _joined(normal)
     N_ip, N_ii = normal.of_segments[:, k:, :k], normal.of_segments[:, k:, k:]
@@ -311,14 +334,14 @@ def _step(normal: Normal, damping: float) -> tuple[Array, Array]:
 
 
 def _joined(normal: Normal) -> tuple[Array, Array]:
-    """N_pp (k, k) and g_p (k,)."""
+    """Return N_pp (k, k) and g_p (k,)."""
     k = len(normal.of_prior)
     whole = normal.of_segments[:, :k, :k].sum(0) + np.diag(normal.of_prior)
     return whole, normal.gradients[:, :k].sum(0) + normal.prior_gradient
 
 
 def covariance(normal: Normal) -> Array:
-    """Of the free unknowns (k, k), with whatever first states."""
+    """Return the covariance (k, k) of the free unknowns, for any first states."""
     k = len(normal.of_prior)
     whole, _ = _joined(normal)
     N_ip, N_ii = normal.of_segments[:, k:, :k], normal.of_segments[:, k:, k:]
@@ -330,10 +353,10 @@ def covariance(normal: Normal) -> Array:
 
 
 def chi2_per_value(residuals: Residuals, problem: Problem) -> dict[str, float]:
-    """chi^2 / n by kind of measurement, of the prior, and of all ("all").
+    """Return chi^2 / n by kind of measurement, of the prior, and of all ("all").
 
-    Each fitted first state takes twelve values' worth of freedom, in equal shares of all values;
-    for the unknowns the prior's own terms make up.
+    Each fitted first state takes twelve degrees of freedom, in equal shares of all values. The
+    prior's terms make up for the unknowns.
     """
     values, _ = problem.measured()
     there = np.isfinite(values)

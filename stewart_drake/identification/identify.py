@@ -1,4 +1,4 @@
-"""From logs to a machine: all steps, and what is told of them."""
+"""Identification of a machine from its logs: all steps, and the result."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,16 +10,16 @@ import numpy as np
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification import short_logs, start
 from stewart_drake.identification.fit import (
+    ASTRAY,
     Fit,
     Guess,
     Problem,
+    Solution,
     chi2_per_value,
     finer,
     followed,
-    misfit,
     nearest,
     solve,
-    without,
 )
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
 from stewart_drake.identification.logs import ANGLES, Log
@@ -40,40 +40,42 @@ from stewart_drake.scenario.calibration import Calibration
 from stewart_drake.types import Array
 
 WRONG: Final = 1.5
-"""chi^2 per value from which on a fit is wrong and its intervals mean nothing."""
+"""chi^2 per value above which a fit is wrong and its intervals have no meaning."""
 USUAL_DELAY: Final = 0.1
-"""s, believed where nobody says anything."""
+"""Believed delay without any other information, s."""
 _FEW: Final = 15
-"""Iterations over the segments that are looked at first."""
-_ASTRAY: Final = 1e3
-"""chi^2 per value of a segment that is not explained by any machine like this one; drawings that
-are off by a millimetre make some fifty."""
+"""Number of iterations over the segments that are fitted first."""
 _COARSE: Final = 0.1
-"""s by which the delay that is begun with may be off."""
+"""Error of the coarse delay, s."""
 
 
 @dataclass(frozen=True)
 class Identification:
-    """A machine as its logs tell it.
+    """Machine identified from logs.
 
     Attributes:
-        logs: that were read.
-        unknowns: what was known before.
-        problem, fit: what was solved, and how it came out.
-        left_out: stretches of the logs in which no trajectory could be followed.
-        middle: pose (6,) in the middle of what was measured.
+        logs: of the machine.
+        unknowns: before the logs.
+        solution: the fit.
+        middle: median of the measured poses (6,).
     """
 
     logs: Sequence[Log]
     unknowns: Unknowns
-    problem: Problem
-    fit: Fit
-    left_out: int
+    solution: Solution
     middle: Array
+
+    @property
+    def problem(self) -> Problem:
+        return self.solution.problem
+
+    @property
+    def fit(self) -> Fit:
+        return self.solution.fit
 
     @cached_property
     def chi2(self) -> dict[str, float]:
-        """Per value: by kind of measurement, of the prior, and of all."""
+        """chi^2 per value: by kind of measurement, of the prior, and of all."""
         return chi2_per_value(self.fit.residuals, self.problem)
 
     @property
@@ -83,7 +85,7 @@ class Identification:
 
     @cached_property
     def values(self) -> Array:
-        """What was found of the unknowns, friction not below zero."""
+        """Values found, with friction not below zero."""
         found = self.fit.guess.values.copy()
         for place in ONE_SIDED:
             found[place] = max(0.0, found[place])
@@ -91,13 +93,11 @@ class Identification:
 
     @cached_property
     def covariance(self) -> Array:
-        """Of all unknowns, 0 where they are known; where the fit is wrong what it was before."""
+        """Covariance of all unknowns, 0 for known ones; of the prior if the fit is wrong."""
         unknowns = self.unknowns
         if not self.right:
             return np.diag(unknowns.std**2)
-        whole = np.zeros((len(unknowns.mean), len(unknowns.mean)))
-        whole[np.ix_(unknowns.free, unknowns.free)] = self.fit.covariance
-        return whole
+        return unknowns.whole(self.fit.covariance)
 
     @property
     def std(self) -> Array:
@@ -107,16 +107,13 @@ class Identification:
 
     @property
     def mechanism(self) -> Mechanism:
-        """The machine that was found; as it was drawn where the fit is wrong."""
+        """Machine found; as drawn if the fit is wrong."""
         return self.unknowns.machine(self.values if self.right else self.unknowns.mean)
 
     def calibration(self, mechanism: Mechanism) -> Calibration:
-        """Return what a controller of this machine may use: all but the geometry.
+        """Return all values for a controller but the geometry, for the mechanism as read from file.
 
-        Where the fit is wrong that is the delay alone, as uncertain as before.
-
-        Args:
-            mechanism: the one that was found, as it was written and read.
+        If the fit is wrong, that is the delay alone, as uncertain as before.
         """
         places = np.r_[DYNAMIC, OFFSETS, DELAY] if self.right else np.array([DELAY])
         return Calibration(
@@ -128,19 +125,19 @@ class Identification:
 
     @cached_property
     def unseen(self) -> tuple[int, list[str]]:
-        """How many directions the logs do not see, and what they are."""
+        """Number and names of the directions that the logs do not show."""
         return unseen(self.unknowns, self.fit.covariance)
 
     @cached_property
     def pose_uncertainty(self) -> PoseUncertainty | None:
-        """Over the workspace; None if the fit is wrong or `middle` is out of reach."""
+        """Accuracy over the workspace; None if the fit is wrong or `middle` is out of reach."""
         if not self.right:
             return None
         return pose_uncertainty(self.unknowns, self.values, self.fit.covariance, self.middle)
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` holds: intervals are null where the fit is wrong."""
+        """Content of `summary.json`; intervals are null if the fit is wrong."""
         std = self.std if self.right else np.full(len(self.values), np.nan)
         poses = self.pose_uncertainty
         return {
@@ -163,7 +160,7 @@ class Identification:
             "pose_uncertainty": None if poses is None else poses.summary,
             "unseen": {"directions": self.unseen[0], "names": self.unseen[1]},
             "segments": len(self.problem.segments),
-            "left_out": self.left_out,
+            "left_out": self.solution.left_out,
             "iterations": self.fit.iterations,
         }
 
@@ -174,16 +171,16 @@ def identify(
     tolerances: Tolerances | None = None,
     delay: float | None = None,
 ) -> Identification:
-    """The machine that explains logs best.
+    """Return the machine that explains the logs best.
 
     Args:
         logs: of one machine.
         mechanism: as drawn.
-        tolerances: how far off it may be, the defaults if None.
-        delay: that is believed in, s; None is what the first log believed.
+        tolerances: of the drawing, the defaults if None.
+        delay: believed one, s; None is that of the first log.
 
     Raises:
-        ConfigError: one line; a log that does not suit the mechanism or is too short.
+        ConfigError: one line; a log does not suit the mechanism or is too short.
     """
     if len({log.gravity for log in logs}) > 1:
         raise ConfigError(
@@ -202,7 +199,7 @@ def identify(
     lasting = max(float(log.times[-1] - log.times[0]) for log in logs)
     if tolerances.delay > 0 and lasting < short_logs.length_needed(unknowns):
         short = short_logs.fit_short(logs, poses, unknowns, WRONG)
-        return Identification(logs, unknowns, short.problem, short.fit, short.left_out, middle)
+        return Identification(logs, unknowns, short, middle)
     starts = [(believed, 1.0)]
     if tolerances.delay > 0:
         coarse = start.coarse_delay(
@@ -215,23 +212,20 @@ def identify(
         tried.append(_begin(delay_at_first, share, logs, poses, unknowns))
         if tried[-1].chi2 <= WRONG:
             break
-    best = min(tried, key=lambda one: one.chi2)
-    whole = best.whole
-    problem, fit = _grown(best)
-    while (halved := finer(problem, fit.guess)) is not None:
-        problem, fit = halved, _solved(halved, fit.guess)
-    left_out = len(whole.segments) - len(problem.segments)
-    return Identification(logs, unknowns, problem, fit, left_out, middle)
+    found = _grown(min(tried, key=lambda one: one.chi2))
+    while (halved := finer(found.problem, found.fit.guess)) is not None:
+        found = found.refitted(halved)
+    return Identification(logs, unknowns, found, middle)
 
 
 class _Begun(NamedTuple):
-    """Where a start leads; chi^2 per value, of the segments that were looked at first."""
+    """Result of a start."""
 
     chi2: float
+    """Per value of the segments that were fitted first."""
     whole: Problem
-    values: Array
-    first: Array
-    """(n, 12) states of all n segments, as measured."""
+    guess: Guess
+    """Values found, and the measured first states of all segments."""
 
 
 def _begin(
@@ -241,53 +235,46 @@ def _begin(
     poses: Sequence[Array],
     unknowns: Unknowns,
 ) -> _Begun:
-    """A delay in s and segments of a share of their usual length, and what the nearest say."""
+    """Fit the nearest segments, from a delay in s, with a share of the usual length."""
     segments, states, values = list[Segment](), list[Array](), unknowns.mean.copy()
     late = _COARSE if unknowns.std[DELAY] > 0 else 0.0
     for log, own in zip(logs, poses, strict=True):
-        length = share * start.segment_length(log, own, unknowns.mechanism, delay)
-        parts = start.segments_of(log, float(log.sent[0]) + delay + late, length)
-        segments += parts
-        states += [start.first_state(log, own, int(part.rows[0])) for part in parts]
+        parts = start.segments_and_states(log, own, unknowns.mechanism, delay, late, share)
+        segments += parts[0]
+        states += parts[1]
     first, values[DELAY] = np.array(states), delay
     whole = Problem(segments, unknowns)
     problem, guess = followed(whole, Guess(values, first))
     if not problem.segments:
-        return _Begun(np.inf, whole, values, first)
+        return _Begun(np.inf, whole, Guess(values, first))
     near, guess = nearest(problem, guess)
     fit = solve(near, guess, _FEW)
     chi2 = chi2_per_value(fit.residuals, near)["all"]
-    return _Begun(chi2, whole, fit.guess.values, first)
+    return _Begun(chi2, whole, Guess(fit.guess.values, first))
 
 
-def _grown(begun: _Begun) -> tuple[Problem, Fit]:
-    """The fit of all segments, without those that nothing fits.
+def _grown(begun: _Begun) -> Solution:
+    """Return the fit of all segments, without those that nothing fits.
 
-    Where the nearest segments are explained, and all of them are not, a trajectory may have gone
-    astray, such as the last before a plate was lost. One that is off by more than a machine that
-    is not quite this one can make it is left out then, as long as more than the nearest are left.
+    If the nearest segments are explained and all of them are not, a trajectory may have gone
+    astray, such as the last before a plate was lost. Such segments are left out, as long as more
+    than the nearest remain.
     """
-    problem, guess = followed(begun.whole, Guess(begun.values, begun.first))
-    if begun.chi2 > WRONG:
-        return problem, _solved(problem, guess)
-    fewest = len(problem.segments) // 2 + 1
-    fit = solve(problem, guess, _FEW)
-    while chi2_per_value(fit.residuals, problem)["all"] > WRONG and len(problem.segments) > fewest:
-        off = misfit(fit.residuals, problem)
-        if off.max() < _ASTRAY:
-            break
-        problem, guess = without(problem, guess, int(off.argmax()))
-        fit = solve(problem, guess, _FEW)
-    return problem, fit if fit.iterations < _FEW else solve(problem, fit.guess)
-
-
-def _solved(problem: Problem, guess: Guess) -> Fit:
+    problem, guess = followed(begun.whole, begun.guess)
     if not problem.segments:
         raise ConfigError(
             "LOG: got no stretch that the mechanism could have moved through under these torques; "
             "expected a log of this machine, torques in N m as they were commanded"
         )
-    return solve(problem, guess)
+    if begun.chi2 > WRONG:
+        return Solution(begun.whole, problem, guess, solve(problem, guess))
+    fewest = len(problem.segments) // 2 + 1
+    found = Solution(begun.whole, problem, guess, solve(problem, guess, _FEW))
+    while found.chi2 > WRONG and len(found.problem.segments) > fewest:
+        if found.misfit.max() < ASTRAY:
+            break
+        found = found.without_worst(_FEW)
+    return found if found.fit.iterations < _FEW else found.refitted(found.problem)
 
 
 def _unknowns(
@@ -297,7 +284,7 @@ def _unknowns(
     tolerances: Tolerances,
     believed: float,
 ) -> Unknowns:
-    """With scales of the logs: the largest torque, and the largest speed of a crank."""
+    """Return the prior, with the largest torque and the largest crank speed of the logs."""
     speeds = []
     for log, own in zip(logs, poses, strict=True):
         known = np.isfinite(own).all(axis=1)

@@ -1,4 +1,4 @@
-"""What a log has told: directions that it cannot see, and how well poses are known afterwards."""
+"""Accuracy of an identification: directions that a log does not show, and poses."""
 
 from typing import Final, NamedTuple
 
@@ -54,7 +54,6 @@ class PoseUncertainty(NamedTuple):
 
     @property
     def summary(self) -> dict[str, dict[str, float]]:
-        """Plain data."""
         units = ("angle_rad", "position_m", "angle_from_middle_rad", "position_from_middle_m")
         return {
             name: {"median": pair[0], "worst": pair[1]}
@@ -63,7 +62,7 @@ class PoseUncertainty(NamedTuple):
 
 
 def named_directions(mechanism: Mechanism) -> dict[str, Array]:
-    """Directions (NUM_UNKNOWNS,) in which whole machines differ, by what they are."""
+    """Return directions (NUM_UNKNOWNS,) in which whole machines differ, by name."""
     joints, found = mechanism.p_PQ, {}
 
     def of_legs(columns: slice | int, values: Array) -> Array:
@@ -90,11 +89,11 @@ def named_directions(mechanism: Mechanism) -> dict[str, Array]:
 
 
 def unseen(unknowns: Unknowns, covariance: Array) -> tuple[int, list[str]]:
-    """How many directions the log does not see, and what they are, in words.
+    """Return number and names of the directions that the log does not show.
 
-    In units of what was known before, the covariance of the unknowns has eigenvalues from 0 (found
-    by the log) to 1 (as uncertain as before). Those above UNSEEN span what it does not see. Of
-    that, whole-machine directions are named; the rest by what it consists of.
+    In units of the prior, the covariance of the unknowns has eigenvalues from 0 (found by the log)
+    to 1 (as uncertain as before). The eigenvectors above UNSEEN span a space. Whole-machine
+    directions in it are named, and the rest by its unknowns.
 
     Args:
         unknowns: before the log.
@@ -125,7 +124,7 @@ def unseen(unknowns: Unknowns, covariance: Array) -> tuple[int, list[str]]:
 
 
 def _mixture(free: NDArray[np.intp], space: Array) -> str:
-    """What the directions of a space (k, n) consist of, the largest shares first."""
+    """Return the unknowns in the directions of a space (k, n), the largest shares first."""
     weights = np.mean(space**2, axis=1)
     shares = {
         group: sum(w for k, w in zip(free, weights, strict=True) if NAMES[k].startswith(start))
@@ -136,9 +135,9 @@ def _mixture(free: NDArray[np.intp], space: Array) -> str:
 
 
 def workspace_poses(mechanism: Mechanism, middle: Array, seed: int = 0) -> Array:
-    """Poses (n, 6) all over the workspace around a pose, which is the first of them.
+    """Return poses (n, 6) all over the workspace around a pose, which is the first of them.
 
-    On rays in random directions, up to where little of the margin in the middle is left.
+    They lie on rays in random directions, where enough of the margin in the middle is left.
     """
     rng, size = np.random.default_rng(seed), np.repeat([1.0, mechanism.crank_lengths.mean()], 3)
     least, poses = _ROOM * margin(mechanism, middle), [middle]
@@ -169,10 +168,8 @@ def pose_uncertainty(
         covariance: (k, k) of the free ones.
         middle: pose (6,) around which the workspace is taken.
     """
-    whole = np.zeros((NUM_UNKNOWNS, NUM_UNKNOWNS))
-    whole[np.ix_(unknowns.free, unknowns.free)] = covariance
     of_angles = np.r_[GEOMETRY, OFFSETS]
-    P = whole[np.ix_(of_angles, of_angles)]
+    P = unknowns.whole(covariance)[np.ix_(of_angles, of_angles)]
     found = unknowns.machine(values)
     if not margin(found, middle) > 0:
         return None
@@ -182,7 +179,7 @@ def pose_uncertainty(
 
 
 def pose_slopes(unknowns: Unknowns, numbers: Numbers, poses: Array) -> Array:
-    """d pose / d[geometry; offsets] (n, 6, 54) at poses (n, 6), crank angles held."""
+    """Return d pose / d[geometry; offsets] (n, 6, 54) at poses (n, 6) for fixed crank angles."""
     model = MachineModel(unknowns.mechanism, 0.0, len(poses))
     _, J, by_geometry = model.crank_angles(poses, numbers)
     offsets = np.broadcast_to(np.eye(len(LEGS)), (len(poses), NUM_LEGS, NUM_LEGS))
@@ -191,7 +188,7 @@ def pose_slopes(unknowns: Unknowns, numbers: Numbers, poses: Array) -> Array:
 
 
 def _spread(slopes: Array, P: Array) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Median and worst over the poses, of angles and of positions."""
+    """Return median and worst over the poses, of angles and of positions."""
     std = np.sqrt(np.maximum(np.einsum("nij,jk,nik->ni", slopes, P, slopes), 0.0))
     largest = (std[:, part].max(axis=1) for part in (ANGLES, POSITION))
     angle, position = ((float(np.median(one)), float(one.max())) for one in largest)

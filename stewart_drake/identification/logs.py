@@ -1,21 +1,58 @@
-"""A log of a machine: torques with the times at which they were sent, and what was measured."""
+"""Logs of a machine, and their files: those of `simulate` (.nc), and CSV of a machine's own.
 
-from dataclasses import dataclass
-from typing import Final
+A log holds torques with the times at which they were sent, and what was measured.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, NamedTuple
 
 import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
 
-from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE
+from stewart_drake.files.arrayio import load_netcdf
+from stewart_drake.files.csvio import ANGLE_UNITS, LENGTH_UNITS, TORQUE_UNITS, read_table
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.yamlio import parse_yaml, validate
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.native.layout import STANDARD_GRAVITY
+from stewart_drake.scenario.config import NetworkConfig, Scenario, StateSensorConfig
+from stewart_drake.scenario.renames import with_new_names
+from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE, NUM_TORQUES
 from stewart_drake.types import Array
 
+# Measurements of a log
 ANGLES: Final = slice(0, NUM_LEGS)
-"""Of a log's measurements: crank angles,"""
 POSE: Final = slice(6, 12)
-"""pose of the plate,"""
 RATES: Final = slice(12, 18)
-"""and its rates."""
 NUM_MEASURED: Final = NUM_LEGS + NUM_STATE
 KINDS: Final = {"angles": ANGLES, "pose": POSE, "rates": RATES}
+
+
+EXPECTED: Final = "a log: signals.nc of simulate, or CSV with time, torque_1 ... and angle_1 ..."
+FINEST: Final = 0.01
+"""Least time between two measurements, s; more frequent ones are left out."""
+_LEAST_VALUES: Final = 96
+"""Least number of values in a log: six crank angles at 16 instants, or a state at eight."""
+_TORQUES: Final = [f"torque_{leg}" for leg in LEGS]
+_CRANKS: Final = [f"angle_{leg}" for leg in LEGS]
+_MEASURED: Final = [(ANGLES, _CRANKS), (POSE, list(COORDINATE_NAMES))]
+_UNITS: Final = {
+    "time": {"s": 1.0},
+    **dict.fromkeys(_TORQUES, TORQUE_UNITS),
+    **dict.fromkeys([*_CRANKS, *COORDINATE_NAMES[:3]], ANGLE_UNITS),
+    **dict.fromkeys(COORDINATE_NAMES[3:], LENGTH_UNITS),
+}
+_HEADER: Final = (
+    "time[s], torque_1[N m] to torque_6, angle_1[rad] to angle_6 and, where it was measured, "
+    "roll[rad], pitch, yaw, x[m], y, z (or mN m, deg, mm)"
+)
+LEAST_STD: Final = np.repeat([1e-6, 1e-7, 1e-5, 1e-6], 3)
+"""Least standard deviation of a state, rad, m and per s: the error of the integration."""
+LEAST_ANGLE: Final = 1e-6
+"""Least standard deviation of a crank angle, rad."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,14 +61,14 @@ class Log:
 
     Attributes:
         name: of the file.
-        sent: (m,) s, when each torque was sent, increasing.
-        torques: (m, 6) N m, as far as the motors give them; each acts until the next one does.
-        times: (n,) s of the measurements, increasing.
-        values: (n, 18) crank angles, pose, rates, in rad, m and per s; NaN where there is none.
+        sent: (m,) increasing times of the torques, s.
+        torques: (m, 6) within the motors' limit, N m; each acts until the next one does.
+        times: (n,) increasing times of the measurements, s.
+        values: (n, 18) crank angles, pose, rates in rad, m and per s; NaN for a missing one.
         std: (18,) of their errors.
         gravity: m/s^2 along -z.
-        delay: s that was believed in, or None.
-        before: torques (6,) that act before the first of these does, or None where unknown.
+        delay: believed delay in s, or None.
+        before: torques (6,) that act before the first of these does, or None if unknown.
     """
 
     name: str
@@ -45,10 +82,240 @@ class Log:
     before: Array | None = None
 
     def acting(self, times: Array, delay: float) -> Array:
-        """Torques (k, 6) that act at so many instants in s; before any arrived, the first one."""
+        """Return the torques (k, 6) at instants (k,) in s; before any arrived, the first one."""
         last = np.searchsorted(self.sent + delay, times, side="right") - 1
         return self.torques[np.maximum(last, 0)]
 
     def measures(self, kind: slice) -> bool:
-        """Whether there is a value of a kind at all."""
+        """Return whether there is any value of a kind."""
         return bool(np.isfinite(self.values[:, kind]).any())
+
+
+def angle_std(bits: int) -> float:
+    """Return the standard deviation of a code's rounding, rad: its step over sqrt(12)."""
+    return 2 * math.pi / 2**bits / math.sqrt(12)
+
+
+class Precision(NamedTuple):
+    """Standard deviations of the measurements in a CSV log."""
+
+    angle: float = angle_std(14)
+    """rad."""
+    pose_angle: float = 1e-4
+    """rad."""
+    pose_position: float = 2e-5
+    """m."""
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (18,) of a log's measurements; a CSV log has no rates."""
+        pose = [self.pose_angle] * 3 + [self.pose_position] * 3
+        return np.array([self.angle] * 6 + pose + [np.inf] * 6)
+
+
+def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bool = True) -> Log:
+    """Read a log.
+
+    Args:
+        path: a file of `simulate` where it ends in .nc, else CSV.
+        mechanism: its motors' limit clips the torques of a CSV log.
+        precision: of a CSV log.
+        gravity: whether it acted, in a CSV log.
+
+    Raises:
+        ConfigError: one line, with the file, and row and column where there are such.
+    """
+    if path.suffix == ".nc":
+        return _of_run(path, mechanism)
+    return _of_csv(path, mechanism, precision, STANDARD_GRAVITY if gravity else 0.0)
+
+
+# ---------------------------------------------------------------- runs of simulate
+
+
+def _of_run(path: Path, mechanism: Mechanism) -> Log:
+    signals = load_netcdf(path, EXPECTED)
+    scenario = _scenario_of(path, signals)
+    problem = _run_problem(signals, scenario)
+    if problem:
+        raise ConfigError(f"{path}: {problem}; expected {EXPECTED}")
+    period, time = scenario.controller.period, signals.time.values
+    # Held signals show a sample's value from its instant on, and every sample has a row.
+    count = int(min(time[-1] / period + 1e-9, len(time))) + 1
+    samples: Array = period * np.arange(count, dtype=np.float64)
+    rows = np.minimum(np.searchsorted(time, samples - 1e-9), len(time) - 1)
+    seen = time[rows] < samples + period - 1e-9
+    if not seen.all():
+        raise ConfigError(
+            f"{path}: log_period: got a step of {np.diff(time, prepend=0.0).max():.4g} s, longer "
+            f"than the controller's {period:g} s; expected each of its samples in the log"
+        )
+    torques, believed = _sent(signals, scenario, samples, rows)
+    own = scenario.actuator.torque_limit
+    limit = mechanism.effort_limit if own is None else own
+    times, values, std = _measured(signals.measurement, scenario, samples, rows)
+    changing = scenario.queue == "reference" or isinstance(scenario.link, NetworkConfig)
+    return _checked(
+        Log(
+            name=str(path),
+            sent=samples,
+            torques=_limited(torques, limit),
+            times=times,
+            values=values,
+            std=std,
+            gravity=STANDARD_GRAVITY if scenario.plant.gravity else 0.0,
+            delay=believed if math.isfinite(believed) else None,
+            before=None if changing else signals.torque_applied.transpose("time", "leg").values[0],
+        ),
+        path,
+    )
+
+
+def _sent(
+    signals: xr.Dataset, scenario: Scenario, samples: Array, rows: NDArray[np.intp]
+) -> tuple[Array, float]:
+    """Return the torques (n, 6) that were sent at `samples` and arrived, and their delay in s.
+
+    Over a network other torques may act than were sent, but when they act is known: a bound later.
+    So the torques that acted then stand for those that were sent.
+    """
+    if not isinstance(scenario.link, NetworkConfig):
+        torques = signals.torque_commanded.transpose("time", "leg").values[rows]
+        return torques, float(signals.delay_estimate.values[-1])
+    eta, time = scenario.eta, signals.time.values
+    then = np.minimum(np.searchsorted(time, samples + eta - 1e-9), len(time) - 1)
+    return signals.torque_applied.transpose("time", "leg").values[then], eta
+
+
+def _measured(
+    signal: xr.DataArray, scenario: Scenario, samples: Array, rows: NDArray[np.intp]
+) -> tuple[Array, Array, Array]:
+    """Return instants (n,), values (n, 18) and their std (18,) of a run's measurements.
+
+    Args:
+        signal: of the record.
+        scenario: of the run.
+        samples: instants of the controller's samples, s.
+        rows: of the record that show them.
+    """
+    sensor, said = scenario.sensor, signal.transpose("time", ...).values[rows]
+    if isinstance(sensor, StateSensorConfig):
+        values = np.full((len(rows), NUM_MEASURED), np.nan)
+        values[:, POSE.start :] = said
+        noise = np.hypot(sensor.noise_std, LEAST_STD)
+        return samples, values, np.concatenate([np.full(6, np.inf), noise])
+    # Readings of the period before a sample, the oldest first; the first sample has none.
+    ago = np.arange(sensor.samples - 1, -1, -1) * scenario.controller.period / sensor.samples
+    times, angles = (samples[:, None] - ago).ravel(), said.reshape(-1, NUM_LEGS)
+    kept = times > -1e-9
+    values = np.full((kept.sum(), NUM_MEASURED), np.nan)
+    values[:, ANGLES] = angles[kept]
+    error = LEAST_ANGLE if sensor.bits is None else angle_std(sensor.bits)
+    return times[kept], values, np.concatenate([np.full(6, error), np.full(NUM_STATE, np.inf)])
+
+
+def _scenario_of(path: Path, signals: xr.Dataset) -> Scenario:
+    text = signals.attrs.get("scenario")
+    data = parse_yaml(text, f"{path}: scenario") if isinstance(text, str) else None
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: says nothing of its scenario; expected {EXPECTED}")
+    return validate(Scenario, with_new_names(data), f"{path}: scenario")
+
+
+def _run_problem(signals: xr.Dataset, scenario: Scenario) -> str | None:
+    """Return why a run cannot serve as a log, or None."""
+    sensor, measured = scenario.sensor, {"state": NUM_STATE}
+    if not isinstance(sensor, StateSensorConfig):
+        measured = {"encoder": NUM_LEGS * sensor.samples}
+    shapes: dict[str, dict[str, int]] = {
+        "torque_commanded": {"leg": NUM_TORQUES},
+        "torque_applied": {"leg": NUM_TORQUES},
+        "measurement": measured,
+        "delay_estimate": {},
+    }
+    for name, others in shapes.items():
+        if name not in signals.data_vars:
+            return f"{name} is missing"
+        found = {str(d): n for d, n in signals[name].sizes.items() if d != "time"}
+        if found != others or signals[name].dtype.kind != "f" or "time" not in signals[name].dims:
+            return f"{name} is no signal over time of {others or 'one number'}"
+    time = signals.time.values if "time" in signals.coords else np.empty(0)
+    if time.dtype.kind != "f" or not len(time) or not np.isfinite(time).all():
+        return "time is missing, or no number"
+    if not np.all(np.diff(time) > 0):
+        return "time does not increase"
+    if isinstance(scenario.link, NetworkConfig) and scenario.link.back is not None:
+        return "its measurements came over a network, each of an age of its own (link.return)"
+    if scenario.actuator.kind != "torque":
+        return f"its motors got no torques (actuator.kind {scenario.actuator.kind!r})"
+    if scenario.sensor.delay > 0:
+        return f"its measurements are {scenario.sensor.delay:g} s old (sensor.delay)"
+    return None
+
+
+def _limited(torques: Array, limit: float | str | None) -> Array:
+    """Return torques (n, 6) within the motors' limit."""
+    return torques if limit is None or isinstance(limit, str) else np.clip(torques, -limit, limit)
+
+
+# ---------------------------------------------------------------- CSV
+
+
+def _of_csv(path: Path, mechanism: Mechanism, precision: Precision, gravity: float) -> Log:
+    optional = _UNITS.keys() - {"time"}
+    table = read_table(path, EXPECTED, _HEADER, _UNITS, optional=optional)
+    time, torques = table.stacked(["time"])[:, 0], table.stacked(_TORQUES)
+    values = np.full((len(time), NUM_MEASURED), np.nan)
+    measured = [kind for kind in _MEASURED if table.columns.keys() & kind[1]]
+    for part, names in measured or _MEASURED[:1]:
+        values[:, part] = table.stacked(names)
+    for bad in 1 + np.flatnonzero(~(np.diff(time) > 0))[:1]:
+        raise ConfigError(
+            f"{table.place(bad, 'time')}: got {time[bad]:.9g} s after {time[bad - 1]:.9g} s; "
+            "expected increasing times"
+        )
+    told = np.isfinite(torques)
+    for bad in np.flatnonzero(told.any(axis=1) != told.all(axis=1))[:1]:
+        raise ConfigError(
+            f"{table.place(bad)}: got some of the six torques; expected all or none of them"
+        )
+    said = np.flatnonzero(told.all(axis=1))
+    # A repeated torque goes on acting, so only changes are kept.
+    changed = np.any(np.diff(torques[said], axis=0, prepend=np.nan) != 0, axis=1)
+    log = Log(
+        name=str(path),
+        sent=time[said][changed],
+        torques=_limited(torques[said][changed], mechanism.effort_limit),
+        times=time,
+        values=values,
+        std=precision.std,
+        gravity=gravity,
+    )
+    return _checked(log, path)
+
+
+# ---------------------------------------------------------------- both
+
+
+def _checked(log: Log, path: Path) -> Log:
+    """Return a log without empty rows, and with at most one row per `FINEST` s.
+
+    Raises:
+        ConfigError: there is too little in it.
+    """
+    if len(log.sent) < 2:
+        raise ConfigError(f"{path}: got one torque throughout; expected torques that change")
+    measured = np.flatnonzero(np.isfinite(log.values).any(axis=1))
+    kept, last = list[int](), -math.inf
+    for row in measured:
+        if log.times[row] - last > FINEST - 1e-6:
+            kept.append(int(row))
+            last = float(log.times[row])
+    values = log.values[kept]
+    count = int(np.isfinite(values).sum())
+    if count < _LEAST_VALUES:
+        raise ConfigError(
+            f"{path}: got {count} measured values, at {len(kept)} instants; expected at least "
+            f"{_LEAST_VALUES}"
+        )
+    return replace(log, times=log.times[kept], values=values)

@@ -40,7 +40,7 @@ NUM_DYNAMIC: Final = SHAPES["parameters"][0]
 
 
 class Numbers(NamedTuple):
-    """A machine as the model takes it."""
+    """Numbers of a machine."""
 
     parameters: Array
     """(NUM_DYNAMIC,) of the dynamics."""
@@ -72,7 +72,7 @@ class SymbolicLegs(NamedTuple):
 
 
 class Compiled(Buffered):
-    """A CasADi function behind its buffer interface; a plain call spends twice its time converting.
+    """CasADi function behind its buffer interface; a plain call spends twice its time converting.
 
     Arguments and results are dense.
     """
@@ -98,7 +98,7 @@ class Compiled(Buffered):
 
 
 class MachineModel:
-    """Accelerations and crank angles of a machine whose numbers may be any, and their derivatives.
+    """Accelerations and crank angles of a machine with any numbers, and their derivatives.
 
     Args:
         mechanism: bodies, motor frames and branches, which stay.
@@ -130,7 +130,7 @@ class MachineModel:
         return equations.assembled(sums, *rows, s["pose"], s["rates"])
 
     def _many(self, name: str, inputs: list[ca.SX], results: list[ca.SX], shared: int) -> Compiled:
-        """A function of so many points; the last `shared` inputs are the same for all."""
+        """Return a function of all points; the last `shared` inputs are the same for all."""
         one = ca.Function(name, inputs, [ca.densify(one) for one in results], {"cse": True})
         same = list(range(len(inputs) - shared, len(inputs)))
         return Compiled(one.map(name, "serial", self.points, same, []))
@@ -170,12 +170,12 @@ class MachineModel:
         return self._many("angles", [s["pose"], legs], [alpha, *slopes], 1)
 
     def accelerations(self, states: Array, torques: Array, numbers: Numbers) -> Array:
-        """(n, 6) of the pose, at states (n, 12) under torques (n, 6)."""
+        """Return the pose's accelerations (n, 6) at states (n, 12) under torques (n, 6)."""
         found: Array = self._accelerations(states[:, :6], states[:, 6:], torques, *numbers)[0]
         return found.reshape(self.points, NUM_COORDINATES)
 
     def slopes(self, states: Array, torques: Array, numbers: Numbers) -> Slopes:
-        """The same with derivatives."""
+        """Return the accelerations with their derivatives."""
         a = self.accelerations(states, torques, numbers)
         # CasADi's columns are numpy's rows, and points follow one another in columns.
         dF, MN = self._residual(states[:, :6], states[:, 6:], a, torques, *numbers)
@@ -185,7 +185,10 @@ class MachineModel:
         return Slopes(a, da[:, :, :NUM_STATE], da[:, :, NUM_STATE:])
 
     def crank_angles(self, poses: Array, numbers: Numbers) -> tuple[Array, Array, Array]:
-        """Angles (n, 6), d/dpose (n, 6, 6), d/dgeometry (n, 6, NUM_GEOMETRY); NaN out of reach."""
+        """Return angles (n, 6), d/dpose (n, 6, 6) and d/dgeometry (n, 6, NUM_GEOMETRY).
+
+        They are NaN out of reach.
+        """
         n = self.points
         alpha, by_pose, by_geometry = self._angles(poses, numbers.legs)
         return (
@@ -196,20 +199,18 @@ class MachineModel:
 
 
 class DrawnModel(MachineModel):
-    """The same machine with its legs as drawn: fifty times as fast, no derivatives by geometry."""
+    """Machine with its legs as drawn: fifty times as fast, zero derivatives by the geometry."""
 
     @cached_property
     def _dynamics(self) -> StewartDynamics:
         return StewartDynamics(self.mechanism, self.gravity, free=PLANT_PARAMETERS)
 
     def accelerations(self, states: Array, torques: Array, numbers: Numbers) -> Array:
-        """(n, 6) of the pose, at states (n, 12) under torques (n, 6)."""
         p, f = numbers.parameters, self._dynamics.accelerations
         pairs = zip(states, torques, strict=True)
         return np.array([f(x[POSE], x[RATES], torque, p) for x, torque in pairs])
 
     def slopes(self, states: Array, torques: Array, numbers: Numbers) -> Slopes:
-        """The same with derivatives, zero by the geometry."""
         p, f = numbers.parameters, self._dynamics.derivatives
         pairs = zip(states, torques, strict=True)
         found = [f(x[POSE], x[RATES], torque, p) for x, torque in pairs]

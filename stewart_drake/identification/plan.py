@@ -1,7 +1,15 @@
-"""What a log would tell: a motion that excites, and the covariance that its log will leave.
+"""Design of an experiment: an exciting motion, and the covariance after its log.
+
+The motion is a sum of sines in all coordinates, inside the workspace. Coordinate i of six moves by
+
+    q_i(t) = q_0i + w(t) a_i sum_j cos(2 pi f_ij t + phi_ij) / f_ij.
+
+Its frequencies f_ij = low + (j + i/6) (high - low) / n are its own. Phases are spread evenly over
+the turn by the golden sequence, so that no two coordinates move alike. The window w rises from rest
+and falls to rest, and a_i gives the peak asked for.
 
 The information of measurements does not depend on their values: along the motion, under the torques
-that hold to it, J'J is known before anything has moved (Fisher's information).
+that follow it, J'J is known before anything has moved (Fisher's information).
 """
 
 import dataclasses
@@ -13,8 +21,8 @@ import numpy as np
 from pydrake.trajectories import PiecewisePolynomial
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification.excitation import fitted_multisine
 from stewart_drake.identification.fit import Evaluator, Guess, Problem, covariance, followed
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
@@ -23,6 +31,7 @@ from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import DELAY, NAMES, UNITS, Unknowns, unknowns_of
 from stewart_drake.law.holds import mean_torques
 from stewart_drake.loop.experiment import Experiment, motion_scale
+from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.reference_config import CsvConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES, COORDINATE_UNITS, NUM_STATE
@@ -31,19 +40,31 @@ from stewart_drake.types import Array
 
 MOTION: Final = "motion.csv"
 _EVERY: Final = 0.02
-"""s between two measurements of the log that is foreseen."""
+"""Time between two measurements of the foreseen log, s."""
+GRID: Final = 0.02
+"""s between two samples of the motion."""
+_LINES: Final = 5
+_LOW: Final = 0.1
+_HIGH: Final = 0.7
+"""Hz."""
+_GOLDEN: Final = (np.sqrt(5) - 1) / 2
+_RISE: Final = 2.0
+"""s."""
+_ROOM: Final = 0.5
+"""Of the workspace's margin at the middle of the motion, what is left at least."""
+_LEAST_SHARE: Final = 0.05
 
 
 @dataclass(frozen=True)
 class Plan:
-    """An experiment, and what it will tell.
+    """Experiment and the expected accuracy of its identification.
 
     Attributes:
-        scenario: the motion of `MOTION` in the place of the scenario's own.
-        share: of the amplitude that was asked for, what fits the workspace.
+        scenario: with the motion of the file `MOTION`.
+        share: part of the requested amplitude that fits the workspace.
         times, poses: (n,) s and (n, 6) rad and m, of the motion.
-        unknowns: as they are known now.
-        covariance: (k, k) of the free ones, after the log.
+        unknowns: before the log.
+        covariance: (k, k) of the free ones after the log.
     """
 
     scenario: Scenario
@@ -55,12 +76,11 @@ class Plan:
 
     @cached_property
     def unseen(self) -> tuple[int, list[str]]:
-        """How many directions the log will not see, and what they are."""
+        """Number and names of the directions that the log will not show."""
         return unseen(self.unknowns, self.covariance)
 
     @cached_property
     def pose_uncertainty(self) -> PoseUncertainty:
-        """Over the workspace, after the log."""
         middle = np.median(self.poses, axis=0)
         found = pose_uncertainty(self.unknowns, self.unknowns.mean, self.covariance, middle)
         assert found is not None, "a planned motion stays inside the workspace"
@@ -68,14 +88,12 @@ class Plan:
 
     @property
     def std(self) -> Array:
-        """Standard deviations of all unknowns after the log, 0 of what is known."""
-        found = np.zeros(len(NAMES))
-        found[self.unknowns.free] = np.sqrt(np.diag(self.covariance))
-        return found
+        """Standard deviations of all unknowns after the log, 0 for known ones."""
+        return np.sqrt(np.diag(self.unknowns.whole(self.covariance)))
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` holds."""
+        """Content of `summary.json`."""
         free = self.unknowns.free
         return {
             "mechanism": self.unknowns.mechanism.name,
@@ -95,12 +113,53 @@ class Plan:
 
     @property
     def motion_csv(self) -> str:
-        """The motion as a reference of kind csv reads it."""
+        """Motion as a file for a reference of kind csv."""
         names = zip(COORDINATE_NAMES, COORDINATE_UNITS, strict=True)
         lines = [",".join(["time[s]", *(f"{name}[{unit}]" for name, unit in names)])]
         rows = np.column_stack([self.times, self.poses])
         lines += [",".join(f"{value:.12g}" for value in row) for row in rows]
         return "\n".join(lines) + "\n"
+
+
+def multisine(middle: Array, peak: Array, duration: float) -> tuple[Array, Array]:
+    """Times (n,) in s and poses (n, 6).
+
+    Args:
+        middle: (6,) pose.
+        peak: (6,) of each coordinate's departure from it, rad and m.
+        duration: s.
+    """
+    time = GRID * np.arange(round(duration / GRID) + 1)
+    line, coordinate = np.arange(_LINES)[:, None], np.arange(6) / 6
+    frequency = _LOW + (line + coordinate) * (_HIGH - _LOW) / _LINES
+    phase = 2 * np.pi * _GOLDEN * (line + _LINES * np.arange(6))
+    waves = np.cos(2 * np.pi * frequency * time[:, None, None] + phase) / frequency
+    rise = min(_RISE, duration / 4)
+    y = np.clip(np.minimum(time, time[-1] - time) / rise, 0, 1)[:, None]
+    window = y**4 * (35 - 84 * y + 70 * y**2 - 20 * y**3)  # three derivatives vanish at both ends
+    moved = window * waves.sum(axis=1)
+    poses: Array = middle + peak * moved / np.abs(moved).max(axis=0)
+    return np.asarray(time, np.float64), poses
+
+
+def fitted_multisine(
+    mechanism: Mechanism, middle: Array, peak: Array, duration: float
+) -> tuple[Array, Array, float]:
+    """Return a multisine that stays well inside the workspace, and its share of `peak`.
+
+    Raises:
+        ConfigError: not even a twentieth of it fits.
+    """
+    least, share = _ROOM * margin(mechanism, middle), 1.0
+    while share > _LEAST_SHARE:
+        time, poses = multisine(middle, share * peak, duration)
+        if min(margin(mechanism, pose) for pose in poses) > least:
+            return time, poses, share
+        share *= 0.9
+    raise ConfigError(
+        f"--plan: got a motion of which not even {100 * _LEAST_SHARE:g} % fits the workspace; "
+        "expected a smaller one, around a pose with room on all sides"
+    )
 
 
 def plan(
@@ -110,12 +169,12 @@ def plan(
     amplitude: float = 0.5,
     duration: float = 20.0,
 ) -> Plan:
-    """A motion around the scenario's, and what its log will tell.
+    """Plan an experiment with a motion around the scenario's.
 
     Args:
-        experiment: of the scenario whose machine, period and delay they are.
-        std: (18,) of the measurements, as of a log, infinite for what will not be measured.
-        tolerances: how far the machine may be off, the defaults if None.
+        experiment: with the machine, period and delay.
+        std: (18,) of the measurements, as of a log; infinite for values that will be missing.
+        tolerances: of the machine, the defaults if None.
         amplitude: share of the scenario's motion.
         duration: s.
 
@@ -159,7 +218,7 @@ def plan(
 def _foreseen(
     experiment: Experiment, motion: PiecewisePolynomial, end: float, std: Array
 ) -> tuple[Log, Array]:
-    """The log that a controller would leave that holds to the motion, and its states (n, 12)."""
+    """Return the log of a controller that follows the motion exactly, and its states (n, 12)."""
     sc, mechanism = experiment.scenario, experiment.mechanism
     dynamics = StewartDynamics(mechanism, experiment.nominal.gravity)
     period, eta = sc.controller.period, sc.eta

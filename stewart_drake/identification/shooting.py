@@ -1,6 +1,6 @@
 """Trajectories of a machine under held torques that come late, with their sensitivities.
 
-A log is cut into segments, each with a first state of its own; all are integrated side by side.
+A log is cut into segments, each with a free first state, which are integrated side by side.
 With x_dot = f(x, T; p) the sensitivity S = dx/d[x_0; p; delay] obeys
 
     S_dot = A S + df/dp,   S = [1, 0, 0] at the start,
@@ -30,7 +30,7 @@ NUMBERS: Final = slice(NUM_STATE, NUM_STATE + NUM_DYNAMIC + NUM_GEOMETRY)
 
 
 class Segment(NamedTuple):
-    """A stretch of a log that is integrated from a state of its own."""
+    """Stretch of a log that is integrated from a free first state."""
 
     log: Log
     start: float
@@ -40,7 +40,7 @@ class Segment(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Steps (m,) of n segments side by side, (m, n); one that is done waits in steps of 0 s."""
+    """Steps (m, n) of n segments side by side, s; a segment that has ended waits in steps of 0."""
 
     h: Array
     torques: Array
@@ -61,7 +61,7 @@ class Course(NamedTuple):
 
 
 def plan_steps(segments: list[Segment], delay: float, longest_step: float) -> Plan:
-    """The steps from sample to sample and from torque to torque; times in s."""
+    """Return the steps from sample to sample and from torque to torque; times in s."""
     plans = [_steps_of(segment, delay, longest_step) for segment in segments]
     longest = max(len(h) for h, *_ in plans)
     joined = Plan(
@@ -114,10 +114,9 @@ def integrate(
     course = Course(
         np.full((count, n, NUM_STATE), np.nan), np.zeros((count, n, NUM_STATE, columns))
     )
-    step = _sensitive_step if sensitive else _step
     with np.errstate(all="ignore"):
         for h, torques, after, sample in zip(*plan, strict=True):
-            x, S = step(model, numbers, x, S, torques, h)
+            x, S = _step(model, numbers, x, S, torques, h)
             if sensitive and np.any(torques != after):
                 old = model.accelerations(x, torques, numbers)
                 S[:, RATES, -1] += old - model.accelerations(x, after, numbers)
@@ -130,24 +129,15 @@ def integrate(
 def _step(
     model: MachineModel, numbers: Numbers, x: Array, S: Array, torques: Array, h: Array
 ) -> tuple[Array, Array]:
-    h = h[:, None]
+    """Return states and sensitivities after a step of the classical Runge-Kutta method.
 
-    def f(x: Array) -> Array:
-        return np.hstack([x[:, RATES], model.accelerations(x, torques, numbers)])
-
-    k1 = f(x)
-    k2 = f(x + h / 2 * k1)
-    k3 = f(x + h / 2 * k2)
-    k4 = f(x + h * k3)
-    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), S
-
-
-def _sensitive_step(
-    model: MachineModel, numbers: Numbers, x: Array, S: Array, torques: Array, h: Array
-) -> tuple[Array, Array]:
-    """Derivatives of the step above, exact: stage by stage by the chain rule."""
+    The sensitivities are exact derivatives of the step, stage by stage by the chain rule. They may
+    have no columns.
+    """
 
     def f(x: Array, S: Array) -> tuple[Array, Array]:
+        if not S.size:
+            return np.hstack([x[:, RATES], model.accelerations(x, torques, numbers)]), S
         at = model.slopes(x, torques, numbers)
         S_dot = np.empty_like(S)
         S_dot[:, :6] = S[:, 6:]

@@ -7,7 +7,7 @@ the best of these the machine with free geometry is fitted to segments of full l
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -15,16 +15,14 @@ from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification import start
 from stewart_drake.identification.fit import (
+    ASTRAY,
     MOST_ITERATIONS,
-    Fit,
     Guess,
     Problem,
-    chi2_per_value,
+    Solution,
     finer,
     followed,
-    misfit,
     solve,
-    without,
 )
 from stewart_drake.identification.logs import Log
 from stewart_drake.identification.shooting import Segment
@@ -49,8 +47,6 @@ _FEW: Final = 4
 """Iterations of the scan at each delay."""
 _LOST: Final = 1e4
 """chi^2 per value of a segment that cannot be followed."""
-_ASTRAY: Final = 1e3
-"""chi^2 per value from which on a fit is not refined but tried without its worst segment."""
 _RIVAL: Final = 30.0
 """Factor of the least chi^2 of the scan, or of 1, up to which other delays are fitted too."""
 _STARTS: Final = 3
@@ -69,59 +65,6 @@ _VAGUE: Final = 1e-3
 """Largest standard deviation of a delay that is accepted, s."""
 
 
-class ShortFit(NamedTuple):
-    """Fit of segments of logs."""
-
-    whole: Problem
-    """All segments."""
-    problem: Problem
-    """Segments that were fitted."""
-    begun: Guess
-    """Start of the fit."""
-    fit: Fit
-
-    @property
-    def delay(self) -> float:
-        """Delay found, s."""
-        return float(self.fit.guess.values[DELAY])
-
-    @property
-    def delay_std(self) -> float:
-        """Standard deviation of the delay, s, the last of the unknowns."""
-        variance: float = self.fit.covariance[-1, -1]
-        return float(np.sqrt(variance))
-
-    @property
-    def left_out(self) -> int:
-        """Number of segments that were not fitted."""
-        return len(self.whole.segments) - len(self.problem.segments)
-
-    @property
-    def share(self) -> float:
-        """Share of the values of all segments that was fitted."""
-        return self.problem.count / self.whole.count
-
-    @property
-    def chi2(self) -> float:
-        """chi^2 per value that was fitted."""
-        return chi2_per_value(self.fit.residuals, self.problem)["all"]
-
-    @property
-    def cost(self) -> float:
-        """chi^2 per value of all segments, `_LOST` for those that could not be followed."""
-        return self.share * self.chi2 + (1 - self.share) * _LOST
-
-    @property
-    def changes(self) -> int:
-        """Number of changes of the torques within the segments that were fitted."""
-        spans = [(s.log.sent[1:] + self.delay, s) for s in self.problem.segments]
-        return sum(int(np.sum((t > s.start) & (t < s.log.times[s.rows[-1]]))) for t, s in spans)
-
-    def explains(self, worst: float) -> bool:
-        """Return whether most values are fitted, with a chi^2 of at most `worst` per value."""
-        return self.chi2 <= worst and self.share > _MOST and self.changes >= _CHANGES
-
-
 def length_needed(unknowns: Unknowns) -> float:
     """Return the length in s from which on a log is not short."""
     return float(unknowns.mean[DELAY] + 3 * unknowns.std[DELAY] + _RESPONSE)
@@ -130,7 +73,7 @@ def length_needed(unknowns: Unknowns) -> float:
 @np.errstate(all="ignore")
 def fit_short(
     logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns, worst: float
-) -> ShortFit:
+) -> Solution:
     """Return the fit with the only delay that explains the logs.
 
     Args:
@@ -143,15 +86,15 @@ def fit_short(
         ConfigError: no delay, or more than one, explains the logs; names the length needed.
     """
     pairs = [_inside(*pair, unknowns.mechanism) for pair in zip(logs, poses, strict=True)]
-    right = list[ShortFit]()
+    right = list[Solution]()
     for values in _scanned(pairs, unknowns):
         with suppress(np.linalg.LinAlgError):  # a trajectory grew beyond all bounds
             one = _grown(pairs, unknowns, values)
-            if one and one.explains(worst) and _apart(one, right):
+            if one and _explains(one, worst) and _apart(one, right):
                 right.append(one)
-    if len(right) == 1 and right[0].delay_std <= _VAGUE:
+    if len(right) == 1 and _std(right[0]) <= _VAGUE:
         return right[0]
-    told = " and ".join(f"{one.delay:.3g} s (+-{1e3 * one.delay_std:.2g} ms)" for one in right)
+    told = " and ".join(f"{_delay(one):.3g} s (+-{1e3 * _std(one):.2g} ms)" for one in right)
     longest = max(logs, key=lambda log: len(log.times))
     raise ConfigError(
         f"{longest.name}: got a log of {longest.times[-1] - longest.times[0]:.3g} s, explained by "
@@ -178,7 +121,7 @@ def _inside(log: Log, poses: Array, mechanism: Mechanism) -> Pair:
 
 def _scanned(pairs: Sequence[Pair], unknowns: Unknowns) -> list[Array]:
     """Return values of the unknowns at the delays that explain the logs best."""
-    std, found = unknowns.std.copy(), list[ShortFit]()
+    std, found = unknowns.std.copy(), list[Solution]()
     std[GEOMETRY] = 0.0
     middle, reach = unknowns.mean[DELAY], 3 * std[DELAY]
     for delay in np.arange(max(0.0, middle - reach), middle + reach + _GRID / 2, _GRID):
@@ -187,17 +130,43 @@ def _scanned(pairs: Sequence[Pair], unknowns: Unknowns) -> list[Array]:
         with suppress(np.linalg.LinAlgError):
             one = _fitted(pairs, replace(unknowns, std=std), values, _SCANNED, _FEW)
             found += [one] if one else []
-    found.sort(key=lambda one: one.cost)
-    kept = list[ShortFit]()
+    found.sort(key=_cost)
+    kept = list[Solution]()
     for one in found:
-        if one.cost <= _RIVAL * max(1.0, found[0].cost) and _apart(one, kept):
+        if _cost(one) <= _RIVAL * max(1.0, _cost(found[0])) and _apart(one, kept):
             kept.append(one)
     return [one.fit.guess.values for one in kept[:_STARTS]]
 
 
-def _apart(one: ShortFit, others: Sequence[ShortFit]) -> bool:
+def _apart(one: Solution, others: Sequence[Solution]) -> bool:
     """Return whether the delay of a fit differs from those of others."""
-    return all(abs(one.delay - other.delay) > _APART for other in others)
+    return all(abs(_delay(one) - _delay(other)) > _APART for other in others)
+
+
+def _delay(one: Solution) -> float:
+    return float(one.fit.guess.values[DELAY])
+
+
+def _std(one: Solution) -> float:
+    """Return the standard deviation of the delay, s, the last of the unknowns."""
+    return float(np.sqrt(one.fit.covariance[-1, -1]))
+
+
+def _share(one: Solution) -> float:
+    """Return the share of the values of all segments that was fitted."""
+    return one.problem.count / one.whole.count
+
+
+def _cost(one: Solution) -> float:
+    """Return chi^2 per value of all segments, `_LOST` for those that could not be followed."""
+    return _share(one) * one.chi2 + (1 - _share(one)) * _LOST
+
+
+def _explains(one: Solution, worst: float) -> bool:
+    """Return whether most values are fitted, with a chi^2 of at most `worst` per value."""
+    spans = [(s.log.sent[1:] + _delay(one), s) for s in one.problem.segments]
+    changes = sum(int(np.sum((t > s.start) & (t < s.log.times[s.rows[-1]]))) for t, s in spans)
+    return one.chi2 <= worst and _share(one) > _MOST and changes >= _CHANGES
 
 
 def _fitted(
@@ -206,28 +175,26 @@ def _fitted(
     values: Array,
     longest: float = np.inf,
     most: int = MOST_ITERATIONS,
-) -> ShortFit | None:
+) -> Solution | None:
     """Return the fit from a start, with segments of `longest` s; None if none can be followed."""
     segments, first, delay = list[Segment](), list[Array](), float(values[DELAY])
     for log, poses in pairs:
-        length = start.segment_length(log, poses, unknowns.mechanism, delay)
-        begin = float(log.sent[0]) + delay + _LATE
-        try:
-            parts = start.segments_of(log, begin, min(longest, length))
-        except ConfigError:  # too little of this log is left after the delay
-            continue
-        segments += parts
-        first += [start.first_state(log, poses, int(part.rows[0])) for part in parts]
+        with suppress(ConfigError):  # too little of this log is left after the delay
+            parts = start.segments_and_states(
+                log, poses, unknowns.mechanism, delay, _LATE, longest=longest
+            )
+            segments += parts[0]
+            first += parts[1]
     if not segments:
         return None
     whole = Problem(segments, unknowns, _STEP)
     problem, guess = followed(whole, Guess(values, np.array(first)))
     if not problem.segments:
         return None
-    return ShortFit(whole, problem, guess, solve(problem, guess, most))
+    return Solution(whole, problem, guess, solve(problem, guess, most))
 
 
-def _grown(pairs: Sequence[Pair], unknowns: Unknowns, values: Array) -> ShortFit | None:
+def _grown(pairs: Sequence[Pair], unknowns: Unknowns, values: Array) -> Solution | None:
     """Return the fit to segments of full length, with steps that are short enough.
 
     At most one segment of each log is left out, such as the last before the plate was lost.
@@ -236,15 +203,13 @@ def _grown(pairs: Sequence[Pair], unknowns: Unknowns, values: Array) -> ShortFit
     if one is None:
         return None
     for _ in pairs:
-        if one.chi2 <= _ASTRAY or len(one.problem.segments) == 1:
+        if one.chi2 <= ASTRAY or len(one.problem.segments) == 1:
             break
-        worst = int(misfit(one.fit.residuals, one.problem).argmax())
-        problem, begun = without(one.problem, one.begun, worst)
-        one = one._replace(problem=problem, begun=begun, fit=solve(problem, begun))
-    while one.chi2 <= _ASTRAY:
+        one = one.without_worst()
+    while one.chi2 <= ASTRAY:
         away = max(1.0, float(np.sqrt(np.mean(one.fit.residuals.measured**2))))
         halved = finer(one.problem, one.fit.guess, away)
         if halved is None:
             break
-        one = one._replace(problem=halved, fit=solve(halved, one.fit.guess))
+        one = one.refitted(halved)
     return one

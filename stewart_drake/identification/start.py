@@ -1,4 +1,4 @@
-"""Where to begin: poses from what was measured, segments, and their first states."""
+"""Start of a fit: measured poses, segments, their first states, and a coarse delay."""
 
 from typing import Final
 
@@ -18,27 +18,26 @@ from stewart_drake.types import Array
 
 LONGEST: Final = 2.0
 SHORTEST: Final = 0.2
-"""s of a segment."""
+"""Length of a segment, s."""
 _GROWTHS: Final = 3.0
-"""Over a segment a small error grows at most e to this."""
+"""Largest exponent of the growth of an error over a segment."""
 _LOOKS: Final = 40
-"""Instants at which it is asked how fast errors grow."""
+"""Number of instants at which the growth of errors is computed."""
 _CUBIC: Final = 0.3
-"""s over which a cubic is laid through the poses to find rates."""
+"""Length of the cubic that gives rates, s."""
 _LEAST_ROWS: Final = 4
 _FEWEST: Final = 8
-"""Poses that rates are taken from, at least."""
+"""Least number of poses that give rates."""
 _WINDOW: Final = 0.3
-"""s of the motion, at least, from which an acceleration is taken,"""
+"""Least length of the polynomial that gives an acceleration, s."""
 _DEGREE: Final = 4
-"""by a polynomial of this degree."""
 _GRID: Final = 0.01
-"""s between two delays that are tried."""
+"""Step of the delays, s."""
 _LEAST_WINDOWS: Final = 8
 
 
 def measured_poses(log: Log, mechanism: Mechanism) -> Array:
-    """The plate's pose (n, 6) at the log's instants, of the sensor or from the crank angles.
+    """Return the plate's poses (n, 6) at the log's instants, measured or from the crank angles.
 
     Raises:
         ConfigError: no pose of this mechanism has such angles.
@@ -61,11 +60,7 @@ def measured_poses(log: Log, mechanism: Mechanism) -> Array:
 
 
 def check_poses(log: Log, poses: Array) -> None:
-    """Refuse a log that tells too few whole poses (n, 6) to begin with.
-
-    Raises:
-        ConfigError: one line.
-    """
+    """Refuse a log with too few whole poses (n, 6) for a start."""
     count = int(np.isfinite(poses).all(axis=1).sum())
     if count < _FEWEST:
         raise ConfigError(
@@ -77,10 +72,10 @@ def check_poses(log: Log, poses: Array) -> None:
 def coarse_delay(
     log: Log, poses: Array, mechanism: Mechanism, believed: float, std: float
 ) -> float:
-    """The delay in s with which the torques suit the motion best, to some hundredths of a second.
+    """Return the delay in s with which the torques suit the motion best, to some hundredths.
 
-    Where the true one is further off than a swing of the motion lasts, iterations from a belief end
-    elsewhere. A polynomial of degree four through the poses of a window gives pose, rates and
+    If the true delay is off by more than a swing of the motion, iterations from the believed one
+    end elsewhere. A polynomial of degree four through the poses of a window gives pose, rates and
     accelerations in its middle, the drawing's inverse dynamics the torque for them, smoothed by
     about (1 - s^2)^2 over the window. It is compared with the torques that were sent, smoothed
     alike and late by each delay within three standard deviations of the belief.
@@ -109,8 +104,10 @@ def coarse_delay(
 def _misfit(
     needed: Array, middles: Array, delay: float, log: Log, span: Array, weights: Array
 ) -> float:
-    """Mean square of torques needed less those that act, whatever the bias, as a share of the
-    former's own: late delays leave fewer windows to compare, in which less may have moved."""
+    """Return the variance of torques needed less those that act, as a share of the former's.
+
+    Late delays leave fewer windows to compare, in which less may have moved.
+    """
     there = np.isfinite(needed).all(axis=1) & (middles + span[0] >= log.sent[0] + delay)
     if there.sum() < _LEAST_WINDOWS:
         return np.inf
@@ -122,7 +119,7 @@ def _misfit(
 
 
 def segment_length(log: Log, poses: Array, mechanism: Mechanism, delay: float) -> float:
-    """How long a trajectory can be without errors growing too much, s."""
+    """Return the time in s over which errors of a trajectory stay small."""
     dynamics = StewartDynamics(mechanism, log.gravity)
     known = np.flatnonzero(np.isfinite(poses).all(axis=1))
     fastest = 1e-9
@@ -135,7 +132,7 @@ def segment_length(log: Log, poses: Array, mechanism: Mechanism, delay: float) -
 
 
 def segments_of(log: Log, start: float, length: float) -> list[Segment]:
-    """The log from `start` in s on, cut into equal parts; those with few values join the next.
+    """Return equal parts of the log from `start` in s on; those with few values join the next.
 
     Raises:
         ConfigError: nothing is left of the log.
@@ -163,8 +160,30 @@ def segments_of(log: Log, start: float, length: float) -> list[Segment]:
     return segments
 
 
+def segments_and_states(
+    log: Log,
+    poses: Array,
+    mechanism: Mechanism,
+    delay: float,
+    late: float,
+    share: float = 1.0,
+    longest: float = np.inf,
+) -> tuple[list[Segment], list[Array]]:
+    """Return segments from the arrival of the first torque on, and their first states (12,).
+
+    They last a `share` of the usual length, at most `longest` s. The delay in s may be longer by
+    `late`.
+
+    Raises:
+        ConfigError: see `segments_of`.
+    """
+    length = min(longest, share * segment_length(log, poses, mechanism, delay))
+    segments = segments_of(log, float(log.sent[0]) + delay + late, length)
+    return segments, [first_state(log, poses, int(segment.rows[0])) for segment in segments]
+
+
 def first_state(log: Log, poses: Array, row: int) -> Array:
-    """State (12,) at a row: as measured, or of a cubic through the poses (n, 6) from there on."""
+    """Return the state (12,) at a row, measured or of a cubic through the next poses (n, 6)."""
     rates = log.values[row, MEASURED_RATES]
     if np.isfinite(rates).all() and np.isfinite(poses[row]).all():
         return np.concatenate([poses[row], rates])

@@ -1,7 +1,7 @@
-"""What is not known of a machine and its delay: names, how far off it may be, what it changes.
+"""Unknowns of a machine and its delay, and their prior.
 
 The vector of unknowns is [parameters of the dynamics; numbers of the legs; offsets of the encoders;
-delay]. What has no tolerance is taken as it is.
+delay]. An unknown without a tolerance is fixed.
 """
 
 import dataclasses
@@ -49,17 +49,17 @@ NAMES: Final = (
 )
 UNITS: Final = (*PLANT_PARAMETER_UNITS, *("m",) * NUM_GEOMETRY, *("rad",) * NUM_LEGS, "s")
 ONE_SIDED: Final = (DAMPING, COULOMB)
-"""What no machine has less than nothing of."""
+"""Unknowns that are not negative."""
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What is taken for what before the logs are looked at.
+    """Prior of the unknowns.
 
     Attributes:
         mechanism: as drawn.
         mean: (NUM_UNKNOWNS,) in SI units.
-        std: (NUM_UNKNOWNS,), 0 where it is known.
+        std: (NUM_UNKNOWNS,), 0 for known ones.
     """
 
     mechanism: Mechanism
@@ -68,23 +68,29 @@ class Unknowns:
 
     @property
     def free(self) -> NDArray[np.intp]:
-        """Places of what is not known."""
+        """Places of the unknowns with a tolerance."""
         return np.flatnonzero(self.std > 0)
 
     def numbers(self, values: Array) -> Numbers:
-        """The machine that values (NUM_UNKNOWNS,) of the unknowns describe, for the model."""
+        """Return the numbers of the machine with values (NUM_UNKNOWNS,) of the unknowns."""
         legs = geometry_of(self.mechanism)[: LEG_NUMBERS * NUM_LEGS].reshape(-1, NUM_LEGS).T.copy()
         legs[:, LEG_PLACES] = values[GEOMETRY].reshape(NUM_LEGS, -1)
         return Numbers(values[DYNAMIC], legs)
 
+    def whole(self, covariance: Array) -> Array:
+        """Return the covariance of all unknowns, 0 for known ones, from that of the free ones."""
+        found = np.zeros((NUM_UNKNOWNS, NUM_UNKNOWNS))
+        found[np.ix_(self.free, self.free)] = covariance
+        return found
+
     def without_encoders(self) -> "Unknowns":
-        """Where no crank angle is measured there are no offsets."""
+        """Return the unknowns without offsets of encoders."""
         std = self.std.copy()
         std[OFFSETS] = 0.0
         return dataclasses.replace(self, std=std)
 
     def machine(self, values: Array) -> Mechanism:
-        """The same as a mechanism.
+        """Return the mechanism with values (NUM_UNKNOWNS,) of the unknowns.
 
         Raises:
             ConfigError, UnreachablePoseError: no such machine can be assembled at home.
@@ -102,7 +108,7 @@ class Unknowns:
 def unknowns_of(
     mechanism: Mechanism, tolerances: Tolerances, delay: float, torque: float, speed: float
 ) -> Unknowns:
-    """The unknowns of a machine.
+    """Return the prior of a machine's unknowns.
 
     Args:
         mechanism: as drawn.

@@ -113,11 +113,11 @@ def file_names(logs: Sequence[Log]) -> list[str]:
 
 def _cautions(found: Identification) -> list[str]:
     told = []
-    if found.left_out:
-        stretches = "stretch" if found.left_out == 1 else "stretches"
+    left_out = found.solution.left_out
+    if left_out:
+        stretches = "stretch" if left_out == 1 else "stretches"
         told.append(
-            f"{found.left_out} {stretches} of the logs left out, where no trajectory could be "
-            "followed"
+            f"{left_out} {stretches} of the logs left out, where no trajectory could be followed"
         )
     beyond = np.abs(found.fit.residuals.prior) > 4
     if beyond.any():

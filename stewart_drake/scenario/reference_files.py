@@ -3,42 +3,40 @@
 Readers return `(times, poses)`: times (n,) s, poses (n, 6) [roll, pitch, yaw, x, y, z] rad and m.
 """
 
-import itertools
 import math
-import re
-from array import array
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final
 
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from stewart_drake.files.csvio import csv_rows, read_columns, read_lines
+from stewart_drake.files.csvio import ANGLE_UNITS, LENGTH_UNITS, read_table
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.yamlio import brief, load_yaml, validate
+from stewart_drake.files.yamlio import load_yaml, validate
 from stewart_drake.scenario.field_types import Row, Seconds
 from stewart_drake.scenario.reference_config import WaypointsConfig
+from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.scenario.smoothness import roughest
 from stewart_drake.types import Array
 
-_ANGLES: Final = ("roll", "pitch", "yaw")
-_COLUMNS: Final = ("time", *_ANGLES, "x", "y", "z")
 _POSE: Final = "pose_"
-"""Before a coordinate's name in the files that `export` writes."""
+"""Prefix of a coordinate's name in the files that `export` writes."""
 _UNITS: Final = {
     "time": {"s": 1.0},
-    **{name: {"rad": 1.0, "deg": math.pi / 180} for name in _ANGLES},
-    **{name: {"m": 1.0, "mm": 1e-3} for name in ("x", "y", "z")},
+    **dict.fromkeys(COORDINATE_NAMES[:3], ANGLE_UNITS),
+    **dict.fromkeys(COORDINATE_NAMES[3:], LENGTH_UNITS),
 }
 _HEADER: Final = "time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m] (or deg, mm)"
-_MAX_BYTES: Final = 50_000_000
 _MIN_ROWS: Final = 4
-"""What a cubic through the samples with free ends needs."""
+"""Least number for a cubic with free ends."""
 _MIN_STEP: Final = 1e-6
+"""s."""
 _MAX_GAP: Final = 10
-"""Times the median step."""
+"""Largest step over the median step."""
 _MAX_SIZE: Final = 1e3
+"""rad or m."""
 
 
 @dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
@@ -48,7 +46,7 @@ class _WaypointFile:
 
 
 def waypoints(config: WaypointsConfig) -> tuple[Array, Array]:
-    """The waypoints of a scenario's section, from its lists or its file.
+    """Return the waypoints of a scenario's section, from its lists or its file.
 
     Raises:
         ConfigError: see `read_waypoints` and `check_waypoints`.
@@ -61,7 +59,7 @@ def waypoints(config: WaypointsConfig) -> tuple[Array, Array]:
 
 
 def read_waypoints(path: str | Path) -> tuple[Array, Array]:
-    """Reads `times` (s) and `poses` (rad, m) from a YAML file.
+    """Read `times` (s) and `poses` (rad, m) from a YAML file.
 
     Raises:
         ConfigError: see `load_yaml`, `validate` and `check_waypoints`.
@@ -73,230 +71,124 @@ def read_waypoints(path: str | Path) -> tuple[Array, Array]:
 def check_waypoints(
     times: list[float], poses: list[list[float]], where: str
 ) -> tuple[Array, Array]:
-    """Waypoints as arrays.
+    """Return waypoints as arrays.
 
     Args:
         times: s.
         poses: one of six numbers per time, rad and m.
-        where: what precedes the field's name in messages.
+        where: opening of a message, before the field's name.
 
     Raises:
-        ConfigError: as many poses as times are expected; times increase; poses lie where roll,
-            pitch and yaw are distinct and do not jump by a turn.
+        ConfigError: there is not one pose per time, or see `_check_samples`.
     """
     if len(poses) != len(times):
         raise ConfigError(
             f"{where}poses: got {len(poses)} poses; expected {len(times)}, one per time"
         )
-    for row in range(len(times)):
-        label = f"{where}times[{row}]"
-        if row and times[row] - times[row - 1] < _MIN_STEP:
-            raise ConfigError(
-                f"{label}: got {times[row]!r} after {times[row - 1]!r}; expected increasing times"
-            )
-        for column in range(6):
-            before = poses[row - 1][column] if row else None
-            problem = _pose_problem(column, poses[row][column], before)
-            if problem:
-                raise ConfigError(f"{where}poses[{row}][{column}]: {problem}")
-    return np.array(times), np.array(poses)
+
+    def place(row: int, name: str) -> str:
+        if name == "time":
+            return f"{where}times[{row}]"
+        return f"{where}poses[{row}][{COORDINATE_NAMES.index(name)}]"
+
+    samples = np.array(times), np.array(poses)
+    _check_samples(*samples, place, dict.fromkeys(COORDINATE_NAMES, 1.0))
+    return samples
 
 
 def read_csv(path: str | Path) -> tuple[Array, Array]:
-    """Reads a sampled motion.
+    """Read a sampled motion.
 
     The first line names seven comma-separated columns with their units, in any order:
     `time[s]`; `roll`, `pitch`, `yaw` in `[rad]` or `[deg]`; `x`, `y`, `z` in `[m]` or `[mm]`.
     Each further line is one sample. Time starts at 0 and increases.
 
-    In a file that `simulate --csv` or `export` wrote, the motion is that of the columns `pose_roll`
-    to `pose_z`, and the others are left alone.
+    In a file that `simulate --csv` or `export` wrote, the motion is in the columns `pose_roll` to
+    `pose_z`. Other columns are ignored.
 
     Raises:
-        ConfigError: the file breaks one of these rules, has too few rows, a gap, a value that is
-            no finite number, an angle that jumps by a turn, or a jump or motion too quick for its
-            samples; row and column are named, rows as a spreadsheet counts them.
+        ConfigError: the file breaks one of these rules, has too few rows, a gap, an angle that
+            jumps by a turn, or a jump or motion too quick for its samples. The message names row
+            and column; rows are counted as in a spreadsheet.
     """
     path = Path(path)
-    text = read_lines(path, _MAX_BYTES, "a CSV file of the motion's samples")
-    header = next((row for _, row in csv_rows(path, text)), None)
-    if header is None:
-        raise ConfigError(f"{path}: is empty; expected a header {_HEADER}")
-    chosen = _motion_columns(header)
-    names, scales = _read_header(path, [header[at] for at in chosen])
-    columns = _Columns(
-        width=len(header),
-        chosen=chosen,
-        labels=[header[at].strip() for at in chosen],
-        order=[_COLUMNS.index(name) for name in names],
-        scales=scales,
-    )
-    lines, values = _read_numbers(path, text, columns)
-    samples = np.empty_like(values)
-    samples[:, columns.order] = values * scales
-    bad = _first_problem(samples)
-    if bad is not None:
-        before = samples[bad - 1] if bad else None
-        _, row = next(itertools.islice(csv_rows(path, text), bad + 1, None))
-        _check_row(f"{path}: row {lines[bad]}", row, columns, before)
-    if len(samples) < _MIN_ROWS:
-        plural = "" if len(samples) == 1 else "s"
+    table = read_table(path, "a CSV file of the motion's samples", _HEADER, _UNITS, prefix=_POSE)
+    samples = table.stacked(["time", *COORDINATE_NAMES])
+    times, poses = samples[:, 0].copy(), samples[:, 1:].copy()
+    if len(times) and abs(times[0]) > 1e-9:
         raise ConfigError(
-            f"{path}: got {len(samples)} sample{plural}; expected at least {_MIN_ROWS}"
+            f"{table.place(0, 'time')}: got {float(times[0])!r}; expected 0 in the first sample, "
+            "subtract it from every time"
         )
-    steps = np.diff(samples[:, 0])
+    _check_samples(times, poses, table.place, table.scales)
+    if len(times) < _MIN_ROWS:
+        plural = "" if len(times) == 1 else "s"
+        raise ConfigError(f"{path}: got {len(times)} sample{plural}; expected at least {_MIN_ROWS}")
+    steps = np.diff(times)
     widest, median = int(np.argmax(steps)), float(np.median(steps))
     if steps[widest] > _MAX_GAP * median:
         raise ConfigError(
-            f"{path}: row {lines[widest + 1]}, column time[s]: got a gap of {steps[widest]:.6g} s; "
+            f"{table.place(widest + 1, 'time')}: got a gap of {steps[widest]:.6g} s; "
             f"expected steps near the median of {median:.6g} s, fill the gap by resampling"
         )
-    samples[0, 0] = 0.0
-    kink = roughest(samples[:, 0], samples[:, 1:])
+    times[0] = 0.0
+    kink = roughest(times, poses)
     if kink is not None:
-        sample, axis, size = kink
-        column = columns.order.index(axis + 1)
-        label = columns.labels[column]
-        size, unit = size / scales[column], label.partition("[")[2].strip(" ]")
+        row, axis, size = kink
+        name = COORDINATE_NAMES[axis]
+        scale = table.scales[name]
         raise ConfigError(
-            f"{path}: row {lines[sample]}, column {label}: got {size:.3g} {unit} off "
+            f"{table.place(row, name)}: got {size / scale:.3g} {_unit(name, scale)} off "
             "the cubic through its neighbours; expected a smooth motion with some ten samples per "
             "swing, filter or resample it"
         )
-    return samples[:, 0].copy(), samples[:, 1:].copy()
+    return times, poses
 
 
-class _Columns(NamedTuple):
-    """Where a file has the motion: of its `width` columns those `chosen`, with their labels, their
-    places in a sample and their factors to SI units."""
-
-    width: int
-    chosen: list[int]
-    labels: list[str]
-    order: list[int]
-    scales: list[float]
-
-
-def _read_numbers(path: Path, text: list[str], columns: _Columns) -> tuple[list[int], Array]:
-    """Line numbers (n,) and chosen cells (n, 7) below the header, up to the first row that is of
-    another width or not seven numbers; that row is the last, with NaN."""
-    lines, numbers = list[int](), array("d")
-    whole = columns.chosen == list(range(columns.width))
-    for line, row in itertools.islice(csv_rows(path, text), 1, None):
-        lines.append(line)
-        try:
-            if len(row) != columns.width:
-                raise ValueError
-            cells = row if whole else [row[at] for at in columns.chosen]
-            numbers.extend([*map(float, cells)])  # whole, or nothing of it
-        except ValueError:
-            numbers.extend([math.nan] * 7)
-            break
-    return lines, np.frombuffer(numbers).reshape(-1, 7)
-
-
-def _first_problem(samples: Array) -> int | None:
-    """The first row of samples (n, 7) in which `_check_row` finds something, or None."""
-    time, poses = samples[:, 0], samples[:, 1:]
-    with np.errstate(invalid="ignore", over="ignore"):
-        wrong = ~np.isfinite(time) | ~(np.abs(poses) < _MAX_SIZE).all(axis=1)
-        wrong |= np.abs(poses[:, 1]) >= math.pi / 2
-        wrong[:1] |= np.abs(time[:1]) > 1e-9
-        wrong[1:] |= np.diff(time) < _MIN_STEP
-        wrong[1:] |= (np.abs(np.diff(poses[:, :3], axis=0)) > math.pi).any(axis=1)
-    return int(wrong.argmax()) if wrong.any() else None
-
-
-def _check_row(where: str, row: list[str], columns: _Columns, before: Array | None) -> None:
-    """Say what is wrong with a row.
+def _check_samples(
+    times: Array, poses: Array, place: Callable[[int, str], str], scales: Mapping[str, float]
+) -> None:
+    """Check that times (n,) increase, and that poses (n, 6) are unique and do not jump by a turn.
 
     Args:
-        where: what opens the message.
-        row: its cells.
-        columns: of the file.
-        before: the sample (7,) of the row above, or None.
+        times: s.
+        poses: rad and m.
+        place: returns the opening of a message about a row and a column.
+        scales: by coordinate, the SI units in the unit of the file.
+
+    Raises:
+        ConfigError: the first sample that breaks a rule.
     """
-    width, chosen, labels, order, scales = columns
-    if len(row) != width:
-        hint = ", with a point for the decimals" if len(row) > width else ""
-        raise ConfigError(f"{where}: got {len(row)} cells; expected {width}, as above{hint}")
-    cells = [row[at] for at in chosen]
-    for label, target, scale, text in zip(labels, order, scales, cells, strict=True):
-        try:
-            value = float(text) * scale
-        except ValueError:
-            raise ConfigError(
-                f"{where}, column {label}: got {brief(text)}; expected a number"
-            ) from None
-        last = None if before is None else float(before[target])
-        if target == 0:
-            problem = _time_problem(value, last)
-        else:
-            problem = _pose_problem(target - 1, value, last, scale)
-        if problem:
-            raise ConfigError(f"{where}, column {label}: {problem}")
-    raise AssertionError("a row that breaks no rule")
 
+    def told(row: int, axis: int, value: float | None = None) -> tuple[str, str, str]:
+        """Return place, value and unit of a coordinate."""
+        name = COORDINATE_NAMES[axis]
+        scale = scales[name]
+        value = float(poses[row, axis]) if value is None else value
+        return place(row, name), f"{value / scale:.6g}", _unit(name, scale)
 
-def _motion_columns(header: list[str]) -> list[int]:
-    """Columns of the motion: all, but of a file that `export` wrote time and pose."""
-    names = [cell.partition("[")[0].strip().lower() for cell in header]
-    if not any(name.startswith(_POSE) for name in names) or set(names) & set(_COLUMNS[1:]):
-        return list(range(len(header)))
-    return [at for at, name in enumerate(names) if name == "time" or name.startswith(_POSE)]
-
-
-def _read_header(path: Path, header: list[str]) -> tuple[list[str], list[float]]:
-    """Name and factor to SI units of each column."""
-    for separator in (";", "\t"):
-        if separator in header[0]:
-            raise ConfigError(
-                f"{path}: row 1: got cells separated by {separator!r}; expected commas, and points "
-                "for the decimals"
-            )
-    if header[0].strip()[:1].isdigit():
-        raise ConfigError(f"{path}: row 1: got {brief(header[0])}; expected a header {_HEADER}")
-    names, scales = read_columns(path, header, _UNITS, _name_and_unit, _HEADER)
-    missing = [name for name in _COLUMNS if name not in names]
-    if missing:
-        raise ConfigError(f"{path}: row 1: column {missing[0]} is missing; expected {_HEADER}")
-    return names, scales
-
-
-def _name_and_unit(cell: str) -> tuple[str, str]:
-    match = re.fullmatch(r"\s*(\w+)\s*\[\s*(\w+)\s*\]\s*", cell)
-    name, unit = (part.lower() for part in match.groups()) if match else ("", "")
-    return name.removeprefix(_POSE), unit
-
-
-def _time_problem(value: float, before: float | None) -> str | None:
-    if not math.isfinite(value):
-        return f"got {value}; expected a finite number"
-    if before is None and abs(value) > 1e-9:
-        return f"got {value!r}; expected 0 in the first sample, subtract it from every time"
-    if before is not None and value - before < _MIN_STEP:
-        return f"got {value!r} after {before!r}; expected increasing times"
-    return None
-
-
-def _pose_problem(
-    column: int, value: float, before: float | None, scale: float = 1.0
-) -> str | None:
-    """What is wrong with a coordinate in rad or m, told in the file's unit, of `scale` SI units."""
-    units = _UNITS[_COLUMNS[1 + column]]
-    unit = next(name for name, factor in units.items() if factor == scale)
-
-    def told(x: float) -> str:
-        return f"{x / scale:.6g}"
-
-    if not abs(value) < _MAX_SIZE:  # also true of NaN
-        return f"got {value / scale!r}; expected a finite number below {told(_MAX_SIZE)} {unit}"
-    if column == 1 and abs(value) >= math.pi / 2:
-        degrees = "" if unit == "deg" else ", 90 degrees"
-        return (
-            f"got {told(value)} {unit}; expected a pitch within {told(math.pi / 2)} {unit}{degrees}"
+    for row in 1 + np.flatnonzero(np.diff(times) < _MIN_STEP)[:1]:
+        raise ConfigError(
+            f"{place(row, 'time')}: got {float(times[row])!r} after {float(times[row - 1])!r}; "
+            "expected increasing times"
         )
-    if column < 3 and before is not None and abs(value - before) > math.pi:
-        change = f"{told(value)} {unit} after {told(before)}"
-        return f"got {change}; expected no jump by a turn, unwrap it"
-    return None
+    for row, axis in np.argwhere(np.abs(poses) >= _MAX_SIZE)[:1]:
+        where, most, unit = told(row, axis, _MAX_SIZE)
+        size = float(poses[row, axis]) / scales[COORDINATE_NAMES[axis]]
+        raise ConfigError(f"{where}: got {size!r}; expected a finite number below {most} {unit}")
+    for row in np.flatnonzero(np.abs(poses[:, 1]) >= math.pi / 2)[:1]:
+        where, value, unit = told(row, 1)
+        most, degrees = told(row, 1, math.pi / 2)[1], "" if unit == "deg" else ", 90 degrees"
+        raise ConfigError(
+            f"{where}: got {value} {unit}; expected a pitch within {most} {unit}{degrees}"
+        )
+    for row, axis in np.argwhere(np.abs(np.diff(poses[:, :3], axis=0)) > math.pi)[:1]:
+        where, value, unit = told(row + 1, axis)
+        raise ConfigError(
+            f"{where}: got {value} {unit} after {told(row, axis)[1]}; expected no jump by a turn, "
+            "unwrap it"
+        )
+
+
+def _unit(name: str, scale: float) -> str:
+    return next(unit for unit, factor in _UNITS[name].items() if factor == scale)
