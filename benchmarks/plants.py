@@ -33,7 +33,7 @@ import stewart_drake as sd
 from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.open_loop import Drive, in_c
 from stewart_drake.loop.exact import ExactPlant
-from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.reporting.style import figure_style, write_figure
 from stewart_drake.scenario.signals import POSE, RATES
 

@@ -21,7 +21,7 @@ from riccati import comparison
 
 import stewart_drake as sd
 from stewart_drake.loop.exact import ExactPlant
-from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.studies.jobs import run_jobs

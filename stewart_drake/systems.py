@@ -2,16 +2,13 @@
 
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.delay_chain import DelayChain
-from stewart_drake.loop.density import DensityWindow
-from stewart_drake.loop.encoders import Encoders
 from stewart_drake.loop.exact import ExactPlant
-from stewart_drake.loop.late_measurements import LateMeasurements
 from stewart_drake.loop.playout import PlayoutBuffer
 from stewart_drake.loop.reference import Reference
-from stewart_drake.loop.sensor import Sensor
-from stewart_drake.loop.servo_controller import ServoController
+from stewart_drake.loop.sensor import Encoders, LateMeasurements, Sensor
+from stewart_drake.loop.servo_design import ServoController
 from stewart_drake.loop.servos import Servos
-from stewart_drake.loop.tuner import AnnTuner, LawTuner
+from stewart_drake.loop.tuner import AnnTuner, DensityWindow, LawTuner
 from stewart_drake.loop.varying_delay import VaryingDelay
 
 __all__ = [

@@ -7,7 +7,8 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.loop.experiment import compose_law, prepare
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.preparation import preparation_of
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.config import NetworkConfig, Scenario

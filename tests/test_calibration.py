@@ -15,7 +15,8 @@ from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.law.filter_settings import CHANCE, EXACT, ParameterSet, usual_parameters
 from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.experiment import GENTLE, Experiment, believed_delay, compose_law, prepare
+from stewart_drake.loop.experiment import Experiment, believed_delay, prepare
+from stewart_drake.loop.law_design import GENTLE, compose_law
 from stewart_drake.mechanism.geometry import Body, fingerprint
 from stewart_drake.scenario.calibration import (
     KNOWABLE,

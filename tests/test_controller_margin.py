@@ -23,8 +23,9 @@ from stewart_drake.loop.controller_margin import (
     controller_margin,
     true_model,
 )
-from stewart_drake.loop.experiment import believed_queue, control_law, prepare, true_dynamics
-from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.loop.experiment import prepare, torques_in_flight, true_dynamics
+from stewart_drake.loop.law_design import control_law
+from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE
@@ -66,7 +67,7 @@ def distances(sc: Scenario, periods: int) -> Array:
     pair = []
     for sign in (1, -1):
         x = experiment.start + sign * SIZE * DIRECTION
-        memory = law.initial_memory(believed_queue(experiment, law.timeline))
+        memory = law.initial_memory(torques_in_flight(experiment, law.timeline.delay))
         standing = np.zeros(NUM_TORQUES)
         if sc.queue == "equilibrium":
             standing = experiment.nominal.equilibrium_torque(experiment.start[POSE])

@@ -12,8 +12,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.bulk import samples_of
 from stewart_drake.loop.diagram import build_closed_loop
-from stewart_drake.loop.encoders import Encoders
 from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.sensor import Encoders
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.scenario.config import Scenario

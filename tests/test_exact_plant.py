@@ -28,7 +28,7 @@ from stewart_drake.dynamics.workspace import (
     standing,
 )
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
-from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import DEAD_CENTRE_SINE
 from stewart_drake.scenario.timing import look_time

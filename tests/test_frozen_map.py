@@ -10,7 +10,8 @@ import stewart_drake as sd
 from stewart_drake.dynamics.frozen_map import Band, FrozenDynamics
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.native_law import uncovered
-from stewart_drake.loop.experiment import compose_law, limits_of, prepare
+from stewart_drake.loop.experiment import limits_of, prepare
+from stewart_drake.loop.law_design import compose_law
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.loading import load_comparison

@@ -10,11 +10,10 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop import weights
 from stewart_drake.loop.bulk import ending_of, run_in_bulk
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.loop.weights import health_of, weights_source
+from stewart_drake.loop.tuner import RULES, health_of, weights_source
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.families import FAMILIES, SAMPLES
 from stewart_drake.tuner.density import WINDOW
@@ -261,7 +260,7 @@ def test_predictions_take_a_state_that_is_measured(settings: tuple[str, ...]) ->
 
 
 def test_what_the_rule_is_depends_on_the_estimator() -> None:
-    assert set(weights.RULES) == {False, True}
+    assert set(RULES) == {False, True}
     made = []
 
     def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource | None:
@@ -270,7 +269,7 @@ def test_what_the_rule_is_depends_on_the_estimator() -> None:
 
     for follows in (FOLLOWS, BLIND):
         run_in_bulk(scenario(*follows, "tuner.kind=rule", "duration=0.2"), tuner=make)
-    assert [one.policy for one in made] == [weights.RULES[True], weights.RULES[False]]
+    assert [one.policy for one in made] == [RULES[True], RULES[False]]
 
 
 @pytest.mark.parametrize(("family", "bound"), [("T", 0.05), ("N2", 0.04)])

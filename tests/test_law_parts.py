@@ -30,7 +30,8 @@ from stewart_drake.law.observers import NoObserver, ParameterObserver
 from stewart_drake.law.sensing import FirstState, Sensing, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import DelayLqiController
-from stewart_drake.loop.experiment import control_law, prepare
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.law_design import control_law
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.mechanism.torque_map import torque_map

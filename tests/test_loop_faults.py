@@ -13,6 +13,7 @@ import pytest
 
 import stewart_drake.law.cost as cost_module
 import stewart_drake.loop.diagram as diagram_module
+import stewart_drake.loop.kinds as kinds_module
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.loop.metrics import accumulated_error
 from stewart_drake.loop.results import SimulationResult
@@ -55,7 +56,7 @@ def run_with(
                 self._sent[k] = spoil(k, np.array(output.value()), self._sent)
             output.SetFromVector(self._sent[k])
 
-    monkeypatch.setattr(diagram_module, "Sensor", Faulty)
+    monkeypatch.setattr(kinds_module, "Sensor", Faulty)
     return simulate(scenario() if sc is None else sc, judge_stability=False)
 
 

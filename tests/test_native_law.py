@@ -19,7 +19,8 @@ from stewart_drake.law.motion import Preview
 from stewart_drake.law.native_law import NativeLqi, serving, uncovered
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError, lqr, reduced_gain
-from stewart_drake.loop.experiment import believed_queue, compose_law, control_law, prepare
+from stewart_drake.loop.experiment import prepare, torques_in_flight
+from stewart_drake.loop.law_design import compose_law, control_law
 from stewart_drake.native import library as native_library
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate
@@ -220,7 +221,7 @@ class Pair:
         experiment = prepare(self.scenario)
         self.law, self.planned, _ = control_law(experiment)
         self.native = NativeLqi(self.law, library)
-        queue = believed_queue(experiment, self.law.timeline)
+        queue = torques_in_flight(experiment, self.law.timeline.delay)
         self.one: Any = self.law.initial_memory(queue)
         self.other: Any = self.native.initial_memory(queue)
         sc = self.scenario

@@ -17,7 +17,8 @@ from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.law.catch_up import plan_catch_up
 from stewart_drake.loop import bulk
 from stewart_drake.loop.bulk import Ending, SampledLaw, ending_of, run_in_bulk
-from stewart_drake.loop.experiment import control_law, prepare
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.native_loop import InPython, instants_of, run_loop, uncovered
 from stewart_drake.loop.preparation import preparation_of
 from stewart_drake.loop.sampling import update_every

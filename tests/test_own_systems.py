@@ -103,7 +103,7 @@ def test_disturbing_torque_is_the_same_as_a_bias(plant):
         scenario(*settings, f"plant.torque_bias={bias.tolist()}"), judge_stability=False
     )
     system = ConstantVectorSource(bias)
-    with pytest.raises(sd.ConfigError, match="output port 'torque'"):
+    with pytest.raises(sd.ConfigError, match=r"and output torque \(6\)"):
         sd.simulate(scenario(*settings), disturbance=system)  # its port has another name
 
     class Pushed(LeafSystem):
@@ -193,25 +193,40 @@ def test_a_mistake_in_a_system_is_an_exception():
     [
         ({"controller": 3}, "controller: got a int; expected a Drake system"),
         ({"controller": lambda: "x"}, "controller: got a str; expected a Drake system"),
-        ({"controller": lambda: controller(())}, "no input port 'measurement'; expected measur"),
+        (
+            {"controller": lambda: controller(())},
+            "got inputs none and outputs torque (6); expected inputs measur",
+        ),
         (
             {"controller": lambda: controller((("measurement", 6),))},
-            "input port 'measurement': got 6 values; expected 12",
+            "got inputs measurement (6) and outputs torque (6); expected inputs measurement (12)",
         ),
         (
             {"controller": lambda: controller((("measurement", 12), ("state", 12)))},
-            "got an input port 'state'; expected measurement (12) and, if wanted, reference (18)",
+            "expected inputs measurement (12), if wanted reference (18)",
         ),
-        ({"controller": lambda: controller(outputs=())}, "got no output port; expected"),
+        (
+            {"controller": lambda: controller(outputs=())},
+            "and outputs none; expected inputs measurement (12)",
+        ),
         (
             {"controller": lambda: controller(outputs=(("torque", 3),))},
-            "output port 'torque': got 3 values; expected 6",
+            "and outputs torque (3); expected inputs",
         ),
-        ({"disturbance": lambda: disturbance("force")}, "'torque' (6) or 'wrench' (6)"),
-        ({"disturbance": lambda: disturbance("wrench", 3)}, "got 3 values; expected 6"),
-        ({"disturbance": controller}, "got an input port 'measurement'; expected none"),
-        ({"sensor": controller}, "sensor: Constant: got an input port 'measurement'; expected st"),
-        ({"link": lambda: Constant((("commanded", 6),))}, "expected an output port 'torque' (6)"),
+        ({"disturbance": lambda: disturbance("force")}, "and output torque (6) or wrench (6)"),
+        (
+            {"disturbance": lambda: disturbance("wrench", 3)},
+            "outputs wrench (3); expected inputs none, and output",
+        ),
+        (
+            {"disturbance": controller},
+            "got inputs measurement (12) and outputs torque (6); expected inputs none",
+        ),
+        ({"sensor": controller}, "sensor: Constant: got inputs measurement (12)"),
+        (
+            {"link": lambda: Constant((("commanded", 6),))},
+            "expected inputs commanded (6), and output torque (6)",
+        ),
         ({"tuner": lambda: Constant((("state", 12),))}, "density (18), measurement (12), refer"),
         ({"modify_law": 3}, "modify_law: got a int; expected a function of the scenario's law"),
         (

@@ -12,8 +12,8 @@ import stewart_drake as sd
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop import scene
-from stewart_drake.loop.lifetime import let_go
-from stewart_drake.loop.multibody_stewart import build_viewer
+from stewart_drake.loop.platforms import build_viewer
+from stewart_drake.loop.sampling import let_go
 from stewart_drake.loop.scene import CRANK_PARTS, crank_paths
 from stewart_drake.reporting import replay as replay_module
 from stewart_drake.reporting.replay import replay_html

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import stewart_drake.loop.diagram as diagram_module
+import stewart_drake.loop.kinds as kinds_module
 from stewart_drake.files.yamlio import parse_yaml
 from stewart_drake.law.filter_settings import FilterSettings
 from stewart_drake.law.memory import Counts
@@ -134,7 +134,7 @@ def test_a_sample_of_zeros_is_rejected_and_counted(
             if round(context.get_time() / 0.1) == 20:
                 output.SetFromVector(np.zeros(12))
 
-    monkeypatch.setattr(diagram_module, "Sensor", Zero)
+    monkeypatch.setattr(kinds_module, "Sensor", Zero)
     run = simulate(
         on_reference(f"controller.estimate={estimate}", "duration=4"), judge_stability=False
     )

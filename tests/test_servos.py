@@ -25,7 +25,8 @@ from stewart_drake.law.servos import (
     turned,
 )
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
-from stewart_drake.loop.experiment import compose_law, prepare
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.servo_design import compose_servo_law, servo_loop
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.mechanism.rotors import with_rotors

@@ -27,8 +27,9 @@ from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.delay_chain import DelayChain
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.loop.exact import ExactPlant
-from stewart_drake.loop.experiment import control_law, prepare
-from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.law_design import control_law
+from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.reference import Reference
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import make_simulator

@@ -14,7 +14,7 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import load_yaml
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.experiment import assemble
-from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.scenario.config import Scenario

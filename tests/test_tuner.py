@@ -11,11 +11,10 @@ from hypothesis.extra.numpy import arrays
 from pydrake.systems.framework import BasicVector, Context
 
 import stewart_drake as sd
-from stewart_drake.loop.density import DensityWindow
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import make_simulator
-from stewart_drake.loop.tuner import AnnTuner
+from stewart_drake.loop.tuner import AnnTuner, DensityWindow
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.tuner.density import NUM_INPUTS, densities
 from stewart_drake.tuner.network import Network, save_network

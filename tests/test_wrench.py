@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 
 import stewart_drake as sd
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
-from stewart_drake.loop.multibody_stewart import MultibodyStewart
+from stewart_drake.loop.platforms import MultibodyStewart
 
 PAPER = sd.load_mechanism("paper")
 POSE0 = PAPER.home + np.array([0.1, -0.15, 0.2, 0.01, -0.02, 0.015])

@@ -29,7 +29,8 @@ from stewart_drake.law.motion import Motion
 from stewart_drake.law.native_law import configuration, uncovered
 from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.experiment import control_law, prepare
+from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import FAULTS, identity_of
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.native.build import FOLDER, compiler

@@ -18,7 +18,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import parse_yaml, validate
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.native.layout import STANDARD_GRAVITY
-from stewart_drake.scenario.config import NetworkConfig, Scenario, StateSensorConfig
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.renames import with_new_names
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE, NUM_TORQUES
 from stewart_drake.types import Array
@@ -154,7 +154,7 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
     own = scenario.actuator.torque_limit
     limit = mechanism.effort_limit if own is None else own
     times, values, std = _measured(signals.measurement, scenario, samples, rows)
-    changing = scenario.queue == "reference" or isinstance(scenario.link, NetworkConfig)
+    changing = scenario.queue == "reference" or scenario.link.kind == "network"
     return _checked(
         Log(
             name=str(path),
@@ -179,7 +179,7 @@ def _sent(
     Over a network other torques may act than were sent, but when they act is known: a bound later.
     So the torques that acted then stand for those that were sent.
     """
-    if not isinstance(scenario.link, NetworkConfig):
+    if scenario.link.kind != "network":
         torques = signals.torque_commanded.transpose("time", "leg").values[rows]
         return torques, float(signals.delay_estimate.values[-1])
     eta, time = scenario.eta, signals.time.values
@@ -199,7 +199,7 @@ def _measured(
         rows: of the record that show them.
     """
     sensor, said = scenario.sensor, signal.transpose("time", ...).values[rows]
-    if isinstance(sensor, StateSensorConfig):
+    if sensor.kind == "state":
         values = np.full((len(rows), NUM_MEASURED), np.nan)
         values[:, POSE.start :] = said
         noise = np.hypot(sensor.noise_std, LEAST_STD)
@@ -225,7 +225,7 @@ def _scenario_of(path: Path, signals: xr.Dataset) -> Scenario:
 def _run_problem(signals: xr.Dataset, scenario: Scenario) -> str | None:
     """Return why a run cannot serve as a log, or None."""
     sensor, measured = scenario.sensor, {"state": NUM_STATE}
-    if not isinstance(sensor, StateSensorConfig):
+    if sensor.kind != "state":
         measured = {"encoder": NUM_LEGS * sensor.samples}
     shapes: dict[str, dict[str, int]] = {
         "torque_commanded": {"leg": NUM_TORQUES},
@@ -244,7 +244,7 @@ def _run_problem(signals: xr.Dataset, scenario: Scenario) -> str | None:
         return "time is missing, or no number"
     if not np.all(np.diff(time) > 0):
         return "time does not increase"
-    if isinstance(scenario.link, NetworkConfig) and scenario.link.back is not None:
+    if scenario.link.kind == "network" and scenario.link.back is not None:
         return "its measurements came over a network, each of an age of its own (link.return)"
     if scenario.actuator.kind != "torque":
         return f"its motors got no torques (actuator.kind {scenario.actuator.kind!r})"

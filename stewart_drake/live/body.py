@@ -5,7 +5,7 @@ pose and rates and has no faults; all other machines are the plant and the senso
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 from pydrake.systems.analysis import Simulator, SimulatorStatus
@@ -18,10 +18,17 @@ from stewart_drake.loop.exact import set_accuracy
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.native_loop import LONGEST_STEP, SHARE
 from stewart_drake.loop.sensor import white_noise
-from stewart_drake.scenario.config import StateSensorConfig
+from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.signals import BIAS, POSE
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.types import Array
+
+_WITHOUT_DRAKE: Final[Accepted] = {
+    "plant.kind": "exact",
+    "sensor.kind": "state",
+    "sensor.faults": [],
+}
+"""Values of fields that `NativeBody` has."""
 
 
 class Body(Protocol):
@@ -35,11 +42,11 @@ class Body(Protocol):
         ...
 
     def advance(self, time: float, torque: Array) -> Failure | None:
-        """On to `time` under a torque (6,) in N m; how the plate left its workspace, or None."""
+        """Advance to `time` under a torque (6,), N m; return how the plate left, or None."""
         ...
 
     def measurement(self) -> Array:
-        """What the sensor reads now: a state (12,) or crank angles (6 N,), NaN what it does not."""
+        """Return what the sensor reads: a state (12,) or crank angles (6 N,), NaN where missing."""
         ...
 
 
@@ -48,7 +55,7 @@ class NativeBody:
 
     def __init__(self, experiment: Experiment) -> None:
         sc, sensor = experiment.scenario, experiment.scenario.sensor
-        assert isinstance(sensor, StateSensorConfig)
+        assert sensor.kind == "state"
         parameters = np.array(sc.plant.parameters)
         self._bias = parameters[BIAS].copy()
         parameters[BIAS] = 0.0  # added to what acts, as in the diagram
@@ -59,11 +66,9 @@ class NativeBody:
 
     @property
     def state(self) -> Array:
-        """See `Body`."""
         return self._state
 
     def advance(self, time: float, torque: Array) -> Failure | None:
-        """See `Body`."""
         if time <= self.time:
             return None
         drives, span = (Drive(torque + self._bias),), (time - self.time,)
@@ -78,7 +83,6 @@ class NativeBody:
         return None if left is None else left._replace(time=began + left.time)
 
     def measurement(self) -> Array:
-        """See `Body`."""
         if not self._noise.any():
             return self._state
         return self._state + self._noise * white_noise(self._seed, round(self.time / self._period))
@@ -104,11 +108,9 @@ class DrakeBody:
 
     @property
     def state(self) -> Array:
-        """See `Body`."""
         return np.array(self._diagram.GetOutputPort("state").Eval(self._simulator.get_context()))
 
     def advance(self, time: float, torque: Array) -> Failure | None:
-        """See `Body`."""
         context = self._simulator.get_mutable_context()
         if time <= self.time:
             return None
@@ -134,20 +136,13 @@ class DrakeBody:
         return found
 
     def measurement(self) -> Array:
-        """See `Body`."""
         context = self._simulator.get_context()
         return np.array(self._diagram.GetOutputPort("measurement").Eval(context))
 
 
 def body_of(experiment: Experiment) -> tuple[Callable[[], Body], str]:
-    """What makes the machine of an experiment anew, at its start, and what it goes by."""
-    sc = experiment.scenario
-    needs_drake = {
-        "plant.kind": sc.plant.kind != "exact",
-        "sensor.kind": not isinstance(sc.sensor, StateSensorConfig),
-        "sensor.faults": bool(sc.sensor.faults),
-    }
-    field = next((name for name, there in needs_drake.items() if there), None)
-    if field is None:
+    """Return what makes the machine of an experiment, and the name of its integrator."""
+    found = differing(experiment.scenario, _WITHOUT_DRAKE)
+    if found is None:
         return lambda: NativeBody(experiment), "DOP853"
-    return lambda: DrakeBody(experiment), f"Drake ({field})"
+    return lambda: DrakeBody(experiment), f"Drake ({found.field})"

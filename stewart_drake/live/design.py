@@ -27,13 +27,10 @@ from stewart_drake.live.protocol import (
     MachineFlags,
     MachineMessage,
 )
-from stewart_drake.loop.experiment import Experiment, control_law, first_queue, prepare
-from stewart_drake.scenario.config import (
-    FixedTunerConfig,
-    NetworkConfig,
-    Scenario,
-    TorqueActuatorConfig,
-)
+from stewart_drake.loop.experiment import Experiment, prepare
+from stewart_drake.loop.law_design import control_law, first_queue
+from stewart_drake.scenario.config import NetworkConfig, Scenario
+from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.packets import usual_bound
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
@@ -44,13 +41,13 @@ _ROOM: Final = 0.25
 _COMPUTING: Final = 0.01
 """s, for the law's step and for waking up."""
 _TRIED: Final = 5
-"""Steps of the law, before it is told how long one takes."""
+"""Number of steps of which the quickest counts."""
 _LEAST_LOSS: Final = 0.01
 """Of packets; none was seen to be lost in a few seconds."""
 
 
 class Design(NamedTuple):
-    """What a controller needs to know before it begins.
+    """Law and settings of a controller before its start.
 
     Attributes:
         experiment: of the scenario as it is seen.
@@ -77,12 +74,8 @@ def check_controller(scenario: Scenario) -> None:
     Raises:
         ConfigError: one line.
     """
-    if not isinstance(scenario.tuner, FixedTunerConfig):
-        raise ConfigError(f"tuner.kind: got {scenario.tuner.kind!r}; expected 'fixed' for live")
-    if not isinstance(scenario.actuator, TorqueActuatorConfig):
-        raise ConfigError(
-            f"actuator.kind: got {scenario.actuator.kind!r}; expected 'torque' for live"
-        )
+    if found := differing(scenario, {"tuner.kind": "fixed", "actuator.kind": "torque"}):
+        raise ConfigError(found.problem("for live"))
 
 
 def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario:
@@ -114,7 +107,7 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
         low=link.shortest,
         high=longest,
         loss=max(link.loss_there, _LEAST_LOSS),
-        burst=scenario.link.burst if isinstance(scenario.link, NetworkConfig) else 1,
+        burst=scenario.link.burst,
         dry="hold" if MachineFlags.HOLDS in machine.flags else "zero",
     )
     eta, period = _whole_delay(scenario, network), c.period
@@ -136,7 +129,7 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
 def _whole_delay(scenario: Scenario, found: NetworkConfig) -> float:
     """s from a measurement to its torque: as the scenario says, or of the link that was found."""
     c, link = scenario.controller, scenario.link
-    if not isinstance(link, NetworkConfig):
+    if link.kind == "wire":
         return scenario.eta
     if link.playout is not None:
         return link.playout + c.packet_repeats * c.period
@@ -153,9 +146,7 @@ def design(scenario: Scenario, machine: MachineMessage) -> Design:
     law, planned, _ = control_law(experiment)
     limit = min(law.plant.motors.limit, machine.torque_limit)
     law = replace(law, plant=replace(law.plant, motors=TorqueLimit(limit)))
-    repeats = scenario.controller.packet_repeats
-    if not isinstance(scenario.link, NetworkConfig):
-        repeats = 0
+    repeats = scenario.controller.packet_repeats if scenario.link.kind == "network" else 0
     queue = first_queue(experiment, law)
     assert law.kept < MOST_HISTORY
     return Design(experiment, law, planned, queue, repeats, limit, _step_time(law, planned, queue))

@@ -19,7 +19,7 @@ from stewart_drake.loop.controller import HELD
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.recording import Record, Table
 from stewart_drake.reporting.csv_file import columns_of
-from stewart_drake.scenario.config import Scenario, StateSensorConfig
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, TUNER_INPUTS, ports_of
 from stewart_drake.types import Array
 
@@ -63,7 +63,7 @@ class LiveRecord(Record):
         self._eta = experiment.scenario.eta
         # What acts at a sample began then, or, with a part of a period, in the one before.
         self._began_before = int(experiment.scenario.true_delay.fraction > 0)
-        self._measures_state = isinstance(experiment.scenario.sensor, StateSensorConfig)
+        self._measures_state = experiment.scenario.sensor.measures_state
         self._rows: dict[int, dict[str, Array]] = {}
         self.applied: dict[int, Array] = {}
         self.latest: Array = np.zeros(NUM_TORQUES)

@@ -36,12 +36,8 @@ from stewart_drake.live.protocol import (
 )
 from stewart_drake.loop.experiment import Experiment, torques_in_flight
 from stewart_drake.loop.peer import FAULTS, Fault, Reason, code_bits, identity_of, in_words
-from stewart_drake.scenario.config import (
-    EncoderSensorConfig,
-    NetworkConfig,
-    Scenario,
-    TorqueActuatorConfig,
-)
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link import (
     forward_times,
     return_times,
@@ -96,14 +92,8 @@ class Drawn(NamedTuple):
 
 def drawn(scenario: Scenario) -> Drawn:
     """As the scenario's simulation has it, sample by sample."""
-    link = scenario.link
-    forward = forward_times(scenario, DRAWN) if isinstance(link, NetworkConfig) else np.zeros(1)
-    return Drawn(
-        *(
-            _by_number(times)
-            for times in (forward, return_times(scenario, DRAWN), sensor_times(scenario, DRAWN))
-        )
-    )
+    every = (forward_times, return_times, sensor_times)
+    return Drawn(*(_by_number(times(scenario, DRAWN)) for times in every))
 
 
 def _by_number(times: Array) -> Callable[[int], int | None]:
@@ -120,15 +110,12 @@ def check_scenario(scenario: Scenario) -> None:
     Raises:
         ConfigError: servos, too many samples of encoders.
     """
-    if not isinstance(scenario.actuator, TorqueActuatorConfig):
+    if found := differing(scenario, {"actuator.kind": "torque"}):
+        raise ConfigError(found.problem("for a machine", ", which is what a controller sends"))
+    samples = scenario.sensor.samples
+    if samples is not None and samples > MOST_SAMPLES:
         raise ConfigError(
-            f"actuator.kind: got {scenario.actuator.kind!r}; expected 'torque', which is what a "
-            "controller sends"
-        )
-    s = scenario.sensor
-    if isinstance(s, EncoderSensorConfig) and s.samples > MOST_SAMPLES:
-        raise ConfigError(
-            f"sensor.samples: got {s.samples}; expected at most {MOST_SAMPLES}, which a datagram "
+            f"sensor.samples: got {samples}; expected at most {MOST_SAMPLES}, which a datagram "
             "holds"
         )
 
@@ -137,7 +124,7 @@ def motors_of(experiment: Experiment) -> Motors:
     """What the link makes of torques: a buffer behind a network, or the end of a wire."""
     sc, limit = experiment.scenario, experiment.torque_limit
     period = round(sc.controller.period * SECOND)
-    if isinstance(sc.link, NetworkConfig):
+    if sc.link.kind == "network":
         return PlayoutMotors(limit, period, sc.link.dry == "hold")
     longer = replace(sc, duration=DRAWN * sc.controller.period)
     delays = torque_delays(longer)
@@ -156,10 +143,7 @@ class Measured:
     """What a sensor has read, as a datagram says it."""
 
     def __init__(self, scenario: Scenario) -> None:
-        s = scenario.sensor
-        self.bits = 0
-        if isinstance(s, EncoderSensorConfig):
-            self.bits = code_bits(s)
+        self.bits = code_bits(scenario.sensor)
         self._zeros: Array = np.full(NUM_LEGS, np.nan)
 
     def said(self, values: Array) -> dict[str, Any]:
@@ -566,8 +550,8 @@ class Machine:
     ) -> MachineMessage:
         to = offered or self.session
         assert to is not None
-        link, acted = self._experiment.scenario.link, self._motors.acted
-        if offered or (isinstance(link, NetworkConfig) and not link.acknowledged):
+        acted = self._motors.acted
+        if offered or not self._experiment.scenario.link.acknowledged:
             acted = type(acted)()
         rows = [torque for _, torque in acted]
         seen = to.window.seen if to.window.newest else 0

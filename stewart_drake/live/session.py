@@ -24,7 +24,7 @@ from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LiveSummary, SimulationResult
-from stewart_drake.scenario.config import DelayConfig, NetworkConfig, Scenario, WireConfig
+from stewart_drake.scenario.config import DelayConfig, Scenario, WireConfig
 from stewart_drake.studies.verdict import milliseconds
 from stewart_drake.types import Array
 
@@ -60,7 +60,7 @@ class Ready(NamedTuple):
         if self.margin.stable is False:
             return "the loop is unstable even without jitter: the plate may be lost"
         jitter, on_wire = self.contact.link.jitter, self.design.experiment.scenario.link
-        if isinstance(on_wire, NetworkConfig) or not jitter > self.margin.delay_margin:
+        if on_wire.kind == "network" or not jitter > self.margin.delay_margin:
             return None  # a torque that comes early waits for its play-out time
         return (
             f"the jitter of {milliseconds(jitter)} is more than the "
@@ -102,7 +102,7 @@ def prepare_session(
 def _in_time(experiment: Experiment) -> Experiment:
     """Return the experiment with a constant delay, as where every packet comes in time."""
     sc = experiment.scenario
-    if not isinstance(sc.link, NetworkConfig):
+    if sc.link.kind == "wire":
         return experiment
     eta = sc.true_delay
     controller = replace(sc.controller, delay_steps=eta.steps, delay_fraction=eta.fraction)
@@ -122,7 +122,7 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
     limit = "without a limit" if math.isinf(made.torque_limit) else f"{made.torque_limit:g} N m"
     rate = "" if machine.rate == 1 else f", {machine.rate:g} of its seconds in one"
     packets = "each torque as it is computed, on a simulated wire"
-    if isinstance(sc.link, NetworkConfig):
+    if sc.link.kind == "network":
         c = sc.controller
         packets = f"packets of {c.packet_repeats + c.packet_torques} torques"
     until = "until it is stopped" if math.isinf(duration) else f"for {duration:g} s"
@@ -154,7 +154,7 @@ def _stability(ready: Ready) -> list[str]:
         f"this loop is {judged}; round trips vary by {milliseconds(link.jitter)} (standard "
         f"deviation {milliseconds(link.spread)})"
     )
-    if isinstance(sc.link, NetworkConfig):
+    if sc.link.kind == "network":
         found += (
             "; the machine's play-out buffer absorbs that while they take less than "
             f"{milliseconds(sc.eta)}"
@@ -183,7 +183,7 @@ def _cautions(made: Design) -> list[str]:
 
 def _queue_advice(scenario: Scenario) -> str | None:
     """Return the line about a queue that is too short over a network, or None."""
-    if not isinstance(scenario.link, NetworkConfig) or scenario.queue != "reference":
+    if scenario.link.kind == "wire" or scenario.queue != "reference":
         return None
     better = "equilibrium" if scenario.plant.gravity else "zero"  # zero lets the plate fall
     return (

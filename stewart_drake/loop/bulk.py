@@ -17,7 +17,8 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.native_law import AnyMemory
-from stewart_drake.loop.experiment import Experiment, assemble, first_queue, followed_motion
+from stewart_drake.loop.experiment import Experiment, assemble
+from stewart_drake.loop.law_design import first_queue, followed_motion
 from stewart_drake.loop.metrics import Figures, accumulated_error, figures
 from stewart_drake.loop.native_loop import (
     Course,
@@ -31,7 +32,7 @@ from stewart_drake.loop.preparation import MakeTuner, Preparation, Prepared, pre
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.config import Scenario, StateSensorConfig
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import POSE, TUNER_INPUTS, WEIGHTS
 from stewart_drake.tuner.source import Decision
 from stewart_drake.types import Array
@@ -124,7 +125,7 @@ class SampledLaw:
         c = experiment.scenario.controller
         self._law, self._previews, self._when = law, prepared.previews, when
         self._wanted, self._fixed = wanted, Decision(np.array([c.w_Q, c.w_R]), False)
-        self._followed = followed_motion(experiment, law, prepared.planned)
+        self._followed = followed_motion(law, prepared.planned, experiment.reference)
         self._served, self.backend = native_law.serving(law)
         self.memory: AnyMemory = self._served.initial_memory(first_queue(experiment, law))
         self._source = prepared.tuner
@@ -252,6 +253,5 @@ def samples_of(result: SimulationResult) -> Array:
     kept = signals.sel(time=at, method="nearest")
     wanted = np.hstack([kept.reference, kept.reference_rates])
     # Where the state is not measured its estimate stands for it.
-    measures_state = isinstance(sc.sensor, StateSensorConfig)
-    state = kept.measurement if measures_state else kept.state_estimate
+    state = kept.measurement if sc.sensor.measures_state else kept.state_estimate
     return np.hstack([state - wanted, kept.torque_commanded])

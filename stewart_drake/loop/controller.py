@@ -14,8 +14,7 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.native_law import AnyMemory, serving
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.lifetime import weak
-from stewart_drake.loop.sampling import Sample, SteppedLaw
+from stewart_drake.loop.sampling import Sample, SteppedLaw, weak
 from stewart_drake.scenario.signals import (
     NUM_PARAMETERS,
     NUM_REFERENCE,

@@ -35,9 +35,9 @@ from stewart_drake.law.stability import (
     spectral_radius,
     worst_margins,
 )
-from stewart_drake.loop.experiment import Experiment, compose_law, longest_wait, true_dynamics
+from stewart_drake.loop.experiment import Experiment, true_dynamics
+from stewart_drake.loop.law_design import compose_law, longest_wait
 from stewart_drake.loop.results import MarginSummary
-from stewart_drake.scenario.config import NetworkConfig
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     NUM_TORQUES,
@@ -170,7 +170,7 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
     problem, loops = "", list[LinearLoop]()
     if not all(inside):
         problem = "the true machine does not reach all of the reference"
-    elif isinstance(sc.link, NetworkConfig) or longest_wait(sc):
+    elif sc.link.kind == "network" or longest_wait(sc):
         problem = "its packets or measurements do not all take the same time"
     elif isinstance(law.observer, DifferencesObserver):
         problem = "its rates are differences of measured poses"

@@ -3,8 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, LeafSystem, State
 
-from stewart_drake.loop.lifetime import weak
-from stewart_drake.loop.sampling import update_every
+from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import CARRIED, Carried
 from stewart_drake.scenario.timing import event_time

@@ -1,5 +1,6 @@
 """The closed loop as a Drake diagram, built from a scenario. Here its systems are connected."""
 
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -15,66 +16,44 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.channel import Channel, Packets, Wire
+from stewart_drake.law.channel import Channel, Wire
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController, reported
-from stewart_drake.loop.delay_chain import DelayChain
-from stewart_drake.loop.density import DensityWindow
-from stewart_drake.loop.encoders import Encoders
 from stewart_drake.loop.exact import ExactPlant
-from stewart_drake.loop.experiment import (
-    Experiment,
-    concrete,
-    control_law,
-    first_queue,
-    followed_motion,
-    limits_of,
-    motion_scale,
-    torques_in_flight,
-    true_dynamics,
-)
-from stewart_drake.loop.late_measurements import LateMeasurements
-from stewart_drake.loop.multibody_stewart import MultibodyStewart
-from stewart_drake.loop.own_controller import SampledController
-from stewart_drake.loop.platforms import add_to_torque
-from stewart_drake.loop.playout import PlayoutBuffer
+from stewart_drake.loop.experiment import Experiment, concrete
+from stewart_drake.loop.kinds import LINKS, PLANTS, SENSORS, wire
+from stewart_drake.loop.law_design import control_law, first_queue, followed_motion
+from stewart_drake.loop.own import SampledController
+from stewart_drake.loop.platforms import MultibodyStewart, StartCheck, add_to_torque
 from stewart_drake.loop.reference import Reference
-from stewart_drake.loop.sensor import Sensor
-from stewart_drake.loop.servo_controller import ServoController
-from stewart_drake.loop.servo_design import commands_in_flight, servo_law, servo_loop
+from stewart_drake.loop.sensor import LateMeasurements
+from stewart_drake.loop.servo_design import (
+    ServoController,
+    commands_in_flight,
+    servo_law,
+    servo_loop,
+)
 from stewart_drake.loop.servos import Servos
-from stewart_drake.loop.start_check import StartCheck
-from stewart_drake.loop.tuner import AnnTuner, LawTuner
-from stewart_drake.loop.varying_delay import VaryingDelay, declare_constant
-from stewart_drake.loop.weights import weights_source
+from stewart_drake.loop.tuner import AnnTuner, DensityWindow, LawTuner, weights_source
 from stewart_drake.scenario.config import (
-    EncoderSensorConfig,
-    NetworkConfig,
     Scenario,
     ServoActuatorConfig,
+    TorqueActuatorConfig,
 )
 from stewart_drake.scenario.link import (
-    forward_times,
     measurement_times,
-    number_sent,
-    torque_delays,
 )
 from stewart_drake.scenario.signals import (
     NUM_TORQUES,
-    PACKETS,
-    POSE,
     RATES,
     SIGNALS,
-    Carried,
     exported_ports,
 )
 from stewart_drake.tuner.features import DensityFeatures
 from stewart_drake.tuner.source import PaperPolicy
-from stewart_drake.types import Array
 
 _TOLD: Final = ("density", "reference")
-"""What a tuner may ask for beside the state, and the systems whose outputs of their name it is."""
+"""Inputs that a tuner may have: outputs of the systems of the same name."""
 
 
 class ClosedLoop(Diagram):
@@ -126,16 +105,13 @@ def build_closed_loop(
 
     Raises:
         ConfigError: bad input, an unreachable reference.
-        TypeError: systems of one's own beside an Experiment, which has its own.
+        TypeError: systems of the user with an Experiment, which already has them.
     """
     experiment = concrete(scenario, **own)
-    experiment.own.claim()
+    experiment.own.claim(experiment.scenario)
     builder = DiagramBuilder()
     _add_surroundings(builder, experiment, meshcat)
-    if isinstance(experiment.scenario.actuator, ServoActuatorConfig):
-        catch_up = _add_servos(builder, experiment)
-    else:
-        catch_up = _add_torques(builder, experiment)
+    catch_up = _ACTUATORS[type(experiment.scenario.actuator)](builder, experiment)
     _connect_loop(builder, experiment)
     loop = ClosedLoop()
     builder.BuildInto(loop)
@@ -177,7 +153,9 @@ def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
     else:
         law, catch_up = _add_law(builder, experiment)
         channel, reports = law.channel, reported(law.kept)
-    link = _link(experiment, channel, reports)
+    link, config = experiment.own.systems.get("link"), experiment.scenario.link
+    if link is None:
+        link = LINKS[type(config)].system(config, experiment, channel, reports)
     limit = np.full(link.GetInputPort("commanded").size(), experiment.torque_limit)
     builder.AddNamedSystem("saturation", Saturation(-limit, limit))
     builder.AddNamedSystem("delay_chain", link)
@@ -190,16 +168,7 @@ def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
 
 
 def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
-    """The law for servos, the delay of its commands, and the servos; its catch-up, s.
-
-    Raises:
-        ConfigError: a controller or a link of the user's own, which are for torques.
-    """
-    for role in ("controller", "link"):
-        if role in experiment.own.systems:
-            raise ConfigError(
-                f"actuator.kind: got 'servo' with a {role} of your own; expected 'torque'"
-            )
+    """Add the law for servos, the delay of its commands, and the servos; return its catch-up, s."""
     sc, machine = experiment.scenario, StewartDynamics(experiment.truth)
     law, planned, catch_up = servo_law(experiment)
     first, believed = commands_in_flight(experiment, law, law.timeline.delay)
@@ -210,7 +179,7 @@ def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
     )
     builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
     _, flying = commands_in_flight(experiment, law, sc.true_delay)
-    chain = builder.AddNamedSystem("delay_chain", _wire(experiment, flying, "command"))
+    chain = builder.AddNamedSystem("delay_chain", wire(experiment, flying, "command"))
     builder.Connect(controller.GetOutputPort("command"), chain.GetInputPort("commanded"))
     servos = builder.AddNamedSystem(
         "servos",
@@ -221,6 +190,13 @@ def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
     plant = builder.GetSubsystemByName("plant")
     builder.Connect(plant.GetOutputPort("state"), servos.GetInputPort("state"))
     return catch_up
+
+
+_ACTUATORS: Final[Mapping[type, Callable[[DiagramBuilder, Experiment], float]]] = {
+    TorqueActuatorConfig: _add_torques,
+    ServoActuatorConfig: _add_servos,
+}
+"""Functions that add controller, link and motors to a loop, and return its catch-up in s."""
 
 
 def _add_surroundings(
@@ -237,27 +213,15 @@ def _add_surroundings(
 
 
 def _sensor(experiment: Experiment) -> System:
-    """The user's own, or the scenario's.
+    """Return the user's own, or the scenario's."""
+    own, config = experiment.own.systems.get("sensor"), experiment.scenario.sensor
+    return SENSORS[type(config)].system(config, experiment) if own is None else own
 
-    Raises:
-        ConfigError: encoders, with a sensor or a controller of the user's own.
-    """
-    s, own, period = (
-        experiment.scenario.sensor,
-        experiment.own.systems,
-        experiment.scenario.controller.period,
-    )
-    motion = motion_scale(experiment)
-    if not isinstance(s, EncoderSensorConfig):
-        sensor = Sensor(np.array(s.noise_std), s.seed, period, s.faults, motion)
-        return own.get("sensor", sensor)
-    for role in ("sensor", "controller"):
-        if role in own:
-            raise ConfigError(
-                f"sensor.kind: got 'encoders' with a {role} of your own; expected 'state'"
-            )
-    cranks = np.abs(experiment.truth.jacobian(experiment.start[POSE])) @ motion
-    return Encoders(experiment.truth, s.bits, s.samples, s.offset, s.seed, period, s.faults, cranks)
+
+def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | MultibodyStewart:
+    disturbance = experiment.own.systems.get("disturbance")
+    wrench = disturbance is not None and disturbance.HasOutputPort("wrench")
+    return PLANTS[experiment.scenario.plant.kind](experiment, wrench, meshcat)
 
 
 def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
@@ -277,14 +241,15 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
     builder.Connect(motors.GetOutputPort("torque"), bias.get_input_port())
     _disturb(builder, experiment, bias.get_output_port())
     builder.Connect(out("plant", "state"), into("sensor", "state"))
-    encoders = isinstance(experiment.scenario.sensor, EncoderSensorConfig)
-    state = out("controller", "estimate") if encoders else measured
+    measured_state = experiment.scenario.sensor.measures_state
+    state = measured if measured_state else out("controller", "estimate")
     builder.Connect(state, into("density", "measurement"))
     builder.Connect(out("reference", "reference"), into("density", "reference"))
     builder.Connect(out("controller", "torque"), into("density", "torque"))
     if builder.HasSubsystemNamed("tuner"):
         # Weights come before the estimate of their sample, so that theirs is of the one before.
-        state = out("controller", "state_estimate") if encoders else out("sensor", "measurement")
+        told = ("sensor", "measurement") if measured_state else ("controller", "state_estimate")
+        state = out(*told)
         _connect_tuner(builder, builder.GetSubsystemByName("tuner"), state)
     if experiment.start[RATES].any() and experiment.scenario.plant.kind == "multibody":
         builder.AddNamedSystem("start_check", StartCheck(experiment.start))
@@ -301,13 +266,13 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
 
 
 def _motors(builder: DiagramBuilder) -> System:
-    """Whose torque acts: the servos' where there are some, else what comes over the link."""
+    """Return the system whose torque acts: the servos, or the link where there are none."""
     servos = builder.HasSubsystemNamed("servos")
     return builder.GetSubsystemByName("servos" if servos else "delay_chain")
 
 
 def _measured(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
-    """Where the controller has its measurements from: the sensor, or what they are delayed by."""
+    """Return the output that the controller measures: of the sensor, or of its delay."""
     sc, controller = experiment.scenario, builder.GetSubsystemByName("controller")
     measured = builder.GetSubsystemByName("sensor").GetOutputPort("measurement")
     motors = _motors(builder)
@@ -327,19 +292,21 @@ def _measured(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
             builder.Connect(way.GetOutputPort("age"), controller.GetInputPort("age"))
         if report is not None:
             report = late("late_report", report).GetOutputPort("measurement")
-    told = not isinstance(sc.link, NetworkConfig) or sc.link.acknowledged
-    if report is not None and told and controller.HasInputPort("report"):
+    if report is not None and sc.link.acknowledged and controller.HasInputPort("report"):
         builder.Connect(report, controller.GetInputPort("report"))
     return measured
 
 
 def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[PredictiveLqi, float]:
-    """The shipped controller behind its reference and weights; its law, and its catch-up, s."""
+    """Add the shipped controller, its reference and weights; return law and catch-up, s."""
     law, planned, catch_up = control_law(experiment)
     reference = builder.AddNamedSystem(
         "reference", Reference(experiment.reference, planned, law.preview_times)
     )
-    queue, motion = first_queue(experiment, law), followed_motion(experiment, law, planned)
+    queue, motion = (
+        first_queue(experiment, law),
+        followed_motion(law, planned, experiment.reference),
+    )
     controller = builder.AddNamedSystem("controller", DelayLqiController(law, queue, motion))
     weights = _weights(builder, experiment, law)
     builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
@@ -348,12 +315,8 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[Predictiv
 
 
 def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None:
-    """The user's controller behind its reference, and what samples it."""
+    """Add the user's controller, its reference, and the system that samples it."""
     sc, system = experiment.scenario, experiment.own.systems["controller"]
-    if experiment.tuned:
-        raise ConfigError(
-            f"tuner.kind: got {sc.tuner.kind!r} with a controller of your own; expected 'fixed'"
-        )
     motion = experiment.reference
     reference = builder.AddNamedSystem("reference", Reference(motion, motion, np.zeros(1)))
     builder.AddNamedSystem("own_controller", system)
@@ -382,7 +345,7 @@ def _disturb(builder: DiagramBuilder, experiment: Experiment, torque: OutputPort
 
 
 def _weights(builder: DiagramBuilder, experiment: Experiment, law: PredictiveLqi) -> OutputPort:
-    """What the controller's weights come from: a `tuner`, or constant `weights`."""
+    """Return the output that sets the weights: of a `tuner`, or of constant `weights`."""
     c, own = experiment.scenario.controller, experiment.own.systems.get("tuner")
     fixed = np.array([c.w_Q, c.w_R])
     if own is None and not experiment.tuned:
@@ -403,7 +366,7 @@ def _tuner(builder: DiagramBuilder, experiment: Experiment, law: PredictiveLqi) 
 
 
 def _connect_tuner(builder: DiagramBuilder, tuner: System, state: OutputPort) -> None:
-    """Give it of what the loop can tell, the state among it, those that it has ports for."""
+    """Connect the inputs that a tuner has, `measurement` with `state`."""
     told = {name: builder.GetSubsystemByName(name).GetOutputPort(name) for name in _TOLD}
     controller = builder.GetSubsystemByName("controller")
     if controller.HasOutputPort("memory"):
@@ -411,61 +374,3 @@ def _connect_tuner(builder: DiagramBuilder, tuner: System, state: OutputPort) ->
     for name, port in (told | {"measurement": state}).items():
         if tuner.HasInputPort(name):
             builder.Connect(port, tuner.GetInputPort(name))
-
-
-def _link(experiment: Experiment, channel: Channel, reports: int) -> System:
-    """What is between limit and motors, for a law's channel and reports of so many periods."""
-    own = experiment.own.systems.get("link")
-    if own is not None:
-        if isinstance(experiment.scenario.link, NetworkConfig):
-            raise ConfigError("link.kind: got 'network' with a link of your own; expected 'wire'")
-        return own
-    sc, delay = experiment.scenario, experiment.scenario.true_delay
-    period, queue = sc.controller.period, torques_in_flight(experiment, delay)
-    if isinstance(sc.link, NetworkConfig):
-        repeats = channel.repeats if isinstance(channel, Packets) else 0
-        times = forward_times(sc, number_sent(sc.duration, period))
-        return PlayoutBuffer(
-            period,
-            times,
-            delay,
-            queue,
-            rows=repeats + channel.torques,
-            repeats=repeats,
-            dry=sc.link.dry,
-            history=reports,
-        )
-    return _wire(experiment, queue, "torque")
-
-
-def _wire(experiment: Experiment, queue: Array, carries: Carried) -> System:
-    """A wire, with what is under way on it at t = 0, (L, n)."""
-    sc, delay = experiment.scenario, experiment.scenario.true_delay
-    period = sc.controller.period
-    if not sc.delay.constant:
-        return VaryingDelay(period, torque_delays(sc), delay, queue, carries)
-    chain = DelayChain(period, delay.steps, delay.fraction, queue, carries)
-    declare_constant(chain, "delay", np.array([sc.eta]))  # for the record alone
-    declare_constant(chain, "packets", np.full(len(PACKETS), np.nan))
-    return chain
-
-
-def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | MultibodyStewart:
-    plant, disturbance = experiment.scenario.plant, experiment.own.systems.get("disturbance")
-    wrench = disturbance is not None and disturbance.HasOutputPort("wrench")
-    if plant.kind == "multibody":
-        return MultibodyStewart(
-            experiment.truth,
-            plant.time_step,
-            gravity=plant.gravity,
-            meshcat=meshcat,
-            start=experiment.start[POSE],
-            wrench=wrench,
-            payload_mass=plant.payload_mass,
-            payload_position=plant.payload_position,
-            joint_damping=plant.joint_damping,
-            coulomb_friction=plant.coulomb_friction,
-            coulomb_speed=plant.coulomb_speed,
-        )
-    truth = true_dynamics(experiment, biased=False)
-    return ExactPlant(truth, experiment.start, wrench, limits_of(experiment))

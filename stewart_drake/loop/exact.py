@@ -17,7 +17,7 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, Limits, Workspace
-from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import weak
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE, RATES
 from stewart_drake.scenario.timing import METRIC_PERIOD
 

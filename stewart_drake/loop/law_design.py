@@ -1,8 +1,10 @@
-"""The control law without a scenario: for a diagram of one's own."""
+"""The control law: of a scenario, composed of parts, and for a diagram of the user."""
 
 import dataclasses
 import math
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,30 +15,286 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import validate
+from stewart_drake.law.catch_up import CatchUp
+from stewart_drake.law.channel import Packets
+from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.delay_filter import delay_settings
 from stewart_drake.law.delay_observer import DelayObserver
+from stewart_drake.law.design_models import MultibodyModel, PaperModel
+from stewart_drake.law.feedforward import (
+    EquilibriumFeedforward,
+    Feedforward,
+    InverseDynamicsFeedforward,
+    NoFeedforward,
+)
+from stewart_drake.law.filter_settings import (
+    ParameterSet,
+    filter_settings,
+    usual_parameters,
+)
+from stewart_drake.law.late import LateObserver
+from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.planner import NoPlanner, Rejoin
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.predictors import (
+    ArrivalPredictor,
+    LinearPredictor,
+    NonlinearPredictor,
+    Predictor,
+)
+from stewart_drake.law.startup import (
+    choose_substeps,
+    machine_torque,
+    reference_torque,
+    turning_substeps,
+    weight_scales,
+)
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.experiment import (
     Experiment,
+    believed_delay,
     calibration_of,
-    control_law,
-    first_queue,
+    motion_scale,
+    planned_limit,
+    torques_in_flight,
 )
-from stewart_drake.loop.own import Own
-from stewart_drake.loop.own_motion import own_motion
+from stewart_drake.loop.kinds import LINKS, REPORTS, SENSORS
+from stewart_drake.loop.own import Own, own_motion
 from stewart_drake.loop.reference import Reference
-from stewart_drake.scenario.config import ControllerConfig, Scenario
+from stewart_drake.native.layout import plate_radius
+from stewart_drake.scenario.calibration import OFFSETS
+from stewart_drake.scenario.config import (
+    ControllerConfig,
+    Scenario,
+)
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.signals import NUM_STATE, POSE
+from stewart_drake.scenario.dependencies import differing
+from stewart_drake.scenario.field_types import MOST_PERIODS
+from stewart_drake.scenario.packets import times_under_way
+from stewart_drake.scenario.signals import (
+    BIAS,
+    DAMPING,
+    NUM_STATE,
+    PARAMETERS,
+    PAYLOAD,
+    POSE,
+)
 from stewart_drake.scenario.trajectories import evaluate, moved
 from stewart_drake.types import Array
+
+GENTLE = 3.0
+"""Largest torque predicted with the usual steps, over that of the reference."""
+_MOST = 0.999
+"""Share of the measurements that are waited for."""
+_PATIENCE = 10
+"""Periods by which a measurement may be later than that, or lost, before the model goes on."""
+
+
+def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
+    """Return the cost that the gain minimises; `peak_torque` of the reference, N m."""
+    c = experiment.scenario.controller
+    errors, integrals, torques = weight_scales(
+        c.weight_scaling, experiment.nominal, experiment.peak_to_peak, peak_torque
+    )
+    return QuadraticCost(errors, c.integral_weight * integrals if c.integral else None, torques)
+
+
+class Sizing(NamedTuple):
+    """Step size and torque scales of a law, computed from its machine and motion.
+
+    Attributes:
+        substeps: of the prediction, per period.
+        reference_torque: largest along the reference, N m.
+        machine_torque: see `law.startup.machine_torque`, N m.
+    """
+
+    substeps: int
+    reference_torque: float
+    machine_torque: float
+
+
+def sizing_of(experiment: Experiment) -> Sizing:
+    """Size a law by mechanism, reference, duration, period and the believed delay."""
+    sc, nominal, reference = experiment.scenario, experiment.nominal, experiment.reference
+    period, steps = sc.controller.period, believed_delay(sc).steps
+    substeps = choose_substeps(nominal, reference, period, steps, sc.duration)
+    return Sizing(
+        max(substeps, turning_substeps(nominal, reference, period, sc.duration)),
+        reference_torque(nominal, reference, sc.duration),
+        machine_torque(nominal),
+    )
+
+
+_PREDICTORS: Final[Mapping[str, Predictor]] = {
+    "linear": LinearPredictor(),
+    "nonlinear": NonlinearPredictor(),
+}
+_FEEDFORWARDS: Final[Mapping[str, Feedforward]] = {
+    "none": NoFeedforward(),
+    "equilibrium": EquilibriumFeedforward(),
+    "inverse_dynamics": InverseDynamicsFeedforward(),
+}
+
+
+def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> PredictiveLqi:
+    """Compose the law of a scenario; only here and in `loop.kinds` are words turned into parts.
+
+    Args:
+        experiment: of the scenario.
+        sizing: `sizing_of` it, where that is known.
+
+    Raises:
+        ConfigError: the scenario asks for no law that sends torques; see `loop.servo_design`.
+    """
+    sc, nominal = experiment.scenario, experiment.nominal
+    if found := differing(sc, {"controller.command": "torque"}):
+        raise ConfigError(found.problem(hint=", for a law that closes its loop across the delay"))
+    c, motion = sc.controller, motion_scale(experiment)
+    sensor, link = SENSORS[type(sc.sensor)], LINKS[type(sc.link)]
+    timeline = Timeline(c.period, believed_delay(sc))
+    substeps, peak_torque, least = sizing or sizing_of(experiment)
+    torque_scale = max(least, peak_torque)
+    plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
+    parameters = estimated_parameters(experiment, torque_scale)
+    settings = filter_settings(motion, plate, torque_scale, asked, c.period, parameters)
+    observer = sensor.observer(sc.sensor, settings if c.estimate else None)
+    quiet = c.open_loop_start and sc.start == "rest"
+    waits = longest_wait(sc)
+    if waits:
+        observer = LateObserver(observer, waits)
+    channel = link.channel(sc.link, experiment, timeline, waits)
+    motors = TorqueLimit(experiment.torque_limit)
+    law = PredictiveLqi(
+        timeline=timeline,
+        plant=NominalPlant(nominal, substeps, GENTLE * torque_scale, motors),
+        sensing=sensor.sensing(sc.sensor, experiment),
+        observer=observer,
+        predictor=_PREDICTORS[c.prediction],
+        feedforward=_FEEDFORWARDS[c.feedforward],
+        model=PaperModel(c.torque_map) if c.model == "paper" else MultibodyModel(),
+        cost=quadratic_cost(experiment, peak_torque),
+        channel=channel,
+        kept=waits + (REPORTS if isinstance(channel, Packets) else 0),
+        silence=_until_seen(timeline.delay, waits) if quiet else 0,
+    )
+    if c.delay_estimator != "none":
+        delay = delay_settings(c.delay_estimator, c.delay_std, c.delay_max)
+        law = replace(
+            law,
+            observer=DelayObserver(settings, delay, timeline.eta, quiet),
+            predictor=ArrivalPredictor(),
+            planner=Rejoin(c.replan, experiment.scale) if c.replan > 0 else NoPlanner(),
+            silence=0,  # until the delay is found
+        )
+    return experiment.own.revised(law)
+
+
+def estimated_parameters(experiment: Experiment, torque_scale: float) -> ParameterSet:
+    """Return the estimated parameters and their prior; `torque_scale` of the motion, N m.
+
+    Raises:
+        ConfigError: the calibration is beyond the bounds of such a machine.
+    """
+    sc, machine = experiment.scenario, experiment.mechanism
+    found = usual_parameters(
+        machine.plate.mass,
+        torque_scale,
+        planned_limit(sc),
+        plate_radius(machine),
+        experiment.nominal.free,
+    )
+    if experiment.calibration is not None:
+        try:
+            found = found.knowing(experiment.calibration)
+        except ValueError as error:
+            raise ConfigError(f"controller.calibration: {error}") from None
+    prior = sc.controller.prior
+    said = {
+        **dict.fromkeys(PARAMETERS[BIAS], prior.torque_bias),
+        PARAMETERS[PAYLOAD]: prior.payload,
+        PARAMETERS[DAMPING]: prior.damping,
+        **dict.fromkeys(OFFSETS, prior.offsets),
+    }
+    return found.trusting({name: std for name, std in said.items() if std is not None})
+
+
+def _until_seen(delay: Delay, waits: int) -> int:
+    """Samples until a whole hold of the first own torque has been seen.
+
+    Before that the measurements are of a plate on which nothing but its bias acts: what they make
+    of payload and friction is noise, and feedback through them puts it on the motors for eta.
+    """
+    late = max(waits - _PATIENCE, 0)
+    return math.ceil(delay.periods + 1 - 1e-9) + late
+
+
+def longest_wait(scenario: Scenario) -> int:
+    """Periods for which the law waits for a late measurement; 0 where none comes late.
+
+    Raises:
+        ConfigError: they are more than any delay may have.
+    """
+    sc, period, back = scenario, scenario.controller.period, scenario.link.back
+    if sc.sensor.delay == 0 and back is None:
+        return 0
+    longest = sc.sensor.delay + (0.0 if back is None else times_under_way(back).ppf(_MOST))
+    if longest > MOST_PERIODS * period:
+        field = "sensor.delay" if back is None else "link.return"
+        raise ConfigError(
+            f"{field}: got measurements that take {longest:.4g} s; expected at most "
+            f"{MOST_PERIODS} periods"
+        )
+    return math.ceil(longest / period - 1e-9) + _PATIENCE
+
+
+def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, float]:
+    """The control law, the motion it follows, and the length of the blend onto the reference."""
+    sc, law = experiment.scenario, compose_law(experiment)
+    law.warm_up()
+    way = way_onto(experiment, law)
+    if way is None:
+        return law, experiment.reference, 0.0
+    return law, *way.plan(sc.controller.catch_up, planned_limit(sc))
+
+
+def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
+    """The ways onto the reference after a start from rest, or None where there is none."""
+    sc, nominal, timeline = experiment.scenario, experiment.nominal, law.timeline
+    if sc.start != "rest" or sc.controller.catch_up == 0:
+        return None
+    state, queue = experiment.start, torques_in_flight(experiment, timeline.delay)
+    if len(queue):
+        state = nominal.predict(state, *timeline.until_next(queue), law.plant.substeps)[-1]
+    return CatchUp(nominal, experiment.reference, state, timeline.eta, sc.controller.period)
+
+
+def first_queue(experiment: Experiment, law: PredictiveLqi) -> Array:
+    """The torques in flight at t = 0 that a law begins with.
+
+    One that does not know the delay has more: what acts in each period until its own do, up to the
+    longest delay.
+    """
+    if not isinstance(law.observer, DelayObserver):
+        return torques_in_flight(experiment, law.timeline.delay)
+    return torques_in_flight(experiment, Delay(law.observer.kept(law.timeline.period)))
+
+
+def followed_motion(
+    law: PredictiveLqi, planned: Trajectory, reference: Trajectory
+) -> tuple[Trajectory, Trajectory] | None:
+    """Return the motions that a law with a delay estimator reads at any instant, or None."""
+    return (planned, reference) if isinstance(law.observer, DelayObserver) else None
+
 
 _HORIZON = 10.0
 """s of a reference without an end that weights and steps are chosen by."""
 
 
+@dataclass(eq=False)
 class DesignedLaw:
-    """What `design_law` returns; a law can be added to several diagrams.
+    """Result of `design_law`; it can be added to several diagrams.
 
     Attributes:
         law: the control law as a pure function, memory in, memory out.
@@ -46,16 +304,11 @@ class DesignedLaw:
         weights: (2,) w_Q and w_R.
     """
 
-    def __init__(
-        self,
-        law: PredictiveLqi,
-        reference: Trajectory,
-        planned: Trajectory,
-        queue: Array,
-        weights: Array,
-    ) -> None:
-        self.law, self.reference, self.planned = law, reference, planned
-        self.queue, self.weights = queue, weights
+    law: PredictiveLqi
+    reference: Trajectory
+    planned: Trajectory
+    queue: Array
+    weights: Array
 
     def __repr__(self) -> str:
         timeline, dynamics = self.law.timeline, self.law.plant.dynamics
@@ -63,8 +316,7 @@ class DesignedLaw:
 
     def controller(self) -> DelayLqiController:
         """The law alone as a LeafSystem, whose `preview` and `weights` are the caller's."""
-        known = isinstance(self.law.observer, DelayObserver)
-        motion = (self.planned, self.reference) if known else None
+        motion = followed_motion(self.law, self.planned, self.reference)
         return DelayLqiController(self.law, self.queue, motion)
 
     def AddToBuilder(self, builder: DiagramBuilder, name: str = "delay_lqi") -> DelayLqiController:
@@ -75,8 +327,8 @@ class DesignedLaw:
             name: of the controller; its reference is `NAME_reference`, its weights `NAME_weights`.
 
         Returns:
-            The controller, of which `measurement` (12) is to be connected, and `torque` (6), which
-            is to be read at its samples: by what holds and delays it, at multiples of its period
+            The controller. Connect its `measurement` (12) and its `torque` (6), which is to be read
+            at its samples: by what holds and delays it, at multiples of its period
             (`scenario.timing.event_time`) and not later.
         """
         controller = builder.AddNamedSystem(name, self.controller())

@@ -26,7 +26,7 @@ from pydrake.systems.framework import (
 )
 
 from stewart_drake.dynamics.workspace import margin
-from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import weak
 from stewart_drake.mechanism.assembly import joint_state
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map

@@ -20,12 +20,8 @@ from stewart_drake.loop.experiment import Experiment, torques_in_flight, true_dy
 from stewart_drake.loop.sensor import white_noises
 from stewart_drake.native.law_layout import CAUSES, address
 from stewart_drake.native.plant import Controller, Ended, LoopStruct
-from stewart_drake.scenario.config import (
-    Scenario,
-    StateSensorConfig,
-    TorqueActuatorConfig,
-    WireConfig,
-)
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.link import releases, torque_delays
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
 from stewart_drake.scenario.timing import event_time, instants, look_time
@@ -157,19 +153,22 @@ class InC:
         return Counts(**dict(zip(CAUSES, self._counts.tolist(), strict=True)))
 
 
+COVERED: Final[Accepted] = {
+    "plant.kind": "exact",
+    "link.kind": "wire",
+    "actuator.kind": "torque",
+    "sensor.kind": "state",
+    "sensor.faults": [],
+    "sensor.delay": 0,
+    "sensor.loss": 0,
+}
+"""Values of fields that the loop in C has."""
+
+
 def uncovered(scenario: Scenario) -> str | None:
-    """What of a scenario only Drake's loop has, by its field, or None."""
-    sc = scenario
-    only_drake = {
-        "plant.kind": sc.plant.kind != "exact",
-        "link.kind": not isinstance(sc.link, WireConfig),
-        "actuator.kind": not isinstance(sc.actuator, TorqueActuatorConfig),
-        "sensor.kind": not isinstance(sc.sensor, StateSensorConfig),
-        "sensor.faults": bool(sc.sensor.faults),
-        "sensor.delay": sc.sensor.delay != 0,
-        "sensor.loss": sc.sensor.loss != 0,
-    }
-    return next((name for name, there in only_drake.items() if there), None)
+    """Return the field of a scenario for which only Drake's loop will do, or None."""
+    found = differing(scenario, COVERED)
+    return found and found.field
 
 
 class Wire(NamedTuple):
@@ -225,7 +224,7 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
         Whatever the law raises.
     """
     sc, sensor = experiment.scenario, experiment.scenario.sensor
-    assert isinstance(sensor, StateSensorConfig)
+    assert sensor.kind == "state"
     noise = np.array(sensor.noise_std)
     truth = true_dynamics(experiment, biased=False)
     accuracy = SHARE * sc.plant.accuracy

@@ -1,24 +1,47 @@
-"""What of a loop is the user's own: systems, a trajectory, a law, checked at the border."""
+"""Systems, trajectory and law of the user in a loop, checked before they are used."""
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple, TypeVar
 from weakref import WeakSet
 
-from pydrake.systems.framework import InputPort, OutputPort, PortDataType, System
-from pydrake.trajectories import Trajectory
+import numpy as np
+from pydrake.systems.framework import Context, InputPort, OutputPort, System
+from pydrake.trajectories import FunctionHandleTrajectory, Trajectory
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.memory import Counts
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.loop.controller import HELD
+from stewart_drake.loop.sampling import SteppedLaw
+from stewart_drake.loop.varying_delay import declare_constant
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
+    NUM_COORDINATES,
     NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
+    POSE,
+    RATES,
     TUNER_INPUTS,
     WEIGHTS,
+    ports_of,
 )
+from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.types import Array
 
+_REST: Final = 1e-6
+"""rad/s or m/s; a trajectory that ends slower than this goes on at rest."""
+_APART: Final = 1e-9
+"""s before and after a joint of two pieces."""
+_CHECKS: Final = 200
+"""Instants at which a trajectory is looked at."""
+_KNOWN: Final = ("torque_commanded", "measurement")
+"""Signals that a controller has whose inside is not known."""
 OwnSystem = System | Callable[[], System]
 """A system, which serves one run, or what makes one, such as its class."""
 OwnReference = Trajectory | Callable[[], Trajectory]
@@ -29,24 +52,36 @@ AnyLaw = TypeVar("AnyLaw", PredictiveLqi, ServoPreview)
 
 
 class Role(NamedTuple):
-    """What a system needs to take a place in the loop: its ports and their sizes."""
+    """Place of a system in the loop: its ports with their sizes."""
 
     inputs: Mapping[str, int]
-    """That it must have."""
+    """Required inputs."""
     may: Mapping[str, int]
-    """Inputs that it may have."""
+    """Optional inputs."""
     outputs: Mapping[str, int]
-    """Of which it has one at least."""
+    """Outputs, at least one of them required."""
+    accepted: Accepted = MappingProxyType({})
+    """Accepted values of the scenario's fields."""
 
 
 ROLES: Final[Mapping[str, Role]] = MappingProxyType(
     {
         "controller": Role(
-            {"measurement": NUM_STATE}, {"reference": NUM_REFERENCE}, {"torque": NUM_TORQUES}
+            {"measurement": NUM_STATE},
+            {"reference": NUM_REFERENCE},
+            {"torque": NUM_TORQUES},
+            {"sensor.kind": "state", "tuner.kind": "fixed", "actuator.kind": "torque"},
         ),
         "disturbance": Role({}, {}, {"torque": NUM_TORQUES, "wrench": 6}),
-        "sensor": Role({"state": NUM_STATE}, {}, {"measurement": NUM_STATE}),
-        "link": Role({"commanded": NUM_TORQUES}, {}, {"torque": NUM_TORQUES}),
+        "sensor": Role(
+            {"state": NUM_STATE}, {}, {"measurement": NUM_STATE}, {"sensor.kind": "state"}
+        ),
+        "link": Role(
+            {"commanded": NUM_TORQUES},
+            {},
+            {"torque": NUM_TORQUES},
+            {"link.kind": "wire", "actuator.kind": "torque"},
+        ),
         "tuner": Role(
             {},
             {
@@ -64,7 +99,7 @@ _used: "WeakSet[Any]" = WeakSet()
 
 
 class Own(NamedTuple):
-    """What of a loop is the user's own; the scenario's is used for all else.
+    """Systems, reference and law of the user; all else is the scenario's.
 
     Attributes:
         systems: by their ROLES.
@@ -80,7 +115,7 @@ class Own(NamedTuple):
 
     @property
     def names(self) -> dict[str, str]:
-        """What each is, as `summary.json` tells it."""
+        """Class of each, as in `summary.json`."""
         found = {role: type(system).__name__ for role, system in self.systems.items()}
         if self.reference is not None:
             found["reference"] = type(self.reference).__name__
@@ -90,17 +125,20 @@ class Own(NamedTuple):
 
     @property
     def unjudged(self) -> str | None:
-        """Whose dynamics nobody knows, so that no stability of the loop can be told, or None."""
+        """Role of a system with unknown dynamics, which prevents a stability verdict, or None."""
         return next(
             (role for role in ("controller", "sensor", "link") if role in self.systems), None
         )
 
-    def claim(self) -> None:
-        """Note that the systems now belong to a loop.
+    def claim(self, scenario: Scenario) -> None:
+        """Note that the systems now belong to a loop of a scenario.
 
         Raises:
-            ConfigError: one of them belongs to another one.
+            ConfigError: one of them belongs to another loop, or does not go with the scenario.
         """
+        for role in self.systems:
+            if found := differing(scenario, ROLES[role].accepted):
+                raise ConfigError(found.problem(f"with a {role} of your own"))
         for system in self.systems.values():
             if system in _used:
                 raise ConfigError(
@@ -110,7 +148,7 @@ class Own(NamedTuple):
             _used.add(system)
 
     def revised(self, law: AnyLaw) -> AnyLaw:
-        """The law to be used in the place of the scenario's.
+        """Return the law to use in place of the scenario's.
 
         Raises:
             ConfigError: the user's function returned something else.
@@ -127,11 +165,11 @@ class Own(NamedTuple):
 
 
 NOTHING: Final = Own()
-"""All is the scenario's."""
+"""Nothing of the user."""
 
 
 def take(given: Mapping[str, Any]) -> Own:
-    """What a user gave for one run, made and checked, the reference's motion excepted.
+    """Make and check what a user gave for one run, except the reference's motion.
 
     Args:
         given: by the name of its argument in `simulate`; None is nothing.
@@ -172,47 +210,174 @@ def _make(what: str, given: Any, kind: type) -> Any:
 
 
 def _check(role: str, system: System) -> None:
-    """Whether the ports fit; the user's system is no longer needed where they do not."""
-    needed, name = ROLES[role], f"{role}: {type(system).__name__}"
-    inputs = _ports(system.get_input_port, system.num_input_ports())
-    outputs = _ports(system.get_output_port, system.num_output_ports())
-    must, may = (
-        ", ".join(f"{port} ({size})" for port, size in ports.items())
-        for ports in (needed.inputs, needed.may)
+    """Refuse a system whose ports do not fit its place in the loop."""
+    needed = ROLES[role]
+    inputs = _sizes(map(system.get_input_port, range(system.num_input_ports())))
+    outputs = _sizes(map(system.get_output_port, range(system.num_output_ports())))
+    found = {name: size for name, size in outputs.items() if name in needed.outputs}
+    known = {**needed.inputs, **needed.may}
+    if needed.inputs.items() <= inputs.items() <= known.items() and (
+        found and found.items() <= needed.outputs.items()
+    ):
+        return
+    wanted = f", if wanted {_listed(needed.may)}" if needed.may else ""
+    raise ConfigError(
+        f"{role}: {type(system).__name__}: got inputs {_listed(inputs)} and outputs "
+        f"{_listed(outputs)}; expected inputs {_listed(needed.inputs)}{wanted}, and output "
+        f"{_listed(needed.outputs, ' or ')}"
     )
-    known = " and, if wanted, ".join(filter(None, (must, may))) or "none"
-    sizes = {**needed.inputs, **needed.may}
-    for port in inputs:
-        if port not in sizes:
-            raise ConfigError(f"{name}: got an input port {port!r}; expected {known}")
-        _check_size(name, "input", inputs[port], sizes[port])
-    for port in needed.inputs:
-        if port not in inputs:
-            raise ConfigError(f"{name}: got no input port {port!r}; expected {known}")
-    found = [port for port in needed.outputs if port in outputs]
-    if not found:
-        wanted = " or ".join(f"{port!r} ({size})" for port, size in needed.outputs.items())
-        raise ConfigError(f"{name}: got {_list(outputs)}; expected an output port {wanted}")
-    for port in found:
-        _check_size(name, "output", outputs[port], needed.outputs[port])
 
 
-def _ports(get: Callable[[int], Any], number: int) -> dict[str, Any]:
-    return {port.get_name(): port for port in map(get, range(number))}
+def _sizes(ports: Iterable[InputPort | OutputPort]) -> dict[str, int]:
+    """Sizes of ports by name, 0 of an abstract one."""
+    return {port.get_name(): port.size() for port in ports}
 
 
-def _list(outputs: Iterable[str]) -> str:
-    names = ", ".join(map(repr, outputs))
-    return f"output ports {names}" if names else "no output port"
+def _listed(sizes: Mapping[str, int], between: str = ", ") -> str:
+    return between.join(f"{name} ({size})" for name, size in sizes.items()) or "none"
 
 
-def _check_size(name: str, way: str, port: InputPort | OutputPort, size: int) -> None:
-    if port.get_data_type() != PortDataType.kVectorValued:
+class OwnMemory(NamedTuple):
+    """The last sample, in the words of the shipped controller's memory.
+
+    `torque` (6,) as asked for, `in_flight` (1, 6) what the limit let through of it, `measurement`
+    (12,) that was read, NaN before the first, `counts` of what is seen from outside.
+    """
+
+    torque: Array
+    in_flight: Array
+    measurement: Array
+    counts: Counts
+
+
+class SampledController(SteppedLaw):
+    """Reads a controller's torque every period, in the place of `DelayLqiController`.
+
+    Attributes:
+        backend: `own`.
+
+    Update:  every period  s <- [T_k; measurement], T_k the torque that the controller puts out
+             then, or the last one where that is no number.
+    Output:  torque = T_k, to be taken at the samples; the others as of the last sample.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | measurement | input | 12 | rad, m, rad/s, m/s | read every period |
+    | own_torque | input | 6 | N m | read every period |
+    | torque | output | 6 | N m | direct feedthrough |
+    | torque_commanded | output | 6 | N m | held |
+    | measurement_used | output | 12 | as measurement | held, NaN before the first sample |
+    | the others of the shipped controller | output | as of `scenario.signals.SIGNALS` | | NaN |
+
+    Args:
+        period: s.
+        torque_limit: of each motor, N m, infinite for none.
+    """
+
+    backend = "own"
+
+    def __init__(self, period: float, torque_limit: float) -> None:
+        super().__init__()
+        self._limit = torque_limit
+        nothing = np.zeros(NUM_TORQUES)
+        first = OwnMemory(nothing, nothing[None], np.full(NUM_STATE, np.nan), Counts())
+        self._measurement = self.DeclareVectorInputPort("measurement", NUM_STATE)
+        self._own = self.DeclareVectorInputPort("own_torque", NUM_TORQUES)
+        self._begin(first, period)
+        self._put_out("torque", NUM_TORQUES, HELD["torque_commanded"], now=True)
+        for port, signal in ports_of("controller").items():
+            if signal.name in _KNOWN:
+                self._put_out(port, signal.size, HELD[signal.name])
+            else:
+                declare_constant(self, port, np.full(signal.size, np.nan))
+
+    def _prepared(self, context: Context) -> Callable[[], OwnMemory]:
+        last, measurement = self.sample(context).memory, np.array(self._measurement.Eval(context))
+
+        def step() -> OwnMemory:
+            torque, causes = np.array(self._own.Eval(context)), []
+            if not np.all(np.isfinite(measurement)):
+                causes.append("measurements_missing")
+            if not np.all(np.isfinite(torque)):
+                causes.append("nonfinite_torque")
+                torque = last.torque
+            if np.any(np.abs(torque) >= self._limit):
+                causes.append("saturated_steps")
+            sent = np.clip(torque, -self._limit, self._limit)[None]
+            return OwnMemory(torque, sent, measurement, last.counts.plus(*causes))
+
+        return step
+
+
+def own_motion(reference: Trajectory, duration: float) -> Trajectory:
+    """A trajectory of the user's own, checked, and at rest after its end.
+
+    Args:
+        reference: 6 x 1, rad and m, with derivatives of order 1 and 2.
+        duration: of the simulation, s.
+
+    Returns:
+        The same, defined for t >= 0: the controller looks ahead of the end.
+
+    Raises:
+        ConfigError: one line.
+    """
+    name = f"reference: {type(reference).__name__}"
+    shape = (reference.rows(), reference.cols())
+    if shape != (NUM_COORDINATES, 1):
+        raise ConfigError(f"{name}: got shape {shape}; expected (6, 1), the pose")
+    begin, end = reference.start_time(), reference.end_time()
+    if begin > 0:
+        raise ConfigError(f"{name}: got a start at {begin:g} s; expected one at 0 s or before")
+    if end < 0:
+        raise ConfigError(f"{name}: got an end at {end:g} s; expected one after 0 s")
+    for t in np.linspace(0.0, min(duration, end), _CHECKS):
+        try:
+            values = evaluate(reference, float(t))
+        except (Exception, SystemExit) as error:  # Drake ends the process where it has none
+            raise ConfigError(
+                f"{name}: got no pose, rates and accelerations at {t:.4g} s "
+                f"({' '.join(str(error).split())}); expected derivatives of order 1 and 2"
+            ) from error
+        if not np.all(np.isfinite(values)):
+            raise ConfigError(f"{name}: got {values} at {t:.4g} s; expected finite numbers")
+    _check_joints(name, reference, min(duration, end))
+    if math.isinf(end):
+        return reference
+    rates = evaluate(reference, end)[RATES]
+    if end < duration and np.abs(rates).max() > _REST:
         raise ConfigError(
-            f"{name}: {way} port {port.get_name()!r}: got an abstract one; expected a vector of "
-            f"{size}"
+            f"{name}: got an end at {end:g} s with rates {rates}; expected it to come to rest, or "
+            f"duration <= {end:g}"
         )
-    if port.size() != size:
-        raise ConfigError(
-            f"{name}: {way} port {port.get_name()!r}: got {port.size()} values; expected {size}"
-        )
+    return _held_after(reference, end)
+
+
+def _check_joints(name: str, reference: Trajectory, until: float) -> None:
+    """Refuse pieces that do not fit, such as straight lines: nothing with a mass follows a jump."""
+    if not hasattr(reference, "get_segment_times"):
+        return
+    joints = [t for t in reference.get_segment_times() if 0 < t < until]
+    for t in joints:
+        before, after = (evaluate(reference, t + side * _APART) for side in (-1, 1))
+        for what, part, change in (("pose", POSE, RATES), ("rates", RATES, ACCELERATIONS)):
+            moving = np.abs(np.concatenate([before[change], after[change]])).max()
+            jump = np.abs(after[part] - before[part]).max()
+            if jump > _REST + 4 * _APART * moving:
+                raise ConfigError(
+                    f"{name}: got a jump of {jump:.3g} in the {what} at {t:.4g} s; expected pose "
+                    "and rates without jumps"
+                )
+
+
+def _held_after(reference: Trajectory, end: float) -> Trajectory:
+    still = np.zeros((NUM_COORDINATES, 1))
+
+    def derivative(t: float, order: int) -> Array:
+        return reference.EvalDerivative(t, order) if t <= end else still
+
+    held = FunctionHandleTrajectory(
+        lambda t: reference.value(min(t, end)), NUM_COORDINATES, 1, 0.0, math.inf
+    )
+    held.set_derivative(derivative)
+    return held

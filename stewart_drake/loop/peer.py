@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import fingerprint
-from stewart_drake.scenario.config import EncoderSensorConfig, Scenario
+from stewart_drake.scenario.config import EncoderSensorConfig, Scenario, StateSensorConfig
 
 DIGEST: Final = 8
 """Bytes of SHA-256 that stand for a part of an identity."""
@@ -109,7 +109,7 @@ def identity_of(scenario: Scenario) -> Identity:
     """
     mechanism, sensor = load_mechanism(scenario.mechanism), scenario.sensor
     period, read = scenario.controller.period, str(sensor.kind)
-    if isinstance(sensor, EncoderSensorConfig):
+    if sensor.kind == "encoders":
         read = f"encoders, {sensor.samples} samples, {code_bits(sensor)} bits"
     return Identity(
         Part(bytes.fromhex(fingerprint(mechanism)), mechanism.name[:NAME]),
@@ -119,8 +119,10 @@ def identity_of(scenario: Scenario) -> Identity:
     )
 
 
-def code_bits(sensor: EncoderSensorConfig) -> int:
-    """Return the bits of a turn in the codes of a datagram."""
+def code_bits(sensor: StateSensorConfig | EncoderSensorConfig) -> int:
+    """Return the bits of a turn in the codes of a datagram, 0 of a sensor without codes."""
+    if sensor.kind == "state":
+        return 0
     return MOST_BITS if sensor.bits is None else min(sensor.bits, MOST_BITS)
 
 

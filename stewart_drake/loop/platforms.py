@@ -1,34 +1,41 @@
-"""A platform in a diagram of one's own: `AddStewartPlatform`, for either engine."""
+"""Platforms in a diagram: `AddStewartPlatform`, and the multibody plant with the exact ports."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.geometry import SceneGraph
+from pydrake.geometry import Meshcat, MeshcatVisualizer, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import Frame, ModelInstanceIndex
 from pydrake.systems.framework import (
     Context,
+    Diagram,
     DiagramBuilder,
+    EventStatus,
     InputPort,
+    LeafSystem,
     OutputPort,
     System,
 )
 from pydrake.systems.primitives import AffineSystem
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.multibody import (
     CoulombFriction,
     PlateState,
     PlateWrench,
+    add_mechanism,
     add_model,
     set_pose,
 )
+from stewart_drake.loop.sampling import weak
 from stewart_drake.mechanism.files import as_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import PlantConfig
@@ -260,3 +267,111 @@ def AddStewartPlatform(
     if own:
         plant.Finalize()
     return StewartPlatform(builder, machine, plant, model, scene_graph, config)
+
+
+class MultibodyStewart(Diagram):
+    """The machine in Drake's multibody engine (SAP), with the ports of `ExactPlant`.
+
+    Like `ExactPlant` it takes every torque as it is: what motors can do is decided before it.
+
+    | port | direction | size | unit |
+    | --- | --- | --- | --- |
+    | torque | input | 6 | N m |
+    | wrench | input | 6, only if asked for | N m, N, in W at the plate's COM |
+    | state | output | 12 | rad, m, rad/s, m/s |
+    | crank_angles | output | 6 | rad |
+    | query | output | SceneGraph query object | - |
+
+    Args:
+        mechanism: the machine.
+        time_step: s.
+        meshcat: where to show it, or None.
+        start: (6,) pose by default, home if None.
+        wrench: whether there is an input for a wrench on the plate; unconnected it is zero.
+        **fields: others of `PlantConfig`; with gravity unless they say otherwise.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        time_step: float = 1e-3,
+        *,
+        meshcat: Meshcat | None = None,
+        start: ArrayLike | None = None,
+        wrench: bool = False,
+        **fields: Any,
+    ) -> None:
+        super().__init__()
+        builder = DiagramBuilder()
+        config = PlantConfig(time_step=time_step, **{"gravity": True} | fields)
+        platform = AddStewartPlatform(builder, mechanism, config, start=start)
+        for name in ("torque", "wrench") if wrench else ("torque",):
+            builder.ExportInput(platform.GetInputPort(name), name)
+        for name in ("state", "crank_angles"):
+            builder.ExportOutput(platform.GetOutputPort(name), name)
+        assert platform.scene_graph is not None
+        builder.ExportOutput(platform.scene_graph.get_query_output_port(), "query")
+        if meshcat is not None:
+            MeshcatVisualizer.AddToBuilder(builder, platform.scene_graph, meshcat)
+        builder.BuildInto(self)
+        self.mechanism, self.tree = mechanism, platform.plant
+
+    def set_state(self, context: Context, state: Array) -> None:
+        """Put the machine, in its own context, into [pose; rates] (12,), all loops closed.
+
+        Raises:
+            UnreachablePoseError, SingularPoseError: see `loop.multibody.set_pose`.
+        """
+        tree_context = self.GetMutableSubsystemContext(self.tree, context)
+        set_pose(self.tree, tree_context, self.mechanism, state[POSE], state[RATES])
+
+    def diagnose(self, context: Context) -> Failure | None:
+        """Why the plate, in its own context, is not inside its workspace, or None."""
+        state, cranks = (
+            np.asarray(self.GetOutputPort(name).Eval(context)) for name in ("state", "crank_angles")
+        )
+        return diagnose(self.mechanism, context.get_time(), state[POSE], cranks)
+
+
+def build_viewer(
+    mechanism: Mechanism, meshcat: Meshcat
+) -> tuple[Diagram, MultibodyPlant, MeshcatVisualizer]:
+    """The SDFormat model alone, shown in Meshcat wherever its context puts it."""
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(time_step=1e-3, discrete_contact_approximation="sap")
+    plant, scene_graph = AddMultibodyPlant(config, builder)
+    add_mechanism(plant, mechanism)
+    visualizer = MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+    return builder.Build(), plant, visualizer
+
+
+class StartCheck(LeafSystem):
+    """Warns at initialisation if a plate that shall start in motion is there at rest.
+
+    A MultibodyPlant has default positions, but no default velocities: a context that C++ makes,
+    such as that of `Simulator(loop)`, is at rest.
+
+    | port | direction | size | unit |
+    | --- | --- | --- | --- |
+    | state | input | 12 | rad, m, rad/s, m/s |
+
+    Args:
+        start: (12,) pose and rates that the plate shall start with.
+    """
+
+    def __init__(self, start: Array) -> None:
+        super().__init__()
+        self._start = start
+        self._state = self.DeclareVectorInputPort("state", NUM_STATE)
+        self.DeclareInitializationPublishEvent(weak(self._look))
+
+    def _look(self, context: Context) -> EventStatus:
+        state = np.asarray(self._state.Eval(context))
+        there = np.allclose(state[POSE], self._start[POSE], rtol=0, atol=1e-9)
+        if there and not state[RATES].any():
+            warnings.warn(
+                "the plate starts at rest, where the scenario starts it in motion: make the "
+                "simulator with Simulator(loop, loop.CreateDefaultContext())",
+                stacklevel=2,
+            )
+        return EventStatus.Succeeded()

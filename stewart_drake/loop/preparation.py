@@ -23,16 +23,14 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.experiment import (
     Experiment,
     believed_delay,
-    believed_queue,
-    compose_law,
     network_of,
     planned_limit,
     prepare,
-    sizing_of,
-    way_onto,
+    torques_in_flight,
 )
+from stewart_drake.loop.law_design import compose_law, sizing_of, way_onto
 from stewart_drake.loop.native_loop import Instants, instants_of
-from stewart_drake.loop.weights import weights_source
+from stewart_drake.loop.tuner import weights_source
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
@@ -115,7 +113,7 @@ class Preparation:
         A tuner takes the place of the scenario's.
         """
         law = compose_law(experiment, self._sizing)
-        queue = believed_queue(experiment, law.timeline).tobytes()
+        queue = torques_in_flight(experiment, law.timeline.delay).tobytes()
         if queue not in self._ways:
             self._ways[queue] = way_onto(experiment, law)
         way, motion = self._ways[queue], experiment.reference

@@ -18,7 +18,6 @@ from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.experiment import Experiment, waits_at_rest
 from stewart_drake.loop.results import DelaySummary, RunSummary
 from stewart_drake.loop.tuner import AnnTuner, LawTuner
-from stewart_drake.scenario.config import EncoderSensorConfig
 from stewart_drake.scenario.loading import scenario_to_dict, scenario_yaml
 from stewart_drake.scenario.signals import (
     NUM_STATE,
@@ -93,8 +92,7 @@ class Record:
 
     def __init__(self, experiment: Experiment, backend: str) -> None:
         self._scenario, self.controller_backend = experiment.scenario, backend
-        sensor = experiment.scenario.sensor
-        samples = sensor.samples if isinstance(sensor, EncoderSensorConfig) else None
+        samples = experiment.scenario.sensor.samples
         self._signals, self._dimensions = run_signals(samples), run_dimensions(samples)
         self._recorded = [signal for signal in self._signals.values() if signal.source]
         self._log = Table(1 + sum(signal.size for signal in self._recorded))

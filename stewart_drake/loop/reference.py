@@ -4,7 +4,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import weak
 from stewart_drake.scenario.signals import NUM_REFERENCE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array

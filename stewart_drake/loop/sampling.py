@@ -1,9 +1,17 @@
-"""Updates of a sampled system, in the order that a discrete plant needs; and laws as systems."""
+"""Base of Drake systems in Python: callbacks, disposal, updates at samples, laws as systems.
+
+Drake keeps a system written in Python for ever, and with it the diagram that it is in (Drake's
+issues 22515, 23930 and 24162): in C++, where Python's garbage collector does not look, a system
+holds its callbacks, which as bound methods hold the system; and a diagram holds its systems, whose
+attributes hold the diagram. A thousand runs would leave up to a gigabyte behind. `weak` makes
+callbacks that hold nothing, `let_go` opens the other circle where a diagram is no longer needed.
+"""
 
 import time
+import weakref
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
 
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
@@ -15,9 +23,46 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from stewart_drake.loop.lifetime import weak
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
+
+_NOTES: Final = "_pydrake_internal_ref_cycle_peers"
+
+
+def weak(method: Callable[..., Any], *first: Any) -> Callable[..., Any]:
+    """A function that calls a bound method with `first` before its own arguments.
+
+    It does not keep the method's object alive, which must still be there when it is called.
+    """
+    reference = weakref.WeakMethod(method)
+
+    def call(*arguments: Any) -> Any:
+        target = reference()
+        assert target is not None, "called for a system that is gone"
+        return target(*first, *arguments)
+
+    return call
+
+
+def let_go(diagram: Any, kept: Sequence[Any] = (), made: Sequence[Any] = ()) -> None:
+    """Remove all attributes of a diagram and its subsystems, which are unusable afterwards.
+
+    Among them is what Drake notes there about builders and ports. In C++ nothing changes.
+
+    Args:
+        diagram: that is no longer needed.
+        kept: systems in it that somebody else goes on using: they lose nothing, and keep the
+            diagram.
+        made: systems of somebody else's that lose Drake's notes only.
+    """
+    if any(diagram is system for system in kept):
+        return
+    if any(diagram is system for system in made):
+        vars(diagram).pop(_NOTES, None)
+        return
+    for system in diagram.GetSystems() if hasattr(diagram, "GetSystems") else ():
+        let_go(system, kept, made)
+    vars(diagram).clear()
 
 
 def update_every(
@@ -49,14 +94,14 @@ def update_every(
 
 
 class Sample(NamedTuple):
-    """What one step of a law left behind."""
+    """Result of one step of a law."""
 
     memory: Any
     seconds: float
     """Time that it took to compute; 0 before the first."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Sample":
-        """Drake copies what it keeps; nobody changes a memory, so that itself will do."""
+        """Return the sample itself: a memory is never changed."""
         return self
 
 
@@ -86,7 +131,7 @@ class SteppedLaw(LeafSystem):
         """The step to the next memory, its inputs read: the time that it takes is the law's."""
 
     def sample(self, context: Context) -> Sample:
-        """What the last step left in a context of this system."""
+        """Return the result of the last step in a context of this system."""
         value: Any = context.get_abstract_state(int(self._last))
         return value.get_value()
 

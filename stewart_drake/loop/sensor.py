@@ -1,15 +1,25 @@
-"""The sensor of pose and rates, and its faults."""
+"""The sensors of a machine, their faults, and the way of measurements to the controller."""
 
 from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    LeafSystem,
+    State,
+)
 
-from stewart_drake.loop.lifetime import weak
+from stewart_drake.loop.sampling import update_every, weak
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import crank_angles_along
 from stewart_drake.scenario.fault_config import SPIKE
-from stewart_drake.scenario.signals import NUM_STATE
+from stewart_drake.scenario.link import newest_measurements
+from stewart_drake.scenario.signals import LEGS, NUM_LEGS, NUM_STATE, POSE
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
 
@@ -37,6 +47,41 @@ def strikes(fault: Any, seed: int, place: int, k: int, size: int) -> NDArray[np.
     if share is None:
         return np.ones(size, dtype=bool)
     return draws(seed, _STRIKES + place, k).random(size) < share
+
+
+def faulty(
+    faults: Sequence[Any], y: Array, last: Array, time: float, seed: int, k: int, motion: Array
+) -> Array:
+    """Return what a sensor with faults reads; of several at a time the first one counts.
+
+    Args:
+        faults: see `scenario.fault_config.SensorFault`.
+        y: (n,) without faults.
+        last: (n,) what it read before, NaN for nothing.
+        time: s.
+        seed: of spikes and of what faults strike.
+        k: number of the sample.
+        motion: (n,) how far each value moves.
+    """
+    legs = len(y) if len(y) == NUM_LEGS else 1  # a state is struck as a whole
+    read, left = y.copy(), np.ones(legs, dtype=bool)
+    for i, fault in enumerate(faults):
+        if not acts(fault, time):
+            continue
+        struck = strikes(fault, seed, i, k, legs) & left
+        if fault.get("leg"):
+            struck &= np.isin(LEGS, fault["leg"])
+        left &= ~struck
+        which = np.broadcast_to(struck, len(y)) if legs == 1 else struck
+        if fault["kind"] == "missing":
+            read[which] = np.nan
+        elif fault["kind"] == "frozen":
+            read[which] = np.where(np.isfinite(last), last, y)[which]
+        else:
+            size = SPIKE if fault.get("size") is None else fault["size"]
+            spikes = draws(seed, SPIKES, k).standard_normal(len(y))
+            read[which] += (size * motion * spikes)[which]
+    return read
 
 
 def white_noise(seed: int, k: int, stream: int = 0) -> Array:
@@ -109,24 +154,10 @@ class Sensor(LeafSystem):
         k = round(time / self._period)
         if self._std.any():
             y = y + self.noise(k)
-        there = (
-            fault
-            for i, fault in enumerate(self._faults)
-            if acts(fault, time) and strikes(fault, self._seed, i, k, 1)[0]
-        )
-        fault = next(there, None)
-        if fault is not None:
-            y = self._faulty(fault, y, k, context)
+        if self._faults:
+            last = context.get_discrete_state_vector().value()
+            y = faulty(self._faults, y, last, time, self._seed, k, self._scale)
         output.SetFromVector(y)
-
-    def _faulty(self, fault: Any, y: Array, k: int, context: Context) -> Array:
-        if fault["kind"] == "missing":
-            return np.full(NUM_STATE, np.nan)
-        if fault["kind"] == "spike":
-            size = SPIKE if fault.get("size") is None else fault["size"]
-            return y + size * self._scale * white_noise(self._seed, k, SPIKES)
-        last = context.get_discrete_state_vector().value()
-        return y if np.all(np.isnan(last)) else last
 
     def _remember_first(self, context: Context, state: DiscreteValues) -> EventStatus:
         self._remember(context, state)
@@ -134,3 +165,156 @@ class Sensor(LeafSystem):
 
     def _remember(self, context: Context, state: DiscreteValues) -> None:
         state.set_value(self.get_output_port().Eval(context))
+
+
+class LateMeasurements(LeafSystem):
+    """Hands on, at each sample, the newest measurement that has arrived since the one before.
+
+    With y_j what is measured at j dt, which takes tau_j, and n_k the newest j with
+    j dt + tau_j <= k dt:
+
+    Update:  at k dt  taken <- [taken without its oldest; y_k].
+    Output:  measurement = y_{n_k}, age = (k - n_k) dt, where n_k is newer than n_{k-1}; else all
+             NaN and age = 0. One that was overtaken is dropped.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | measured | input | size | as measured | read every period |
+    | measurement | output | size | the same | meant to be read at samples |
+    | age | output | 1 | s | the same |
+
+    Args:
+        period: dt in s.
+        times: (n,) tau_j in s, infinite for one that is lost; further ones are lost.
+        size: of the measurement.
+    """
+
+    def __init__(self, period: float, times: Array, size: int) -> None:
+        super().__init__()
+        self._period, self._size = period, size
+        self._given = newest_measurements(np.asarray(times, dtype=np.float64), period)
+        ages = np.where(self._given >= 0, np.arange(len(self._given)) - self._given, 0)
+        self._kept = max(1, int(ages.max(initial=0)))
+        self._taken = self.DeclareDiscreteState(np.full(self._kept * size, np.nan))
+        self._measured = self.DeclareVectorInputPort("measured", size)
+        self.DeclareVectorOutputPort("measurement", size, weak(self._measurement))
+        self.DeclareVectorOutputPort("age", 1, weak(self._age), {self.time_ticket()})
+        update_every(self, period, self._take)
+
+    def _take(self, context: Context, state: State) -> None:
+        taken = context.get_discrete_state(self._taken).value()
+        moved = np.concatenate([taken[self._size :], self._measured.Eval(context)])
+        state.get_mutable_discrete_state(self._taken).SetFromVector(moved)
+
+    def _periods(self, context: Context) -> int | None:
+        """How old what is handed on is, in samples; None for nothing."""
+        k = round(context.get_time() / self._period)
+        if k >= len(self._given) or self._given[k] < 0:
+            return None
+        return int(k - self._given[k])
+
+    def _measurement(self, context: Context, output: BasicVector) -> None:
+        periods = self._periods(context)
+        if periods is None:
+            output.SetFromVector(np.full(self._size, np.nan))
+        elif periods == 0:
+            output.SetFromVector(self._measured.Eval(context))
+        else:
+            taken = context.get_discrete_state(self._taken).value()
+            output.SetFromVector(taken.reshape(-1, self._size)[-periods])
+
+    def _age(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector([self._period * (self._periods(context) or 0)])
+
+
+_PHASES: Final = 7
+"""Stream of random numbers."""
+
+
+class Encoders(LeafSystem):
+    """Reads the crank angles N times a period, in codes of 2^bits to a turn.
+
+    With a(t) the crank angles of the pose, o where the encoders stand on their shafts, q the width
+    of a code and p their phases, uniform from -1/2 to 1/2 and drawn once per seed,
+
+        y(t) = q (round((a(t) + o) / q + p) - p),   or a(t) + o of exact ones.
+
+    While a leg has a fault, y of its samples is
+        frozen:   that of the sample before,
+        missing:  NaN,
+        spike:    y + size * motion * s,   s ~ N(0, 1), new for each sample.
+
+    Initialise: window = [N samples of t = 0], as from a burst.
+    Update:     at n dt / N   window <- [window without its oldest; y(n dt / N)].
+    Output:     measurement = window, with the sample of now whether or not its update has been.
+
+    The window is sample by sample, the oldest first. Random numbers are functions of (seed, number
+    of the sample) by a counter-based generator.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | state | input | 12 | rad, m, rad/s, m/s | continuous |
+    | measurement | output | 6 N | rad | meant to be read at the controller's samples |
+
+    Args:
+        mechanism: the true machine.
+        bits: of a turn; None is exact.
+        samples: N, per period; the last one is at the controller's sample.
+        offset: (6,) rad.
+        seed: of phases, spikes and what a fault strikes.
+        period: dt, of the controller, s.
+        faults: see `scenario.fault_config.SensorFault`; of several at a time the first one counts.
+        motion: (6,) how far each crank moves, rad.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        bits: int | None,
+        samples: int,
+        offset: ArrayLike,
+        seed: int,
+        period: float,
+        faults: Sequence[Any] = (),
+        motion: ArrayLike = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
+    ) -> None:
+        super().__init__()
+        self._mechanism, self._samples, self._seed = mechanism, samples, seed
+        self._quantum = 0.0 if bits is None else 2 * np.pi / 2**bits
+        self._offset, self._motion = np.array(offset), np.asarray(motion, np.float64)
+        self._phases = draws(seed, _PHASES, 0).uniform(-0.5, 0.5, NUM_LEGS)
+        self._step, self._faults = period / samples, list(faults)
+        size = samples * NUM_LEGS
+        self._last = self.DeclareDiscreteState([-1.0])
+        self._window = self.DeclareDiscreteState(np.full(size, np.nan))
+        self._state = self.DeclareVectorInputPort("state", NUM_STATE)
+        self.DeclareVectorOutputPort("measurement", size, weak(self._measure))
+        update_every(self, self._step, self._take)
+
+    def _measure(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._taken(context)[1].ravel())
+
+    def _take(self, context: Context, state: State) -> None:
+        number, window = self._taken(context)
+        state.get_mutable_discrete_state(self._last).SetFromVector([number])
+        state.get_mutable_discrete_state(self._window).SetFromVector(window.ravel())
+
+    def _taken(self, context: Context) -> tuple[int, Array]:
+        """Number of the sample of now, and the window (N, 6) with it."""
+        time = context.get_time()
+        number = round(time / self._step)
+        last = int(context.get_discrete_state(self._last).value()[0])
+        kept = np.reshape(context.get_discrete_state(self._window).value(), (-1, NUM_LEGS))
+        window = np.array(kept)
+        if last == number:
+            return number, window
+        state = np.asarray(self._state.Eval(context))
+        angles = crank_angles_along(self._mechanism, state[None, POSE])[0] + self._offset
+        if self._quantum > 0:
+            q, p = self._quantum, self._phases
+            angles = q * (np.round(angles / q + p) - p)
+        for i in range(1 if last >= 0 else self._samples):
+            k = number + i
+            read = faulty(self._faults, angles, window[-1], time, self._seed, k, self._motion)
+            window = np.vstack([window[1:], read])
+        return number, window

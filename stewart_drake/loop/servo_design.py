@@ -1,10 +1,12 @@
-"""A scenario with servos made concrete: the law, what is in flight, the local loops."""
+"""The law for servos: its design by a scenario, and the Drake system."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from pydrake.systems.framework import Context
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -12,22 +14,30 @@ from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.catch_up import PIECE, shortest
 from stewart_drake.law.late import LateObserver
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.motion import Preview
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.servo_preview import ReportedTimeline, ServoPreview
+from stewart_drake.law.servo_preview import ReportedTimeline, ServoMemory, ServoPreview
 from stewart_drake.law.servos import ReportLayout, ServoLoop, crank_mobility, mean_inertia
 from stewart_drake.law.startup import INSTANTS
-from stewart_drake.loop.experiment import Experiment, compose_law, planned_limit
+from stewart_drake.loop.controller import HELD
+from stewart_drake.loop.experiment import Experiment, planned_limit
+from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.own import NOTHING
-from stewart_drake.scenario.config import Scenario, ServoActuatorConfig, understanding
+from stewart_drake.loop.sampling import SteppedLaw
+from stewart_drake.scenario.config import Scenario, understanding
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     MODEL_TORQUE,
     NUM_REFERENCE,
+    NUM_STATE,
+    NUM_TORQUES,
     POSE,
     RATES,
+    ports_of,
 )
 from stewart_drake.scenario.timing import servo_ticks
 from stewart_drake.scenario.trajectories import catch_up, evaluate, spread_instants
@@ -47,7 +57,7 @@ def servo_loop(experiment: Experiment) -> ServoLoop:
     """
     sc, nominal = experiment.scenario, experiment.nominal
     actuator = sc.actuator
-    assert isinstance(actuator, ServoActuatorConfig)
+    assert actuator.kind == "servo"
     loop = ServoLoop(
         inertia=mean_inertia(nominal),
         bandwidth=2 * math.pi * actuator.bandwidth,
@@ -78,9 +88,7 @@ def quickest_crank(dynamics: StewartDynamics, experiment: Experiment) -> float:
 
 
 def _ticks(scenario: Scenario) -> int:
-    plant = scenario.plant
-    step = plant.time_step if plant.kind == "multibody" else None
-    return servo_ticks(scenario.controller.period, step)
+    return servo_ticks(scenario.controller.period, scenario.plant.step)
 
 
 def compose_servo_law(experiment: Experiment) -> ServoPreview:
@@ -158,3 +166,57 @@ def commands_in_flight(
     if sc.queue == "zero":
         commands[:, MODEL_TORQUE] = 0.0
     return commands[0], commands[1:]
+
+
+class ServoController(SteppedLaw):
+    """Sends crank angles ahead, in the place of `loop.controller.DelayLqiController`.
+
+    With m the memory and `step` the law (`law.servo_preview.ServoPreview`):
+
+    Update:  every period m <- step(m, measurement, preview, report), and the time it took
+    Output:  command = step(m, measurement, preview, report).command, to be taken at the samples;
+             the others = parts of m, as of the last sample.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | measurement | input | 12 | rad, m, rad/s, m/s | read every period; NaN is lost |
+    | preview | input | 18 | rad, m and time derivatives | read every period |
+    | report | input | of `law.servos.ReportLayout` | N m | read every period; NaN is lost |
+    | age | input | 1 | s, whole periods | of measurement and report; 0 where unconnected |
+    | command | output | 18 | rad, rad/s, N m | direct feedthrough |
+    | estimate | output | 12 | rad, m, rad/s, m/s | direct feedthrough |
+    | torque | output | 6 | N m, that servos asked for | held |
+    | torque_commanded | output | 6 | the same | held |
+    | integral, weights_used | output | 6, 2 | | NaN |
+    | the others | output | as of `DelayLqiController` | | held |
+
+    Args:
+        law: the control law.
+        command: (18,) that was sent before t = 0.
+    """
+
+    backend = "python (controller.command)"
+
+    def __init__(self, law: ServoPreview, command: Array) -> None:
+        super().__init__()
+        self._law = law
+        first = law.initial_memory(command)
+        self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
+        self._preview = self.DeclareVectorInputPort("preview", NUM_REFERENCE)
+        self._report = self.DeclareVectorInputPort("report", law.reports.size)
+        self._age = self.DeclareVectorInputPort("age", 1)
+        self._begin(first, law.timeline.period)
+        self._put_out("command", NUM_REFERENCE, lambda m: m.command, now=True)
+        self._put_out("estimate", NUM_STATE, lambda m: m.belief.state, now=True)
+        self._put_out("torque", NUM_TORQUES, HELD["torque_commanded"])
+        for port, signal in ports_of("controller").items():
+            part = HELD[signal.name]
+            self._put_out(port, len(part(first)), part)
+
+    def _prepared(self, context: Context) -> Callable[[], ServoMemory]:
+        age = float(np.asarray(self._age.Eval(context))[0]) if self._age.HasValue(context) else 0.0
+        measurement = Measurement.of(np.asarray(self._measurement.Eval(context)), age)
+        reference = np.reshape(np.asarray(self._preview.Eval(context)), (-1, NUM_REFERENCE))
+        motion, report = Preview(self._law.preview_times, reference), self._report.Eval(context)
+        memory = self.sample(context).memory
+        return lambda: self._law.step(memory, measurement, motion, np.asarray(report))

@@ -9,8 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.servos import ReportLayout, Segment, ServoLoop, still
-from stewart_drake.loop.lifetime import weak
-from stewart_drake.loop.sampling import update_every
+from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.signals import (
     MODEL_TORQUE,

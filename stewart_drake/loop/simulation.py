@@ -18,10 +18,10 @@ from stewart_drake.loop.controller_margin import ControllerMargin, controller_ma
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.loop.exact import set_accuracy
 from stewart_drake.loop.experiment import Experiment, concrete
-from stewart_drake.loop.lifetime import let_go
 from stewart_drake.loop.own import OwnLaw, OwnReference, OwnSystem
 from stewart_drake.loop.recording import Recorder, summarize
 from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.sampling import let_go
 from stewart_drake.loop.scene import Live
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario

@@ -1,6 +1,8 @@
-"""The tuner of the weights as a Drake system: of densities, or of what the law remembers."""
+"""The tuner of the weights: features and policy, and the Drake systems that they decide in."""
 
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -12,13 +14,87 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from stewart_drake.loop.lifetime import weak
-from stewart_drake.loop.sampling import Sample, update_every
-from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, WEIGHTS
-from stewart_drake.tuner.density import NUM_INPUTS
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.delay_observer import DelayObserver
+from stewart_drake.law.late import LateObserver
+from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.sensing import StateSensing
+from stewart_drake.law.startup import INSTANTS, TOLERANCE, least_torque, reference_torque
+from stewart_drake.loop.experiment import Experiment, motion_scale
+from stewart_drake.loop.sampling import Sample, update_every, weak
+from stewart_drake.scenario.config import AnnTunerConfig, FixedTunerConfig, RuleTunerConfig
+from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, RATES, WEIGHTS
+from stewart_drake.scenario.trajectories import evaluate, spread_instants
+from stewart_drake.tuner.density import NUM_INPUTS, WINDOW, Kind, density
+from stewart_drake.tuner.features import DensityFeatures, Features, HealthFeatures
 from stewart_drake.tuner.network import Network
-from stewart_drake.tuner.source import MAX_FACTOR, TunerMemory, WeightsSource, tune
+from stewart_drake.tuner.source import (
+    MAX_FACTOR,
+    PaperPolicy,
+    RatioPolicy,
+    Rule,
+    TunerMemory,
+    WeightsSource,
+    tune,
+)
 from stewart_drake.types import Array
+
+
+class DensityWindow(LeafSystem):
+    """Keeps the last 31 samples and takes the densities (45) of the newest.
+
+    With s_k = [y_k - r_k; T_k], y the measured state, or where it is not measured the estimate, r
+    the reference's pose and rates, T_k the torque computed at t = k dt:
+
+    Initialise: window = [unknown, ..., unknown], then the update of k = 0.
+    Update:     at k dt   window <- [window without its oldest; s_k].
+    Output:     density = `tuner.density.density`(window), hence of samples up to k from k dt on.
+
+    What is not finite in s_k is unknown and left out of the window's mean, so that a missed
+    measurement spoils nothing. While the window fills, the mean is over the samples there are.
+    The update is an early, unrestricted one, like the controller's: T_k is then the torque of the
+    same step that the delay chain takes.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | measurement | input | 12 | rad, m, rad/s, m/s | read every period |
+    | reference | input | 18 | rad, m and time derivatives | read every period |
+    | torque | input | 6 | N m | read every period |
+    | density | output | 18 | - | held, NaN before the first sample |
+
+    Args:
+        period: dt in s.
+        kind: of density, `magnitude` or `signed`.
+    """
+
+    def __init__(self, period: float, kind: Kind = "magnitude") -> None:
+        super().__init__()
+        self._kind: Kind = kind
+        self._window = self.DeclareDiscreteState(np.full(WINDOW * NUM_INPUTS, np.nan))
+        self._measurement = self.DeclareVectorInputPort("measurement", NUM_STATE)
+        self._reference = self.DeclareVectorInputPort("reference", NUM_REFERENCE)
+        self._torque = self.DeclareVectorInputPort("torque", NUM_TORQUES)
+        self.DeclareVectorOutputPort(
+            "density", NUM_INPUTS, weak(self._density), {self.discrete_state_ticket(self._window)}
+        )
+        update_every(self, period, self._update)
+
+    def window(self, context: Context) -> Array:
+        """(31, 18) samples in a context of this system, the newest last, NaN where unknown."""
+        return np.reshape(context.get_discrete_state(self._window).value(), (WINDOW, NUM_INPUTS))
+
+    def _update(self, context: Context, state: State) -> None:
+        target = np.asarray(self._reference.Eval(context))[:NUM_STATE]
+        error = np.asarray(self._measurement.Eval(context)) - target
+        sample = np.concatenate([error, self._torque.Eval(context)])
+        moved = np.vstack([self.window(context)[1:], sample])
+        state.get_mutable_discrete_state(self._window).SetFromVector(moved.ravel())
+
+    def _density(self, context: Context, output: BasicVector) -> None:
+        window = self.window(context)
+        known = np.isfinite(window).any()
+        output.SetFromVector(density(window, self._kind) if known else window[-1])
 
 
 class AnnTuner(LeafSystem):
@@ -94,7 +170,7 @@ class Remembered(NamedTuple):
     memory: TunerMemory
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Remembered":
-        """Drake copies what it keeps; nobody changes a memory, so that itself will do."""
+        """Return the same object: a memory is never changed."""
         return self
 
 
@@ -134,7 +210,7 @@ class LawTuner(LeafSystem):
         update_every(self, period, self._update)
 
     def memory(self, context: Context) -> TunerMemory:
-        """What the tuner remembers in a context of this system."""
+        """Return the tuner's memory in a context of this system."""
         value: Any = context.get_abstract_state(int(self._kept))
         return value.get_value().memory
 
@@ -152,3 +228,85 @@ class LawTuner(LeafSystem):
         decision = self._source.decide(memory)
         after = self._source.observe(memory, decision, sample.memory, wanted)
         state.get_mutable_abstract_state(int(self._kept)).set_value(Remembered(after))
+
+
+RULES: Final = {True: Rule(-1.77, 2.35, 0.41), False: Rule(-0.82, 1.37, 0.33)}
+"""Usual rule of a controller with an estimator, and of one without."""
+
+
+def weights_source(experiment: Experiment, law: PredictiveLqi) -> WeightsSource | None:
+    """Make features and policy of a scenario's tuner, None where weights are fixed.
+
+    Raises:
+        ConfigError: what it decides by takes a state that is measured, without delay.
+    """
+    config = experiment.scenario.tuner
+    return TUNERS[type(config)](config, experiment, law)
+
+
+def _fixed(config: FixedTunerConfig, experiment: Experiment, law: PredictiveLqi) -> None:
+    return None
+
+
+def _ann(config: AnnTunerConfig, experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
+    network, c = experiment.network, experiment.scenario.controller
+    assert network is not None
+    features: Features = DensityFeatures(network.density)
+    if network.features == "health":
+        features = health_of(experiment, law)
+    if network.start is None:
+        return WeightsSource(features, PaperPolicy(network, np.array([c.w_Q, c.w_R])))
+    return WeightsSource(features, RatioPolicy(network))
+
+
+def _rule(config: RuleTunerConfig, experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
+    usual = RULES[bool(experiment.scenario.controller.estimate)]
+    given = {name: getattr(config, name) for name in ("ratio", "slope", "knee")}
+    own = {name: value for name, value in given.items() if value is not None}
+    return WeightsSource(health_of(experiment, law), replace(usual, **own))
+
+
+TUNERS: Final[Mapping[type, Callable[[Any, Experiment, PredictiveLqi], WeightsSource | None]]] = {
+    FixedTunerConfig: _fixed,
+    AnnTunerConfig: _ann,
+    RuleTunerConfig: _rule,
+}
+"""Functions that make features and policy, by the kind of tuner."""
+
+
+def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
+    """The features `health` of a law.
+
+    Raises:
+        ConfigError: it does not measure the state, or late.
+    """
+    sc = experiment.scenario
+    sensing = law.sensing
+    if not isinstance(sensing, StateSensing) or isinstance(law.observer, LateObserver):
+        raise ConfigError(
+            f"tuner.kind: got {sc.tuner.kind!r}, which goes by the law's predictions, with "
+            f"sensor.kind {sc.sensor.kind!r} and a sensor.delay of {sc.sensor.delay:g} s; expected "
+            "'fixed', or measurements of the state, of now"
+        )
+    motion = np.tile(motion_scale(experiment), 2)
+    nominal, reference = experiment.nominal, experiment.reference
+    torque = max(least_torque(nominal), reference_torque(nominal, reference, sc.duration))
+    observer, prior = law.observer, None
+    if isinstance(observer, ParameterObserver | DelayObserver):
+        prior = observer.settings.parameters.std
+    return HealthFeatures(
+        plant=law.plant,
+        noise=np.array(sensing.noise_std),
+        motion=motion,
+        tolerance=TOLERANCE * motion,
+        torque=torque,
+        prior=prior,
+        delay=law.timeline.eta * angular_frequency(experiment),
+    )
+
+
+def angular_frequency(experiment: Experiment) -> float:
+    """rad/s, of the reference: its largest rate over half its peak to peak; of a sine its own."""
+    times = spread_instants(experiment.scenario.duration, INSTANTS)
+    rates = np.array([evaluate(experiment.reference, t)[RATES] for t in times])
+    return float((np.abs(rates).max(axis=0) / motion_scale(experiment)).max())

@@ -6,8 +6,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.delay_chain import Arrived
-from stewart_drake.loop.lifetime import weak
-from stewart_drake.loop.sampling import update_every
+from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import TOGETHER, releases
 from stewart_drake.scenario.signals import CARRIED, PACKETS, Carried

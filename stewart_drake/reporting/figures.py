@@ -16,7 +16,6 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting import style
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import FACTORS, UNITS, Line, write_figures
-from stewart_drake.scenario.config import FixedTunerConfig
 from stewart_drake.scenario.signals import (
     ANGLES,
     COORDINATES,
@@ -117,7 +116,7 @@ def draw_run(result: SimulationResult) -> dict[str, Figure]:
 
 
 def _is_tuned(run: SimulationResult) -> bool:
-    return not isinstance(run.scenario.tuner, FixedTunerConfig)
+    return run.scenario.tuner.kind != "fixed"
 
 
 def _finds_delay(run: SimulationResult) -> bool:

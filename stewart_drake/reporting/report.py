@@ -43,10 +43,7 @@ from stewart_drake.reporting.figures import (
 from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.reporting.run import comparison_blocks, run_blocks
 from stewart_drake.scenario.config import (
-    AnnTunerConfig,
-    EncoderSensorConfig,
     Scenario,
-    ServoActuatorConfig,
 )
 from stewart_drake.scenario.link import link_text, number_sent
 from stewart_drake.scenario.loading import load_understood, scenario_yaml
@@ -171,7 +168,7 @@ def collect(
 
 def has_network(scenario: Scenario) -> bool:
     """Whether there is a network whose weights can be shown beside the scenario's fixed ones."""
-    if isinstance(scenario.tuner, AnnTunerConfig):
+    if scenario.tuner.kind == "ann":
         return False  # the comparison itself has them
     try:
         resolve("weights", DEFAULT)
@@ -399,10 +396,10 @@ def _unusual(scenario: Scenario) -> dict[str, str]:
     sensor, motors = scenario.sensor, scenario.actuator
     if text := link_text(scenario):
         told["link"] = text
-    if isinstance(sensor, EncoderSensorConfig):
+    if sensor.kind == "encoders":
         fine = "exact" if sensor.bits is None else f"of {sensor.bits} bit"
         told["sensor"] = f"encoders, {fine}, {sensor.samples} in a period"
-    if isinstance(motors, ServoActuatorConfig):
+    if motors.kind == "servo":
         told["motors"] = f"position servos, {motors.bandwidth:g} Hz"
     if scenario.tuner.kind != "fixed":
         told["weights"] = {"ann": "set by a network", "rule": "set by a rule"}[scenario.tuner.kind]

@@ -18,7 +18,6 @@ from stewart_drake.reporting.document import (
     number,
 )
 from stewart_drake.scenario.config import ControllerConfig, Scenario
-from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.studies.compare import PAPER_ERRORS, is_papers, label
 from stewart_drake.studies.reach import largest_factor
@@ -251,7 +250,7 @@ def _conditions(scenario: Scenario) -> str:
 def _share(scenario: Scenario) -> float:
     """How large the motion is, of (46)."""
     own = Scenario().reference
-    assert isinstance(own, SineConfig) and isinstance(scenario.reference, SineConfig)
+    assert own.kind == "sine" and scenario.reference.kind == "sine"
     return scenario.reference.amplitude[0] / own.amplitude[0]
 
 

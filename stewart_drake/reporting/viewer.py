@@ -10,9 +10,9 @@ from pydrake.geometry import Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
 from stewart_drake.dynamics.workspace import Failure, diagnose
-from stewart_drake.loop.lifetime import let_go
 from stewart_drake.loop.multibody import set_pose
-from stewart_drake.loop.multibody_stewart import build_viewer
+from stewart_drake.loop.platforms import build_viewer
+from stewart_drake.loop.sampling import let_go
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.reporting.style import FACTORS

@@ -15,6 +15,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.schema import ByKind
 from stewart_drake.files.yamlio import brief, differences, validate
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.dependencies import contradiction
 from stewart_drake.scenario.fault_config import SensorFault, fault_problem
 from stewart_drake.scenario.field_types import (
     MOST_PERIODS,
@@ -44,7 +45,7 @@ from stewart_drake.scenario.timing import (
 
 @dataclass(config=STRICT)
 class PlantConfig:
-    """The simulated platform; from the payload on nobody tells the controller.
+    """The simulated platform; fields from the payload on are unknown to the controller.
 
     Attributes:
         kind: `multibody` (MultibodyPlant with constraints, fixed steps), `exact` (closed-form
@@ -83,6 +84,11 @@ class PlantConfig:
         """All of the plant, in the order of `scenario.signals.PLANT_PARAMETERS`."""
         shafts = (self.joint_damping, self.coulomb_friction, self.coulomb_speed)
         return [*self.torque_bias, self.payload_mass, *shafts, *self.payload_position]
+
+    @property
+    def step(self) -> float | None:
+        """Step of a discrete plant, s, None of a continuous one."""
+        return self.time_step if self.kind == "multibody" else None
 
     @property
     def without_engine(self) -> "PlantConfig":
@@ -129,7 +135,7 @@ class DelayConfig:
 
 @dataclass(config=STRICT)
 class PriorConfig:
-    """How far may be off what nobody tells the controller: standard deviations of the estimator.
+    """Prior standard deviations of the estimated parameters.
 
     null is what `controller.calibration` says, and without it what machine and motion say. A number
     stands before both.
@@ -159,6 +165,12 @@ def _check_estimate(names: list[str]) -> list[str]:
     if names and not (len({*names}) == len(names) and {*ESTIMATED} <= {*names} <= {*order}):
         raise ValueError(f"[], or {', '.join(ESTIMATED)}, and of coulomb, offsets some or none")
     return sorted(names, key=order.index)
+
+
+def _check_catch_up(duration: float) -> float:
+    if 0 < duration < 1e-3:
+        raise ValueError("0 for none, null, or at least 0.001 s")
+    return duration
 
 
 Estimate = Annotated[list[str], AfterValidator(_check_estimate)]
@@ -227,7 +239,7 @@ class ControllerConfig:
     weight_scaling: Literal["bryson", "identity"] = "bryson"
     packet_torques: Annotated[int, Field(ge=1, le=100)] = 8
     packet_repeats: Annotated[int, Field(ge=0, le=100)] = 1
-    catch_up: Annotated[float, Field(ge=0, le=10)] | None = None
+    catch_up: Annotated[float, Field(ge=0, le=10), AfterValidator(_check_catch_up)] | None = None
     command: Literal["torque", "cranks"] = "torque"
     delay_estimator: Literal["none", "constant", "drifting"] = "none"
     delay_std: Annotated[float, Field(ge=1e-3, le=10)] = 0.3
@@ -248,6 +260,7 @@ class TorqueActuatorConfig:
             `none` no limit. Only a number is also planned with, see `ControllerConfig.catch_up`.
     """
 
+    reflected_inertia = 0.0  # not annotated: no field
     kind: Literal["torque"] = "torque"
     torque_limit: TorqueLimit = None
 
@@ -280,7 +293,7 @@ class ServoActuatorConfig:
 
     @property
     def reflected_inertia(self) -> float:
-        """What the rotor adds to the inertia of its crank, kg m^2."""
+        """Inertia of the rotor at its crank, kg m^2."""
         return self.gear_ratio**2 * self.rotor_inertia
 
 
@@ -291,7 +304,7 @@ ActuatorConfig = Annotated[AnyActuator, ByKind()]
 def understanding(command: str, actuator: AnyActuator) -> AnyActuator:
     """Motors of the kind that a controller's command is for: these, or others of their limit."""
     wanted = TorqueActuatorConfig if command == "torque" else ServoActuatorConfig
-    return actuator if isinstance(actuator, wanted) else wanted(torque_limit=actuator.torque_limit)
+    return actuator if actuator.kind == wanted.kind else wanted(torque_limit=actuator.torque_limit)
 
 
 def with_actuator(given: dict[str, Any], change: Any, where: str) -> AnyActuator:
@@ -312,6 +325,7 @@ class WireConfig:
         kind: `wire`.
     """
 
+    back, burst, acknowledged, follows_delay = None, 1, True, False  # not annotated: no fields
     kind: Literal["wire"] = "wire"
 
 
@@ -403,6 +417,7 @@ class StateSensorConfig:
         faults: when it measures nothing, the same again, or nonsense; see `fault_config`.
     """
 
+    measures_state, samples = True, None  # not annotated: no fields
     kind: Literal["state"] = "state"
     noise_std: Annotated[list[Deviation], Field(min_length=12, max_length=12)] = field(
         default_factory=lambda: [0.0] * 12
@@ -413,7 +428,7 @@ class StateSensorConfig:
     faults: list[SensorFault] = field(default_factory=list)
 
     def problem(self) -> str | None:
-        """What is wrong with fields that are well formed one by one, or None."""
+        """Return what is wrong with the faults, or None."""
         return fault_problem(self.faults, legs=False)
 
 
@@ -432,6 +447,7 @@ class EncoderSensorConfig:
         faults: when legs measure nothing, the same again, or nonsense; see `fault_config`.
     """
 
+    measures_state = False  # not annotated: no field
     kind: Literal["encoders"] = "encoders"
     bits: Annotated[int, Field(ge=4, le=32)] | None = 14
     samples: Annotated[int, Field(ge=1, le=1000)] = 1
@@ -442,7 +458,7 @@ class EncoderSensorConfig:
     faults: list[SensorFault] = field(default_factory=list)
 
     def problem(self) -> str | None:
-        """What is wrong with fields that are well formed one by one, or None."""
+        """Return what is wrong with the faults, or None."""
         return fault_problem(self.faults, legs=True)
 
 
@@ -451,7 +467,7 @@ SensorConfig = Annotated[StateSensorConfig | EncoderSensorConfig, ByKind()]
 
 @dataclass(config=STRICT)
 class FixedTunerConfig:
-    """Nobody sets w_Q and w_R while the controller runs.
+    """w_Q and w_R stay those of the controller.
 
     Attributes:
         kind: `fixed`.
@@ -544,7 +560,7 @@ class Scenario:
             ConfigError: they shall follow the delay, which is none or not constant.
         """
         link, c = self.link, self.controller
-        if not isinstance(link, NetworkConfig):
+        if link.kind == "wire":
             return link
         if problem := self._times_problem(link):
             raise ConfigError(problem)
@@ -563,9 +579,9 @@ class Scenario:
 
     @property
     def true_delay(self) -> Delay:
-        """What the torques wait for at t = 0, which the controller need not know."""
+        """Delay of the torques at t = 0, which may be unknown to the controller."""
         c, link = self.controller, self.assumed_link
-        if isinstance(link, NetworkConfig):
+        if link.kind == "network":
             assert link.playout is not None
             return Delay.of(link.playout + c.packet_repeats * c.period, c.period)
         return Delay(self.delay.steps, self.delay.fraction)
@@ -577,24 +593,24 @@ class Scenario:
 
     def _delay_problem(self) -> str | None:
         c = self.controller
-        if c.delay_estimator == "none":
-            return None
-        if not isinstance(self.link, WireConfig) or self.sensor.delay > 0:
-            return (
-                f"controller.delay_estimator: got {c.delay_estimator!r} with link.kind "
-                f"{self.link.kind!r} and a sensor.delay of {self.sensor.delay:g} s; expected "
-                "'none', or a wire and measurements of now"
-            )
-        if c.delay_steps is None and c.calibration is not None:
+        if c.delay_estimator == "none" or (c.delay_steps is None and c.calibration is not None):
             return None  # what is known may say a delay, see `loop.experiment`
-        believed = self.eta
-        if c.delay_steps is not None:
-            believed = Delay(c.delay_steps, c.delay_fraction or 0.0).eta(c.period)
-        if believed <= c.delay_max:
+        if c.delay_steps is None:
+            return self.delay_max_problem(self.true_delay)
+        return self.delay_max_problem(Delay(c.delay_steps, c.delay_fraction or 0.0))
+
+    def delay_max_problem(self, believed: Delay) -> str | None:
+        """Return what is wrong with the longest delay that an estimator thinks possible, or None.
+
+        Args:
+            believed: the delay that the controller assumes at first.
+        """
+        c = self.controller
+        if c.delay_estimator == "none" or believed.eta(c.period) <= c.delay_max:
             return None
         return (
-            f"controller.delay_max: got {c.delay_max:g} s, less than the {believed:g} s that are "
-            "believed in; expected as much or more"
+            f"controller.delay_max: got {c.delay_max:g} s, less than the "
+            f"{believed.eta(c.period):g} s that are believed in; expected as much or more"
         )
 
     def _times_problem(self, link: NetworkConfig) -> str | None:
@@ -612,34 +628,18 @@ class Scenario:
 
     def _network_problem(self) -> str | None:
         """Return what is wrong with a network and with what is believed of it, or None."""
-        link, c = self.link, self.controller
-        if not isinstance(link, NetworkConfig):
+        link = self.link
+        if link.kind == "wire":
             return None
         back = link.back.times_problem("link.return") if link.back else None
         if problem := self._times_problem(link) or back:
             return problem
-        if c.delay_steps:
-            return (
-                f"controller.delay_steps: got {c.delay_steps} with link.kind 'network'; expected "
-                "null, as the play-out bound sets the delay, or 0 for a controller without one"
-            )
         if self.true_delay.steps <= MOST_PERIODS:
             return None
         bound = "null" if link.playout is None else f"{link.playout:g} s"
         return (
             f"link.playout: got {bound}, with which torques wait for more than {MOST_PERIODS} "
             "periods; expected a shorter one, or a quicker network"
-        )
-
-    def _offsets_problem(self) -> str | None:
-        if "offsets" not in self.controller.estimate:
-            return None
-        if self.sensor.kind == "encoders" and self.controller.delay_estimator == "none":
-            return None
-        return (
-            f"controller.estimate: got offsets with sensor.kind {self.sensor.kind!r} and "
-            f"delay_estimator {self.controller.delay_estimator!r}; expected none, or 'encoders' "
-            "and 'none': offsets are found beside a known delay alone"
         )
 
     def check(self, where: str = "scenario") -> None:
@@ -654,20 +654,17 @@ class Scenario:
         # Assignment is validated, but a list can also be changed in place.
         validate(Scenario, dataclasses.asdict(self), where)
         self.check_rows(where)
-        step = self.plant.time_step if self.plant.kind == "multibody" else None
-        for problem in (
-            self.reference.problem(),
-            _controller_problem(self.controller),
-            self._command_problem(),
-            self._map_problem(),
-            self.sensor.problem(),
-            self._network_problem(),
-            self._delay_problem(),
-            self._offsets_problem(),
-            self.step_problem(step) if step else log_problem(self.log_period, self.duration, None),
-        ):
-            if problem:
-                raise ConfigError(f"{where}: {problem}")
+        step = self.plant.step
+        problem = (
+            self.reference.problem()
+            or contradiction(self)
+            or self.sensor.problem()
+            or self._network_problem()
+            or self._delay_problem()
+            or (self.step_problem(step) if step else log_problem(self.log_period, self.duration))
+        )
+        if problem:
+            raise ConfigError(f"{where}: {problem}")
 
     def check_rows(self, where: str) -> None:
         """Checks what `compare` says, each row by itself.
@@ -685,81 +682,14 @@ class Scenario:
             with_actuator({"kind": "servo"}, fields.pop("actuator", {}), place)  # has every field
             validate(ControllerConfig, fields, place)
 
-    def _command_problem(self) -> str | None:
-        """Whether the motors understand what they are sent, and who else would have a say."""
-        c, kind = self.controller, self.actuator.kind
-        if c.command == "torque":
-            if kind == "torque":
-                return None
-            return (
-                f"controller.command: got 'torque' with actuator.kind {kind!r}; expected 'cranks', "
-                "as of the controllers servo_preview and servo_feedforward"
-            )
-        for name, got, expected in (
-            ("actuator.kind", kind, "servo"),
-            ("link.kind", self.link.kind, "wire"),
-            ("tuner.kind", self.tuner.kind, "fixed"),
-            ("controller.delay_estimator", c.delay_estimator, "none"),
-        ):
-            if got != expected:
-                return (
-                    f"{name}: got {got!r} with controller.command 'cranks'; expected {expected!r}"
-                )
-        return None
-
-    def _map_problem(self) -> str | None:
-        """What has no place in a plant that is a torque map, without legs, or None."""
-        p = self.plant
-        if p.kind != "paper":
-            return None
-        nothing = ("gravity", "payload_mass", "joint_damping", "coulomb_friction")
-        usual = PlantConfig()
-        parts = [(f"plant.{name}", getattr(p, name), getattr(usual, name)) for name in nothing]
-        parts += [("sensor.kind", self.sensor.kind, "state")]
-        parts += [("actuator.kind", self.actuator.kind, "torque")]
-        for name, got, expected in parts:
-            if got != expected:
-                return (
-                    f"{name}: got {brief(got)} with plant.kind 'paper'; expected "
-                    f"{brief(expected)}, or another plant"
-                )
-        return None
-
     def step_problem(self, step: float) -> str | None:
-        """What does not suit the steps in s of a discrete plant, or None."""
+        """Return what does not fit a discrete plant with steps of `step` s, or None."""
         period, link, sensor = self.controller.period, self.link, self.sensor
         fraction, bound, samples = self.delay.fraction, None, None
-        if isinstance(link, NetworkConfig):
+        if link.kind == "network":
             fraction = 0.0
             bound = link.playout and whole_problem("link.playout", link.playout, step)
-        if isinstance(sensor, EncoderSensorConfig):
+        if sensor.samples is not None:
             samples = samples_problem(sensor.samples, period, step)
         logged = log_problem(self.log_period, self.duration, step)
         return samples or step_problem(step, period, fraction) or bound or logged
-
-
-def _controller_problem(controller: ControllerConfig) -> str | None:
-    if controller.delay_fraction is not None and controller.delay_steps is None:
-        return (
-            f"controller.delay_fraction: got {brief(controller.delay_fraction)} without "
-            "delay_steps; expected both or neither"
-        )
-    if controller.catch_up is not None and 0 < controller.catch_up < 1e-3:
-        return (
-            f"controller.catch_up: got {controller.catch_up!r}; expected 0 for none, null, or at "
-            "least 0.001 s"
-        )
-    if controller.delay_estimator != "none" and (
-        not controller.estimate or controller.prediction != "nonlinear"
-    ):
-        return (
-            f"controller.delay_estimator: got {controller.delay_estimator!r} with estimate "
-            f"{controller.estimate} and prediction {controller.prediction!r}; expected 'none', "
-            f"or estimate {ESTIMATED} and prediction 'nonlinear'"
-        )
-    if controller.torque_map == "printed" and controller.model != "paper":
-        return (
-            "controller.torque_map: got 'printed' with model 'multibody'; expected "
-            "'virtual_work', or model 'paper'"
-        )
-    return None

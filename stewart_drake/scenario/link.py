@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from stewart_drake.scenario.config import (
     ASSUMED_TIMES,
     DelayConfig,
-    NetworkConfig,
     PacketsConfig,
     Scenario,
 )
@@ -52,8 +51,7 @@ def torque_delays(scenario: Scenario) -> Array:
     rng = np.random.Generator(np.random.Philox(key=delay.seed))
     jitter = delay.jitter_std * rng.standard_normal(len(sent))
     eta: Array = np.maximum(delay_at(delay, period, sent) + jitter, 0.0)
-    if scenario.plant.kind == "multibody":
-        step = scenario.plant.time_step
+    if (step := scenario.plant.step) is not None:
         eta = np.maximum(step * np.round((sent + eta) / step) - sent, 0.0)
     return eta
 
@@ -90,14 +88,13 @@ def releases(period: float, delays: Array, delay: Delay) -> tuple[NDArray[np.int
 
 
 def forward_times(scenario: Scenario, number: int) -> Array:
-    """(number,) s that each packet of torques is under way; infinite for one that is lost."""
+    """Return for how long each packet of torques (number,) is under way, s; infinite if lost."""
     link = scenario.assumed_link
-    assert isinstance(link, NetworkConfig)
-    return packet_times(link, number, link.seed)
+    return np.zeros(number) if link.kind == "wire" else packet_times(link, number, link.seed)
 
 
 def sensor_times(scenario: Scenario, number: int) -> Array:
-    """(number,) s from each sample until the machine has what was measured; infinite for never."""
+    """Return times (number,) from sample to measurement, s; infinite where it is lost."""
     sc = scenario.sensor
     none_late = PacketsConfig(low=0.0, high=0.0, loss=sc.loss)
     lost = packet_times(none_late, number, sc.seed, SENSOR)
@@ -105,15 +102,15 @@ def sensor_times(scenario: Scenario, number: int) -> Array:
 
 
 def return_times(scenario: Scenario, number: int) -> Array:
-    """(number,) s that each measurement is under way to the controller; infinite for never."""
+    """Return for how long each measurement (number,) is under way, s; infinite if it is lost."""
     link = scenario.link
-    if not isinstance(link, NetworkConfig) or link.back is None:
+    if link.kind == "wire" or link.back is None:
         return np.zeros(number)
     return packet_times(link.back, number, link.seed, BACK)
 
 
 def measurement_times(scenario: Scenario) -> Array:
-    """(n,) s from each sample until the controller has what was measured; infinite for never."""
+    """Return times (n,) from sample to the controller, s; infinite where it is lost."""
     n = number_sent(scenario.duration, scenario.controller.period)
     return sensor_times(scenario, n) + return_times(scenario, n)
 
@@ -137,13 +134,13 @@ def newest_measurements(times: Array, period: float) -> NDArray[np.int64]:
 def link_text(scenario: Scenario) -> str | None:
     """Return the assumed network in a few words, None for a wire."""
     link = scenario.assumed_link
-    if not isinstance(link, NetworkConfig):
+    if link.kind == "wire":
         return None
     if link.distribution == "lognormal":
         times = f"{link.median:g} s in the median, sigma {link.sigma:g}"
     else:
         times = f"{link.low:g} to {link.high:g} s"
-    if isinstance(scenario.link, NetworkConfig) and scenario.link.follows_delay:
+    if scenario.link.follows_delay:
         delay, period = scenario.delay, scenario.controller.period
         times += (
             f" ({ASSUMED_TIMES[0]:g} to {ASSUMED_TIMES[1]:g} times the delay of "

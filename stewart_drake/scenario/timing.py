@@ -142,7 +142,9 @@ def whole_problem(field: str, value: float, time_step: float) -> str | None:
     )
 
 
-def log_problem(log_period: float | None, duration: float, time_step: float | None) -> str | None:
+def log_problem(
+    log_period: float | None, duration: float, time_step: float | None = None
+) -> str | None:
     """What is wrong with the period of a log.
 
     Args:

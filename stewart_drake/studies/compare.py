@@ -24,9 +24,8 @@ from stewart_drake.loop.experiment import believed_delay
 from stewart_drake.loop.own import OwnReference
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.scenario.config import Scenario, ServoActuatorConfig, WireConfig
+from stewart_drake.scenario.config import Scenario, ServoActuatorConfig
 from stewart_drake.scenario.loading import load_comparison, load_understood, read_scenario
-from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.studies.jobs import run_jobs
 
 ADAPTIVE: Final = "adaptive_lqi"
@@ -144,7 +143,7 @@ def shown(scenario_name: str | Path, settings: Iterable[str] = ()) -> dict[str, 
     rows, further = load_comparison(scenario_name, CONTROLLERS, settings, False), list[str]()
     aware = rows["predictor_lqi"]
     known = aware.delay.constant and believed_delay(aware) == aware.true_delay
-    at_once = isinstance(aware.link, WireConfig) and aware.sensor.delay == 0
+    at_once = aware.link.kind == "wire" and aware.sensor.delay == 0
     if not known and at_once and "offsets" not in aware.controller.estimate:
         further.append(ADAPTIVE)
     if isinstance(
@@ -190,7 +189,7 @@ def is_papers(scenario: Scenario, *, any_size: bool = False) -> bool:
     With `any_size` the motion may be a multiple of the paper's: E_ac is relative to it.
     """
     own, motion = Scenario(), scenario.reference
-    if any_size and isinstance(motion, SineConfig) and isinstance(own.reference, SineConfig):
+    if any_size and motion.kind == "sine" and own.reference.kind == "sine":
         shares = np.divide(motion.amplitude, own.reference.amplitude)
         if np.allclose(shares, shares[0], rtol=1e-6) and shares[0] > 0:
             motion = replace(motion, amplitude=own.reference.amplitude)

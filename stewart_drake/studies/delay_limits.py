@@ -15,7 +15,7 @@ from stewart_drake.law.stability import amplification, fastest_pole, largest_del
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.experiment import waits_at_rest
 from stewart_drake.loop.metrics import delay_floor
-from stewart_drake.scenario.config import NetworkConfig, Scenario
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.studies.basis import Basis, basis
@@ -248,7 +248,7 @@ def _growths(found: Basis, poles: list[PolePoint], eta: float) -> list[Growth]:
 
 
 def _loops(found: Basis) -> tuple[list[LoopMargins], str]:
-    if isinstance(found.experiment.scenario.link, NetworkConfig):
+    if found.experiment.scenario.link.kind == "network":
         return [], "its torques come in packets, which analyze link is about"
     pose = found.experiment.reference.value(0.0)[:, 0]
     failure = diagnose(found.experiment.mechanism, 0.0, pose)

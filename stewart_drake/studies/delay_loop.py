@@ -20,7 +20,8 @@ from stewart_drake.law.stability import (
     spectral_radius,
     worst_margins,
 )
-from stewart_drake.loop.experiment import believed_delay, quadratic_cost, true_dynamics
+from stewart_drake.loop.experiment import believed_delay, true_dynamics
+from stewart_drake.loop.law_design import quadratic_cost
 from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import POSE

@@ -99,7 +99,7 @@ class LinkStudy:
     def checked(self) -> Cell | None:
         """The best bound at the scenario's loss with new seeds, or None."""
         link = self.scenario.link
-        assert isinstance(link, NetworkConfig)
+        assert link.kind == "network"
         return next((cell for cell in self.losses if cell.loss == link.loss), None)
 
     @property
@@ -156,7 +156,7 @@ def study_link(
         ConfigError: the scenario has no network.
     """
     link = scenario.assumed_link
-    if not isinstance(link, NetworkConfig):
+    if link.kind != "network":
         raise ConfigError(f"link.kind: got {link.kind!r}; expected 'network'")
     runs = options.runs
     period, repeats = scenario.controller.period, scenario.controller.packet_repeats
@@ -226,7 +226,7 @@ def _simulated(
 ) -> tuple[list[Cell], bool]:
     """Return a cell for each bound and loss, and whether Ctrl-C ended it early."""
     link, c = base.link, base.controller
-    assert isinstance(link, NetworkConfig)
+    assert link.kind == "network"
     jobs = {
         f"bound{bound:g}-loss{loss:g}-seed{seed}": (
             replace(

@@ -19,7 +19,7 @@ from stewart_drake.files.yamlio import validate
 from stewart_drake.law.startup import INSTANTS
 from stewart_drake.loop.experiment import Experiment, assemble, believed_delay, motion_scale
 from stewart_drake.mechanism.geometry import Body, Mechanism
-from stewart_drake.scenario.config import NetworkConfig, Scenario, StateSensorConfig
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
 from stewart_drake.scenario.trajectories import spread_instants
 from stewart_drake.studies.ranges import Ranges
@@ -139,7 +139,7 @@ def add_noise(truth: Truth, share: float) -> None:
 
     Encoders have none beside their codes.
     """
-    if share != 0 and isinstance(truth.scenario.sensor, StateSensorConfig):
+    if share != 0 and truth.scenario.sensor.kind == "state":
         moving = dataclasses.asdict(truth.scenario) | {"reference": truth.fields["reference"]}
         motion = motion_scale(assemble(validate(Scenario, moving, "drawn")))
         sensor = truth.fields["sensor"]
@@ -150,7 +150,7 @@ def add_noise(truth: Truth, share: float) -> None:
 def seed_noise(truth: Truth, seed: int) -> None:
     """Of noise that was drawn, or of the phases of encoders; else a sensor has its own seed."""
     fields, sensor = truth.fields["sensor"], truth.scenario.sensor
-    if not isinstance(sensor, StateSensorConfig) or fields["noise_std"] != sensor.noise_std:
+    if sensor.kind != "state" or fields["noise_std"] != sensor.noise_std:
         truth.fields["sensor"]["seed"] = seed
 
 
@@ -160,7 +160,7 @@ def draw_seed(rng: Generator, _: Any) -> int:
 
 
 def _over_network(truth: Truth) -> bool:
-    return isinstance(truth.scenario.link, NetworkConfig)
+    return truth.scenario.link.kind == "network"
 
 
 def _jitter(truth: Truth, std: float) -> None:

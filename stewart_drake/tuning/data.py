@@ -31,7 +31,7 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.bulk import Ending, run_in_bulk
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.preparation import MakeTuner
-from stewart_drake.loop.weights import health_of
+from stewart_drake.loop.tuner import health_of
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS

@@ -1,0 +1,203 @@
+"""Kinds of a scenario's sections: a row per class of configuration, with what a loop makes of it.
+
+Whoever builds a loop or a law looks its parts up here. What bulk runs and live machines have of all
+this they say themselves, in tables of accepted values (`scenario.dependencies.Accepted`).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import System
+
+from stewart_drake.law.channel import Channel, Packets, Wire
+from stewart_drake.law.encoder_observers import DifferencesObserver, EncoderObserver
+from stewart_drake.law.encoder_sensing import EncoderSensing
+from stewart_drake.law.filter_settings import FilterSettings
+from stewart_drake.law.gaps import GapObserver
+from stewart_drake.law.observers import NoObserver, Observer, ParameterObserver
+from stewart_drake.law.sensing import Sensing, StateSensing
+from stewart_drake.law.timeline import Timeline
+from stewart_drake.loop.controller import reported
+from stewart_drake.loop.delay_chain import DelayChain
+from stewart_drake.loop.exact import ExactPlant
+from stewart_drake.loop.experiment import (
+    Experiment,
+    limits_of,
+    motion_scale,
+    torques_in_flight,
+    true_dynamics,
+)
+from stewart_drake.loop.platforms import MultibodyStewart
+from stewart_drake.loop.playout import PlayoutBuffer
+from stewart_drake.loop.sensor import Encoders, Sensor
+from stewart_drake.loop.varying_delay import VaryingDelay, declare_constant
+from stewart_drake.scenario.calibration import OFFSETS
+from stewart_drake.scenario.config import (
+    EncoderSensorConfig,
+    NetworkConfig,
+    StateSensorConfig,
+    WireConfig,
+)
+from stewart_drake.scenario.link import forward_times, number_sent, torque_delays
+from stewart_drake.scenario.packets import BurstChain, in_time
+from stewart_drake.scenario.signals import PACKETS, POSE, Carried
+from stewart_drake.types import Array
+
+REPORTS: Final = 10
+"""Reports in a row that may be lost without losing what they said."""
+
+
+class SensorKind(NamedTuple):
+    """A kind of sensor.
+
+    Attributes:
+        system: the sensor, a Drake system with the ports `state` and `measurement`.
+        sensing: part of the law that knows what is measured.
+        observer: part of the law that estimates from it, with the settings of its filter, or None
+            where nothing is to be estimated.
+    """
+
+    system: Callable[[Any, Experiment], System]
+    sensing: Callable[[Any, Experiment], Sensing]
+    observer: Callable[[Any, FilterSettings | None], Observer]
+
+
+class LinkKind(NamedTuple):
+    """A kind of link between controller and motors.
+
+    Attributes:
+        system: the link, a Drake system with the ports `commanded` and `torque`, for a channel of
+            the law and reports of so many periods.
+        channel: part of the law that knows what is sent, for measurements that are waited for so
+            many periods.
+    """
+
+    system: Callable[[Any, Experiment, Channel, int], System]
+    channel: Callable[[Any, Experiment, Timeline, int], Channel]
+
+
+def _sensor(config: StateSensorConfig, experiment: Experiment) -> Sensor:
+    period, motion = experiment.scenario.controller.period, motion_scale(experiment)
+    return Sensor(np.array(config.noise_std), config.seed, period, config.faults, motion)
+
+
+def _state_sensing(config: StateSensorConfig, experiment: Experiment) -> Sensing:
+    anywhere = experiment.scenario.plant.kind == "paper"
+    return StateSensing(np.array(config.noise_std), motion_scale(experiment), anywhere)
+
+
+def _observer(config: StateSensorConfig, settings: FilterSettings | None) -> Observer:
+    if settings is None:
+        return NoObserver()
+    return GapObserver(settings) if config.loss > 0 else ParameterObserver(settings)
+
+
+def _encoders(c: EncoderSensorConfig, experiment: Experiment) -> Encoders:
+    truth, period = experiment.truth, experiment.scenario.controller.period
+    cranks = np.abs(truth.jacobian(experiment.start[POSE])) @ motion_scale(experiment)
+    return Encoders(truth, c.bits, c.samples, c.offset, c.seed, period, c.faults, cranks)
+
+
+def _encoder_sensing(config: EncoderSensorConfig, experiment: Experiment) -> Sensing:
+    rates, motion = experiment.scenario.controller.prior.rates, motion_scale(experiment)
+    calibration, estimated = experiment.calibration, OFFSETS[0] in experiment.nominal.free
+    known = None if calibration is None or estimated else calibration
+    return EncoderSensing(
+        mechanism=experiment.mechanism,
+        samples=config.samples,
+        quantum=0.0 if config.bits is None else 2 * np.pi / 2**config.bits,
+        declared=experiment.start,
+        rates_std=motion if rates is None else np.array(rates),
+        motion=motion,
+        offset=np.array([(known and known.value(name)) or 0.0 for name in OFFSETS]),
+    )
+
+
+def _encoder_observer(config: EncoderSensorConfig, settings: FilterSettings | None) -> Observer:
+    return DifferencesObserver() if settings is None else EncoderObserver(settings)
+
+
+SENSORS: Final[Mapping[type, SensorKind]] = {
+    StateSensorConfig: SensorKind(_sensor, _state_sensing, _observer),
+    EncoderSensorConfig: SensorKind(_encoders, _encoder_sensing, _encoder_observer),
+}
+
+
+def wire(experiment: Experiment, queue: Array, carries: Carried) -> System:
+    """Make the delay of a wire, with what is under way on it at t = 0, (L, n)."""
+    sc, delay = experiment.scenario, experiment.scenario.true_delay
+    period = sc.controller.period
+    if not sc.delay.constant:
+        return VaryingDelay(period, torque_delays(sc), delay, queue, carries)
+    chain = DelayChain(period, delay.steps, delay.fraction, queue, carries)
+    declare_constant(chain, "delay", np.array([sc.eta]))  # for the record alone
+    declare_constant(chain, "packets", np.full(len(PACKETS), np.nan))
+    return chain
+
+
+def _torque_wire(link: WireConfig, experiment: Experiment, *_: Any) -> System:
+    return wire(experiment, torques_in_flight(experiment, experiment.scenario.true_delay), "torque")
+
+
+def _playout(link: NetworkConfig, experiment: Experiment, channel: Channel, reports: int) -> System:
+    sc, delay = experiment.scenario, experiment.scenario.true_delay
+    period = sc.controller.period
+    repeats = channel.repeats if isinstance(channel, Packets) else 0
+    return PlayoutBuffer(
+        period,
+        forward_times(sc, number_sent(sc.duration, period)),
+        delay,
+        torques_in_flight(experiment, delay),
+        rows=repeats + channel.torques,
+        repeats=repeats,
+        dry=link.dry,
+        history=reports,
+    )
+
+
+def _packets(_: NetworkConfig, experiment: Experiment, timeline: Timeline, waits: int) -> Channel:
+    c, link = experiment.scenario.controller, experiment.scenario.assumed_link
+    assert link.kind == "network"
+    if c.delay_steps == 0:
+        return Wire()
+    rows = c.packet_repeats + c.packet_torques
+    due = timeline.eta + (np.arange(rows) - c.packet_repeats) * c.period
+    kept = rows + timeline.steps + waits + REPORTS + 1
+    return Packets(
+        torques=c.packet_torques,
+        repeats=c.packet_repeats,
+        in_time=tuple(in_time(link, due).tolist()),
+        arrived_by=tuple(in_time(link, c.period * np.arange(kept)).tolist()),
+        losses=BurstChain(link.loss, link.burst),
+        holds=link.dry == "hold",
+        told=reported(waits + REPORTS),
+    )
+
+
+LINKS: Final[Mapping[type, LinkKind]] = {
+    WireConfig: LinkKind(_torque_wire, lambda *_: Wire()),
+    NetworkConfig: LinkKind(_playout, _packets),
+}
+
+
+def _multibody(experiment: Experiment, wrench: bool, meshcat: Meshcat | None) -> MultibodyStewart:
+    fields, start = asdict(experiment.scenario.plant), experiment.start[POSE]
+    del fields["mechanism"], fields["torque_bias"]  # which is added before the record of torques
+    return MultibodyStewart(experiment.truth, meshcat=meshcat, start=start, wrench=wrench, **fields)
+
+
+def _exact(experiment: Experiment, wrench: bool, meshcat: Meshcat | None) -> ExactPlant:
+    truth = true_dynamics(experiment, biased=False)
+    return ExactPlant(truth, experiment.start, wrench, limits_of(experiment))
+
+
+MakePlant = Callable[[Experiment, bool, Meshcat | None], ExactPlant | MultibodyStewart]
+"""Makes a plant, with an input for a wrench or without, shown in Meshcat or not."""
+PLANTS: Final[Mapping[str, MakePlant]] = {
+    "multibody": _multibody,
+    "exact": _exact,
+    "paper": _exact,
+}
