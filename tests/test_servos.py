@@ -574,7 +574,7 @@ def test_systems_for_torques_are_refused_and_laws_may_be_changed() -> None:
         experiment = prepare(scenario())
         own = experiment.own._replace(systems={role: system})  # type: ignore[dict-item]
         with pytest.raises(ConfigError, match=f"got 'servo' with a {role} of your own"):
-            build_closed_loop_with(experiment, own)
+            sd.build_closed_loop(experiment._replace(own=own))
     with pytest.raises(ConfigError, match="expected 'torque', for a law that closes"):
         compose_law(prepare(scenario()))
     early = sd.simulate(
@@ -586,12 +586,6 @@ def test_systems_for_torques_are_refused_and_laws_may_be_changed() -> None:
     assert early.summary["own"] == {"law": "<lambda>"}
     with pytest.raises(ConfigError, match="expected a ServoPreview"):
         sd.simulate(scenario(), modify_law=lambda law: law.timeline)
-
-
-def build_closed_loop_with(experiment: Any, own: Any) -> None:
-    from stewart_drake.loop.diagram import _add_servos
-
-    _add_servos(None, experiment._replace(own=own))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
