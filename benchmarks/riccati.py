@@ -22,7 +22,7 @@ import stewart_drake as sd
 from stewart_drake.law.delay_model import ChainModel, DelayedModel, chain, delayed_model
 from stewart_drake.law.error_model import double_integrators
 from stewart_drake.law.riccati import augmented_gain, full_gain, reduced_gain
-from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.mechanism.assembly import torque_map
 
 PERIOD = 0.1
 STEPS = (0, 1, 5, 8, 10, 20, 30)

@@ -15,7 +15,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from _page import QUICK, size, table, write
+from _page import size, table, write
 
 import stewart_drake as sd
 from stewart_drake.reporting.document import number
@@ -32,7 +32,7 @@ from stewart_drake.tuning.worth import HINDSIGHT, TUNER, Worth, evaluate
 WORKERS = 2
 CELLS = size("CELLS", 16)
 SCENARIOS = size("SCENARIOS", 20, least=2)
-EXACT = ("plant.kind=exact", *(["duration=2"] if QUICK else []))
+EXACT = ("plant.kind=exact",)
 ON_REFERENCE = (*EXACT, "start=on_reference", "queue=reference")
 BASES = {
     "as shipped, from rest": EXACT,

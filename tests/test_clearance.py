@@ -20,6 +20,7 @@ from stewart_drake.mechanism.clearance import (
     APART,
     LINKS,
     clearances,
+    proportions,
     segment_distances,
 )
 from stewart_drake.mechanism.files import load_mechanism
@@ -30,7 +31,6 @@ from stewart_drake.mechanism.kinematics import (
     reach_margins,
     reach_margins_along,
 )
-from stewart_drake.mechanism.proportions import proportions
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.clearance import clearance_along, study_clearance
 from stewart_drake.studies.workspace_map import Section, Travel, sections, travel

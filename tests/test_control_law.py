@@ -34,7 +34,7 @@ from stewart_drake.law.riccati import RiccatiError, full_gain
 from stewart_drake.law.startup import weight_scales
 from stewart_drake.loop.experiment import assemble, motion_scale, prepare
 from stewart_drake.loop.law_design import control_law
-from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate, make_reference
 from stewart_drake.types import Array

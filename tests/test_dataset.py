@@ -34,7 +34,7 @@ from stewart_drake.studies.families import (
     vary,
     with_gain,
 )
-from stewart_drake.tuner.density import WINDOW, densities
+from stewart_drake.tuner.network import WINDOW, densities
 from stewart_drake.tuner.source import ratio_of, weights_of
 from stewart_drake.tuning.data import (
     LOST,

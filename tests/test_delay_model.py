@@ -17,7 +17,7 @@ from stewart_drake.law.error_model import (
     linear_model,
     with_integral,
 )
-from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from stewart_drake.tuner.density import (
+from stewart_drake.tuner.network import (
     NUM_INPUTS,
     SIGNED_LIMIT,
     WINDOW,

@@ -42,8 +42,8 @@ from stewart_drake.law.riccati import reduced_gain
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.metrics import accumulated_error
+from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
-from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.config import ControllerConfig, Scenario
 from stewart_drake.scenario.loading import load_controller, load_understood, setting_choices
 from stewart_drake.scenario.reference_files import read_waypoints

@@ -12,7 +12,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.native_law import uncovered
 from stewart_drake.loop.experiment import limits_of, prepare
 from stewart_drake.loop.law_design import compose_law
-from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.scenario.signals import PLANT_PARAMETERS, POSE, RATES

@@ -10,7 +10,7 @@ from scipy.linalg import block_diag, expm
 from stewart_drake.law.delay_model import chain, delayed_model, sample
 from stewart_drake.law.error_model import double_integrators, with_integral
 from stewart_drake.law.hautus import TOLERANCE, cluster, hautus, scaled
-from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.studies.mode_words import describe, state_labels
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER

@@ -16,7 +16,6 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.loop.tuner import RULES, health_of, weights_source
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.families import FAMILIES, SAMPLES
-from stewart_drake.tuner.density import WINDOW
 from stewart_drake.tuner.features import (
     HIGHEST,
     LOWEST,
@@ -25,7 +24,7 @@ from stewart_drake.tuner.features import (
     HealthFeatures,
     Row,
 )
-from stewart_drake.tuner.network import Network, load_network, save_network
+from stewart_drake.tuner.network import WINDOW, Network, load_network, save_network
 from stewart_drake.tuner.source import (
     FALL,
     LEAST,

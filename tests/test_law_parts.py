@@ -34,7 +34,6 @@ from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.types import Array

@@ -27,7 +27,7 @@ from stewart_drake.law.stability import (
     spectral_radius,
 )
 from stewart_drake.loop.exact import ExactPlant
-from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.delay_limits import error_floor, simulated_growth

@@ -15,7 +15,7 @@ from stewart_drake.law.delay_model import DelayedModel, delayed_model
 from stewart_drake.law.error_model import double_integrators
 from stewart_drake.law.riccati import augmented_gain
 from stewart_drake.loop.metrics import accumulated_error
-from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.mechanism.assembly import torque_map
 from tests.mechanisms import PAPER
 
 AMPLITUDE = np.array([math.pi / 12] * 3 + [0.02, 0.02, 0.08])

@@ -14,7 +14,7 @@ from stewart_drake.law.delay_model import DelayedModel, chain, delayed_model
 from stewart_drake.law.error_model import double_integrators, linear_model
 from stewart_drake.law.riccati import RiccatiError, augmented_gain, full_gain, lqr, reduced_gain
 from stewart_drake.law.stability import is_stable
-from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative

@@ -7,9 +7,9 @@ import pytest
 from pydrake.math import RollPitchYaw
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.mechanism.geometry import Link, Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, leg_geometry
-from stewart_drake.mechanism.torque_map import torque_map
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 

@@ -11,8 +11,7 @@ from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.signals import TUNER_INPUTS
 from stewart_drake.studies.families import FAMILIES, PAIRS, RATIOS
-from stewart_drake.tuner.density import Kind
-from stewart_drake.tuner.network import load_network, save_network
+from stewart_drake.tuner.network import Kind, load_network, save_network
 from stewart_drake.tuner.source import ratio_of
 from stewart_drake.tuning import training
 from stewart_drake.tuning.data import data_hash

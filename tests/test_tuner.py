@@ -16,8 +16,7 @@ from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.loop.tuner import AnnTuner, DensityWindow
 from stewart_drake.scenario.timing import look_time
-from stewart_drake.tuner.density import NUM_INPUTS, densities
-from stewart_drake.tuner.network import Network, save_network
+from stewart_drake.tuner.network import NUM_INPUTS, Network, densities, save_network
 from stewart_drake.tuner.source import MAX_FACTOR, tune
 from stewart_drake.types import Array
 from tests.test_network import small_network, torch_twin

@@ -1,6 +1,6 @@
 """The paper's plant: its torque map (19) frozen at home, behind the interface of the exact one.
 
-    d2(pose)/dt2 = map (torque + bias),      map = `mechanism.torque_map.torque_map` at home,
+    d2(pose)/dt2 = map (torque + bias),      map = `mechanism.assembly.torque_map` at home,
 
 everywhere and without limits. It is the model that the paper's controller is designed with, taken
 for the machine. Legs have no mass, and nothing else of a plant's parameters has a place in it.
@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 from stewart_drake.dynamics.functions import Call
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.mechanism.assembly import TorqueMap, torque_map
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, rotation
-from stewart_drake.mechanism.torque_map import TorqueMap, torque_map
 from stewart_drake.scenario.signals import (
     ANGLES,
     BIAS,

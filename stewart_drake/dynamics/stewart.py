@@ -10,9 +10,9 @@ from stewart_drake.dynamics.functions import MotionFunctions
 from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import standing
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.mechanism.assembly import TorqueMap, torque_map
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, angle_rate_map
-from stewart_drake.mechanism.torque_map import TorqueMap, torque_map
 from stewart_drake.native.layout import DEAD_CENTRE_SINE, STANDARD_GRAVITY
 from stewart_drake.scenario.signals import (
     ANGLES,
@@ -189,7 +189,7 @@ class StewartDynamics:
             raise UnreachablePoseError(self.mechanism.reach_margins(pose))
 
     def massless_map(self, pose: Array, form: TorqueMap = "virtual_work") -> Array:
-        """(6, 6) the paper's accelerations per torque at a pose: see `mechanism.torque_map`."""
+        """(6, 6) the paper's accelerations per torque at a pose: see `mechanism.assembly`."""
         return torque_map(self.mechanism, pose, form)
 
     def accelerations(

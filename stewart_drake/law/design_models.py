@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from stewart_drake.law.error_model import ContinuousModel, double_integrators, linear_model
 from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.mechanism.torque_map import TorqueMap
+from stewart_drake.mechanism.assembly import TorqueMap
 from stewart_drake.scenario.signals import POSE, RATES
 from stewart_drake.types import Array
 

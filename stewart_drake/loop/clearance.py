@@ -19,10 +19,9 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, Multibody
 from pydrake.systems.framework import DiagramBuilder
 
 from stewart_drake.loop.multibody import add_mechanism, set_pose
-from stewart_drake.mechanism.clearance import LINKS, center_lines, segment_distances
+from stewart_drake.mechanism.clearance import LINKS, center_lines, proportions, segment_distances
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along
-from stewart_drake.mechanism.proportions import proportions
 from stewart_drake.scenario.signals import NUM_LEGS
 from stewart_drake.types import Array
 

@@ -26,9 +26,8 @@ from stewart_drake.loop.sampling import Sample, update_every, weak
 from stewart_drake.scenario.config import AnnTunerConfig, FixedTunerConfig, RuleTunerConfig
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, RATES, WEIGHTS
 from stewart_drake.scenario.trajectories import evaluate, spread_instants
-from stewart_drake.tuner.density import NUM_INPUTS, WINDOW, Kind, density
 from stewart_drake.tuner.features import DensityFeatures, Features, HealthFeatures
-from stewart_drake.tuner.network import Network
+from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, Network, density
 from stewart_drake.tuner.source import (
     MAX_FACTOR,
     PaperPolicy,
@@ -49,7 +48,7 @@ class DensityWindow(LeafSystem):
 
     Initialise: window = [unknown, ..., unknown], then the update of k = 0.
     Update:     at k dt   window <- [window without its oldest; s_k].
-    Output:     density = `tuner.density.density`(window), hence of samples up to k from k dt on.
+    Output:     density = `tuner.network.density`(window), hence of samples up to k from k dt on.
 
     What is not finite in s_k is unknown and left out of the window's mean, so that a missed
     measurement spoils nothing. While the window fills, the mean is over the samples there are.

@@ -1,4 +1,4 @@
-"""How far cranks and rods are from each other at least, for many poses at once.
+"""How thick the parts are, and how far cranks and rods are apart at least, for many poses at once.
 
 Each link is held in a capsule, what is within a radius of its centre line: a rod of the SDFormat
 model with the rod's own radius, a crank, a bar of width w and thickness h, with hypot(w, h) / 2.
@@ -12,7 +12,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from stewart_drake.mechanism.kinematics import LegGeometry, Legs
-from stewart_drake.mechanism.proportions import proportions
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, POSITION
 from stewart_drake.types import Array
 
@@ -20,6 +19,32 @@ LINKS: Final = tuple(f"{kind} {leg}" for kind in ("crank", "rod") for leg in LEG
 """Names of the links, in the order of `center_lines`."""
 APART: Final = tuple((i, j) for i, j in combinations(range(2 * NUM_LEGS), 2) if j - i != NUM_LEGS)
 """Pairs (60) of links that no joint holds together: all but a crank and its own rod."""
+
+
+class Proportions(NamedTuple):
+    """Sizes of the shapes that are drawn and that collide, in m."""
+
+    crank_thickness: float
+    """Along the motor axis."""
+    crank_width: float
+    motor_radius: float
+    motor_length: float
+    rod_radius: float
+    plate_thickness: float
+
+
+def proportions(mechanism: Legs) -> Proportions:
+    """Return them by the shortest crank and rod: a machine's file does not tell them."""
+    u, rod = float(mechanism.crank_lengths.min()), float(mechanism.rod_lengths.min())
+    thickness = 0.10 * u
+    return Proportions(
+        crank_thickness=thickness,
+        crank_width=1.6 * thickness,
+        motor_radius=0.22 * u,
+        motor_length=0.40 * u,
+        rod_radius=0.012 * rod,
+        plate_thickness=0.03 * rod,
+    )
 
 
 class Lines(NamedTuple):

@@ -1,4 +1,4 @@
-"""Moments of inertia that a mechanism file leaves out: those of uniform bars and discs.
+"""Moments of inertia that a mechanism file leaves out, and those of rotors behind gears.
 
 *Bar*, of length L, diameter d and mass m: with the density m/(pi d^2/4 L) constant,
 
@@ -13,10 +13,12 @@ spin of its own can have.
 I_z = I_x + I_y for anything flat, m R^2/4 across it.
 """
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
+from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.types import Array
 
 THINNESS: Final = 20.0
@@ -43,3 +45,22 @@ def disc_inertia(mass: float, radius: float) -> Array:
         radius: m.
     """
     return mass * radius**2 * np.array([0.25, 0.25, 0.5])
+
+
+def with_rotors(mechanism: Mechanism, inertia: float) -> Mechanism:
+    """Return the machine with a rotor at each shaft.
+
+    A rotor of moment I that turns N times as fast as its crank has the energy I (N a')^2 / 2, as if
+    the crank had N^2 I more about the motor axis; the axis stands still, so that no other moment of
+    a crank counts. Half of it goes to each of these, as for a thin disk: a body has no moment that
+    is larger than the other two together.
+
+    Args:
+        mechanism: without them.
+        inertia: N^2 I in kg m^2.
+    """
+    if inertia == 0:
+        return mechanism
+    crank = mechanism.crank
+    disk = inertia * np.array([0.5, 0.5, 1.0])
+    return replace(mechanism, crank=replace(crank, inertia=crank.inertia + disk))

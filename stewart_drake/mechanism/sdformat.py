@@ -6,8 +6,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from stewart_drake.mechanism.assembly import Assembly, assemble
+from stewart_drake.mechanism.clearance import proportions
 from stewart_drake.mechanism.geometry import Body, Mechanism
-from stewart_drake.mechanism.proportions import proportions
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.types import Array
 

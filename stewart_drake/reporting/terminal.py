@@ -56,8 +56,7 @@ def shipped_table(kind: "Kind") -> str:
 
 def _description(path: Path) -> str:
     if path.suffix == ".json":  # which has no comments
-        from stewart_drake.tuner.density import NUM_INPUTS
-        from stewart_drake.tuner.network import NUM_OUTPUTS, load_network
+        from stewart_drake.tuner.network import NUM_INPUTS, NUM_OUTPUTS, load_network
 
         network = load_network(path)
         low, high = network.bounds.min(), network.bounds.max()

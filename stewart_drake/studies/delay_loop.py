@@ -22,7 +22,7 @@ from stewart_drake.law.stability import (
 )
 from stewart_drake.loop.experiment import believed_delay, true_dynamics
 from stewart_drake.loop.law_design import quadratic_cost
-from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate

@@ -29,7 +29,7 @@ from stewart_drake.law.error_model import (
     with_integral,
 )
 from stewart_drake.law.hautus import TOLERANCE, Hautus, hautus, scaled
-from stewart_drake.mechanism.torque_map import torque_map
+from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.studies.basis import Basis, basis

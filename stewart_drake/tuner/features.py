@@ -30,7 +30,7 @@ from stewart_drake.law.filter_settings import MODEL_ERROR
 from stewart_drake.law.native_law import AnyMemory
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE, RATES
-from stewart_drake.tuner.density import NUM_INPUTS, WINDOW, Kind, density
+from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, density
 from stewart_drake.types import Array
 
 
@@ -60,7 +60,7 @@ class Features(Protocol):
 
 @dataclass(frozen=True)
 class DensityFeatures:
-    """The paper's densities (45), `tuner.density`.
+    """The paper's densities (45), `tuner.network`.
 
     Attributes:
         kind: of density.

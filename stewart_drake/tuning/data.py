@@ -37,9 +37,8 @@ from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS
 from stewart_drake.studies.families import SAMPLES, Family, with_gain
 from stewart_drake.studies.jobs import Progress, run_jobs
-from stewart_drake.tuner.density import NUM_INPUTS, WINDOW, densities
 from stewart_drake.tuner.features import HealthFeatures
-from stewart_drake.tuner.network import Network
+from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Network, densities
 from stewart_drake.tuner.source import Decision, RatioPolicy, WeightsSource
 from stewart_drake.types import Array
 

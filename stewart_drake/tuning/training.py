@@ -43,8 +43,7 @@ from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.renames import with_new_names
 from stewart_drake.studies.families import FAULTY, RATIOS, vary
 from stewart_drake.studies.jobs import Progress, run_jobs
-from stewart_drake.tuner.density import NUM_INPUTS, Kind, densities
-from stewart_drake.tuner.network import NUM_OUTPUTS, Network
+from stewart_drake.tuner.network import NUM_INPUTS, NUM_OUTPUTS, Kind, Network, densities
 from stewart_drake.tuner.source import weights_of
 from stewart_drake.tuning.data import (
     EVERY,
