@@ -312,7 +312,7 @@ def _is_number(cell: str) -> bool:
     return text in ("", "-", "–", "∞", "NaN") or text.lstrip("+-−<>≤≥±* ")[:1].isdigit()
 
 
-def from_template(name: str, tone: Tone = "plain", **context: Any) -> Document:
+def from_template(name: str, tone: Tone = "plain", /, **context: Any) -> Document:
     """Return the document that a template makes of its context."""
     top, *others = sections(name, **context)
     verdict = " ".join(part.text for part in top.all(Paragraph))
@@ -320,7 +320,7 @@ def from_template(name: str, tone: Tone = "plain", **context: Any) -> Document:
     return Document(top.heading, verdict, others, tone, facts)
 
 
-def sections(name: str, **context: Any) -> list[Section]:
+def sections(name: str, /, **context: Any) -> list[Section]:
     """Return the sections of a template, without those all of whose named blocks are missing."""
     found = []
     for heading, folded, parts in _template(name):

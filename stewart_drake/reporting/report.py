@@ -29,8 +29,8 @@ from stewart_drake.reporting.document import (
     Picture,
     Section,
     Tone,
+    from_template,
     number,
-    sections,
     sentence,
 )
 from stewart_drake.reporting.figures import (
@@ -42,9 +42,7 @@ from stewart_drake.reporting.figures import (
 )
 from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.reporting.run import comparison_blocks, run_blocks
-from stewart_drake.scenario.config import (
-    Scenario,
-)
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link import link_text, number_sent
 from stewart_drake.scenario.loading import load_understood, scenario_yaml
 from stewart_drake.studies.compare import LABELS, is_papers, label, shown
@@ -216,8 +214,14 @@ def document(found: Collected, name: str, replay: str = "") -> Document:
     """
     text, tone = verdict(found)
     compared, weights = _compared(found)
-    parts = sections(
+    made = from_template(
         "report",
+        tone,
+        name=name,
+        verdict=text,
+        sc=found.scenario,
+        mechanism=load_mechanism(found.scenario.mechanism).name,
+        link=link_text(found.scenario),
         failure=found.failure,
         replay=replay and Frame(replay),
         run=found.run and [*run_blocks(found.run), *_run_pictures(found.run)],
@@ -227,12 +231,12 @@ def document(found: Collected, name: str, replay: str = "") -> Document:
         compared=compared,
     )
     answers = {_QUESTIONS[key]: found.analyses[key] for key in ANALYSES}
-    parts += [_answer(question, answer) for question, answer in answers.items()]
-    parts += [_details(question, answer) for question, answer in answers.items()]
-    text_above = "Every field, in the format of a scenario file: saved as one it runs again."
+    made.sections.extend(_answer(question, answer) for question, answer in answers.items())
+    made.sections.extend(_details(question, answer) for question, answer in answers.items())
+    above = "Every field, in the format of a scenario file: saved as one it runs again."
     listing = Listing(scenario_yaml(found.scenario))
-    parts.append(Section("The scenario", text_above, listing, folded=True))
-    return Document(f"Report on the scenario {name}", text, parts, tone, _facts(found.scenario))
+    made.sections.append(Section("The scenario", above, listing, folded=True))
+    return made
 
 
 def report_summary(found: Collected) -> dict[str, Any]:
@@ -371,36 +375,3 @@ def _details(question: str, answer: AnalysisResult) -> Section:
         if not isinstance(block, Picture)
     ]
     return Section(f"Details: {question}", *parts, folded=True)
-
-
-def _facts(scenario: Scenario) -> dict[str, str]:
-    c, plant = scenario.controller, scenario.plant
-    sent = f"{c.prediction} prediction" if c.command == "torque" else "cranks sent ahead"
-    law = f"{sent}, feedforward {c.feedforward}"
-    law += f", estimate of {', '.join(c.estimate)}" if c.estimate else ", no estimator"
-    if c.delay_estimator != "none":
-        law += f", delay estimator {c.delay_estimator}"
-    return {
-        "mechanism": load_mechanism(scenario.mechanism).name,
-        "reference": f"{scenario.reference.kind}, {scenario.duration:g} s",
-        "delay": f"{scenario.eta:.4g} s, {scenario.true_delay.periods:g} periods of {c.period:g} s",
-        "plant": f"{plant.kind}, {'with' if plant.gravity else 'without'} gravity",
-        "controller": law.replace("_", " "),
-        "start": f"{scenario.start.replace('_', ' ')}, torques in flight: {scenario.queue}",
-    } | _unusual(scenario)
-
-
-def _unusual(scenario: Scenario) -> dict[str, str]:
-    """Link, sensor, motors and weights, where they are not those of a plain scenario."""
-    told = {}
-    sensor, motors = scenario.sensor, scenario.actuator
-    if text := link_text(scenario):
-        told["link"] = text
-    if sensor.kind == "encoders":
-        fine = "exact" if sensor.bits is None else f"of {sensor.bits} bit"
-        told["sensor"] = f"encoders, {fine}, {sensor.samples} in a period"
-    if motors.kind == "servo":
-        told["motors"] = f"position servos, {motors.bandwidth:g} Hz"
-    if scenario.tuner.kind != "fixed":
-        told["weights"] = {"ann": "set by a network", "rule": "set by a rule"}[scenario.tuner.kind]
-    return told
