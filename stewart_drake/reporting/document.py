@@ -52,7 +52,7 @@ _SHORT: Final = 36
 
 
 def wrap(text: str, first: str = "", rest: str = "  ") -> str:
-    """One paragraph of at most WIDTH columns, its first line and the others opened as given."""
+    """Return a paragraph of at most WIDTH columns; `first` and `rest` open its lines."""
     together = re.sub(_TOGETHER, _NO_BREAK, text)
     filled = textwrap.fill(
         together, WIDTH, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
@@ -61,13 +61,13 @@ def wrap(text: str, first: str = "", rest: str = "  ") -> str:
 
 
 def rows(entries: Mapping[str, str]) -> str:
-    """Names and texts in two columns, long texts wrapped."""
+    """Return names and texts in two columns, long texts wrapped."""
     indent = " " * (max(map(len, entries)) + 2)
     return "\n".join(wrap(text, name.ljust(len(indent)), indent) for name, text in entries.items())
 
 
 def number(value: float, digits: int = 3) -> str:
-    """So many significant digits; a dash where there is no number."""
+    """Return a number with significant digits, a dash for NaN and infinity."""
     if not math.isfinite(value):
         return "-"
     if value != 0 and not 1e-4 <= abs(value) < 1e5:
@@ -77,12 +77,12 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def capital(text: str) -> str:
-    """With a capital letter."""
+    """Return a text with a capital letter."""
     return text[:1].upper() + text[1:]
 
 
 def sentence(text: str) -> str:
-    """With a capital letter and a full stop."""
+    """Return a text with a capital letter and a full stop."""
     return capital(text).removesuffix(".") + "."
 
 
@@ -321,7 +321,7 @@ def from_template(name: str, tone: Tone = "plain", /, **context: Any) -> Documen
 
 
 def sections(name: str, /, **context: Any) -> list[Section]:
-    """Return the sections of a template, without those all of whose named blocks are missing."""
+    """Return the sections of a template that have a named block, or need none."""
     found = []
     for heading, folded, parts in _template(name):
         named = [bool(context[part.name]) for part in parts if part.name]
