@@ -26,8 +26,13 @@ from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario, load_scenario, scenario_yaml
 from stewart_drake.studies.jobs import Progress
-from stewart_drake.studies.mechanism_check import MechanismCheck, check_mechanism
-from stewart_drake.studies.new_machine import Measurements, NewMachine, new_machine
+from stewart_drake.studies.new_machine import (
+    Measurements,
+    MechanismCheck,
+    NewMachine,
+    check_mechanism,
+    new_machine,
+)
 from stewart_drake.studies.options import takes
 from stewart_drake.tuning.options import DataOptions, TrainingOptions, WorthOptions
 

@@ -30,9 +30,9 @@ from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE
 from stewart_drake.scenario.trajectories import evaluate
-from stewart_drake.studies.basis import basis
 from stewart_drake.studies.compare import CONTROLLERS
 from stewart_drake.studies.delay_loop import loop_margins
+from stewart_drake.studies.verdict import basis
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 

@@ -11,7 +11,7 @@ from stewart_drake.law.delay_model import chain, delayed_model, sample
 from stewart_drake.law.error_model import double_integrators, with_integral
 from stewart_drake.law.hautus import TOLERANCE, cluster, hautus, scaled
 from stewart_drake.mechanism.assembly import torque_map
-from stewart_drake.studies.mode_words import describe, state_labels
+from stewart_drake.studies.hautus import describe, state_labels
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 

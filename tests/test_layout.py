@@ -28,23 +28,21 @@ from stewart_drake.studies.layout import (
     problem_of,
     search,
 )
-from stewart_drake.studies.layout_measures import (
+from stewart_drake.studies.layout_space import (
     MEASURES,
+    PARAMETERS,
+    Arrangement,
     Wish,
     geometry,
     motion_of,
-    peak_torque,
-    wish_of,
-)
-from stewart_drake.studies.layout_space import (
-    PARAMETERS,
-    Arrangement,
     own_values,
+    peak_torque,
     space_around,
+    wish_of,
 )
 from stewart_drake.studies.reach import margins_along
 from stewart_drake.studies.runs import Outcome
-from stewart_drake.studies.sizing import size_motors
+from stewart_drake.studies.workspace import size_motors
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.screen import too_long

@@ -29,9 +29,9 @@ from stewart_drake.law.stability import (
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.trajectories import evaluate
-from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.delay_limits import error_floor, simulated_growth
 from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
+from stewart_drake.studies.verdict import Basis, basis
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 

@@ -21,7 +21,7 @@ from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.reporting.viewer import SLIDERS, STOP, PoseViewer, place, slider_range
-from stewart_drake.studies.mechanism_check import check_mechanism
+from stewart_drake.studies.new_machine import check_mechanism
 from tests.mechanisms import PAPER
 from tests.screen import too_long
 from tests.singular import parallel_rods, stretched, write_mechanism

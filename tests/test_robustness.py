@@ -26,11 +26,11 @@ from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.reporting.robustness import document, influence_figure
 from stewart_drake.scenario.config import Scenario, StateSensorConfig
 from stewart_drake.studies import robustness, statistics
-from stewart_drake.studies.failures import auc_interval, explain
 from stewart_drake.studies.ranges import Ranges, read_ranges
 from stewart_drake.studies.robustness import RobustnessOptions, run_draw, study_robustness
 from stewart_drake.studies.robustness_result import RobustnessStudy, factor_values, table
 from stewart_drake.studies.runs import Outcome
+from stewart_drake.studies.statistics import auc_interval, explain
 from stewart_drake.studies.uncertainty import (
     MACHINE,
     About,

@@ -31,10 +31,15 @@ from stewart_drake.studies.reach import (
     largest_factor,
     margins_along,
 )
-from stewart_drake.studies.singularity import characteristic_length, measure, wrenches
-from stewart_drake.studies.sizing import size_motors
-from stewart_drake.studies.workspace import study_workspace
-from stewart_drake.studies.workspace_map import last_inside, sections, travel
+from stewart_drake.studies.workspace import size_motors, study_workspace
+from stewart_drake.studies.workspace_map import (
+    characteristic_length,
+    last_inside,
+    measure,
+    sections,
+    travel,
+    wrenches,
+)
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.screen import too_long

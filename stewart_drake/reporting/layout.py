@@ -18,8 +18,7 @@ from stewart_drake.reporting.document import (
 )
 from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.studies.layout import INSTANTS, Layout, LayoutStudy
-from stewart_drake.studies.layout_measures import MEASURES
-from stewart_drake.studies.layout_space import PARAMETERS
+from stewart_drake.studies.layout_space import MEASURES, PARAMETERS
 
 _RUN: Final = {"completed": "completed", "refused": "does not reach the motion"}
 _TONES: Final[dict[str, Tone]] = {"yes": "good", "partly": "fair"}

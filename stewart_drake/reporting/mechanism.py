@@ -18,7 +18,7 @@ from stewart_drake.reporting.panels import Panel, draw
 from stewart_drake.reporting.style import Line, write_figures
 from stewart_drake.reporting.workspace import travel_text
 from stewart_drake.scenario.signals import LEGS
-from stewart_drake.studies.mechanism_check import MechanismCheck
+from stewart_drake.studies.new_machine import MechanismCheck
 from stewart_drake.types import Array
 
 # Told apart by width and darkness too, for grey print.

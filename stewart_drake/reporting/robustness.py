@@ -14,7 +14,6 @@ from matplotlib.ticker import MaxNLocator
 from stewart_drake.reporting.document import Document, Table, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw, limit
 from stewart_drake.reporting.style import LIMIT, RUN, TRUTH
-from stewart_drake.studies.failures import Pair, Separation
 from stewart_drake.studies.robustness_result import (
     QUANTILES,
     Influence,
@@ -23,7 +22,14 @@ from stewart_drake.studies.robustness_result import (
     factors,
     unit_of,
 )
-from stewart_drake.studies.statistics import Correlation, Interval, wilson_interval
+from stewart_drake.studies.statistics import (
+    Correlation,
+    Explanation,
+    Interval,
+    Pair,
+    Separation,
+    wilson_interval,
+)
 from stewart_drake.types import Array
 
 TITLES: Final = {

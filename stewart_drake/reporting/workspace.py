@@ -19,8 +19,7 @@ from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import FACTORS, LEG_LINES, LIMIT, UNITS, figure_style, line
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
 from stewart_drake.studies.clearance import Nearest
-from stewart_drake.studies.sizing import Sizing
-from stewart_drake.studies.workspace import WorkspaceStudy
+from stewart_drake.studies.workspace import Sizing, WorkspaceStudy
 from stewart_drake.studies.workspace_map import Section, Travel
 from stewart_drake.types import Array
 

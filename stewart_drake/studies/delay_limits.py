@@ -18,12 +18,11 @@ from stewart_drake.loop.metrics import delay_floor
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import POSE
-from stewart_drake.studies.basis import Basis, basis
 from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
 from stewart_drake.studies.delay_map import Cell, delay_map, map_delays
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.options import Options
-from stewart_drake.studies.verdict import Verdict, pole_in_motion
+from stewart_drake.studies.verdict import Basis, Verdict, basis, pole_in_motion
 from stewart_drake.types import Array
 
 INSTANTS: Final = 62

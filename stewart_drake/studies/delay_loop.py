@@ -26,7 +26,7 @@ from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
-from stewart_drake.studies.basis import Basis
+from stewart_drake.studies.verdict import Basis
 from stewart_drake.types import Array
 
 DELAYS: Final = (0, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 25, 30)

@@ -46,24 +46,22 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.clearance import Nearest, clearance_along
 from stewart_drake.studies.jobs import Progress, run_jobs
-from stewart_drake.studies.layout_measures import (
+from stewart_drake.studies.layout_space import (
+    DIGITS,
     MEASURES,
+    PARAMETERS,
+    Arrangement,
     Motion,
+    Space,
     Wish,
     geometry,
     least_reach,
     motion_of,
+    own_values,
     peak_torque,
     singular,
-    wish_of,
-)
-from stewart_drake.studies.layout_space import (
-    DIGITS,
-    PARAMETERS,
-    Arrangement,
-    Space,
-    own_values,
     space_around,
+    wish_of,
 )
 from stewart_drake.studies.options import Flag, JobOptions, Seed
 from stewart_drake.studies.runs import Outcome, outcome_of

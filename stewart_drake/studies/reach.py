@@ -7,8 +7,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.workspace import Failure, diagnose, margin
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.studies.singularity import measure
-from stewart_drake.studies.workspace_map import border, last_inside
+from stewart_drake.studies.workspace_map import border, last_inside, measure
 from stewart_drake.types import Array
 
 LARGEST_FACTOR: Final = 3.0

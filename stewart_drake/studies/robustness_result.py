@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from stewart_drake.files.versions import versions
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.studies.failures import Explanation, explain
 from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.runs import Outcome, loops_of
 from stewart_drake.studies.statistics import (
     Correlation,
+    Explanation,
     Interval,
+    explain,
     holm,
     quantile_interval,
     rank_correlation,

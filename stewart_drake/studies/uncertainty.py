@@ -23,7 +23,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
 from stewart_drake.scenario.trajectories import spread_instants
 from stewart_drake.studies.ranges import Ranges
-from stewart_drake.studies.sizing import rms, size_motors
+from stewart_drake.studies.workspace import rms, size_motors
 
 Draw = dict[str, Any]
 """What was drawn by name of the quantity, SI units: a number, a tuple of them, or None for nothing.
