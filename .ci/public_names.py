@@ -23,7 +23,8 @@ def text():
             continue
         shown = f"def {name}{inspect.signature(value)}: ..."
         shown = shown.replace("pathlib._local.", "pathlib.")  # of Python 3.13
-        shown = re.sub(r"Optional\[(Literal\[.*?\])\]", r"typing.\1 | None", shown)
+        shown = re.sub(r"Optional\[(Literal\[.*?\])\]", r"\1 | None", shown)
+        shown = re.sub(r"(?<!typing\.)\bLiteral\[", "typing.Literal[", shown)
         modules |= set(re.findall(r"\b[a-z_.]+(?=\.[A-Z])", shown))
         functions.append(shown)
     lines += [f"from stewart_drake import {name} as {name}" for name in sd._MODULES]

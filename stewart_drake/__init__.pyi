@@ -5,6 +5,7 @@ import typing
 
 import stewart_drake.reporting.results
 import stewart_drake.scenario.config
+import stewart_drake.studies.new_machine
 import stewart_drake.studies.ranges
 from stewart_drake import law as law
 from stewart_drake import systems as systems
@@ -16,10 +17,7 @@ from stewart_drake.functions import export_c as export_c
 from stewart_drake.functions import export_csv as export_csv
 from stewart_drake.functions import identify as identify
 from stewart_drake.functions import model_sdf as model_sdf
-from stewart_drake.functions import new as new
 from stewart_drake.functions import plan_identification as plan_identification
-from stewart_drake.functions import run_live as run_live
-from stewart_drake.functions import run_machine as run_machine
 from stewart_drake.functions import view_model as view_model
 from stewart_drake.loop.diagram import ClosedLoop as ClosedLoop
 from stewart_drake.loop.diagram import build_closed_loop as build_closed_loop
@@ -158,6 +156,49 @@ def make_tuner_data(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
+def new(
+    directory: str | pathlib.Path,
+    name: str,
+    *,
+    base_radius: float,
+    shaft_distance: float,
+    plate_radius: float,
+    joint_distance: float,
+    crank: float,
+    rod: float,
+    plate_mass: float,
+    crank_mass: float,
+    rod_mass: float,
+    shaft_height: float = 0.0,
+    upright: float = 90.0,
+    cranks: typing.Literal["apart", "together"] = "apart",
+    torque_limit: float | None = None,
+    delay: float = 0.1,
+    gravity: bool = True,
+) -> stewart_drake.studies.new_machine.NewMachine: ...
+def run_live(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    machine: str,
+    *,
+    log: str | pathlib.Path | None = None,
+    duration: float | None = None,
+    armed: bool = False,
+    key: pathlib.Path | None = None,
+    max_missing: float | None = None,
+    accept_jitter: bool = False,
+) -> stewart_drake.reporting.results.SimulationResult: ...
+def run_machine(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    *,
+    rate: float = 1.0,
+    watchdog: float = 1.0,
+    safe: typing.Literal["zero", "hold"] = "zero",
+    restart: typing.Literal["rest", "motion"] = "rest",
+    port: int = 47000,
+    host: str = "127.0.0.1",
+    key: pathlib.Path | None = None,
+    duration: float = 0.0,
+) -> dict[str, typing.Any]: ...
 def train_tuner(
     data: str | pathlib.Path,
     out: str | pathlib.Path,

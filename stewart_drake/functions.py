@@ -14,6 +14,7 @@ from stewart_drake.identification import identify as identification
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, read_log
 from stewart_drake.identification.plan import MOTION, Plan, plan
 from stewart_drake.identification.tolerances import Tolerances
+from stewart_drake.live.options import LiveOptions, MachineOptions
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.mechanism.files import as_mechanism, load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import Mechanism
@@ -26,8 +27,8 @@ from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario, load_scenario, scenario_yaml
 from stewart_drake.studies.jobs import Progress
+from stewart_drake.studies.measurements import Measurements
 from stewart_drake.studies.new_machine import (
-    Measurements,
     MechanismCheck,
     NewMachine,
     check_mechanism,
@@ -174,20 +175,21 @@ def export_c(
     return write(exported(scenario, single), folder)
 
 
-def new(directory: str | Path, name: str, **measurements: float | bool | str | None) -> NewMachine:
+@takes(Measurements)
+def new(directory: str | Path, name: str, *, options: Measurements) -> NewMachine:
     """Make a machine and a first scenario from a few measurements.
 
     Args:
         directory: for the two files.
         name: of the machine.
-        measurements: fields of `stewart_drake.studies.new_machine.Measurements`, m and kg.
+        OPTIONS
 
     Raises:
         ConfigError: measurements that fit no machine, or files that are there already.
     """
     folder = Path(directory)
     folder.mkdir(parents=True, exist_ok=True)
-    return new_machine(Measurements(**measurements), name, folder)  # type: ignore[arg-type]
+    return new_machine(options, name, folder)
 
 
 def check_model(mechanism: Mechanism | str | Path) -> MechanismCheck:
@@ -221,15 +223,12 @@ def view_model(mechanism: Mechanism | str | Path) -> None:
     PoseViewer(as_mechanism(mechanism), Meshcat()).run(print)
 
 
+@takes(LiveOptions)
 def run_live(
     scenario: Scenario | str | Path,
     machine: str,
-    duration: float = math.inf,
     *,
-    armed: bool = False,
-    accept_jitter: bool = False,
-    max_missing: float | None = None,
-    key: str | Path | None = None,
+    options: LiveOptions,
     log: str | Path | None = None,
 ) -> SimulationResult:
     """Drive a machine over UDP in real time.
@@ -237,13 +236,8 @@ def run_live(
     Args:
         scenario: or a shipped name or a path.
         machine: HOST:PORT where it listens.
-        duration: s.
-        armed: whether a machine that is no simulation may be driven.
-        accept_jitter: whether to start where the jitter is more than the loop is stable for.
-        max_missing: s without measurements after which the run ends; by the estimator's
-            uncertainty if None.
-        key: file whose bytes both sides share.
         log: CSV file that is written as the run goes on.
+        OPTIONS
 
     Raises:
         ConfigError: bad input, no such machine, or one that does not begin.
@@ -252,50 +246,29 @@ def run_live(
     from stewart_drake.live.endpoint import read_key
     from stewart_drake.live.session import drive, prepare_session
 
-    secret = None if key is None else read_key(Path(key))
+    secret = None if options.key is None else read_key(options.key)
     ready = prepare_session(as_scenario(scenario), address_of(machine), secret)
-    how: Any = {"armed": armed, "accept_jitter": accept_jitter, "max_missing": max_missing}
-    how["log"] = None if log is None else Path(log)
-    return SimulationResult.of(drive(ready, duration, **how))
+    how: Any = options.model_dump(include={"armed", "accept_jitter", "max_missing"})
+    span = math.inf if options.duration is None else options.duration
+    return SimulationResult.of(drive(ready, span, log=None if log is None else Path(log), **how))
 
 
-def run_machine(
-    scenario: Scenario | str | Path,
-    duration: float = math.inf,
-    *,
-    host: str = "127.0.0.1",
-    port: int = 47000,
-    key: str | Path | None = None,
-    **settings: float | str,
-) -> dict[str, Any]:
+@takes(MachineOptions)
+def run_machine(scenario: Scenario | str | Path, *, options: MachineOptions) -> dict[str, Any]:
     """Simulate a machine in real time, for a controller over UDP; return what happened.
 
     Args:
         scenario: or a shipped name or a path; its plant, sensor, delay, link and limits.
-        duration: s of the machine's clock.
-        host: to listen at; beyond loopback with a key.
-        port: UDP.
-        key: file whose bytes both sides share.
-        settings: fields of `stewart_drake.live.machine.Settings`: rate, watchdog, safe, restart.
+        OPTIONS
 
     Raises:
         ConfigError: bad input.
     """
-    from stewart_drake.live.endpoint import Endpoint, read_key
-    from stewart_drake.live.machine import Machine, Settings, check_scenario
-    from stewart_drake.live.protocol import ControllerMessage
+    from stewart_drake.live.machine import open_machine
 
-    loaded = as_scenario(scenario)
-    check_scenario(loaded)
-    chosen = Settings(**settings)  # type: ignore[arg-type]
-    secret = None if key is None else read_key(Path(key))
-    endpoint = Endpoint(ControllerMessage, host, port, secret)
-    try:
-        running = Machine(prepare(loaded), endpoint, chosen)
-        running.run(duration)
-    finally:
-        endpoint.close()
-    return running.summary()
+    with open_machine(as_scenario(scenario), options) as (machine, _):
+        machine.run(options.duration or math.inf)
+    return machine.summary()
 
 
 @takes(DataOptions)

@@ -503,7 +503,7 @@ def test_what_the_protocol_cannot_say_is_refused(settings: tuple[str, ...], mess
     ("name", "value"), [("rate", 0.0), ("rate", float("nan")), ("watchdog", -1)]
 )
 def test_settings_have_a_range(name: str, value: float) -> None:
-    with pytest.raises(ConfigError, match=f"--{name}: got"):
+    with pytest.raises(ConfigError, match=f"{name}: got"):
         Settings(**{name: value})  # type: ignore[arg-type]
 
 

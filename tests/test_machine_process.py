@@ -371,7 +371,7 @@ def test_wrong_commands_are_one_line(capfd: pytest.CaptureFixture[str], tmp_path
         (("--host", "0.0.0.0"), "host: got 0.0.0.0 without a key"),
         (("--port", str(busy.getsockname()[1])), "expected a free one"),
         (("--port", "70000"), "65535"),
-        (("--rate", "0"), "--rate: got 0; expected"),
+        (("--rate", "0"), "--rate: got 0.0; expected"),
         (("--watchdog", "nan"), "--watchdog: got nan; expected"),
         (("--key", str(tmp_path / "none")), "--key: got"),
         (("--safe", "brake"), "brake"),

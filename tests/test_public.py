@@ -113,11 +113,11 @@ def test_a_machine_and_a_live_run_from_python():
     way = "low: 0.1, high: 0.12, loss: 0"
     network = f"link={{kind: network, {way}, return: {{{way}}}}}"
     machine = sd.load_scenario("paper", settings=("plant.kind=exact", network))
-    assert sd.run_machine(machine, 0.1, port=0, safe="hold")["runs"] == 0
+    assert sd.run_machine(machine, duration=0.1, port=0, safe="hold")["runs"] == 0
     serve = threading.Thread(target=sd.run_machine, args=(machine,), kwargs={"port": port})
     serve.daemon = True
     serve.start()
-    run = sd.run_live("paper", f"127.0.0.1:{port}", 1.0, accept_jitter=True)
+    run = sd.run_live("paper", f"127.0.0.1:{port}", duration=1.0, accept_jitter=True)
     assert run.summary["live"]["samples"] > 5 and run.table()
 
 

@@ -22,7 +22,9 @@ from stewart_drake.cli.common import (
     ScenarioName,
     Settings,
 )
+from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.live.options import LiveOptions
 from stewart_drake.reporting.terminal import echo
 
 if TYPE_CHECKING:
@@ -39,45 +41,24 @@ _LOST: Final = 0.02
 _REQUESTS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
-Arm = Annotated[bool, typer.Option("--arm", help="Drive a machine that is no simulation.")]
-Demo = Annotated[
-    bool,
-    typer.Option(
-        "--demo",
-        help="Start a simulated machine too, each way 0.35 to 0.4 of the scenario's delay.",
-    ),
-]
-Duration = Annotated[
-    float | None, typer.Option(min=0.1, metavar="S", help="Until it is stopped by default.")
-]
-Key = Annotated[Path | None, typer.Option(metavar="FILE", help="Whose bytes both sides share.")]
-MaxMissing = Annotated[
-    float | None,
-    typer.Option(
-        min=0.001,
-        metavar="SECONDS",
-        help="Without measurements, then it ends; by the estimator's uncertainty by default.",
-    ),
-]
-Yes = Annotated[
-    bool, typer.Option("--yes", help="Start without the question that a large jitter raises.")
-]
-
-
+@with_options(LiveOptions)
 def live(
+    *,
     scenario: ScenarioName = "paper",
     machine: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Where the machine listens.")
     ] = None,
-    demo: Demo = False,
-    duration: Duration = None,
+    demo: Annotated[
+        bool,
+        typer.Option(
+            "--demo",
+            help="Start a simulated machine too, each way 0.35 to 0.4 of the scenario's delay.",
+        ),
+    ] = False,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Without a page; only what is printed.")
     ] = False,
-    arm: Arm = False,
-    key: Key = None,
-    max_missing: MaxMissing = None,
-    yes: Yes = False,
+    given: Given,
     controller: Controller = None,
     settings: Settings = None,
     out: Out = None,
@@ -96,9 +77,10 @@ def live(
 
     if (machine is None) != demo:
         raise ConfigError("--machine: expected either --machine HOST:PORT or --demo")
+    options = given.options()
     loaded = load_scenario(scenario, controller, settings or ())
     delivery = Delivery(out, quiet, as_json)
-    span = math.inf if duration is None else duration
+    span = math.inf if options.duration is None else options.duration
     name = Path(scenario).stem
 
     with contextlib.ExitStack() as running:
@@ -107,20 +89,20 @@ def live(
             _demo_machine(scenario, loaded.eta, controller, settings or ())
         )
         delivery.say(f"calling {where}")
-        secret = None if key is None else read_key(key)
+        secret = None if options.key is None else read_key(options.key)
         ready = prepare_session(loaded, address_of(where), secret)
         for line in plans(ready, span, name):
             delivery.tell(line)
-        check_armed(ready, arm)
+        check_armed(ready, options.armed)
         # Nothing is at stake with the demo's own machine.
-        problem = None if yes or demo else ready.jitter_problem
+        problem = None if options.accept_jitter or demo else ready.jitter_problem
         check_jitter(ready, problem is None or _agreed(problem))
         if viewer is not None:
             _show(viewer.opened())
         if not ready.simulated and sys.stdin.isatty():
             input("Enter begins, Ctrl-C leaves it alone")
         delivery.discard("signals.nc")
-        how: Any = {"armed": arm, "viewer": viewer, "max_missing": max_missing}
+        how: Any = {"armed": options.armed, "viewer": viewer, "max_missing": options.max_missing}
         how["log"] = None if out is None else out / LOG
         with _Ending() as ending:
             result = drive(ready, span, ending=ending, say=delivery.tell, accept_jitter=True, **how)

@@ -2,53 +2,22 @@
 
 import signal
 from collections.abc import Callable
-from enum import StrEnum
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from stewart_drake.cli.common import AsJson, Controller, Delivery, Quiet, ScenarioName, Settings
+from stewart_drake.cli.options import Given, with_options
+from stewart_drake.live.options import MachineOptions
 from stewart_drake.reporting.document import wrap
 
 if TYPE_CHECKING:
     from stewart_drake.live.machine import Machine
 
 
-class Safe(StrEnum):
-    """The torque of a machine that hears nothing."""
-
-    zero = "zero"
-    hold = "hold"
-
-
-class Restart(StrEnum):
-    """Where a new session begins."""
-
-    rest = "rest"
-    motion = "motion"
-
-
+@with_options(MachineOptions)
 def machine(
+    *,
     scenario: ScenarioName = "paper",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="UDP; 0 is any.")] = 47000,
-    host: Annotated[str, typer.Option(help="To listen at; beyond loopback with a key.")] = (
-        "127.0.0.1"
-    ),
-    rate: Annotated[float, typer.Option(help="Seconds of the machine in a second.")] = 1.0,
-    key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Whose bytes both sides share.")
-    ] = None,
-    watchdog: Annotated[
-        float, typer.Option(help="Seconds of silence before the safe torque.")
-    ] = 1.0,
-    safe: Annotated[Safe, typer.Option(help="The safe torque: none, or the last one.")] = Safe.zero,
-    restart: Annotated[
-        Restart, typer.Option(help="Where a new session begins: put back, or as it is.")
-    ] = Restart.rest,
-    duration: Annotated[
-        float, typer.Option(min=0, help="Seconds of the machine, then it ends; 0: until Ctrl-C.")
-    ] = 0.0,
+    given: Given,
     controller: Controller = None,
     settings: Settings = None,
     quiet: Quiet = False,
@@ -58,26 +27,18 @@ def machine(
 
     Plant, sensor, delay, link and limits are those of the scenario. Ctrl-C ends it.
     """
-    from stewart_drake.live.endpoint import Endpoint, read_key
-    from stewart_drake.live.machine import Machine, Settings, check_scenario
-    from stewart_drake.live.protocol import ControllerMessage
-    from stewart_drake.loop.experiment import prepare
+    from stewart_drake.live.machine import open_machine
     from stewart_drake.scenario.loading import load_scenario
 
-    chosen = Settings(rate, watchdog, safe.value, restart.value)
-    loaded = load_scenario(scenario, controller, settings or ())
-    check_scenario(loaded)
-    experiment = prepare(loaded)
+    options, loaded = given.options(), load_scenario(scenario, controller, settings or ())
     delivery = Delivery(None, quiet, as_json)
-    delivery.tell_link(loaded)
-    endpoint = Endpoint(ControllerMessage, host, port, None if key is None else read_key(key))
-    running = Machine(experiment, endpoint, chosen, delivery.tell)
-    interrupted = _run(
-        running,
-        duration or float("inf"),
-        lambda: delivery.say(_first_lines(running, scenario, endpoint.address)),
-    )
-    endpoint.close()
+    with given.named(), open_machine(loaded, options, delivery.tell) as (running, address):
+        delivery.tell_link(loaded)
+        interrupted = _run(
+            running,
+            options.duration or float("inf"),
+            lambda: delivery.say(_first_lines(running, scenario, address)),
+        )
     summary = running.summary()
     delivery.say(_last_lines(summary))
     return delivery.end(summary, interrupted)

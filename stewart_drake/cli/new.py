@@ -2,66 +2,26 @@
 
 import re
 import sys
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stewart_drake.cli.common import AsJson, Delivery, Quiet
-from stewart_drake.cli.options import flags_named
+from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.studies.measurements import LARGEST, Measurements
 
 if TYPE_CHECKING:
     from stewart_drake.studies.new_machine import NewMachine
+    from stewart_drake.studies.options import Option
 
 
-class Cranks(StrEnum):
-    """Where the cranks of a pair point."""
-
-    apart = "apart"
-    together = "together"
-
-
-_ASKED: Final = {
-    "base_radius": "radius of the circle of the motor shafts, m",
-    "shaft_distance": "distance of the two shafts of a pair, m",
-    "plate_radius": "radius of the circle of the plate's joints, m",
-    "joint_distance": "distance of two neighbouring joints of the plate, m",
-    "crank": "crank, from shaft to rod, m",
-    "rod": "rod, from joint to joint, m",
-    "plate_mass": "mass of the plate with its load, kg",
-    "crank_mass": "mass of a crank, kg",
-    "rod_mass": "mass of a rod, kg",
-}
-"""What nobody else knows, and how it is asked for."""
-
-
-def _measured(field: str) -> Any:
-    return typer.Option(help=_ASKED[field][0].upper() + _ASKED[field][1:] + ".")
-
-
+@with_options(Measurements)
 def new(
+    *,
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="For the two files.")],
-    base_radius: Annotated[float | None, _measured("base_radius")] = None,
-    shaft_distance: Annotated[float | None, _measured("shaft_distance")] = None,
-    plate_radius: Annotated[float | None, _measured("plate_radius")] = None,
-    joint_distance: Annotated[float | None, _measured("joint_distance")] = None,
-    crank: Annotated[float | None, _measured("crank")] = None,
-    rod: Annotated[float | None, _measured("rod")] = None,
-    plate_mass: Annotated[float | None, _measured("plate_mass")] = None,
-    crank_mass: Annotated[float | None, _measured("crank_mass")] = None,
-    rod_mass: Annotated[float | None, _measured("rod_mass")] = None,
-    shaft_height: Annotated[float, typer.Option(help="Of the shafts, m.")] = 0.0,
-    upright: Annotated[
-        float, typer.Option(help="Degrees from the horizon of the planes the cranks turn in.")
-    ] = 90.0,
-    cranks: Annotated[
-        Cranks, typer.Option(help="Of a pair: they point apart, or together.")
-    ] = Cranks.apart,
-    torque_limit: Annotated[float | None, typer.Option(help="Of each motor, N m.")] = None,
-    delay: Annotated[float, typer.Option(help="From computing a torque to feeling it, s.")] = 0.1,
-    gravity: Annotated[bool, typer.Option(help="Whether it acts.")] = True,
+    given: Given,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
@@ -69,33 +29,14 @@ def new(
 
     What is not given is asked for. Lengths in m, masses in kg; moments of inertia are estimated.
     """
-    given = {
-        "base_radius": base_radius,
-        "shaft_distance": shaft_distance,
-        "plate_radius": plate_radius,
-        "joint_distance": joint_distance,
-        "crank": crank,
-        "rod": rod,
-        "plate_mass": plate_mass,
-        "crank_mass": crank_mass,
-        "rod_mass": rod_mass,
-    }
     from stewart_drake.studies import new_machine as study
 
     delivery = Delivery(folder, quiet, as_json)
     study.check_free(folder)  # before nine questions
-    measured = _complete(given, asking=sys.stdin.isatty() and not (quiet or as_json))
-    with flags_named({name: _flag(name) for name in study.Measurements.__annotations__}):
-        measurements = study.Measurements(
-            **measured,
-            shaft_height=shaft_height,
-            upright=upright,
-            cranks=cranks.value,
-            torque_limit=torque_limit,
-            delay=delay,
-            gravity=gravity,
-        )
-    made = study.new_machine(measurements, _name_of(folder), folder)
+    asked = _asked(given.missing, sys.stdin.isatty() and not (quiet or as_json))
+    measurements = given.options(**asked)
+    with given.named():
+        made = study.new_machine(measurements, _name_of(folder), folder)
     _tell(delivery, made)
     delivery.wrote(study.MACHINE, study.SCENARIO)
     delivery.write(made.summary)
@@ -116,32 +57,24 @@ def _tell(delivery: Delivery, made: "NewMachine") -> None:
         delivery.tell(text)
 
 
-def _complete(given: dict[str, float | None], asking: bool) -> dict[str, float]:
-    """Every measurement; what is missing is asked for at a terminal, and an error elsewhere."""
-    missing = [name for name, value in given.items() if value is None]
+def _asked(missing: "list[Option]", asking: bool) -> dict[str, float]:
+    """Ask for what is missing at a terminal; elsewhere it is an error."""
     if missing and not asking:
-        flags = ", ".join(_flag(name) for name in missing)
+        flags = ", ".join("--" + one.name.replace("_", "-") for one in missing)
         raise ConfigError(
             f"new: got no {flags}; expected what is measured on the machine; "
             "a terminal is asked for it"
         )
-    answers = {name: _ask(_ASKED[name]) for name in missing}
-    return {name: answers[name] if value is None else value for name, value in given.items()}
+    return {one.name: _ask(one.help[0].lower() + one.help[1:-1]) for one in missing}
 
 
 def _ask(question: str) -> float:
-    from stewart_drake.studies.new_machine import LARGEST
-
     while True:
         value = float(typer.prompt(question, type=float))
         if not (question.endswith(", m") and value > LARGEST):
             return value
         if typer.confirm(f"{value:g} m? {value / 1000:g} m for {value:g} mm", default=True):
             return value / 1000
-
-
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
 
 
 def _name_of(folder: Path) -> str:

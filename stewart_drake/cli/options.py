@@ -19,26 +19,35 @@ class Given:
 
     Args:
         kind: class of the options.
-        typed: values by the option's name on the command line.
+        typed: values by the option's name on the command line, None for what is missing.
     """
 
     def __init__(self, kind: type[Options], typed: Mapping[str, Any]) -> None:
         self._kind, self._typed = kind, typed
 
     @property
+    def missing(self) -> list[Option]:
+        """Options without a default that were not given."""
+        return [one for one in _offered(self._kind) if one.required and not self._given(one)]
+
+    @property
     def words(self) -> dict[str, Any]:
-        """What was typed, as the command on a page shows it."""
+        """Typed values, as the command on a page shows them."""
         return {_dashed(one): self._typed[_name(one)] for one in _offered(self._kind, True)}
 
-    def options(self, load: "Callable[[str], Scenario] | None" = None) -> Any:
-        """Return the options; `load` loads the scenario with another controller.
+    def options(self, load: "Callable[[str], Scenario] | None" = None, **more: Any) -> Any:
+        """Return the options.
+
+        Args:
+            load: loads the scenario with another controller.
+            more: values by field that take the place of what was typed.
 
         Raises:
             ConfigError: a value that is not accepted.
         """
         with self.named():
             values = {one.name: self._value(one, load) for one in _offered(self._kind)}
-            return self._kind(**{name: value for name, value in values.items() if value is not ...})
+            return self._kind(**(values | more))
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
@@ -46,6 +55,9 @@ class Given:
         flags = {one.name: f"--{_dashed(one)}" for one in _offered(self._kind)}
         with flags_named(flags):
             yield
+
+    def _given(self, one: Option) -> bool:
+        return self._typed[_name(one)] is not None
 
     def _value(self, one: Option, load: Any) -> Any:
         typed = self._typed[_name(one)]
@@ -101,14 +113,16 @@ def _offered(kind: type[Options], recorded: bool = False) -> list[Option]:
 def _parameter(one: Option) -> inspect.Parameter:
     """Return the command line's parameter."""
     assert one.flag is not None
+    annotation, default, name = one.annotation, one.default, _dashed(one)
+    if one.flag.read:
+        annotation, default = list[str] | None, None
+    elif one.required:
+        annotation, default = annotation | None, None
     option = typer.Option(
-        f"--{_dashed(one)}",
+        f"--{name}/--no-{name}" if default is True else f"--{name}",
         metavar=one.flag.metavar,
         help=one.help + " Repeatable." * bool(one.flag.read),
     )
-    annotation, default = one.annotation, one.default
-    if one.flag.read:
-        annotation, default = list[str] | None, None
     return inspect.Parameter(
         _name(one),
         inspect.Parameter.KEYWORD_ONLY,

@@ -9,18 +9,20 @@ order, and the plate follows exactly, however late the process gets to it. Nothi
 import heapq
 import select
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.body import Body, body_of
-from stewart_drake.live.endpoint import STOOD, Address, Endpoint, Offers, Session, now
+from stewart_drake.live.endpoint import STOOD, Address, Endpoint, Offers, Session, now, read_key
 from stewart_drake.live.motors import Motors, Plan, PlayoutMotors, WireMotors
+from stewart_drake.live.options import MachineOptions, Settings
 from stewart_drake.live.protocol import (
     MISSING,
     MOST_SAMPLES,
@@ -34,7 +36,7 @@ from stewart_drake.live.protocol import (
     MachineMessage,
     Refusal,
 )
-from stewart_drake.loop.experiment import Experiment, torques_in_flight
+from stewart_drake.loop.experiment import Experiment, prepare, torques_in_flight
 from stewart_drake.loop.peer import FAULTS, Fault, Reason, code_bits, identity_of, in_words
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
@@ -56,30 +58,6 @@ LAST_WORDS: Final = 3
 """Datagrams at the end, which say that it is one: some may be lost."""
 FURTHEST: Final = 3600 * SECOND
 """ns ahead that a run may begin, or torques be planned."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How a machine is run.
-
-    Attributes:
-        rate: seconds of its clock in a second.
-        watchdog: s of silence after which the safe torque acts.
-        safe: what that is.
-        restart: where a new session begins: at `rest` at the scenario's start, or in `motion`,
-            wherever the plate is. One that has left its workspace begins at rest.
-    """
-
-    rate: float = 1.0
-    watchdog: float = 1.0
-    safe: Literal["zero", "hold"] = "zero"
-    restart: Literal["rest", "motion"] = "rest"
-
-    def __post_init__(self) -> None:
-        for name, low, high in (("rate", 1e-3, 1e3), ("watchdog", 1e-2, 1e4)):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ConfigError(f"--{name}: got {value:g}; expected {low:g} to {high:g}")
 
 
 class Drawn(NamedTuple):
@@ -118,6 +96,25 @@ def check_scenario(scenario: Scenario) -> None:
             f"sensor.samples: got {samples}; expected at most {MOST_SAMPLES}, which a datagram "
             "holds"
         )
+
+
+@contextmanager
+def open_machine(
+    scenario: Scenario, options: MachineOptions, say: Callable[[str], None] = print
+) -> "Iterator[tuple[Machine, Address]]":
+    """Yield a machine that listens, and where.
+
+    Raises:
+        ConfigError: a scenario that the protocol does not cover, or an address in use.
+    """
+    check_scenario(scenario)
+    experiment = prepare(scenario)
+    key = None if options.key is None else read_key(options.key)
+    endpoint = Endpoint(ControllerMessage, options.host, options.port, key)
+    try:
+        yield Machine(experiment, endpoint, options, say), endpoint.address
+    finally:
+        endpoint.close()
 
 
 def motors_of(experiment: Experiment) -> Motors:

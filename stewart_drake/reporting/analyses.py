@@ -113,7 +113,10 @@ def options_of(name: str) -> "type[Options]":
     """Return the class of an analysis' options."""
     from stewart_drake.studies.options import Options
 
-    return getattr(_module(name), f"{name.capitalize()}Options", Options)
+    if not ANALYSES[name].counts:
+        return Options
+    options: type[Options] = getattr(_module(name), f"{name.capitalize()}Options")
+    return options
 
 
 def analyze(

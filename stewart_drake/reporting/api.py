@@ -2,7 +2,6 @@
 
 import functools
 import inspect
-import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from stewart_drake.reporting.results import AnalysisResult, ComparisonResult, Si
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.studies import compare as comparison
+from stewart_drake.studies.options import argument_lines
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -109,37 +109,25 @@ def _exact(value: Any) -> Any:
 
 def _signature(name: str) -> inspect.Signature:
     row, kinds = ANALYSES[name], inspect.Parameter
-    parameters = [
-        kinds("scenario", kinds.POSITIONAL_OR_KEYWORD, annotation=Scenario | str | Path),
-        *(
-            kinds(one.name, kinds.KEYWORD_ONLY, default=one.default, annotation=one.annotation)
-            for one in options_of(name).described()
-        ),
-    ]
+    by_place = kinds.POSITIONAL_OR_KEYWORD
+    parameters = options_of(name).parameters()
     if row.keeps:
         folder = str | Path | None
         parameters.append(kinds("directory", kinds.KEYWORD_ONLY, default=None, annotation=folder))
-    positional = [
-        one.replace(kind=kinds.POSITIONAL_OR_KEYWORD)
-        for one in parameters
-        if one.name == row.second
-    ]
-    others = [one for one in parameters[1:] if one.name != row.second]
-    return inspect.Signature(
-        [parameters[0], *positional, *others], return_annotation=AnalysisResult
-    )
+    second = [one.replace(kind=by_place) for one in parameters if one.name == row.second]
+    others = [one for one in parameters if one.name != row.second]
+    scenario = kinds("scenario", by_place, annotation=Scenario | str | Path)
+    return inspect.Signature([scenario, *second, *others], return_annotation=AnalysisResult)
 
 
 def _documentation(name: str) -> str:
     row = ANALYSES[name]
-    lines = [row.help.split("\n")[0], "", "Args:", "    scenario: or a shipped name or a path."]
-    told = {one.name: one.help for one in options_of(name).described()}
+    told = {"scenario": "or a shipped name or a path."}
+    told |= {one.name: one.help for one in options_of(name).described()}
     if row.keeps:
         kept = f"where {row.keeps} are kept, so that a second call goes on with them;"
         told["directory"] = f"{kept} None is nowhere."
-    for argument, meaning in told.items():
-        text = f"{argument}: {meaning}"
-        lines += textwrap.wrap(text, 96, initial_indent=" " * 4, subsequent_indent=" " * 8)
+    lines = [row.help.split("\n")[0], "", "Args:", *argument_lines(told)]
     return "\n".join([*lines, "", "Raises:", "    ConfigError: bad input."])
 
 

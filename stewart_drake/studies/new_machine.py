@@ -12,10 +12,10 @@ dead centre. `check_mechanism` looks at any machine at home: reach, torque, pole
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ from stewart_drake.mechanism.kinematics import leg_geometry, reachable_heights
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES
+from stewart_drake.studies.measurements import Measurements
 from stewart_drake.studies.workspace_map import (
     Measures,
     Travel,
@@ -120,90 +121,11 @@ def check_mechanism(mechanism: Mechanism) -> MechanismCheck:
 MACHINE: Final = "machine.yaml"
 SCENARIO: Final = "scenario.yaml"
 
-LARGEST: Final = 5.0
-"""m; the parts of a larger machine are more likely in millimetres."""
 _HEIGHTS: Final = 400
 _SHARE: Final = 0.25
 """Of the travel of z, what the first motion takes."""
 _PERIODS: Final = 25
 """Periods of delay up to which torques are computed every 20 ms, beyond that every 100 ms."""
-
-
-@dataclass(frozen=True)
-class Measurements:
-    """What is measured on a machine; lengths in m, masses in kg.
-
-    Attributes:
-        base_radius: of the circle on which the six motor shafts lie.
-        shaft_distance: between the two shafts of a pair.
-        plate_radius: of the circle on which the rods meet the plate.
-        joint_distance: between two neighbouring joints of the plate.
-        crank: from shaft to rod.
-        rod: between the joints at its ends.
-        plate_mass: of the plate with what it carries.
-        crank_mass, rod_mass: of one.
-        shaft_height: of the shafts above the base.
-        upright: degrees from the horizon of the planes in which the cranks turn.
-        cranks: whether the cranks of a pair point `apart` or `together`.
-        torque_limit: of each motor, N m, or None.
-        delay: from computing a torque to feeling it, s.
-        gravity: whether it acts; a counterbalanced plate feels none.
-    """
-
-    base_radius: float
-    shaft_distance: float
-    plate_radius: float
-    joint_distance: float
-    crank: float
-    rod: float
-    plate_mass: float
-    crank_mass: float
-    rod_mass: float
-    shaft_height: float = 0.0
-    upright: float = 90.0
-    cranks: Literal["apart", "together"] = "apart"
-    torque_limit: float | None = None
-    delay: float = 0.1
-    gravity: bool = True
-
-    def __post_init__(self) -> None:
-        for name, value in self.lengths().items():
-            if not 0 < value < math.inf:
-                raise ConfigError(f"{name}: got {value:g} m; expected a positive length")
-            if value > LARGEST:
-                raise ConfigError(
-                    f"{name}: got {value:g} m; expected metres, {value / 1000:g} for {value:g} mm"
-                )
-        if self.rod <= self.crank:
-            raise ConfigError(
-                f"rod: got {self.rod:g} m with cranks of {self.crank:g} m; expected a rod longer "
-                "than its crank"
-            )
-        for name in ("plate_mass", "crank_mass", "rod_mass"):
-            if not 0 < getattr(self, name) < 1e6:
-                raise ConfigError(
-                    f"{name}: got {getattr(self, name):g}; expected a mass in kg, above 0"
-                )
-        for name, radius in (("shaft", self.base_radius), ("joint", self.plate_radius)):
-            distance = getattr(self, f"{name}_distance")
-            if distance >= math.sqrt(3) * radius:
-                raise ConfigError(
-                    f"{name}_distance: got {distance:g} m on a circle of radius {radius:g} m; "
-                    f"expected less than {math.sqrt(3) * radius:.4g}, where pairs meet"
-                )
-        if self.torque_limit is not None and not 0 < self.torque_limit < 1e6:
-            raise ConfigError(f"torque_limit: got {self.torque_limit:g}; expected N m above 0")
-        if not 0 <= self.delay <= 5:
-            raise ConfigError(f"delay: got {self.delay:g}; expected 0 to 5 s")
-        if not 0 <= abs(self.shaft_height) <= LARGEST:
-            raise ConfigError(f"shaft_height: got {self.shaft_height:g}; expected metres")
-        if not -180 <= self.upright <= 180:
-            raise ConfigError(f"upright: got {self.upright:g}; expected degrees, -180 to 180")
-
-    def lengths(self) -> dict[str, float]:
-        """By name, m."""
-        names = (field.name for field in fields(self)[:6])
-        return {name: getattr(self, name) for name in names}
 
 
 class NewMachine(NamedTuple):

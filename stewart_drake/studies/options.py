@@ -45,7 +45,7 @@ class Option(NamedTuple):
     Attributes:
         name: of the field and of the Python argument.
         annotation: of the Python argument.
-        default: in both.
+        default: in both; `inspect.Parameter.empty` for none.
         help: unit and meaning.
         flag: or None.
     """
@@ -55,6 +55,11 @@ class Option(NamedTuple):
     default: Any
     help: str
     flag: Flag | None
+
+    @property
+    def required(self) -> bool:
+        """Whether there is no default."""
+        return self.default is inspect.Parameter.empty
 
     @property
     def recorded(self) -> bool:
@@ -79,9 +84,8 @@ class Options(BaseModel):
         found = []
         for name, field in cls.model_fields.items():
             flag = next((one for one in field.metadata if isinstance(one, Flag)), None)
-            found.append(
-                Option(name, field.annotation, field.default, field.description or "", flag)
-            )
+            default = inspect.Parameter.empty if field.is_required() else field.default
+            found.append(Option(name, field.annotation, default, field.description or "", flag))
         yield from sorted(found, key=lambda option: not option.recorded)
 
     @classmethod
