@@ -23,8 +23,7 @@ from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.ranges import Ranges
-from stewart_drake.studies.robustness import run_draw
-from stewart_drake.studies.uncertainty import MACHINE, Draw, draw, drawn, scales_of
+from stewart_drake.studies.uncertainty import MACHINE, Draw, draw, drawn, run_draw, scales_of
 
 TIMED: Final = 5
 """Every so many runs, one is timed in Drake."""

@@ -19,7 +19,7 @@ from stewart_drake.mechanism.files import build_mechanism, load_mechanism, mecha
 from stewart_drake.mechanism.inertias import bar_inertia
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.layout import (
+from stewart_drake.studies.layout_search import (
     Found,
     Layout,
     LayoutStudy,

@@ -36,7 +36,7 @@ from stewart_drake.scenario.packets import (
 )
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.studies import link_bound
-from stewart_drake.studies.link_bound import LinkOptions
+from stewart_drake.studies.link import LinkOptions, study_link
 from stewart_drake.studies.runs import Outcome
 
 PERIOD = 0.1
@@ -466,9 +466,7 @@ def test_the_study_finds_the_best_bound_and_the_loss_that_is_borne(
 ) -> None:
     """Half periods beside the best whole one are tried: 0.45 s is better than 0.4 s."""
     told = []
-    study = link_bound.study_link(
-        scenario(*QUICK), LinkOptions(runs=3), lambda *counts: told.append(counts)
-    )
+    study = study_link(scenario(*QUICK), LinkOptions(runs=3), lambda *counts: told.append(counts))
     bounds = [0.3, 0.35, 0.4, 0.45, 0.5, 0.6]
     assert [cell.bound for cell in study.bounds] == pytest.approx(bounds)
     late = [0.6, 0.4, 0.2, 0, 0, 0]
@@ -489,7 +487,7 @@ def test_the_study_finds_the_best_bound_and_the_loss_that_is_borne(
 def test_the_worst_run_has_an_interval_from_runs_that_chose_nothing(
     known_outcomes: list[sd.Scenario],
 ) -> None:
-    study = link_bound.study_link(scenario(*QUICK), LinkOptions(runs=3))
+    study = study_link(scenario(*QUICK), LinkOptions(runs=3))
     chose, checked = (
         {run.link.seed for run in runs}  # type: ignore[union-attr]
         for runs in (known_outcomes[:18], known_outcomes[18:])
@@ -511,7 +509,7 @@ def test_half_periods_that_a_plant_cannot_have_are_left_out(
     known_outcomes: list[sd.Scenario],
 ) -> None:
     coarse = ("plant.kind=multibody", "plant.time_step=0.02")
-    study = link_bound.study_link(scenario(*QUICK, *coarse), LinkOptions(runs=1))
+    study = study_link(scenario(*QUICK, *coarse), LinkOptions(runs=1))
     assert [cell.bound for cell in study.bounds] == pytest.approx([0.3, 0.4, 0.5, 0.6])
     assert study.left_out == pytest.approx((0.35, 0.45))
     assert "Not tried: 0.35 s and 0.45 s" in document(study).plain()
@@ -542,7 +540,7 @@ def test_statements_on_the_worst_run_are_wrong_in_five_percent_at_most(completes
 
 def test_the_study_asks_for_a_network_and_for_runs() -> None:
     with pytest.raises(ConfigError, match="got 'wire'; expected 'network'"):
-        link_bound.study_link(scenario(), LinkOptions())
+        study_link(scenario(), LinkOptions())
     with pytest.raises(ConfigError, match="runs: got 0; expected greater than or equal to 1"):
         LinkOptions(runs=0)
 

@@ -27,7 +27,7 @@ from stewart_drake.reporting.robustness import document, influence_figure
 from stewart_drake.scenario.config import Scenario, StateSensorConfig
 from stewart_drake.studies import robustness, statistics
 from stewart_drake.studies.ranges import Ranges, read_ranges
-from stewart_drake.studies.robustness import RobustnessOptions, run_draw, study_robustness
+from stewart_drake.studies.robustness import RobustnessOptions, study_robustness
 from stewart_drake.studies.robustness_result import RobustnessStudy, factor_values, table
 from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.statistics import auc_interval, explain
@@ -41,6 +41,7 @@ from stewart_drake.studies.uncertainty import (
     draw,
     draw_from,
     drawn,
+    run_draw,
     scales_of,
 )
 from tests.mechanisms import PAPER

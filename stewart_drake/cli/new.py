@@ -34,7 +34,7 @@ def new(
     delivery = Delivery(folder, quiet, as_json)
     study.check_free(folder)  # before nine questions
     asked = _asked(given.missing, sys.stdin.isatty() and not (quiet or as_json))
-    measurements = given.options(**asked)
+    measurements = given.options(more=asked)
     with given.named():
         made = study.new_machine(measurements, _name_of(folder), folder)
     _tell(delivery, made)

@@ -35,7 +35,11 @@ class Given:
         """Typed values, as the command on a page shows them."""
         return {_dashed(one): self._typed[_name(one)] for one in _offered(self._kind, True)}
 
-    def options(self, load: "Callable[[str], Scenario] | None" = None, **more: Any) -> Any:
+    def options(
+        self,
+        load: "Callable[[str], Scenario] | None" = None,
+        more: Mapping[str, Any] | None = None,
+    ) -> Any:
         """Return the options.
 
         Args:
@@ -47,7 +51,7 @@ class Given:
         """
         with self.named():
             values = {one.name: self._value(one, load) for one in _offered(self._kind)}
-            return self._kind(**(values | more))
+            return self._kind(**(values | dict(more or {})))
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:

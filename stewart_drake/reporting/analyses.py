@@ -60,7 +60,7 @@ ANALYSES: Final = {
         second="simulations",
     ),
     "link": Analysis(
-        "link_bound",
+        "link",
         "Which play-out bound suits a network, and what loss it bears.\n\n"
         "Needs --set link.kind=network or a scenario with a network.",
         ("analyze link paper --set link.kind=network --out out/link",),

@@ -17,7 +17,7 @@ from stewart_drake.reporting.document import (
     number,
 )
 from stewart_drake.reporting.mechanism import mechanism_figure
-from stewart_drake.studies.layout import INSTANTS, Layout, LayoutStudy
+from stewart_drake.studies.layout_search import INSTANTS, Layout, LayoutStudy
 from stewart_drake.studies.layout_space import MEASURES, PARAMETERS
 
 _RUN: Final = {"completed": "completed", "refused": "does not reach the motion"}

@@ -11,17 +11,14 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.config import NetworkConfig, Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.scenario.packets import in_time, times_under_way, torque_missing, usual_bound
+from stewart_drake.scenario.packets import in_time, times_under_way, torque_missing
 from stewart_drake.studies.jobs import Progress, finished, run_jobs
-from stewart_drake.studies.options import Flag, Options
 from stewart_drake.studies.runs import read_outcome, run_scenario
 from stewart_drake.studies.statistics import least_share
 
@@ -93,7 +90,7 @@ class LinkStudy:
     @property
     def best(self) -> Cell | None:
         """Cell of the least mean E_ac among those with the most completed runs, or None."""
-        return _best(self.bounds)
+        return best_of(self.bounds)
 
     @property
     def checked(self) -> Cell | None:
@@ -136,73 +133,7 @@ class LinkStudy:
         }
 
 
-class LinkOptions(Options):
-    """Options of `study_link`."""
-
-    runs: Annotated[int, Field(ge=1, description="Seeds for each bound and loss."), Flag("N")] = 5
-
-
-def study_link(
-    scenario: Scenario, options: LinkOptions, progress: Progress | None = None
-) -> LinkStudy:
-    """Simulate a scenario on the exact plant over bounds, then over losses.
-
-    Args:
-        scenario: with a network; its `playout` is not used.
-        options: see `LinkOptions`.
-        progress: called for each finished simulation.
-
-    Raises:
-        ConfigError: the scenario has no network.
-    """
-    link = scenario.assumed_link
-    if link.kind != "network":
-        raise ConfigError(f"link.kind: got {link.kind!r}; expected 'network'")
-    runs = options.runs
-    period, repeats = scenario.controller.period, scenario.controller.packet_repeats
-    base = replace(scenario, link=link, plant=scenario.plant.without_engine)
-    losses = sorted({*LOSSES, link.loss})
-    done = 0
-
-    def simulated(
-        base: Scenario, cells: list[tuple[float, float]], following: int
-    ) -> tuple[list[Cell], bool]:
-        """Simulate cells, before some number of `following` ones."""
-        nonlocal done
-        if not cells:
-            return [], False
-        before, total = done, done + runs * (len(cells) + following)
-        done += runs * len(cells)
-
-        def tell(now: int, _: int) -> None:
-            if progress is not None:
-                progress(before + now, total)
-
-        return _simulated(base, cells, runs, tell)
-
-    wanted, left_out, found = bounds_for(link, period), set[float](), list[Cell]()
-    for step in (1.0, 0.5, 0.0):  # periods between the best bound and those that are tried next
-        following = len(losses) + (2 if step else 0)
-        cells, stopped = simulated(base, [(bound, link.loss) for bound in wanted], following)
-        found = sorted([*found, *cells])
-        best = _best(found)
-        if best is None or stopped:
-            break
-        near = {round(best.bound + sign * step * period, 12) for sign in (-1, 1)}
-        near = {b for b in near if b > 0 and min(abs(b - cell.bound) for cell in found) > 1e-9}
-        left_out |= {bound for bound in near if not _possible(scenario, link, bound)}
-        wanted = sorted(near - left_out)
-    kept: list[Cell] = []
-    if best is not None and not stopped:
-        sensor = replace(base.sensor, seed=base.sensor.seed + runs)
-        fresh = replace(base, link=replace(link, seed=link.seed + runs), sensor=sensor)
-        kept, stopped = simulated(fresh, [(best.bound, loss) for loss in losses], 0)
-    usual = usual_bound(link, repeats, period)
-    there = tuple(sorted(left_out))
-    return LinkStudy(scenario, runs, tuple(found), tuple(kept), usual, there, stopped)
-
-
-def _possible(scenario: Scenario, link: NetworkConfig, bound: float) -> bool:
+def possible(scenario: Scenario, link: NetworkConfig, bound: float) -> bool:
     """Return whether the scenario's own plant can have a bound in s."""
     other = replace(scenario, link=replace(link, playout=bound))
     return scenario.plant.kind != "multibody" or not other.step_problem(scenario.plant.time_step)
@@ -216,12 +147,12 @@ def bounds_for(link: NetworkConfig, period: float) -> list[float]:
     return [float(period * step) for step in steps]
 
 
-def _best(cells: Iterable[Cell]) -> Cell | None:
+def best_of(cells: Iterable[Cell]) -> Cell | None:
     done = [cell for cell in cells if cell.errors]
     return min(done, key=lambda c: (-c.completed, np.mean(c.errors)), default=None)
 
 
-def _simulated(
+def simulated(
     base: Scenario, wanted: list[tuple[float, float]], runs: int, progress: Progress
 ) -> tuple[list[Cell], bool]:
     """Return a cell for each bound and loss, and whether Ctrl-C ended it early."""

@@ -1,30 +1,24 @@
-"""Monte Carlo study of a scenario: many runs, each with one drawn machine."""
+"""Monte Carlo study of a scenario: many runs, each with one drawn machine.
+
+Drake is imported by the study, not by its options.
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials, write_whole
-from stewart_drake.loop.bulk import run_in_bulk
-from stewart_drake.loop.experiment import prepare, simulated_machine
-from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.studies.jobs import Progress, run_jobs
 from stewart_drake.studies.options import Flag, JobOptions, Seed
 from stewart_drake.studies.ranges import RANGE_UNITS, Ranges, read_ranges
-from stewart_drake.studies.robustness_result import RobustnessStudy, table
-from stewart_drake.studies.runs import (
-    Outcome,
-    outcome_of,
-    read_outcome,
-    run_file,
-)
-from stewart_drake.studies.uncertainty import MACHINE, Draw, draw, drawn, scales_of
+
+if TYPE_CHECKING:
+    from stewart_drake.studies.jobs import Progress
+    from stewart_drake.studies.robustness_result import RobustnessStudy
 
 
 def _read_also(names: list[str], load: Callable[[str], Scenario]) -> dict[str, Scenario]:
@@ -69,8 +63,8 @@ def study_robustness(
     scenario: Scenario,
     directory: str | Path,
     options: RobustnessOptions,
-    progress: Progress | None = None,
-) -> RobustnessStudy:
+    progress: "Progress | None" = None,
+) -> "RobustnessStudy":
     """Run a scenario undisturbed and then with drawn machines, or go on with an earlier study.
 
     Nothing is drawn where an undisturbed run, with this or another controller, does not complete.
@@ -85,6 +79,13 @@ def study_robustness(
         As `run_jobs`, and ConfigError for a scenario that does not suit, and for an undisturbed run
             that does not complete.
     """
+    from stewart_drake.loop.experiment import prepare
+    from stewart_drake.scenario.loading import scenario_to_dict
+    from stewart_drake.studies.jobs import run_jobs
+    from stewart_drake.studies.robustness_result import RobustnessStudy, table
+    from stewart_drake.studies.runs import read_outcome
+    from stewart_drake.studies.uncertainty import draw, run_draw, scales_of, undisturbed_run
+
     ranges, seed, also = options.ranges or Ranges(), options.seed, dict(options.also or {})
     experiment, directory = prepare(scenario), Path(directory)
     settings: dict[str, Any] = {
@@ -98,9 +99,9 @@ def study_robustness(
         "scheduler": options.scheduler,
         "read": read_outcome,
     }
-    undisturbed = _undisturbed(scenario, "", directory / "runs", common)
+    undisturbed = undisturbed_run(scenario, "", directory / "runs", common)
     alone = {
-        name: _undisturbed(other, name, directory / f"runs_{name}", common)
+        name: undisturbed_run(other, name, directory / f"runs_{name}", common)
         for name, other in also.items()
     }
     scales = scales_of(experiment, undisturbed.peak_torque)
@@ -128,37 +129,3 @@ def study_robustness(
     remove_partials(directory)
     write_whole(directory / "runs.csv", table(study))
     return study
-
-
-def _undisturbed(scenario: Scenario, name: str, folder: Path, common: dict[str, Any]) -> Outcome:
-    settings = common["settings"] | {"scenario": scenario_to_dict(scenario)}
-    first = {"undisturbed": (scenario, Draw())}
-    one = run_jobs(first, run_draw, folder, **(common | {"settings": settings}))["undisturbed"]
-    if one.status != "completed":
-        raise ConfigError(
-            f"robustness{f' with {name}' if name else ''}: the undisturbed run fails at "
-            f"{one.time:.2f} s ({one.reason}), so no machine was drawn; expected a scenario and a "
-            "controller that complete undisturbed"
-        )
-    return one
-
-
-def run_draw(scenario: Scenario, one: Draw) -> bytes:
-    """The file of one run of a scenario with what was drawn."""
-    return run_file(_run(scenario, one), one)
-
-
-def _run(scenario: Scenario, one: Draw) -> Outcome:
-    try:
-        changed = drawn(MACHINE, scenario, simulated_machine(scenario), one)
-        variant = changed.as_scenario()
-    except ConfigError as error:
-        return Outcome("refused", str(error), time=0.0)
-    try:
-        truth = changed.machine()
-    except (ConfigError, UnreachablePoseError) as error:
-        return Outcome("not_assembled", str(error), time=0.0)
-    try:
-        return outcome_of(run_in_bulk(variant, truth))
-    except ConfigError as error:
-        return Outcome("refused", str(error), time=0.0)

@@ -10,19 +10,32 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
 
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import validate
 from stewart_drake.law.startup import INSTANTS
-from stewart_drake.loop.experiment import Experiment, assemble, believed_delay, motion_scale
+from stewart_drake.loop.bulk import run_in_bulk
+from stewart_drake.loop.experiment import (
+    Experiment,
+    assemble,
+    believed_delay,
+    motion_scale,
+    simulated_machine,
+)
 from stewart_drake.mechanism.geometry import Body, Mechanism
+from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
 from stewart_drake.scenario.trajectories import spread_instants
+from stewart_drake.studies.jobs import run_jobs
 from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.runs import Outcome, outcome_of, run_file
 from stewart_drake.studies.workspace import rms, size_motors
 
 Draw = dict[str, Any]
@@ -368,3 +381,40 @@ MACHINE: Final[Model] = {
     "link_seed": Quantity(draw_seed, _seed_link),
 }  # fmt: skip
 """True less believed, of what `Ranges` says how far it may be off."""
+
+
+# ---------------------------------------------------------------- runs
+
+
+def undisturbed_run(scenario: Scenario, name: str, folder: Path, common: dict[str, Any]) -> Outcome:
+    settings = common["settings"] | {"scenario": scenario_to_dict(scenario)}
+    first = {"undisturbed": (scenario, Draw())}
+    one = run_jobs(first, run_draw, folder, **(common | {"settings": settings}))["undisturbed"]
+    if one.status != "completed":
+        raise ConfigError(
+            f"robustness{f' with {name}' if name else ''}: the undisturbed run fails at "
+            f"{one.time:.2f} s ({one.reason}), so no machine was drawn; expected a scenario and a "
+            "controller that complete undisturbed"
+        )
+    return one
+
+
+def run_draw(scenario: Scenario, one: Draw) -> bytes:
+    """The file of one run of a scenario with what was drawn."""
+    return run_file(_run(scenario, one), one)
+
+
+def _run(scenario: Scenario, one: Draw) -> Outcome:
+    try:
+        changed = drawn(MACHINE, scenario, simulated_machine(scenario), one)
+        variant = changed.as_scenario()
+    except ConfigError as error:
+        return Outcome("refused", str(error), time=0.0)
+    try:
+        truth = changed.machine()
+    except (ConfigError, UnreachablePoseError) as error:
+        return Outcome("not_assembled", str(error), time=0.0)
+    try:
+        return outcome_of(run_in_bulk(variant, truth))
+    except ConfigError as error:
+        return Outcome("refused", str(error), time=0.0)
