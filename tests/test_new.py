@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import stewart_drake as sd
-from stewart_drake.cli import main, new
+from stewart_drake.cli import main, model
 from stewart_drake.mechanism.kinematics import leg_geometry
 from tests.screen import too_long
 
@@ -115,9 +115,9 @@ def test_what_is_missing_is_asked_for_and_millimetres_are_noticed(
         agreed.append(text)
         return len(agreed) > 1  # no: it is asked for again
 
-    monkeypatch.setattr(new.sys.stdin, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(new.typer, "prompt", lambda *_, **__: next(answers))
-    monkeypatch.setattr(new.typer, "confirm", agree)
+    monkeypatch.setattr(model.sys.stdin, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(model.typer, "prompt", lambda *_, **__: next(answers))
+    monkeypatch.setattr(model.typer, "confirm", agree)
     assert main(["new", str(tmp_path), *flags(rod=None, plate_mass=None)]) == 0
     assert agreed == ["270 m? 0.27 m for 270 mm", "260 m? 0.26 m for 260 mm"]
     assert sd.load_mechanism(tmp_path / "machine.yaml").rod_lengths[0] == 0.26

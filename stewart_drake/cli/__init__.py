@@ -9,17 +9,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from stewart_drake.cli import (
-    analyze,
-    identify,
-    live,
-    machine,
-    model,
-    new,
-    report,
-    run,
-    tune,
-)
+from stewart_drake.cli import analyze, identify, live, model, run, tune
 from stewart_drake.cli.common import INTERRUPTED, release
 from stewart_drake.cli.examples import add_examples
 from stewart_drake.files.errors import ConfigError
@@ -36,10 +26,10 @@ app.command()(run.simulate)
 app.command()(run.compare)
 app.command()(run.export)
 app.command("export-c")(run.export_c)
-app.command()(report.report)
+app.command()(run.report)
 app.command()(identify.identify)
-app.command()(new.new)
-app.command()(machine.machine)
+app.command()(model.new)
+app.command()(live.machine)
 app.command()(live.live)
 analyze.add_analyses(app)
 app.add_typer(model.app, name="model")

@@ -1,15 +1,22 @@
-"""Looking at mechanisms: model check, model sdf, model view."""
+"""Machines: new, model check, model sdf, model view."""
 
+import re
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stewart_drake.cli.common import AsJson, Delivery, Quiet
+from stewart_drake.cli.options import Given, with_options
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.studies.measurements import LARGEST, Measurements
+
+if TYPE_CHECKING:
+    from stewart_drake.studies.new_machine import NewMachine
+    from stewart_drake.studies.options import Option
 from stewart_drake.cli.common import (
-    AsJson,
-    Delivery,
     MechanismName,
-    Quiet,
     check_file,
     open_meshcat,
 )
@@ -87,3 +94,75 @@ def view(
     # A reader needs the address even when everything else is quiet.
     echo(f"showing it at {viewer.meshcat.web_url()}, ends with {STOP!r} there or Ctrl-C")
     viewer.run(delivery.say)
+
+
+# ---------------------------------------------------------------- a new machine
+
+
+@with_options(Measurements)
+def new(
+    *,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="For the two files.")],
+    given: Given,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> int:
+    """Make a machine and a first scenario from a few measurements.
+
+    What is not given is asked for. Lengths in m, masses in kg; moments of inertia are estimated.
+    """
+    from stewart_drake.studies import new_machine as study
+
+    delivery = Delivery(folder, quiet, as_json)
+    study.check_free(folder)  # before nine questions
+    asked = _asked(given.missing, sys.stdin.isatty() and not (quiet or as_json))
+    measurements = given.options(more=asked)
+    with given.named():
+        made = study.new_machine(measurements, _name_of(folder), folder)
+    _tell(delivery, made)
+    delivery.wrote(study.MACHINE, study.SCENARIO)
+    delivery.write(made.summary)
+    status = delivery.end(made.summary)
+    delivery.say(f"next: stewart-drake simulate {folder / study.SCENARIO} --out {folder / 'run'}")
+    return status
+
+
+def _tell(delivery: Delivery, made: "NewMachine") -> None:
+    """The machine at home, the motion, and what the delay does."""
+    from stewart_drake.reporting.mechanism import document
+    from stewart_drake.studies.verdict import Verdict, loop_verdict
+
+    delivery.say(document(made.check).plain())
+    margin = made.margin
+    delay = Verdict(margin.eta, margin.pole, margin.pole_time)
+    for text in (made.verdict, loop_verdict(margin), str(delay)):
+        delivery.tell(text)
+
+
+def _asked(missing: "list[Option]", asking: bool) -> dict[str, float]:
+    """Ask for what is missing at a terminal; elsewhere it is an error."""
+    if missing and not asking:
+        flags = ", ".join("--" + one.name.replace("_", "-") for one in missing)
+        raise ConfigError(
+            f"new: got no {flags}; expected what is measured on the machine; "
+            "a terminal is asked for it"
+        )
+    return {one.name: _ask(one.help[0].lower() + one.help[1:-1]) for one in missing}
+
+
+def _ask(question: str) -> float:
+    while True:
+        value = float(typer.prompt(question, type=float))
+        if not (question.endswith(", m") and value > LARGEST):
+            return value
+        if typer.confirm(f"{value:g} m? {value / 1000:g} m for {value:g} mm", default=True):
+            return value / 1000
+
+
+def _name_of(folder: Path) -> str:
+    """A machine's name from that of its folder; `machine` where it makes none."""
+    name = re.sub("[^A-Za-z0-9_-]", "_", folder.resolve().name)
+    from stewart_drake.mechanism.geometry import RESERVED_NAMES
+
+    fits = re.match("[A-Za-z]", name) and name not in RESERVED_NAMES
+    return name if fits else "machine"

@@ -1,7 +1,8 @@
-"""Running scenarios: simulate, compare, export."""
+"""Running scenarios: simulate, compare, report, export, export-c."""
 
 import select
 import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -21,13 +22,14 @@ from stewart_drake.cli.common import (
     open_meshcat,
 )
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.reporting.terminal import echo, progress_bars
+from stewart_drake.reporting.terminal import count_bar, echo, progress_bars
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from stewart_drake.loop.results import SimulationResult
     from stewart_drake.mechanism.geometry import Mechanism
+
 
 CSV: Final = "signals.csv"
 REPLAY: Final = "replay.html"
@@ -226,3 +228,53 @@ def compare(
     ended = [result.status for result in results.values()]
     interrupted = "interrupted" in ended or len(ended) < len(names)
     return delivery.end(study.comparison_summary(results), interrupted)
+
+
+def report(
+    scenario: ScenarioName = "paper",
+    controller: Controller = None,
+    settings: Settings = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where it goes.")] = Path("out/report"),
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> int:
+    """Write one HTML file about a scenario.
+
+    It is run, compared under all shipped controllers, and analysed.
+    """
+    from stewart_drake.loop.experiment import simulated_machine
+    from stewart_drake.reporting import report as report_document
+    from stewart_drake.reporting.report import collect
+    from stewart_drake.reporting.page import Provenance, command_line
+    from stewart_drake.reporting.results import PAGE, AnalysisResult
+
+    delivery = Delivery(out, quiet, as_json)
+    started, name = time.perf_counter(), Path(scenario).stem
+    with count_bar("runs, analyses", delivery.silent) as progress:
+        found = collect(scenario, settings or (), progress, controller)
+    # Nothing of an earlier scenario beside this one's numbers, which come first.
+    delivery.discard(REPLAY, PAGE)
+    summary = report_document.report_summary(found)
+    delivery.write(summary)
+    replay = ""
+
+    def film(folder: Path) -> None:
+        nonlocal replay
+        from stewart_drake.reporting.replay import write_replay
+
+        assert found.run is not None
+        mechanism = simulated_machine(found.scenario)
+        replay = write_replay(found.run, mechanism, folder / REPLAY, name).read_text("utf-8")
+
+    def page(folder: Path) -> None:
+        document = report_document.document(found, name, replay)
+        delivery.say(document.plain())
+        AnalysisResult(found, summary, document, made).write_page(folder)
+
+    if found.run is not None:
+        delivery.draw(REPLAY, film)
+    words = {"controller": controller, "out": out}
+    command = command_line("report", scenario, settings=settings or (), options=words)
+    made = Provenance(command, seconds=time.perf_counter() - started)
+    delivery.draw(PAGE, page)
+    return delivery.end(summary)

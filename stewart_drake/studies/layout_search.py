@@ -26,7 +26,7 @@ from stewart_drake.files.jsonio import load_json, sealed_json
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import validate, yaml_text
 from stewart_drake.loop.bulk import run_in_bulk
-from stewart_drake.loop.clearance import ClearanceScene, Pair
+from stewart_drake.loop.clearance import ClearanceScene
 from stewart_drake.loop.experiment import (
     Experiment,
     assemble,
@@ -100,16 +100,9 @@ class Found:
 
 
 @checked(config=_STRICT)
-class _Near:
-    parts: list[str]
-    distance: float
-    time: float
-
-
-@checked(config=_STRICT)
 class Judged:
     measures: dict[str, float]
-    nearest: _Near | None
+    nearest: Nearest | None
     outcome: Outcome
 
 
@@ -398,8 +391,7 @@ def judge(problem: Problem, machine: str) -> bytes:
         outcome = outcome_of(run_in_bulk(scenario))
     except ConfigError as error:
         outcome = Outcome("refused", str(error), time=0.0)
-    nearest = None if least is None else _Near(list(least.pair), least.distance, least.time)
-    return _bytes_of(Judged(_finite(measures), nearest, outcome))
+    return _bytes_of(Judged(_finite(measures), least, outcome))
 
 
 def best_of(problem: Problem, found: list[Found], best: int) -> list[Found]:
@@ -433,17 +425,14 @@ def layout(
     values: Sequence[float] | Array,
     judged: Judged,
 ) -> Layout:
-    near, mechanism = judged.nearest, load_mechanism(machine)
-    nearest = None if near is None else Nearest(Pair(*near.parts), near.distance, near.time)
-    missed = _missed(problem, judged.measures)
     return Layout(
         name=name,
-        mechanism=mechanism,
+        mechanism=load_mechanism(machine),
         order=tuple(order),
         values=np.array(values),
         measures=judged.measures,
-        missed=missed,
-        nearest=nearest,
+        missed=_missed(problem, judged.measures),
+        nearest=judged.nearest,
         outcome=judged.outcome,
     )
 

@@ -145,26 +145,23 @@ class RobustnessStudy(NamedTuple):
     @property
     def summary(self) -> dict[str, Any]:
         """What `summary.json` holds; E_ac in % s, infinite quantiles (failed runs) as null."""
-        done = np.isfinite(self.errors)
+        done, of_completed = np.isfinite(self.errors), None
+        if done.any():
+            of_completed = {
+                str(q): quantile_interval(self.errors[done], q)._asdict() for q in QUANTILES
+            }
         by_leg = Counter(one.leg for one in self.outcomes if one.leg is not None)
         return {
             "runs": len(self.outcomes),
             "seed": self.seed,
-            "success": {"runs": int(np.sum(~self.failed)), **self.success._asdict()},
+            **self._of_all(),
             "limit": self.limit,
             "completed": int(done.sum()),
-            "failures": self.reasons,
             "failures_by_leg": {str(leg): by_leg[leg] for leg in sorted(by_leg)},
-            "E_ac_of_all": {str(q): self.quantile(q)._asdict() for q in QUANTILES},
-            "E_ac_of_completed": {
-                str(q): quantile_interval(self.errors[done], q)._asdict() for q in QUANTILES
-            }
-            if done.any()
-            else None,
+            "E_ac_of_completed": of_completed,
             "influences": [_influence_summary(one) for one in self.influences()],
             "explanation": self.explanation.summary,
             "loops": self.loops,
-            "undisturbed": dataclasses.asdict(self.undisturbed),
             "beside": {name: one._of_all() for name, one in self.others.items()},
             "ranges": dataclasses.asdict(self.ranges),
             "scales": self.scales._asdict(),
