@@ -32,7 +32,6 @@ class Nearest(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Plain data, SI units."""
         return {"parts": list(self.pair), "distance": self.distance, "time": self.time}
 
 
@@ -104,7 +103,6 @@ class ClearanceStudy(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """The answer in a clause."""
         least, disc = self.along.least(fixed=False), self.along.disc
         if least is None:
             return "no pose of it is in reach, so that nothing is known of links that touch"

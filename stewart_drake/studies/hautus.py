@@ -160,7 +160,6 @@ class HautusStudy:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What summary.json holds."""
         return {
             "tolerance": TOLERANCE,
             "units": {"pose": self.basis.motion, "torque": self.basis.torque},

@@ -126,7 +126,6 @@ class Layout(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Plain data, SI units and degrees."""
         pattern = dict(zip(PARAMETERS, self.values.tolist(), strict=True))
         return {
             "name": self.name,
@@ -224,7 +223,6 @@ class LayoutStudy:
 
     @property
     def evaluations(self) -> int:
-        """How many layouts were tried."""
         return sum(found.evaluations for found in self.searches.values())
 
     @property
@@ -234,7 +232,6 @@ class LayoutStudy:
 
     @property
     def verdict(self) -> str:
-        """The answer in a sentence."""
         tried = f"of {self.evaluations} layouts in {len(self.searches)} searches"
         if not self.layouts:
             least = min(self.searches.values(), key=self._distance)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import Field
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.scenario.config import NetworkConfig, Scenario
 from stewart_drake.studies.options import Flag, Options
 
 if TYPE_CHECKING:
-    from stewart_drake.scenario.config import Scenario
     from stewart_drake.studies.jobs import Progress
     from stewart_drake.studies.link_bound import LinkStudy
 
@@ -24,7 +24,7 @@ class LinkOptions(Options):
 
 
 def study_link(
-    scenario: "Scenario", options: LinkOptions, progress: "Progress | None" = None
+    scenario: Scenario, options: LinkOptions, progress: "Progress | None" = None
 ) -> "LinkStudy":
     """Simulate a scenario on the exact plant over bounds, then over losses.
 

@@ -111,7 +111,6 @@ class LinkStudy:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Contents of summary.json."""
         best = self.best
 
         def told(cells: Iterable[Cell]) -> list[dict[str, Any]]:

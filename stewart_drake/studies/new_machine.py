@@ -149,7 +149,6 @@ class NewMachine(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` holds."""
         return self.check.summary | {
             "peak_torque": self.peak_torque,
             "controller_margin": self.margin.summary,

@@ -205,7 +205,6 @@ class Explanation(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Plain data."""
         return {
             "failing": self.failing,
             "others": self.others,

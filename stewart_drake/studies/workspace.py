@@ -137,7 +137,6 @@ class WorkspaceStudy:
 
     @property
     def verdict(self) -> str:
-        """The answer in a sentence."""
         opening = "" if self.home is None else f"the home pose is singular ({self.home.reason}); "
         time, leg, margin = self.worst
         if self.exit is None:
