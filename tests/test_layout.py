@@ -191,7 +191,7 @@ def test_a_machine_told_leg_by_leg_has_no_numbers_to_vary() -> None:
 
 
 def test_a_search_keeps_limits_and_betters_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stewart_drake.studies.layout.POPULATION", 3)
+    monkeypatch.setattr("stewart_drake.studies.layout_search.POPULATION", 3)
     asked = problem(limits={"reach": 0.005, "clearance": -1.0}, vary={"crank": (0.1, 0.12)})
     found = json.loads(search(asked, OWN, 3, 0, 4))
     values, own = np.array(found["values"]), asked.trial(own_values(SPEC), OWN)
@@ -285,7 +285,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         return (call() for call in calls)
 
     monkeypatch.setattr("stewart_drake.studies.jobs._on_this_machine", here)
-    monkeypatch.setattr("stewart_drake.studies.layout.POPULATION", 2)
+    monkeypatch.setattr("stewart_drake.studies.layout_search.POPULATION", 2)
     return done
 
 

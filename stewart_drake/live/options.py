@@ -1,77 +1,45 @@
 """Options of a live run and of a simulated machine; nothing heavy is imported here."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import Field
-
-from stewart_drake.studies.options import Flag, Options
-
-Key = Annotated[Path | None, Field(description="File whose bytes both sides share."), Flag("FILE")]
+from stewart_drake.studies.options import Options, option
 
 
 class Settings(Options):
     """How a machine is run."""
 
-    rate: Annotated[
-        float, Field(ge=1e-3, le=1e3, description="Seconds of the machine in a second."), Flag()
-    ] = 1.0
-    watchdog: Annotated[
-        float,
-        Field(ge=1e-2, le=1e4, description="Seconds of silence before the safe torque."),
-        Flag(),
-    ] = 1.0
-    safe: Annotated[
-        Literal["zero", "hold"],
-        Field(description="The safe torque: none, or the last one."),
-        Flag(),
-    ] = "zero"
-    restart: Annotated[
-        Literal["rest", "motion"],
-        Field(
-            description="Where a new session begins: put back, or as it is. A plate that has left "
-            "its workspace is put back."
-        ),
-        Flag(),
-    ] = "rest"
+    rate: float = option(1.0, "Seconds of the machine in a second.", ge=1e-3, le=1e3)
+    watchdog: float = option(1.0, "Seconds of silence before the safe torque.", ge=1e-2, le=1e4)
+    safe: Literal["zero", "hold"] = option("zero", "The safe torque: none, or the last one.")
+    restart: Literal["rest", "motion"] = option(
+        "rest",
+        "Where a new session begins: put back, or as it is. A plate that has left "
+        "its workspace is put back.",
+    )
 
 
 class MachineOptions(Settings):
     """Options of a simulated machine in real time."""
 
-    port: Annotated[int, Field(ge=0, le=65535, description="UDP; 0 is any."), Flag()] = 47000
-    host: Annotated[str, Field(description="To listen at; beyond loopback with a key."), Flag()] = (
-        "127.0.0.1"
-    )
-    key: Key = None
-    duration: Annotated[
-        float,
-        Field(ge=0, description="Seconds of the machine, then it ends; 0: until Ctrl-C."),
-        Flag(),
-    ] = 0.0
+    port: int = option(47000, "UDP; 0 is any.", ge=0, le=65535)
+    host: str = option("127.0.0.1", "To listen at; beyond loopback with a key.")
+    key: Path | None = option(None, "File whose bytes both sides share.", "FILE")
+    duration: float = option(0.0, "Seconds of the machine, then it ends; 0: until Ctrl-C.", ge=0)
 
 
 class LiveOptions(Options):
     """Options of the loop in real time."""
 
-    duration: Annotated[
-        float | None, Field(ge=0.1, description="s; until it is stopped by default."), Flag("S")
-    ] = None
-    armed: Annotated[
-        bool, Field(description="Drive a machine that is no simulation."), Flag(name="arm")
-    ] = False
-    key: Key = None
-    max_missing: Annotated[
-        float | None,
-        Field(
-            ge=0.001,
-            description="Without measurements, then it ends; by the estimator's uncertainty by "
-            "default.",
-        ),
-        Flag("SECONDS"),
-    ] = None
-    accept_jitter: Annotated[
-        bool,
-        Field(description="Start without the question that a large jitter raises."),
-        Flag(name="yes"),
-    ] = False
+    duration: float | None = option(None, "s; until it is stopped by default.", "S", ge=0.1)
+    armed: bool = option(False, "Drive a machine that is no simulation.", name="arm")
+    key: Path | None = option(None, "File whose bytes both sides share.", "FILE")
+    max_missing: float | None = option(
+        None,
+        "Without measurements, then it ends; by the estimator's uncertainty by default.",
+        "SECONDS",
+        ge=0.001,
+    )
+    accept_jitter: bool = option(
+        False, "Start without the question that a large jitter raises.", name="yes"
+    )

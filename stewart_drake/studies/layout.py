@@ -5,13 +5,11 @@ Drake is imported by the search, not by its options.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from pydantic import Field
+from typing import TYPE_CHECKING
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.studies.options import Flag, JobOptions, Seed
+from stewart_drake.studies.options import JobOptions, option
 
 if TYPE_CHECKING:
     from stewart_drake.scenario.config import Scenario
@@ -48,40 +46,35 @@ def _read_bounds(texts: list[str], _: object) -> dict[str, tuple[float, float]]:
 class LayoutOptions(JobOptions):
     """Options of `study_layout`."""
 
-    goal: Annotated[
-        str,
-        Field(
-            description="What should be as good as can be: condition, torque, reach, clearance, "
-            "transmission, plate_joint_deg or crank_joint_deg."
-        ),
-        Flag("NAME"),
-    ] = "condition"
-    limits: Annotated[
-        Mapping[str, float] | None,
-        Field(description="Least (reach, clearance, transmission) or largest value, SI units."),
-        Flag("NAME=VALUE", "limit", _read_limits),
-    ] = None
-    vary: Annotated[
-        Mapping[str, tuple[float, float]] | None,
-        Field(
-            description="Bounds of a number of the machine's pattern, or of crank or rod; one "
-            "value fixes it."
-        ),
-        Flag("NAME=LOW:HIGH", read=_read_bounds),
-    ] = None
-    keep: Annotated[
-        Sequence[str],
-        Field(description="A number that stays as it is, or branches or plate_order."),
-        Flag("NAME", read=lambda texts, _: texts),
-    ] = ()
-    best: Annotated[int, Field(ge=1, description="How many machines to write."), Flag("N")] = 3
-    starts: Annotated[
-        int, Field(ge=1, description="Searches per arrangement of legs."), Flag("N")
-    ] = 1
-    generations: Annotated[int, Field(ge=1, description="Of each search, at most."), Flag("N")] = (
-        100
+    goal: str = option(
+        "condition",
+        "What should be as good as can be: condition, torque, reach, clearance, "
+        "transmission, plate_joint_deg or crank_joint_deg.",
+        "NAME",
     )
-    seed: Seed = 0
+    limits: Mapping[str, float] | None = option(
+        None,
+        "Least (reach, clearance, transmission) or largest value, SI units.",
+        "NAME=VALUE",
+        name="limit",
+        read=_read_limits,
+    )
+    vary: Mapping[str, tuple[float, float]] | None = option(
+        None,
+        "Bounds of a number of the machine's pattern, or of crank or rod; one value fixes it.",
+        "NAME=LOW:HIGH",
+        read=_read_bounds,
+    )
+    keep: Sequence[str] = option(
+        (),
+        "A number that stays as it is, or branches or plate_order.",
+        "NAME",
+        read=lambda texts, _: texts,
+    )
+    best: int = option(3, "How many machines to write.", "N", ge=1)
+    starts: int = option(1, "Searches per arrangement of legs.", "N", ge=1)
+    generations: int = option(100, "Of each search, at most.", "N", ge=1)
+    seed: int = option(0, "Of everything that is drawn.", ge=0)
 
 
 def study_layout(

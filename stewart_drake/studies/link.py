@@ -4,13 +4,11 @@ Drake is imported by the analysis, not by its options.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated
-
-from pydantic import Field
+from typing import TYPE_CHECKING
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.config import NetworkConfig, Scenario
-from stewart_drake.studies.options import Flag, Options
+from stewart_drake.studies.options import Options, option
 
 if TYPE_CHECKING:
     from stewart_drake.studies.jobs import Progress
@@ -20,7 +18,7 @@ if TYPE_CHECKING:
 class LinkOptions(Options):
     """Options of `study_link`."""
 
-    runs: Annotated[int, Field(ge=1, description="Seeds for each bound and loss."), Flag("N")] = 5
+    runs: int = option(5, "Seeds for each bound and loss.", "N", ge=1)
 
 
 def study_link(

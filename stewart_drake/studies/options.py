@@ -8,7 +8,7 @@ import inspect
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -37,6 +37,29 @@ class Flag:
     name: str = ""
     read: "Callable[[list[str], Callable[[str], Scenario]], Any] | None" = None
     recorded: bool = True
+
+
+def option(
+    default: Any,
+    help: str,
+    metavar: str | None = None,
+    *,
+    name: str = "",
+    read: "Callable[[list[str], Callable[[str], Scenario]], Any] | None" = None,
+    recorded: bool = True,
+    **bounds: Any,
+) -> Any:
+    """Return the field of an option that the command line has too.
+
+    Args:
+        default: `...` for none.
+        help: unit and meaning.
+        metavar, name, read, recorded: see `Flag`.
+        bounds: as `pydantic.Field` takes them.
+    """
+    extra = {"flag": Flag(metavar, name, read, recorded)}
+    more: dict[str, Any] = {"description": help, "json_schema_extra": extra, **bounds}
+    return Field(default, **more)
 
 
 class Option(NamedTuple):
@@ -83,7 +106,8 @@ class Options(BaseModel):
         """Yield all options; those that pages do not record come last."""
         found = []
         for name, field in cls.model_fields.items():
-            flag = next((one for one in field.metadata if isinstance(one, Flag)), None)
+            extra = field.json_schema_extra
+            flag: Any = extra.get("flag") if isinstance(extra, dict) else None
             default = inspect.Parameter.empty if field.is_required() else field.default
             found.append(Option(name, field.annotation, default, field.description or "", flag))
         yield from sorted(found, key=lambda option: not option.recorded)
@@ -148,19 +172,12 @@ def refuse(options: Mapping[str, object], why: str) -> None:
 class JobOptions(Options):
     """Options of a study whose runs go to several processes."""
 
-    workers: Annotated[
-        int | None, Field(description="Processes; all cores by default."), Flag("N", recorded=False)
-    ] = None
-    scheduler: Annotated[
-        str | None,
-        Field(description="Of a Dask cluster to run on instead."),
-        Flag("ADDRESS", recorded=False),
-    ] = None
+    workers: int | None = option(None, "Processes; all cores by default.", "N", recorded=False)
+    scheduler: str | None = option(
+        None, "Of a Dask cluster to run on instead.", "ADDRESS", recorded=False
+    )
 
     @property
     def jobs(self) -> dict[str, Any]:
         """Return where the runs go, as `run_jobs` takes it."""
         return {"workers": self.workers, "scheduler": self.scheduler}
-
-
-Seed = Annotated[int, Field(ge=0, description="Of everything that is drawn."), Flag()]

@@ -6,14 +6,12 @@ Drake is imported by the study, not by its options.
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from pydantic import Field
+from typing import TYPE_CHECKING, Any
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials, write_whole
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.studies.options import Flag, JobOptions, Seed
+from stewart_drake.studies.options import JobOptions, option
 from stewart_drake.studies.ranges import RANGE_UNITS, Ranges, read_ranges
 
 if TYPE_CHECKING:
@@ -33,30 +31,25 @@ def _read_also(names: list[str], load: Callable[[str], Scenario]) -> dict[str, S
 class RobustnessOptions(JobOptions):
     """Options of `study_robustness`."""
 
-    ranges: Annotated[
-        Ranges | None,
-        Field(
-            description="How far off, 0: not at all. "
-            + "; ".join(f"{name}: {unit}" for name, unit in RANGE_UNITS.items())
-            + ". torque_limit takes null too: as the scenario has it."
-        ),
-        Flag("NAME=VALUE", "vary", lambda texts, _: read_ranges(texts)),
-    ] = None
-    runs: Annotated[int, Field(ge=1, description="How many machines to draw."), Flag("N")] = 200
-    seed: Seed = 0
-    limit: Annotated[
-        float | None,
-        Field(gt=0, description="A run above, in % s, counts as failed."),
-        Flag("E_AC"),
-    ] = None
-    also: Annotated[
-        Mapping[str, Scenario] | None,
-        Field(
-            description="Run the same machines with this controller too, such as adaptive_lqi, "
-            "which finds the delay."
-        ),
-        Flag("CONTROLLER", read=_read_also),
-    ] = None
+    ranges: Ranges | None = option(
+        None,
+        "How far off, 0: not at all. "
+        + "; ".join(f"{name}: {unit}" for name, unit in RANGE_UNITS.items())
+        + ". torque_limit takes null too: as the scenario has it.",
+        "NAME=VALUE",
+        name="vary",
+        read=lambda texts, _: read_ranges(texts),
+    )
+    runs: int = option(200, "How many machines to draw.", "N", ge=1)
+    seed: int = option(0, "Of everything that is drawn.", ge=0)
+    limit: float | None = option(None, "A run above, in % s, counts as failed.", "E_AC", gt=0)
+    also: Mapping[str, Scenario] | None = option(
+        None,
+        "Run the same machines with this controller too, such as adaptive_lqi, "
+        "which finds the delay.",
+        "CONTROLLER",
+        read=_read_also,
+    )
 
 
 def study_robustness(

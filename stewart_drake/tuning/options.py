@@ -2,11 +2,9 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
-from pydantic import Field
-
-from stewart_drake.studies.options import Flag, JobOptions, Options, Seed, refuse
+from stewart_drake.studies.options import JobOptions, Options, option, refuse
 
 if TYPE_CHECKING:
     from stewart_drake.studies.families import Family
@@ -20,12 +18,10 @@ class FamilyOptions(JobOptions):
     """Options of runs under the conditions of a family."""
 
     purpose: ClassVar[Literal["training", "evaluation"]]
-    family: Annotated[
-        Literal["T", "N2"] | None,
-        Field(description="Conditions where weights matter: T with the estimator, N2 without."),
-        Flag(),
-    ] = None
-    seed: Seed = 0
+    family: Literal["T", "N2"] | None = option(
+        None, "Conditions where weights matter: T with the estimator, N2 without."
+    )
+    seed: int = option(0, "Of everything that is drawn.", ge=0)
 
     @property
     def number(self) -> int:
@@ -64,19 +60,12 @@ class DataOptions(FamilyOptions):
     """Options of the data that a tuner is trained on."""
 
     purpose = "training"
-    disturbed: Annotated[
-        int | None,
-        Field(ge=0, description="N drawn conditions instead of the paper's grid."),
-        Flag("N"),
-    ] = None
-    draws: Annotated[
-        int | None,
-        Field(
-            ge=10,
-            description=f"With --family: how many, each with 13 ratios; {DRAWS} by default.",
-        ),
-        Flag("N"),
-    ] = None
+    disturbed: int | None = option(
+        None, "N drawn conditions instead of the paper's grid.", "N", ge=0
+    )
+    draws: int | None = option(
+        None, f"With --family: how many, each with 13 ratios; {DRAWS} by default.", "N", ge=10
+    )
 
     @property
     def number(self) -> int:
@@ -92,7 +81,7 @@ class WorthOptions(FamilyOptions):
     """Options of the evaluation of a tuner."""
 
     purpose = "evaluation"
-    scenarios: Annotated[int, Field(ge=2, description="How many to draw."), Flag("N")] = 40
+    scenarios: int = option(40, "How many to draw.", "N", ge=2)
 
     @property
     def number(self) -> int:
@@ -102,33 +91,17 @@ class WorthOptions(FamilyOptions):
 class TrainingOptions(Options):
     """Options of the training of a network."""
 
-    regret: Annotated[
-        bool,
-        Field(description="By regret, on data of a --family; else as the paper."),
-        Flag(),
-    ] = False
-    start: Annotated[
-        float | None,
-        Field(description="With --regret: log10 w_Q / w_R at first; else the best."),
-        Flag("RATIO"),
-    ] = None
-    labels: Annotated[
-        Labels | None,
-        Field(description="What the network learns to answer; best_in_cell by default."),
-        Flag(),
-    ] = None
-    split: Annotated[
-        Split | None, Field(description="What 70 % of are trained on; run by default."), Flag()
-    ] = None
-    density: Annotated[
-        Literal["magnitude", "signed"] | None,
-        Field(description="Of (45); magnitude by default."),
-        Flag(),
-    ] = None
-    seed: Seed = 0
-    workers: Annotated[
-        int | None, Field(description="Processes; all cores by default."), Flag("N")
-    ] = None
+    regret: bool = option(False, "By regret, on data of a --family; else as the paper.")
+    start: float | None = option(
+        None, "With --regret: log10 w_Q / w_R at first; else the best.", "RATIO"
+    )
+    labels: Labels | None = option(
+        None, "What the network learns to answer; best_in_cell by default."
+    )
+    split: Split | None = option(None, "What 70 % of are trained on; run by default.")
+    density: Literal["magnitude", "signed"] | None = option(None, "Of (45); magnitude by default.")
+    seed: int = option(0, "Of everything that is drawn.", ge=0)
+    workers: int | None = option(None, "Processes; all cores by default.", "N")
 
     def check(self) -> None:
         """Refuse options of the other loss.
