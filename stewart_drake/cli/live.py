@@ -110,7 +110,7 @@ def live(
         how["log"] = None if out is None else out / LOG
         with _Ending() as ending:
             result = drive(ready, span, ending=ending, say=delivery.tell, accept_jitter=True, **how)
-    return _told(delivery, result)
+    return _delivered(delivery, result)
 
 
 def _agreed(problem: str) -> bool:
@@ -141,8 +141,8 @@ def _show(url: str) -> None:
         webbrowser.open(url)
 
 
-def _told(delivery: Delivery, result: "SimulationResult") -> int:
-    """Write and print what has come of it."""
+def _delivered(delivery: Delivery, result: "SimulationResult") -> int:
+    """Write and print the result, and return the exit status."""
     from stewart_drake.reporting.run import run_document
 
     stopped = result.stopped
@@ -178,7 +178,7 @@ def _end_with_parent() -> Callable[[], None] | None:
 def _demo_machine(
     scenario: str, eta: float, controller: str | None, settings: Sequence[str]
 ) -> Iterator[str]:
-    """A simulated machine in a process of its own, on a free port, over a link of its own."""
+    """Run a simulated machine in another process, on a free port, over another link."""
     low, high = (share * eta for share in _EACH_WAY)
     way = f"low: {low:g}, high: {high:g}, loss: {_LOST}"
     words = ["machine", scenario, "--port", "0"]

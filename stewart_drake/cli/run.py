@@ -252,7 +252,7 @@ def report(
     started, name = time.perf_counter(), Path(scenario).stem
     with count_bar("runs, analyses", delivery.silent) as progress:
         found = collect(scenario, settings or (), progress, controller)
-    # Nothing of an earlier scenario beside this one's numbers, which come first.
+    # An earlier scenario's files must not stay next to this one's numbers.
     delivery.discard(REPLAY, PAGE)
     summary = report_document.report_summary(found)
     delivery.write(summary)

@@ -1,8 +1,8 @@
 """Whether the parts of a machine touch: along a motion, and around home.
 
 Distances are those of `loop.clearance`; a negative one is by how far two parts are in each other.
-Links are cranks, rods and plate. The base with its motors is told apart: where its disc lies is the
-drawing's choice, not the machine's.
+Links are cranks, rods and plate. The base with its motors is reported apart: the drawing
+chooses where its disc lies, not the machine.
 """
 
 from typing import Any, Final, NamedTuple
@@ -17,7 +17,7 @@ from stewart_drake.studies.workspace_map import Section, Travel, last_inside
 from stewart_drake.types import Array
 
 EVERY: Final = 3
-"""Each so manieth pose of a section, along both sides, is looked at."""
+"""Interval of the poses of a section that are checked, along both sides."""
 _STEPS: Final = 60
 
 
@@ -43,7 +43,7 @@ class ClearanceAlong(NamedTuple):
     links: Array
     """(n,) m, of the nearest two links; NaN out of reach."""
     base: Array
-    """(n,) m, of whatever is nearest to the base or its motors; NaN out of reach."""
+    """(n,) m, of the part nearest to the base or its motors; NaN out of reach."""
     nearest: list[Nearest]
     """Of every pair, the nearest first; empty where no pose is in reach."""
 
@@ -82,7 +82,7 @@ class ClearTravel(NamedTuple):
 
 
 class ClearSection(NamedTuple):
-    """Of a section of the workspace; arrays (len(y), len(x))."""
+    """Distances in a section of the workspace; arrays (len(y), len(x))."""
 
     x: Array
     y: Array
@@ -93,7 +93,7 @@ class ClearSection(NamedTuple):
 
 
 class ClearanceStudy(NamedTuple):
-    """What is found of a machine and a motion."""
+    """Clearance of a machine along a motion and around home."""
 
     along: ClearanceAlong
     home: Nearest | None
@@ -119,7 +119,6 @@ class ClearanceStudy(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` holds; m and s."""
         least, base = self.along.least(fixed=False), self.along.least(fixed=True)
         return {
             "verdict": self.verdict,

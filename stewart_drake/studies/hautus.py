@@ -49,7 +49,7 @@ class Label(NamedTuple):
 
 
 def state_labels(n: int) -> list[Label]:
-    """Of 12 states of the plant, 18 of the error model, or those and torques in flight."""
+    """Return labels of the states of the plant (12) or error model (18), then torques in flight."""
     groups = ("pose error", "rate error", "integral")[: min(n // len(COORDINATE_NAMES), 3)]
     labels = [Label(group, name) for group in groups for name in COORDINATE_NAMES]
     length = (n - len(labels)) // NUM_TORQUES
@@ -85,7 +85,7 @@ def describe(directions: NDArray[np.complex128], labels: list[Label]) -> str:
 
 
 def mode_words(mode: Mode, labels: list[Label]) -> str:
-    """What of a mode fails, and its eigenvalue: `1 direction in pose error (x), mode 0`."""
+    """Return what fails in a mode, and its eigenvalue: `1 direction in pose error (x), mode 0`."""
     value = f"{mode.eigenvalue.real:.3g}"
     if mode.eigenvalue.imag:
         value += f" ± {mode.eigenvalue.imag:.3g}j"
@@ -173,7 +173,7 @@ def study_hautus(scenario: Scenario) -> HautusStudy:
     """Test every model of a scenario.
 
     Raises:
-        ConfigError: one line. A motion or a home pose outside the workspace is no error, see
+        ConfigError: one line. A motion or a home pose outside the workspace is not an error, see
             `Basis.obstacles`.
     """
     with threadpool_limits(limits=1):

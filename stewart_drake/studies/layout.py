@@ -1,4 +1,4 @@
-"""From a motion to a machine: layouts and lengths that suit it, searched for, measured and tried.
+"""Search of the layouts and lengths of a machine that suit a motion.
 
 Drake is imported by the search, not by its options.
 """

@@ -1,4 +1,4 @@
-"""Search of a layout: problem, trials, judgement of what was found, and the result.
+"""Search of a layout: problem, trials, judgement of the best, and result.
 
 For every arrangement of the legs (`studies.layout_space`) SciPy's differential evolution looks for
 the numbers that make the goal best within the limits. A trial is better than another first by its
@@ -141,7 +141,7 @@ class Layout(NamedTuple):
 
 @dataclass(frozen=True)
 class Problem:
-    """What is searched for; it is sent to other processes.
+    """Problem of a search; it is sent to other processes.
 
     Attributes:
         scenario: whose motion it is.
@@ -158,7 +158,7 @@ class Problem:
     def trial(self, values: Sequence[float] | Array, arrangement: Arrangement) -> dict[str, float]:
         """Measures of a layout, as far as the limits before them are kept."""
         legs = self.space.legs(values, arrangement)
-        # A crank as long as its rod is no machine.
+        # A crank as long as its rod cannot turn.
         spare = float((legs.rod_lengths - legs.crank_lengths).min())
         reach = min(least_reach(legs, self.motion), spare)
         if reach <= 0:
@@ -189,7 +189,7 @@ class Problem:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What all searches depend on, plain data."""
+        """Return what all searches depend on, plain data."""
         return {
             "scenario": scenario_to_dict(self.scenario),
             "machine": _plain(self.space.spec),
@@ -203,7 +203,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class LayoutStudy:
-    """What `layout` finds.
+    """Result of `layout`.
 
     Attributes:
         problem: what was searched for.
@@ -227,7 +227,7 @@ class LayoutStudy:
 
     @property
     def files(self) -> list[str]:
-        """Names of what the study leaves in its folder."""
+        """Names of the files and folders of the study."""
         return [*(f"{one.name}.yaml" for one in self.layouts), "searches/", "judged/"]
 
     @property
@@ -261,7 +261,6 @@ class LayoutStudy:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` holds; SI units and degrees."""
         return {
             "verdict": self.verdict,
             **self.problem.summary,
@@ -285,7 +284,7 @@ def problem_of(
     vary: Mapping[str, tuple[float, float]],
     keep: Sequence[str],
 ) -> Problem:
-    """What is searched for.
+    """Return the problem of a search.
 
     Raises:
         ConfigError: one line.
@@ -369,7 +368,7 @@ def search(
 
 
 def judge(problem: Problem, machine: str) -> bytes:
-    """What a machine, by name or file, is worth: measured at all instants, and run."""
+    """Measure a machine, by name or file, at all instants, and run it."""
     scenario = dataclasses.replace(problem.scenario, mechanism=machine)
     experiment = assemble(scenario)
     mechanism, time = experiment.mechanism, check_instants(scenario.duration)
@@ -461,7 +460,7 @@ def _plain(spec: MechanismSpec) -> dict[str, Any]:
 
 
 def _finite(measures: Mapping[str, float]) -> dict[str, float]:
-    """As a file keeps them; an infinite condition number is a motion through a singularity."""
+    """Return finite measures; an infinite condition number is a motion through a singularity."""
     return {name: float(value) for name, value in measures.items() if math.isfinite(value)}
 
 

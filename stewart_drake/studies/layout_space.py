@@ -135,14 +135,14 @@ def peak_torque(dynamics: StewartDynamics, motion: Motion) -> float:
 
 
 class Wish(NamedTuple):
-    """What a layout must keep to, and what should be as good as can be."""
+    """Limits of a layout, and the goal of the search."""
 
     limits: dict[str, float]
-    """By measure; at least so much of what is better the more there is, else at most."""
+    """By measure: the least value where more is better, else the largest."""
     goal: str
 
     def missed(self, found: Mapping[str, float]) -> dict[str, float]:
-        """By how much each limit is missed, as a share of it; those that are kept are left out."""
+        """Return by how much each limit is missed, as a share of it; kept limits are left out."""
         missing = {
             name: (limit - found[name]) * (1 if MEASURES[name].more else -1) / (abs(limit) or 1.0)
             for name, limit in self.limits.items()
@@ -151,7 +151,7 @@ class Wish(NamedTuple):
         return {name: share for name, share in missing.items() if not share <= 0}
 
     def cost(self, found: Mapping[str, float]) -> float:
-        """Of the goal; less is better."""
+        """Return the cost of the goal; less is better."""
         return -found[self.goal] if MEASURES[self.goal].more else found[self.goal]
 
 
@@ -159,7 +159,7 @@ def wish_of(goal: str, limits: Mapping[str, float], usual: Mapping[str, float]) 
     """Limits as asked for, and as usual where nothing was asked.
 
     Raises:
-        ConfigError: an unknown measure, or a limit that is no number.
+        ConfigError: an unknown measure, or a limit that is not a number.
     """
     for option, names in (("goal", [goal]), ("limit", limits)):
         for name in names:
@@ -174,7 +174,7 @@ def wish_of(goal: str, limits: Mapping[str, float], usual: Mapping[str, float]) 
 
 
 def singular(found: Mapping[str, float]) -> float:
-    """By how much a motion misses staying off parallel singularities; 0 where it does not."""
+    """Return the shortfall of det W below its least accepted value; 0 for none."""
     return max(0.0, SINGULARITY_LIMIT - found["parallel"])
 
 
@@ -210,14 +210,14 @@ class Arrangement(NamedTuple):
 
     @property
     def key(self) -> str:
-        """For the name of a file."""
+        """Text for the name of a file."""
         signs = "".join("+" if branch > 0 else "-" for branch in self.branches[:2])
         return f"joints{''.join(map(str, self.order))}_cranks{signs}"
 
 
 @dataclass(frozen=True)
 class Space:
-    """What may be chosen.
+    """Set of the layouts to choose from.
 
     Attributes:
         spec: of the machine that the search begins from; what is not varied stays as it is there.
@@ -234,7 +234,7 @@ class Space:
 
     @property
     def pattern(self) -> PatternSpec:
-        """That of the machine it begins from."""
+        """Pattern of the machine that the search begins from."""
         assert self.spec.pattern is not None
         return self.spec.pattern
 
@@ -258,7 +258,7 @@ class Space:
         ]
 
     def legs(self, values: Sequence[float] | Array, arrangement: Arrangement) -> SixLegs:
-        """What kinematics needs of a machine."""
+        """Return the legs, which kinematics needs."""
         named = dict(zip(PARAMETERS, map(float, values), strict=True))
         crank, rod = named.pop("crank"), named.pop("rod")
         return pattern_legs(self._pattern(named, arrangement), crank, rod)
@@ -290,7 +290,7 @@ class Space:
         return replace(self.pattern, plate_order=order, branches=branches, **named)
 
     def rounded(self, values: Array, digits: int = DIGITS) -> Array:
-        """To so many decimals; what does not vary stays as it is."""
+        """Return values rounded to `digits` decimals, except those that do not vary."""
         free = np.array([low < high for low, high in self.bounds.values()])
         return np.where(free, np.round(values, digits), values)
 

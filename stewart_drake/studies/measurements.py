@@ -1,4 +1,4 @@
-"""What is measured on a machine with a ruler and scales; nothing heavy is imported here."""
+"""Measurements of a machine with a ruler and scales; nothing heavy is imported here."""
 
 import math
 from typing import Annotated, Final, Literal

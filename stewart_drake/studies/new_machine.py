@@ -51,7 +51,7 @@ class MechanismCheck(NamedTuple):
 
     mechanism: Mechanism
     failure: Failure | None
-    """Why home is no pose to work from, or None; with it torque, poles and travel are empty."""
+    """Why the home pose is unusable, or None; with it torque, poles and travel are empty."""
     measures: Measures
     crank_angles: Array
     """(6,) rad"""
@@ -76,7 +76,7 @@ class MechanismCheck(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` holds; SI units, NaN where a value does not exist."""
+        """Content of `summary.json`, SI units; NaN for a missing value."""
         limit = self.mechanism.effort_limit
         return {
             "name": self.mechanism.name,
@@ -129,7 +129,7 @@ _PERIODS: Final = 25
 
 
 class NewMachine(NamedTuple):
-    """What was made, and what a first look at it says."""
+    """New machine, with a first check of it."""
 
     check: MechanismCheck
     margin: ControllerMargin
@@ -161,7 +161,7 @@ def separation(distance: float, radius: float) -> float:
 
 
 def proposed_pattern(m: Measurements) -> PatternSpec:
-    """Where the legs are."""
+    """Return the legs."""
     return PatternSpec(
         rotation_deg=0.0,
         base_radius=m.base_radius,

@@ -81,7 +81,7 @@ class Option(NamedTuple):
 
     @property
     def required(self) -> bool:
-        """Whether there is no default."""
+        """Whether a value must be given."""
         return self.default is inspect.Parameter.empty
 
     @property

@@ -1,4 +1,4 @@
-"""What a Monte Carlo study of a scenario has found: shares, quantiles, and what mattered."""
+"""Results of a Monte Carlo study of a scenario: shares, quantiles, and influences."""
 
 import csv
 import dataclasses
@@ -35,7 +35,7 @@ SIGNED: Final = tuple(name for name, one in MACHINE.items() if one.signed)
 
 
 class Influence(NamedTuple):
-    """What a quantity has to do with the outcome. Adjusted p-values are Holm's, over all asked."""
+    """Correlation of a quantity with the outcome. Adjusted p-values are Holm's, over all asked."""
 
     factor: str
     unit: str
@@ -66,7 +66,7 @@ class RobustnessStudy(NamedTuple):
 
     @property
     def files(self) -> list[str]:
-        """Names of what the study leaves in its folder."""
+        """Names of the files and folders of the study."""
         return ["runs.csv", "runs/"]
 
     @property
@@ -112,7 +112,7 @@ class RobustnessStudy(NamedTuple):
         return loops_of(self.outcomes)
 
     def quantile(self, probability: float) -> Interval:
-        """Of E_ac over all runs, % s; a run that did not complete counts as infinite."""
+        """Return a quantile of E_ac over all runs, % s; an incomplete run counts as infinite."""
         return quantile_interval(np.where(np.isnan(self.errors), np.inf, self.errors), probability)
 
     def influences(self) -> list[Influence]:
@@ -129,7 +129,7 @@ class RobustnessStudy(NamedTuple):
         return sorted(found, key=lambda one: -_strength(one))
 
     def _of_all(self) -> dict[str, Any]:
-        """Of `summary` what is told of a controller beside others."""
+        """Return the part of the summary that another controller has too."""
         return {
             "success": {"runs": int(np.sum(~self.failed)), **self.success._asdict()},
             "failures": self.reasons,
@@ -144,7 +144,7 @@ class RobustnessStudy(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` holds; E_ac in % s, infinite quantiles (failed runs) as null."""
+        """Content of `summary.json`; E_ac in % s, infinite quantiles (failed runs) as null."""
         done, of_completed = np.isfinite(self.errors), None
         if done.any():
             of_completed = {
@@ -176,7 +176,7 @@ def unit_of(factor: str) -> str:
 
 
 def factors(draws: list[Draw]) -> dict[str, str]:
-    """What is ranked, with its unit; what has several parts by its rms."""
+    """Return the ranked quantities with their units; several numbers count by their rms."""
     return {
         name: one.unit
         for name, one in MACHINE.items()
@@ -195,7 +195,7 @@ def factor_values(draws: list[Draw]) -> dict[str, Array]:
 
 
 def table(study: RobustnessStudy) -> str:
-    """All runs as CSV, a row each, empty where there is no number."""
+    """Return all runs as CSV, a row each; a missing number is empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     told = factors(study.draws)

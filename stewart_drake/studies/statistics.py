@@ -83,10 +83,10 @@ def least_share(successes: int, trials: int, confidence: float = CONFIDENCE) -> 
 def quantile_interval(
     values: ArrayLike, probability: float, confidence: float = CONFIDENCE
 ) -> Interval:
-    """A quantile of the distribution behind a sample, whatever that is.
+    """Return a quantile of the distribution behind a sample, distribution-free.
 
-    The number of values below the true quantile is binomial, which tells the ordered values that
-    enclose it, each tail with at most half of what is left over. Infinite values, such as of runs
+    The number of values below the true quantile is binomial, which gives the ordered values that
+    enclose it, each tail with at most half of the rest. Infinite values, such as of runs
     that failed, are values like all others. Where the sample is too small, an end is infinite.
 
     Args:
@@ -186,7 +186,7 @@ class Pair(NamedTuple):
 
 
 class Explanation(NamedTuple):
-    """What sets the failing runs apart; the lists hold everything asked, the most telling first."""
+    """Differences of the failing runs; the lists hold everything asked, the clearest first."""
 
     failing: int
     others: int
@@ -258,7 +258,7 @@ def auc_interval(auc: float, failing: int, others: int, confidence: float = CONF
         spread = 1 + half * (1 - a) / (2 - a) + half * a / (1 + a)
         return (auc - a) ** 2 - z**2 * a * (1 - a) * spread / (failing * others)
 
-    # The estimate itself is a root where it is an end of [0, 1]: just beside it begins the search.
+    # An estimate of 0 or 1 is a root itself: the search begins next to it.
     low = brentq(beyond, 0.0, min(auc, 1 - 1e-12)) if auc > 0 else 0.0
     high = brentq(beyond, max(auc, 1e-12), 1.0) if auc < 1 else 1.0
     return Interval(auc, float(low), float(high))
@@ -304,6 +304,6 @@ def _both_needed(a: Flags, b: Flags, failed: Flags) -> float:
 
 
 def _more_often(failed: Flags, there: Flags) -> float:
-    """Fisher's exact test, one-sided: P(so many of the failing runs are there by chance)."""
+    """Fisher's exact test, one-sided: P(at least this number of failing runs by chance)."""
     together = int(np.sum(failed & there))
     return float(hypergeom.sf(together - 1, len(failed), int(failed.sum()), int(there.sum())))

@@ -1,6 +1,6 @@
-"""What is not known of a machine before it runs: quantities, draws of them, and what they change.
+"""Unknown quantities of a machine: their draws, what they change, and runs with them.
 
-A quantity says how it is drawn, what it changes, and how it is told; a model is a table of them by
+A quantity says how it is drawn, what it changes, and its unit; a model is a table of them by
 name. The table's order is that of the random numbers, so that a new quantity goes to its end and
 leaves all other draws as they were. A draw adds to what the scenario says already. All scales are
 those of the machine and its motion, so that the same shares suit any mechanism.
@@ -79,12 +79,12 @@ class Quantity(NamedTuple):
     """One thing that is not known."""
 
     draw: Callable[[Generator, Any], Any]
-    """From random numbers and whatever its model draws with; takes the same share of the random
-    numbers whatever its range, so that narrowing one range leaves the others' draws alone."""
+    """From random numbers and what its model draws with. It takes the same number of random numbers
+    for any range, so that a narrower range leaves the other draws unchanged."""
     apply: Callable[[Truth, Any], None]
     """Changes `fields` or `parts`."""
     unit: str = ""
-    """In which it is told, empty where it is not."""
+    """Unit in results; empty for a quantity that is not reported."""
     per_unit: float = 1.0
     """Units in one of SI."""
     signed: bool = False
@@ -95,7 +95,7 @@ class Quantity(NamedTuple):
     """Told only where it is drawn at all."""
 
     def told(self, value: Any) -> float:
-        """What was drawn in its unit, of several numbers their rms, of None infinite."""
+        """Return the value in its unit: the rms of several numbers, infinite for None."""
         if value is None:
             return math.inf
         return self.per_unit * (rms(np.array(value)) if isinstance(value, tuple) else value)
@@ -133,7 +133,7 @@ def _times(there: int, value: Any) -> Any:
 
 
 def add_payload(truth: Truth, mass: float) -> None:
-    """Of kg at the plate's centre of mass; beyond the payload it is taken off the plate."""
+    """Add kg at the plate's centre of mass; a mass below the payload is taken off the plate."""
     plant, plate = truth.fields["plant"], truth.mechanism.plate
     total = plant["payload_mass"] + mass
     plant["payload_mass"] = max(0.0, total)
@@ -142,15 +142,15 @@ def add_payload(truth: Truth, mass: float) -> None:
 
 
 def add_bias(truth: Truth, bias: tuple[float, ...]) -> None:
-    """Of (6,) N m at the shafts."""
+    """Add a bias (6,) in N m at the shafts."""
     plant = truth.fields["plant"]
     plant["torque_bias"] = [a + b for a, b in zip(plant["torque_bias"], bias, strict=True)]
 
 
 def add_noise(truth: Truth, share: float) -> None:
-    """Of a standard deviation that is a share of half the reference's peak to peak.
+    """Add noise; its standard deviation is a share of half the reference's peak to peak.
 
-    Encoders have none beside their codes.
+    Encoders have no other noise than their codes.
     """
     if share != 0 and truth.scenario.sensor.kind == "state":
         moving = dataclasses.asdict(truth.scenario) | {"reference": truth.fields["reference"]}
@@ -161,7 +161,7 @@ def add_noise(truth: Truth, share: float) -> None:
 
 
 def seed_noise(truth: Truth, seed: int) -> None:
-    """Of noise that was drawn, or of the phases of encoders; else a sensor has its own seed."""
+    """Set the seed of drawn noise, or of the phases of encoders; else a sensor keeps its seed."""
     fields, sensor = truth.fields["sensor"], truth.scenario.sensor
     if sensor.kind != "state" or fields["noise_std"] != sensor.noise_std:
         truth.fields["sensor"]["seed"] = seed
@@ -183,18 +183,18 @@ def _jitter(truth: Truth, std: float) -> None:
 
 
 def _lose(truth: Truth, share: float) -> None:
-    """Of what gets there already."""
+    """Lose a share of the packets or measurements that arrive."""
     place = _lossy(truth)
     place["loss"] += share * (1 - place["loss"])
 
 
 def _lossy(truth: Truth) -> dict[str, Any]:
-    """What loses something: a network its packets, else the sensor its measurements."""
+    """Return the section with the loss: a network of packets, else the sensor of measurements."""
     return truth.fields["link" if _over_network(truth) else "sensor"]
 
 
 def _seed_link(truth: Truth, seed: int) -> None:
-    """Of jitter and losses that were drawn; a link that is as it was has its own seed."""
+    """Set the seed of drawn jitter and losses; an unchanged link keeps its seed."""
     if truth.fields["delay"]["jitter_std"] != truth.scenario.delay.jitter_std:
         truth.fields["delay"]["seed"] = seed
     own = dataclasses.asdict(truth.scenario)
@@ -255,7 +255,7 @@ def _move_anchors(truth: Truth, errors: tuple[float, ...]) -> None:
 
 
 class Scales(NamedTuple):
-    """What shares are taken of, SI units."""
+    """Scales that shares refer to, SI units."""
 
     plate_mass: float
     motion: tuple[float, ...]
@@ -275,7 +275,7 @@ class Scales(NamedTuple):
 
 
 class About(NamedTuple):
-    """What machines are drawn with."""
+    """Ranges and scales that machines are drawn with."""
 
     ranges: Ranges
     scales: Scales
@@ -311,7 +311,7 @@ def draw(ranges: Ranges, scales: Scales, scenario: Scenario, seed: int, index: i
 
 
 def _of_random_size(rng: Generator, number: int, largest: float) -> tuple[float, ...]:
-    """So many values whose rms is uniform in [0, largest], in a direction that is uniform too."""
+    """Draw values whose rms is uniform in [0, largest], in a uniform direction."""
     size, direction = largest * rng.uniform(), rng.standard_normal(number)
     return tuple((size * np.sqrt(number) / np.linalg.norm(direction) * direction).tolist())
 
@@ -380,7 +380,7 @@ MACHINE: Final[Model] = {
     ),
     "link_seed": Quantity(draw_seed, _seed_link),
 }  # fmt: skip
-"""True less believed, of what `Ranges` says how far it may be off."""
+"""True less believed value of each quantity of `Ranges`."""
 
 
 # ---------------------------------------------------------------- runs

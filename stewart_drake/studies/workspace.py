@@ -99,11 +99,11 @@ def size_motors(dynamics: StewartDynamics, reference: Trajectory, time: Array) -
 
 @dataclass(frozen=True)
 class WorkspaceStudy:
-    """What `analyze workspace` finds.
+    """Result of `analyze workspace`.
 
     Attributes:
         experiment: the scenario made concrete, reachable or not.
-        home: why the home pose is no place to work from, or None.
+        home: why the home pose is unusable, or None.
         exit: when and why the reference first leaves the workspace, or None.
         margins: along the reference.
         factor: largest amplitude factor that fits.
@@ -171,7 +171,7 @@ class WorkspaceStudy:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` holds; SI units, NaN where a value does not exist."""
+        """Content of `summary.json`, SI units; NaN for a missing value."""
         m, (time, leg, margin) = self.margins, self.worst
         return {
             "verdict": self.verdict,

@@ -26,7 +26,7 @@ from stewart_drake.types import Array
 
 
 class Measures(NamedTuple):
-    """Of one pose; NaN from `transmission` on where the pose is out of the workspace."""
+    """Measures of one pose; NaN from `transmission` on for a pose outside the workspace."""
 
     reach: Array
     """(6,) reach margin of each leg, m, negative where short."""
