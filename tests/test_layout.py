@@ -225,7 +225,7 @@ def test_a_judgement_is_of_all_instants_and_a_run() -> None:
     found = json.loads(judge(asked, "paper"))
     along = margins_along(PAPER, assemble(asked.scenario).reference, check_instants(1.5))
     assert found["measures"]["reach"] == pytest.approx(along.reach.min(), abs=1e-4)
-    assert found["measures"]["clearance"] == found["nearest"]["distance"] < 0
+    assert found["measures"]["clearance"] == found["nearest"][1] < 0
     assert found["outcome"]["status"] == "completed"
     assert set(found["measures"]) == {*MEASURES, "parallel"}
 
