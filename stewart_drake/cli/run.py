@@ -244,8 +244,8 @@ def report(
     """
     from stewart_drake.loop.experiment import simulated_machine
     from stewart_drake.reporting import report as report_document
-    from stewart_drake.reporting.report import collect
     from stewart_drake.reporting.page import Provenance, command_line
+    from stewart_drake.reporting.report import collect
     from stewart_drake.reporting.results import PAGE, AnalysisResult
 
     delivery = Delivery(out, quiet, as_json)

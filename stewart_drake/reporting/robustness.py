@@ -24,7 +24,6 @@ from stewart_drake.studies.robustness_result import (
 )
 from stewart_drake.studies.statistics import (
     Correlation,
-    Explanation,
     Interval,
     Pair,
     Separation,
