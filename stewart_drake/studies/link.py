@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.scenario.config import NetworkConfig, Scenario
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.options import Options, option
 
 if TYPE_CHECKING:
