@@ -25,7 +25,7 @@ from stewart_drake.mechanism import kinematics
 from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.reporting.robustness import document, influence_figure
 from stewart_drake.scenario.config import Scenario, StateSensorConfig
-from stewart_drake.studies import robustness, statistics
+from stewart_drake.studies import statistics, uncertainty
 from stewart_drake.studies.ranges import Ranges, read_ranges
 from stewart_drake.studies.robustness import RobustnessOptions, study_robustness
 from stewart_drake.studies.robustness_result import RobustnessStudy, factor_values, table
@@ -813,7 +813,7 @@ def test_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) ->
     def interrupted(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(robustness, "run_jobs", interrupted)
+    monkeypatch.setattr(uncertainty, "run_jobs", interrupted)
     assert main(["analyze", "robustness", "--out", str(tmp_path)]) == 130
     assert "finished runs are kept" in capsys.readouterr().err
     assert main(["analyze", "robustness"]) == 130
