@@ -14,7 +14,7 @@ from stewart_drake.files.resources import shipped
 from stewart_drake.loop import scene
 from stewart_drake.loop.platforms import build_viewer
 from stewart_drake.loop.sampling import let_go
-from stewart_drake.loop.scene import CRANK_PARTS, crank_paths
+from stewart_drake.loop.scene import CRANK_PARTS, crank_paths, pointer, ring
 from stewart_drake.reporting import replay as replay_module
 from stewart_drake.reporting.replay import replay_html
 from stewart_drake.scenario.signals import LEGS
@@ -117,3 +117,12 @@ def test_a_run_that_ends_outside_is_shown_up_to_there(run):
     signals.pose.values[-3:, 5] += 1.0
     outside = dataclasses.replace(run, signals=signals)
     assert "off by" in replay_html(outside, PAPER, "outside")
+
+
+def test_the_ring_is_a_closed_surface_around_the_plate():
+    for vertices, faces in (ring(0.1), pointer(0.1)):
+        edges = np.sort(np.hstack([faces[[0, 1]], faces[[1, 2]], faces[[2, 0]]]), axis=0)
+        _, counts = np.unique(edges, axis=1, return_counts=True)
+        assert (counts == 2).all(), "every edge belongs to two triangles"
+        assert np.hypot(*vertices[:2]).min() > 0.1, "the plate stays visible"
+        assert set(np.unique(faces)) == set(range(vertices.shape[1]))
