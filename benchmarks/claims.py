@@ -41,14 +41,18 @@ AMPLITUDE = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
 """Of the reference, rad and m."""
 BIAS = 3e-4
 """Torque bias of each motor, N m; its sign is drawn."""
+OFFSET = float(np.deg2rad(0.1))
+"""Of each encoder, rad; its sign is drawn."""
 
 ON = ("start=on_reference", "queue=reference")
 NONE = "controller.estimate=[]"
 PAYLOAD = "plant.payload_mass=0.4"
+THREE = (PAYLOAD, "plant.joint_damping=1e-3")
 HALF = f"reference.amplitude={(0.5 * AMPLITUDE).tolist()}"
 NETWORK = (*ON, "link.kind=network", "link.low=0.5", "link.high=0.9", "link.playout=0.9")
 ENCODERS = "sensor.kind=encoders"
 OFTEN = "sensor.samples=100"
+NARROW = "controller.prior={torque_bias: 0.003, payload: 0.5, damping: 0.003}"
 IDENTIFIED = "controller.prior={torque_bias: 0.00006, payload: 0.01, damping: 0.00006}"
 
 
@@ -84,6 +88,7 @@ def of_seed(drawn: str, seed: int) -> list[str]:
         "noise": (noise(1e-3), f"sensor.seed={seed}"),
         "half_noise": (noise(5e-4), f"sensor.seed={seed}"),
         "codes": (f"sensor.seed={seed}",),
+        "offsets": (f"sensor.offset={(OFFSET * signs).tolist()}",),
         "losses": (f"sensor.seed={seed}",),
         "packets": (f"link.seed={seed}",),
         "jitter": (f"delay.seed={seed}",),
@@ -366,26 +371,83 @@ def push() -> list[Row]:
 
 def encoders() -> list[Row]:
     """Motor encoders in the place of the measured state."""
-    rows = []
+    rows, fourteen = [], "sensor.bits=14"
 
-    def add(name: str, words: str, *settings: str, drawn: str = "codes") -> None:
-        rows.append(Row(name, words, (*settings, ENCODERS), drawn))
+    def add(name: str, words: str, *settings: str, drawn: str = "codes", **other: Any) -> None:
+        rows.append(Row(name, words, (*settings, ENCODERS), drawn, **other))
 
-    add("codes-exact", "exact, one sample", *ON, "sensor.bits=null", drawn="")
-    for bits in (20, 17, 14, 12):
-        add(f"codes-{bits}", f"{bits} bit, one sample", *ON, f"sensor.bits={bits}")
-    fourteen = "sensor.bits=14"
-    add("codes-14-1k", "14 bit, 1 kHz", *ON, OFTEN, fourteen)
-    add("rest-codes-14", "from rest, 14 bit, one sample", fourteen)
-    add("identified-14", "priors as identified, 14 bit", *ON, fourteen, IDENTIFIED)
+    for end, often, samples in (("", "one sample", ()), ("-1k", "1 kHz", (OFTEN,))):
+        exact = f"exact, {often}"
+        add(f"codes-exact{end}", exact, *ON, "sensor.bits=null", *samples, drawn="")
+        for bits in (20, 17, 14, 12):
+            code = (f"sensor.bits={bits}", *samples)
+            add(f"codes-{bits}{end}", f"{bits} bit, {often}", *ON, *code)
+            if bits < 17:
+                add(f"rest-codes-{bits}{end}", f"from rest, {bits} bit, {often}", *code)
+    for name, prior in (("narrow", NARROW), ("identified", IDENTIFIED)):
+        for bits, samples in ((17, ()), (14, ()), (14, (OFTEN,)), (12, (OFTEN,))):
+            end, often = ("-1k", "1 kHz") if samples else ("", "one sample")
+            words = f"priors {name}, {bits} bit, {often}"
+            code = f"sensor.bits={bits}"
+            add(f"{name}-{bits}{end}", words, *ON, *samples, code, prior)
+    for name, words, prior in (("three", "", ()), ("three-narrow", ", narrow priors", (NARROW,))):
+        for bits in (14, 12):
+            settings = (*ON, OFTEN, f"sensor.bits={bits}", *THREE, *prior)
+            what = f"bias, payload, damping 1e-3, {bits} bit, 1 kHz{words}"
+            add(f"{name}-codes-{bits}-1k", what, *settings, drawn="codes bias")
+    for bits in (20, 17, 14):
+        for end, often, samples in (("", "one sample", 1), ("-1k", "1 kHz", 10)):
+            code = (f"sensor.bits={bits}", f"sensor.samples={samples}")
+            words = f"`gravity`, 10 s, {bits} bit, {often}"
+            add(f"gravity-codes-{bits}{end}", words, *code, scenario="gravity")
+    estimate = "controller.estimate=[torque_bias,payload,damping"
+    for name, words, also in (("off", "not looked for", ""), ("found", "estimated", ",offsets")):
+        add(
+            f"offsets-{name}",
+            f"offsets of 0.1 degree, {words}, narrow priors, 14 bit, 1 kHz",
+            *(*ON, OFTEN, fourteen, NARROW, f"{estimate}{also}]"),
+            drawn="codes offsets",
+        )
+    faults = {
+        "nan": ("5 % NaN", "{kind: missing, share: 0.05, from: 0, to: 100}"),
+        "silent-leg": ("a leg silent for 1 s", "{kind: missing, leg: 2, from: 4, to: 5}"),
+        "frozen-leg": ("a leg frozen for 0.4 s", "{kind: frozen, leg: 3, from: 4, to: 4.4}"),
+        "silent": ("all silent for 0.5 s", "{kind: missing, from: 4, to: 4.5}"),
+        "spikes": ("1 % spikes", "{kind: spike, share: 0.01, from: 0, to: 100}"),
+    }
+    for name, (words, fault) in faults.items():
+        for end, often, samples in (("", "one sample", ()), ("-1k", "1 kHz", (OFTEN,))):
+            if samples or name == "nan":
+                settings = (*ON, fourteen, *samples, f"sensor.faults=[{fault}]")
+                add(f"faults-{name}{end}", f"{words}, 14 bit, {often}", *settings)
+    wrong = ("controller.delay_estimator=constant", *believed(0.7), OFTEN, fourteen)
+    add("codes-found", "delay believed 0.7 s and found, 14 bit, 1 kHz", *ON, *wrong)
+    add("rest-codes-found", "from rest, believed 0.7 s and found, 14 bit, 1 kHz", *wrong)
     return rows
 
 
 def servos() -> list[Row]:
     """Position servos, bias, payload and damping 3e-4 unknown."""
-    settings = (*ON, PAYLOAD, "plant.joint_damping=3e-4", "actuator.kind=servo")
-    words = "bias, payload, damping 3e-4 unknown, servos of 10 Hz"
-    return [Row("servo-preview", words, settings, "bias", "servo_preview")]
+    rows = []
+    for fall, load in (("", ()), ("gravity-", ("plant.gravity=true",))):
+        settings = (*ON, PAYLOAD, "plant.joint_damping=3e-4", "actuator.kind=servo", *load)
+        for controller, hz, known in (
+            *(("servo_preview", hz, False) for hz in ((10,) if load else (10, 2, 5, 20))),
+            ("servo_feedforward", 10, False),
+            ("servo_feedforward", 10, True),
+        ):
+            name = controller.replace("_", "-") + (f"-{hz}" if hz != 10 else "")
+            words = f"servos of {hz} Hz{', full gravity' if load else ''}"
+            bandwidth = (f"actuator.bandwidth={hz}",) if hz != 10 else ()
+            row = Row(f"{fall}{name}", words, (*settings, *bandwidth), "bias", controller)
+            rows.append(both(row)[1] if known else row)
+        for law in ("predictor_lqi", "adaptive_lqi"):
+            motors = tuple(one for one in settings if "servo" not in one)
+            name = f"{fall}{law.replace('_lqi', '')}-all"
+            words = f"law across the delay{', full gravity' if load else ''}"
+            if load or law != "predictor_lqi":  # without gravity, the row `all`
+                rows.append(Row(name, words, motors, "bias", law))
+    return rows
 
 
 def network() -> list[Row]:
