@@ -21,7 +21,7 @@ from _page import run_sections, size
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
-from stewart_drake.loop import controller
+from stewart_drake.loop import sampling
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.link import delay_at
 
@@ -76,7 +76,7 @@ def believed(eta: float) -> tuple[str, ...]:
 
 def run(kind: str, settings: Sequence[str], scenario: str = "paper") -> Outcome:
     """One run."""
-    controller.time = CpuTime  # type: ignore[assignment,attr-defined]
+    sampling.time = CpuTime  # type: ignore[assignment,attr-defined]
     chosen = ("plant.kind=exact", f"controller.delay_estimator={kind}", *settings)
     asked = sd.load_scenario(scenario, settings=chosen)
     result = simulate(asked, judge_stability=False)

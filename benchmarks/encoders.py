@@ -21,7 +21,7 @@ from joblib import Parallel, delayed
 import stewart_drake as sd
 from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop import controller
+from stewart_drake.loop import sampling
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.simulation import make_simulator, simulate
 
@@ -52,7 +52,7 @@ def in_python(law: PredictiveLqi) -> PredictiveLqi:
 
 def median_step(settings: Sequence[str], seed: int) -> float:
     """Return the median CPU time of a step, ms, of the law in Python."""
-    controller.time = CpuTime  # type: ignore[assignment,attr-defined]
+    sampling.time = CpuTime  # type: ignore[assignment,attr-defined]
     base = ("plant.kind=exact", "sensor.kind=encoders", f"sensor.seed={seed}", *ON_REFERENCE)
     state = any(setting == "sensor.kind=state" for setting in settings)
     chosen = (base[0], *ON_REFERENCE, *settings) if state else (*base, *settings)
