@@ -1,5 +1,8 @@
 """Runs are shown live in Meshcat: where the machine is, where it should be, what its motors do."""
 
+import contextlib
+import gc
+import socket
 import time
 
 import msgpack
@@ -10,6 +13,7 @@ from pydrake.geometry import Meshcat, MeshcatParams
 import stewart_drake as sd
 from stewart_drake.loop.scene import Scene, crank_paths, full_color, torque_color, torque_shares
 from stewart_drake.mechanism.kinematics import rotation
+from stewart_drake.reporting.replay import replay
 from stewart_drake.scenario.signals import LEGS
 
 PAPER = sd.load_mechanism("paper")
@@ -99,6 +103,14 @@ def test_the_camera_sees_a_machine_of_any_size(name):
     assert size < np.linalg.norm(eye - target) < 3 * size
 
 
+def test_a_scene_begins_without_the_colours_of_the_one_before(meshcat):
+    with contextlib.closing(Scene(PAPER, meshcat)) as scene:
+        scene.paint(np.ones(6))
+    assert meshcat._GetPackedProperty(crank(3), "color")
+    Scene(PAPER, meshcat).close()
+    assert not meshcat._GetPackedProperty(crank(3), "color")
+
+
 def test_colours_are_of_the_usual_torque():
     assert full_color(np.array([])) == full_color(np.zeros(3)) == 1
     assert full_color(np.array([0.0] * 99 + [0.4])) == 0.4, "before that there was none"
@@ -107,3 +119,29 @@ def test_colours_are_of_the_usual_torque():
     for share, expected in ((-1, "0072b2"), (0, "dadada"), (1, "d55e00")):
         got = "".join(f"{round(255 * part):02x}" for part in torque_color(share))
         assert got == expected
+
+
+def listening(port: int) -> bool:
+    try:
+        socket.create_connection(("localhost", port), 1).close()
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("show", ["live", "replay"])
+def test_meshcat_goes_with_its_last_user_and_waits_for_no_collection_of_garbage(show):
+    """One that is collected in another thread than its own ends the process."""
+    made = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    port = made.port()
+    scenario = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=0.06"))
+    gc.disable()
+    try:
+        run = sd.simulate(scenario, meshcat=made if show == "live" else None, judge_stability=False)
+        if show == "replay":
+            replay(run.signals, PAPER, made)
+        assert listening(port)
+        del made
+        assert not listening(port)
+    finally:
+        gc.enable()
