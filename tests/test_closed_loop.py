@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import stewart_drake as sd
+from stewart_drake.dynamics.workspace import standing
 from stewart_drake.files.resources import data_root
+from stewart_drake.loop import metrics
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.scenario.signals import LEGS
@@ -45,6 +47,17 @@ def test_joints_stay_closed_through_a_multibody_run(settings: tuple[str, ...]) -
             worst = max(worst, float(np.linalg.norm(next(ends) - next(ends))))
     assert simulator.get_context().get_time() == pytest.approx(end)
     assert worst < 1e-6
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+def test_torques_arrive_after_the_delay_and_not_before(plant: str) -> None:
+    result = run(f"plant.kind={plant}", "duration=1.6")
+    time = result.signals.time.values
+    commanded = result.signals["torque_commanded"].values
+    for t, torque in zip(time, result.signals["torque_applied"].values, strict=True):
+        sent = np.flatnonzero(time <= t - 0.8 + 1e-9)
+        expected = commanded[sent[-1]] if len(sent) else np.zeros(6)
+        np.testing.assert_array_equal(torque, expected)
 
 
 @pytest.mark.parametrize(
@@ -91,6 +104,30 @@ def test_nonlinear_prediction_previews_the_reference() -> None:
     assert run(*full, controller="delay_lqi").accumulated_error == pytest.approx(13.7, rel=5e-3)
     lost = run(*law, "controller.w_Q=10", controller="delay_lqr")
     assert lost.status == "left_workspace"
+
+
+def test_the_floor_from_rest_is_the_area_above_one_minus_cosine() -> None:
+    """Integral of |sin t| / 2 * 100 over 0.8 s; the trapezoid on 20 ms loses h^2/12 of it."""
+    time = np.arange(0, 10.01, 0.02)
+    reference = np.tile(np.sin(time)[:, None], 6)
+    floor = metrics.delay_floor(time, reference, np.full(6, 2.0), 0.8)
+    exact = 50 * (1 - np.cos(0.8))
+    assert floor == pytest.approx(exact * (1 - 0.02**2 / 12), rel=1e-6)
+    assert floor == pytest.approx(run(EXACT, "duration=1.0").summary["delay_floor"], rel=1e-9)
+
+
+@pytest.mark.parametrize("plant", ["exact", "multibody"])
+def test_a_run_that_leaves_the_workspace_says_when_and_which_leg(plant: str) -> None:
+    result = run(f"plant.kind={plant}", controller="lqr")
+    assert result.status == "left_workspace"
+    assert np.isnan(result.accumulated_error)
+    stopped = result.stopped
+    assert stopped is not None and stopped.leg is not None
+    assert 1.2 < stopped.time < 1.6
+    assert result.failure is not None and f"leg {stopped.leg}" in result.failure
+    sines = standing(sd.load_mechanism("paper"), result.signals.pose.values[-1]).sines
+    assert np.argmin(sines) == stopped.leg - 1  # nearest to its dead centre in the last log row
+    assert result.signals.time.values[-1] <= stopped.time
 
 
 def test_the_predictor_beats_the_delay_on_both_plants() -> None:

@@ -106,6 +106,15 @@ def test_a_delay_that_is_next_to_whole_is_whole(tiny: float) -> None:
     assert sc.delay.fraction == 1e-9
 
 
+def test_torque_is_limited_before_the_chain() -> None:
+    run = result("duration=1.2", "actuator.torque_limit=0.5", "delay.steps=2")
+    assert run.summary["peak_torque_applied"] <= 0.5
+    assert np.abs(run.signals.torque_applied.values).max() <= 0.5
+    limited = result("duration=0.6", "delay.steps=2", "actuator.torque_limit=0.004", *ON_REFERENCE)
+    assert np.abs(limited.signals.torque_applied.values).max() == 0.004
+    assert limited.summary["counts"]["saturated_steps"] > 0
+
+
 # How it begins.
 
 
