@@ -66,7 +66,7 @@ BAD_ARGUMENTS = [
     (["tune", "evaluate", "--scenarios", "0"], "--scenarios"),
     (["tune", "evaluate", "--scenarios", "1"], "--scenarios"),
     (["tune", "evaluate", "--family", "T", "--scenarios", "1"], "--scenarios"),
-    (["tune", "evaluate", "--family", "Q"], "--family"),
+    (["tune", "evaluate", "--family", "Q"], "'--family': 'Q' is not one of"),
     (["tune", "evaluate", "tuner", "tuner"], "WEIGHTS"),
     (["tune", "evaluate", "tuner", "tuner", "--family", "T"], "weights"),
     (["tune", "evaluate", "--family", "T", "--controller", "lqi"], "--controller"),

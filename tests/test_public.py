@@ -47,7 +47,7 @@ def test_the_signature_of_an_analysis_shows_its_options():
     shown = inspect.signature(sd.analyze_robustness).parameters
     assert list(shown)[:2] == ["scenario", "runs"] and shown["runs"].default == 200
     assert shown["limit"].kind is inspect.Parameter.KEYWORD_ONLY
-    assert "limit: A run above, in % s" in (sd.analyze_robustness.__doc__ or "")
+    assert "limit: E_ac above which a run counts as failed, % s" in (sd.analyze_robustness.__doc__ or "")
 
 
 def test_a_scenario_tells_what_is_not_as_usual():

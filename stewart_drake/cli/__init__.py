@@ -140,7 +140,7 @@ def _usage_message(error: Any) -> str:
         return f"--{option}: got an option of 0.2; expected --{RENAMED[option]}"
     if getattr(error, "possibilities", None):
         return f"{error.message}; did you mean {error.possibilities[0]}?"
-    message = error.format_message().rstrip(".")
+    message = error.format_message().rstrip(".").replace(": Value error, ", ": ")  # pydantic's
     if message.endswith("?"):
         return message
     command = "stewart-drake" if error.ctx is None else error.ctx.command_path

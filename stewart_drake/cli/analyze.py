@@ -28,7 +28,7 @@ from stewart_drake.reporting.terminal import count_bar
 if TYPE_CHECKING:
     from stewart_drake.scenario.config import Scenario
 
-app = typer.Typer(rich_markup_mode=None, help="Tell beforehand what can be controlled, and how.")
+app = typer.Typer(rich_markup_mode=None, help="Analyse a loop before it is built.")
 
 
 class _Command(TyperCommand):

@@ -63,14 +63,16 @@ Settings = Annotated[
     typer.Option(
         "--set",
         metavar="FIELD=VALUE",
-        help="E.g. plant.gravity=true; repeatable.",
+        help="Set a field, such as plant.gravity=true; repeatable.",
         autocompletion=complete_setting,
     ),
 ]
 Controller = Annotated[
-    str | None, typer.Option(metavar="NAME|FILE", help="Laid over the scenario's own.")
+    str | None, typer.Option(metavar="NAME|FILE", help="Controller in place of the scenario's.")
 ]
-Out = Annotated[Path | None, typer.Option(metavar="DIR", help="For summary, signals, figures.")]
+Out = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="Folder of summary, signals and figures.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
 

@@ -19,39 +19,41 @@ Tolerance = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME=VALUE",
-        help="How far off it may be, a standard deviation, 0: known. Repeatable. "
+        help="Standard deviation of an unknown, 0: known. Repeatable. "
         + "; ".join(f"{name}: {unit}" for name, unit in TOLERANCE_UNITS.items())
         + ".",
     ),
 ]
 Bits = Annotated[
     int | None,
-    typer.Option(metavar="N", help="Of the encoders of a CSV log, per turn; 14 by default."),
+    typer.Option(metavar="N", help="Bits per turn of the encoders of a CSV log; 14 by default."),
 ]
 Gravity = Annotated[
     bool | None,
-    typer.Option(help="Whether gravity acted in a CSV log, as by default, or was balanced."),
+    typer.Option(help="Gravity acts on the machine of a CSV log, or is balanced."),
 ]
 
 
 def identify(
     logs: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[LOG]...", help="signals.nc of simulate, or CSV; of one machine."),
+        typer.Argument(
+            metavar="[LOG]...", help="Logs of one machine: signals.nc of simulate, or CSV."
+        ),
     ] = None,
     mechanism: Annotated[
-        str | None, typer.Option(metavar="NAME|FILE", help="As drawn; needed with logs.")
+        str | None, typer.Option(metavar="NAME|FILE", help="Mechanism as drawn; needed with logs.")
     ] = None,
     plan: Annotated[
         str | None,
         typer.Option(
-            metavar="SCENARIO", help="Instead of logs: a motion to log, and what it would tell."
+            metavar="SCENARIO", help="Plan a motion to log for this scenario, without logs."
         ),
     ] = None,
     settings: Settings = None,
     delay: Annotated[
         float | None,
-        typer.Option(metavar="S", help="Believed; that of the log by default, or 0.1 s."),
+        typer.Option(metavar="S", help="Assumed delay; that of the log by default, or 0.1 s."),
     ] = None,
     tolerance: Tolerance = None,
     bits: Bits = None,
@@ -59,7 +61,7 @@ def identify(
         str | None,
         typer.Option(
             metavar="RAD,M",
-            help="Errors of poses; 1e-4,2e-5 in a CSV log. With --plan: poses are measured too.",
+            help="Errors of measured poses; 1e-4,2e-5 in a CSV log. With --plan: measure poses.",
         ),
     ] = None,
     gravity: Gravity = None,

@@ -50,18 +50,16 @@ def live(
     *,
     scenario: ScenarioName = "paper",
     machine: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Where the machine listens.")
+        str | None, typer.Option(metavar="HOST:PORT", help="Address of the machine.")
     ] = None,
     demo: Annotated[
         bool,
         typer.Option(
             "--demo",
-            help="Start a simulated machine too, each way 0.35 to 0.4 of the scenario's delay.",
+            help="Start a simulated machine too, with 0.35 to 0.4 of the delay each way.",
         ),
     ] = False,
-    no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Without a page; only what is printed.")
-    ] = False,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Open no page.")] = False,
     given: Given,
     controller: Controller = None,
     settings: Settings = None,

@@ -23,14 +23,15 @@ from stewart_drake.cli.common import (
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.reporting.terminal import echo
 
-app = typer.Typer(rich_markup_mode=None, help="Look at a mechanism.")
+app = typer.Typer(rich_markup_mode=None, help="Check and view a mechanism.")
 
 
 @app.command()
 def sdf(
     mechanism: MechanismName,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Instead of standard output.")
+        Path | None,
+        typer.Option(metavar="FILE", help="File to write, in place of standard output."),
     ] = None,
 ) -> None:
     """Write a mechanism as SDFormat."""
@@ -49,7 +50,7 @@ def sdf(
 def check(
     mechanism: MechanismName,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="For summary and a drawing.")
+        Path | None, typer.Option(metavar="DIR", help="Folder of summary and drawing.")
     ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -76,7 +77,7 @@ def check(
 def view(
     mechanism: MechanismName,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="For a page of the home pose; then end.")
+        Path | None, typer.Option(metavar="DIR", help="Write a page of the home pose, and end.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -102,7 +103,7 @@ def view(
 @with_options(Measurements)
 def new(
     *,
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="For the two files.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the two files.")],
     given: Given,
     quiet: Quiet = False,
     as_json: AsJson = False,

@@ -47,14 +47,16 @@ def simulate(
     controller: Controller = None,
     settings: Settings = None,
     out: Out = None,
-    csv: Annotated[bool, typer.Option("--csv", help="Write signals.csv too; needs --out.")] = False,
+    csv: Annotated[
+        bool, typer.Option("--csv", help="Also write signals.csv; needs --out.")
+    ] = False,
     replay: Annotated[
         bool, typer.Option("--replay", help="Write replay.html, a 3-D animation; needs --out.")
     ] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
     meshcat: Annotated[
-        bool, typer.Option("--meshcat", help="Show it in a browser, live and as a replay.")
+        bool, typer.Option("--meshcat", help="Show the run in a browser, live and as a replay.")
     ] = False,
 ) -> int:
     """Run one scenario."""
@@ -149,9 +151,10 @@ def _pictures(names: Iterable[str]) -> list[str]:
 
 
 def export(
-    signals: Annotated[Path, typer.Argument(metavar="FILE.nc", help="Saved by a simulation.")],
+    signals: Annotated[Path, typer.Argument(metavar="FILE.nc", help="Signals that a run saved.")],
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Instead of standard output.")
+        Path | None,
+        typer.Option(metavar="FILE", help="File to write, in place of standard output."),
     ] = None,
 ) -> None:
     """Convert saved signals to CSV.
@@ -171,11 +174,13 @@ def export(
 
 def export_c(
     scenario: ScenarioName = "paper",
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where it goes.")] = Path("out/export-c"),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path(
+        "out/export-c"
+    ),
     controller: Controller = None,
     settings: Settings = None,
     single: Annotated[
-        bool, typer.Option("--single", help="Numbers of single precision; without estimator.")
+        bool, typer.Option("--single", help="Use single precision; without estimator.")
     ] = False,
 ) -> None:
     """Write the controller as C, for a board.
@@ -234,7 +239,7 @@ def report(
     scenario: ScenarioName = "paper",
     controller: Controller = None,
     settings: Settings = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where it goes.")] = Path("out/report"),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path("out/report"),
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:

@@ -24,9 +24,11 @@ from stewart_drake.tuning.options import DataOptions, TrainingOptions, WorthOpti
 if TYPE_CHECKING:
     from stewart_drake.tuning.training import Training
 
-app = typer.Typer(rich_markup_mode=None, help="Data for the neural tuner, its training, its worth.")
+app = typer.Typer(
+    rich_markup_mode=None, help="Make data for the neural tuner, train it, evaluate it."
+)
 
-Out = Annotated[Path, typer.Option(metavar="DIR", help="Where runs, results and summary go.")]
+Out = Annotated[Path, typer.Option(metavar="DIR", help="Folder of runs, results and summary.")]
 
 
 @app.command()
@@ -62,10 +64,12 @@ def dataset(
 @with_options(TrainingOptions)
 def train(
     *,
-    data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder or file of tune dataset.")],
+    data: Annotated[
+        Path, typer.Argument(metavar="DATA", help="Folder or file that tune dataset wrote.")
+    ],
     given: Given,
     out: Annotated[
-        Path, typer.Option(metavar="FILE", help="For the network; figures go beside it.")
+        Path, typer.Option(metavar="FILE", help="File of the network; figures go to its folder.")
     ] = Path("out/tuner/tuner.json"),
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -105,7 +109,7 @@ def evaluate(
     ] = None,
     out: Out = Path("out/tuner/evaluation"),
     scenario: Annotated[
-        str, typer.Option(metavar="SCENARIO", help="Shipped name or file, to be varied.")
+        str, typer.Option(metavar="SCENARIO", help="Shipped name or file.")
     ] = "paper",
     controller: Controller = None,
     settings: Settings = None,

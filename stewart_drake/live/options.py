@@ -9,12 +9,12 @@ from stewart_drake.studies.options import Options, option
 class Settings(Options):
     """How a machine is run."""
 
-    rate: float = option(1.0, "Seconds of the machine in a second.", ge=1e-3, le=1e3)
+    rate: float = option(1.0, "Speed of the machine's clock, 1: real time.", ge=1e-3, le=1e3)
     watchdog: float = option(1.0, "Seconds of silence before the safe torque.", ge=1e-2, le=1e4)
-    safe: Literal["zero", "hold"] = option("zero", "The safe torque: none, or the last one.")
+    safe: Literal["zero", "hold"] = option("zero", "Safe torque: zero, or the last one.")
     restart: Literal["rest", "motion"] = option(
         "rest",
-        "Where a new session begins: put back, or as it is. A plate that has left "
+        "Start of a new session: reset, or as it is. A plate that has left "
         "its workspace is put back.",
     )
 
@@ -22,21 +22,23 @@ class Settings(Options):
 class MachineOptions(Settings):
     """Options of a simulated machine in real time."""
 
-    port: int = option(47000, "UDP; 0 is any.", ge=0, le=65535)
-    host: str = option("127.0.0.1", "To listen at; beyond loopback with a key.")
-    key: Path | None = option(None, "File whose bytes both sides share.", "FILE")
-    duration: float = option(0.0, "Seconds of the machine, then it ends; 0: until Ctrl-C.", ge=0)
+    port: int = option(47000, "UDP port; 0: any free one.", ge=0, le=65535)
+    host: str = option("127.0.0.1", "Address to listen at; beyond loopback with a key.")
+    key: Path | None = option(None, "File with the shared key.", "FILE")
+    duration: float = option(0.0, "Seconds after which the machine ends; 0: at Ctrl-C.", ge=0)
 
 
 class LiveOptions(Options):
     """Options of the loop in real time."""
 
-    duration: float | None = option(None, "s; until it is stopped by default.", "S", ge=0.1)
-    armed: bool = option(False, "Drive a machine that is no simulation.", name="arm")
-    key: Path | None = option(None, "File whose bytes both sides share.", "FILE")
+    duration: float | None = option(
+        None, "Duration, s; until it is stopped by default.", "S", ge=0.1
+    )
+    armed: bool = option(False, "Drive a real machine.", name="arm")
+    key: Path | None = option(None, "File with the shared key.", "FILE")
     max_missing: float | None = option(
         None,
-        "Without measurements, then it ends; by the estimator's uncertainty by default.",
+        "Longest gap of measurements; by the estimator's uncertainty by default.",
         "SECONDS",
         ge=0.001,
     )

@@ -48,12 +48,12 @@ class Analysis(NamedTuple):
 ANALYSES: Final = {
     "hautus": Analysis(
         "hautus",
-        "Whether every model can be controlled and observed, by mode.",
+        "Check controllability and observability, by mode.",
         ("analyze hautus paper --out out/hautus",),
     ),
     "delay": Analysis(
         "delay_limits",
-        "How much delay the open loop, and the closed one, can bear.",
+        "Find the delay that the loop tolerates.",
         ("analyze delay gravity --out out/delay",),
         counts="simulations",
         controller=True,
@@ -61,7 +61,7 @@ ANALYSES: Final = {
     ),
     "link": Analysis(
         "link",
-        "Which play-out bound suits a network, and what loss it bears.\n\n"
+        "Find the best play-out bound of a network.\n\n"
         "Needs --set link.kind=network or a scenario with a network.",
         ("analyze link paper --set link.kind=network --out out/link",),
         counts="simulations",
@@ -70,15 +70,15 @@ ANALYSES: Final = {
     ),
     "workspace": Analysis(
         "workspace",
-        "Whether the motion fits the machine, and what the motors do.\n\n"
-        "A motion that does not fit is analysed too. Shown are the reach that each leg has left, "
-        "how\nlarge the motion may be, and torque, speed and power of each motor.",
+        "Check whether the motion fits the machine.\n\n"
+        "Also for a motion that does not fit. Shows the reach margin of each leg, the largest "
+        "feasible\namplitude, and torque, speed and power of each motor.",
         ("analyze workspace paper --out out/workspace",),
     ),
     "robustness": Analysis(
         "robustness",
-        "Monte Carlo: how often it works, how well, and what matters.\n\n"
-        "With --out the same command goes on where it was stopped.",
+        "Run a Monte Carlo study of uncertain machines.\n\n"
+        "With --out the same command continues an interrupted study.",
         ("analyze robustness paper --out out/robustness",),
         counts="runs",
         keeps="runs",
@@ -88,9 +88,9 @@ ANALYSES: Final = {
     ),
     "layout": Analysis(
         "layout",
-        "Search layouts and lengths that suit a motion.\n\n"
-        "The best few become machine files, beside a page that compares them. With --out the same\n"
-        "command goes on where it was stopped.",
+        "Search the layout and lengths of a machine for a motion.\n\n"
+        "Writes the best few as machine files, and a page that compares them. With --out the same\n"
+        "command continues an interrupted search.",
         (
             "layout paper --out out/layout",
             "layout paper --keep crank --keep rod --out out/layout",

@@ -48,7 +48,7 @@ class LayoutOptions(JobOptions):
 
     goal: str = option(
         "condition",
-        "What should be as good as can be: condition, torque, reach, clearance, "
+        "Goal of the search: condition, torque, reach, clearance, "
         "transmission, plate_joint_deg or crank_joint_deg.",
         "NAME",
     )
@@ -61,20 +61,20 @@ class LayoutOptions(JobOptions):
     )
     vary: Mapping[str, tuple[float, float]] | None = option(
         None,
-        "Bounds of a number of the machine's pattern, or of crank or rod; one value fixes it.",
+        "Bounds of a number of the pattern, or of crank or rod; one value fixes it.",
         "NAME=LOW:HIGH",
         read=_read_bounds,
     )
     keep: Sequence[str] = option(
         (),
-        "A number that stays as it is, or branches or plate_order.",
+        "Number to keep, or branches or plate_order.",
         "NAME",
         read=lambda texts, _: texts,
     )
-    best: int = option(3, "How many machines to write.", "N", ge=1)
-    starts: int = option(1, "Searches per arrangement of legs.", "N", ge=1)
-    generations: int = option(100, "Of each search, at most.", "N", ge=1)
-    seed: int = option(0, "Of everything that is drawn.", ge=0)
+    best: int = option(3, "Number of machines to write.", "N", ge=1)
+    starts: int = option(1, "Number of searches per arrangement of legs.", "N", ge=1)
+    generations: int = option(100, "Largest number of generations of a search.", "N", ge=1)
+    seed: int = option(0, "Random seed.", ge=0)
 
 
 def study_layout(

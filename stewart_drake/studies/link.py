@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class LinkOptions(Options):
     """Options of `study_link`."""
 
-    runs: int = option(5, "Seeds for each bound and loss.", "N", ge=1)
+    runs: int = option(5, "Number of seeds for each bound and loss.", "N", ge=1)
 
 
 def study_link(

@@ -28,16 +28,16 @@ class Measurements(Options):
     plate_mass: _Mass = option(..., "Mass of the plate with its load, kg.")
     crank_mass: _Mass = option(..., "Mass of a crank, kg.")
     rod_mass: _Mass = option(..., "Mass of a rod, kg.")
-    shaft_height: float = option(0.0, "Of the shafts, m.", ge=-LARGEST, le=LARGEST)
+    shaft_height: float = option(0.0, "Height of the shafts, m.", ge=-LARGEST, le=LARGEST)
     upright: float = option(
         90.0, "Degrees from the horizon of the planes the cranks turn in.", ge=-180, le=180
     )
     cranks: Literal["apart", "together"] = option(
         "apart", "Of a pair: they point apart, or together."
     )
-    torque_limit: float | None = option(None, "Of each motor, N m.", gt=0, lt=1e6)
-    delay: float = option(0.1, "From computing a torque to feeling it, s.", ge=0, le=5)
-    gravity: bool = option(True, "Whether it acts; a counterbalanced plate feels none.")
+    torque_limit: float | None = option(None, "Torque limit of each motor, N m.", gt=0, lt=1e6)
+    delay: float = option(0.1, "Time from computing a torque to its action, s.", ge=0, le=5)
+    gravity: bool = option(True, "Gravity acts; not on a counterbalanced plate.")
 
     def __init__(self, **values: object) -> None:
         super().__init__(**values)

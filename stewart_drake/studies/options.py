@@ -172,9 +172,11 @@ def refuse(options: Mapping[str, object], why: str) -> None:
 class JobOptions(Options):
     """Options of a study whose runs go to several processes."""
 
-    workers: int | None = option(None, "Processes; all cores by default.", "N", recorded=False)
+    workers: int | None = option(
+        None, "Number of processes; all cores by default.", "N", recorded=False
+    )
     scheduler: str | None = option(
-        None, "Of a Dask cluster to run on instead.", "ADDRESS", recorded=False
+        None, "Address of a Dask scheduler to run on.", "ADDRESS", recorded=False
     )
 
     @property

@@ -33,16 +33,18 @@ class RobustnessOptions(JobOptions):
 
     ranges: Ranges | None = option(
         None,
-        "How far off, 0: not at all. "
+        "Size of a variation, 0: none. "
         + "; ".join(f"{name}: {unit}" for name, unit in RANGE_UNITS.items())
         + ". torque_limit takes null too: as the scenario has it.",
         "NAME=VALUE",
         name="vary",
         read=lambda texts, _: read_ranges(texts),
     )
-    runs: int = option(200, "How many machines to draw.", "N", ge=1)
-    seed: int = option(0, "Of everything that is drawn.", ge=0)
-    limit: float | None = option(None, "A run above, in % s, counts as failed.", "E_AC", gt=0)
+    runs: int = option(200, "Number of machines.", "N", ge=1)
+    seed: int = option(0, "Random seed.", ge=0)
+    limit: float | None = option(
+        None, "E_ac above which a run counts as failed, % s.", "E_AC", gt=0
+    )
     also: Mapping[str, Scenario] | None = option(
         None,
         "Run the same machines with this controller too, such as adaptive_lqi, "

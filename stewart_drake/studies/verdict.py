@@ -140,9 +140,8 @@ def loop_verdict(loop: ControllerMargin) -> str:
     m = loop.margins
     up = f"{m.gain_up:.4g}" if math.isfinite(m.gain_up) else "any"
     return (
-        f"this loop is stable: {where}, it bears a true delay {milliseconds(m.shorter)} shorter "
-        f"to {milliseconds(m.longer)} longer and motors {m.gain_down:.3g} to {up} times as "
-        f"strong{_left_out(loop)}"
+        f"this loop is stable: {where}, for delay errors from -{milliseconds(m.shorter)} to "
+        f"+{milliseconds(m.longer)} and motor gains from {m.gain_down:.3g} to {up}{_left_out(loop)}"
     )
 
 
@@ -152,7 +151,7 @@ def loop_word(margin: MarginSummary | None) -> str:
         return "not judged"
     if not margin["stable"]:
         return f"unstable, {margin['spectral_radius']:.3g} fold per period"
-    return f"stable, bears a delay wrong by {milliseconds(min(margin['delay_margin_s']))}"
+    return f"stable, delay margin {milliseconds(min(margin['delay_margin_s']))}"
 
 
 def delay_verdict(experiment: Experiment) -> Verdict:

@@ -21,7 +21,7 @@ class FamilyOptions(JobOptions):
     family: Literal["T", "N2"] | None = option(
         None, "Conditions where weights matter: T with the estimator, N2 without."
     )
-    seed: int = option(0, "Of everything that is drawn.", ge=0)
+    seed: int = option(0, "Random seed.", ge=0)
 
     @property
     def number(self) -> int:
@@ -81,7 +81,7 @@ class WorthOptions(FamilyOptions):
     """Options of the evaluation of a tuner."""
 
     purpose = "evaluation"
-    scenarios: int = option(40, "How many to draw.", "N", ge=2)
+    scenarios: int = option(40, "Number of scenarios.", "N", ge=2)
 
     @property
     def number(self) -> int:
@@ -91,17 +91,19 @@ class WorthOptions(FamilyOptions):
 class TrainingOptions(Options):
     """Options of the training of a network."""
 
-    regret: bool = option(False, "By regret, on data of a --family; else as the paper.")
+    regret: bool = option(False, "Train by regret, on data of a --family; else as in the paper.")
     start: float | None = option(
         None, "With --regret: log10 w_Q / w_R at first; else the best.", "RATIO"
     )
     labels: Labels | None = option(
         None, "What the network learns to answer; best_in_cell by default."
     )
-    split: Split | None = option(None, "What 70 % of are trained on; run by default.")
-    density: Literal["magnitude", "signed"] | None = option(None, "Of (45); magnitude by default.")
-    seed: int = option(0, "Of everything that is drawn.", ge=0)
-    workers: int | None = option(None, "Processes; all cores by default.", "N")
+    split: Split | None = option(None, "Unit of the split into 70 % training data; run by default.")
+    density: Literal["magnitude", "signed"] | None = option(
+        None, "Form of (45); magnitude by default."
+    )
+    seed: int = option(0, "Random seed.", ge=0)
+    workers: int | None = option(None, "Number of processes; all cores by default.", "N")
 
     def check(self) -> None:
         """Refuse options of the other loss.
