@@ -4,7 +4,7 @@ import ast
 import inspect
 import runpy
 import socket
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -47,7 +47,9 @@ def test_the_signature_of_an_analysis_shows_its_options():
     shown = inspect.signature(sd.analyze_robustness).parameters
     assert list(shown)[:2] == ["scenario", "runs"] and shown["runs"].default == 200
     assert shown["limit"].kind is inspect.Parameter.KEYWORD_ONLY
-    assert "limit: E_ac above which a run counts as failed, % s" in (sd.analyze_robustness.__doc__ or "")
+    assert "limit: E_ac above which a run counts as failed, % s" in (
+        sd.analyze_robustness.__doc__ or ""
+    )
 
 
 def test_a_scenario_tells_what_is_not_as_usual():
@@ -114,11 +116,11 @@ def test_a_machine_and_a_live_run_from_python():
     network = f"link={{kind: network, {way}, return: {{{way}}}}}"
     machine = sd.load_scenario("paper", settings=("plant.kind=exact", network))
     assert sd.run_machine(machine, duration=0.1, port=0, safe="hold")["runs"] == 0
-    serve = threading.Thread(target=sd.run_machine, args=(machine,), kwargs={"port": port})
-    serve.daemon = True
-    serve.start()
-    run = sd.run_live("paper", f"127.0.0.1:{port}", duration=1.0, accept_jitter=True)
-    assert run.summary["live"]["samples"] > 5 and run.table()
+    with ThreadPoolExecutor(1) as pool:
+        serving = pool.submit(sd.run_machine, machine, port=port, duration=10.0)
+        run = sd.run_live("paper", f"127.0.0.1:{port}", duration=1.0, accept_jitter=True)
+        assert run.summary["live"]["samples"] > 5 and run.table()
+        assert serving.result(20)["runs"] == 1
 
 
 @pytest.mark.slow
