@@ -1,40 +1,38 @@
 """The loop in real time, and a simulated machine for it: live, machine."""
 
-import signal
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
-
-from stewart_drake.cli.common import AsJson, Controller, Delivery, Quiet, ScenarioName, Settings
-from stewart_drake.cli.options import Given, with_options
-from stewart_drake.live.options import MachineOptions
-from stewart_drake.reporting.document import wrap
-
-if TYPE_CHECKING:
-    from stewart_drake.live.machine import Machine
 import contextlib
 import ctypes
 import math
+import signal
 import subprocess
 import sys
 import webbrowser
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from stewart_drake.cli.common import (
+    AsJson,
+    Controller,
+    Delivery,
     Out,
+    Quiet,
+    ScenarioName,
+    Settings,
 )
+from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.live.options import LiveOptions
+from stewart_drake.live.options import LiveOptions, MachineOptions
+from stewart_drake.reporting.document import wrap
 from stewart_drake.reporting.terminal import echo
 
 if TYPE_CHECKING:
+    from stewart_drake.live.machine import Machine
     from stewart_drake.live.page import PageViewer
     from stewart_drake.loop.results import SimulationResult
     from stewart_drake.scenario.config import Scenario
-
 
 LOG: Final = "log.csv"
 _EACH_WAY: Final = (0.35, 0.4)
@@ -253,7 +251,7 @@ def machine(
         delivery.tell_link(loaded)
         interrupted = _run(
             running,
-            options.duration or float("inf"),
+            options.duration or math.inf,
             lambda: delivery.say(_first_lines(running, scenario, address)),
         )
     summary = running.summary()

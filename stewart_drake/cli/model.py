@@ -7,21 +7,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stewart_drake.cli.common import AsJson, Delivery, Quiet
+from stewart_drake.cli.common import (
+    AsJson,
+    Delivery,
+    MechanismName,
+    Quiet,
+    check_file,
+    open_meshcat,
+)
 from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import write_whole
+from stewart_drake.reporting.terminal import echo
 from stewart_drake.studies.measurements import LARGEST, Measurements
 
 if TYPE_CHECKING:
     from stewart_drake.studies.new_machine import NewMachine
     from stewart_drake.studies.options import Option
-from stewart_drake.cli.common import (
-    MechanismName,
-    check_file,
-    open_meshcat,
-)
-from stewart_drake.files.fileio import write_whole
-from stewart_drake.reporting.terminal import echo
 
 app = typer.Typer(rich_markup_mode=None, help="Check and view a mechanism.")
 
@@ -162,8 +164,8 @@ def _ask(question: str) -> float:
 
 def _name_of(folder: Path) -> str:
     """A machine's name from that of its folder; `machine` where it makes none."""
-    name = re.sub("[^A-Za-z0-9_-]", "_", folder.resolve().name)
     from stewart_drake.mechanism.geometry import RESERVED_NAMES
 
+    name = re.sub("[^A-Za-z0-9_-]", "_", folder.resolve().name)
     fits = re.match("[A-Za-z]", name) and name not in RESERVED_NAMES
     return name if fits else "machine"
