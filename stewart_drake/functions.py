@@ -246,8 +246,7 @@ def run_live(
     from stewart_drake.live.endpoint import read_key
     from stewart_drake.live.session import drive, prepare_session
 
-    secret = None if options.key is None else read_key(options.key)
-    ready = prepare_session(as_scenario(scenario), address_of(machine), secret)
+    ready = prepare_session(as_scenario(scenario), address_of(machine), read_key(options.key))
     how: Any = options.model_dump(include={"armed", "accept_jitter", "max_missing"})
     span = math.inf if options.duration is None else options.duration
     return SimulationResult.of(drive(ready, span, log=None if log is None else Path(log), **how))

@@ -89,8 +89,7 @@ def live(
             _demo_machine(scenario, loaded.eta, controller, settings or ())
         )
         delivery.say(f"calling {where}")
-        secret = None if options.key is None else read_key(options.key)
-        ready = prepare_session(loaded, address_of(where), secret)
+        ready = prepare_session(loaded, address_of(where), read_key(options.key))
         for line in plans(ready, span, name):
             delivery.tell(line)
         check_armed(ready, options.armed)

@@ -169,12 +169,14 @@ class Endpoint:
                 self.refuse(Refusal.MALFORMED, "a datagram of this side's own")
 
 
-def read_key(path: Path) -> bytes:
-    """The bytes of a key's file, but for line breaks at its end.
+def read_key(path: Path | None) -> bytes | None:
+    """Return the bytes of a key's file without line breaks at its end; None without a file.
 
     Raises:
         ConfigError: it cannot be read, or is too short or too long to be a key.
     """
+    if path is None:
+        return None
     try:
         with path.open("rb") as file:
             data = file.read(LONGEST_KEY + 1)

@@ -109,7 +109,7 @@ def open_machine(
     """
     check_scenario(scenario)
     experiment = prepare(scenario)
-    key = None if options.key is None else read_key(options.key)
+    key = read_key(options.key)
     endpoint = Endpoint(ControllerMessage, options.host, options.port, key)
     try:
         yield Machine(experiment, endpoint, options, say), endpoint.address
