@@ -81,7 +81,7 @@ bench: $(INSTALLED_BENCH)  ## every script in benchmarks/; QUICK=1: at the least
 
 generate: $(INSTALLED)  ## writes equations.h and models/*.sdf anew, and compiles the core
 	$(BIN)/python -m stewart_drake.dynamics.generate
-	$(BIN)/python -m stewart_drake.native.build
+	$(BIN)/python -m stewart_drake.core.build
 
 clean:  ## removes builds, caches and the demo's output, keeps .venv and .venv-docs
 	rm -rf build dist out/demo out/site .pytest_cache .hypothesis .mypy_cache .ruff_cache
@@ -92,9 +92,9 @@ help:  ## this list
 
 # The installation compiles the core, and first generates what is not committed. A library that is
 # older than its source is refused.
-EQUATIONS := stewart_drake/native/equations.h
+EQUATIONS := stewart_drake/core/equations.h
 $(INSTALLED): pyproject.toml constraints.txt hatch_build.py \
-		$(filter-out $(EQUATIONS),$(wildcard stewart_drake/native/*.[ch]))
+		$(filter-out $(EQUATIONS),$(wildcard stewart_drake/core/*.[ch]))
 	@test -n "$(PYTHON)" || { echo "no Python found: set PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "$(PYTHON) is too old: set PYTHON to a Python 3.11 or newer"; exit 1; }

@@ -20,9 +20,9 @@ class CoreHook(BuildHookInterface):
 
     @property
     def build(self) -> Any:
-        """The module native/build.py, loaded by its path."""
-        path = Path(self.root, "stewart_drake/native/build.py")
-        spec = importlib.util.spec_from_file_location("native_build", path)
+        """The module core/build.py, loaded by its path."""
+        path = Path(self.root, "stewart_drake/core/build.py")
+        spec = importlib.util.spec_from_file_location("core_build", path)
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
         return module

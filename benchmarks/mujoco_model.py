@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 import stewart_drake as sd
+from stewart_drake.core.layout import STANDARD_GRAVITY
 from stewart_drake.mechanism.assembly import assemble, joint_state
 from stewart_drake.mechanism.geometry import Body, Mechanism
-from stewart_drake.native.layout import STANDARD_GRAVITY
 from stewart_drake.scenario.signals import LEGS, POSE, RATES
 from stewart_drake.types import Array
 

@@ -17,6 +17,7 @@ from _page import write
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 
 import stewart_drake as sd
+from stewart_drake.core.library import core_library
 from stewart_drake.export.controller import recorded_law
 from stewart_drake.law.delay_model import delayed_model
 from stewart_drake.law.doubling import Doubling
@@ -26,7 +27,6 @@ from stewart_drake.law.motion import Preview
 from stewart_drake.law.native_law import NativeLqi
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import lqr, reduced_gain
-from stewart_drake.native.library import core_library
 
 MECHANISM = sd.load_mechanism("paper")
 

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from stewart_drake.core.layout import DEAD_CENTRE_SINE, STANDARD_GRAVITY
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.mechanism.kinematics import (
     UnreachablePoseError,
     angle_rate_map,
     rotation,
 )
-from stewart_drake.native.layout import DEAD_CENTRE_SINE, STANDARD_GRAVITY
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,

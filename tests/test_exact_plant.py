@@ -17,6 +17,7 @@ from pydrake.systems.primitives import (
     Linearize,
 )
 
+from stewart_drake.core.layout import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import (
     PITCH_LIMIT,
@@ -30,7 +31,6 @@ from stewart_drake.dynamics.workspace import (
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.native.layout import DEAD_CENTRE_SINE
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose

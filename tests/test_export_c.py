@@ -8,9 +8,9 @@ from typing import Final
 import pytest
 
 from stewart_drake.cli import main
+from stewart_drake.core import build
 from stewart_drake.export import controller as export_c
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.native import build
 from stewart_drake.scenario.loading import load_scenario
 
 NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stewart_drake.core import build
 from stewart_drake.export import controller as export_c
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.native import build
 from stewart_drake.scenario.loading import load_scenario
 from tests.live_driver import Driver, drive_in_real_time
 

@@ -17,13 +17,13 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
+from stewart_drake.core import build, library
+from stewart_drake.core.layout import SIGNATURES
 from stewart_drake.dynamics import generate, native_functions
 from stewart_drake.dynamics.native_functions import NativeFunctions, functions_of
 from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.dynamics.workspace import margin, standing
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.native import build, library
-from stewart_drake.native.layout import SIGNATURES
 from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, PAYLOAD
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
@@ -236,7 +236,7 @@ def test_a_library_that_does_not_fit_is_refused_in_one_line(
             assert main(["model", "check", "paper"]) == 2
         error = capsys.readouterr().err
         assert error.count("\n") == 1
-        assert f"the compiled core {problem}" in error and "native.build" in error
+        assert f"the compiled core {problem}" in error and "core.build" in error
 
 
 def test_the_build_knows_whether_its_generated_text_is_current(monkeypatch, tmp_path: Path) -> None:

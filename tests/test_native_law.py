@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import stewart_drake as sd
+from stewart_drake.core import library as core_library_module
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.delay_model import DelayedModel, delayed_model
 from stewart_drake.law.doubling import Doubling
@@ -21,7 +22,6 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError, lqr, reduced_gain
 from stewart_drake.loop.experiment import prepare, torques_in_flight
 from stewart_drake.loop.law_design import compose_law, control_law
-from stewart_drake.native import library as native_library
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
@@ -41,7 +41,7 @@ DIRTY = (
 @pytest.fixture(scope="module")
 def library() -> ctypes.CDLL:
     """The compiled one."""
-    return native_library.core_library()
+    return core_library_module.core_library()
 
 
 # The Riccati equation.

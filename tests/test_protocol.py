@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stewart_drake.core import build
 from stewart_drake.export.controller import TEMPLATES
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.endpoint import (
@@ -48,7 +49,6 @@ from stewart_drake.live.protocol import (
     encode,
 )
 from stewart_drake.loop.peer import Fault, Identity, Part, Reason, identity_of
-from stewart_drake.native import build
 from stewart_drake.scenario.loading import load_scenario
 from tests import exchange
 from tests.live_driver import OtherClock

@@ -10,11 +10,11 @@ from typing import Final
 
 import pytest
 
+from stewart_drake.core import build
 from stewart_drake.export.controller import TEMPLATES
 from stewart_drake.live.endpoint import LONGEST_KEY, SHORTEST_KEY, now
 from stewart_drake.live.protocol import ControllerMessage, MachineMessage, encode
 from stewart_drake.loop.peer import FAULTS, Fault
-from stewart_drake.native import build
 from stewart_drake.scenario.loading import load_scenario
 from tests.live_driver import Driver
 from tests.test_machine_process import (

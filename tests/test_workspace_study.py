@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stewart_drake.cli import main
+from stewart_drake.core.layout import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, margin, standing
 from stewart_drake.files.errors import ConfigError
@@ -20,7 +21,6 @@ from stewart_drake.loop.experiment import assemble, check_instants, prepare, ref
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
-from stewart_drake.native.layout import DEAD_CENTRE_SINE
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import HoldConfig, SineConfig

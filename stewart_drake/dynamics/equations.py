@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import casadi as ca
 
+from stewart_drake.core.layout import DEAD_CENTRE_SINE, SHAPES
 from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers, Number
-from stewart_drake.native.layout import DEAD_CENTRE_SINE, SHAPES
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stewart_drake.core.layout import SHAPES, SIGNATURES, geometry_of
+from stewart_drake.core.library import core_library
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.native.layout import SHAPES, SIGNATURES, geometry_of
-from stewart_drake.native.library import core_library
 from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, NUM_STATE, NUM_TORQUES
 from stewart_drake.types import Array
 
@@ -61,7 +61,7 @@ class Buffered(ABC):
 
 
 class NativeFunction(Buffered):
-    """A function of native/packed.c: one buffer with arguments, geometry and results.
+    """A function of core/packed.c: one buffer with arguments, geometry and results.
 
     Args:
         name: its name there.

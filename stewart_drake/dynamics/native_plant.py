@@ -1,15 +1,15 @@
-"""The exact plant of native/plant.c: one machine, one run."""
+"""The exact plant of core/plant.c: one machine, one run."""
 
 from ctypes import byref, c_double
 from typing import Any
 
 import numpy as np
 
+from stewart_drake.core.library import core_library
+from stewart_drake.core.plant import Ended, LooksStruct, MachineStruct, RunStruct
 from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import LEAST, home_sign
-from stewart_drake.native.library import core_library
-from stewart_drake.native.plant import Ended, LooksStruct, MachineStruct, RunStruct
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
 

@@ -2,7 +2,7 @@
 
 DOP853, the Runge-Kutta method of order 8 of Dormand and Prince, goes from one change of the torques
 to the next and stops where the plate leaves its workspace (docs/theory.md, section 32). It runs in
-the compiled core, native/plant.c.
+the compiled core, core/plant.c.
 """
 
 import ctypes
@@ -14,10 +14,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stewart_drake.core.plant import DriveStruct, Ended
 from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose, margin
-from stewart_drake.native.plant import DriveStruct, Ended
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
 from stewart_drake.types import Array
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stewart_drake.core.layout import DEAD_CENTRE_SINE, STANDARD_GRAVITY
 from stewart_drake.dynamics.functions import MotionFunctions
 from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import standing
@@ -13,7 +14,6 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.assembly import TorqueMap, torque_map
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, angle_rate_map
-from stewart_drake.native.layout import DEAD_CENTRE_SINE, STANDARD_GRAVITY
 from stewart_drake.scenario.signals import (
     ANGLES,
     COULOMB_SPEED,

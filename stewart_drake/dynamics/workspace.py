@@ -5,9 +5,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from stewart_drake.core.layout import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.native.layout import DEAD_CENTRE_SINE
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS
 from stewart_drake.types import Array
 

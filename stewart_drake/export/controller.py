@@ -1,6 +1,6 @@
 """The controller of a scenario as a folder of C, with a test that replays a run of it.
 
-The sources are those of native/, as they are; what is written here is what they are compiled with:
+The sources are those of core/, as they are; what is written here is what they are compiled with:
 the size of their arrays, the configuration, and what the law in Python was given and answered.
 """
 
@@ -18,6 +18,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stewart_drake.core.build import FOLDER, compiler
+from stewart_drake.core.law_layout import CONFIG_FIELDS, CONFIG_FLAGS
 from stewart_drake.dynamics.workspace import LEAST, home_sign
 from stewart_drake.export.motion import TOLERANCE, knots
 from stewart_drake.files.errors import ConfigError
@@ -33,8 +35,6 @@ from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import FAULTS, identity_of
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.native.build import FOLDER, compiler
-from stewart_drake.native.law_layout import CONFIG_FIELDS, CONFIG_FLAGS
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.types import Array

@@ -12,12 +12,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from stewart_drake.core.layout import STANDARD_GRAVITY
 from stewart_drake.files.arrayio import load_netcdf
 from stewart_drake.files.csvio import ANGLE_UNITS, LENGTH_UNITS, TORQUE_UNITS, read_table
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import parse_yaml, validate
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.native.layout import STANDARD_GRAVITY
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.renames import with_new_names
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE, NUM_TORQUES

@@ -15,12 +15,12 @@ from typing import Final, NamedTuple
 import casadi as ca
 import numpy as np
 
+from stewart_drake.core.layout import LEG_NUMBERS, SHAPES
 from stewart_drake.dynamics import equations
 from stewart_drake.dynamics.native_functions import Buffered, Buffers
 from stewart_drake.dynamics.numbers import leg_numbers, numbers_of
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.native.layout import LEG_NUMBERS, SHAPES
 from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
     NUM_LEGS,
@@ -32,7 +32,7 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.types import Array
 
 LEG_PLACES: Final = (0, 1, 12, 13, 14, 15, 16, 17)
-"""In a leg's numbers (`native.layout.geometry_of`): crank, rod, plate joint, shaft centre; m."""
+"""In a leg's numbers (`core.layout.geometry_of`): crank, rod, plate joint, shaft centre; m."""
 PER_LEG: Final = len(LEG_PLACES)
 NUM_GEOMETRY: Final = NUM_LEGS * PER_LEG
 NUM_DYNAMIC: Final = SHAPES["parameters"][0]
@@ -45,7 +45,7 @@ class Numbers(NamedTuple):
     parameters: Array
     """(NUM_DYNAMIC,) of the dynamics."""
     legs: Array
-    """(6, LEG_NUMBERS), see `native.layout`."""
+    """(6, LEG_NUMBERS), see `core.layout`."""
 
 
 class Slopes(NamedTuple):

@@ -1,4 +1,4 @@
-"""The Riccati equation by structure-preserving doubling, in C: see native/riccati.c.
+"""The Riccati equation by structure-preserving doubling, in C: see core/riccati.c.
 
 The law in C designs with it. The law in Python and the analyses use `law.riccati.lqr`, by Drake's
 solver, which is the oracle of this one.
@@ -6,9 +6,9 @@ solver, which is the oracle of this one.
 
 import numpy as np
 
+from stewart_drake.core.law_layout import MAX_ORDER
 from stewart_drake.dynamics.native_functions import NativeFunction
 from stewart_drake.law.riccati import RiccatiError
-from stewart_drake.native.law_layout import MAX_ORDER
 from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.types import Array
 

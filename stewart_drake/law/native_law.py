@@ -1,4 +1,4 @@
-"""The law in C, native/law.c, in the place of `PredictiveLqi.step`; see there for what it computes.
+"""The law in C, core/law.c, in the place of `PredictiveLqi.step`; see there for what it computes.
 
 It has the parts of the default law. Any other law, or one without a compiled library, is stepped in
 Python; `serving` is the only place that decides.
@@ -12,6 +12,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.core.law_layout import (
+    CAUSES,
+    CONFIG,
+    MAX_KEPT,
+    MAX_QUEUE,
+    MEMORY,
+    address,
+    check_sizes,
+)
+from stewart_drake.core.layout import geometry_of
+from stewart_drake.core.library import core_library
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Belief, Estimate
 from stewart_drake.law.channel import Report, Sent, Wire
@@ -32,17 +43,6 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import NonlinearPredictor
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.native.law_layout import (
-    CAUSES,
-    CONFIG,
-    MAX_KEPT,
-    MAX_QUEUE,
-    MEMORY,
-    address,
-    check_sizes,
-)
-from stewart_drake.native.layout import geometry_of
-from stewart_drake.native.library import core_library
 from stewart_drake.scenario.signals import (
     NUM_REFERENCE,
     NUM_STATE,

@@ -1,6 +1,6 @@
 """One run of many: how it ended, and no record of it.
 
-It takes the loop of native/plant.c where that has all that the scenario asks for, and Drake's where
+It takes the loop of core/plant.c where that has all that the scenario asks for, and Drake's where
 it has not; both come to the same.
 """
 

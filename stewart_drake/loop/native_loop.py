@@ -1,4 +1,4 @@
-"""The closed loop without Drake, for many runs: the exact plant of native/plant.c behind the same
+"""The closed loop without Drake, for many runs: the exact plant of core/plant.c behind the same
 delay chain, limit, bias and noise, seen and judged at the same instants (theory.md, section 32).
 """
 
@@ -10,6 +10,8 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.core.law_layout import CAUSES, address
+from stewart_drake.core.plant import Controller, Ended, LoopStruct
 from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.dynamics.workspace import Failure, diagnose
@@ -18,8 +20,6 @@ from stewart_drake.law.native_law import configuration
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.experiment import Experiment, torques_in_flight, true_dynamics
 from stewart_drake.loop.sensor import white_noises
-from stewart_drake.native.law_layout import CAUSES, address
-from stewart_drake.native.plant import Controller, Ended, LoopStruct
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.link import releases, torque_delays
@@ -125,7 +125,7 @@ class InPython:
 
 
 class InC:
-    """The law of native/law.c.
+    """The law of core/law.c.
 
     Args:
         law: one of which nothing is `law.native_law.uncovered`.

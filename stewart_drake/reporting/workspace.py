@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
+from stewart_drake.core.layout import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
-from stewart_drake.native.layout import DEAD_CENTRE_SINE
 from stewart_drake.reporting.document import Document, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import FACTORS, LEG_LINES, LIMIT, UNITS, figure_style, line

@@ -6,7 +6,7 @@
 #include "real.h"
 
 #define STEWART_PARAMETERS 13 /* of the equations, see scenario/signals.py */
-#define STEWART_GEOMETRY 121 /* numbers of a machine, see native/layout.py */
+#define STEWART_GEOMETRY 121 /* numbers of a machine, see core/layout.py */
 #define STEWART_MEASURES 8   /* of the workspace */
 
 /* A machine, and what is known of it. */

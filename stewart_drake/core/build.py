@@ -1,4 +1,4 @@
-"""`python -m stewart_drake.native.build` makes the compiled core, as an installation does.
+"""`python -m stewart_drake.core.build` makes the compiled core, as an installation does.
 
 First the text that is generated from the equations and the mechanism files, where it is missing or
 older than its source; then the library. The build hook loads this file by its path before anything
@@ -29,7 +29,7 @@ GENERATORS = ("equations", "derivatives", "measures", "emit", "numbers", "genera
 # legs at a time; that changes no number.
 FLAGS = (
     *("-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
-    *("-fPIC", "-shared", "-fvisibility=hidden"),
+    *("-fPIC", "-shared", "-fno-semantic-interposition"),
 )
 SOURCES = sorted(str(path) for path in FOLDER.glob("*.c"))
 

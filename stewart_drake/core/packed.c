@@ -1,5 +1,5 @@
 /* For who calls from another language. The functions of dynamics.h behind one packed buffer each: the
-   arguments, the geometry, the results, matrices by columns (native/layout.py). */
+   arguments, the geometry, the results, matrices by columns (core/layout.py). */
 
 #include <math.h>
 #include <string.h>

@@ -1,4 +1,4 @@
-/* For who calls the law and its Riccati equation from another language (native/law_layout.py). */
+/* For who calls the law and its Riccati equation from another language (core/law_layout.py). */
 
 #include "riccati.h"
 #include "stewart.h"

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.native.layout import GEOMETRY
+from stewart_drake.core.layout import GEOMETRY
 from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
     NUM_PARAMETERS,

@@ -1,0 +1,227 @@
+/* See machine.h. */
+
+#include "machine.h"
+
+#define X STEWART_STATES
+#define U STEWART_MOTORS
+#define VIGOROUS 2
+#define DEAD_CENTRE_SINE ((real)0.01) /* dynamics/equations.py */
+
+static const real GAUSS_NODES[2] = {(real)0.21132486540518713, (real)0.7886751345948129};
+static const real SQRT_3 = (real)1.7320508075688772;
+
+void stewart_believe(const stewart_machine *machine, const real *theta, stewart_belief *belief)
+{
+    stewart_copy(STEWART_PARAMETERS, machine->parameters, belief->parameters);
+    for (int i = 0; theta && i < machine->estimated; i++)
+        if (machine->place[i] >= 0)
+            belief->parameters[machine->place[i]] = theta[i];
+    belief->plant.geometry = machine->geometry;
+    belief->plant.gravity = &machine->gravity;
+    belief->plant.parameters = belief->parameters;
+}
+
+int stewart_substeps(const stewart_machine *machine, int number, const real *torques)
+{
+    for (int i = 0; i < U * number; i++)
+        if (REAL(fabs)(torques[i]) > machine->gentle_torque)
+            return VIGOROUS * machine->substeps;
+    return machine->substeps;
+}
+
+int stewart_at_limit(const stewart_machine *machine, int number, const real *torques)
+{
+    for (int i = 0; i < U * number; i++)
+        if (REAL(fabs)(torques[i]) >= machine->torque_limit)
+            return 1;
+    return 0;
+}
+
+int stewart_within_reach(const real *geometry, const real *pose, int strictly)
+{
+    real sines[3], cosines[3];
+    for (int i = 0; i < 3; i++) {
+        sines[i] = REAL(sin)(pose[i]);
+        cosines[i] = REAL(cos)(pose[i]);
+    }
+    real cf = cosines[0], ct = cosines[1], cp = cosines[2], sf = sines[0], st = sines[1];
+    real sp = sines[2];
+    real R[3][3] = {{cp * ct, cp * st * sf - sp * cf, cp * st * cf + sp * sf},
+                    {sp * ct, sp * st * sf + cp * cf, sp * st * cf - cp * sf},
+                    {-st, ct * sf, ct * cf}};
+    for (int leg = 0; leg < 6; leg++) {
+        const real *own = geometry + leg;
+        real crank = own[0], rod = own[6], p[3], q[3];
+        for (int i = 0; i < 3; i++) {
+            p[i] = pose[3 + i] - own[6 * (15 + i)];
+            for (int j = 0; j < 3; j++)
+                p[i] += R[i][j] * own[6 * (12 + j)];
+        }
+        for (int j = 0; j < 3; j++) { /* in the motor's frame, whose axes are columns */
+            q[j] = 0;
+            for (int i = 0; i < 3; i++)
+                q[j] += own[6 * (3 + 3 * j + i)] * p[i];
+        }
+        real rho = REAL(hypot)(q[0], q[1]), shortest = REAL(hypot)(rho - crank, q[2]);
+        real longest = REAL(hypot)(rho + crank, q[2]);
+        real margin = rod - shortest < longest - rod ? rod - shortest : longest - rod;
+        if (!(strictly ? margin > 0 : margin >= 0)) /* or NaN */
+            return 0;
+    }
+    return 1;
+}
+
+int stewart_is_workable(const real *geometry, const real *pose)
+{
+    real measures[STEWART_MEASURES];
+    if (!stewart_within_reach(geometry, pose, 1))
+        return 0;
+    stewart_measures(geometry, pose, NULL, measures);
+    for (int i = 0; i < 6; i++)
+        if (measures[i] < DEAD_CENTRE_SINE)
+            return 0;
+    return 1;
+}
+
+/* On by one torque, from a state in its place. */
+static void move(const stewart_plant *plant, const real *torque, real duration, int substeps,
+                 real *state)
+{
+    for (int i = 0; i < substeps; i++)
+        stewart_move(plant, torque, duration / (real)substeps, state);
+}
+
+static int substeps_of(const stewart_machine *machine, const stewart_acting *acting)
+{
+    if (acting->substeps)
+        return acting->substeps;
+    return stewart_substeps(machine, acting->number, acting->torques);
+}
+
+void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_acting *acting,
+                     const real *state, real *states)
+{
+    const int substeps = substeps_of(machine, acting);
+    stewart_belief belief;
+    stewart_believe(machine, theta, &belief);
+    for (int k = 0; k < acting->number; k++, state = states, states += X) {
+        stewart_copy(X, state, states);
+        move(&belief.plant, acting->torques + U * k, acting->durations[k], substeps, states);
+    }
+}
+
+int stewart_derivatives(const stewart_machine *machine, const stewart_belief *belief,
+                        const real *state, const real *torque, real *A, real *B, real *G,
+                        stewart_scratch scratch)
+{
+    const int p = G ? machine->estimated : 0, columns = X + U + p;
+    real *dF_dx = stewart_take(&scratch, 6 * X);
+    real *dF_dp = stewart_take(&scratch, 6 * STEWART_PARAMETERS);
+    real *right = stewart_take(&scratch, 6 * columns);
+    real accelerations[6], M[36], mass[36], arm[36];
+    stewart_accelerations(&belief->plant, state, state + 6, torque, accelerations);
+    stewart_residual_derivatives(&belief->plant, state, state + 6, accelerations, torque, dF_dx,
+                                 dF_dp, M, arm);
+    for (int i = 0; i < 6; i++) {
+        real *row = right + columns * i;
+        for (int j = 0; j < 6; j++)
+            mass[6 * i + j] = M[6 * j + i];
+        for (int j = 0; j < X; j++)
+            row[j] = -dF_dx[6 * j + i];
+        for (int j = 0; j < U; j++)
+            row[X + j] = arm[6 * i + j];
+        for (int j = 0; j < p; j++)
+            row[X + U + j] = machine->place[j] < 0 ? 0 : -dF_dp[6 * machine->place[j] + i];
+    }
+    if (!stewart_solve(6, columns, mass, right))
+        return 0;
+    stewart_fill(6 * X, 0, A);
+    stewart_fill(6 * U, 0, B);
+    if (G)
+        stewart_fill(6 * p, 0, G);
+    for (int i = 0; i < 6; i++) {
+        const real *row = right + columns * i;
+        A[X * i + 6 + i] = 1;
+        stewart_copy(X, row, A + X * (6 + i));
+        stewart_copy(U, row + X, B + U * (6 + i));
+        if (G)
+            stewart_copy(p, row + X + U, G + p * (6 + i));
+    }
+    return 1;
+}
+
+void stewart_within_hold(const real *start, const real *end, real h, real s, real *state)
+{
+    real left = 1 - s;
+    for (int i = 0; i < 6; i++) {
+        real rise = (end[i] - start[i]) / h, a = start[6 + i] - rise, b = end[6 + i] - rise;
+        state[i] = left * start[i] + s * end[i] + h * s * left * (left * a - s * b);
+        state[6 + i] = rise + left * (1 - 3 * s) * a + s * (3 * s - 2) * b;
+    }
+}
+
+/* Phi (12, 12) and S (12, p) of one torque that leads from `start` to `end` in h seconds. They solve
+   F_dot = L F, L = [A G; 0 0], at the Gauss nodes: F = exp(h/2 (L1 + L2) + sqrt(3)/12 h^2 [L2, L1]). */
+static int transition_of_hold(const stewart_machine *machine, const stewart_belief *belief,
+                              const real *torque, real h, int exact, const real *start,
+                              const real *end, real *Phi, real *S, stewart_scratch scratch)
+{
+    const int p = machine->estimated, nodes = 1 + exact;
+    real *A = stewart_take(&scratch, nodes * X * X), *G = stewart_take(&scratch, nodes * X * p);
+    real *omega = stewart_take(&scratch, X * X), *turned = stewart_take(&scratch, X * p);
+    real *B = stewart_take(&scratch, X * U), state[X];
+    for (int node = 0; node < nodes; node++) {
+        stewart_within_hold(start, end, h, exact ? GAUSS_NODES[node] : (real)0.5, state);
+        if (!stewart_derivatives(machine, belief, state, torque, A + X * X * node, B,
+                                 G + X * p * node, scratch))
+            return 0;
+    }
+    if (exact) {
+        const real part = SQRT_3 / 12 * h * h, *A1 = A + X * X, *G1 = G + X * p;
+        real *one = stewart_take(&scratch, X * X), *other = stewart_take(&scratch, X * X);
+        real *first = stewart_take(&scratch, X * p), *second = stewart_take(&scratch, X * p);
+        stewart_multiply(X, X, X, A1, A, one);
+        stewart_multiply(X, X, X, A, A1, other);
+        stewart_multiply(X, X, p, A1, G, first);
+        stewart_multiply(X, X, p, A, G1, second);
+        for (int i = 0; i < X * X; i++)
+            omega[i] = h / 2 * (A[i] + A1[i]) + part * (one[i] - other[i]);
+        for (int i = 0; i < X * p; i++)
+            turned[i] = h / 2 * (G[i] + G1[i]) + part * (first[i] - second[i]);
+    } else {
+        for (int i = 0; i < X * X; i++)
+            omega[i] = h * A[i];
+        for (int i = 0; i < X * p; i++)
+            turned[i] = h * G[i];
+    }
+    stewart_exponential(X, p, omega, turned, Phi, S, scratch);
+    return 1;
+}
+
+int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_acting *acting,
+                        int exact, real *states, real *H, stewart_scratch scratch)
+{
+    const int p = machine->estimated, n = X + p, substeps = substeps_of(machine, acting);
+    real *Phi = stewart_take(&scratch, X * X), *S = stewart_take(&scratch, X * p);
+    const real *start = xi, *before = NULL;
+    stewart_belief belief;
+    stewart_believe(machine, xi + X, &belief);
+    for (int k = 0; k < acting->number; k++, before = H, start = states, states += X, H += X * n) {
+        const real *torque = acting->torques + U * k, h = acting->durations[k];
+        stewart_copy(X, start, states);
+        move(&belief.plant, torque, h, substeps, states);
+        if (!transition_of_hold(machine, &belief, torque, h, exact, start, states, Phi, S, scratch))
+            return 0;
+        if (before) /* [Phi S; 0 1] [H; 0 1] */
+            stewart_multiply(X, X, n, Phi, before, H);
+        else
+            for (int i = 0; i < X; i++) {
+                stewart_copy(X, Phi + X * i, H + n * i);
+                stewart_fill(p, 0, H + n * i + X);
+            }
+        for (int i = 0; i < X; i++)
+            for (int j = 0; j < p; j++)
+                H[n * i + X + j] += S[p * i + j];
+    }
+    return 1;
+}

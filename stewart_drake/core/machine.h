@@ -1,0 +1,73 @@
+/* What the controller knows of a machine, and the motion of its plate under known torques. */
+
+#ifndef STEWART_MACHINE_H
+#define STEWART_MACHINE_H
+
+#include "dynamics.h"
+#include "matrix.h"
+
+#define STEWART_STATES 12
+#define STEWART_MOTORS 6
+#define STEWART_MAX_ESTIMATED 19 /* parameters of the plant, and offsets of six encoders */
+
+/* Estimated parameters theta (p) are some of the plant's; what else xi = [state; theta] has, such as
+   offsets of encoders, changes nothing in the motion. */
+typedef struct {
+    real geometry[STEWART_GEOMETRY];
+    real parameters[STEWART_PARAMETERS]; /* as they are known beforehand */
+    real gravity;                        /* m/s^2 */
+    real torque_limit;                   /* of each motor, N m; infinite for none */
+    real gentle_torque;                  /* N m, beyond which twice as many substeps are taken */
+    int substeps;                        /* Runge-Kutta steps per torque */
+    int estimated;                       /* p */
+    int place[STEWART_MAX_ESTIMATED];    /* of each in `parameters`, or -1 */
+} stewart_machine;
+
+/* What acts, one torque after the other. */
+typedef struct {
+    int number;
+    const real *torques;   /* (number, 6) N m */
+    const real *durations; /* (number) s */
+    int substeps;          /* for each of them; 0: by the largest torque */
+} stewart_acting;
+
+/* A machine with estimated parameters in the place of those known beforehand. */
+typedef struct {
+    stewart_plant plant;
+    real parameters[STEWART_PARAMETERS];
+} stewart_belief;
+
+/* `theta` (p), or NULL for what is known beforehand. The belief points into itself: it is not copied. */
+void stewart_believe(const stewart_machine *machine, const real *theta, stewart_belief *belief);
+
+int stewart_substeps(const stewart_machine *machine, int number, const real *torques);
+
+/* Whether any of the torques is at the limit or beyond. */
+int stewart_at_limit(const stewart_machine *machine, int number, const real *torques);
+
+/* Whether every leg can be closed at a pose; `strictly`: and still be moved. */
+int stewart_within_reach(const real *geometry, const real *pose, int strictly);
+
+/* Whether a plate at a pose can be regulated: all legs are within reach, none at a dead centre. */
+int stewart_is_workable(const real *geometry, const real *pose);
+
+/* States (number, 12) after each of the torques, from a state (12). */
+void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_acting *acting,
+                     const real *state, real *states);
+
+/* d[accelerations]/d[state, torque, theta] at a point: A (12, 12), B (12, 6), G (12, p) of the state;
+   G may be NULL. Returns 0 where they do not exist. */
+int stewart_derivatives(const stewart_machine *machine, const stewart_belief *belief,
+                        const real *state, const real *torque, real *A, real *B, real *G,
+                        stewart_scratch scratch);
+
+/* The state when the share s of h seconds is over: the cubic through both ends. */
+void stewart_within_hold(const real *start, const real *end, real h, real s, real *state);
+
+/* States (number, 12) after each of the torques, and the first 12 rows H (number, 12, 12 + p) of
+   F = [Phi S; 0 1] from xi = [state; theta] to there. `exact`: Magnus steps of fourth order, else the
+   midpoint's of second. Returns 0 where they do not exist. */
+int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_acting *acting,
+                        int exact, real *states, real *H, stewart_scratch scratch);
+
+#endif

@@ -1,0 +1,183 @@
+/* Small matrices: see matrix.h. */
+
+#include <string.h>
+
+#include "matrix.h"
+
+int stewart_all_finite(int n, const real *x)
+{
+    for (int i = 0; i < n; i++)
+        if (!isfinite(x[i]))
+            return 0;
+    return 1;
+}
+
+void stewart_copy(int n, const real *from, real *to)
+{
+    memcpy(to, from, (size_t)n * sizeof(real));
+}
+
+void stewart_fill(int n, real value, real *x)
+{
+    for (int i = 0; i < n; i++)
+        x[i] = value;
+}
+
+void stewart_multiply(int n, int k, int m, const real *A, const real *B, real *restrict C)
+{
+    for (int i = 0; i < n; i++) {
+        real *restrict c = C + m * i;
+        for (int j = 0; j < m; j++)
+            c[j] = 0;
+        for (int p = 0; p < k; p++) {
+            real a = A[k * i + p];
+            for (int j = 0; j < m; j++)
+                c[j] += a * B[m * p + j];
+        }
+    }
+}
+
+void stewart_multiply_by_transpose(int n, int k, int m, const real *A, const real *B,
+                                   real *restrict C)
+{
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < m; j++) {
+            real sum = 0;
+            for (int p = 0; p < k; p++)
+                sum += A[k * i + p] * B[k * j + p];
+            C[m * i + j] = sum;
+        }
+}
+
+int stewart_solve(int n, int m, real *A, real *restrict B)
+{
+    for (int k = 0; k < n; k++) {
+        int best = k;
+        for (int i = k + 1; i < n; i++)
+            if (REAL(fabs)(A[n * i + k]) > REAL(fabs)(A[n * best + k]))
+                best = i;
+        if (!(REAL(fabs)(A[n * best + k]) > 0)) /* or NaN */
+            return 0;
+        for (int j = 0; j < n; j++) {
+            real a = A[n * best + j];
+            A[n * best + j] = A[n * k + j];
+            A[n * k + j] = a;
+        }
+        for (int j = 0; j < m; j++) {
+            real b = B[m * best + j];
+            B[m * best + j] = B[m * k + j];
+            B[m * k + j] = b;
+        }
+        for (int i = k + 1; i < n; i++) {
+            real f = A[n * i + k] / A[n * k + k];
+            for (int j = k + 1; j < n; j++)
+                A[n * i + j] -= f * A[n * k + j];
+            for (int j = 0; j < m; j++)
+                B[m * i + j] -= f * B[m * k + j];
+        }
+    }
+    for (int i = n - 1; i >= 0; i--) {
+        for (int k = i + 1; k < n; k++)
+            for (int j = 0; j < m; j++)
+                B[m * i + j] -= A[n * i + k] * B[m * k + j];
+        for (int j = 0; j < m; j++)
+            B[m * i + j] /= A[n * i + i];
+    }
+    return 1;
+}
+
+int stewart_cholesky(int n, real *A)
+{
+    for (int j = 0; j < n; j++) {
+        real *row = A + n * j, square = row[j];
+        for (int k = 0; k < j; k++)
+            square -= row[k] * row[k];
+        if (!(square > 0)) /* or NaN */
+            return 0;
+        row[j] = REAL(sqrt)(square);
+        for (int i = j + 1; i < n; i++) {
+            real *below = A + n * i, sum = below[j];
+            for (int k = 0; k < j; k++)
+                sum -= below[k] * row[k];
+            below[j] = sum / row[j];
+        }
+        for (int i = j + 1; i < n; i++)
+            row[i] = 0;
+    }
+    return 1;
+}
+
+void stewart_triangularize(int m, int n, real *A)
+{
+    for (int k = 0; k < n; k++) {
+        real square = 0, alpha, top = A[n * k + k];
+        for (int i = k; i < m; i++)
+            square += A[n * i + k] * A[n * i + k];
+        alpha = REAL(sqrt)(square);
+        if (top > 0)
+            alpha = -alpha;
+        real v0 = top - alpha, beta = -v0 * alpha; /* |v|^2 / 2 of v = column - alpha e1 */
+        if (!(beta > 0)) /* the column is 0 already */
+            continue;
+        for (int j = k + 1; j < n; j++) {
+            real sum = v0 * A[n * k + j];
+            for (int i = k + 1; i < m; i++)
+                sum += A[n * i + k] * A[n * i + j];
+            sum /= beta;
+            A[n * k + j] -= sum * v0;
+            for (int i = k + 1; i < m; i++)
+                A[n * i + j] -= sum * A[n * i + k];
+        }
+        A[n * k + k] = alpha;
+        for (int i = k + 1; i < m; i++)
+            A[n * i + k] = 0;
+    }
+}
+
+/* With phi(A) = sum A^k / (k+1)!,  exp(A) = 1 + A phi(A) and S = phi(A) B. The sum is taken for
+   |A| / 2^s <= 1/2 up to k = 11, in blocks of three, and then doubled s times:
+   S <- (1 + Phi) S, Phi <- Phi^2. */
+void stewart_exponential(int n, int m, const real *A, const real *B, real *Phi, real *S,
+                         stewart_scratch scratch)
+{
+    static const real factorials[12] = {1,    2,     6,      24,      120,      720,
+                                        5040, 40320, 362880, 3628800, 39916800, 479001600};
+    real *A1 = stewart_take(&scratch, n * n), *A2 = stewart_take(&scratch, n * n);
+    real *A3 = stewart_take(&scratch, n * n), *sum = stewart_take(&scratch, n * n);
+    real *next = stewart_take(&scratch, n * (n > m ? n : m)), size = 0, scale = 1;
+    int doublings = 0;
+    for (int j = 0; j < n; j++) {
+        real column = 0;
+        for (int i = 0; i < n; i++)
+            column += REAL(fabs)(A[n * i + j]);
+        size = column > size ? column : size;
+    }
+    for (; size * scale > (real)0.5 && doublings < 60; doublings++)
+        scale /= 2;
+    for (int i = 0; i < n * n; i++)
+        A1[i] = scale * A[i];
+    stewart_multiply(n, n, n, A1, A1, A2);
+    stewart_multiply(n, n, n, A2, A1, A3);
+    stewart_fill(n * n, 0, sum);
+    for (int block = 9; block >= 0; block -= 3) {
+        stewart_multiply(n, n, n, sum, A3, next);
+        const real *f = factorials + block;
+        for (int i = 0; i < n * n; i++)
+            sum[i] = next[i] + A1[i] / f[1] + A2[i] / f[2];
+        for (int i = 0; i < n; i++)
+            sum[(n + 1) * i] += 1 / f[0];
+    }
+    stewart_multiply(n, n, n, A1, sum, Phi);
+    for (int i = 0; i < n; i++)
+        Phi[(n + 1) * i] += 1;
+    stewart_multiply(n, n, m, sum, B, S);
+    for (int i = 0; i < n * m; i++)
+        S[i] *= scale;
+    for (; doublings > 0; doublings--) {
+        stewart_multiply(n, n, m, Phi, S, next);
+        for (int i = 0; i < n * m; i++)
+            S[i] += next[i];
+        stewart_multiply(n, n, n, Phi, Phi, next);
+        stewart_copy(n * n, next, Phi);
+    }
+}
