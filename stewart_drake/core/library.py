@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stewart_drake.core.build import FOLDER, LIBRARY, source_hash
 from stewart_drake.files.errors import ConfigError
 
-HEADERS: Final = ("dynamics.h", "scratch.h", "matrix.h", "machine.h")
+HEADERS: Final = ("dynamics.h", "scratch.h", "matrix.h", "machine.h", "arrivals.h")
 """Headers that Python calls, each after those that it includes."""
 
 

@@ -1,24 +1,14 @@
-"""Which torque acts when, for a delay that is any number and may drift.
-
-Seen from an instant 0, with the delay eta that torques arriving then have and its rate r, a torque
-that is sent at i dt arrives after eta + r a if it arrives at a, so to first order of r at
-
-    a_i = (i dt + eta) (1 + r).
-
-It acts until the next one arrives. Until the first of the controller's own does, act those that
-were sent before t = 0, by whoever and whenever: all that is known of them is what they do in each
-period from t = 0 on.
-"""
+"""Which torque acts when, for a delay of any length that may drift: see core/arrivals.h."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
+from stewart_drake.core.library import core
 from stewart_drake.law.timeline import Acting, Timeline
+from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.types import Array
-
-INSTANT = 1e-9
-"""s; arrivals closer than this are one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +44,9 @@ class Arrivals(Timeline):
     @property
     def samples(self) -> Array:
         """(s,) s from now at which another torque begins to act, up to the next one's."""
-        return np.append(self._switches(0.0, self.eta, -1), self.eta)
+        view, at = self.compiled(), np.empty(self._most(self.eta))
+        number = core().lib.stewart_switches(view, 0.0, self.eta, -1, core().at(at))
+        return np.append(at[:number], self.eta)
 
     def queue(self, in_flight: Array) -> Array:
         """All of them: which acts when is for `until_next`."""
@@ -77,32 +69,24 @@ class Arrivals(Timeline):
             begin, end: s.
             newest: i of the last one: -1 at a sample that is to compute one, 0 after it.
         """
-        starts = np.append(begin, self._switches(begin, end, newest))
-        durations = np.diff(np.append(starts, end))
-        place = np.searchsorted(self._arrivals(newest), starts + INSTANT, side="right") - 1
-        period = np.floor(starts / self.period + INSTANT / self.period).astype(int)
-        ours = in_flight[len(in_flight) - self.sent :]
-        theirs = self.before[np.clip(period, 0, len(self.before) - 1)]
-        if not len(ours):
-            return Acting(theirs, durations)
-        own = place[:, None] >= 0
-        return Acting(np.where(own, ours[np.maximum(place, 0)], theirs), durations)
-
-    def _arrivals(self, newest: int) -> Array:
-        """(sent,) s from now, ascending."""
-        i = newest - np.arange(self.sent - 1, -1, -1)
-        return np.asarray((i * self.period + self.arrival) * (1 + self.rate))
-
-    def _switches(self, begin: float, end: float, newest: int) -> Array:
-        """Instants within (begin, end) at which another torque begins to act."""
-        arrivals = self._arrivals(newest)
-        first = arrivals[0] if len(arrivals) else np.inf
-        grid = self.period * np.arange(1, int(min(end, 1e3) / self.period) + 1)
-        grid = grid[grid < first - INSTANT]
-        at = np.concatenate([grid, arrivals])
-        return at[(at > begin + INSTANT) & (at < end - INSTANT)]
+        queue = np.ascontiguousarray(in_flight)
+        durations = np.empty(self._most(end))
+        torques, c = np.empty((len(durations), NUM_TORQUES)), core()
+        number = c.lib.stewart_within(
+            *(self.compiled(), len(queue), c.at(queue), begin, end, newest),
+            *(c.at(torques), c.at(durations)),
+        )
+        return Acting(torques[:number], durations[:number])
 
     def later(self, kept: int) -> "Arrivals":
         """The same a period later with one more torque sent, of the `kept` that are in flight."""
         before = np.vstack([self.before[1:], self.before[-1:]])
         return replace(self, sent=min(self.sent + 1, kept), before=before)
+
+    def compiled(self) -> Any:
+        """This in C; `before` must be contiguous and outlive it."""
+        numbers = (self.period, self.arrival, self.rate, self.sent, len(self.before))
+        return core().ffi.new("stewart_arrivals *", (*numbers, core().at(self.before)))
+
+    def _most(self, end: float) -> int:
+        return int(core().lib.stewart_arrivals_most(self.compiled(), end))

@@ -20,7 +20,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from stewart_drake.law.arrivals import INSTANT, Arrivals
+from stewart_drake.law.arrivals import Arrivals
 from stewart_drake.law.belief import Estimate
 from stewart_drake.law.filter_settings import FilterSettings, ParameterSet
 from stewart_drake.law.holds import GAUSS_NODES
@@ -39,6 +39,8 @@ from stewart_drake.law.timeline import Acting
 from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
 from stewart_drake.types import Array
 
+INSTANT = 1e-9
+"""s; arrivals closer than this are one."""
 DIFFERENCE = 1e-3
 """s."""
 FEW = 4

@@ -1,0 +1,68 @@
+/* See arrivals.h. */
+
+#include "arrivals.h"
+
+#define U STEWART_MOTORS
+#ifdef STEWART_FLOAT
+#define INSTANT 1e-6f /* s; arrivals closer than this are one */
+#else
+#define INSTANT 1e-9
+#endif
+#define FURTHEST ((real)1e3) /* s; up to there periods are told apart */
+
+static real arrival(const stewart_arrivals *a, int i)
+{
+    return ((real)i * a->period + a->eta) * (1 + a->rate);
+}
+
+/* Number of periods up to an instant. */
+static int periods(const stewart_arrivals *a, real end)
+{
+    if (!(end > 0))
+        return 0;
+    return (int)((end < FURTHEST ? end : FURTHEST) / a->period);
+}
+
+int stewart_arrivals_most(const stewart_arrivals *a, real end)
+{
+    return 1 + periods(a, end) + a->sent;
+}
+
+int stewart_switches(const stewart_arrivals *a, real begin, real end, int newest, real *at)
+{
+    const real first = a->sent > 0 ? arrival(a, newest + 1 - a->sent) : (real)INFINITY;
+    const int grid = periods(a, end);
+    int number = 0;
+    for (int k = 1; k <= grid + a->sent; k++) {
+        const int own = k - grid;
+        const real t = own > 0 ? arrival(a, newest + own - a->sent) : a->period * (real)k;
+        if ((own > 0 || t < first - INSTANT) && t > begin + INSTANT && t < end - INSTANT)
+            at[number++] = t;
+    }
+    return number;
+}
+
+int stewart_within(const stewart_arrivals *a, int flights, const real *in_flight, real begin,
+                   real end, int newest, real *torques, real *durations)
+{
+    const int number = 1 + stewart_switches(a, begin, end, newest, durations + 1);
+    static const real none[U];
+    int own = 0; /* of the controller's torques that have arrived */
+    durations[0] = begin;
+    for (int k = 0; k < number; k++) {
+        const real start = durations[k], *torque;
+        while (own < a->sent && arrival(a, newest + 1 + own - a->sent) <= start + INSTANT)
+            own++;
+        if (own > 0) {
+            torque = in_flight + U * (flights - a->sent + own - 1);
+        } else {
+            const real passed = REAL(floor)(start / a->period + INSTANT / a->period);
+            const int last = a->before - 1;
+            const int period = !(passed > 0) ? 0 : passed < (real)last ? (int)passed : last;
+            torque = last < 0 ? none : a->others + U * period;
+        }
+        stewart_copy(U, torque, torques + U * k);
+        durations[k] = (k + 1 < number ? durations[k + 1] : end) - start;
+    }
+    return number;
+}
