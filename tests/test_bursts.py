@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stewart_drake.law.channel import Packets
+from stewart_drake.core.library import core
+from stewart_drake.law.channel import Packets, structure
 from stewart_drake.scenario.config import PacketsConfig
 from stewart_drake.scenario.packets import (
     BurstChain,
@@ -15,6 +16,7 @@ from stewart_drake.scenario.packets import (
     torque_missing,
     usual_bound,
 )
+from stewart_drake.types import Array
 
 PERIOD = 0.1
 COUNTED = 400_000
@@ -72,6 +74,18 @@ def test_the_first_packets_are_lost_as_often_as_later_ones() -> None:
     assert np.all(np.abs(share - 0.2) < 4.5 * np.sqrt(0.2 * 0.8 / 4000))
 
 
+def chances(channel: Packets, arrived: NDArray[np.bool_], since: int, last: int) -> Array:
+    """(last, n + 1) probabilities of the sources of the last torques, see core/packets.h."""
+    c, packets, known = core(), structure(channel), len(arrived)
+    flags, rows = arrived.astype(np.float64), np.empty((last, known + 1))
+    for d in range(last):
+        n = c.lib.stewart_packet_chances(
+            *(packets, known, c.at(flags), since, last, d, c.at(rows[d])),
+            c.scratch(c.lib.stewart_packets_scratch(packets)),
+        )
+    return rows[:, : n + 1]
+
+
 @pytest.mark.parametrize("burst", [1, 2, 3])
 @pytest.mark.parametrize("seed", range(6))
 def test_packets_are_weighed_by_every_course_of_the_losses(burst: int, seed: int) -> None:
@@ -86,7 +100,7 @@ def test_packets_are_weighed_by_every_course_of_the_losses(burst: int, seed: int
     channel = Packets(
         rows - repeats, repeats, tuple(in_time), tuple(arrived_by), BurstChain(loss, burst)
     )
-    found = channel._chances(arrived, since, last)
+    found = chances(channel, arrived, since, last)
     begins = 1 - (1 - loss) ** (1 / burst)
     # By packet, the oldest first: the probability that it had arrived by the report.
     told = [arrived_by[max(n - k - since, 0)] for k in range(n)]
@@ -117,8 +131,11 @@ def test_a_lost_neighbour_makes_a_packet_unlikely() -> None:
     """Packet 1 came late for no reason but loss: with bursts the next one is probably lost too."""
     told = (0.0, 0.0, 1.0, 1.0, 1.0, 1.0)
     by_burst = {
-        burst: Packets(1, 0, (1.0,), told, BurstChain(0.3, burst))._chances(
-            np.zeros(5, dtype=bool), since=0, last=1
+        burst: chances(
+            Packets(1, 0, (1.0,), told, BurstChain(0.3, burst)),
+            np.zeros(5, dtype=bool),
+            since=0,
+            last=1,
         )[0]
         for burst in (1, 6)
     }

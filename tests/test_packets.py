@@ -356,12 +356,14 @@ def test_packets_that_come_later_than_reports_tell_of_are_borne() -> None:
         sent = channel.send(sent, np.full((1, 6), 10.0 + k), np.zeros((6, 6)))
     none = np.zeros(6, dtype=bool)
     late = dataclasses.replace(channel, in_time=(1.0,))
+    nothing, timeline = Report(none, np.empty((0, 6))), Timeline(PERIOD, Delay(4))
     # (1 - 0.4) / (1 - 0.4): it takes four periods, and is there by then.
-    chances = late._chances(none, 0, 4)
-    assert late._expected(sent.packets, chances[3], 3)[0] == 12
+    _, believed = late.in_flight(sent, np.zeros((6, 6)), timeline, nothing)
+    assert believed[-4, 0] == 12
     # All were told of after four periods, by when every packet is there: this one is lost.
-    chances = dataclasses.replace(late, told=4)._chances(none, 0, 4)
-    assert late._expected(sent.packets, chances[3], 3) is None
+    longer = dataclasses.replace(late, told=4)
+    _, believed = longer.in_flight(sent, np.zeros((6, 6)), timeline, nothing)
+    assert believed[-4, 0] == 0
     law = compose_law(prepare(scenario(*NETWORK)))
     assert isinstance(law.channel, Packets) and law.channel.told == reported(law.kept)
     slow = run(*NETWORK, "link.loss=0", "link.high=2.5", "link.playout=2.3", *LONG)

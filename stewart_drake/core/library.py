@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 from stewart_drake.core.build import FOLDER, LIBRARY, source_hash
 from stewart_drake.files.errors import ConfigError
 
-HEADERS: Final = ("dynamics.h", "scratch.h", "matrix.h", "machine.h", "arrivals.h")
+HEADERS: Final = (
+    "dynamics.h",
+    "scratch.h",
+    "matrix.h",
+    "machine.h",
+    "arrivals.h",
+    "packets.h",
+)
 """Headers that Python calls, each after those that it includes."""
 
 
@@ -85,6 +92,10 @@ class Core:
         if kind is None or not array.flags.c_contiguous:
             raise ValueError(f"array: got {array.dtype}; expected contiguous doubles or C ints")
         return self.ffi.cast(kind, array.ctypes.data)
+
+    def scratch(self, numbers: int) -> Any:
+        """Return a `stewart_scratch` of so many numbers, for one call."""
+        return [self.ffi.new("real[]", numbers)]
 
 
 @lru_cache(maxsize=1)

@@ -1,0 +1,63 @@
+/* What the controller believes to be in flight over a network. */
+
+#ifndef STEWART_PACKETS_H
+#define STEWART_PACKETS_H
+
+#include "scratch.h"
+
+/* Packet k has the torques of `repeats` earlier samples, word for word, then T_k and the plan of
+   those that follow: rows = repeats + torques, of 6 numbers each. */
+typedef struct {
+    int torques; /* N >= 1 */
+    int repeats; /* r */
+    int kept;    /* packets that are remembered, >= 1 */
+    int told;    /* periods that a report looks back */
+    int holds;   /* whether a dry buffer holds the last torque, or puts out zero */
+    int burst;   /* packets that are lost together, >= 1 */
+    real loss;   /* share of the packets that are lost */
+    const real *in_time;    /* (rows) probability that a packet which is not lost is there at the
+                               time of the row */
+    const real *arrived_by; /* (kept) the same after 0, 1, ... periods */
+} stewart_packets;
+
+/* What came with a measurement. */
+typedef struct {
+    int packets;         /* of which it tells, the newest first */
+    const real *arrived; /* whether the one sent i + 1 samples before has arrived, 1 or 0 */
+    int periods;         /* of which it tells, the newest first */
+    const real *acted;   /* (periods, 6) torque that acted i + 1 periods before, N m */
+    int age;             /* periods since that sample */
+} stewart_report;
+
+/* Memory: periods since the last report, `kept` where there was none; whether each packet is known to
+   have arrived, 1 or 0 (kept); the packets, the newest last (kept, rows, 6), NaN before there were
+   any. */
+int stewart_packets_memory(const stewart_packets *packets);
+
+int stewart_packets_scratch(const stewart_packets *packets);
+
+/* Memory before the first sample. */
+void stewart_packets_start(const stewart_packets *packets, real *memory);
+
+/* Update the memory and the torques in flight (number, 6), the oldest first, by a report or NULL. T_k
+   acts from (k + steps) dt on, and a part of a period later. */
+void stewart_packets_update(const stewart_packets *packets, real *memory,
+                            const stewart_report *report, int steps, int number, real *in_flight,
+                            stewart_scratch scratch);
+
+/* Add the packet of a plan (torques, 6); `in_flight` (number, 6) are the torques before it. */
+void stewart_packets_send(const stewart_packets *packets, real *memory, const real *plan, int number,
+                          const real *in_flight);
+
+/* Probabilities (n + 1) of the sources of T_{k-1-d}: chances[i], i < n, that the packet sent i + 1
+   samples ago is in time and no newer one is; chances[n] that no packet is. Returns n <= known. Place
+   for known + 1 numbers.
+
+   known: packets that were sent so far, of those that are remembered.
+   arrived: (known) whether each is known to have arrived, the newest last.
+   since: periods since the last report.
+   last: number of torques of which a source is asked for, > d. */
+int stewart_packet_chances(const stewart_packets *packets, int known, const real *arrived, int since,
+                           int last, int d, real *chances, stewart_scratch scratch);
+
+#endif
