@@ -21,6 +21,7 @@ HEADERS: Final = (
     "scratch.h",
     "matrix.h",
     "machine.h",
+    "kalman.h",
     "arrivals.h",
     "packets.h",
 )
@@ -79,6 +80,7 @@ class Core:
         self.ffi: Any = FFI()
         self.ffi.cdef(declarations())
         self.lib: Any = self.ffi.dlopen(str(LIBRARY))
+        self._block = self.ffi.new_allocator(should_clear_after_alloc=False)
 
     def at(self, array: NDArray[Any] | None) -> Any:
         """Return the pointer to the numbers of a contiguous array of doubles or C ints.
@@ -95,7 +97,7 @@ class Core:
 
     def scratch(self, numbers: int) -> Any:
         """Return a `stewart_scratch` of so many numbers, for one call."""
-        return [self.ffi.new("real[]", numbers)]
+        return [self._block("real[]", numbers)]
 
 
 @lru_cache(maxsize=1)

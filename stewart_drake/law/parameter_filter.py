@@ -19,6 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag, expm
 from scipy.special import chdtri
 
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import THETA, Estimate
 from stewart_drake.law.filter_settings import FilterSettings, ParameterSet
@@ -249,31 +250,16 @@ def transitions(
 def within_bounds(mean: Array, covariance: Array, parameters: ParameterSet) -> Array:
     """The mean nearest to `mean`, as the covariance measures it, with each parameter in bounds.
 
-    Fixing components at bounds moves all that is correlated with them along their columns of P, so
-    that what the measurements have told about combinations of parameters is kept. Which ones are
-    fixed is found by adding the one furthest out and freeing those that are held back from inside.
-    The covariance stays: a parameter at its bound may leave it again.
+    Raises:
+        LinAlgError: the covariance is not positive, or numbers are not finite.
     """
-    fixed: dict[int, float] = {}
-    moved = mean
-    for _ in range(4 * len(parameters.names)):
-        within = np.clip(moved[THETA], parameters.lower, parameters.upper)
-        excess = (moved[THETA] - within) / np.sqrt(np.diag(covariance)[THETA])
-        worst = int(np.argmax(np.abs(excess)))
-        if np.abs(excess[worst]) <= 1e-9:
-            break
-        fixed[NUM_STATE + worst] = within[worst]
-        while True:
-            at = list(fixed)
-            push = np.linalg.solve(covariance[np.ix_(at, at)], mean[at] - list(fixed.values()))
-            if not (fixed and np.all(np.isfinite(push))):
-                raise np.linalg.LinAlgError("the covariance is not positive definite")
-            upper = np.array([fixed[i] == parameters.upper[i - NUM_STATE] for i in at])
-            inwards = np.where(upper, push, -push)
-            if inwards.min() >= 0:
-                break
-            del fixed[at[int(inwards.argmin())]]
-        moved = mean - covariance[:, at] @ push
-    moved = moved.copy()
-    moved[THETA] = np.clip(moved[THETA], parameters.lower, parameters.upper)
+    c, n = core(), len(mean)
+    free = np.full(NUM_STATE, np.inf)
+    lower = np.concatenate([-free, parameters.lower])
+    upper = np.concatenate([free, parameters.upper])
+    mean, root, moved = np.array(mean), np.array(covariance), np.empty(n)
+    scratch = c.scratch(n + c.lib.STEWART_MAX_BOUNDED**2)
+    given = (c.at(mean), c.at(root), c.at(lower), c.at(upper), c.at(moved))
+    if not (c.lib.stewart_root(n, c.at(root)) and c.lib.stewart_within_bounds(n, *given, scratch)):
+        raise np.linalg.LinAlgError("the covariance is not positive definite")
     return moved

@@ -1,0 +1,271 @@
+/* See kalman.h. */
+
+#include "kalman.h"
+
+#define STATES 12 /* of the plate, the first of xi */
+#define MAX STEWART_MAX_BOUNDED
+#define BEYOND ((real)1e-9) /* standard deviations out of bounds that are rounding */
+#ifdef STEWART_FLOAT
+#define ROUNDING ((real)1e-5) /* of a variance, as a share */
+#else
+#define ROUNDING ((real)1e-13)
+#endif
+
+/* Householder reflections of row k of R and all rows of W make column k of W zero. */
+void stewart_absorb(int n, int m, real *R, real *W, stewart_scratch scratch)
+{
+    real *restrict product = stewart_take(&scratch, n);
+    for (int k = 0; k < n; k++) {
+        real *restrict row = R + n * k;
+        real square = row[k] * row[k];
+        for (int i = 0; i < m; i++)
+            square += W[n * i + k] * W[n * i + k];
+        real alpha = REAL(sqrt)(square);
+        if (row[k] > 0)
+            alpha = -alpha;
+        const real v = row[k] - alpha, beta = -v * alpha; /* |v|^2 / 2 of v = column - alpha e1 */
+        if (beta == 0) /* the column is 0 already; NaN stays NaN */
+            continue;
+        for (int j = k + 1; j < n; j++)
+            product[j] = v * row[j];
+        for (int i = 0; i < m; i++) {
+            const real *restrict w = W + n * i;
+            const real f = w[k];
+            for (int j = k + 1; j < n; j++)
+                product[j] += f * w[j];
+        }
+        for (int j = k + 1; j < n; j++) {
+            product[j] /= beta;
+            row[j] -= v * product[j];
+        }
+        for (int i = 0; i < m; i++) {
+            real *restrict w = W + n * i;
+            const real f = w[k];
+            for (int j = k + 1; j < n; j++)
+                w[j] -= f * product[j];
+        }
+        row[k] = alpha;
+    }
+}
+
+void stewart_root_of_prediction(int n, const real *H, const real *std, real *L,
+                                stewart_scratch scratch)
+{
+    real *R = stewart_take(&scratch, n * n), *W = stewart_take(&scratch, n * n);
+    stewart_fill(n * n, 0, R);
+    for (int i = 0; i < STATES; i++)
+        R[(n + 1) * i] = std[i];
+    for (int i = 0; i < n; i++) /* W = (F L)' */
+        for (int j = 0; j < n; j++)
+            W[n * j + i] = L[n * i + j];
+    for (int j = 0; j < n; j++) {
+        real *w = W + n * j, moved[STATES];
+        for (int i = 0; i < STATES; i++) {
+            moved[i] = 0;
+            for (int k = 0; k < n; k++)
+                moved[i] += H[n * i + k] * w[k];
+        }
+        stewart_copy(STATES, moved, w);
+    }
+    stewart_absorb(n, n, R, W, scratch);
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < n; j++)
+            L[n * i + j] = j <= i ? R[n * j + i] : 0;
+}
+
+int stewart_root(int n, real *P)
+{
+    for (int j = 0; j < n; j++) {
+        real *row = P + n * j, left = row[j], scale = 0;
+        const real least = ROUNDING * row[j];
+        for (int k = 0; k < j; k++)
+            left -= row[k] * row[k];
+        if (!(left >= -least)) /* or NaN */
+            return 0;
+        if (left > least)
+            scale = 1 / REAL(sqrt)(left);
+        row[j] = scale > 0 ? REAL(sqrt)(left) : 0;
+        for (int i = j + 1; i < n; i++) {
+            real *below = P + n * i, sum = below[j];
+            for (int k = 0; k < j; k++)
+                sum -= below[k] * row[k];
+            below[j] = sum * scale;
+        }
+        for (int i = j + 1; i < n; i++)
+            row[i] = 0;
+    }
+    return stewart_all_finite(n * n, P);
+}
+
+static real dot(int n, const real *x, const real *y)
+{
+    real sum = 0;
+    for (int i = 0; i < n; i++)
+        sum += x[i] * y[i];
+    return sum;
+}
+
+static real clipped(real x, real lower, real upper)
+{
+    return x < lower ? lower : x > upper ? upper : x;
+}
+
+/* Components that are held at a bound. */
+typedef struct {
+    int number, at[MAX], upper[MAX];
+    real value[MAX], push[MAX];
+} Held;
+
+/* push = P_hh^-1 (mean_h - value_h), after freeing those that are held back from inside their bounds. */
+static int pushed(Held *h, int n, const real *mean, const real *L, real *P)
+{
+    while (h->number) {
+        int least = 0;
+        real inwards = INFINITY;
+        for (int a = 0; a < h->number; a++) {
+            h->push[a] = mean[h->at[a]] - h->value[a];
+            for (int b = 0; b < h->number; b++)
+                P[h->number * a + b] = dot(n, L + n * h->at[a], L + n * h->at[b]);
+        }
+        if (!stewart_solve(h->number, 1, P, h->push) || !stewart_all_finite(h->number, h->push))
+            return 0;
+        for (int a = 0; a < h->number; a++) {
+            const real push = h->upper[a] ? h->push[a] : -h->push[a];
+            if (push < inwards) {
+                inwards = push;
+                least = a;
+            }
+        }
+        if (inwards >= 0)
+            return 1;
+        h->number--;
+        for (int a = least; a < h->number; a++) {
+            h->at[a] = h->at[a + 1];
+            h->upper[a] = h->upper[a + 1];
+            h->value[a] = h->value[a + 1];
+        }
+    }
+    return 0;
+}
+
+/* Fixing components at bounds moves all that is correlated with them along their columns of P = L L',
+   so that what the measurements have said about combinations of them is kept. Which ones are fixed is
+   found by adding the one furthest out and freeing those that are held back from inside. The
+   covariance stays: a component at its bound may leave it again. */
+int stewart_within_bounds(int n, const real *mean, const real *L, const real *lower,
+                          const real *upper, real *moved, stewart_scratch scratch)
+{
+    real *along = stewart_take(&scratch, n), *P = stewart_take(&scratch, MAX * MAX);
+    Held h = {0};
+    stewart_copy(n, mean, moved);
+    for (int round = 0; round < 4 * MAX; round++) {
+        int worst = -1, place = 0;
+        real furthest = BEYOND;
+        for (int i = 0; i < n; i++) {
+            const real beyond = moved[i] - clipped(moved[i], lower[i], upper[i]);
+            if (beyond == 0)
+                continue;
+            const real excess = REAL(fabs)(beyond) / REAL(sqrt)(dot(n, L + n * i, L + n * i));
+            if (!isfinite(excess))
+                return 0;
+            if (excess > furthest) {
+                furthest = excess;
+                worst = i;
+            }
+        }
+        if (worst < 0)
+            break;
+        while (place < h.number && h.at[place] != worst)
+            place++;
+        if (place == MAX)
+            return 0;
+        h.number += place == h.number;
+        h.at[place] = worst;
+        h.upper[place] = moved[worst] > upper[worst];
+        h.value[place] = h.upper[place] ? upper[worst] : lower[worst];
+        if (!pushed(&h, n, mean, L, P))
+            return 0;
+        stewart_fill(n, 0, along);
+        for (int a = 0; a < h.number; a++)
+            for (int i = 0; i < n; i++)
+                along[i] += h.push[a] * L[n * h.at[a] + i];
+        for (int i = 0; i < n; i++)
+            moved[i] = mean[i] - dot(n, L + n * i, along);
+    }
+    for (int i = 0; i < n; i++)
+        moved[i] = clipped(moved[i], lower[i], upper[i]);
+    return 1;
+}
+
+int stewart_kalman_scratch(int n, int most)
+{
+    return most + most * n + (most + n + 1) * (n + 1) + n + (n + 1)
+        + n + MAX * MAX;
+}
+
+/* With the residuals whitened the mean is the minimum over z, xi = mean + L z, of
+
+       |W z - (e + H (xi_0 - mean))|^2 + |z|^2,   W = H L,
+
+   about the xi_0 where it was linearised. QR of [W wanted; 1 0] to [R c; 0 d] solves it:
+
+       R'R = 1 + W'W,   z = R^-1 c,   P = L (1 + W'W)^-1 L' = L R^-1 (L R^-1)',
+
+   nu' S^-1 nu = d^2 and |S| / |C C'| = |1 + W W'| = |R|^2. No covariance is subtracted from another. */
+int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, real *distance,
+                          real *spread, stewart_scratch scratch)
+{
+    const int n = filter->n, N = n + 1;
+    real *e = stewart_take(&scratch, filter->most), *H = stewart_take(&scratch, filter->most * n);
+    real *R = stewart_take(&scratch, N * N), *W = stewart_take(&scratch, filter->most * N);
+    real *moved = stewart_take(&scratch, n);
+    for (int round = 0; round < filter->iterations; round++) {
+        const int m = filter->rows(filter->model, xi, e, H, scratch);
+        if (m < 0)
+            return 0;
+        for (int i = 0; i < m; i++) {
+            const real *h = H + n * i;
+            real *w = W + N * i;
+            stewart_fill(N, 0, w);
+            w[n] = e[i];
+            for (int k = 0; k < n; k++) {
+                if (h[k] == 0)
+                    continue;
+                w[n] += h[k] * (xi[k] - filter->mean[k]);
+                for (int j = 0; j < n; j++)
+                    w[j] += h[k] * filter->root[n * k + j];
+            }
+        }
+        stewart_fill(N * N, 0, R);
+        for (int i = 0; i < n; i++)
+            R[(N + 1) * i] = 1;
+        stewart_absorb(N, m, R, W, scratch);
+        *spread = 0;
+        for (int i = 0; i < n; i++)
+            *spread += 2 * REAL(log)(REAL(fabs)(R[(N + 1) * i]));
+        *distance = R[N * n + n] * R[N * n + n];
+        for (int i = 0; i < n; i++) { /* root R = L, row by row */
+            const real *l = filter->root + n * i;
+            real *x = root + n * i;
+            real better = filter->mean[i];
+            stewart_copy(n, l, x);
+            for (int j = 0; j < n; j++) {
+                x[j] /= R[N * j + j];
+                for (int k = j + 1; k < n; k++)
+                    x[k] -= x[j] * R[N * j + k];
+                better += x[j] * R[N * j + n];
+            }
+            moved[i] = better;
+        }
+        stewart_copy(n, moved, R);
+        if (!stewart_within_bounds(n, R, root, filter->lower, filter->upper, moved, scratch))
+            return 0;
+        const int settled = filter->settle(filter->model, xi, moved, scratch);
+        stewart_copy(n, moved, xi);
+        if (settled < 0)
+            return 0;
+        if (settled)
+            break;
+    }
+    return 1;
+}
