@@ -16,16 +16,8 @@ from numpy.typing import NDArray
 from stewart_drake.core.build import FOLDER, LIBRARY, source_hash
 from stewart_drake.files.errors import ConfigError
 
-HEADERS: Final = (
-    "dynamics.h",
-    "scratch.h",
-    "matrix.h",
-    "machine.h",
-    "kalman.h",
-    "arrivals.h",
-    "packets.h",
-)
-"""Headers that Python calls, each after those that it includes."""
+PRIVATE: Final = ("real.h", "equations.h", "dop853.h", "dop853_table.h")
+"""Headers that Python does not call."""
 
 
 @lru_cache(maxsize=1)
@@ -51,16 +43,29 @@ def core_library() -> ctypes.CDLL:
 
 
 def declarations() -> str:
-    """Return what HEADERS declare, without directives but for whole numbers.
+    """Return what the headers declare, without directives but for whole numbers.
 
     A size that is a sum is an enumeration constant in a header, not a macro.
     """
-    text = "\n".join((FOLDER / name).read_text("utf-8") for name in HEADERS)
+    headers: dict[str, str] = {}
+    for path in sorted(FOLDER.glob("*.h")):
+        _include(path.name, headers)
+    text = "\n".join(headers.values())
     text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
     text = re.sub(r"^static inline .*?^}\n", "", text, flags=re.DOTALL | re.MULTILINE)
-    text = re.sub(r"\brestrict\b", "", text)
+    text = re.sub(r"\brestrict\b|(?<=extern )const", "", text)
     lines = (line for line in text.splitlines() if not _is_directive(line))
     return "typedef double real;\n" + "\n".join(lines)
+
+
+def _include(name: str, headers: dict[str, str]) -> None:
+    """Add a header to the others, after those that it includes."""
+    if name in headers or name in PRIVATE:
+        return
+    text = (FOLDER / name).read_text("utf-8")
+    for included in re.findall(r'^#include "(.*)"', text, re.MULTILINE):
+        _include(included, headers)
+    headers.setdefault(name, text)
 
 
 def _is_directive(line: str) -> bool:
@@ -80,7 +85,6 @@ class Core:
         self.ffi: Any = FFI()
         self.ffi.cdef(declarations())
         self.lib: Any = self.ffi.dlopen(str(LIBRARY))
-        self._block = self.ffi.new_allocator(should_clear_after_alloc=False)
 
     def at(self, array: NDArray[Any] | None) -> Any:
         """Return the pointer to the numbers of a contiguous array of doubles or C ints.
@@ -97,7 +101,7 @@ class Core:
 
     def scratch(self, numbers: int) -> Any:
         """Return a `stewart_scratch` of so many numbers, for one call."""
-        return [self._block("real[]", numbers)]
+        return [self.ffi.new("real[]", numbers)]
 
 
 @lru_cache(maxsize=1)
