@@ -21,7 +21,7 @@ PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
 COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null || true
 
 .DEFAULT_GOAL := help
-.PHONY: generate demo docs test slow arm lint format-check types wheel newest bench soak clean help
+.PHONY: generate demo docs test slow board lint format-check types wheel newest bench soak clean help
 
 demo: $(INSTALLED)  ## the paper's comparison, from rest, on the reference, and with a delay of 0.8 s believed to be 0.6 s
 	$(BIN)/stewart-drake compare paper --out out/demo/rest
@@ -39,10 +39,10 @@ docs: $(DOCS_VENV)/.installed  ## the documentation as a site with search, in ou
 # Each takes a stretch of the files, so that what their tests share is made once, and who is done
 # takes from the other.
 WORKERS := -n logical --maxprocesses 4 --dist worksteal
-test slow arm soak bench: export OMP_NUM_THREADS := 1
-test slow arm soak bench: export OPENBLAS_NUM_THREADS := 1
+test slow board soak bench: export OMP_NUM_THREADS := 1
+test slow board soak bench: export OPENBLAS_NUM_THREADS := 1
 # Tests start commands, and each would compile all of the package anew.
-test slow arm soak: export PYTHONDONTWRITEBYTECODE :=
+test slow board soak: export PYTHONDONTWRITEBYTECODE :=
 
 test: $(INSTALLED)  ## the tests but for the slow ones; ARGS="..." is handed to pytest
 	$(BIN)/pytest $(WORKERS) $(ARGS)
@@ -50,8 +50,8 @@ test: $(INSTALLED)  ## the tests but for the slow ones; ARGS="..." is handed to 
 slow: $(INSTALLED)  ## the slow ones: whole commands, documents and processes
 	$(BIN)/pytest $(WORKERS) -m "slow and not soak" $(ARGS)
 
-arm: $(INSTALLED)  ## the exported C with arm-none-eabi-gcc and newlib, or why not
-	$(BIN)/pytest -m "not soak" -rs tests/test_export_arm.py $(ARGS)
+board: $(INSTALLED)  ## exported controllers on emulated Cortex-M processors; their table in docs/howto/board.md
+	$(BIN)/python -m tests.board.run
 
 soak: $(INSTALLED)  ## the endurance runs
 	$(BIN)/pytest $(WORKERS) -m soak -o faulthandler_timeout=0 $(ARGS)

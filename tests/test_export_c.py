@@ -219,7 +219,7 @@ int main(void) {
 def test_the_stack_is_not_deeper_than_told(tmp_path: Path, compiler: list[str]) -> None:
     folder = exported(tmp_path, "paper", ("duration=1.0",))
     (folder / "painted.c").write_text(PAINTED)
-    sources = ["dynamics.c", "riccati.c", "law.c", "stewart_config.c", "painted.c"]
+    sources = ["dynamics.c", "riccati.c", "law.c", "stewart_config.c", "meter.c", "painted.c"]
     command = [*compiler, "-O2", "-Dmain=replay", "-c", "stewart_test.c"]
     subprocess.run(command, cwd=folder, check=True)
     command = [*compiler, "-O2", *sources, "stewart_test.o", "-lm", "-pthread", "-o", "painted"]

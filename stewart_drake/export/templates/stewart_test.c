@@ -4,13 +4,15 @@
 
 #include <math.h>
 #include <stdio.h>
-#include <time.h>
 
+#include "meter.h"
 #include "stewart_config.h"
 
 #define STEPS @STEPS@
 #define ROWS @PREVIEW@
+#ifndef REPEATS
 #define REPEATS 20
+#endif
 #define TOLERANCE @TOLERANCE@
 
 static const real measurement[STEPS][STEWART_STATES] = {
@@ -28,22 +30,20 @@ static const int status[STEPS] = {@STATUS@};
 
 static stewart_memory memory;
 static stewart_workspace work;
-static double least[STEPS];
 
 int main(void)
 {
-    double error = 0, peak = 0, worst = 0, sum = 0;
+    double error = 0, peak = 0;
     int different = 0;
     for (int repeat = 0; repeat < REPEATS; repeat++) {
         stewart_init(&stewart_configuration, &memory, stewart_queue);
         for (int k = 0; k < STEPS; k++) {
             real torque[STEWART_MOTORS];
-            clock_t began = clock();
+            meter_start();
             int found = stewart_step(&stewart_configuration, &memory, &work, measurement[k], age[k],
                                      preview[k], weights[k], torque);
-            double took = (double)(clock() - began) / CLOCKS_PER_SEC;
+            meter_stop(k);
             stewart_sent(&stewart_configuration, &memory, sent[k]);
-            least[k] = repeat == 0 || took < least[k] ? took : least[k];
             different += found != status[k];
             for (int i = 0; i < STEWART_MOTORS; i++) {
                 double off = fabs((double)(torque[i] - expected[k][i]));
@@ -53,15 +53,10 @@ int main(void)
             }
         }
     }
-    for (int k = 0; k < STEPS; k++) {
-        worst = least[k] > worst ? least[k] : worst;
-        sum += least[k];
-    }
     printf("%d steps, largest error %.1e of the peak torque of %.3g N m, tolerance %.0e\n", STEPS,
            error / peak, peak, TOLERANCE);
     printf("statuses that differ: %d\n", different);
-    printf("a step takes %.0f us, at the most %.0f us (least of %d repeats each)\n",
-           1e6 * sum / STEPS, 1e6 * worst, REPEATS);
+    meter_report(STEPS);
     printf("state %u B, configuration %u B, workspace %u B\n", (unsigned)sizeof memory,
            (unsigned)sizeof stewart_configuration, (unsigned)sizeof work);
     return error <= TOLERANCE * peak && different == 0 ? 0 : 1;

@@ -1,0 +1,216 @@
+"""Replay exported controllers on emulated Cortex-M processors and count instructions: `make board`.
+
+QEMU counts instructions, not cycles: it emulates neither caches nor the latency of an operation.
+Writes the table in docs/howto/board.md. The exit status is 0 where every replay is within the
+tolerance of its export and every step within the bounds of its row.
+"""
+
+import re
+import shlex
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from stewart_drake.export import controller as export_c
+from stewart_drake.scenario.loading import load_scenario
+
+HERE: Final = Path(__file__).parent
+PAGE: Final = HERE.parents[1] / "docs" / "howto" / "board.md"
+MARKS: Final = ("<!-- make board -->\n", "\n<!-- end of make board -->")
+PACKAGES: Final = {
+    "qemu-system-arm": "qemu-system-arm",
+    "arm-none-eabi-gcc": "gcc-arm-none-eabi",
+    "make": "make",
+}
+"""Debian's package of each command."""
+CONTROLLER: Final = tuple(
+    Path(name).with_suffix(".o").name for name in export_c.SOURCES if name.endswith(".c")
+) + ("stewart_config.o",)
+OPTIMISED: Final = "-O2 -ffunction-sections -fdata-sections"
+HEADER: Final = (
+    *("controller", "processor", "flash, kB", "state, B", "workspace, B", "stack, B"),
+    *("million instructions per step, median", "most", "error / peak"),
+)
+
+
+@dataclass(frozen=True)
+class Processor:
+    """A processor that QEMU emulates, and the compiler's options for it."""
+
+    name: str
+    machine: str
+    options: str
+    single: bool
+
+
+M7: Final = Processor(
+    "M7, double", "mps2-an500", "-mcpu=cortex-m7 -mfpu=fpv5-d16 -mfloat-abi=hard", False
+)
+M4: Final = Processor(
+    "M4, single", "mps2-an386", "-mcpu=cortex-m4 -mfpu=fpv4-sp-d16 -mfloat-abi=hard", True
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A controller on a processor.
+
+    Attributes:
+        name: in the table.
+        settings: of `paper`, beside an exact plant.
+        median, most: bounds of a step, in million instructions.
+        workspace: bound, in bytes.
+    """
+
+    name: str
+    processor: Processor
+    settings: tuple[str, ...] = ()
+    median: float = float("inf")
+    most: float = float("inf")
+    workspace: float = float("inf")
+
+
+OUTLIERS: Final = "sensor.faults=[{kind: spike, size: 0.02, share: 0.3, from: 3.0, to: 10.0}]"
+ROWS: Final = (
+    Row("ideal", M7),
+    Row("ideal, outliers in measurements", M7, (OUTLIERS,)),
+    Row("ideal, without estimator", M7, ("controller.estimate=[]",)),
+    Row("ideal, without estimator", M4, ("controller.estimate=[]",)),
+)
+
+
+@dataclass(frozen=True)
+class Counted:
+    """What a replay on a board took."""
+
+    flash: int
+    state: int
+    workspace: int
+    stack: int
+    median: float
+    most: float
+    error: float
+
+
+def missing() -> list[str]:
+    """Return Debian's packages of what is not installed."""
+    packages = [package for command, package in PACKAGES.items() if shutil.which(command) is None]
+    if "gcc-arm-none-eabi" not in packages:
+        command = "arm-none-eabi-gcc -E -x c -o /dev/null -"
+        if subprocess.run(shlex.split(command), input=b"#include <math.h>\n").returncode != 0:
+            packages.append("libnewlib-arm-none-eabi")
+    return packages
+
+
+def made(folder: Path, target: str, **variables: str) -> str:
+    """Return what make prints.
+
+    Raises:
+        SystemExit: it fails, with what it printed.
+    """
+    command = ["make", "-s", *target.split(), *(f"{k}={v}" for k, v in variables.items())]
+    done = subprocess.run(
+        command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        sys.exit(f"{shlex.join(command)}\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def counted(row: Row, folder: Path) -> Counted:
+    """Export, compile without a warning, and replay."""
+    processor = row.processor
+    settings = ("plant.kind=exact", *row.settings)
+    scenario = load_scenario("paper", settings=settings)
+    export_c.write(export_c.exported(scenario, processor.single, measured=False), folder)
+    for name in ("startup", "meter"):
+        shutil.copy(HERE / f"{name}.c", folder / f"board_{name}.c")
+    compiler = f"arm-none-eabi-gcc -mthumb {processor.options}"
+    link = f"-nostartfiles --specs=rdimon.specs -T {HERE / 'mps2.ld'} -Wl,--gc-sections"
+    emulator = (
+        f"qemu-system-arm -M {processor.machine} -icount shift=0 -display none -monitor none "
+        "-serial none -semihosting-config enable=on,target=native -kernel"
+    )
+    made(
+        folder,
+        " ".join(CONTROLLER),
+        CC=compiler,
+        CFLAGS=f"{OPTIMISED} -Wdouble-promotion -Wundef",
+    )
+    listed = subprocess.check_output(["arm-none-eabi-nm", "-u", *CONTROLLER], cwd=folder, text=True)
+    if processor.single and "__aeabi_d" in listed:
+        sys.exit(f"{row.name}: computes a double in software\n{listed}")
+    made(folder, "board_startup.o stewart_motion.o", CC=compiler, CFLAGS=OPTIMISED)
+    said = made(
+        folder,
+        "test",
+        CC=f"{compiler} {link} -Wl,board_startup.o",
+        CFLAGS=f"{OPTIMISED} -DREPEATS=1",
+        METER="board_meter.o",
+        EMULATOR=emulator,
+    )
+    sizes = made(folder, "size", CC=compiler, SIZE="arm-none-eabi-size").splitlines()[-1].split()
+    steps = re.findall(r"^step \d+: instructions (\d+), stack (\d+) B$", said, re.MULTILINE)
+    instructions = [int(number) / 1e6 for number, _ in steps]
+    return Counted(
+        int(sizes[0]) + int(sizes[1]),
+        int(said.split("state ")[1].split()[0]),
+        int(said.split("workspace ")[1].split()[0]),
+        max(int(depth) for _, depth in steps),
+        statistics.median(instructions),
+        max(instructions),
+        float(said.split("largest error ")[1].split()[0]),
+    )
+
+
+def cells(row: Row, found: Counted) -> list[str]:
+    """Return the cells of a row of the table."""
+    sizes = (found.state, found.workspace, found.stack)
+    million = (f"{number:.2f}" for number in (found.median, found.most))
+    return [
+        *(row.name, row.processor.name, f"{found.flash / 1000:.1f}"),
+        *(str(size) for size in sizes),
+        *million,
+        f"{found.error:.0e}",
+    ]
+
+
+def beyond(row: Row, found: Counted) -> list[str]:
+    """Return a line for each bound of a row that is exceeded."""
+    return [
+        f"{row.name}, {row.processor.name}: {name} is {getattr(found, name):.5g}, bound {bound:g}"
+        for name in ("median", "most", "workspace")
+        if not getattr(found, name) <= (bound := getattr(row, name))
+    ]
+
+
+def main() -> int:
+    """Replay every row, print the table and write it into the page."""
+    packages = missing()
+    if packages:
+        print(f"make board: not installed: {', '.join(packages)} (apt-get install)")
+        return 1
+    lines = [f"| {' | '.join(HEADER)} |", "| --- | --- |" + " ---: |" * (len(HEADER) - 2)]
+    exceeded: list[str] = []
+    print("\n".join(lines), flush=True)
+    for row in ROWS:
+        with tempfile.TemporaryDirectory() as folder:
+            found = counted(row, Path(folder))
+        lines.append(f"| {' | '.join(cells(row, found))} |")
+        print(lines[-1], flush=True)
+        exceeded += beyond(row, found)
+    text = PAGE.read_text("utf-8")
+    before, rest = text.split(MARKS[0])
+    table = "\n".join(("", *lines, ""))
+    PAGE.write_text(f"{before}{MARKS[0]}{table}{MARKS[1]}{rest.split(MARKS[1])[1]}", "utf-8")
+    print("\n".join(exceeded), end="\n" if exceeded else "")
+    return 1 if exceeded else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
