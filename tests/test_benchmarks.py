@@ -47,8 +47,11 @@ def test_what_scripts_send_to_workers_can_be_read_there(monkeypatch, tmp_path):
     scripts = {name: functions for name, functions in scripts.items() if functions}
     assert {"identification", "tracking", "table2"} <= set(scripts)
     code = (
-        "import pickle, sys; from pathlib import Path; packed = Path(sys.argv[1]).read_bytes()\n"
-        "sys.modules[Path(sys.argv[1]).name] = None; pickle.loads(packed)"
+        "import pickle, sys; from pathlib import Path\n"
+        "for path in map(Path, sys.argv[1:]):\n"
+        "    sys.modules[path.name] = None\n"
+        "    pickle.loads(path.read_bytes())\n"
+        "    del sys.modules[path.name]"
     )
     for name, functions in scripts.items():
         module = script(name, monkeypatch)
@@ -57,10 +60,10 @@ def test_what_scripts_send_to_workers_can_be_read_there(monkeypatch, tmp_path):
         packed = cloudpickle.dumps([vars(module).get(one) for one in functions])
         cloudpickle.unregister_pickle_by_value(module)
         (tmp_path / name).write_bytes(packed)
-        command = [sys.executable, "-c", code, str(tmp_path / name)]
-        surroundings = os.environ | {"PYTHONPATH": f"{FOLDER.parent}:{FOLDER}"}
-        done = subprocess.run(command, env=surroundings, capture_output=True, text=True)
-        assert done.returncode == 0, f"{name}: {done.stderr}"
+    command = [sys.executable, "-c", code, *(str(tmp_path / name) for name in scripts)]
+    surroundings = os.environ | {"PYTHONPATH": f"{FOLDER.parent}:{FOLDER}"}
+    done = subprocess.run(command, env=surroundings, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_every_part_of_a_step_is_timed(monkeypatch):

@@ -202,7 +202,7 @@ def test_sensitivities_are_differences_of_trajectories(delay):
     model = MachineModel(PAPER, 0.0, 1)
 
     def at(values, first=states[0], sensitive=False):
-        plan = plan_steps(segment, values[DELAY], 1e-3)
+        plan = plan_steps(segment, values[DELAY], 2e-3)
         return integrate(model, unknowns.numbers(values), first[None], plan, sensitive)
 
     slopes = at(values, sensitive=True).slopes[:, 0]
@@ -494,9 +494,12 @@ def test_segments_hold_all_samples_once(log_and_truth):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", short_logs.CASES, ids=str)
+@pytest.mark.parametrize("case", [short_logs.CASES[k] for k in (1, 2, 4, 7)], ids=str)
 def test_the_delay_is_found_in_a_short_log_of_a_lost_run(case):
-    """Some 1.5 s with unknown payload and biases; the delay is at most 0.9 s."""
+    """Some 1.5 s with unknown payload and biases; the delay is at most 0.9 s.
+
+    Each machine, delay and noise twice; `benchmarks/short_logs.py` tries all their combinations.
+    """
     found = short_logs.find(*case, 3000)
     assert found.refusal == "" and abs(found.late) < 1e-3 and abs(found.late) < 4 * found.std
 

@@ -64,9 +64,7 @@ def run(workers: int, *arguments: str, folder: Path) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("place", "workers"), [("script", 1), ("script", 2), ("module", 2), ("notebook", 2)]
-)
+@pytest.mark.parametrize(("place", "workers"), [("script", 2), ("module", 1), ("notebook", 2)])
 def test_own_controllers_are_compared(place, workers, tmp_path):
     """Those of a script ended in "a worker process was killed, perhaps for want of memory"."""
     script, code = tmp_path / "mine.py", CLASS + COMPARE

@@ -33,6 +33,9 @@ from tests.test_network import small_network
 EXACT = ("plant.kind=exact",)
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
 
+BLANK = AnalysisResult(None, {}, Document("t", "yes: it is.", [], "good"), Provenance("command"))
+"""Stands for an analysis."""
+
 pytestmark = pytest.mark.slow  # one report of all there is, which most of them look at
 
 
@@ -182,14 +185,11 @@ def test_the_mean_error_leaves_out_the_time_in_which_nothing_can_act(summary):
 
 def collect_of(scenario, **changes):
     """What a report is made of, with one run and without the analyses' work."""
-    blank = AnalysisResult(
-        None, {}, Document("t", "yes: it is.", [], "good"), Provenance("command")
-    )
     parts = {
         "scenario": scenario,
         "failure": None,
         "run": changes.get("run") or simulate(scenario),
-        "analyses": dict.fromkeys(ANALYSES, blank),
+        "analyses": dict.fromkeys(ANALYSES, BLANK),
     }
     return report_document.Collected(**(parts | changes))
 

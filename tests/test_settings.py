@@ -29,22 +29,22 @@ DOCS = Path(__file__).parents[1] / "docs" / "reference" / "scenario.md"
 SIX = [0.01, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 SCENARIOS: dict[str, tuple[str, str | None, tuple[str, ...]]] = {
-    "paper": ("paper", None, ("duration=1.5",)),
-    "paper's plant": ("table2", "delay_lqi", ("overlay=paper_plant", "duration=1.5")),
+    "paper": ("paper", None, ("duration=0.6", "delay.steps=2")),
+    "paper's plant": ("table2", "delay_lqi", ("overlay=paper_plant", "duration=0.9")),
     "gravity, hold": (
         "gravity",
         None,
-        ("reference.kind=hold", "overlay=dirty", "duration=0.5", "queue=equilibrium"),
+        ("reference.kind=hold", "overlay=dirty", "duration=0.25", "queue=equilibrium"),
     ),
     "desktop, encoders": (
         "desktop",
         None,
-        ("plant.kind=exact", "sensor.kind=encoders", "sensor.bits=20", "duration=1"),
+        ("plant.kind=exact", "sensor.kind=encoders", "sensor.bits=20", "duration=0.5"),
     ),
     "motion_base, rule": (
         "motion_base",
         "lqi",
-        ("plant.kind=exact", "tuner.kind=rule", "duration=0.5"),
+        ("plant.kind=exact", "tuner.kind=rule", "duration=0.2"),
     ),
     "network, ann": (
         "paper",
@@ -59,7 +59,7 @@ SCENARIOS: dict[str, tuple[str, str | None, tuple[str, ...]]] = {
             "link.return={low: 0.0, high: 0.1, loss: 0.1}",
             "sensor.loss=0.05",
             "tuner.kind=ann",
-            "duration=2",
+            "duration=1.6",
             "start=on_reference",
             "queue=reference",
         ),
@@ -67,23 +67,24 @@ SCENARIOS: dict[str, tuple[str, str | None, tuple[str, ...]]] = {
     "servos": (
         "paper",
         "servo_feedforward",
-        ("actuator.kind=servo", "plant.kind=exact", "delay.steps=2", "duration=0.8"),
+        ("actuator.kind=servo", "plant.kind=exact", "delay.steps=2", "duration=0.5"),
     ),
     "adaptive, drifting": (
         "paper",
         "adaptive_lqi",
         (
             "controller.delay_estimator=drifting",
-            "controller.delay_steps=6",
+            "delay.steps=3",
+            "controller.delay_steps=2",
             "delay.drift=0.01",
             "delay.swing=0.02",
             "delay.jump=0.02",
-            "delay.jump_time=0.5",
+            "delay.jump_time=0.4",
             "delay.jitter_std=0.001",
             "overlay=dirty",
             "plant.kind=exact",
             "plant.coulomb_friction=0.0002",
-            "duration=3",
+            "duration=1.2",
         ),
     ),
 }

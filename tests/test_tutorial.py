@@ -13,8 +13,10 @@ import pytest
 import xarray as xr
 
 from stewart_drake.cli import main
+from stewart_drake.reporting import report
 from stewart_drake.studies import delay_limits
 from tests import test_docs
+from tests.test_report import BLANK
 
 TUTORIAL = test_docs.ROOT / "docs" / "tutorial.md"
 TEXT = TUTORIAL.read_text(encoding="utf-8")
@@ -22,6 +24,8 @@ FENCE = re.compile(r"^```(\w+) ?(\S*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 """Language, name under which the reader is told to save it, text."""
 BEFORE, _, _REST = TEXT.partition("\n## 6. ")
 IDENTIFICATION, _, _AFTER = _REST.partition("\n## ")
+SHORTER = ("--set", "duration=4")
+"""Part of the run at half the amplitude that the second fit needs."""
 OTHERS = f"{BEFORE}\n## {_AFTER}"
 
 
@@ -34,6 +38,8 @@ def do(tmp_path, monkeypatch, capsys):
     # The report's pieces in this process, which has loaded everything: tests/test_report_stopped.py
     # has processes.
     monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
+    # Commands before it print these analyses.
+    monkeypatch.setattr(report, "_analyse", lambda name, scenario: BLANK)
 
     def done(part: str) -> dict[str, str]:
         told = {}
@@ -45,7 +51,8 @@ def do(tmp_path, monkeypatch, capsys):
                 capsys.readouterr()
             elif language == "sh":
                 for arguments in test_docs.command_lines(test_docs.Block(TUTORIAL, 0, "sh", text)):
-                    assert main(arguments) == 0, arguments
+                    shorter = SHORTER if "out/half" in arguments else ()
+                    assert main([*arguments, *shorter]) == 0, arguments
                     out, err = capsys.readouterr()
                     assert err == "", arguments
                     assert [line for line in out.splitlines() if len(line) > 80] == [], arguments
