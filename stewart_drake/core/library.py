@@ -95,17 +95,19 @@ class Core:
         self.lib: Any = self.ffi.dlopen(str(LIBRARY))
 
     def at(self, array: NDArray[Any] | None) -> Any:
-        """Return the pointer to the numbers of a contiguous array of doubles or C ints.
+        """Return the numbers of a contiguous array of doubles or C ints, which it keeps alive.
+
+        A structure that points to them does not.
 
         Raises:
             ValueError: other numbers, or not contiguous.
         """
         if array is None:
             return self.ffi.NULL
-        kind = {np.dtype(np.float64): "double *", np.dtype(np.intc): "int *"}.get(array.dtype)
+        kind = {np.dtype(np.float64): "double[]", np.dtype(np.intc): "int[]"}.get(array.dtype)
         if kind is None or not array.flags.c_contiguous:
             raise ValueError(f"array: got {array.dtype}; expected contiguous doubles or C ints")
-        return self.ffi.cast(kind, array.ctypes.data)
+        return self.ffi.from_buffer(kind, array)
 
     def scratch(self, numbers: int) -> Any:
         """Return a `stewart_scratch` of so many numbers, for one call."""

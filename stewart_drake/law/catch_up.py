@@ -1,38 +1,30 @@
 """The way from rest onto a moving reference, planned with torques that are held.
 
-A plan is a sequence of n held torques that takes the nominal plant from its state at the first
-instant a torque can act, exactly onto the reference: 12 equations in 6 n unknowns, n >= 2. Starting
-from the mean torques along a quintic, Newton steps of least norm (a Gauss-Newton shooting method)
-
-    dT = J^+ (x_reference - x_n(T)),     J = [Phi_n ... Phi_2 Gamma_1, ..., Gamma_n],
-
-change it as little as possible, so that it stays smooth. The controller then follows the response
-to the plan, which held torques can follow without error. Each torque is held for one period, and in
-a plan of more than MOST_HOLDS periods for several: that can be followed just as well, and the time
-it takes to plan no longer grows with the number of periods.
+The plan itself is made in C, see core/planning.h. Here is how long it takes, and its trajectory.
 """
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.core.layout import geometry_of
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.threads import one_blas_thread
-from stewart_drake.dynamics.workspace import margin
+from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.delay_model import sample
-from stewart_drake.law.holds import (
-    mean_torques,
-    means_and_changes,
-    rates_at_samples,
-    torques_at_nodes,
+from stewart_drake.law.timeline import Acting
+from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
+    NUM_REFERENCE,
+    NUM_STATE,
+    NUM_TORQUES,
+    POSE,
+    RATES,
 )
-from stewart_drake.law.startup import sizes
-from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
-from stewart_drake.scenario.trajectories import Piece, catch_up, evaluate, through_states
+from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
 
 DEFAULT_CATCH_UP = 0.3
@@ -40,12 +32,8 @@ DEFAULT_CATCH_UP = 0.3
 LONGEST_CATCH_UP = 10.0
 HEADROOM = 0.95
 """Share of the torque limit that a plan may use; feedback needs the rest."""
-MOST_HOLDS = 100
-"""Torques in a plan."""
 PIECE = 0.025
-"""s; longest piece of the planned motion between two states taken from the dynamics."""
-TOLERANCE = 1e-10
-"""rad, shares of the reach, and per s, by which a plan may miss the reference."""
+"""s; longest part of a planned motion between two instants at which it is judged."""
 
 
 def plan_catch_up(
@@ -78,12 +66,16 @@ def plan_catch_up(
     return CatchUp(dynamics, reference, start, t_start, period).plan(duration, torque_limit)
 
 
-class _Holds(NamedTuple):
-    """States, the start first, under torques that are held from edge to edge, s."""
+class Plan(NamedTuple):
+    """A plan as of core/planning.h.
 
-    states: Array
-    torques: Array
-    edges: Array
+    Attributes:
+        pieces: (n, 38) of the planned motion.
+        peak: N m, its largest torque.
+    """
+
+    pieces: Array
+    peak: float
 
 
 class CatchUp:
@@ -101,9 +93,9 @@ class CatchUp:
         t_start: float,
         period: float,
     ) -> None:
-        self._dynamics, self._reference, self._period = dynamics, reference, period
+        self._model, self._reference, self._period = Model(dynamics), reference, period
         self._start, self._t_start = start, t_start
-        self._holds: dict[int, _Holds | None] = {}
+        self._plans: dict[int, Plan | None] = {}
         self._motions: dict[int, Trajectory] = {}
 
     def plan(self, duration: float | None, torque_limit: float | None) -> tuple[Trajectory, float]:
@@ -114,18 +106,20 @@ class CatchUp:
         return self._motion(periods), periods * self._period
 
     def _possible(self, periods: int, limit: float) -> bool:
-        if periods not in self._holds:
-            given = self._dynamics, self._reference, self._start, self._t_start, self._period
-            with one_blas_thread:
-                self._holds[periods] = _plan(*given, periods)
-        found = self._holds[periods]
-        return found is not None and bool(np.abs(found.torques).max() <= limit)
+        if periods not in self._plans:
+            given = self._reference, self._start, self._t_start, self._period, periods
+            self._plans[periods] = self._model.plan(*given)
+        found = self._plans[periods]
+        return found is not None and found.peak <= limit
 
     def _motion(self, periods: int) -> Trajectory:
         if periods not in self._motions:
-            found = self._holds[periods]
+            found = self._plans[periods]
             assert found is not None
-            self._motions[periods] = _motion(self._dynamics, self._reference, *found)
+            pieces = [
+                (p[0], p[2 : 2 + NUM_REFERENCE], p[1], p[-NUM_REFERENCE:]) for p in found.pieces
+            ]
+            self._motions[periods] = through_states(pieces, self._reference)
         return self._motions[periods]
 
 
@@ -146,8 +140,8 @@ def shortest(
         ConfigError: there is none of the given duration.
     """
     wanted = DEFAULT_CATCH_UP if duration is None else duration
-    fewest = 2 if torque_limit is not None and duration is None else _periods(wanted, period)
-    most = fewest if duration is not None else _periods(LONGEST_CATCH_UP, period)
+    fewest = 2 if torque_limit is not None and duration is None else periods_of(wanted, period)
+    most = fewest if duration is not None else periods_of(LONGEST_CATCH_UP, period)
     limit = math.inf if torque_limit is None or duration is not None else HEADROOM * torque_limit
     # What n periods can do, more can do with less torque: double n, then halve the bracket.
     failed, periods = fewest - 1, fewest
@@ -166,89 +160,86 @@ def shortest(
     return periods
 
 
-def _periods(duration: float, period: float) -> int:
+def periods_of(duration: float, period: float) -> int:
+    """Return the periods of a plan of so many s."""
     return max(2, math.ceil(duration / period - 1e-9))
 
 
-def _plan(
-    dynamics: StewartDynamics,
-    reference: Trajectory,
-    start: Array,
-    t_start: float,
-    period: float,
-    periods: int,
-) -> _Holds | None:
-    """The plan over so many periods, or None where there is none."""
-    samples = np.round(np.linspace(0, periods, min(periods, MOST_HOLDS) + 1))
-    edges, holds = t_start + period * samples, period * np.diff(samples)
-    pieces = math.ceil(holds.max() / PIECE)
-    target = _target(dynamics, reference, float(edges[-1]), period)
-    origin = start[POSE] - t_start * start[RATES]  # where a plate with these rates was at t = 0
-    guess = catch_up(origin, start[RATES], reference, t_start, periods * period)
-    torques = mean_torques(dynamics, guess, edges[:-1], edges[1:])
-    size = np.tile(sizes(dynamics.mechanism), 2)
-    for _ in range(12):
-        states = _response(dynamics, start, torques, holds, pieces)
-        if not _inside(dynamics, states):
-            return None
-        miss = (target - states[-1]) / size
-        if np.abs(miss).max() <= TOLERANCE:
-            return _Holds(states, torques, edges)
-        J = _sensitivity(dynamics, states, torques, holds) / size[:, None]
-        torques = torques + np.reshape(np.linalg.lstsq(J, miss)[0], torques.shape)
-    return None
+class Model:
+    """The `stewart_model` of core/planning.h of a calculator, and what it points to.
 
+    Args:
+        dynamics: the plant; methods of one that is written in Python are called back.
+    """
 
-def _target(dynamics: StewartDynamics, reference: Trajectory, t: float, period: float) -> Array:
-    """State (12,) at which held torques take the reference over, see `law.holds`."""
-    x = evaluate(reference, t)
-    nodes = torques_at_nodes(dynamics, reference, np.array([t]), np.array([t + period]))
-    means, changes = means_and_changes(nodes)
-    B = dynamics.derivatives(x[POSE], x[RATES], means[0]).B[RATES]
-    before = np.zeros_like(changes)  # the plan's own torques do not change within their holds
-    x[RATES] += rates_at_samples(np.vstack([before, changes]), B, period)
-    return x[:12]
+    def __init__(self, dynamics: StewartDynamics) -> None:
+        c = core()
+        numbers = geometry_of(dynamics.mechanism), dynamics.plant_parameters.copy()
+        gravity = np.array([dynamics.gravity])
+        plant = c.ffi.new("stewart_plant *", [*map(c.at, numbers), c.at(gravity)])
+        self.data = c.ffi.new("stewart_model *")
+        c.lib.stewart_plant_model(plant, home_sign(dynamics.mechanism), self.data)
+        self._kept = [*numbers, gravity, plant]
+        if type(dynamics) is not StewartDynamics:
+            self._call_back(dynamics)
 
+    def _call_back(self, dynamics: StewartDynamics) -> None:
+        ffi, d = core().ffi, dynamics
 
-def _response(
-    dynamics: StewartDynamics, start: Array, torques: Array, holds: Array, pieces: int
-) -> Array:
-    """States (n pieces + 1, 12) under torques (n, 6) held for `holds` (n,) s, the start first."""
-    short = np.repeat(torques, pieces, axis=0)
-    return np.vstack([start, dynamics.predict(start, short, np.repeat(holds / pieces, pieces))])
+        def at(place: Any, *shape: int) -> Array:
+            return np.frombuffer(ffi.buffer(place, 8 * math.prod(shape))).reshape(shape)
 
+        def move(_: Any, torque: Any, h: float, state: Any) -> None:
+            x = at(state, NUM_STATE)
+            x[:] = d.predict(x.copy(), at(torque, NUM_TORQUES), h)[-1]
 
-def _inside(dynamics: StewartDynamics, states: Array) -> bool:
-    mechanism = dynamics.mechanism
-    return all(margin(mechanism, state[POSE]) > 0 for state in states)
+        def accelerations(_: Any, state: Any, torque: Any, result: Any) -> None:
+            x = at(state, NUM_STATE)
+            at(result, 6)[:] = d.accelerations(x[POSE], x[RATES], at(torque, NUM_TORQUES))
 
+        def inverse_dynamics(_: Any, row: Any, torque: Any) -> None:
+            x = at(row, NUM_REFERENCE)
+            found = d.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
+            at(torque, NUM_TORQUES)[:] = found
 
-def _sensitivity(dynamics: StewartDynamics, states: Array, torques: Array, holds: Array) -> Array:
-    """J (12, 6 n): last state per torque, linearised half-way through each hold."""
-    pieces = (len(states) - 1) // len(torques)
-    after, columns = np.eye(NUM_STATE), []
-    for k in reversed(range(len(torques))):
-        middle = (states[k * pieces] + states[(k + 1) * pieces]) / 2
-        derivatives = dynamics.derivatives(middle[POSE], middle[RATES], torques[k])
-        Phi, Gamma = sample(derivatives.A, derivatives.B, holds[k])
-        columns.append(after @ Gamma)
-        after = after @ Phi
-    return np.hstack(columns[::-1])
+        def derivatives(_: Any, state: Any, torque: Any, A: Any, B: Any, work: Any) -> int:
+            x = at(state, NUM_STATE)
+            found = d.derivatives(x[POSE], x[RATES], at(torque, NUM_TORQUES))
+            at(A, NUM_STATE, NUM_STATE)[:], at(B, NUM_STATE, NUM_TORQUES)[:] = found.A, found.B
+            return 1
 
+        for function in (move, accelerations, inverse_dynamics, derivatives):
+            kind = ffi.typeof(getattr(self.data, function.__name__))
+            called = ffi.callback(kind, function)
+            setattr(self.data, function.__name__, called)
+            self._kept.append(called)
 
-def _motion(
-    dynamics: StewartDynamics, reference: Trajectory, states: Array, torques: Array, edges: Array
-) -> Trajectory:
-    pieces: list[Piece] = []
-    per_hold = (len(states) - 1) // len(torques)
-    times = np.append(
-        np.linspace(edges[:-1], edges[1:], per_hold, endpoint=False, axis=1), edges[-1]
-    )
-    for i in range(len(states) - 1):
-        torque = torques[i // per_hold]
-        ends = (
-            np.concatenate([x, dynamics.accelerations(x[POSE], x[RATES], torque)])
-            for x in states[i : i + 2]
+    def plan(
+        self, reference: Trajectory, start: Array, begin: float, period: float, periods: int
+    ) -> Plan | None:
+        """Return the plan over so many periods, or None where there is none.
+
+        Args:
+            reference: the motion to reach.
+            start: (12,) state at `begin`, s.
+            period: s.
+            periods: two at least.
+        """
+        c, times, peak = core(), np.empty(3), np.empty(1)
+        c.lib.stewart_plan_times(begin, period, periods, c.at(times))
+        rows = np.array([evaluate(reference, t) for t in times])
+        pieces = np.empty((c.lib.stewart_plan_pieces(period, periods), c.lib.STEWART_PIECE))
+        number = c.lib.stewart_plan(
+            *(self.data, c.at(np.array(start, np.float64)), begin, period, periods, c.at(rows)),
+            *(c.at(pieces), c.at(peak), c.scratch(c.lib.stewart_plan_scratch(period, periods))),
         )
-        pieces.append((float(times[i]), next(ends), float(times[i + 1]), next(ends)))
-    return through_states(pieces, reference)
+        return Plan(pieces, float(peak[0])) if number else None
+
+    def way(self, acting: Acting, states: Array, begin: float) -> Array:
+        """Return the pieces (n, 38) of the motion through states (1 + n, 12) from `begin` s on."""
+        c, number = core(), len(acting.torques)
+        kept = [np.array(a, np.float64) for a in (*acting, states)]
+        what = c.ffi.new("stewart_acting *", [number, *map(c.at, kept[:2]), 0])
+        pieces = np.empty((number, c.lib.STEWART_PIECE))
+        given = self.data, what, c.at(kept[2]), begin, c.at(pieces)
+        return pieces[: c.lib.stewart_predicted_pieces(*given)]

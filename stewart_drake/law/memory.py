@@ -4,7 +4,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.trajectories import Trajectory
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Sent
@@ -75,7 +74,7 @@ class Memory:
         sent: what the channel remembers.
         reference: that was given, with numbers for what was missing; NaN before there was any.
         followed: (p, 18) the same with the way back after a gap.
-        path: that was planned in flight, or None.
+        path: (n, 38) pieces that were planned in flight, or None.
         silence: samples that are still to go on without feedback.
         gap: whether the last row of the last preview was missing.
         back: way back since the end of the last gap.
@@ -95,7 +94,7 @@ class Memory:
     sent: Sent
     reference: Previewed
     followed: Array
-    path: Trajectory | None = None
+    path: Array | None = None
     silence: int = 0
     gap: bool = False
     back: ReturnPath = field(default_factory=ReturnPath)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.core.library import core
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
@@ -63,15 +64,26 @@ class KnownMotion:
         planned: what is followed, a trajectory (6, 1): the way onto the reference, then that.
         reference: what there is to come back to.
         now: s, on the clock of both.
+        pieces: (n, 38) of what was planned in flight, see core/planning.h, in the place of
+            `planned`; then comes the reference.
     """
 
     planned: Trajectory
     reference: Trajectory
     now: float
+    pieces: Array | None = None
 
     def __call__(self, times: Array) -> Array:
-        """`planned` at all of `times`."""
-        return np.array([evaluate(self.planned, max(0.0, self.now + t)) for t in times])
+        """Return the motion at all of `times`."""
+        return np.array([self._at(max(0.0, self.now + t)) for t in times])
+
+    def _at(self, time: float) -> Array:
+        if self.pieces is None:
+            return evaluate(self.planned, time)
+        c, row = core(), np.empty(NUM_REFERENCE)
+        if c.lib.stewart_along(len(self.pieces), c.at(self.pieces), time, c.at(row)):
+            return row
+        return evaluate(self.reference, time)
 
 
 class Previewed(NamedTuple):

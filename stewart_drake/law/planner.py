@@ -11,32 +11,22 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from pydrake.trajectories import Trajectory
 
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.core.library import core
 from stewart_drake.law.belief import Belief
-from stewart_drake.law.catch_up import plan_catch_up
+from stewart_drake.law.catch_up import Model, periods_of
 from stewart_drake.law.motion import KnownMotion, Motion
 from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
-from stewart_drake.scenario.trajectories import Piece, through_states
+from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
-
-SURPRISE = 0.02
-"""Share of the motion by which a prediction is off the reference, when the delay was just found."""
-OFF = 0.08
-"""The same at any other time."""
-
-SHORTEST = 1e-6
-"""s; a hold that is shorter is no piece of a path."""
 
 
 class Followed(NamedTuple):
     """What the law is to follow."""
 
     motion: Motion
-    path: Trajectory | None
-    """The same as a trajectory, where it was planned in flight."""
+    path: Array | None
+    """(n, 38) pieces of what was planned in flight, see core/planning.h, or None."""
     anew: bool
     """Whether it was planned now."""
 
@@ -46,7 +36,7 @@ class Planner(Protocol):
 
     def follow(
         self,
-        path: Trajectory | None,
+        path: Array | None,
         belief: Belief,
         in_flight: Array,
         motion: Motion,
@@ -55,7 +45,7 @@ class Planner(Protocol):
         """What to follow from now on.
 
         Args:
-            path: planned before, or None.
+            path: pieces (n, 38) planned before, or None.
             belief: of now.
             in_flight: (n, 6) torques, before this sample's.
             motion: that is asked for.
@@ -70,7 +60,7 @@ class NoPlanner:
 
     def follow(
         self,
-        path: Trajectory | None,
+        path: Array | None,
         belief: Belief,
         in_flight: Array,
         motion: Motion,
@@ -94,7 +84,7 @@ class Rejoin:
 
     def follow(
         self,
-        path: Trajectory | None,
+        path: Array | None,
         belief: Belief,
         in_flight: Array,
         motion: Motion,
@@ -103,35 +93,21 @@ class Rejoin:
         """See `Planner.follow`; only a `KnownMotion` can be left and come back to."""
         if not isinstance(motion, KnownMotion):
             return Followed(motion, path, False)
-        followed = motion if path is None else replace(motion, planned=path)
+        followed = motion if path is None else replace(motion, pieces=path)
         before = Followed(followed, path, False)
         if not (belief.has_state and belief.settled):
             return before
-        acting = belief.timeline.until_next(belief.timeline.queue(in_flight))
+        timeline, c = belief.timeline, core()
+        acting = timeline.until_next(timeline.queue(in_flight))
         states = np.vstack([belief.state, plant.predict(belief.state, acting, belief.parameters)])
-        wanted = followed(np.array([belief.timeline.eta]))[0, :NUM_STATE]
-        away = np.abs(states[-1] - wanted) / np.tile(self.size, 2)
-        if not away.max() > (SURPRISE if belief.found else OFF):  # or NaN
+        wanted = followed(np.array([timeline.eta]))[0, :NUM_STATE].copy()
+        where = c.at(np.array(self.size, np.float64)), c.at(states[-1]), c.at(wanted)
+        if not c.lib.stewart_is_off(*where, belief.found):
             return before
-        dynamics = plant.dynamics.assuming(belief.parameters)
-        begin = motion.now + belief.timeline.eta
-        period = belief.timeline.period
-        try:
-            plan, span = plan_catch_up(
-                dynamics, motion.reference, states[-1], begin, period, self.duration, None
-            )
-        except (ConfigError, ArithmeticError, np.linalg.LinAlgError):
+        model = Model(plant.dynamics.assuming(belief.parameters))
+        begin, periods = motion.now + timeline.eta, periods_of(self.duration, timeline.period)
+        plan = model.plan(motion.reference, states[-1], begin, timeline.period, periods)
+        if plan is None:
             return before  # there is none from here; the next sample may see another
-        if span == 0:
-            return before
-        times = motion.now + np.append(0.0, np.cumsum(acting.durations))
-        pieces: list[Piece] = []
-        for i, torque in enumerate(acting.torques):
-            if acting.durations[i] > SHORTEST:
-                ends = (
-                    np.append(x, dynamics.accelerations(x[POSE], x[RATES], torque))
-                    for x in states[i : i + 2]
-                )
-                pieces.append((float(times[i]), next(ends), float(times[i + 1]), next(ends)))
-        whole = through_states(pieces, plan) if pieces else plan
-        return Followed(replace(motion, planned=whole), whole, True)
+        pieces = np.vstack([model.way(acting, states, motion.now), plan.pieces])
+        return Followed(replace(motion, pieces=pieces), pieces, True)

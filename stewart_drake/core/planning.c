@@ -1,0 +1,405 @@
+/* Plans: see planning.h. */
+
+#include "planning.h"
+
+#define X STEWART_STATES
+#define U STEWART_MOTORS
+#define ROW 18
+#define ROUNDS 12 /* Newton steps */
+
+/* By which a plan may miss the reference: rad, shares of the reach, and per s. */
+#ifdef STEWART_FLOAT
+#define TOLERANCE ((real)1e-5)
+#else
+#define TOLERANCE ((real)1e-10)
+#endif
+/* Longest piece between two states that are taken from the dynamics, and shortest one, s. */
+#define PIECE ((real)0.025)
+#define SHORTEST ((real)1e-6)
+/* Share of the motion by which a prediction is off, when the delay was just found and else. */
+#define SURPRISE ((real)0.02)
+#define OFF ((real)0.08)
+/* Limits of the measures of the workspace: dynamics/workspace.py. */
+#define DEAD_CENTRE_SINE ((real)0.01)
+#define SINGULARITY_LIMIT ((real)1e-3)
+#define PITCH_LIMIT ((real)1.4835298641951802)
+
+static const real GAUSS_NODES[2] = {(real)0.21132486540518713, (real)0.7886751345948129};
+static const real SQRT_3 = (real)1.7320508075688772;
+
+/* ---- the model ---------------------------------------------------------------------------------- */
+
+static void move(const void *about, const real *torque, real h, real *state)
+{
+    stewart_move(about, torque, h, state);
+}
+
+static void accelerations(const void *about, const real *state, const real *torque, real *result)
+{
+    stewart_accelerations(about, state, state + 6, torque, result);
+}
+
+static void inverse_dynamics(const void *about, const real *row, real *torque)
+{
+    stewart_inverse_dynamics(about, row, row + 6, row + 12, torque);
+}
+
+static int derivatives(const void *about, const real *state, const real *torque, real *A, real *B,
+                       real *work)
+{
+    const stewart_scratch scratch = {work};
+    stewart_belief belief;
+    belief.plant = *(const stewart_plant *)about;
+    return stewart_derivatives(NULL, &belief, state, torque, A, B, NULL, scratch);
+}
+
+void stewart_plant_model(const stewart_plant *plant, real sign, stewart_model *model)
+{
+    const stewart_model made = {plant, plant->geometry,  sign,       move,
+                                accelerations, inverse_dynamics, derivatives};
+    *model = made;
+}
+
+static int is_inside(const stewart_model *model, const real *pose)
+{
+    real measures[STEWART_MEASURES];
+    stewart_measures(model->geometry, pose, NULL, measures);
+    for (int i = 0; i < 6; i++)
+        if (!(measures[i] > DEAD_CENTRE_SINE)) /* or NaN */
+            return 0;
+    return model->sign * measures[6] > SINGULARITY_LIMIT && measures[7] > -PITCH_LIMIT;
+}
+
+/* The longest that a leg reaches, crank and rod in line, m. */
+static real reach(const real *geometry)
+{
+    real longest = 0;
+    for (int leg = 0; leg < 6; leg++)
+        if (geometry[leg] + geometry[6 + leg] > longest)
+            longest = geometry[leg] + geometry[6 + leg];
+    return longest;
+}
+
+/* ---- pieces ------------------------------------------------------------------------------------- */
+
+/* The share s of the way between two rows that are h seconds apart: the polynomial of fifth order. */
+static void quintic(const real *from, const real *to, real h, real s, real *row)
+{
+    for (int i = 0; i < 6; i++) {
+        real v0 = h * from[6 + i], v1 = h * to[6 + i], a0 = h * h * from[12 + i];
+        real a1 = h * h * to[12 + i], c2 = a0 / 2, d = to[i] - from[i] - v0 - c2, e = v1 - v0 - a0;
+        real f = a1 - a0, c3 = 10 * d - 4 * e + f / 2, c4 = -15 * d + 7 * e - f;
+        real c5 = 6 * d - 3 * e + f / 2;
+        row[i] = from[i] + s * (v0 + s * (c2 + s * (c3 + s * (c4 + s * c5))));
+        row[6 + i] = (v0 + s * (2 * c2 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))) / h;
+        row[12 + i] = (2 * c2 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))) / (h * h);
+    }
+}
+
+int stewart_along(int number, const real *pieces, real time, real *row)
+{
+    for (int k = 0; k < number; k++, pieces += STEWART_PIECE) {
+        const real begin = pieces[0], end = pieces[1], *first = pieces + 2, *last = first + ROW;
+        if (!(time < end))
+            continue;
+        if (time >= begin) {
+            quintic(first, last, end - begin, (time - begin) / (end - begin), row);
+            return 1;
+        }
+        for (int i = 0; i < 6; i++) {
+            row[i] = first[i] + (time - begin) * first[6 + i];
+            row[6 + i] = first[6 + i];
+            row[12 + i] = 0;
+        }
+        return 1;
+    }
+    return 0;
+}
+
+static void end_row(const stewart_model *model, const real *state, const real *torque, real *row)
+{
+    stewart_copy(X, state, row);
+    model->accelerations(model->about, state, torque, row + X);
+}
+
+static void add_piece(const stewart_model *model, real begin, real end, const real *states,
+                      const real *torque, real *piece)
+{
+    piece[0] = begin;
+    piece[1] = end;
+    end_row(model, states, torque, piece + 2);
+    end_row(model, states + X, torque, piece + 2 + ROW);
+}
+
+int stewart_predicted_pieces(const stewart_model *model, const stewart_acting *acting,
+                             const real *states, real begin, real *pieces)
+{
+    int number = 0;
+    real passed = 0;
+    for (int k = 0; k < acting->number; k++) {
+        const real from = begin + passed, h = acting->durations[k];
+        passed += h;
+        if (h > SHORTEST)
+            add_piece(model, from, begin + passed, states + X * k, acting->torques + U * k,
+                      pieces + STEWART_PIECE * number++);
+    }
+    return number;
+}
+
+int stewart_is_off(const real *size, const real *state, const real *wanted, int found)
+{
+    real most = 0;
+    for (int i = 0; i < X; i++) {
+        const real away = REAL(fabs)(state[i] - wanted[i]) / size[i % 6];
+        if (isnan(away))
+            return 0;
+        most = away > most ? away : most;
+    }
+    return most > (found ? SURPRISE : OFF);
+}
+
+/* ---- plans --------------------------------------------------------------------------------------
+
+   A plan is a sequence of n held torques that takes the plant from its state at the first instant a
+   torque can act exactly onto the reference: 12 equations in 6 n unknowns, n >= 2. Starting from the
+   mean torques along a quintic, Newton steps of least norm (a Gauss-Newton shooting method)
+
+       dT = J^+ (x_reference - x_n(T)),     J = [Phi_n ... Phi_2 Gamma_1, ..., Gamma_n],
+
+   change it as little as possible, so that it stays smooth. What is followed then is the response to
+   the plan. Each torque is held for one period, and in a plan of more than STEWART_MOST_HOLDS periods
+   for several: that can be followed just as well, and the time it takes to plan no longer grows with
+   the number of periods. */
+
+typedef struct {
+    int number, pieces; /* holds, and equal pieces of each */
+    real *edges;        /* (number + 1) s from the beginning */
+    real *torques;      /* (number, 6) */
+    real *states;       /* (number pieces + 1, 12) */
+    real *J;            /* (6 number, 12), transposed */
+} plan;
+
+static int holds_of(int periods)
+{
+    return periods < STEWART_MOST_HOLDS ? periods : STEWART_MOST_HOLDS;
+}
+
+/* Periods until the hold k begins. */
+static real sample_of(int periods, int k)
+{
+    const int holds = holds_of(periods);
+    return k < holds ? REAL(rint)((real)k * ((real)periods / (real)holds)) : (real)periods;
+}
+
+static int pieces_per_hold(real period, int periods)
+{
+    real longest = 0;
+    for (int k = 0; k < holds_of(periods); k++) {
+        const real hold = period * (sample_of(periods, k + 1) - sample_of(periods, k));
+        longest = hold > longest ? hold : longest;
+    }
+    return (int)REAL(ceil)(longest / PIECE);
+}
+
+int stewart_plan_pieces(real period, int periods)
+{
+    return holds_of(periods) * pieces_per_hold(period, periods);
+}
+
+int stewart_plan_scratch(real period, int periods)
+{
+    const int holds = holds_of(periods), states = stewart_plan_pieces(period, periods) + 1;
+    return holds * (1 + U + U * X) + 1 + X * states + 9 * X * X + 6 * X * U + STEWART_MODEL_WORK + X;
+}
+
+void stewart_plan_times(real begin, real period, int periods, real times[3])
+{
+    const real end = begin + period * (real)periods;
+    times[0] = end;
+    for (int node = 0; node < 2; node++)
+        times[1 + node] = end + period * GAUSS_NODES[node];
+}
+
+/* State (12) at which held torques take the reference over: with a change s of the torque over the
+   hold, rates are off by -dt/24 B s at its beginning (law/holds.py). */
+static int target(const stewart_model *model, real period, const real *rows, real *state,
+                  stewart_scratch scratch)
+{
+    real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U), torques[2][U], mean[U];
+    for (int node = 0; node < 2; node++)
+        model->inverse_dynamics(model->about, rows + ROW * (1 + node), torques[node]);
+    for (int j = 0; j < U; j++)
+        mean[j] = (torques[0][j] + torques[1][j]) / 2;
+    stewart_copy(X, rows, state);
+    if (!model->derivatives(model->about, rows, mean, A, B, scratch.next))
+        return 0;
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j < U; j++)
+            state[6 + i] -=
+                period / 24 * B[U * (6 + i) + j] * (SQRT_3 * (torques[1][j] - torques[0][j]));
+    return 1;
+}
+
+/* Mean torques along the quintic from the start, without acceleration, to a row. */
+static void guess(const stewart_model *model, const real *start, const real *end, plan *p)
+{
+    const real duration = p->edges[p->number];
+    real from[ROW], row[ROW], torques[2][U];
+    stewart_copy(X, start, from);
+    stewart_fill(6, 0, from + X);
+    for (int k = 0; k < p->number; k++) {
+        for (int node = 0; node < 2; node++) {
+            const real time = p->edges[k] + (p->edges[k + 1] - p->edges[k]) * GAUSS_NODES[node];
+            quintic(from, end, duration, time / duration, row);
+            model->inverse_dynamics(model->about, row, torques[node]);
+        }
+        for (int j = 0; j < U; j++)
+            p->torques[U * k + j] = (torques[0][j] + torques[1][j]) / 2;
+    }
+}
+
+/* States under the torques. Returns 0 where one of them is out of the workspace. */
+static int respond(const stewart_model *model, plan *p)
+{
+    for (int i = 0; i < p->number * p->pieces; i++) {
+        const int k = i / p->pieces;
+        real *state = p->states + X * (i + 1);
+        stewart_copy(X, state - X, state);
+        model->move(model->about, p->torques + U * k,
+                    (p->edges[k + 1] - p->edges[k]) / (real)p->pieces, state);
+    }
+    for (int i = 0; i <= p->number * p->pieces; i++)
+        if (!is_inside(model, p->states + X * i))
+            return 0;
+    return 1;
+}
+
+/* J, its rows divided by `size`, linearised half-way through each hold. */
+static int differentiate(const stewart_model *model, const real *size, plan *p,
+                         stewart_scratch scratch)
+{
+    real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U);
+    real *Phi = stewart_take(&scratch, X * X), *Gamma = stewart_take(&scratch, X * U);
+    real *after = stewart_take(&scratch, X * X), *product = stewart_take(&scratch, X * X);
+    stewart_fill(X * X, 0, after);
+    for (int i = 0; i < X; i++)
+        after[(X + 1) * i] = 1;
+    for (int k = p->number - 1; k >= 0; k--) {
+        const real h = p->edges[k + 1] - p->edges[k], *start = p->states + X * k * p->pieces;
+        const real *end = start + X * p->pieces;
+        real middle[X];
+        for (int i = 0; i < X; i++)
+            middle[i] = (start[i] + end[i]) / 2;
+        if (!model->derivatives(model->about, middle, p->torques + U * k, A, B, scratch.next))
+            return 0;
+        for (int i = 0; i < X * X; i++)
+            A[i] *= h;
+        for (int i = 0; i < X * U; i++)
+            B[i] *= h;
+        stewart_exponential(X, U, A, B, Phi, Gamma, scratch);
+        stewart_multiply(X, X, U, after, Gamma, product);
+        for (int i = 0; i < X; i++)
+            for (int j = 0; j < U; j++)
+                p->J[X * (U * k + j) + i] = product[U * i + j] / size[i % 6];
+        stewart_multiply(X, X, X, after, Phi, product);
+        stewart_copy(X * X, product, after);
+    }
+    return stewart_all_finite(X * U * p->number, p->J);
+}
+
+/* x (m) += the shortest d with A' d = b, A (m, n), m >= n, which is lost, as b is. Householder
+   reflections make A = Q [R; 0], and d = Q [R'^-1 b; 0]. */
+static int add_least_norm(int m, int n, real *A, real *b, real *x, stewart_scratch scratch)
+{
+    real *d = stewart_take(&scratch, m), diagonal[X], beta[X];
+    for (int k = 0; k < n; k++) {
+        real square = 0;
+        for (int i = k; i < m; i++)
+            square += A[n * i + k] * A[n * i + k];
+        diagonal[k] = A[n * k + k] > 0 ? -REAL(sqrt)(square) : REAL(sqrt)(square);
+        if (!(square > 0))
+            return 0;
+        A[n * k + k] -= diagonal[k]; /* the reflection's vector v takes the place of the column */
+        beta[k] = -A[n * k + k] * diagonal[k];
+        for (int j = k + 1; j < n; j++) {
+            real sum = 0;
+            for (int i = k; i < m; i++)
+                sum += A[n * i + k] * A[n * i + j];
+            for (int i = k; i < m; i++)
+                A[n * i + j] -= sum / beta[k] * A[n * i + k];
+        }
+    }
+    stewart_fill(m, 0, d);
+    for (int k = 0; k < n; k++) {
+        for (int i = 0; i < k; i++)
+            b[k] -= A[n * i + k] * d[i];
+        d[k] = b[k] / diagonal[k];
+    }
+    for (int k = n - 1; k >= 0; k--) {
+        real sum = 0;
+        for (int i = k; i < m; i++)
+            sum += A[n * i + k] * d[i];
+        for (int i = k; i < m; i++)
+            d[i] -= sum / beta[k] * A[n * i + k];
+    }
+    for (int i = 0; i < m; i++)
+        x[i] += d[i];
+    return stewart_all_finite(m, d);
+}
+
+static int solve(const stewart_model *model, const real *goal, plan *p, stewart_scratch scratch)
+{
+    const real longest = reach(model->geometry), size[6] = {1, 1, 1, longest, longest, longest};
+    const real *last = p->states + X * p->number * p->pieces;
+    for (int round = 0; round < ROUNDS; round++) {
+        real miss[X], most = 0;
+        if (!respond(model, p))
+            return 0;
+        for (int i = 0; i < X; i++) {
+            miss[i] = (goal[i] - last[i]) / size[i % 6];
+            most = REAL(fabs)(miss[i]) > most ? REAL(fabs)(miss[i]) : most;
+        }
+        if (most <= TOLERANCE)
+            return stewart_all_finite(X, miss);
+        if (!differentiate(model, size, p, scratch) ||
+            !add_least_norm(U * p->number, X, p->J, miss, p->torques, scratch))
+            return 0;
+    }
+    return 0;
+}
+
+/* s from the beginning to a state. */
+static real time_of(const plan *p, int state)
+{
+    const int k = state / p->pieces, part = state % p->pieces;
+    if (part == 0)
+        return p->edges[k];
+    return p->edges[k] + (p->edges[k + 1] - p->edges[k]) / (real)p->pieces * (real)part;
+}
+
+int stewart_plan(const stewart_model *model, const real *start, real begin, real period, int periods,
+                 const real *rows, real *pieces, real *peak, stewart_scratch scratch)
+{
+    plan p = {holds_of(periods), pieces_per_hold(period, periods), NULL, NULL, NULL, NULL};
+    real goal[X];
+    p.edges = stewart_take(&scratch, p.number + 1);
+    p.torques = stewart_take(&scratch, U * p.number);
+    p.states = stewart_take(&scratch, X * (p.number * p.pieces + 1));
+    p.J = stewart_take(&scratch, X * U * p.number);
+    for (int k = 0; k <= p.number; k++)
+        p.edges[k] = period * sample_of(periods, k);
+    stewart_copy(X, start, p.states);
+    if (!target(model, period, rows, goal, scratch))
+        return 0;
+    guess(model, start, rows, &p);
+    if (!solve(model, goal, &p, scratch))
+        return 0;
+    *peak = 0;
+    for (int i = 0; i < U * p.number; i++)
+        if (REAL(fabs)(p.torques[i]) > *peak)
+            *peak = REAL(fabs)(p.torques[i]);
+    for (int i = 0; i < p.number * p.pieces; i++)
+        add_piece(model, begin + time_of(&p, i), begin + time_of(&p, i + 1), p.states + X * i,
+                  p.torques + U * (i / p.pieces), pieces + STEWART_PIECE * i);
+    return p.number * p.pieces;
+}

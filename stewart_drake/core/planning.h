@@ -1,0 +1,62 @@
+/* Ways of the plate onto its reference that held torques can follow without error, and the pieces of
+   which such a way consists. A row has 18 numbers: pose, rates and accelerations. */
+
+#ifndef STEWART_PLANNING_H
+#define STEWART_PLANNING_H
+
+#include "machine.h"
+
+enum {
+    STEWART_PIECE = 2 + 2 * 18, /* numbers of a piece: begin and end in s, the row at both */
+    STEWART_MOST_HOLDS = 100,   /* torques in a plan */
+    STEWART_MODEL_WORK = 6 * (12 + 13 + 18)
+};
+
+/* The motion of a plate, as far as a plan needs it. `stewart_plant_model` has it from the equations. */
+typedef struct {
+    const void *about;
+    const real *geometry; /* of the machine */
+    real sign;            /* of its parallel measure at home */
+    /* A step of h seconds, of a state (12) in its place. */
+    void (*move)(const void *about, const real *torque, real h, real *state);
+    void (*accelerations)(const void *about, const real *state, const real *torque,
+                          real *accelerations);
+    /* The torque that a row takes. */
+    void (*inverse_dynamics)(const void *about, const real *row, real *torque);
+    /* A (12, 12), B (12, 6) of d state/dt; `work` has place for STEWART_MODEL_WORK numbers. Returns 0
+       where they do not exist. */
+    int (*derivatives)(const void *about, const real *state, const real *torque, real *A, real *B,
+                       real *work);
+} stewart_model;
+
+/* The model of a plant, to which it points. */
+void stewart_plant_model(const stewart_plant *plant, real sign, stewart_model *model);
+
+/* Where a plan that begins at an instant needs the reference: its end, and two nodes of the period
+   after it. */
+void stewart_plan_times(real begin, real period, int periods, real times[3]);
+
+/* Pieces of a plan over so many periods, and scratch memory to make it. */
+int stewart_plan_pieces(real period, int periods);
+int stewart_plan_scratch(real period, int periods);
+
+/* Plan over so many periods from a state (12) onto the reference, whose rows (3, 18) are those at
+   `stewart_plan_times`. Returns the number of pieces, 0 where there is no such plan; `peak` is the
+   largest torque. */
+int stewart_plan(const stewart_model *model, const real *start, real begin, real period, int periods,
+                 const real *rows, real *pieces, real *peak, stewart_scratch scratch);
+
+/* Pieces of the motion through `states` (1 + acting->number, 12) under torques from `begin` s on;
+   their number. */
+int stewart_predicted_pieces(const stewart_model *model, const stewart_acting *acting,
+                             const real *states, real begin, real *pieces);
+
+/* Whether a predicted state (12) is so far off the one that is wanted that a new plan is worth while,
+   for a motion of a size (6), peak to peak; `found`: whether the delay has just been found. */
+int stewart_is_off(const real *size, const real *state, const real *wanted, int found);
+
+/* The row of a way at an instant. Before a piece the pose goes on the straight line that its first
+   rates continue. Returns 0 after the last piece. */
+int stewart_along(int number, const real *pieces, real time, real *row);
+
+#endif
