@@ -48,8 +48,7 @@ static int derivatives(const void *about, const real *state, const real *torque,
                        real *work)
 {
     const stewart_scratch scratch = {work};
-    stewart_belief belief;
-    belief.plant = *(const stewart_plant *)about;
+    const stewart_belief belief = {.plant = *(const stewart_plant *)about};
     return stewart_derivatives(NULL, &belief, state, torque, A, B, NULL, scratch);
 }
 
