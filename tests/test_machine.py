@@ -10,7 +10,7 @@ import pytest
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.machine import Settings, check_scenario
-from stewart_drake.live.motors import Plan, PlayoutMotors, WireMotors
+from stewart_drake.live.motors import Motors, Plan
 from stewart_drake.live.protocol import (
     MISSING,
     NEVER,
@@ -450,7 +450,7 @@ def test_a_flooded_socket_is_survived() -> None:
 
 def test_the_newest_plan_of_a_period_acts_and_a_dry_buffer_holds_or_not() -> None:
     for holds in (True, False):
-        motors = PlayoutMotors(1.0, 10, holds)
+        motors = Motors(1.0, 10, holds)
         motors.begin(Plan(0, 0, 0, 100, np.full((2, 6), 0.5)))
         assert motors.take(Plan(5, 0, 0, 110, np.full((2, 6), 0.2)), 50) is None
         assert motors.take(Plan(4, 0, 0, 110, np.full((3, 6), 9.0)), 50) is None
@@ -469,7 +469,7 @@ def test_the_newest_plan_of_a_period_acts_and_a_dry_buffer_holds_or_not() -> Non
 
 def test_over_a_wire_what_was_overtaken_never_acts() -> None:
     delays = {0: 50, 1: 20, 2: 30}
-    motors = WireMotors(1.0, 10, delays.__getitem__)
+    motors = Motors(1.0, 10, delay_of=delays.__getitem__)
     motors.begin(Plan(0, 0, 0, 0, np.array([[0.1] * 6, [0.2] * 6])))
     for k in range(3):
         plan = Plan(k + 1, 10 * k, k, 0, np.full((1, 6), 0.5 + k))
@@ -479,7 +479,7 @@ def test_over_a_wire_what_was_overtaken_never_acts() -> None:
         time = motors.next_change
         motors.change(time)
         seen.append((time, motors.torque[0]))
-    assert seen == [(0, 0.1), (10, 0.2), (30, 1.0), (50, 1.0), (50, 1.0)]
+    assert seen == [(0, 0.1), (10, 0.2), (30, 1.0), (50, 1.0)]  # the newer one of those at 50
     assert motors.played == 2
     assert motors.take(Plan(1, 0, 0, 0, np.ones((1, 6))), 60) == Refusal.LATE
 

@@ -21,7 +21,7 @@ from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.body import Body, body_of
 from stewart_drake.live.endpoint import STOOD, Address, Endpoint, Offers, Session, now, read_key
-from stewart_drake.live.motors import Motors, Plan, PlayoutMotors, WireMotors
+from stewart_drake.live.motors import Motors, Plan
 from stewart_drake.live.options import MachineOptions, Settings
 from stewart_drake.live.protocol import (
     MISSING,
@@ -122,10 +122,11 @@ def motors_of(experiment: Experiment) -> Motors:
     sc, limit = experiment.scenario, experiment.torque_limit
     period = round(sc.controller.period * SECOND)
     if sc.link.kind == "network":
-        return PlayoutMotors(limit, period, sc.link.dry == "hold")
+        return Motors(limit, period, sc.link.dry == "hold")
     longer = replace(sc, duration=DRAWN * sc.controller.period)
     delays = torque_delays(longer)
-    return WireMotors(limit, period, lambda k: round(delays[min(k, len(delays) - 1)] * SECOND))
+    last = len(delays) - 1
+    return Motors(limit, period, delay_of=lambda k: round(delays[min(k, last)] * SECOND))
 
 
 def reason_of(failure: Failure) -> Reason:
@@ -547,9 +548,8 @@ class Machine:
     ) -> MachineMessage:
         to = offered or self.session
         assert to is not None
-        acted = self._motors.acted
-        if offered or not self._experiment.scenario.link.acknowledged:
-            acted = type(acted)()
+        told = not offered and self._experiment.scenario.link.acknowledged
+        acted = self._motors.acted if told else []
         rows = [torque for _, torque in acted]
         seen = to.window.seen if to.window.newest else 0
         return MachineMessage(

@@ -1,48 +1,106 @@
 """The delay between computing a torque and feeling it."""
 
-import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, LeafSystem, State
+from abc import abstractmethod
 
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+
+from stewart_drake.core.link import Link
 from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.link import TOGETHER
 from stewart_drake.scenario.signals import CARRIED, Carried
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
 
 
-class Arrived(LeafSystem):
-    """What has come over a wire, and when, as outputs; for what decides when that is."""
+class LinkSystem(LeafSystem):
+    """A link of core/link.h as a system: its memory is the state, its commands come at samples."""
 
-    def _begin(self, carries: Carried, applied: Array, arrived: float) -> None:
-        """Declare the input, and the outputs with what acts at first and when that arrived, s."""
-        self._size = CARRIED[carries]
-        self._commanded = self.DeclareVectorInputPort("commanded", self._size)
-        self._applied = self.DeclareDiscreteState(applied)
-        self._arrived = self.DeclareDiscreteState([arrived])
-        self._put_out(carries, self._size, self._applied)
+    def _begin(self, link: Link, period: float, rows: int, delay: Delay, queue: Array) -> None:
+        """Declare input, state and samples. `queue` (L, size) is what is under way at t = 0.
+
+        Raises:
+            ValueError: a queue of the wrong shape.
+        """
+        queue, size = np.asarray(queue, np.float64), link.size
+        if queue.shape != (delay.queue_length, size):
+            raise ValueError(
+                f"queue: got shape {queue.shape}; expected {(delay.queue_length, size)}"
+            )
+        self._link, self._period = link, period
+        self._commanded = self.DeclareVectorInputPort("commanded", rows * size)
+        memory, first = link.start(), (delay.periods - len(queue)) * period
+        if len(queue):
+            link.assume(memory, first, queue[0])
+            link.begin(memory, first, queue)
+        else:
+            link.assume(memory, np.nan, np.zeros(size))
+        self._memory = self.DeclareDiscreteState(memory)
+        update_every(self, period, self._take)
+
+    @abstractmethod
+    def _send(self, memory: Array, number: int, command: Array) -> None:
+        """Let the link take the command of a sample."""
+
+    def _take(self, context: Context, state: State) -> None:
+        # Of what another event of this instant has left: it may be an arrival.
+        memory = self._of(state)
+        number = self._taken(memory)
+        self._send(memory, number, self._commanded.Eval(context))
+        self._change(memory, number * self._period)
+
+    def _change(self, memory: Array, time: float) -> None:
+        if self._link.next_change(memory) <= time + TOGETHER * self._period:
+            self._link.change(memory, time)
+
+    def _of(self, state: Context | State) -> Array:
+        if isinstance(state, State):
+            return np.asarray(state.get_mutable_discrete_state(self._memory).get_mutable_value())
+        return np.asarray(state.get_discrete_state(self._memory).value())
+
+    def _taken(self, memory: Array) -> int:
+        return int(self._link.number(memory, "taken"))
+
+    def _put_out(self, name: str, columns: slice) -> None:
+        """Declare an output of what acts: of [when it began to; command]."""
+        size = len(range(*columns.indices(1 + self._link.size)))
+        ticket = self.discrete_state_ticket(self._memory)
+        self.DeclareVectorOutputPort(name, size, weak(self._output, columns), {ticket})
+
+    def _output(self, columns: slice, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._link.acted(self._of(context))[0, columns])
+
+
+class Wire(LinkSystem):
+    """A link on which every command acts when it arrives."""
+
+    def _lay(self, period: float, kept: int, delay: Delay, queue: Array, carries: Carried) -> None:
+        """Declare all, with place for so many commands under way beyond the queue."""
+        kept += delay.queue_length
+        link = Link(CARRIED[carries], kept, period, wire=True, together=TOGETHER * period)
+        self._begin(link, period, 1, delay, queue)
+        self._put_out(carries, slice(1, None))
         if carries == "command":
-            self._put_out("arrived", 1, self._arrived)
+            self._put_out("arrived", slice(0, 1))
 
-    def _apply(self, torque: Array, context: Context, state: State) -> None:
-        state.get_mutable_discrete_state(self._applied).SetFromVector(torque)
-        state.get_mutable_discrete_state(self._arrived).SetFromVector([context.get_time()])
+    @abstractmethod
+    def _arrival(self, number: int) -> float:
+        """Return when the command of a sample arrives, s."""
 
-    def _put_out(self, name: str, size: int, index: DiscreteStateIndex) -> None:
-        ticket = self.discrete_state_ticket(index)
-        self.DeclareVectorOutputPort(name, size, weak(self._output, index), {ticket})
-
-    def _output(self, index: DiscreteStateIndex, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(index).value())
+    def _send(self, memory: Array, number: int, command: Array) -> None:
+        now, at = number * self._period, self._arrival(number)
+        self._link.take(memory, now, number + 1, at, command[None])
 
 
-class DelayChain(Arrived):
+class DelayChain(Wire):
     """Holds torques back for eta = mu dt + eta0.
 
     With T_k the input at t = k dt:
 
     Initialise: queue = [T_{-mu}, ..., T_{-1}], preceded by T_{-mu-1} when eta0 > 0; the oldest
                 acts first.
-    Update:     at k dt        queue <- [queue without its oldest; T_k], T_k joining at the end,
+    Update:     at k dt        T_k is under way,
                 at k dt + eta0 applied <- T_{k-mu}.
     Output:     torque = applied, hence T_k during [(k + mu) dt + eta0, (k + 1 + mu) dt + eta0).
 
@@ -72,33 +130,16 @@ class DelayChain(Arrived):
         self, period: float, steps: int, fraction: float, queue: Array, carries: Carried = "torque"
     ) -> None:
         super().__init__()
-        length, size = Delay(steps, fraction).queue_length, CARRIED[carries]
-        queue = np.asarray(queue, dtype=np.float64)
-        if queue.shape != (length, size):
-            raise ValueError(f"queue: got shape {queue.shape}; expected {(length, size)}")
-        # `line` is [applied; waiting ...]: T_{k-mu} ... T_k after the update at k dt, with the
-        # applied torque kept apart because it changes eta0 later than the rest.
-        self._fraction = fraction
-        waiting = queue[1:] if fraction > 0 else queue
-        began = (fraction - 1) * period if fraction > 0 else 0.0
-        if length > 0:
-            self._begin(carries, queue[0], began)
-        else:
-            self._begin(carries, np.zeros(size), np.nan)
-        self._waiting = self.DeclareDiscreteState(np.vstack([np.zeros(size), waiting]).ravel())
-        update_every(self, period, self._take)
+        self._delay = Delay(steps, fraction)
+        self._lay(period, steps + 2, self._delay, queue, carries)
         if fraction > 0:
             self.DeclarePeriodicUnrestrictedUpdateEvent(
                 event_time(period), event_time(fraction * period), weak(self._release)
             )
 
-    def _take(self, context: Context, state: State) -> None:
-        waiting = context.get_discrete_state(self._waiting).value()
-        moved = np.concatenate([waiting[self._size :], self._commanded.Eval(context)])
-        state.get_mutable_discrete_state(self._waiting).SetFromVector(moved)
-        if self._fraction == 0:
-            self._apply(moved[: self._size], context, state)
+    def _arrival(self, number: int) -> float:
+        return (number + self._delay.periods) * self._period
 
     def _release(self, context: Context, state: State) -> None:
-        waiting = context.get_discrete_state(self._waiting).value()
-        self._apply(waiting[: self._size], context, state)
+        memory = self._of(state)
+        self._change(memory, (self._taken(memory) - 1 + self._delay.fraction) * self._period)

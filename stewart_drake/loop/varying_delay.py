@@ -5,11 +5,11 @@ from typing import Final
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from stewart_drake.loop.delay_chain import Arrived
-from stewart_drake.loop.sampling import update_every, weak
+from stewart_drake.loop.delay_chain import Wire
+from stewart_drake.loop.sampling import weak
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import TOGETHER, releases
-from stewart_drake.scenario.signals import CARRIED, PACKETS, Carried
+from stewart_drake.scenario.signals import PACKETS, Carried
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
 
@@ -17,13 +17,13 @@ _ONCE: Final = 1e9
 """s, the period of an event that comes once: longer than any run."""
 
 
-class VaryingDelay(Arrived):
+class VaryingDelay(Wire):
     """Holds torque k back for eta_k, each for a time of its own.
 
     With T_k the input at t = k dt, which arrives at a_k = k dt + eta_k:
 
     Initialise: T_{-L}, ..., T_{-1} are under way and arrive at (k + mu) dt + eta0.
-    Update:     at k dt        sent <- [sent without its oldest; T_k],
+    Update:     at k dt        T_k is under way,
                 at a_k         applied <- T_k, unless a newer one has arrived before.
     Output:     torque = applied.
 
@@ -59,55 +59,30 @@ class VaryingDelay(Arrived):
         carries: Carried = "torque",
     ) -> None:
         super().__init__()
-        queue, delays = np.asarray(queue, np.float64), np.asarray(delays, np.float64)
-        length, size = delay.queue_length, CARRIED[carries]
-        if queue.shape != (length, size):
-            raise ValueError(f"queue: got shape {queue.shape}; expected {(length, size)}")
+        delays = np.asarray(delays, np.float64)
         if delays.ndim != 1 or not len(delays) or not np.all(delays >= 0):
             raise ValueError("delays: got an empty or negative one; expected (n,) of at least 0 s")
         self._delays = np.where(delays > TOGETHER * period, delays, 0.0)
-        self._numbers, times = releases(period, delays, delay)
-        self._at_once = set(self._numbers[times == period * self._numbers].tolist())
-        # Sent by the time each of them acts, and one more where both fall on a sample.
-        sent_by_then = np.floor(times / period + TOGETHER) + 1
-        kept = int(np.max(sent_by_then - self._numbers, initial=1)) + 1
-        sent = np.zeros((max(kept, length + 1), size))
-        sent[len(sent) - length :] = queue
-        at_first = (times <= 0) & (self._numbers < 0)
-        first = self._numbers[at_first]
-        if len(first):
-            self._begin(carries, queue[first[-1] + length], times[at_first][-1])
-        else:
-            self._begin(carries, np.zeros(size), np.nan)
-        self._sent = self.DeclareDiscreteState(sent.ravel())
-        self._taken = self.DeclareDiscreteState(1)
-        taken_ticket = self.discrete_state_ticket(self._taken)
-        self.DeclareVectorOutputPort("delay", 1, weak(self._delay), {taken_ticket})
+        longest = self._delays.max(initial=0.0, where=np.isfinite(delays))
+        self._lay(period, int(longest / period) + 2, delay, queue, carries)
+        ticket = self.discrete_state_ticket(self._memory)
+        self.DeclareVectorOutputPort("delay", 1, weak(self._delay), {ticket})
         declare_constant(self, "packets", np.full(len(PACKETS), np.nan))
-        update_every(self, period, self._take)
-        for number, time in zip(self._numbers.tolist(), times.tolist(), strict=True):
-            if time > 0 and number not in self._at_once:
-                arrive = weak(self._arrive, number)
-                self.DeclarePeriodicUnrestrictedUpdateEvent(_ONCE, event_time(time), arrive)
+        numbers, times = releases(period, delays, delay)
+        # Where a torque arrives as it is sent, its sample is the event.
+        for time in times[(times > 0) & (times != period * numbers)].tolist():
+            arrive = weak(self._arrive, time)
+            self.DeclarePeriodicUnrestrictedUpdateEvent(_ONCE, event_time(time), arrive)
 
-    def _take(self, context: Context, state: State) -> None:
-        number = int(context.get_discrete_state(self._taken).value()[0])
-        sent = context.get_discrete_state(self._sent).value()
-        torque = self._commanded.Eval(context)
-        moved = np.concatenate([sent[self._size :], torque])
-        state.get_mutable_discrete_state(self._sent).SetFromVector(moved)
-        state.get_mutable_discrete_state(self._taken).SetFromVector([number + 1])
-        if number in self._at_once:
-            self._apply(torque, context, state)
+    def _arrival(self, number: int) -> float:
+        return float(number * self._period + self._delays[min(number, len(self._delays) - 1)])
 
-    def _arrive(self, number: int, context: Context, state: State) -> None:
-        taken = int(context.get_discrete_state(self._taken).value()[0])
-        sent = context.get_discrete_state(self._sent).value().reshape(-1, self._size)
-        self._apply(sent[number - taken], context, state)
+    def _arrive(self, time: float, context: Context, state: State) -> None:
+        self._change(self._of(state), time)
 
     def _delay(self, context: Context, output: BasicVector) -> None:
-        taken = int(context.get_discrete_state(self._taken).value()[0])
-        output.SetFromVector([self._delays[min(max(taken, 1), len(self._delays)) - 1]])
+        sent = max(self._taken(self._of(context)), 1)
+        output.SetFromVector([self._delays[min(sent, len(self._delays)) - 1]])
 
 
 def declare_constant(system: LeafSystem, name: str, value: Array) -> None:

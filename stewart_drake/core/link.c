@@ -1,0 +1,172 @@
+/* The machine of the link: see link.h. */
+
+#include <string.h>
+
+#include "link.h"
+
+enum { AT, SEQUENCE, ARRIVAL, COMMAND }; /* of a command that waits */
+
+static int width(const stewart_link *link) { return COMMAND + link->size; }
+
+static double *acted(double *memory) { return memory + STEWART_LINK_COMMANDS; }
+
+static double *waiting(const stewart_link *link, double *memory)
+{
+    return acted(memory) + link->history * (1 + link->size);
+}
+
+int stewart_link_memory(const stewart_link *link)
+{
+    return STEWART_LINK_COMMANDS + link->history * (1 + link->size) + link->kept * width(link);
+}
+
+void stewart_link_start(const stewart_link *link, double *memory)
+{
+    for (int i = 0; i < stewart_link_memory(link); i++)
+        memory[i] = 0;
+    memory[STEWART_LINK_LAST] = memory[STEWART_LINK_NEWEST] = -(double)HUGE_VAL;
+}
+
+const double *stewart_link_acting(const double *memory) { return memory + STEWART_LINK_COMMANDS + 1; }
+
+/* `command` NULL is zero; it may be the one that acts. */
+static void act(const stewart_link *link, double *memory, const double *command, double time)
+{
+    const size_t size = (size_t)link->size * sizeof(double);
+    double *newest = acted(memory), *older = newest + 1 + link->size;
+    memmove(older, newest, (size_t)((link->history - 1) * (1 + link->size)) * sizeof(double));
+    newest[0] = time;
+    if (command)
+        memmove(newest + 1, command, size);
+    else
+        memset(newest + 1, 0, size);
+    memory[STEWART_LINK_ACTED] += memory[STEWART_LINK_ACTED] < link->history;
+}
+
+void stewart_link_assume(const stewart_link *link, double *memory, double time,
+                         const double *command)
+{
+    for (int i = 0; i < link->history; i++)
+        act(link, memory, command, time);
+}
+
+static void drop(const stewart_link *link, double *memory, double *row)
+{
+    const int last = (int)--memory[STEWART_LINK_WAITING];
+    memmove(row, waiting(link, memory) + width(link) * last, (size_t)width(link) * sizeof(double));
+}
+
+/* Keep a command, in the place of one that can never act any more because of it. Returns 0 where
+   there is no place. */
+static int keep(const stewart_link *link, double *memory, double at, double sequence, double arrival,
+                const double *command)
+{
+    const int number = (int)memory[STEWART_LINK_WAITING];
+    double *row = waiting(link, memory);
+    if (!isfinite(at) || arrival == (double)HUGE_VAL) /* it is lost */
+        return 1;
+    for (int i = 0; i < number; i++, row += width(link))
+        if (!link->wire && fabs(row[AT] - at) <= link->together) {
+            if (row[SEQUENCE] > sequence && row[ARRIVAL] <= arrival)
+                return 1;
+            if (row[SEQUENCE] <= sequence && row[ARRIVAL] >= arrival)
+                break;
+        }
+    if (row == waiting(link, memory) + width(link) * number) {
+        if (number == link->kept)
+            return 0;
+        memory[STEWART_LINK_WAITING]++;
+    }
+    row[AT] = at;
+    row[SEQUENCE] = sequence;
+    row[ARRIVAL] = arrival;
+    for (int i = 0; i < link->size; i++) {
+        const double limit = (double)link->limit, value = command[i];
+        row[COMMAND + i] = value > limit ? limit : value < -limit ? -limit : value;
+    }
+    return 1;
+}
+
+void stewart_link_begin(const stewart_link *link, double *memory, double first, int number,
+                        const double *commands)
+{
+    for (int i = 0; i < number; i++)
+        keep(link, memory, first + i * link->period, i - number + 1, -(double)HUGE_VAL,
+             commands + link->size * i);
+}
+
+int stewart_link_take(const stewart_link *link, double *memory, double now, double sequence,
+                      double arrival, double first, int number, const double *commands)
+{
+    const double last = first + (number - 1) * link->period;
+    if (memory[STEWART_LINK_WAITING] + (link->wire ? 1 : number) > link->kept)
+        return STEWART_LINK_FULL;
+    memory[STEWART_LINK_TAKEN]++;
+    if (number == 0)
+        return STEWART_LINK_TAKES;
+    if (link->wire) {
+        if (sequence < memory[STEWART_LINK_NEWEST])
+            return STEWART_LINK_LATE;
+        keep(link, memory, first, sequence, arrival, commands);
+        return STEWART_LINK_TAKES;
+    }
+    if (last < now - link->together || last <= memory[STEWART_LINK_LAST] + link->together)
+        return STEWART_LINK_LATE;
+    for (int i = 0; i < number; i++)
+        if (first + i * link->period > memory[STEWART_LINK_LAST] + link->together)
+            keep(link, memory, first + i * link->period, sequence, arrival, commands + link->size * i);
+    return STEWART_LINK_TAKES;
+}
+
+double stewart_link_next(const stewart_link *link, const double *memory)
+{
+    const double *row = waiting(link, (double *)memory);
+    double next = HUGE_VAL;
+    for (int i = 0; i < (int)memory[STEWART_LINK_WAITING]; i++, row += width(link))
+        if (row[AT] < next)
+            next = row[AT];
+    if (!link->wire && memory[STEWART_LINK_COUNTS] > 0 &&
+        memory[STEWART_LINK_LAST] + link->period < next)
+        next = memory[STEWART_LINK_LAST] + link->period;
+    return next;
+}
+
+/* Of the commands whose time has come the newest acts, of those that have arrived by then. In a buffer
+   that is one for this very period. On a wire one that was overtaken never acts. All others of that
+   time are forgotten. */
+void stewart_link_change(const stewart_link *link, double *memory, double time)
+{
+    const double until = time + link->together;
+    const double from = link->wire ? -(double)HUGE_VAL : time - link->together;
+    double *row = waiting(link, memory), *best = NULL;
+    for (int i = 0; i < (int)memory[STEWART_LINK_WAITING]; i++, row += width(link))
+        if (row[AT] >= from && row[AT] <= until && row[ARRIVAL] <= until &&
+            !(best && best[SEQUENCE] > row[SEQUENCE]))
+            best = row;
+    memory[STEWART_LINK_LAST] = time;
+    if (best && !(link->wire && best[SEQUENCE] < memory[STEWART_LINK_NEWEST])) {
+        act(link, memory, best + COMMAND, best[AT]);
+        memory[STEWART_LINK_NEWEST] = best[SEQUENCE];
+        memory[STEWART_LINK_FED] = best[SEQUENCE] > 0;
+        memory[STEWART_LINK_PLAYED] += best[SEQUENCE] > 0;
+    } else if (!link->wire) {
+        memory[STEWART_LINK_DRY]++;
+        memory[STEWART_LINK_FED] = 0;
+        act(link, memory, link->holds ? stewart_link_acting(memory) : NULL, time);
+    }
+    memory[STEWART_LINK_COUNTS] = 1;
+    for (int i = (int)memory[STEWART_LINK_WAITING] - 1; i >= 0; i--) {
+        row = waiting(link, memory) + width(link) * i;
+        if (row[AT] <= until)
+            drop(link, memory, row);
+    }
+}
+
+void stewart_link_safe(const stewart_link *link, double *memory, double time, int holds)
+{
+    memory[STEWART_LINK_WAITING] = memory[STEWART_LINK_COUNTS] = memory[STEWART_LINK_FED] = 0;
+    memory[STEWART_LINK_NEWEST] = -(double)HUGE_VAL; /* a new session counts anew */
+    if (time > memory[STEWART_LINK_LAST])
+        memory[STEWART_LINK_LAST] = time;
+    act(link, memory, holds ? stewart_link_acting(memory) : NULL, time);
+}

@@ -1,0 +1,93 @@
+"""The link of core/link.h: a wire, or a buffer in which commands wait for their times."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from stewart_drake.core.library import core
+from stewart_drake.types import Array
+
+
+class Link:
+    """A machine of events whose memory, a vector of numbers, is the caller's.
+
+    Args:
+        size: numbers of a command.
+        kept: commands that can wait.
+        period: of a buffered command, in the unit of all times.
+        wire: whether commands act when they arrive.
+        holds: whether a dry buffer holds the last command, or puts out zero.
+        history: commands that have acted and are remembered.
+        together: instants so close to each other are one.
+        limit: of each number of a command.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        kept: int,
+        period: float,
+        *,
+        wire: bool,
+        holds: bool = True,
+        history: int = 1,
+        together: float = 0.0,
+        limit: float = math.inf,
+    ) -> None:
+        c = core()
+        self._at, self._lib, self.size, self._history = c.at, c.lib, size, history
+        values = size, kept, history, wire, holds, period, together, limit
+        self.data: Any = c.ffi.new("stewart_link *", values)
+
+    def start(self) -> Array:
+        """Return the memory of a link on which nothing is under way."""
+        memory = np.empty(self._lib.stewart_link_memory(self.data))
+        self._lib.stewart_link_start(self.data, self._at(memory))
+        return memory
+
+    def assume(self, memory: Array, time: float, command: Array) -> None:
+        """Let a command (size,) act since a time."""
+        command = np.array(command, np.float64)
+        self._lib.stewart_link_assume(self.data, self._at(memory), time, self._at(command))
+
+    def begin(self, memory: Array, first: float, commands: Array) -> None:
+        """Put commands (n, size) under way that act at `first`, a period later and so on."""
+        commands = np.array(commands, np.float64)
+        given = first, len(commands), self._at(commands)
+        self._lib.stewart_link_begin(self.data, self._at(memory), *given)
+
+    def take(
+        self,
+        memory: Array,
+        now: float,
+        sequence: float,
+        first: float,
+        commands: Array,
+        arrival: float = -math.inf,
+    ) -> int:
+        """Take a plan (n, size), see core/link.h. Return 0, or why it is of no use."""
+        commands = np.array(commands, np.float64)
+        given = now, sequence, arrival, first, len(commands), self._at(commands)
+        return int(self._lib.stewart_link_take(self.data, self._at(memory), *given))
+
+    def next_change(self, memory: Array) -> float:
+        """Return when `change` is to be called next, or infinity."""
+        return float(self._lib.stewart_link_next(self.data, self._at(memory)))
+
+    def change(self, memory: Array, time: float) -> None:
+        """Let act what acts from a time on."""
+        self._lib.stewart_link_change(self.data, self._at(memory), time)
+
+    def safe(self, memory: Array, time: float, holds: bool) -> None:
+        """Forget what waits, and hold the last command or put out zero."""
+        self._lib.stewart_link_safe(self.data, self._at(memory), time, holds)
+
+    def acted(self, memory: Array) -> Array:
+        """Return a view (h, 1 + size) of what has acted, after its time, the newest first."""
+        begin = self._lib.STEWART_LINK_COMMANDS
+        return memory[begin : begin + self._history * (1 + self.size)].reshape(self._history, -1)
+
+    def number(self, memory: Array, name: str) -> float:
+        """Return a number of the memory by its name in core/link.h, such as `taken`."""
+        return float(memory[getattr(self._lib, f"STEWART_LINK_{name.upper()}")])
