@@ -10,9 +10,11 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares, lsq_linear
 from scipy.stats import chi2
 
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law import parameter_filter
 from stewart_drake.law.belief import Estimate
+from stewart_drake.law.compiled import machine_of
 from stewart_drake.law.filter_settings import FilterSettings, ParameterSet, filter_settings
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motors import TorqueLimit
@@ -205,21 +207,26 @@ def test_kicks_are_what_early_and_late_torques_do(
     held = PLANT.inverse_dynamics(pose, rates, accelerations, theta)
     three = held + rng.normal(0, 0.05, (3, 6))
     durations = PERIOD * np.array([split, 1 - split])[: 1 if split == 1 else 2]
-    period = Period(three[: len(durations)], durations, three[len(durations)], 8)
-    after = PLANT.predict(x, period.torques, durations, 8, theta)[-1]
-    kick = parameter_filter.kicks(PLANT, after, theta, period)[0]
+    torques = three[: len(durations)].copy()
+    after = PLANT.predict(x, torques, durations, 8, theta)[-1]
+    c, kick, following = core(), np.empty(12), three[1].copy()  # one change alone
+    acting = [len(torques), c.at(torques), c.at(durations), 8]
+    period = c.ffi.new("stewart_acted *", [acting, c.at(following)])
+    machine = machine_of(PLANT).it
+    c.lib.stewart_kicks(machine, period, c.at(after), c.at(theta), c.at(kick))
+    kick = np.sqrt(kick)
 
     # The same second in three pieces, the first change `late` after its time.
     parts = [split * PERIOD + late, PERIOD * (1 - split) - late]
     if split == 1.0 and late > 0:  # still the old torque when the new one should act
         forwards = PLANT.predict(x, three[:1], np.array(parts[:1]), 8, theta)[-1]
         expected = PLANT.predict(x, three[:2], np.array([PERIOD, late]), 8, theta)[-1]
-        assert relative((forwards - expected)[6:], -late * kick[6:]) < tolerance
+        assert relative(np.abs(forwards - expected)[6:], abs(late) * kick[6:]) < tolerance
     else:
-        moved = PLANT.predict(x, three[:2], np.array(parts), 8, theta)[-1] - after
-        assert relative(moved[6:], -late * kick[6:]) < tolerance
+        moved = np.abs(PLANT.predict(x, three[:2], np.array(parts), 8, theta)[-1] - after)
+        assert relative(moved[6:], abs(late) * kick[6:]) < tolerance
         if split < 1:  # else there is no time to move the pose
-            assert relative(moved[:6], -late * kick[:6]) < tolerance
+            assert relative(moved[:6], abs(late) * kick[:6]) < tolerance
 
 
 def test_a_period_of_two_torques_is_two_shorter_ones() -> None:

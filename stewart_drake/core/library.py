@@ -93,6 +93,7 @@ class Core:
         self.ffi: Any = FFI()
         self.ffi.cdef(declarations())
         self.lib: Any = self.ffi.dlopen(str(LIBRARY))
+        self._block = self.ffi.new_allocator(should_clear_after_alloc=False)
 
     def at(self, array: NDArray[Any] | None) -> Any:
         """Return the numbers of a contiguous array of doubles or C ints, which it keeps alive.
@@ -111,7 +112,7 @@ class Core:
 
     def scratch(self, numbers: int) -> Any:
         """Return a `stewart_scratch` of so many numbers, for one call."""
-        return [self.ffi.new("real[]", numbers)]
+        return [self._block("real[]", numbers)]
 
 
 @lru_cache(maxsize=1)

@@ -19,6 +19,21 @@ void stewart_believe(const stewart_machine *machine, const real *theta, stewart_
     belief->plant.geometry = machine->geometry;
     belief->plant.gravity = &machine->gravity;
     belief->plant.parameters = belief->parameters;
+    belief->map = machine->map;
+}
+
+void stewart_accelerate(const stewart_belief *belief, const real *state, const real *torque,
+                        real *accelerations)
+{
+    if (!belief->map) {
+        stewart_accelerations(&belief->plant, state, state + 6, torque, accelerations);
+        return;
+    }
+    for (int i = 0; i < 6; i++) {
+        accelerations[i] = 0;
+        for (int j = 0; j < U; j++) /* the biases are the first of the parameters */
+            accelerations[i] += belief->map[U * i + j] * (torque[j] + belief->parameters[j]);
+    }
 }
 
 int stewart_substeps(const stewart_machine *machine, int number, const real *torques)
@@ -84,11 +99,20 @@ int stewart_is_workable(const real *geometry, const real *pose)
 }
 
 /* On by one torque, from a state in its place. */
-static void move(const stewart_plant *plant, const real *torque, real duration, int substeps,
+static void move(const stewart_belief *belief, const real *torque, real duration, int substeps,
                  real *state)
 {
-    for (int i = 0; i < substeps; i++)
-        stewart_move(plant, torque, duration / (real)substeps, state);
+    real a[6];
+    if (!belief->map) {
+        for (int i = 0; i < substeps; i++)
+            stewart_move(&belief->plant, torque, duration / (real)substeps, state);
+        return;
+    }
+    stewart_accelerate(belief, state, torque, a);
+    for (int i = 0; i < 6; i++) {
+        state[i] += duration * (state[6 + i] + duration / 2 * a[i]);
+        state[6 + i] += duration * a[i];
+    }
 }
 
 static int substeps_of(const stewart_machine *machine, const stewart_acting *acting)
@@ -106,18 +130,18 @@ void stewart_predict(const stewart_machine *machine, const real *theta, const st
     stewart_believe(machine, theta, &belief);
     for (int k = 0; k < acting->number; k++, state = states, states += X) {
         stewart_copy(X, state, states);
-        move(&belief.plant, acting->torques + U * k, acting->durations[k], substeps, states);
+        move(&belief, acting->torques + U * k, acting->durations[k], substeps, states);
     }
 }
 
-int stewart_derivatives(const stewart_machine *machine, const stewart_belief *belief,
-                        const real *state, const real *torque, real *A, real *B, real *G,
+/* -dF/d[state, torque, theta] of the equations, times the inverse mass matrix: (6, 18 + p). */
+static int of_equations(const stewart_machine *machine, const stewart_belief *belief,
+                        const real *state, const real *torque, int p, real *right,
                         stewart_scratch scratch)
 {
-    const int p = G ? machine->estimated : 0, columns = X + U + p;
+    const int columns = X + U + p;
     real *dF_dx = stewart_take(&scratch, 6 * X);
     real *dF_dp = stewart_take(&scratch, 6 * STEWART_PARAMETERS);
-    real *right = stewart_take(&scratch, 6 * columns);
     real accelerations[6], M[36], mass[36], arm[36];
     stewart_accelerations(&belief->plant, state, state + 6, torque, accelerations);
     stewart_residual_derivatives(&belief->plant, state, state + 6, accelerations, torque, dF_dx,
@@ -133,8 +157,26 @@ int stewart_derivatives(const stewart_machine *machine, const stewart_belief *be
         for (int j = 0; j < p; j++)
             row[X + U + j] = machine->place[j] < 0 ? 0 : -dF_dp[6 * machine->place[j] + i];
     }
-    if (!stewart_solve(6, columns, mass, right))
+    return stewart_solve(6, columns, mass, right);
+}
+
+int stewart_derivatives(const stewart_machine *machine, const stewart_belief *belief,
+                        const real *state, const real *torque, real *A, real *B, real *G,
+                        stewart_scratch scratch)
+{
+    const int p = G ? machine->estimated : 0, columns = X + U + p;
+    real *right = stewart_take(&scratch, 6 * columns);
+    if (belief->map) {
+        stewart_fill(6 * columns, 0, right);
+        for (int i = 0; i < 6; i++) {
+            stewart_copy(U, belief->map + U * i, right + columns * i + X);
+            for (int j = 0; j < p; j++)
+                if (machine->place[j] >= 0 && machine->place[j] < U)
+                    right[columns * i + X + U + j] = belief->map[U * i + machine->place[j]];
+        }
+    } else if (!of_equations(machine, belief, state, torque, p, right, scratch)) {
         return 0;
+    }
     stewart_fill(6 * X, 0, A);
     stewart_fill(6 * U, 0, B);
     if (G)
@@ -209,7 +251,7 @@ int stewart_transitions(const stewart_machine *machine, const real *xi, const st
     for (int k = 0; k < acting->number; k++, before = H, start = states, states += X, H += X * n) {
         const real *torque = acting->torques + U * k, h = acting->durations[k];
         stewart_copy(X, start, states);
-        move(&belief.plant, torque, h, substeps, states);
+        move(&belief, torque, h, substeps, states);
         if (!transition_of_hold(machine, &belief, torque, h, exact, start, states, Phi, S, scratch))
             return 0;
         if (before) /* [Phi S; 0 1] [H; 0 1] */
@@ -224,4 +266,12 @@ int stewart_transitions(const stewart_machine *machine, const real *xi, const st
                 H[n * i + X + j] += S[p * i + j];
     }
     return 1;
+}
+
+int stewart_transitions_scratch(int p)
+{
+    const int held = X * X + X * p, nodes = 4 * X * X + 4 * X * p;
+    const int derivatives = 6 * (X + STEWART_PARAMETERS + X + U + p);
+    const int exponential = 4 * X * X + X * (p > X ? p : X);
+    return 2 * held + nodes + X * U + (derivatives > exponential ? derivatives : exponential);
 }

@@ -21,6 +21,7 @@ typedef struct {
     int substeps;                        /* Runge-Kutta steps per torque */
     int estimated;                       /* p */
     int place[STEWART_MAX_ESTIMATED];    /* of each in `parameters`, or -1 */
+    const real *map; /* (6, 6), or NULL: accelerations = map (torque + bias), whatever the pose */
 } stewart_machine;
 
 /* What acts, one torque after the other. */
@@ -35,6 +36,7 @@ typedef struct {
 typedef struct {
     stewart_plant plant;
     real parameters[STEWART_PARAMETERS];
+    const real *map; /* as of the machine */
 } stewart_belief;
 
 /* `theta` (p), or NULL for what is known beforehand. The belief points into itself: it is not copied. */
@@ -50,6 +52,10 @@ int stewart_within_reach(const real *geometry, const real *pose, int strictly);
 
 /* Whether a plate at a pose can be regulated: all legs are within reach, none at a dead centre. */
 int stewart_is_workable(const real *geometry, const real *pose);
+
+/* Second derivative (6) of the pose of a state (12) under torques (6). */
+void stewart_accelerate(const stewart_belief *belief, const real *state, const real *torque,
+                        real *accelerations);
 
 /* States (number, 12) after each of the torques, from a state (12). */
 void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_acting *acting,
@@ -69,5 +75,7 @@ void stewart_within_hold(const real *start, const real *end, real h, real s, rea
    midpoint's of second. Returns 0 where they do not exist. */
 int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_acting *acting,
                         int exact, real *states, real *H, stewart_scratch scratch);
+
+int stewart_transitions_scratch(int estimated);
 
 #endif

@@ -93,11 +93,15 @@ class FrozenDynamics(StewartDynamics):
     """`StewartDynamics` of that plant: the map at home, at any pose, in or out of reach.
 
     Gravity and all parameters but the torque bias change nothing.
+
+    Attributes:
+        map: (6, 6) accelerations per torque.
     """
 
     def __init__(self, mechanism: Mechanism, *arguments: Any, **named: Any) -> None:
         super().__init__(mechanism, *arguments, **named)
-        self._functions = FrozenMap(mechanism)
+        self._functions = frozen = FrozenMap(mechanism)
+        self.map = frozen.map
 
     def __repr__(self) -> str:
         return f"FrozenDynamics({self.mechanism})"

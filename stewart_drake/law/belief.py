@@ -23,6 +23,7 @@ class Estimate:
         outliers: how many in a row, up to the last measurement, bear each other out.
         unseen: periods since a measurement was last used.
         partly: why values of that were left out, as names of counts.
+        root: (12 + p, 12 + p) L with L L' the covariance; NaN where no filter has made one.
     """
 
     mean: Array
@@ -31,6 +32,11 @@ class Estimate:
     outliers: int = 0
     unseen: int = 0
     partly: tuple[str, ...] = ()
+    root: Array = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.root is None:
+            object.__setattr__(self, "root", np.full_like(self.covariance, np.nan))
 
     @property
     def state(self) -> Array:

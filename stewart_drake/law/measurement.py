@@ -37,6 +37,17 @@ class Measurement:
         """(m,) the last value of each that was there; `last` (m,) is that before."""
         return np.where(self.valid, self.values, last)
 
+    def known(self, size: int) -> Array:
+        """Return the values (size,), NaN in the place of those that are lost.
+
+        Raises:
+            ValueError: another number of values.
+        """
+        values = np.where(self.valid, self.values, np.nan)
+        if values.shape != (size,):
+            raise ValueError(f"measurement: got shape {values.shape}; expected {(size,)}")
+        return values
+
     def require_fresh(self) -> None:
         """For who takes the values for those of now.
 

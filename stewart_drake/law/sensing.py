@@ -2,38 +2,26 @@
 
 The law and its observers know a sensor by `Sensing` alone. Which measurements are no use shows by
 what they say themselves and by what was said before. One that is *missing* says so. One that is
-*frozen* repeats what was measured before, bit for bit, which is a fault only where it cannot be so:
-
-- noise that doubles can tell apart never comes twice: with noise a value that repeats is frozen;
-- without noise the poses q and rates v have to agree. Between two samples a smooth motion goes
-
-      q_k - q_{k-1} = dt/2 (v_{k-1} + v_k) + O(dt^3),
-
-  so a pose that repeats is frozen if its own rates say that it has moved on. A plate at rest
-  repeats pose and rates and is not frozen.
-
-A pose that the machine cannot have is *rejected*. What needs a model of the motion, an outlier or a
+*frozen* repeats what was measured before, bit for bit, which is a fault only where it cannot be so.
+One that the machine cannot have is *rejected*. What needs a model of the motion, an outlier or a
 sensor that froze while the plate was at rest, is for the filter to find (`law.parameter_filter`).
+The numbers are those of core/sensing.h.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from stewart_drake.core.library import core
+from stewart_drake.law.compiled import Compiled, Once, geometry, numbers
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.scenario.signals import NUM_STATE, POSE, RATES
+from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE
 from stewart_drake.types import Array
 
-MOVED = 1e-3
-"""Share of the motion that a pose has to go within a period to have moved."""
-NOISY = 2.0**20
-"""Noise has so many units in the last place: by chance it repeats once in a million values."""
-SIGMAS = 6.0
-"""Standard deviations by which rates may be off without saying that anything moved."""
-_STEEPEST = np.pi / 2
-"""rad; beyond this pitch another roll and yaw describe the same pose."""
+FAULTS = ("measurements_missing", "measurements_frozen", "measurements_rejected")
+"""Counts by the bits of `STEWART_MISSING` and so on."""
 
 
 class FirstState(NamedTuple):
@@ -141,22 +129,12 @@ class StateSensing:
         self, measurement: Measurement, last: Array, period: float, mechanism: Mechanism
     ) -> str | None:
         """See `Sensing.fault`; one value that is lost loses the others."""
-        if not measurement.complete:
-            return "measurements_missing"
-        values = measurement.values
-        repeats = values == last
-        noisy = self.noise_std > NOISY * np.spacing(np.abs(values))
-        moved = period / 2 * np.abs(values[RATES] + last[RATES])
-        perhaps = MOVED * self.motion + SIGMAS * period * self.noise_std[RATES]
-        stuck = repeats[POSE] & (moved > perhaps)
-        if np.any(repeats & noisy) or np.any(stuck):
-            return "measurements_frozen"
-        pose = values[POSE]
-        if self.anywhere:
-            return None
-        if abs(pose[1]) >= _STEEPEST or not np.all(mechanism.reach_margins(pose) >= 0):
-            return "measurements_rejected"
-        return None
+        c, values, before = core(), measurement.known(self.size), numbers(last, self.size)
+        sensor, legs = _state_sensor(self).it, geometry(mechanism)
+        found = c.lib.stewart_state_fault(
+            sensor, *map(c.at, (legs,)), period, c.at(values), c.at(before)
+        )
+        return next(iter(causes(found)), None)
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState:
         """The measurement, as uncertain as its noise."""
@@ -169,3 +147,74 @@ class StateSensing:
     def now(self, measurement: Measurement) -> tuple[Sensing, Measurement]:
         """All of it."""
         return self, measurement
+
+    def compiled(self) -> Compiled:
+        """Return the `stewart_sensing`."""
+        sensor, noise = _state_sensor(self), numbers(self.noise_std, NUM_STATE)
+        sensing = core().lib.stewart_state_sensing(sensor.it)
+        return Compiled(core().ffi.new("stewart_sensing *", sensing), (sensor, noise))
+
+
+@Once
+def _state_sensor(sensing: StateSensing) -> Compiled:
+    sensor = core().ffi.new("stewart_state_sensor *")
+    sensor.noise_std = list(numbers(sensing.noise_std, NUM_STATE))
+    sensor.motion = list(numbers(sensing.motion, NUM_COORDINATES))
+    sensor.anywhere = sensing.anywhere
+    return Compiled(sensor)
+
+
+def causes(bits: int) -> tuple[str, ...]:
+    """Return the counts of bits of `STEWART_MISSING` and so on."""
+    return tuple(name for i, name in enumerate(FAULTS) if bits >> i & 1)
+
+
+@Once
+def compiled_sensing(sensing: Sensing) -> Compiled:
+    """Return the `stewart_sensing` of a sensor.
+
+    C calls Python for a class that has no method `compiled` of its own, not an inherited one.
+    """
+    own = vars(type(sensing)).get("compiled")
+    return _of_python(sensing) if own is None else own(sensing)
+
+
+def _of_python(sensing: Sensing) -> Compiled:
+    c, m, raised = core(), sensing.size, list[BaseException]()
+    noise, kind = numbers(sensing.noise_std, m), "const stewart_sensing *, const real *,"
+    started = "const real *, real *, real *, stewart_scratch"
+
+    def read(pointer: Any, number: int) -> Array:
+        return np.frombuffer(c.ffi.buffer(pointer, 8 * number)).copy()
+
+    def write(pointer: Any, values: Array, shape: tuple[int, ...]) -> None:
+        there = np.frombuffer(c.ffi.buffer(pointer, 8 * int(np.prod(shape)))).reshape(shape)
+        there[...] = values
+
+    def failed(_: Any, error: BaseException, __: Any) -> None:
+        raised.append(error)
+
+    def seen(_: Any, state: Any, values: Any) -> None:
+        write(values, np.nan, (m,))
+        write(values, sensing.seen(read(state, NUM_STATE)), (m,))
+
+    def jacobian(_: Any, state: Any, J: Any) -> None:
+        write(J, np.nan, (m, NUM_STATE))
+        write(J, sensing.through(read(state, NUM_STATE), np.eye(NUM_STATE)), (m, NUM_STATE))
+
+    def start(_: Any, values: Any, near: Any, state: Any, root: Any, __: Any) -> int:
+        expected = None if near == c.ffi.NULL else read(near, NUM_STATE)
+        first = sensing.start(Measurement.of(read(values, m)), expected)
+        if first is None:
+            return 0
+        write(state, first.state, (NUM_STATE,))
+        write(root, first.covariance, (NUM_STATE, NUM_STATE))
+        return int(c.lib.stewart_root(NUM_STATE, root))
+
+    functions = (
+        c.ffi.callback(f"void({kind} real *)", seen, onerror=failed),
+        c.ffi.callback(f"void({kind} real *)", jacobian, onerror=failed),
+        c.ffi.callback(f"int({kind} {started})", start, onerror=failed),
+    )
+    it = c.ffi.new("stewart_sensing *", [m, c.at(noise), c.ffi.NULL, *functions])
+    return Compiled(it, (noise, *functions), (raised,))

@@ -1,0 +1,35 @@
+/* Crank angles of a pose, their Jacobian, and the pose of crank angles. */
+
+#ifndef STEWART_KINEMATICS_H
+#define STEWART_KINEMATICS_H
+
+#include "matrix.h"
+
+/* Leg i, with q = p_SQ_S from the shaft centre to the plate joint in the motor's frame, crank length u
+   and rod length l: the crank tip is u [cos(alpha), sin(alpha), 0] from the shaft centre and must lie
+   at distance l from the joint,
+
+       A cos(alpha) + B sin(alpha) = C,   A = 2 u q_x,  B = 2 u q_y,  C = q.q + u^2 - l^2,
+       alpha = atan2(B, A) + e acos(C / hypot(A, B)),   e = -1 or +1 the crank branch.
+
+   `geometry` is that of a machine, see dynamics.h. */
+
+/* Crank angles (6) in rad at a pose (6); NaN where a leg does not reach. */
+void stewart_crank_angles(const real *geometry, const real *pose, real *angles);
+
+/* J (6, 6), rates of the cranks per rates of the pose. The rod keeps its length, so that
+
+       u rod.tangent alpha_dot = [(p_PQ x rod)' E, rod'] rates,
+
+   E the map from rates of roll, pitch and yaw to the angular velocity. Returns 0, and J of NaN, where
+   a leg does not reach, or is at its dead centre. */
+int stewart_crank_jacobian(const real *geometry, const real *pose, real *J);
+
+/* The pose (6) with these crank angles (6), from a guess in its place. Newton's method with halving
+   steps on f_i = |p_TQ|^2 / l^2 - 1 from crank tip to plate joint, which stays smooth through dead
+   centres and outside the workspace. Returns 0 where it finds none, or one of another branch.
+   Scratch: 48 numbers. */
+int stewart_forward_kinematics(const real *geometry, const real *angles, real *pose,
+                               stewart_scratch scratch);
+
+#endif
