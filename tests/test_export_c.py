@@ -91,7 +91,7 @@ def test_compiling_without_checks_for_nan_is_refused(
     option: str, tmp_path: Path, compiler: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of every source of the controller, and of the package's own library."""
-    for source in (name for name in export_c.SOURCES if name.endswith(".c")):
+    for source in export_c.CONTROLLER[:-1]:
         done = subprocess.run(
             [*compiler, "-std=c99", option, "-fsyntax-only", str(build.FOLDER / source)],
             capture_output=True,
@@ -179,8 +179,7 @@ def test_odd_inputs_are_survived(
     """NaN, infinity, huge numbers, INT_MIN and INT_MAX, under both sanitizers."""
     folder = exported(tmp_path, name, (*settings, "duration=0.5"))
     shutil.copy(Path(__file__).with_name("odd_inputs.c"), folder)
-    names = "odd_inputs dynamics riccati law stewart_config stewart_motion"
-    sources = [f"{n}.c" for n in names.split()]
+    sources = ["odd_inputs.c", *export_c.CONTROLLER, "stewart_motion.c"]
     options = ["-std=c99", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     command = [*compiler, *options, *sources, "-lm", "-o", "odd_inputs"]
     subprocess.run(command, cwd=folder, check=True)
@@ -219,7 +218,7 @@ int main(void) {
 def test_the_stack_is_not_deeper_than_told(tmp_path: Path, compiler: list[str]) -> None:
     folder = exported(tmp_path, "paper", ("duration=1.0",))
     (folder / "painted.c").write_text(PAINTED)
-    sources = ["dynamics.c", "riccati.c", "law.c", "stewart_config.c", "meter.c", "painted.c"]
+    sources = [*export_c.CONTROLLER, "meter.c", "painted.c"]
     command = [*compiler, "-O2", "-Dmain=replay", "-c", "stewart_test.c"]
     subprocess.run(command, cwd=folder, check=True)
     command = [*compiler, "-O2", *sources, "stewart_test.o", "-lm", "-pthread", "-o", "painted"]

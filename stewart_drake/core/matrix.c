@@ -23,17 +23,84 @@ void stewart_fill(int n, real value, real *x)
         x[i] = value;
 }
 
+/* c <- (c +) s: one sum of a tile. */
+static inline void put(int how, real s, real *c)
+{
+    *c = how == STEWART_SET ? s : how == STEWART_ADD ? *c + s : *c - s;
+}
+
+/* Twelve sums at a time, each with a name: a compiler keeps them in registers, of which a Cortex-M has
+   16 in double precision, and sums in an array it does not. A loop of unknown length is one that no
+   compiler takes apart, to put several p of one sum into a vector: vectors are for several j. */
+void stewart_two_rows(int how, int k, const real *a0, const real *a1, int next, const real *b,
+                      int m, int columns, real *c0, real *c1)
+{
+    int j = 0;
+    if (k < 1)
+        return;
+    for (; j + 6 <= columns; j += 6, c0 += 6, c1 += 6) {
+        const real *x = a0, *y = a1, *row = b + j, *last = row + m * (k - 1);
+        real s0 = 0, s1 = 0, s2 = 0, s3 = 0, s4 = 0, s5 = 0;
+        real t0 = 0, t1 = 0, t2 = 0, t3 = 0, t4 = 0, t5 = 0;
+        for (;; x += next, y += next, row += m) {
+            const real u = *x, v = *y;
+            s0 += u * row[0];
+            t0 += v * row[0];
+            s1 += u * row[1];
+            t1 += v * row[1];
+            s2 += u * row[2];
+            t2 += v * row[2];
+            s3 += u * row[3];
+            t3 += v * row[3];
+            s4 += u * row[4];
+            t4 += v * row[4];
+            s5 += u * row[5];
+            t5 += v * row[5];
+            if (row == last)
+                break;
+        }
+        put(how, s0, c0);
+        put(how, s1, c0 + 1);
+        put(how, s2, c0 + 2);
+        put(how, s3, c0 + 3);
+        put(how, s4, c0 + 4);
+        put(how, s5, c0 + 5);
+        put(how, t0, c1);
+        put(how, t1, c1 + 1);
+        put(how, t2, c1 + 2);
+        put(how, t3, c1 + 3);
+        put(how, t4, c1 + 4);
+        put(how, t5, c1 + 5);
+    }
+    for (; j < columns; j++, c0++, c1++) {
+        const real *x = a0, *y = a1, *row = b + j;
+        real s = 0, t = 0;
+        for (int p = 0; p < k; p++, x += next, y += next, row += m) {
+            s += *x * *row;
+            t += *y * *row;
+        }
+        put(how, s, c0);
+        put(how, t, c1);
+    }
+}
+
+/* The last of an odd number of rows is computed twice. */
 void stewart_multiply(int n, int k, int m, const real *A, const real *B, real *restrict C)
 {
-    for (int i = 0; i < n; i++) {
-        real *restrict c = C + m * i;
-        for (int j = 0; j < m; j++)
-            c[j] = 0;
-        for (int p = 0; p < k; p++) {
-            real a = A[k * i + p];
-            for (int j = 0; j < m; j++)
-                c[j] += a * B[m * p + j];
-        }
+    for (int i = 0; i < n; i += 2) {
+        const int other = i + 1 < n;
+        stewart_two_rows(STEWART_SET, k, A + k * i, A + k * (i + other), 1, B, m, m, C + m * i,
+                         C + m * (i + other));
+    }
+}
+
+void stewart_multiply_transpose(int n, int k, int m, const real *A, const real *B,
+                                real *restrict C)
+{
+    for (int i = 0; i < n; i += 2) {
+        const int other = i + 1 < n;
+        stewart_two_rows(STEWART_SET, k, A + i, A + i + other, n, B, m, m, C + m * i,
+                         C + m * (i + other));
     }
 }
 

@@ -12,9 +12,23 @@ void stewart_fill(int n, real value, real *x);
 /* C = A B, (n, k) (k, m). */
 void stewart_multiply(int n, int k, int m, const real *A, const real *B, real *restrict C);
 
+/* C = A' B, (k, n)' (k, m). */
+void stewart_multiply_transpose(int n, int k, int m, const real *A, const real *B,
+                                real *restrict C);
+
 /* C = A B', (n, k) (m, k)'. */
 void stewart_multiply_by_transpose(int n, int k, int m, const real *A, const real *B,
                                    real *restrict C);
+
+/* Two rows of a product, which all products of this file are made of:
+
+       c_ij <- (c_ij +) sum_p a_ip b_pj,   j < columns,
+
+   a_0p and a_1p `next` numbers apart, the rows of b (k) `m` numbers apart. c may be rows of b beyond
+   its first k ones. */
+enum { STEWART_SET, STEWART_ADD, STEWART_SUBTRACT };
+void stewart_two_rows(int how, int k, const real *a0, const real *a1, int next, const real *b,
+                      int m, int columns, real *c0, real *c1);
 
 /* B <- A^-1 B, (n, n) (n, m), by elimination with row pivoting; A is lost. Returns 0 for a singular
    A. */

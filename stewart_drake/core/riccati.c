@@ -8,15 +8,14 @@
        H_{k+1} = H_k + A_k' H_k W^-1 A_k,
 
    goes twice as far back in time as all before it: H_k is the cost of the first 2^k samples, and P
-   its limit. A_k = (I + G_k P) (A - B K)^(2^k) vanishes where, and only where, the loop is stable. */
-
-#include <string.h>
+   its limit. A_k = (I + G_k P) (A - B K)^(2^k) vanishes where, and only where, the loop is stable.
+   G, H, H W^-1 and W^-1 G are symmetric, so that every product is one of rows by rows, X'Y. */
 
 #include "riccati.h"
 
-#define WIDTH STEWART_MAX_ORDER
 #define INPUTS STEWART_INPUTS
 #define DOUBLINGS 40 /* 2^40 samples: longer than any loop takes to settle */
+#define BLOCK 6      /* columns: what a tile has, and a divisor of n */
 
 #ifdef STEWART_FLOAT
 #define VANISHED 1e-4f
@@ -28,227 +27,239 @@
 #define LARGEST_RESIDUAL 1e-4 /* as of law/riccati.py: relative to the solution */
 #endif
 
-#define TILE 6 /* all matrices are of a multiple: so many sums at a time fit into registers */
+/* Columns of rows i and i + 1 that are not above the diagonal, in whole blocks; i is even. */
+static int columns_below(int i) { return (i / BLOCK + 1) * BLOCK; }
 
-typedef real rows[WIDTH]; /* of a matrix, the first n of them in use */
-
-/* C = A B, of n rows and m columns; of a symmetric C (LOWER) at least what is not above the diagonal. */
-enum { WHOLE, LOWER };
-
-static void multiply(int n, int inner, int m, int part, rows *A, rows *B, rows *restrict C)
-{
-    for (int i = 0; i < n; i += 3)
-        for (int j = 0; j < (part == LOWER ? i + 3 : m); j += TILE) {
-            real a[TILE] = {0}, b[TILE] = {0}, c[TILE] = {0};
-            for (int k = 0; k < inner; k++)
-                for (int t = 0; t < TILE; t++) {
-                    a[t] += A[i][k] * B[k][j + t];
-                    b[t] += A[i + 1][k] * B[k][j + t];
-                    c[t] += A[i + 2][k] * B[k][j + t];
-                }
-            memcpy(C[i] + j, a, sizeof a);
-            memcpy(C[i + 1] + j, b, sizeof b);
-            memcpy(C[i + 2] + j, c, sizeof c);
-        }
-}
-
-static void transpose(int n, int m, rows *A, rows *restrict T)
+static void mirror(int n, real *S)
 {
     for (int i = 0; i < n; i++)
-        for (int j = 0; j < m; j++)
-            T[j][i] = A[i][j];
+        for (int j = 0; j < i; j++)
+            S[n * j + i] = S[n * i + j];
 }
 
-static void swap_rows(rows a, rows b)
+/* S <- S + X'Y of (n, n), where X'Y is symmetric. */
+static void add_symmetric(int n, const real *X, const real *Y, real *S)
 {
-    rows kept;
-    memcpy(kept, a, sizeof kept);
-    memcpy(a, b, sizeof kept);
-    memcpy(b, kept, sizeof kept);
+    for (int i = 0; i < n; i += 2)
+        stewart_two_rows(STEWART_ADD, n, X + i, X + i + 1, n, Y, n, columns_below(i), S + n * i,
+                         S + n * (i + 1));
+    mirror(n, S);
 }
 
-/* X_i <- (X_i - sum W_ik X_k) f, over `from` <= k < `to`: a row of a triangular solution. */
-static void substitute(int m, const real *row, int from, int to, real f, rows *X, real *target)
+static void transpose(int n, real *A)
 {
-    for (int j = 0; j < m; j += TILE) {
-        real sum[TILE];
-        memcpy(sum, target + j, sizeof sum);
-        for (int k = from; k < to; k++)
-            for (int t = 0; t < TILE; t++)
-                sum[t] -= row[k] * X[k][j + t];
-        for (int t = 0; t < TILE; t++)
-            target[j + t] = f * sum[t];
-    }
-}
-
-/* X <- W^-1 X, and so Y unless it is NULL, of m columns; W = L U with row pivoting in the place of W.
-   0 for a singular W. */
-static int solve(int n, int m, rows *W, rows *X, rows *Y)
-{
-    for (int k = 0; k < n; k++) {
-        int best = k;
-        for (int i = k + 1; i < n; i++)
-            if (REAL(fabs)(W[i][k]) > REAL(fabs)(W[best][k]))
-                best = i;
-        if (!(REAL(fabs)(W[best][k]) > 0)) /* or NaN */
-            return 0;
-        if (best != k) {
-            swap_rows(W[best], W[k]);
-            swap_rows(X[best], X[k]);
-            if (Y)
-                swap_rows(Y[best], Y[k]);
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < i; j++) {
+            const real a = A[n * i + j];
+            A[n * i + j] = A[n * j + i];
+            A[n * j + i] = a;
         }
-        for (int i = k + 1; i < n; i++) {
-            real f = W[i][k] / W[k][k];
-            for (int j = k + 1; j < n; j++)
-                W[i][j] -= f * W[k][j];
-            W[i][k] = f;
+}
+
+static void swap_rows(int n, real *a, real *b)
+{
+    for (int j = 0; j < n; j++) {
+        const real kept = a[j];
+        a[j] = b[j];
+        b[j] = kept;
+    }
+}
+
+/* x_j <- f (x_j - c y_j) */
+static void reduce(int columns, real f, real c, const real *y, real *x)
+{
+    for (int j = 0; j < columns; j++)
+        x[j] = f * (x[j] - c * y[j]);
+}
+
+/* X <- L^-1 X of some columns, where L, of unit diagonal, has the first `known` columns of W below the
+   diagonal and those of the identity after them. */
+static void forward(int n, int known, const real *W, int columns, real *X)
+{
+    for (int i = 0; i < n; i += 2) {
+        const real *w = W + n * i;
+        real *x = X + n * i;
+        stewart_two_rows(STEWART_SUBTRACT, i < known ? i : known, w, w + n, 1, X, n, columns, x,
+                         x + n);
+        if (i < known)
+            reduce(columns, 1, w[n + i], x, x + n);
+    }
+}
+
+/* W = L U with row pivoting, in the place of W, in blocks of columns; row k has changed its place with
+   row pivot[k]. Returns 0 for a singular W. */
+static int factor(int n, real *W, int *pivot)
+{
+    for (int first = 0; first < n; first += BLOCK) {
+        forward(n, first, W, BLOCK, W + first);
+        for (int k = first; k < first + BLOCK; k++) {
+            int best = k;
+            for (int i = k + 1; i < n; i++)
+                if (REAL(fabs)(W[n * i + k]) > REAL(fabs)(W[n * best + k]))
+                    best = i;
+            if (!(REAL(fabs)(W[n * best + k]) > 0)) /* or NaN */
+                return 0;
+            pivot[k] = best;
+            if (best != k)
+                swap_rows(n, W + n * best, W + n * k);
+            for (int i = k + 1; i < n; i++) {
+                const real f = W[n * i + k] /= W[n * k + k];
+                for (int j = k + 1; j < first + BLOCK; j++)
+                    W[n * i + j] -= f * W[n * k + j];
+            }
         }
-    }
-    for (int i = 1; i < n; i++) {
-        substitute(m, W[i], 0, i, 1, X, X[i]);
-        if (Y)
-            substitute(m, W[i], 0, i, 1, Y, Y[i]);
-    }
-    for (int i = n - 1; i >= 0; i--) {
-        substitute(m, W[i], i + 1, n, 1 / W[i][i], X, X[i]);
-        if (Y)
-            substitute(m, W[i], i + 1, n, 1 / W[i][i], Y, Y[i]);
     }
     return 1;
 }
 
-/* S <- S + D of symmetric matrices, of D what is not above the diagonal. */
-static void add_symmetric(int n, rows *D, rows *S)
+/* X <- W^-1 X (n, n) with the factors of W; of a symmetric solution what is not above the diagonal, and
+   then the rest. */
+static void solve(int n, const real *W, const int *pivot, int symmetric, real *X)
 {
-    for (int i = 0; i < n; i++)
-        for (int j = 0; j <= i; j++)
-            S[j][i] = S[i][j] += D[i][j];
+    for (int k = 0; k < n; k++)
+        if (pivot[k] != k)
+            swap_rows(n, X + n * pivot[k], X + n * k);
+    forward(n, n, W, n, X);
+    for (int i = n - 2; i >= 0; i -= 2) {
+        const real *w = W + n * i + i;
+        const int columns = symmetric ? columns_below(i) : n;
+        real *x = X + n * i;
+        stewart_two_rows(STEWART_SUBTRACT, n - i - 2, w + 2, w + n + 2, 1, x + 2 * n, n, columns, x,
+                         x + n);
+        reduce(columns, 1 / w[n + 1], 0, x, x + n);
+        reduce(columns, 1 / w[0], w[1], x + n, x);
+    }
+    if (symmetric)
+        mirror(n, X);
 }
 
-static real norm(int n, rows *A)
+static real norm(int n, const real *A)
 {
     real sum = 0;
-    for (int i = 0; i < n; i++)
-        for (int j = 0; j < n; j++)
-            sum += A[i][j] * A[i][j];
+    for (int i = 0; i < n * n; i++)
+        sum += A[i] * A[i];
     return REAL(sqrt)(sum);
 }
 
-static void load(int n, int m, const real *from, rows *to)
-{
-    for (int i = 0; i < n; i++)
-        memcpy(to[i], from + m * i, (size_t)m * sizeof(real));
-}
-
-/* w->H from w->A, w->G and w->H: the number of doublings, or 0.
+/* H from A, G and H, of which A and G are lost: the number of doublings, or 0.
 
    P - H_k = A_k' P (I + G_k P)^-1 A_k: no digit of P is missing once |A_k|^2 is that small. */
-static int doubled(int n, stewart_riccati_work *w)
+static int doubled(int n, real *A, real *G, real *H, stewart_scratch scratch)
 {
+    real *W = stewart_take(&scratch, n * n), *V = stewart_take(&scratch, n * n);
+    real *next = stewart_take(&scratch, n * n);
+    int pivot[STEWART_MAX_ORDER];
     for (int count = 1; count <= DOUBLINGS; count++) {
-        multiply(n, n, n, WHOLE, w->G, w->H, w->W);
+        stewart_multiply_transpose(n, n, n, G, H, W);
         for (int i = 0; i < n; i++)
-            w->W[i][i] += 1;
-        memcpy(w->left, w->A, sizeof w->A);
-        memcpy(w->right, w->G, sizeof w->G);
-        if (!solve(n, n, w->W, w->left, w->right))
+            W[(n + 1) * i] += 1;
+        if (!factor(n, W, pivot))
             return 0;
-        transpose(n, n, w->A, w->W);
-        multiply(n, n, n, WHOLE, w->H, w->left, w->product);
-        multiply(n, n, n, LOWER, w->W, w->product, w->other);
-        add_symmetric(n, w->other, w->H);
-        multiply(n, n, n, WHOLE, w->A, w->right, w->product);
-        multiply(n, n, n, LOWER, w->product, w->W, w->other);
-        add_symmetric(n, w->other, w->G);
-        multiply(n, n, n, WHOLE, w->A, w->left, w->product);
-        memcpy(w->A, w->product, sizeof w->A);
-        real left = norm(n, w->A);
+        stewart_copy(n * n, A, V);
+        solve(n, W, pivot, 0, V); /* W^-1 A */
+        stewart_multiply_transpose(n, n, n, H, V, next);
+        add_symmetric(n, A, next, H);
+        transpose(n, A);
+        stewart_multiply_transpose(n, n, n, A, V, next);
+        const real left = norm(n, next);
         if (left < VANISHED)
             return count;
         if (!isfinite(left))
             return 0;
+        stewart_copy(n * n, G, V);
+        solve(n, W, pivot, 1, V); /* W^-1 G */
+        stewart_multiply_transpose(n, n, n, V, A, W);
+        add_symmetric(n, A, W, G);
+        stewart_copy(n * n, next, A);
     }
     return 0;
 }
 
-/* (R + B'P B) K = B'P A, with A in w->A, B in w->W, P in w->H; K in w->right, P A in w->left. */
-static int gain_of(int n, const real *R, stewart_riccati_work *w)
+/* (R + B'P B) K = B'P A and PA = P A; returns 0 where there is no K. */
+static int gain(int n, const real *A, const real *B, const real *P, const real *R, real *PA,
+                real *K, stewart_scratch scratch)
 {
-    transpose(n, INPUTS, w->W, w->closed);
-    multiply(n, n, INPUTS, WHOLE, w->H, w->W, w->product);
-    multiply(INPUTS, n, INPUTS, WHOLE, w->closed, w->product, w->other);
-    for (int i = 0; i < INPUTS; i++)
-        for (int j = 0; j < INPUTS; j++)
-            w->other[i][j] += R[INPUTS * i + j];
-    multiply(n, n, n, WHOLE, w->H, w->A, w->left);
-    multiply(INPUTS, n, n, WHOLE, w->closed, w->left, w->right);
-    return solve(INPUTS, n, w->other, w->right, NULL);
+    real *PB = stewart_take(&scratch, n * INPUTS), *M = stewart_take(&scratch, INPUTS * INPUTS);
+    stewart_multiply_transpose(n, n, INPUTS, P, B, PB);
+    stewart_multiply_transpose(INPUTS, n, INPUTS, B, PB, M);
+    for (int i = 0; i < INPUTS * INPUTS; i++)
+        M[i] += R[i];
+    stewart_multiply_transpose(n, n, n, P, A, PA);
+    stewart_multiply_transpose(INPUTS, n, n, B, PA, K);
+    return stewart_solve(INPUTS, n, M, K);
 }
 
-/* |E| / |P|, E = Q + A'P (A - B K) - P in w->other and A - B K in w->closed, with P A in w->left and
-   K in w->right. */
-static real residual(int n, const real *Q, stewart_riccati_work *w)
+/* |E| / |P|, E = Q + A'P F - P, and F = A - B K. */
+static real residual(int n, const real *A, const real *B, const real *Q, const real *P,
+                     const real *PA, const real *K, real *F, real *E)
 {
-    multiply(n, INPUTS, n, WHOLE, w->W, w->right, w->closed);
-    for (int i = 0; i < n; i++)
-        for (int j = 0; j < n; j++)
-            w->closed[i][j] = w->A[i][j] - w->closed[i][j];
-    transpose(n, n, w->left, w->product);
-    multiply(n, n, n, WHOLE, w->product, w->closed, w->other);
-    for (int i = 0; i < n; i++)
-        for (int j = 0; j < n; j++)
-            w->other[i][j] += Q[n * i + j] - w->H[i][j];
-    return norm(n, w->other) / norm(n, w->H);
+    stewart_multiply(n, INPUTS, n, B, K, F);
+    for (int i = 0; i < n * n; i++)
+        F[i] = A[i] - F[i];
+    stewart_multiply_transpose(n, n, n, PA, F, E);
+    for (int i = 0; i < n * n; i++)
+        E[i] += Q[i] - P[i];
+    return norm(n, E) / norm(n, P);
 }
 
 /* One step of Newton's from the residual E: P <- P + sum F^k' E F^k, F = A - B K (Kleinman, 1968),
-   twice as many terms at a time. */
-static void corrected(int n, stewart_riccati_work *w)
+   twice as many terms at a time. F and E are lost. */
+static void correct(int n, real *F, real *E, real *P, stewart_scratch scratch)
 {
+    real *product = stewart_take(&scratch, n * n);
     for (int i = 0; i < n; i++)
         for (int j = 0; j < i; j++)
-            w->other[j][i] = w->other[i][j] = (w->other[i][j] + w->other[j][i]) / 2;
-    for (int count = 0; count < DOUBLINGS && norm(n, w->closed) > (real)1e-3; count++) {
-        transpose(n, n, w->closed, w->left);
-        multiply(n, n, n, WHOLE, w->other, w->closed, w->product);
-        multiply(n, n, n, LOWER, w->left, w->product, w->right);
-        add_symmetric(n, w->right, w->other);
-        multiply(n, n, n, WHOLE, w->closed, w->closed, w->product);
-        memcpy(w->closed, w->product, sizeof w->closed);
+            E[n * j + i] = E[n * i + j] = (E[n * i + j] + E[n * j + i]) / 2;
+    for (int count = 0; count < DOUBLINGS && norm(n, F) > (real)1e-3; count++) {
+        stewart_multiply_transpose(n, n, n, E, F, product);
+        add_symmetric(n, F, product, E);
+        stewart_multiply(n, n, n, F, F, product);
+        stewart_copy(n * n, product, F);
     }
-    add_symmetric(n, w->other, w->H);
+    for (int i = 0; i < n * n; i++)
+        P[i] += E[i];
 }
 
-int stewart_riccati(int n, const real *A, const real *B, const real *Q, const real *R, real *K,
-                    real *P, stewart_riccati_work *w)
+int stewart_lqr_scratch(int n) { return 6 * n * n + INPUTS * INPUTS; }
+
+int stewart_lqr(int n, const real *A, const real *B, const real *Q, const real *R, real *K, real *P,
+                stewart_scratch scratch)
 {
-    load(n, INPUTS, B, w->W);
-    transpose(n, INPUTS, w->W, w->right);
-    load(INPUTS, INPUTS, R, w->other);
-    if (!solve(INPUTS, n, w->other, w->right, NULL))
+    real *H = stewart_take(&scratch, n * n), *M = stewart_take(&scratch, INPUTS * INPUTS);
+    stewart_scratch rest = scratch;
+    real *G = stewart_take(&rest, n * n), *power = stewart_take(&rest, n * n);
+    for (int i = 0; i < n; i++) /* K as a place for R^-1 B' */
+        for (int j = 0; j < INPUTS; j++)
+            K[n * j + i] = B[INPUTS * i + j];
+    stewart_copy(INPUTS * INPUTS, R, M);
+    if (!stewart_solve(INPUTS, n, M, K))
         return 0;
-    multiply(n, INPUTS, n, WHOLE, w->W, w->right, w->G);
-    load(n, n, A, w->A);
-    load(n, n, Q, w->H);
-    int count = doubled(n, w);
+    stewart_multiply(n, INPUTS, n, B, K, G);
+    stewart_copy(n * n, A, power);
+    stewart_copy(n * n, Q, H);
+    const int count = doubled(n, power, G, H, rest);
     if (!count)
         return 0;
-    load(n, n, A, w->A);
-    load(n, INPUTS, B, w->W);
-    if (!gain_of(n, R, w))
+    rest = scratch;
+    real *PA = stewart_take(&rest, n * n), *F = stewart_take(&rest, n * n);
+    real *E = stewart_take(&rest, n * n);
+    if (!gain(n, A, B, H, R, PA, K, rest))
         return 0;
-    real left = residual(n, Q, w);
+    const real left = residual(n, A, B, Q, H, PA, K, F, E);
     if (!(left <= LARGEST_RESIDUAL)) /* or NaN */
         return 0;
     if (left > NOTED_RESIDUAL) {
-        corrected(n, w);
-        if (!gain_of(n, R, w))
+        correct(n, F, E, H, rest);
+        if (!gain(n, A, B, H, R, PA, K, rest))
             return 0;
     }
-    for (int i = 0; i < INPUTS; i++)
-        memcpy(K + n * i, w->right[i], (size_t)n * sizeof(real));
-    for (int i = 0; P && i < n; i++)
-        memcpy(P + n * i, w->H[i], (size_t)n * sizeof(real));
+    if (P)
+        stewart_copy(n * n, H, P);
     return count;
+}
+
+int stewart_riccati(int n, const real *A, const real *B, const real *Q, const real *R, real *K,
+                    real *P, stewart_riccati_work *work)
+{
+    return stewart_lqr(n, A, B, Q, R, K, P, (stewart_scratch){work->numbers});
 }

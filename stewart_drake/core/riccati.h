@@ -3,23 +3,27 @@
 #ifndef STEWART_RICCATI_H
 #define STEWART_RICCATI_H
 
-#include "real.h"
+#include "matrix.h"
 
 #define STEWART_MAX_ORDER 24 /* states: pose, rates, integral, and a torque that is still to act */
 #define STEWART_INPUTS 6
-
-/* The first n rows and columns of a matrix. */
-typedef real stewart_matrix[STEWART_MAX_ORDER][STEWART_MAX_ORDER];
-
-typedef struct {
-    stewart_matrix A, G, H, W, left, right, product, other, closed;
-} stewart_riccati_work;
 
 /* Gain K (6, n) of u = -K x that minimises sum x'Qx + u'Ru of x+ = A x + B u, and P (n, n), its cost
    x'Px, or NULL. A (n, n), B (n, 6), Q (n, n), R (6, 6) by rows; Q and R are symmetric, n is 6, 12,
    18 or 24.
 
-   Returns the number of doublings, or 0 where there is no stabilising solution, or none was found. */
+   Returns the number of doublings, or 0 where there is no stabilising solution, or none was found.
+   Scratch: `stewart_lqr_scratch` numbers. */
+int stewart_lqr(int n, const real *A, const real *B, const real *Q, const real *R, real *K, real *P,
+                stewart_scratch scratch);
+
+int stewart_lqr_scratch(int n);
+
+/* The same with a place for every n. */
+typedef struct {
+    real numbers[6 * STEWART_MAX_ORDER * STEWART_MAX_ORDER + 36];
+} stewart_riccati_work;
+
 int stewart_riccati(int n, const real *A, const real *B, const real *Q, const real *R, real *K,
                     real *P, stewart_riccati_work *work);
 

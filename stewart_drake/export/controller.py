@@ -40,10 +40,12 @@ from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.types import Array
 
 SOURCES: Final = (
-    *("stewart_limits.h", "real.h", "dynamics.h", "equations.h", "riccati.h"),
-    *("stewart.h", "workspace.h"),
-    *("dynamics.c", "riccati.c", "law.c"),
+    *("stewart_limits.h", "real.h", "scratch.h", "matrix.h", "dynamics.h", "equations.h"),
+    *("riccati.h", "stewart.h", "workspace.h"),
+    *("matrix.c", "dynamics.c", "riccati.c", "law.c"),
 )
+CONTROLLER: Final = (*(name for name in SOURCES if name.endswith(".c")), "stewart_config.c")
+"""What is compiled of them, with the configuration."""
 TEMPLATES: Final = Path(__file__).with_name("templates")
 MOST_SAMPLES: Final = 100
 """Of a run that the test replays."""
@@ -160,6 +162,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     files = {name: (FOLDER / name).read_text("utf-8") for name in SOURCES}
     files["stewart_limits.h"] = _limits(files["stewart_limits.h"], law, single)
     values = {
+        "OBJECTS": " ".join(name.replace(".c", ".o") for name in CONTROLLER),
         "SCENARIO": scenario_yaml(scenario).replace("*/", "* /").strip(),
         "STEPS": str(len(law.steps)),
         "PREVIEW": str(len(law.preview_times)),

@@ -28,9 +28,7 @@ PACKAGES: Final = {
     "make": "make",
 }
 """Debian's package of each command."""
-CONTROLLER: Final = tuple(
-    Path(name).with_suffix(".o").name for name in export_c.SOURCES if name.endswith(".c")
-) + ("stewart_config.o",)
+CONTROLLER: Final = tuple(name.replace(".c", ".o") for name in export_c.CONTROLLER)
 OPTIMISED: Final = "-O2 -ffunction-sections -fdata-sections"
 HEADER: Final = (
     *("controller", "processor", "flash, kB", "state, B", "workspace, B", "stack, B"),

@@ -464,7 +464,7 @@ int stewart_read_plan(const uint8_t *data, size_t size, stewart_key key, stewart
 
 /* ---------------------------------------------------------------- sessions */
 
-int stewart_take(stewart_window *w, uint32_t sequence)
+int stewart_arrive(stewart_window *w, uint32_t sequence)
 {
     if (sequence > w->newest) {
         uint32_t ahead = sequence - w->newest;
@@ -533,7 +533,7 @@ int stewart_note(stewart_session *s, const stewart_head *head, uint64_t now)
     if (head->session != s->number || (s->nonce != 0 && head->nonce != s->nonce))
         return STEWART_FOREIGN;
     uint32_t before = s->window.newest;
-    int refused = stewart_take(&s->window, head->sequence);
+    int refused = stewart_arrive(&s->window, head->sequence);
     if (refused)
         return refused;
     s->heard = now;

@@ -145,7 +145,7 @@ typedef struct {
 } stewart_window;
 
 /* STEWART_TAKEN, STEWART_REPLAYED or STEWART_LATE. */
-int stewart_take(stewart_window *window, uint32_t sequence);
+int stewart_arrive(stewart_window *window, uint32_t sequence);
 
 /* One side's view of a session. */
 typedef struct {

@@ -207,7 +207,7 @@ static void test_window(void)
                  {500, STEWART_TAKEN},  {437, STEWART_TAKEN},  {436, STEWART_LATE}};
     stewart_window window = {0, 0};
     for (size_t i = 0; i < sizeof steps / sizeof steps[0]; i++)
-        check(stewart_take(&window, steps[i].sequence) == steps[i].cause, "a window");
+        check(stewart_arrive(&window, steps[i].sequence) == steps[i].cause, "a window");
 }
 
 static int filter(stewart_key with)
