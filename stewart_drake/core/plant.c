@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "dop853.h"
+#include "link.h"
 #include "stewart.h"
 
 #define EXPORT __attribute__((visibility("default")))
@@ -147,16 +148,13 @@ typedef int (*controller)(void *about, long sample, const double *measurement, d
 /* What stands between a controller and the plant. */
 typedef struct {
     long samples;             /* that are taken in the run */
-    long before;              /* torques that were sent before the start and are still to act */
     const double *sampled;    /* when, s */
-    long releases;            /* torques that ever begin to act, at the most */
-    const double *released;   /* when each of them does, ascending, s; at a sample's instant after it */
-    const long *which;        /* and its place in `waiting` */
+    double period;            /* between them by the controller's clock, s */
+    const double *delays;     /* (samples) of the torques on their way, s */
+    const stewart_link *link; /* a wire */
+    double *memory;           /* of the link */
     const double *noise;      /* (samples, 12), or NULL */
-    double *waiting;          /* (before + samples, 6) torques in the order in which they are sent */
-    double applied[MOTORS];   /* what acts at first */
     double bias[MOTORS];      /* added to what acts */
-    double limit;             /* of each motor */
     double *measured;         /* (samples, 12) result */
     double *asked;            /* (samples, 6) result: torques, without limit */
     long taken;               /* result: samples */
@@ -164,42 +162,46 @@ typedef struct {
 
 static int sample(dop853 *s, loop *o, long k, controller law, void *about)
 {
-    double *y = o->measured + STATES * k, *torque = o->asked + MOTORS * k;
+    double *y = o->measured + STATES * k, *torque = o->asked + MOTORS * k, now = o->period * (double)k;
     for (int i = 0; i < STATES; i++)
         y[i] = o->noise ? s->x[i] + o->noise[STATES * k + i] : s->x[i];
     if (law(about, k, y, torque))
         return CONTROLLER_FAILED;
-    for (int i = 0; i < MOTORS; i++)
-        o->waiting[MOTORS * (o->before + k) + i] = fmax(-o->limit, fmin(o->limit, torque[i]));
+    stewart_link_take(o->link, o->memory, now, (double)(k + 1), 0., now + o->delays[k], 1, torque);
     o->taken = k + 1;
     return INSIDE;
 }
 
-static void apply(machine *m, const loop *o, const double *torque)
+static void apply(machine *m, const loop *o)
 {
+    const double *torque = stewart_link_acting(o->memory);
     for (int i = 0; i < MOTORS; i++)
         m->torque[i] = torque[i] + o->bias[i];
 }
 
-/* Sample, wait, release, until the run's end: the delay chain of `loop.delay_chain.DelayChain`, or
-   `loop.varying_delay.VaryingDelay`. */
+/* Sample, wait, release, until the run's end. A change of the torque that is together with a sample
+   takes place at its instant. */
 EXPORT int closed_loop(run *r, machine *m, looks *l, loop *o, controller law, void *about)
 {
     dop853 s = integrator(r, m);
     m->sine = NULL;
-    apply(m, o, o->applied);
-    for (long k = 0, i = 0;;) {
+    apply(m, o);
+    for (long k = 0;;) {
         double sampled = k < o->samples ? o->sampled[k] : HUGE_VAL;
-        double released = i < o->releases ? o->released[i] : HUGE_VAL;
-        int how = advance(&s, m, fmin(fmin(sampled, released), r->end), l);
-        if (how == INSIDE && sampled <= released && sampled <= r->end)
+        double released = stewart_link_next(o->link, o->memory);
+        int samples = sampled <= released + o->link->together, how = INSIDE;
+        double next = samples ? sampled : released;
+        if (next > r->end)
+            return ended(r, &s, advance(&s, m, r->end, l));
+        if (next > s.time + o->link->together)
+            how = advance(&s, m, next, l);
+        if (how == INSIDE && samples)
             how = sample(&s, o, k++, law, about);
-        else if (how == INSIDE && released < r->end)
-            apply(m, o, o->waiting + MOTORS * o->which[i++]);
-        else
-            return ended(r, &s, how);
+        else if (how == INSIDE)
+            stewart_link_change(o->link, o->memory, fmax(released, s.time));
         if (how != INSIDE)
             return ended(r, &s, how);
+        apply(m, o);
     }
 }
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.core.law_layout import CAUSES, address
+from stewart_drake.core.link import Link
 from stewart_drake.core.plant import Controller, Ended, LoopStruct
 from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.open_loop import IntegrationError
@@ -22,7 +23,7 @@ from stewart_drake.loop.experiment import Experiment, torques_in_flight, true_dy
 from stewart_drake.loop.sensor import white_noises
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
-from stewart_drake.scenario.link import releases, torque_delays
+from stewart_drake.scenario.link import TOGETHER, torque_delays
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
 from stewart_drake.scenario.timing import event_time, instants, look_time
 from stewart_drake.types import Array
@@ -171,44 +172,22 @@ def uncovered(scenario: Scenario) -> str | None:
     return found and found.field
 
 
-class Wire(NamedTuple):
-    """What a run's torques wait for.
-
-    Attributes:
-        applied: (6,) N m, what acts at first.
-        waiting: (b, 6) N m, sent before the start and still to act.
-        released: (n,) s, ascending, when another torque begins to act.
-        which: (n,) its place among those that wait and, after them, the run's own.
-    """
-
-    applied: Array
-    waiting: Array
-    released: Array
-    which: NDArray[np.int_]
-
-
-def wire_of(experiment: Experiment, when: Instants) -> Wire:
-    """The delay chain of an experiment, as `loop.delay_chain` and `loop.varying_delay` are."""
-    sc, delay, number = experiment.scenario, experiment.scenario.true_delay, len(when.samples)
+def _wire_of(experiment: Experiment, number: int) -> tuple[Link, Array, Array]:
+    """Return the link of an experiment, its memory at t = 0, and the delays (number,) in s."""
+    sc, delay = experiment.scenario, experiment.scenario.true_delay
     period, queue = sc.controller.period, torques_in_flight(experiment, delay)
-    nothing = np.zeros(NUM_TORQUES)
-    if sc.delay.constant:
-        released = when.samples
-        if delay.fraction > 0:
-            first = event_time(delay.fraction * period)
-            released = first + event_time(period) * np.arange(number, dtype=np.float64)
-        waiting, applied = queue[len(queue) - delay.steps :], queue[0] if len(queue) else nothing
-        return Wire(applied, waiting, released, np.arange(number))
-    numbers, arrivals = releases(period, torque_delays(sc), delay)
-    ours = numbers < number
-    numbers, arrivals = numbers[ours], arrivals[ours]
-    begun = (arrivals <= 0) & (numbers < 0)
-    which = numbers + len(queue)
-    applied = queue[which[begun][-1]] if begun.any() else nothing
-    at_once = arrivals == period * numbers
-    at_samples = when.samples[np.maximum(numbers, 0)]
-    acts = np.where(at_once, at_samples, event_time(1.0) * arrivals)
-    return Wire(applied, queue, acts[~begun], which[~begun])
+    delays = np.full(number, delay.eta(period))
+    if not sc.delay.constant:
+        drawn = torque_delays(sc)
+        delays = drawn[np.minimum(np.arange(number), len(drawn) - 1)]
+    kept = len(queue) + int(delays.max(initial=0.0) / period) + 2
+    together, limit = TOGETHER * period, experiment.torque_limit
+    link = Link(NUM_TORQUES, kept, period, wire=True, together=together, limit=limit)
+    memory, first = link.start(), (delay.periods - len(queue)) * period
+    if len(queue):
+        link.assume(memory, first, queue[0])
+        link.begin(memory, first, queue)
+    return link, memory, delays
 
 
 def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
@@ -230,25 +209,20 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
     accuracy = SHARE * sc.plant.accuracy
     plant = NativePlant(truth, experiment.start, when.looks, accuracy, LONGEST_STEP)
     number = len(when.samples)
-    wire = wire_of(experiment, when)
-    before = len(wire.waiting)
-    waiting = np.vstack([wire.waiting, np.zeros((number, NUM_TORQUES))])
+    link, memory, delays = _wire_of(experiment, number)
     measured, asked = np.empty((number, NUM_STATE)), np.empty((number, NUM_TORQUES))
     drawn = None
     if noise.any():
         drawn = noise * white_noises(sensor.seed, number)
     loop = LoopStruct(
         samples=number,
-        before=before,
         sampled=when.samples.ctypes.data,
-        releases=len(wire.released),
-        released=wire.released.ctypes.data,
-        which=wire.which.ctypes.data,
+        period=sc.controller.period,
+        delays=delays.ctypes.data,
+        link=link.address,
+        memory=memory.ctypes.data,
         noise=None if drawn is None else drawn.ctypes.data,
-        waiting=waiting.ctypes.data,
-        applied=tuple(wire.applied),
         bias=tuple(sc.plant.torque_bias),
-        limit=experiment.torque_limit,
         measured=measured.ctypes.data,
         asked=asked.ctypes.data,
     )
@@ -258,8 +232,6 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
     stopped = None
     if ended == Ended.LEFT:
         stopped = diagnose(experiment.truth, plant.time, plant.final[POSE])
-    taken = loop.taken
-    sent = waiting[before : before + taken]
-    return Course(
-        plant.states[: plant.seen], measured[:taken], asked[:taken], sent, plant.time, stopped
-    )
+    measured, asked = measured[: loop.taken], asked[: loop.taken]
+    sent = np.clip(asked, -experiment.torque_limit, experiment.torque_limit)
+    return Course(plant.states[: plant.seen], measured, asked, sent, plant.time, stopped)
