@@ -8,16 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.stats import norm
+from scipy.stats import norm, truncnorm
 
 import stewart_drake as sd
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.arrivals import Arrivals
-from stewart_drake.law.delay_filter import DelayFilter, DelayModel, Guess, delay_settings
-from stewart_drake.law.delay_observer import DelayBelief, DelayObserver
+from stewart_drake.law.delay_observer import (
+    DelayBelief,
+    DelayObserver,
+    compiled_delay,
+    delay_settings,
+)
 from stewart_drake.law.filter_settings import filter_settings
-from stewart_drake.law.holds import GAUSS_NODES
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
@@ -44,6 +48,7 @@ NOISE = 1e-4 * np.tile(AMPLITUDES, 2)
 SENSING = StateSensing(NOISE, AMPLITUDES)
 DELAY = delay_settings("constant", 0.3, 1.5)
 HOME = np.concatenate([PAPER.home, np.zeros(6)])
+OBSERVER = DelayObserver(SETTINGS, DELAY, 0.45, quiet=False)
 THETA = np.concatenate([1e-3 * np.array([1, -1, 2, 0, -2, 1.0]), [0.5, 0.002]])
 
 
@@ -101,25 +106,70 @@ def swing(k: int) -> Array:
     return 0.02 * np.sin(0.9 * k + np.arange(6)) + 0.01 * np.cos(0.5 * k * np.arange(1, 7))
 
 
+class Period:
+    """One period of the filter in C.
+
+    Args:
+        torques: (n, 6) in flight, all the controller's.
+        sent: how many of them; None is all.
+        plant: as it is known.
+    """
+
+    def __init__(
+        self, torques: Array, sent: int | None = None, plant: NominalPlant = PLANT
+    ) -> None:
+        c = core()
+        self.torques, self.before, self.n = torques, np.zeros((1, 6)), 22
+        self.delay = compiled_delay(OBSERVER, SENSING, plant, DT)
+        view = (DT, 0.0, 0.0, len(torques) if sent is None else sent, 1, c.at(self.before))
+        numbers = (self.delay.it, view, len(torques), 0, c.at(torques))
+        self.it = c.ffi.new("stewart_period *", numbers)
+
+    def scratch(self) -> Any:
+        lib = core().lib
+        return core().scratch(lib.stewart_delay_advance_scratch(8, 12, len(self.torques)))
+
+    def end(self, xi: Array) -> Array:
+        state = np.empty(12)
+        given = (self.it, core().at(xi), core().at(state), self.scratch())
+        assert core().lib.stewart_period_end(*given)
+        return state
+
+    def derivatives(self, xi: Array) -> Array:
+        """(12, 22) of the state at the end."""
+        state, H = np.empty(12), np.empty((12, self.n))
+        given = (self.it, core().at(xi), 1, core().at(state), core().at(H), self.scratch())
+        assert core().lib.stewart_period_at(*given)
+        assert state == pytest.approx(self.end(xi), abs=1e-14)
+        return H
+
+    def late(self, xi: Array, state: Array, std: float) -> Array:
+        """Rows (k, 12) of the controller's own torques, which are all here."""
+        K, others = np.empty((8, 12)), core().ffi.new("int *")
+        given = (core().at(xi), core().at(state), std, core().at(K), others, self.scratch())
+        rows = core().lib.stewart_period_late(self.it, *given)
+        assert rows > 0 and others[0] == 0
+        return K[:rows]
+
+
 @pytest.mark.parametrize("eta", [0.137, 0.25, 0.449])
 def test_sensitivity_to_the_delay_equals_a_finer_difference(eta: float) -> None:
     """Richardson's extrapolation of the response, with 64 steps per torque."""
     fine = NominalPlant(DYNAMICS, 64, 1.0, TorqueLimit())
     torques = np.array([swing(k) for k in range(12)])
-    view = Arrivals(DT, Delay(0), 0.0, 0.0, 12, np.zeros((1, 6)))
     xi = np.concatenate([HOME, THETA, [eta, 0.0]])
     xi[6:12] = 0.3 * AMPLITUDES
 
     def end(at: float) -> Array:
         moved = xi.copy()
         moved[-2] = at
-        return DelayModel(fine, view, torques).end(moved)
+        return Period(torques, plant=fine).end(moved)
 
     def slope(h: float) -> Array:
         return (end(eta + h) - end(eta - h)) / (2 * h)
 
     expected = (4 * slope(5e-4) - slope(1e-3)) / 3
-    found = DelayModel(PLANT, view, torques).at(xi, GAUSS_NODES).F[:12, -2]
+    found = Period(torques).derivatives(xi)[:, -2]
     assert np.abs(found - expected).max() < 1e-3 * np.abs(expected).max()
 
 
@@ -164,20 +214,19 @@ def observed(torques: Array, measured: Array, believed: float, **changes: Any) -
 def test_a_torque_that_is_early_or_late_does_what_the_filter_says(eta: float) -> None:
     """Second moment over normal errors; next to a sample each period has half of them."""
     torques, std = np.array([swing(k) for k in range(12)]), 2e-3
-    view = Arrivals(DT, Delay(0), 0.0, 0.0, 12, np.zeros((1, 6)))
-    model, xi = DelayModel(PLANT, view, torques), np.concatenate([HOME, THETA, [eta, 0.0]])
+    model, xi = Period(torques), np.concatenate([HOME, THETA, [eta, 0.0]])
     on_time = model.end(xi)
     errors = std * norm.ppf((np.arange(200) + 0.5) / 200)
     late = [model.end(np.concatenate([HOME, THETA, [eta + error, 0.0]])) for error in errors]
     expected = np.array(late) - on_time
     expected = expected.T @ expected / len(errors) / std**2
-    found = model.late(xi, on_time, std)
+    rows = model.late(xi, on_time, std) / std
+    found = rows.T @ rows
     # To first order: the acceleration is that of the pose and the rates at the end.
-    assert np.abs(found.own - expected).max() < 0.12 * expected.max()
+    assert np.abs(found - expected).max() < 0.12 * expected.max()
     for part in (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)):
-        own, true = (np.trace(matrix[part, part]) for matrix in (found.own, expected))
+        own, true = (np.trace(matrix[part, part]) for matrix in (found, expected))
         assert own == pytest.approx(true, rel=0.2)
-    assert not np.any(found.others)
 
 
 @pytest.mark.slow
@@ -187,8 +236,8 @@ def test_how_early_or_late_single_torques_come_is_found(
 ) -> None:
     for seed in range(5):
         torques, _, measured = record(0.337, 30, seed, jitter=jitter)
-        guess = observed(torques, measured, 0.3)[-1].guess
-        assert guess is not None and least <= np.sqrt(guess.timing) <= most
+        [guess] = observed(torques, measured, 0.3)[-1].guesses
+        assert least <= np.sqrt(guess.timing) <= most
         # Of 26 torques the mean delay cannot be known better than this.
         assert guess.std >= 0.5 * jitter / np.sqrt(26)
 
@@ -203,9 +252,8 @@ def test_the_first_torques_that_jitter_are_believed() -> None:
     for seed in range(8):
         torques, _, measured = record(0.337, 14, seed, jitter=3e-3)
         guesses = [belief.guess for belief in observed(torques, measured, 0.3)]
-        odd += sum(guess is None or guess.outliers > 0 or not guess.fits for guess in guesses)
+        odd += sum(guess.outliers > 0 or not guess.fits for guess in guesses)
         last = guesses[-1]
-        assert last is not None
         ratios.append((last.eta - 0.337) / last.std)
     assert odd <= 8 and np.sqrt(np.mean(np.square(ratios))) < 3
 
@@ -236,7 +284,7 @@ def test_the_filter_finds_what_batch_least_squares_finds() -> None:
     jacobian = np.asarray(batch.jac)
     std = float(np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[20, 20]))
     last = observed(torques, measured, believed=0.5)[-1]
-    assert last.settled and last.guess is not None
+    assert last.settled
     assert abs(batch.x[20] - eta) < 4 * std  # the oracle is one
     # The filter also allows for errors of the model, and is wider for them.
     assert std < last.guess.std < 0.01
@@ -253,16 +301,17 @@ def test_the_search_weighs_as_a_grid_of_filters_does(size: float) -> None:
     torques = size * np.array([swing(k) for k in range(samples)])
     measured = small_record(torques, 0.43, samples)
     belief = observed(torques, measured, believed, std=std)[-1]
-    assert not belief.settled and belief.master is not None
-    weights = np.exp([belief.master.weight, *(c.weight for c in belief.cells)])
+    assert not belief.settled
+    master, *cells = belief.guesses
+    weights = np.exp([master.weight, *(cell.weight for cell in cells)])
     weights = weights / weights.sum()
     grid = np.arange(0.005, 1.5, 0.01)
     log = np.array([known_delay_likelihood(torques, measured, eta) for eta in grid])
     posterior = norm(believed, std).pdf(grid) * np.exp(log - log.max())
     posterior /= posterior.sum()
     assert weights[0] == pytest.approx(posterior[grid > (samples - 1) * DT].sum(), abs=0.06)
-    for weight, cell in zip(weights[1:], belief.cells, strict=True):
-        inside = (grid > cell.guess.low) & (grid < cell.guess.high)
+    for weight, cell in zip(weights[1:], cells, strict=True):
+        inside = (grid > cell.low) & (grid < cell.high)
         assert weight == pytest.approx(posterior[inside].sum(), abs=0.06)
 
 
@@ -280,15 +329,20 @@ def small_record(torques: Array, eta: float, samples: int) -> Array:
 
 def known_delay_likelihood(torques: Array, measured: Array, eta: float) -> float:
     """Log-likelihood of the measurements by a filter that is told the delay."""
-    ekf = DelayFilter(PLANT, SENSING, SETTINGS, DELAY)
-    prior = SETTINGS.parameters
-    mean = np.concatenate([measured[0], prior.prior, [eta, 0.0]])
-    covariance = np.diag(np.concatenate([NOISE**2, prior.std**2, [0.0, 0.0]]))
-    guess, total = Guess(mean, covariance, 0.0, 1.5), 0.0
+    c, prior = core(), SETTINGS.parameters
+    size = c.lib.stewart_guess_size(8)
+    guess, after = np.zeros(size), np.zeros(size)
+    before, later = (c.ffi.cast("stewart_guess *", c.at(array)) for array in (guess, after))
+    before.high, before.fits, before.torques = 1.5, 1, 1
+    before.numbers = list(np.concatenate([measured[0], prior.prior, [eta, 0.0]]))
+    root = np.diag(np.concatenate([NOISE, prior.std, [0.0, 0.0]]))
+    c.lib.stewart_guess_keep_root(22, c.at(root), before)
+    total = 0.0
     for k in range(1, len(measured)):
-        view = Arrivals(DT, Delay(0), eta, 0.0, k, np.zeros((1, 6)))
-        guess = ekf.advance(guess, view, torques[:k], measured[k])
-        total += guess.log_likelihood
+        period, y = Period(torques[:k].copy()), measured[k].copy()
+        c.lib.stewart_delay_advance(period.it, before, c.at(y), later, period.scratch())
+        guess[:] = after
+        total += later.log_likelihood
     return total
 
 
@@ -302,7 +356,10 @@ def test_the_delay_is_found_soon_after_the_first_arrival(eta: float) -> None:
     last = beliefs[-1]
     assert abs(last.delay_mean - eta) < 3 * last.delay_std + 1e-4 and last.delay_std < 5e-3
     assert np.all(np.abs(last.state - truth[-1]) < 6 * NOISE + 1e-4)
-    assert beliefs[0].delay_std > 0.2  # the prior, cut off at 0 and at the longest
+
+    prior = truncnorm(-0.6 / DELAY.std, (DELAY.longest - 0.6) / DELAY.std, 0.6, DELAY.std)
+    assert beliefs[0].delay_mean == pytest.approx(prior.mean(), abs=1e-12)
+    assert beliefs[0].delay_std == pytest.approx(prior.std(), abs=1e-12)
 
 
 def test_a_lost_or_impossible_measurement_is_survived() -> None:
@@ -314,6 +371,25 @@ def test_a_lost_or_impossible_measurement_is_survived() -> None:
     assert beliefs[0].fault == beliefs[9].fault == "measurements_missing"
     assert beliefs[12].fault == "measurements_rejected"
     assert beliefs[-1].settled and abs(beliefs[-1].delay_mean - 0.337) < 3e-3
+
+
+def test_the_stated_scratch_memory_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search, a jump of the delay and outliers write nothing beyond it."""
+    given, take, spare, mark = [], core().scratch, 100, -1.25
+
+    def marked(numbers: int) -> Any:
+        scratch = take(numbers + spare)
+        for i in range(numbers, numbers + spare):
+            scratch[0][i] = mark
+        given.append((scratch[0], numbers))
+        return scratch
+
+    torques, _, measured = record(0.337, 16, seed=4)
+    torques[10:], measured[12, :6] = 2 * torques[10:], measured[12, :6] + 0.05
+    monkeypatch.setattr(core(), "scratch", marked)
+    observed(torques, measured, 0.3)
+    for numbers, stated in given:
+        assert list(numbers[stated : stated + spare]) == [mark] * spare
 
 
 # The loop.

@@ -3,11 +3,6 @@
 #include "arrivals.h"
 
 #define U STEWART_MOTORS
-#ifdef STEWART_FLOAT
-#define INSTANT 1e-6f /* s; arrivals closer than this are one */
-#else
-#define INSTANT 1e-9
-#endif
 #define FURTHEST ((real)1e3) /* s; up to there periods are told apart */
 
 static real arrival(const stewart_arrivals *a, int i)
@@ -36,7 +31,8 @@ int stewart_switches(const stewart_arrivals *a, real begin, real end, int newest
     for (int k = 1; k <= grid + a->sent; k++) {
         const int own = k - grid;
         const real t = own > 0 ? arrival(a, newest + own - a->sent) : a->period * (real)k;
-        if ((own > 0 || t < first - INSTANT) && t > begin + INSTANT && t < end - INSTANT)
+        const int acts = own > 0 || t < first - STEWART_INSTANT;
+        if (acts && t > begin + STEWART_INSTANT && t < end - STEWART_INSTANT)
             at[number++] = t;
     }
     return number;
@@ -51,12 +47,12 @@ int stewart_within(const stewart_arrivals *a, int flights, const real *in_flight
     durations[0] = begin;
     for (int k = 0; k < number; k++) {
         const real start = durations[k], *torque;
-        while (own < a->sent && arrival(a, newest + 1 + own - a->sent) <= start + INSTANT)
+        while (own < a->sent && arrival(a, newest + 1 + own - a->sent) <= start + STEWART_INSTANT)
             own++;
         if (own > 0) {
             torque = in_flight + U * (flights - a->sent + own - 1);
         } else {
-            const real passed = REAL(floor)(start / a->period + INSTANT / a->period);
+            const real passed = REAL(floor)(start / a->period + STEWART_INSTANT / a->period);
             const int last = a->before - 1;
             const int period = !(passed > 0) ? 0 : passed < (real)last ? (int)passed : last;
             torque = last < 0 ? none : a->others + U * period;

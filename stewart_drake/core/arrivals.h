@@ -5,6 +5,12 @@
 
 #include "machine.h"
 
+#ifdef STEWART_FLOAT
+#define STEWART_INSTANT 1e-6f /* s; arrivals closer than this are one */
+#else
+#define STEWART_INSTANT 1e-9
+#endif
+
 /* Seen from an instant 0. Torques arriving then have the delay eta, of rate r. A torque sent at i dt
    that arrives at a has the delay eta + r a, so to first order of r
 

@@ -1,4 +1,4 @@
-"""Which torque acts when, for a delay of any length that may drift: see core/arrivals.h."""
+"""Timeline for a delay of any length that may drift, see core/arrivals.h."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -84,7 +84,7 @@ class Arrivals(Timeline):
         return replace(self, sent=min(self.sent + 1, kept), before=before)
 
     def compiled(self) -> Any:
-        """This in C; `before` must be contiguous and outlive it."""
+        """Return the `stewart_arrivals`; `before` must be contiguous and outlive it."""
         numbers = (self.period, self.arrival, self.rate, self.sent, len(self.before))
         return core().ffi.new("stewart_arrivals *", (*numbers, core().at(self.before)))
 

@@ -19,8 +19,7 @@ from stewart_drake.files.yamlio import validate
 from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.channel import Packets
 from stewart_drake.law.cost import QuadraticCost
-from stewart_drake.law.delay_filter import delay_settings
-from stewart_drake.law.delay_observer import DelayObserver
+from stewart_drake.law.delay_observer import DelayObserver, delay_settings
 from stewart_drake.law.design_models import MultibodyModel, PaperModel
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,

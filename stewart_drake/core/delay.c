@@ -1,0 +1,647 @@
+/* The filter over state, parameters and the delay, xi = [x; theta; eta; eta_dot]: see delay.h.
+
+   eta is the delay of what arrives now,
+
+       eta_{k+1} = eta_k + dt eta_dot_k + noise,   eta_dot_{k+1} = eta_dot_k + noise,
+
+   and what acts between two samples follows from it (arrivals.h). A torque that arrives tau later
+   moves the plate by minus its kick, so dx/deta is minus the sum of the kicks; here it is a central
+   difference of the whole prediction over DIFFERENCE, which also has what happens after the kick.
+   With a torque change at a sample itself it is the mean of both sides. An arrival at a within the
+   period moves by a eta_dot with the rate: to first order dx/deta_dot = dt/2 dx/deta.
+
+   The likelihood of a measurement, -1/2 (nu' S^-1 nu + ln |S|) with innovation nu and covariance S,
+   is kept: the delay is found by comparing filters (delay_search.c). */
+
+#include "delay.h"
+
+#define X STEWART_STATES
+#define U STEWART_MOTORS
+#define MOST STEWART_MOST_ACTING
+
+#define ITERATIONS 6 /* at the most, while the delay is hardly known */
+#define FEW 4        /* once it is known */
+#define TRIED 15     /* values of the delay that are tried before the iterations of a vague one */
+#define DIFFERENCE ((real)1e-3) /* s */
+#define SMALL ((real)0.1)  /* standard deviations; a shorter correction ends the iterations */
+#define KNOWN ((real)0.01) /* a parameter is known at this share of its usual standard deviation */
+#define MEMORY 5           /* s over which the timing of single torques is judged */
+#define UNTIMELY ((real)0.05) /* periods by which a torque may come early or late at the most */
+#define JERKED ((real)0.02)   /* periods by which the delay may have changed where it did */
+#define EDGE ((real)0.1)      /* periods about one from which torques may come into it */
+#define BEFORE ((real)1 / 120) /* see stewart_period_late */
+#define ASIDE ((real)0.01) /* share of a kick's variance in every other direction */
+#define LARGEST_RATE ((real)0.5) /* s/s */
+#define UNLIKELY ((real)-1e6) /* log-likelihood of a measurement that cannot be explained */
+#define SQRT_HALF ((real)0.70710678118654752)
+
+static int size_of(const stewart_delay *d) { return X + d->machine->estimated + 2; }
+
+int stewart_guess_size(int p)
+{
+    const int n = X + p + 2;
+    return STEWART_GUESS + n + n * (n + 1) / 2;
+}
+
+void stewart_guess_root(const stewart_guess *guess, int n, real *L)
+{
+    const real *packed = guess->numbers + n;
+    for (int i = 0; i < n; packed += ++i) {
+        stewart_copy(i + 1, packed, L + n * i);
+        stewart_fill(n - i - 1, 0, L + n * i + i + 1);
+    }
+}
+
+void stewart_guess_keep_root(int n, const real *L, stewart_guess *guess)
+{
+    real *packed = guess->numbers + n;
+    for (int i = 0; i < n; packed += ++i)
+        stewart_copy(i + 1, L + n * i, packed);
+}
+
+real stewart_guess_std(const stewart_guess *guess, int n)
+{
+    const real *row = guess->numbers + n + (n - 2) * (n - 1) / 2;
+    real square = 0;
+    for (int j = 0; j < n - 1; j++)
+        square += row[j] * row[j];
+    return REAL(sqrt)(square);
+}
+
+/* ---- one period ------------------------------------------------------------------------------- */
+
+static stewart_arrivals arriving(const stewart_period *t, const real *xi)
+{
+    const int n = size_of(t->delay);
+    stewart_arrivals view = t->view;
+    view.eta = xi[n - 2];
+    view.rate = xi[n - 1];
+    return view;
+}
+
+/* Torques that act between two instants, their durations, and their number; 0 for too many. */
+static int acting(const stewart_period *t, const real *xi, real begin, real end, real *torques,
+                  real *durations)
+{
+    const stewart_arrivals view = arriving(t, xi);
+    const int number = stewart_within(&view, t->flights, t->in_flight, begin, end, t->newest,
+                                      torques, durations);
+    return number <= MOST ? number : 0;
+}
+
+/* Numbers that what acts in a period takes. */
+static int acting_scratch(const stewart_period *t) { return (U + 1) * (t->flights + 3); }
+
+int stewart_period_scratch(int p, int flights)
+{
+    return 2 * (U + 1) * (flights + 3) + MOST * X * (X + p) + X + p + 2
+        + stewart_transitions_scratch(p);
+}
+
+int stewart_delay_advance_scratch(int p, int m, int flights)
+{
+    const int n = X + p + 2, own = (4 * n + MOST + X + 1 + m) * n + (m + 2 * X + 2) * m;
+    const int tried = (X + 1) * n + (X + 1 + n) * m, judged = (n + m + MOST) * m;
+    const int update = stewart_kalman_scratch(n, m);
+    const int more = tried > update ? tried : update, period = stewart_period_scratch(p, flights);
+    return own + 2 * n + (more + period > judged ? more + period : judged);
+}
+
+int stewart_period_end(const stewart_period *t, const real *xi, real *state,
+                       stewart_scratch scratch)
+{
+    real *torques = stewart_take(&scratch, acting_scratch(t));
+    real *durations = torques + U * (t->flights + 3), states[X * MOST];
+    const int number = acting(t, xi, 0, t->delay->period, torques, durations);
+    const stewart_acting all = {number, torques, durations, 0};
+    if (!number)
+        return 0;
+    stewart_predict(t->delay->machine, xi + X, &all, xi, states);
+    stewart_copy(X, states + X * (number - 1), state);
+    return 1;
+}
+
+int stewart_period_at(const stewart_period *t, const real *xi, int exact, real *state, real *H,
+                      stewart_scratch scratch)
+{
+    const stewart_machine *machine = t->delay->machine;
+    const int n = size_of(t->delay), known = n - 2;
+    const real dt = t->delay->period;
+    real *torques = stewart_take(&scratch, acting_scratch(t));
+    real *durations = torques + U * (t->flights + 3);
+    real *all = stewart_take(&scratch, MOST * X * known), *moved = stewart_take(&scratch, n);
+    real states[X * MOST], later[X], sooner[X];
+    const int number = acting(t, xi, 0, dt, torques, durations);
+    const stewart_acting acts = {number, torques, durations, 0};
+    if (!number || !stewart_transitions(machine, xi, &acts, exact, states, all, scratch))
+        return 0;
+    stewart_copy(X, states + X * (number - 1), state);
+    for (int i = 0; i < X; i++) {
+        stewart_copy(known, all + X * known * (number - 1) + known * i, H + n * i);
+        H[n * i + n - 2] = H[n * i + n - 1] = 0;
+    }
+    if (!(xi[n - 2] < STEWART_NEVER))
+        return 1;
+    stewart_copy(n, xi, moved);
+    moved[n - 2] = xi[n - 2] + DIFFERENCE;
+    if (!stewart_period_end(t, moved, later, scratch))
+        return 0;
+    moved[n - 2] = xi[n - 2] - DIFFERENCE;
+    if (!stewart_period_end(t, moved, sooner, scratch))
+        return 0;
+    for (int i = 0; i < X; i++) {
+        H[n * i + n - 2] = (later[i] - sooner[i]) / (2 * DIFFERENCE);
+        H[n * i + n - 1] = dt / 2 * H[n * i + n - 2];
+    }
+    return 1;
+}
+
+/* Probability that a normal error of this standard deviation lies between two bounds. */
+static real between(real low, real high, real std)
+{
+    const real part = SQRT_HALF / std;
+    return (real)0.5 * (REAL(erfc)(low * part) - REAL(erfc)(high * part));
+}
+
+/* A change of torque at c that comes a second earlier leaves B dT in the rates at the end and moves
+   the pose by that for the rest of the period. It does so in this period if c + j is within it, j its
+   error: next to a sample with the probability Phi.
+
+   What was in flight at t = 0 was held from unknown instants, phi dt off the samples. Held mean
+   torques of changes dT per period leave the rates off by B dT dt phi (1 - phi) / 2 at the samples,
+   of which the mean square is BEFORE (B dT dt)^2 for phi uniform in [0, 1]. */
+int stewart_period_late(const stewart_period *t, const real *xi, const real *state, real std,
+                        real *K, int *others, stewart_scratch scratch)
+{
+    const real dt = t->delay->period;
+    const stewart_arrivals view = arriving(t, xi);
+    real *torques = stewart_take(&scratch, acting_scratch(t));
+    real *durations = torques + U * (t->flights + 3), before[6], after[6], at = -EDGE * dt;
+    const int number = acting(t, xi, at, dt - at, torques, durations);
+    const real first = ((real)(t->newest + 1 - view.sent) * dt + view.eta) * (1 + view.rate);
+    stewart_belief belief;
+    stewart_believe(t->delay->machine, xi + X, &belief);
+    *others = 0;
+    if (!number)
+        return -1;
+    stewart_accelerate(&belief, state, torques, before);
+    for (int k = 0; k + 1 < number; k++, K += X) {
+        real left, share = REAL(sqrt)(BEFORE) * dt;
+        at += durations[k];
+        left = dt - at < 0 ? 0 : dt - at < dt ? dt - at : dt;
+        if (view.sent > 0 && at >= first - STEWART_INSTANT)
+            share = std * REAL(sqrt)(REAL(fmax)(between(-at, dt - at, std), 0));
+        else
+            ++*others;
+        stewart_accelerate(&belief, state, torques + U * (k + 1), after);
+        for (int i = 0; i < 6; i++) {
+            K[6 + i] = share * (after[i] - before[i]);
+            K[i] = left * K[6 + i];
+            before[i] = after[i];
+        }
+    }
+    return number - 1;
+}
+
+/* ---- a measurement at its end ----------------------------------------------------------------- */
+
+/* A period linearised at xi, and how its end is seen. */
+typedef struct {
+    const stewart_period *period;
+    const real *y, *mean; /* (m) measured; (n) prior */
+    int m, n, exact, rows, others;
+    real state[X];
+    real *H;             /* (12, n) */
+    real K[X * MOST];    /* see stewart_period_late */
+    real drift[X];       /* standard deviations of the model's other errors */
+    real *C;             /* (m, m) root of the covariance of the noise, the model's error too */
+    real *small;         /* (m) */
+    real *J;             /* (m, 12) */
+    real *seen, *white;  /* (m, n) C^-1 J H, and (m) C^-1 nu, nu the innovation about the prior */
+    real *nu;
+} Model;
+
+static const stewart_sensing *sensing_of(const Model *a) { return a->period->delay->sensing; }
+
+void stewart_seen_jacobian(const stewart_sensing *sensing, const real *state, real *J)
+{
+    if (sensing->seen) {
+        sensing->jacobian(sensing, state, J);
+        return;
+    }
+    stewart_fill(X * X, 0, J);
+    for (int i = 0; i < X; i++)
+        J[(X + 1) * i] = 1;
+}
+
+void stewart_seen(const stewart_sensing *sensing, const real *state, real *y)
+{
+    if (sensing->seen)
+        sensing->seen(sensing, state, y);
+    else
+        stewart_copy(X, state, y);
+}
+
+void stewart_whiten(int m, int n, const real *C, real *B)
+{
+    for (int i = 0; i < m; i++) {
+        real *row = B + n * i;
+        for (int k = 0; k < i; k++)
+            for (int j = 0; j < n; j++)
+                row[j] -= C[m * i + k] * B[n * k + j];
+        for (int j = 0; j < n; j++)
+            row[j] /= C[m * i + i];
+    }
+}
+
+static int rows(void *about, const real *xi, real *e, real *H, stewart_scratch scratch)
+{
+    Model *a = about;
+    (void)scratch;
+    stewart_seen(sensing_of(a), a->state, e);
+    stewart_seen_jacobian(sensing_of(a), a->state, a->J);
+    stewart_multiply(a->m, X, a->n, a->J, a->H, H);
+    for (int i = 0; i < a->m; i++)
+        e[i] = a->y[i] - e[i];
+    stewart_whiten(a->m, a->n, a->C, H);
+    stewart_whiten(a->m, 1, a->C, e);
+    stewart_copy(a->m * a->n, H, a->white);
+    for (int i = 0; i < a->m; i++) {
+        a->nu[i] = e[i];
+        for (int j = 0; j < a->n; j++)
+            a->nu[i] += H[a->n * i + j] * (xi[j] - a->mean[j]);
+    }
+    return a->m;
+}
+
+/* Whether a difference of states is small as the sensor sees it. */
+static int is_small(Model *a, const real *state, const real *difference)
+{
+    stewart_seen_jacobian(sensing_of(a), state, a->J);
+    for (int i = 0; i < a->m; i++) {
+        real sum = 0;
+        for (int j = 0; j < X; j++)
+            sum += a->J[X * i + j] * difference[j];
+        if (!(REAL(fabs)(sum) <= a->small[i])) /* or NaN */
+            return 0;
+    }
+    return 1;
+}
+
+/* What linearising leaves out is of second order: negligible for a small correction. */
+static int settle(void *about, const real *xi, const real *better, stewart_scratch scratch)
+{
+    Model *a = about;
+    real shift[X], linear[X], end[X];
+    for (int i = 0; i < X; i++) {
+        shift[i] = 0;
+        for (int j = 0; j < a->n; j++)
+            shift[i] += a->H[a->n * i + j] * (better[j] - xi[j]);
+        linear[i] = a->state[i] + shift[i];
+    }
+    if (is_small(a, a->state, shift)) {
+        stewart_copy(X, linear, a->state);
+        return 1;
+    }
+    if (!stewart_period_end(a->period, better, end, scratch))
+        return -1;
+    for (int i = 0; i < X; i++)
+        shift[i] = end[i] - linear[i];
+    if (is_small(a, end, shift)) {
+        stewart_copy(X, end, a->state);
+        return 1;
+    }
+    return stewart_period_at(a->period, better, a->exact, a->state, a->H, scratch) ? 0 : -1;
+}
+
+int stewart_seen_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
+                      const real *std, real *C, stewart_scratch scratch)
+{
+    const int m = sensing->size;
+    real *J = stewart_take(&scratch, m * X), *JA = stewart_take(&scratch, m * k);
+    stewart_seen_jacobian(sensing, state, J);
+    stewart_multiply_by_transpose(m, X, k, J, A, JA);
+    stewart_multiply_by_transpose(m, k, m, JA, JA, C);
+    for (int i = 0; i < m; i++)
+        for (int l = 0; l < X; l++)
+            J[X * i + l] *= std[l];
+    for (int i = 0; i < m; i++) {
+        for (int j = 0; j < m; j++)
+            for (int l = 0; l < X; l++)
+                C[m * i + j] += J[X * i + l] * J[X * j + l];
+        C[(m + 1) * i] += sensing->noise_std[i] * sensing->noise_std[i];
+    }
+    return stewart_cholesky(m, C);
+}
+
+static real timing_of(const stewart_delay *d, const stewart_guess *guess)
+{
+    const real least = d->timing_std * d->timing_std;
+    return guess->timing > least ? guess->timing : least;
+}
+
+static real deviation(int n, const real *L, int i)
+{
+    real square = 0;
+    for (int j = 0; j < n; j++)
+        square += L[n * i + j] * L[n * i + j];
+    return REAL(sqrt)(square);
+}
+
+/* Linearise at xi, with the noise of torques early or late by a variance `used` and of the model. */
+static int linearize(Model *a, const real *xi, real used, stewart_scratch scratch)
+{
+    const stewart_delay *d = a->period->delay;
+    if (!stewart_period_at(a->period, xi, a->exact, a->state, a->H, scratch))
+        return 0;
+    a->rows = stewart_period_late(a->period, xi, a->state, REAL(sqrt)(used), a->K, &a->others,
+                                    scratch);
+    if (a->rows < 0)
+        return 0;
+    for (int i = 0; i < X; i++) {
+        real square = d->model_std[i] * d->model_std[i];
+        for (int k = 0; k < a->rows; k++)
+            square += ASIDE * a->K[X * k + i] * a->K[X * k + i];
+        a->drift[i] = REAL(sqrt)(square);
+    }
+    return 1;
+}
+
+/* xi <- the prior with that eta of TRIED ones that the measurement fits best.
+
+   By nu' S^-1 nu, S of all but the delay: the linearised effect of a torque that has not arrived yet
+   is none, and iterations from there would never find one that has. */
+static int best_of_many(Model *a, const stewart_guess *guess, const real *L, real std, real *xi,
+                        stewart_scratch scratch)
+{
+    const stewart_delay *d = a->period->delay;
+    const int n = a->n, m = a->m, known = n - 2;
+    const real reach = (real)2.5 * std, eta = a->mean[n - 2];
+    const real low = guess->low > eta - reach ? guess->low : eta - reach;
+    const real high = guess->high < eta + reach ? guess->high : eta + reach;
+    real *A = stewart_take(&scratch, known * X), *miss = stewart_take(&scratch, m), end[X];
+    real *trial = stewart_take(&scratch, n), least = (real)INFINITY;
+    for (int i = 0; i < X; i++) /* rows of (H L)' */
+        for (int j = 0; j < known; j++) {
+            A[X * j + i] = 0;
+            for (int k = j; k < known; k++)
+                A[X * j + i] += a->H[n * i + k] * L[n * k + j];
+        }
+    /* Seen from where the period begins. */
+    if (!stewart_seen_root(sensing_of(a), a->mean, known, A, d->model_std, a->C, scratch))
+        return 0;
+    stewart_copy(n, a->mean, trial);
+    for (int k = 0; k < TRIED; k++) {
+        real cost = 0;
+        trial[n - 2] = k < TRIED - 1 ? low + (high - low) / (TRIED - 1) * (real)k : high;
+        if (!stewart_period_end(a->period, trial, end, scratch))
+            return 0;
+        stewart_seen(sensing_of(a), end, miss);
+        for (int i = 0; i < m; i++)
+            miss[i] = a->y[i] - miss[i];
+        stewart_whiten(m, 1, a->C, miss);
+        for (int i = 0; i < m; i++)
+            cost += miss[i] * miss[i];
+        if (cost < least) {
+            least = cost;
+            xi[n - 2] = trial[n - 2];
+        }
+    }
+    return 1;
+}
+
+/* Update what a hypothesis says of the timing of single torques, and its outliers.
+
+   With S = S_0 + s M, s the variance, the log-likelihood has the slope and the information
+
+       dL/ds = 1/2 (nu' S^-1 M S^-1 nu - tr S^-1 M),   I = 1/2 tr S^-1 M S^-1 M,
+
+   so that s + (dL/ds) / I is what this measurement alone says of it (Fisher scoring). One torque whose
+   timing is all that is uncertain says it to I = 1 / (2 s^2): a measurement counts as 2 s^2 I torques.
+   The mean over those is the estimate; a weight that is itself 1 / s^4 would for ever believe the first
+   ones that happened to be on time.
+
+   Whitened by C, S is 1 + W W' with W = C^-1 H L, and s M is B B' with B = C^-1 J K' of the own rows
+   of K. With T = B' S^-1 B the traces are those of T and of T T. Returns 0 where S is not positive
+   definite, 2 for a torque further off than any is, else 1. */
+static int judge_timing(Model *a, const real *L, real used, stewart_guess *after,
+                        stewart_scratch scratch)
+{
+    const real dt = a->period->delay->period, most = UNTIMELY * dt * (UNTIMELY * dt);
+    const int m = a->m, n = a->n, k = a->rows - a->others + 1;
+    real *W = stewart_take(&scratch, m * n), *S = stewart_take(&scratch, m * m);
+    real *B = stewart_take(&scratch, m * k), square = 0, trace = 0, pull = 0;
+    stewart_multiply(m, n, n, a->white, L, W);
+    stewart_multiply_by_transpose(m, n, m, W, W, S);
+    for (int i = 0; i < m; i++)
+        S[(m + 1) * i] += 1;
+    if (!stewart_cholesky(m, S))
+        return 0;
+    for (int i = 0; i < m; i++)
+        for (int j = 0; j < k - 1; j++) {
+            B[k * i + j] = 0;
+            for (int l = 0; l < X; l++)
+                B[k * i + j] += a->seen[X * i + l] * a->K[X * (a->others + j) + l];
+        }
+    for (int i = 0; i < m; i++)
+        B[k * i + k - 1] = 0;
+    stewart_whiten(m, k, a->C, B);
+    for (int i = 0; i < m; i++)
+        B[k * i + k - 1] = a->nu[i];
+    stewart_whiten(m, k, S, B); /* T = B' B, its last column B' S^-1 nu */
+    for (int i = 0; i < k - 1; i++)
+        for (int j = 0; j < k; j++) {
+            real t = 0;
+            for (int l = 0; l < m; l++)
+                t += B[k * l + i] * B[k * l + j];
+            if (j == k - 1)
+                pull += t * t;
+            else
+                square += t * t;
+            if (i == j)
+                trace += t;
+        }
+    if (!(square > 0)) /* no torque has changed */
+        return 1;
+    const real told = used * (1 + (pull - trace) / square); /* of `square` torques */
+    const real kept = after->torques < MEMORY / dt ? after->torques : MEMORY / dt;
+    const real timing = (kept * after->timing + square * told) / (kept + square);
+    after->timing = timing < 0 ? 0 : timing < most ? timing : most;
+    after->torques = kept + square;
+    return 1 + (told > 2 * most);
+}
+
+/* Whether the effect of a single torque can be separated from that of the delay. */
+static int is_precise(const stewart_delay *d, const stewart_guess *guess, int n, real std)
+{
+    return std < d->period / 50 && guess->numbers[n - 2] < STEWART_NEVER;
+}
+
+/* Correct xi and the root of its covariance by a measurement; 0 where it does not fit. */
+static int correct(Model *a, const stewart_guess *guess, const real *L, real std, real used, real *xi,
+                   real *root, stewart_guess *after, stewart_scratch scratch)
+{
+    const stewart_delay *d = a->period->delay;
+    const int n = a->n, m = a->m, p = d->machine->estimated;
+    const int free_eta = deviation(n, L, n - 2) > 0, free_rate = deviation(n, L, n - 1) > 0;
+    real *lower = stewart_take(&scratch, n), *upper = stewart_take(&scratch, n);
+    real distance, spread;
+    if (std > d->period / 10) {
+        if (!best_of_many(a, guess, L, std, xi, scratch) || !linearize(a, xi, used, scratch))
+            return 0;
+    }
+    if (!stewart_seen_root(d->sensing, a->state, a->rows, a->K, a->drift, a->C, scratch))
+        return 0;
+    stewart_seen_jacobian(d->sensing, a->state, a->seen);
+    for (int i = 0; i < m; i++)
+        a->small[i] = SMALL * deviation(m, a->C, i);
+    for (int i = 0; i < n; i++) {
+        lower[i] = -(real)INFINITY;
+        upper[i] = (real)INFINITY;
+    }
+    stewart_copy(p, d->lower, lower + X);
+    stewart_copy(p, d->upper, upper + X);
+    if (free_eta) {
+        lower[n - 2] = guess->low;
+        upper[n - 2] = guess->high;
+    }
+    if (free_rate) {
+        lower[n - 1] = -LARGEST_RATE;
+        upper[n - 1] = LARGEST_RATE;
+    }
+    const stewart_kalman filter = {
+        n, m, std > d->period / 100 ? ITERATIONS : FEW, a->mean, L, lower, upper, a, rows, settle};
+    if (!stewart_kalman_update(&filter, xi, root, &distance, &spread, scratch))
+        return 0;
+    if (!(distance <= d->gate)) /* or NaN */
+        return 0;
+    for (int i = 0; i < m; i++)
+        spread += 2 * REAL(log)(a->C[(m + 1) * i]);
+    after->log_likelihood = -(distance + spread) / 2;
+    after->outliers = 0;
+    after->heard += guess->numbers[n - 2] < STEWART_NEVER;
+    if (is_precise(d, guess, n, std)) {
+        const int judged = judge_timing(a, L, used, after, scratch);
+        if (!judged)
+            return 0;
+        after->outliers = judged == 2 ? guess->outliers + 1 : 0;
+    }
+    return 1;
+}
+
+/* `after` (but its root, which is L's) a period after a hypothesis with the root L (n, n), with a
+   variance of the timing of at least `least` (s^2); y may be NULL. 0 where it does not fit. */
+static int attempt(const stewart_period *t, const stewart_guess *guess, const real *L, const real *y,
+                   real least, stewart_guess *after, stewart_scratch scratch)
+{
+    const stewart_delay *d = t->delay;
+    const int n = size_of(d), p = n - X - 2, m = d->sensing->size;
+    const real dt = d->period, std = deviation(n, L, n - 2), timing = timing_of(d, guess);
+    const real used = timing > least ? timing : least;
+    real *xi = stewart_take(&scratch, n), *posterior = stewart_take(&scratch, n * n);
+    real *R = stewart_take(&scratch, n * n), *W = stewart_take(&scratch, n * (n + MOST));
+    Model a = {.period = t, .y = y, .mean = guess->numbers, .m = m, .n = n, .exact = 0};
+    a.H = stewart_take(&scratch, X * n);
+    a.C = stewart_take(&scratch, m * m);
+    a.small = stewart_take(&scratch, m);
+    a.J = stewart_take(&scratch, m * X);
+    a.seen = stewart_take(&scratch, m * X);
+    a.white = stewart_take(&scratch, m * n);
+    a.nu = stewart_take(&scratch, m);
+    for (int i = 0; i < p; i++)
+        if (!(deviation(n, L, X + i) <= KNOWN * d->usual_std[i])) /* or NaN */
+            a.exact = 1;
+    stewart_copy(n, guess->numbers, xi);
+    if (!linearize(&a, xi, used, scratch))
+        return 0;
+    for (int i = 0; i < STEWART_GUESS; i++)
+        ((real *)after)[i] = ((const real *)guess)[i];
+    after->log_likelihood = 0;
+    after->fits = 1;
+    if (y) {
+        if (!correct(&a, guess, L, std, used, xi, posterior, after, scratch))
+            return 0;
+        L = posterior;
+    }
+    real less_sure = 0; /* the mean delay is not known better than the timing of what was heard */
+    if (after->heard > 0)
+        less_sure = (timing_of(d, after) - timing) / after->heard;
+    if (!(less_sure > 0))
+        less_sure = 0;
+    /* QR of [noise; (F L)'; kicks] */
+    stewart_fill(n * n, 0, R);
+    for (int i = 0; i < X; i++)
+        R[(n + 1) * i] = a.drift[i];
+    if (guess->numbers[n - 2] < STEWART_NEVER) {
+        R[n * n - n - 2] = REAL(sqrt)(less_sure + d->walk * d->walk * dt);
+        R[n * n - 1] = d->rate_walk * REAL(sqrt)(dt);
+    }
+    for (int j = 0; j < n; j++) {
+        real *w = W + n * j;
+        for (int k = 0; k < n; k++)
+            w[k] = L[n * k + j];
+        w[n - 2] += dt * w[n - 1];
+        for (int i = 0; i < X; i++) {
+            real sum = 0;
+            for (int k = 0; k < n; k++)
+                sum += a.H[n * i + k] * L[n * k + j];
+            w[i] = sum;
+        }
+    }
+    for (int k = 0; k < a.rows; k++) {
+        real *w = W + n * (n + k);
+        stewart_fill(n, 0, w);
+        stewart_copy(X, a.K + X * k, w);
+    }
+    stewart_absorb(n, n + a.rows, R, W, scratch);
+    stewart_copy(X, a.state, after->numbers);
+    stewart_copy(n - X, xi + X, after->numbers + X);
+    after->numbers[n - 2] += dt * xi[n - 1];
+    real *packed = after->numbers + n;
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j <= i; j++)
+            *packed++ = R[n * j + i];
+    return stewart_all_finite(n + n * (n + 1) / 2, after->numbers);
+}
+
+/* Let the delay itself have changed by a standard deviation: a variance added to that of eta, in the
+   last two rows of the root. */
+static void jerk(int n, real std, real *L)
+{
+    real *eta = L + n * (n - 2) + n - 2, *rate = L + n * (n - 1) + n - 2;
+    const real before = *eta, along = rate[0];
+    *eta = REAL(sqrt)(before * before + std * std);
+    if (!(*eta > 0))
+        return;
+    rate[0] = along * before / *eta;
+    rate[1] = REAL(hypot)(rate[1], along * std / *eta);
+}
+
+void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, const real *y,
+                           stewart_guess *after, stewart_scratch scratch)
+{
+    const stewart_delay *d = t->delay;
+    const int n = size_of(d), size = stewart_guess_size(n - X - 2);
+    real *L = stewart_take(&scratch, n * n);
+    stewart_guess_root(guess, n, L);
+    if (y) {
+        if (attempt(t, guess, L, y, 0, after, scratch))
+            return;
+        if (is_precise(d, guess, n, stewart_guess_std(guess, n))) {
+            const real most = UNTIMELY * d->period;
+            jerk(n, JERKED * d->period, L);
+            if (attempt(t, guess, L, y, most * most, after, scratch)) {
+                after->outliers = guess->outliers + 1; /* one more of these may be a jump */
+                return;
+            }
+            stewart_guess_root(guess, n, L);
+        }
+    }
+    if (!attempt(t, guess, L, NULL, 0, after, scratch)) /* astray: it explains nothing any more */
+        stewart_copy(size, (const real *)guess, (real *)after);
+    if (y) {
+        after->fits = 0;
+        after->outliers = guess->outliers + 1;
+        after->log_likelihood = UNLIKELY;
+    }
+}

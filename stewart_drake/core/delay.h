@@ -1,0 +1,138 @@
+/* State, parameters and an unknown delay: the filter of one hypothesis, and the search among them. */
+
+#ifndef STEWART_DELAY_H
+#define STEWART_DELAY_H
+
+#include "arrivals.h"
+#include "kalman.h"
+#include "sensing.h"
+
+#define STEWART_NEVER 1000000 /* s; the delay of torques that do not arrive */
+
+enum {
+    STEWART_GUESS = 9,        /* numbers of a hypothesis without its mean and root */
+    STEWART_DELAY_NUMBERS = 16, /* numbers of the memory without its arrays */
+    STEWART_MOST_ACTING = 8,  /* torques that act in a period, at a rate of the delay within bounds */
+};
+
+void stewart_seen(const stewart_sensing *sensing, const real *state, real *y);
+void stewart_seen_jacobian(const stewart_sensing *sensing, const real *state, real *J);
+
+/* C (m, m) <- root of J (A'A + diag(std)^2) J' and the sensor's noise, A (k, 12). Returns 0 where it is
+   not positive definite. Scratch: m (12 + k) numbers. */
+int stewart_seen_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
+                      const real *std, real *C, stewart_scratch scratch);
+
+/* B <- C^-1 B, (m, m) lower triangular, (m, n). */
+void stewart_whiten(int m, int n, const real *C, real *B);
+
+/* What is assumed of the state, the parameters theta (p) and the delay. */
+typedef struct {
+    const stewart_machine *machine;
+    const stewart_sensing *sensing;
+    real period;                     /* dt, s */
+    real model_std[STEWART_STATES];  /* by which one step of the model may be off */
+    const real *prior, *prior_root;  /* of theta: mean (p), root of the covariance (p, p) */
+    const real *std, *usual_std;     /* (p) of the prior, and of the prior from a drawing alone */
+    const real *lower, *upper;       /* (p) bounds of theta */
+    real gate;                       /* squared innovation that makes an outlier */
+    real first_timing;               /* s, by which a torque may come early or late, to begin with */
+    real believed, delay_std;        /* s, mean and standard deviation of the delay's prior */
+    real longest;                    /* s */
+    real timing_std;                 /* s, the least by which a torque may come early or late */
+    real walk, rate_std, rate_walk;  /* s per root s; s/s, 0 for a delay without a rate; s/s per root s */
+    int quiet;                       /* whether nothing is fed back before the delay is found */
+} stewart_delay;
+
+/* A hypothesis of the delay, with all that follows from it, in one flat vector. */
+typedef struct {
+    real low, high;      /* s, between which eta is */
+    real log_likelihood; /* of the last measurement */
+    real fits;           /* whether the last measurement was not an outlier */
+    real outliers;       /* in a row, with those that a torque at another time explains */
+    real timing;         /* s^2, variance by which single torques come early or late */
+    real torques;        /* number of torques behind that */
+    real heard;          /* number of measurements that an own torque had to do with */
+    real weight;         /* log of the odds */
+    real numbers[];      /* mean of xi = [x; theta; eta; eta_dot] (n), then the lower triangle of the
+                            root of its covariance, by rows; its last two rows are 0, and eta is
+                            NEVER, where nothing has arrived */
+} stewart_guess;
+
+int stewart_guess_size(int p);
+
+/* The root of its covariance, lower triangular (n, n), and back; the standard deviation of eta. */
+void stewart_guess_root(const stewart_guess *guess, int n, real *L);
+void stewart_guess_keep_root(int n, const real *L, stewart_guess *guess);
+real stewart_guess_std(const stewart_guess *guess, int n);
+
+/* One period as a function of xi. */
+typedef struct {
+    const stewart_delay *delay;
+    stewart_arrivals view; /* from its beginning; eta and rate do not count */
+    int flights, newest;   /* see stewart_within */
+    const real *in_flight; /* (flights, 6) */
+} stewart_period;
+
+int stewart_period_scratch(int p, int flights); /* of each of these */
+
+/* State at the end. Returns 0 where that does not exist. */
+int stewart_period_end(const stewart_period *period, const real *xi, real *state,
+                       stewart_scratch scratch);
+
+/* State at the end, and H (12, n) = d[state]/d[xi]; `exact`: see stewart_transitions. Returns 0 where
+   they do not exist. */
+int stewart_period_at(const stewart_period *period, const real *xi, int exact, real *state, real *H,
+                      stewart_scratch scratch);
+
+/* Rows K (k, 12) by which the state at the end differs where single torques are early or late: the
+   first `others` by one standard deviation of those before the controller's own, the rest by that of
+   the own ones, `std` in s. K'K is the covariance. Returns k, at most STEWART_MOST_ACTING, or -1. */
+int stewart_period_late(const stewart_period *period, const real *xi, const real *state, real std,
+                        real *K, int *others, stewart_scratch scratch);
+
+/* The hypothesis a period later, with a measurement y (m) at its end, or NULL. */
+void stewart_delay_advance(const stewart_period *period, const stewart_guess *guess, const real *y,
+                           stewart_guess *after, stewart_scratch scratch);
+
+int stewart_delay_advance_scratch(int p, int m, int flights);
+
+/* What is believed, in one flat vector. */
+typedef struct {
+    real eta, rate, sent;        /* the delay to act on, s and s/s, see stewart_arrivals */
+    real known;                  /* whether there is a state: not before the first measurement */
+    real searching;              /* whether there are several hypotheses */
+    real cells;                  /* number of hypotheses that something has arrived */
+    real best;                   /* place of the one that the law goes on with */
+    real rejected;               /* whether the last measurement was an outlier */
+    real found;                  /* whether the delay has just been found, or is another than before */
+    real fresh;                  /* whether that was at this sample, and took so long that planning waits
+                                    for the next one */
+    real silent;                 /* whether nothing is fed back until then */
+    real feeds_back;             /* whether the estimate is good enough to act on */
+    real caution;                /* factor on the weight of torques */
+    real settled;                /* whether the delay is known */
+    real mean, std;              /* s, of the delay; NaN before the first measurement */
+    real numbers[];              /* what acts without own torques (flights - 1 or 1, 6), the last two
+                                    measurements (2, m), then hypotheses; the first is that nothing
+                                    has arrived, or the only one */
+} stewart_delay_memory;
+
+/* Numbers of the memory for p parameters, m values and a number of torques in flight at a sample. */
+int stewart_delay_size(int p, int m, int flights);
+
+int stewart_delay_scratch(int p, int m, int flights);
+
+/* The hypothesis at a place: 0 is the master or the only one, 1 to `cells` are cells. */
+stewart_guess *stewart_delay_guess(int p, int m, int flights, stewart_delay_memory *memory,
+                                   int place);
+
+void stewart_delay_start(const stewart_delay *delay, int flights, stewart_delay_memory *memory);
+
+/* One period, then a measurement y (m) at its end, or NULL. `in_flight` (flights, 6) are the torques
+   before this sample's; `near` (12) is where the plate is thought to be. */
+void stewart_delay_observe(const stewart_delay *delay, int flights, const real *in_flight,
+                           const real *y, const real *near, stewart_delay_memory *memory,
+                           stewart_scratch scratch);
+
+#endif

@@ -1,0 +1,564 @@
+/* State, parameters and an unknown delay: a Gaussian sum over its arrival, see delay.h.
+
+   Until the first of the controller's torques arrives, it is only known that it has not. A
+   *master* filter assumes just this. At t_k a *cell* is taken from it, as it was at t_{k-1}, for an
+   arrival in between: eta uniform in (t_{k-1}, t_k]. With Phi the distribution of the prior,
+
+       p = [Phi(t_k) - Phi(t_{k-1})] / [1 - Phi(t_{k-1})]
+
+   of the master's weight goes to the cell, 1 - p stays. Each measurement multiplies all weights by its
+   likelihood. When one cell, and what lies within NEAR of it, has all but e^-LEAD of the weight and
+   knows the delay to NEAR, it is the delay: the search is over, and one filter goes on.
+
+   Two outliers in a row may be a jump of the delay. Then state and parameters are known, and what was
+   measured last is compared with what every delay of a grid would have done; filters are begun at the
+   best few, and one that fits alone takes over. */
+
+#include "delay.h"
+
+#define X STEWART_STATES
+#define U STEWART_MOTORS
+
+#define LEAD 7       /* log of the odds at which the search is over */
+#define FORGOTTEN 14 /* log of the odds at which a cell is dropped */
+#define NEAR ((real)0.2) /* periods; what is nearer is one hypothesis */
+#define LEAST_SHARE ((real)1e-4) /* of the master's weight that goes to a cell, and that stays */
+#define SUSPICIOUS 2 /* outliers in a row that may be a jump */
+#define PATIENCE 3   /* outliers in a row after which the measurement is believed */
+#define GRID ((real)0.5) /* periods between the delays that are tried after a jump */
+#define BEST 2       /* of them, from which filters are begun */
+#define HOPELESS 100 /* squared distance from which on a filter is not begun */
+#define SETTLED 5    /* log of the odds at which one of those takes over */
+#define AT_ONCE 2    /* cells that leave time for a plan at the same sample */
+#define CAUTION 10   /* times the weight of torques while the delay is sought */
+#define LOOSENED ((real)0.05) /* deviations of the prior by which parameters may change with the delay */
+#define LOOSENED_BY_JUMP ((real)0.01)
+#define TORQUES 1 /* torques taken to have come early or late by `first_timing` before any was looked at.
+                     Were they taken to have been on time, the first late ones would be outliers, and
+                     the next ones payload and bias. */
+#define SQRT_HALF ((real)0.70710678118654752)
+#define SQRT_12 ((real)3.4641016151377546)
+#define SQRT_2_PI ((real)2.5066282746310005)
+
+/* The memory during one sample. */
+typedef struct {
+    const stewart_delay *delay;
+    int n, m, flights;
+    stewart_period since; /* the period before this sample */
+    stewart_delay_memory *memory;
+    real *before, *past;
+} Search;
+
+static int periods_before(int flights) { return flights > 1 ? flights - 1 : 1; }
+
+int stewart_delay_size(int p, int m, int flights)
+{
+    return STEWART_DELAY_NUMBERS + U * periods_before(flights) + 2 * m
+        + (flights + 1) * stewart_guess_size(p);
+}
+
+int stewart_delay_scratch(int p, int m, int flights)
+{
+    const int n = X + p + 2, advance = stewart_delay_advance_scratch(p, m, flights);
+    const int compared = n * n + (2 * X + 1 + m) * n + 2 * X * X + (m + 1 + X) * m
+        + stewart_period_scratch(p, flights);
+    const int more = advance > 3 * n * n ? advance : 3 * n * n; /* a new start */
+    return (BEST + 1) * stewart_guess_size(p) + (2 + U) * flights + U
+        + (more > compared ? more : compared);
+}
+
+stewart_guess *stewart_delay_guess(int p, int m, int flights, stewart_delay_memory *memory,
+                                   int place)
+{
+    real *first = memory->numbers + U * periods_before(flights) + 2 * m;
+    return (stewart_guess *)(first + place * stewart_guess_size(p));
+}
+
+static stewart_guess *guess_at(const Search *s, int place)
+{
+    return stewart_delay_guess(s->n - X - 2, s->m, s->flights, s->memory, place);
+}
+
+static void copy_guess(int n, const stewart_guess *from, stewart_guess *to)
+{
+    stewart_copy(stewart_guess_size(n - X - 2), (const real *)from, (real *)to);
+}
+
+static real distance_of(int n, const stewart_guess *a, const stewart_guess *b)
+{
+    return REAL(fabs)(a->numbers[n - 2] - b->numbers[n - 2]);
+}
+
+/* ---- the prior of the delay ------------------------------------------------------------------- */
+
+/* Probability that a normal number is between x and y. */
+static real probability(real x, real y)
+{
+    const int mirrored = x + y < 0; /* far from the mean a difference from 1 would be lost */
+    const real low = mirrored ? -y : x, high = mirrored ? -x : y;
+    return (real)0.5 * (REAL(erfc)(low * SQRT_HALF) - REAL(erfc)(high * SQRT_HALF));
+}
+
+static real density(real x) { return REAL(exp)(-x * x / 2) / SQRT_2_PI; }
+
+/* Prior probability of a delay longer than t, up to the longest. */
+static real left_of_prior(const stewart_delay *d, real t)
+{
+    const real left = probability((t - d->believed) / d->delay_std,
+                                  (d->longest - d->believed) / d->delay_std);
+    return left > 0 ? left : 0;
+}
+
+/* Mean and standard deviation of the prior between t and the longest delay. With a and b the bounds
+   in standard deviations, Z the probability between them, phi the density,
+
+       mean = believed + std r,   variance = std^2 (1 + (a phi(a) - b phi(b)) / Z - r^2),
+       r = (phi(a) - phi(b)) / Z. */
+static void rest_of_prior(const stewart_delay *d, real t, real *mean, real *std)
+{
+    const real from = t < d->longest ? t : d->longest;
+    const real a = (from - d->believed) / d->delay_std;
+    const real b = (d->longest - d->believed) / d->delay_std, Z = probability(a, b);
+    if (Z < (real)1e-12) {
+        *mean = (from + d->longest) / 2;
+        *std = (d->longest - from) / SQRT_12;
+        return;
+    }
+    const real r = (density(a) - density(b)) / Z;
+    const real variance = 1 + (a * density(a) - b * density(b)) / Z - r * r;
+    *mean = d->believed + d->delay_std * r;
+    *std = d->delay_std * REAL(sqrt)(variance > 0 ? variance : 0);
+}
+
+/* ---- the search ------------------------------------------------------------------------------- */
+
+/* The cell of an arrival within period k becomes the next one. */
+static void spawn(Search *s, int k, stewart_scratch scratch)
+{
+    const stewart_delay *d = s->delay;
+    const int n = s->n;
+    stewart_guess *master = guess_at(s, 0), *cell;
+    const real low = (real)(k - 1) * d->period, high = (real)k * d->period;
+    const real left = left_of_prior(d, low);
+    real share = left > 0 ? 1 - left_of_prior(d, high) / left : 1;
+    real *L = stewart_take(&scratch, n * n);
+    share = share < LEAST_SHARE ? LEAST_SHARE : share < 1 - LEAST_SHARE ? share : 1 - LEAST_SHARE;
+    s->memory->cells += 1;
+    cell = guess_at(s, (int)s->memory->cells);
+    copy_guess(n, master, cell);
+    cell->low = low;
+    cell->high = high;
+    cell->weight += REAL(log)(share);
+    master->weight += REAL(log1p)(-share);
+    cell->numbers[n - 2] = (low + high) / 2;
+    cell->numbers[n - 1] = 0;
+    stewart_guess_root(cell, n, L); /* its last two rows are 0 */
+    L[n * n - n - 2] = d->period / SQRT_12;
+    L[n * n - 1] = d->rate_std;
+    stewart_guess_keep_root(n, L, cell);
+}
+
+static void transpose(int n, real *A)
+{
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < i; j++) {
+            const real a = A[n * i + j];
+            A[n * i + j] = A[n * j + i];
+            A[n * j + i] = a;
+        }
+}
+
+/* State (12) from one measurement alone, and the lower triangular root (12, 12) of its covariance. */
+static int start_of(const stewart_sensing *sensing, const real *y, const real *near, real *state,
+                    real *root, stewart_scratch scratch)
+{
+    real W[X * X];
+    if (!sensing->start(sensing, y, near, state, W, scratch))
+        return 0;
+    transpose(X, W);
+    stewart_fill(X * X, 0, root);
+    stewart_absorb(X, X, root, W, scratch);
+    transpose(X, root);
+    return 1;
+}
+
+/* From one measurement alone: nothing has arrived, or something in any period so far. */
+static void begin(Search *s, const real *y, const real *near, stewart_scratch scratch)
+{
+    const stewart_delay *d = s->delay;
+    const int n = s->n, p = n - X - 2;
+    stewart_guess *master = guess_at(s, 0);
+    real *L = stewart_take(&scratch, n * n), root[X * X], state[X];
+    if (!start_of(d->sensing, y, near, state, root, scratch))
+        return;
+    stewart_fill(STEWART_GUESS, 0, (real *)master);
+    master->high = d->longest;
+    master->fits = 1;
+    master->timing = d->first_timing * d->first_timing;
+    master->torques = TORQUES;
+    stewart_copy(X, state, master->numbers);
+    stewart_copy(p, d->prior, master->numbers + X);
+    master->numbers[n - 2] = STEWART_NEVER;
+    master->numbers[n - 1] = 0;
+    stewart_fill(n * n, 0, L);
+    for (int i = 0; i < X; i++)
+        stewart_copy(X, root + X * i, L + n * i);
+    for (int i = 0; i < p; i++)
+        stewart_copy(p, d->prior_root + p * i, L + n * (X + i) + X);
+    stewart_guess_keep_root(n, L, master);
+    s->memory->known = s->memory->searching = 1;
+    s->memory->cells = s->memory->best = 0;
+    for (int k = 1; k <= s->since.view.sent; k++)
+        if ((real)k * d->period < d->longest)
+            spawn(s, k, scratch);
+}
+
+/* One period and a measurement, or NULL, for the hypothesis at a place. */
+static void update(Search *s, int place, const real *y, stewart_scratch scratch)
+{
+    stewart_guess *guess = guess_at(s, place);
+    stewart_guess *after =
+        (stewart_guess *)stewart_take(&scratch, stewart_guess_size(s->n - X - 2));
+    stewart_delay_advance(&s->since, guess, y, after, scratch);
+    if (y && s->memory->searching > 0)
+        after->weight += after->log_likelihood;
+    copy_guess(s->n, after, guess);
+}
+
+/* One more measurement, or NULL, for master and cells, and perhaps the end of the search. */
+static void search(Search *s, const real *y, stewart_scratch scratch)
+{
+    const stewart_delay *d = s->delay;
+    stewart_delay_memory *memory = s->memory;
+    const int n = s->n, k = s->since.view.sent;
+    const real near = NEAR * d->period;
+    real top, rival;
+    int busy, best = 0, kept = 0;
+    if (k < s->flights && (real)(k - 1) * d->period < d->longest)
+        spawn(s, k, scratch);
+    const int cells = (int)memory->cells;
+    busy = cells > AT_ONCE;
+    for (int i = 0; i <= cells; i++)
+        update(s, i, y, scratch);
+    top = guess_at(s, 0)->weight;
+    for (int i = 1; i <= cells; i++)
+        top = guess_at(s, i)->weight > top ? guess_at(s, i)->weight : top;
+    guess_at(s, 0)->weight -= top;
+    for (int i = 1; i <= cells; i++) {
+        stewart_guess *cell = guess_at(s, i);
+        if (!(cell->weight > top - FORGOTTEN))
+            continue;
+        cell->weight -= top;
+        kept++;
+        if (kept < i)
+            copy_guess(n, cell, guess_at(s, kept));
+        if (guess_at(s, kept)->weight > guess_at(s, best)->weight)
+            best = kept;
+    }
+    memory->cells = (real)kept;
+    memory->best = (real)best;
+    stewart_guess *found = guess_at(s, best);
+    rival = guess_at(s, 0)->weight;
+    for (int i = 1; i <= kept; i++) {
+        const stewart_guess *cell = guess_at(s, i);
+        if (distance_of(n, cell, found) > near && cell->weight > rival)
+            rival = cell->weight;
+    }
+    if (best == 0 || !(found->fits > 0) || !y || !(rival < -LEAD)
+        || !(stewart_guess_std(found, n) < near))
+        return;
+    found->low = 0;
+    found->high = d->longest;
+    found->weight = 0;
+    copy_guess(n, found, guess_at(s, 0));
+    memory->searching = memory->cells = memory->best = 0;
+    memory->found = 1;
+    memory->fresh = (real)busy;
+}
+
+/* ---- jumps and new starts --------------------------------------------------------------------- */
+
+/* `guess` from a state (12) with the root of its covariance (12, 12) and another eta of variance
+   std^2, its parameters as they are known, to `loosened` deviations of the prior. */
+static void begin_at(const Search *s, const stewart_guess *from, real eta, real std, real loosened,
+                     const real *state, const real *root, stewart_guess *guess,
+                     stewart_scratch scratch)
+{
+    const stewart_delay *d = s->delay;
+    const int n = s->n, p = n - X - 2;
+    real *L = stewart_take(&scratch, n * n), *R = stewart_take(&scratch, p * p);
+    real *W = stewart_take(&scratch, (X + p) * p);
+    stewart_guess_root(from, n, L);
+    stewart_fill(p * p, 0, R);
+    for (int i = 0; i < p; i++)
+        R[(p + 1) * i] = loosened * d->std[i];
+    for (int i = 0; i < X + p; i++) /* the parameters' rows have columns of the state's, too */
+        for (int j = 0; j < p; j++)
+            W[p * i + j] = L[n * (X + j) + i];
+    stewart_absorb(p, X + p, R, W, scratch);
+    copy_guess(n, from, guess);
+    stewart_copy(X, state, guess->numbers);
+    guess->numbers[n - 2] = eta;
+    guess->numbers[n - 1] = 0;
+    stewart_fill(n * n, 0, L);
+    for (int i = 0; i < X; i++)
+        stewart_copy(X, root + X * i, L + n * i);
+    for (int i = 0; i < p; i++)
+        for (int j = 0; j <= i; j++)
+            L[n * (X + i) + X + j] = R[p * j + i];
+    L[n * n - n - 2] = std;
+    L[n * n - 1] = d->rate_std;
+    stewart_guess_keep_root(n, L, guess);
+    guess->outliers = 0;
+}
+
+/* Add to `cost` the squared distance of a measurement after a period from the prediction for every
+   delay of a grid. The period begins in a state with the root of its covariance. */
+static int compare(const Search *s, const stewart_period *t, const stewart_guess *guess,
+                   const real *state, const real *root, const real *y, int number, real *cost,
+                   stewart_scratch scratch)
+{
+    const stewart_delay *d = s->delay;
+    const stewart_sensing *sensing = d->sensing;
+    const int n = s->n, m = s->m, known = n - 2;
+    real *L = stewart_take(&scratch, n * n), *H = stewart_take(&scratch, X * n);
+    real *xi = stewart_take(&scratch, n), *A = stewart_take(&scratch, X * (n + X));
+    real *C = stewart_take(&scratch, m * m), *miss = stewart_take(&scratch, m), end[X];
+    stewart_copy(n, guess->numbers, xi);
+    stewart_copy(X, state, xi);
+    xi[n - 1] = 0;
+    if (!stewart_period_at(t, xi, 0, end, H, scratch))
+        return 0;
+    stewart_guess_root(guess, n, L);
+    for (int i = 0; i < X; i++) {
+        stewart_copy(X, root + X * i, L + n * i);
+        stewart_fill(n - X, 0, L + n * i + X);
+    }
+    /* Columns of the state's root and of the parameters': they are not taken to be correlated. */
+    stewart_fill((known + X) * X, 0, A);
+    for (int k = 0; k < known; k++)
+        for (int j = 0; j <= k; j++)
+            for (int i = 0; i < X; i++)
+                A[X * (k < X ? j : X + j) + i] += H[n * i + k] * L[n * k + j];
+    if (!stewart_seen_root(sensing, state, known + X, A, d->model_std, C, scratch))
+        return 0;
+    for (int k = 0; k < number; k++) {
+        xi[n - 2] = (real)(k + 1) * GRID * d->period;
+        if (!stewart_period_end(t, xi, end, scratch))
+            return 0;
+        stewart_seen(sensing, end, miss);
+        for (int i = 0; i < m; i++)
+            miss[i] = y[i] - miss[i];
+        stewart_whiten(m, 1, C, miss);
+        for (int i = 0; i < m; i++)
+            cost[k] += miss[i] * miss[i];
+    }
+    return 1;
+}
+
+/* The place of the lowest local minimum but one that was chosen before (-1 for none), or -1. */
+static int valley(int number, const real *cost, int but)
+{
+    int best = -1;
+    for (int i = 0; i < number; i++) {
+        const int falls = i == 0 || cost[i] <= cost[i - 1];
+        const int rises = i == number - 1 || cost[i] <= cost[i + 1];
+        if (i != but && falls && rises && isfinite(cost[i]) && (best < 0 || cost[i] < cost[best]))
+            best = i;
+    }
+    return best;
+}
+
+/* Put a hypothesis of another delay that explains the last of three measurements, the last two of the
+   memory and y, in the place of the only one. Returns 0 where there is none. */
+static int jump(Search *s, const real *y, stewart_scratch scratch)
+{
+    const stewart_delay *d = s->delay;
+    const int n = s->n, m = s->m, size = stewart_guess_size(n - X - 2);
+    const real near = NEAR * d->period;
+    const real *seen[3] = {s->past, s->past + m, y};
+    const int wanted = (int)REAL(ceil)((d->longest / d->period - GRID) / GRID);
+    const int number = wanted < 2 * s->flights ? wanted : 2 * s->flights;
+    stewart_guess *guess = guess_at(s, 0);
+    stewart_guess *ended[BEST], *moved = (stewart_guess *)stewart_take(&scratch, size);
+    real *cost = stewart_take(&scratch, number), states[2][X], roots[2][X * X], total[BEST];
+    real *before = stewart_take(&scratch, U * (s->since.view.before + 1));
+    stewart_period periods[2] = {s->since, s->since};
+    if (!stewart_all_finite(2 * m, s->past) || !stewart_all_finite(m, y))
+        return 0;
+    stewart_copy(U, s->before, before); /* what acted before is not known: the same */
+    stewart_copy(U * s->since.view.before, s->before, before + U);
+    periods[0].view.others = before;
+    periods[0].view.before++;
+    periods[0].newest = 1;
+    stewart_fill(number, 0, cost);
+    for (int i = 0; i < 2; i++)
+        if (!start_of(d->sensing, seen[i], guess->numbers, states[i], roots[i], scratch))
+            return 0;
+    for (int i = 0; i < 2; i++)
+        if (!compare(s, periods + i, guess, states[i], roots[i], seen[i + 1], number, cost, scratch))
+            return 0;
+    int chosen = 0, place = -1;
+    for (; chosen < BEST; chosen++) {
+        const int next = valley(number, cost, place);
+        if (next < 0 || (chosen > 0 && !(cost[next] <= HOPELESS + 10 * cost[place])))
+            break;
+        place = chosen > 0 ? place : next;
+        const real eta = (real)(next + 1) * GRID * d->period;
+        ended[chosen] = (stewart_guess *)stewart_take(&scratch, size);
+        begin_at(s, guess, eta, d->period / SQRT_12, LOOSENED_BY_JUMP, states[0], roots[0],
+                 ended[chosen], scratch);
+        ended[chosen]->low = eta > d->period ? eta - d->period : 0;
+        ended[chosen]->high = eta + d->period < d->longest ? eta + d->period : d->longest;
+        total[chosen] = 0;
+        for (int i = 0; i < 2; i++) {
+            stewart_delay_advance(periods + i, ended[chosen], seen[i + 1], moved, scratch);
+            copy_guess(n, moved, ended[chosen]);
+            total[chosen] += moved->log_likelihood;
+        }
+    }
+    if (!chosen) /* no number: astray */
+        return 0;
+    const int second = chosen > 1, best = second && total[1] > total[0];
+    stewart_guess *found = ended[best];
+    if (second && distance_of(n, ended[0], ended[1]) > near
+        && !(total[best] - total[1 - best] >= SETTLED))
+        return 0;
+    if (!(found->fits > 0) || !(stewart_guess_std(found, n) < near)
+        || !(distance_of(n, found, guess) > near)) /* less than that is not a jump */
+        return 0;
+    found->low = 0;
+    found->high = d->longest;
+    found->outliers = 0;
+    copy_guess(n, found, guess);
+    return 1;
+}
+
+/* From the last measurement, after outliers that nothing explains. */
+static void restart(Search *s, const real *y, const real *near, stewart_scratch scratch)
+{
+    const stewart_delay *d = s->delay;
+    const int n = s->n;
+    stewart_guess *guess = guess_at(s, 0);
+    stewart_guess *anew = (stewart_guess *)stewart_take(&scratch, stewart_guess_size(n - X - 2));
+    real state[X], root[X * X];
+    if (s->memory->searching > 0) {
+        begin(s, y, near, scratch);
+        return;
+    }
+    if (!start_of(d->sensing, y, guess->numbers, state, root, scratch))
+        return;
+    const real std = stewart_guess_std(guess, n), least = d->period / 10;
+    begin_at(s, guess, guess->numbers[n - 2], std > least ? std : least, LOOSENED, state, root, anew,
+             scratch);
+    anew->numbers[n - 1] = guess->numbers[n - 1];
+    copy_guess(n, anew, guess);
+}
+
+/* ---- one sample ------------------------------------------------------------------------------- */
+
+/* Mean and standard deviation of the delay while it is sought. */
+static void mix(Search *s)
+{
+    stewart_delay_memory *memory = s->memory;
+    const int n = s->n, cells = (int)memory->cells;
+    real total = 0, mean = 0, square = 0, rest, spread, top = guess_at(s, 0)->weight;
+    rest_of_prior(s->delay, memory->sent * s->delay->period, &rest, &spread);
+    for (int i = 1; i <= cells; i++)
+        top = guess_at(s, i)->weight > top ? guess_at(s, i)->weight : top;
+    for (int pass = 0; pass < 2; pass++)
+        for (int i = 0; i <= cells; i++) {
+            const stewart_guess *cell = guess_at(s, i);
+            const real share = REAL(exp)(cell->weight - top);
+            const real eta = i > 0 ? cell->numbers[n - 2] : rest;
+            const real std = i > 0 ? stewart_guess_std(cell, n) : spread;
+            if (pass == 0) {
+                total += share;
+                mean += share * eta;
+            } else {
+                square += share * (std * std + (eta - memory->mean) * (eta - memory->mean));
+            }
+            if (pass == 0 && i == cells)
+                memory->mean = mean / total;
+        }
+    memory->std = REAL(sqrt)(square / total);
+}
+
+/* Write what the law reads: the delay, and whether to act on it. */
+static void report(Search *s, int measured)
+{
+    const stewart_delay *d = s->delay;
+    stewart_delay_memory *memory = s->memory;
+    const stewart_guess *guess = guess_at(s, (int)memory->best);
+    const real eta = guess->numbers[s->n - 2];
+    const int settled = !(memory->searching > 0) && !(memory->fresh > 0);
+    const int silent = memory->silent > 0 && !settled, waiting = !(eta < STEWART_NEVER);
+    memory->rejected = measured && !(guess->fits > 0);
+    memory->settled = (real)settled;
+    memory->silent = (real)silent;
+    memory->caution = settled ? 1 : CAUTION;
+    memory->eta = eta > 0 ? eta : 0;
+    memory->rate = guess->numbers[s->n - 1];
+    memory->feeds_back = 1;
+    if (!settled && (waiting || silent)) {
+        const int late = memory->sent * d->period >= d->believed;
+        memory->feeds_back = !(silent || (waiting && late));
+        memory->eta = d->believed > 0 ? d->believed : 0;
+        memory->rate = 0;
+    }
+    memory->mean = eta;
+    memory->std = stewart_guess_std(guess, s->n);
+    if (memory->searching > 0)
+        mix(s);
+}
+
+void stewart_delay_start(const stewart_delay *d, int flights, stewart_delay_memory *memory)
+{
+    const int p = d->machine->estimated, m = d->sensing->size;
+    stewart_fill(stewart_delay_size(p, m, flights), 0, (real *)memory);
+    memory->eta = d->believed;
+    memory->sent = -1; /* before the first sample */
+    memory->silent = d->quiet ? 1 : 0;
+    memory->settled = memory->feeds_back = memory->caution = 1;
+    memory->mean = memory->std = (real)NAN;
+    stewart_fill(2 * m, (real)NAN, memory->numbers + U * periods_before(flights));
+}
+
+void stewart_delay_observe(const stewart_delay *d, int flights, const real *in_flight,
+                           const real *y, const real *near, stewart_delay_memory *memory,
+                           stewart_scratch scratch)
+{
+    const int n = X + d->machine->estimated + 2, m = d->sensing->size, first = memory->sent < 0;
+    const int others = periods_before(flights);
+    Search s = {.delay = d, .n = n, .m = m, .flights = flights, .memory = memory};
+    s.before = memory->numbers;
+    s.past = memory->numbers + U * others;
+    if (first) /* all in flight is others'; without a queue the torque of the last period goes on */
+        stewart_copy(U * others, in_flight + U * (flights - others), s.before);
+    memory->sent = first ? 0 : memory->sent < (real)flights ? memory->sent + 1 : (real)flights;
+    memory->found = memory->fresh;
+    memory->fresh = memory->rejected = 0;
+    s.since = (stewart_period){d, {d->period, 0, 0, (int)memory->sent, others, s.before},
+                               flights, 0, in_flight};
+    if (!(memory->known > 0)) {
+        if (y)
+            begin(&s, y, near, scratch);
+    } else if (memory->searching > 0) {
+        search(&s, y, scratch);
+    } else {
+        update(&s, 0, y, scratch);
+        if (y && guess_at(&s, 0)->outliers >= SUSPICIOUS && jump(&s, y, scratch))
+            memory->fresh = 1;
+    }
+    if (y && memory->known > 0 && guess_at(&s, (int)memory->best)->outliers >= PATIENCE)
+        restart(&s, y, near, scratch);
+    stewart_copy(m, s.past + m, s.past);
+    for (int i = 0; i < m; i++)
+        s.past[m + i] = y ? y[i] : (real)NAN;
+    if (!first) { /* a period on */
+        for (int i = 0; i < U * (others - 1); i++)
+            s.before[i] = s.before[i + U];
+    }
+    if (memory->known > 0)
+        report(&s, y != NULL);
+}
