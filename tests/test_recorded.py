@@ -28,17 +28,17 @@ QUICK = [row for row in runs.ROWS if row.startswith("paper/") and row.endswith("
     "row", [pytest.param(r, marks=() if r in QUICK else pytest.mark.slow) for r in runs.ROWS]
 )
 def test_torques_are_what_they_were(row: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The law's answers to 1e-12 of the peak torque; to 1e-9 around the loop with its plant.
+    """The law's first answers and the loop with its plant, to 1e-9 of the peak torque.
 
-    With other releases or another processor the law's first samples, to 1e-7.
+    With other releases or another processor the law's first answers, to 1e-7.
     """
     stepped_in_python(monkeypatch)
     measurements, torques = RECORDED[row]
     peak = np.abs(torques).max()
     loop = runs.closed_loop(row)
-    number, bound = (len(torques), 1e-12) if runs.same_rounding() else (FEW, 1e-7)
-    answers = runs.answers(loop, measurements[:number])
-    assert np.abs(answers - torques[:number]).max() <= bound * peak
+    bound = 1e-9 if runs.same_rounding() else 1e-7
+    answers = runs.answers(loop, measurements[:FEW])
+    assert np.abs(answers - torques[:FEW]).max() <= bound * peak
     if runs.same_rounding():
         _, found = runs.run(loop)
         assert found.shape == torques.shape
