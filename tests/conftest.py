@@ -7,6 +7,7 @@ import pytest
 
 from stewart_drake.reporting import terminal
 from tests.browser import Browser, browser
+from tests.pictures import leave_blank
 
 # A shell that runs the tests in the background lets them ignore Ctrl-C, and the commands that they
 # start would inherit that; those are tested for what they do on Ctrl-C.
@@ -29,3 +30,9 @@ def tab(one_browser: Browser) -> Iterator[Browser]:
     """Its tab; `Browser.open` sets all that a test before may have changed."""
     yield one_browser
     one_browser.call("Page.navigate", url="about:blank")  # an animation would go on for ever
+
+
+@pytest.fixture
+def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write empty pictures."""
+    leave_blank(monkeypatch)

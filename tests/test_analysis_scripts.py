@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 FOLDER = Path(__file__).resolve().parents[1] / "analysis"
 
 

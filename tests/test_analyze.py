@@ -24,6 +24,8 @@ from stewart_drake.studies.verdict import delay_verdict
 from tests.mechanisms import PAPER
 from tests.screen import too_long
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 TOO_FAR = "reference.amplitude=[0.26, 0.26, 0.26, 0.02, 0.02, 0.2]"
 
 

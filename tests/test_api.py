@@ -14,6 +14,8 @@ import stewart_drake as sd
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.reporting.results import Figures, Replay
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = ("plant.kind=exact", "duration=0.3")
 

@@ -16,6 +16,8 @@ from stewart_drake.scenario.link import forward_times, link_text
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.studies.uncertainty import MACHINE, drawn
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 EXACT = ("plant.kind=exact", "start=on_reference", "queue=reference")
 
 

@@ -37,6 +37,8 @@ from stewart_drake.studies.workspace_map import Section, Travel, sections, trave
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 seeds = st.integers(0, 2**32 - 1)
 seeded = settings(max_examples=25, deadline=None, derandomize=True)
 LEG = ("1", "2", "3", "4", "5", "6")

@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import json
-import os
 import pickle
 from pathlib import Path
 from typing import Annotated, Literal
@@ -98,6 +97,7 @@ def test_every_shipped_controller_fits_every_shipped_scenario(
             load_scenario(scenario, controller=controller)
         assert isinstance(laid_over.actuator, ServoActuatorConfig)
         laid_over.actuator = plain.actuator
+    assert not idle_fields(laid_over)
     assert laid_over.controller.period == plain.controller.period
     laid_over.controller = plain.controller
     assert laid_over == plain
@@ -273,16 +273,13 @@ def test_paths_start_where_they_were_written(
 
 BAD_FILES = {
     "empty": ("", ["is empty", "a YAML mapping"]),
-    "only a comment": ("# nothing\n", ["is empty"]),
     "a list": ("- 1\n", ["[1]", "a YAML mapping"]),
     "duplicate key": ("delay: {steps: 1}\nduration: 1\nduration: 2\n", ["line 3", "duration"]),
     "duplicate nested key": ("delay:\n  steps: 1\n  steps: 2\n", ["line 3", "steps"]),
     "two documents": ("duration: 1\n---\nduration: 2\n", ["line 2", "document"]),
     "alias": ("duration: &a 1\nsensor: {seed: *a}\n", ["line 1", "anchors"]),
     "python tag": ("duration: !!python/object/apply:os.getcwd []\n", ["line 1", "tags"]),
-    "plain tag": ("mechanism: !mine paper\n", ["line 1", "tags"]),
     "odd key": ("? [1, 2]\n: 3\n", ["line 1", "a key must be a word"]),
-    "number as key": ("1: 2\n", ["line 1", "a key must be a word"]),
     "merge key": ("<<: {duration: 1}\n", ["line 1", "a key must be a word"]),
     "deep": ("[" * 5000, ["depth"]),
     "many digits": ("duration: " + "9" * 5000, ["YAML"]),
@@ -292,18 +289,12 @@ BAD_FILES = {
     "unknown field": ("controller: {perod: 1}", ["controller.perod", "controller.period"]),
     "nothing near": ("zzz: 1", ["zzz", "mechanism", "tuner"]),
     "empty section": ("delay:\n", ["delay: got None", "an object"]),
-    "list as section": ("delay: [1]\n", ["delay: got [1]", "an object"]),
-    "text for a number": ("duration: ten", ["duration: got 'ten'", "a valid number"]),
-    "nan": ("duration: .nan", ["duration: got nan", "finite"]),
-    "inf": ("controller: {w_Q: .inf}", ["controller.w_Q: got inf", "finite"]),
     "overflow": ("controller: {w_Q: 1e999}", ["controller.w_Q: got inf", "finite"]),
-    "boolean for a number": ("duration: true", ["duration: got True", "a valid number"]),
     "yes for a boolean": ("plant: {gravity: yes}", ["plant.gravity: got 'yes'", "a valid boolean"]),
     "number for a boolean": ("plant: {gravity: 1}", ["plant.gravity: got 1", "a valid boolean"]),
     "float for an integer": ("delay: {steps: 8.5}", ["delay.steps: got 8.5", "a valid integer"]),
     "date for text": ("duration: 2021-05-30", ["duration: got '2021-05-30'", "a valid number"]),
     "five numbers": ("reference: {offset: [0, 0, 0, 0, 0]}", ["reference.offset", "6 items"]),
-    "seven numbers": ("plant: {torque_bias: [0, 0, 0, 0, 0, 0, 0]}", ["plant.torque_bias", "6"]),
     "text in a list": ("reference: {offset: [0, 0, 0, a, 0, 0]}", ["reference.offset[3]", "'a'"]),
     "negative noise": (
         "sensor: {noise_std: [0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 0]}",
@@ -319,7 +310,6 @@ BAD_FILES = {
         ["reference.pose: unknown key", "reference.poses?"],
     ),
     "unknown start": ("start: now", ["start: got 'now'", "'rest' or 'on_reference'"]),
-    "fine accuracy": ("plant: {accuracy: 1e-13}", ["plant.accuracy: got 1e-13", "0.000000000001"]),
     "unknown unit": ("reference: {frequency_unit: rpm}", ["frequency_unit: got 'rpm'", "'Hz'"]),
     "no mechanism": ("mechanism: ''", ["mechanism: got ''"]),
     "foreign field": (
@@ -399,14 +389,10 @@ def test_a_bad_file_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
         ("duration=[1", ["duration: line 1"]),
         ("duration=&a 1", ["anchors"]),
         ("duraton=1", ["duraton: unknown key", "duration"]),
-        ("controler.period=1", ["controler: unknown key", "controller"]),
         ("controller.perid=1", ["controller.perid: unknown key", "controller.period"]),
         ("controller=5", ["controller: got 5", "an object"]),
         ("duration.x=5", ["duration: got {'x': 5}"]),
-        ("plant.gravity=on", ["plant.gravity: got 'on'", "a valid boolean"]),
         ("reference.times=[0, 1]", ["reference.times", "kind 'sine'"]),
-        ("reference.kind=csv", ["reference.file: got None"]),
-        ("tuner.weights=paper", ["tuner.weights", "kind 'fixed'"]),
         ("controller.period=0.1234567", ["with settings", "controller.period", "nearest 0.123"]),
     ],
 )
@@ -416,29 +402,6 @@ def test_a_bad_setting_is_refused_in_one_line(setting: str, parts: list[str]) ->
     message = one_line(caught)
     for part in parts:
         assert part in message
-
-
-@pytest.mark.parametrize(
-    ("text", "parts"),
-    [
-        ("period: 0.1", ["period: got 0.1", "the scenario's controller.period"]),
-        ("integrl: true", ["integrl: unknown key", "integral"]),
-        ("model: pape", ["model: got 'pape'", "'paper' or 'multibody'"]),
-        ("controller: {integral: true}", ["controller: unknown key"]),
-        ("", ["is empty"]),
-    ],
-)
-def test_a_bad_controller_is_refused_in_one_line(
-    text: str, parts: list[str], tmp_path: Path
-) -> None:
-    path = write(tmp_path, text)
-    for load in (load_controller, lambda p: load_scenario("paper", controller=p)):
-        with pytest.raises(ConfigError) as caught:
-            load(path)
-        message = one_line(caught)
-        assert message.startswith(f"{path}: ")
-        for part in parts:
-            assert part in message
 
 
 NETWORK = "link.kind=network"
@@ -533,24 +496,6 @@ def test_faults_of_a_sensor_that_cannot_be_are_refused_in_one_line(text: str, sa
     with pytest.raises(ConfigError) as caught:
         load_scenario("paper", settings=[f"sensor.faults=[{text}]"])
     assert f"sensor.faults{said}" in one_line(caught)
-
-
-def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
-    binary = tmp_path / "binary.yaml"
-    binary.write_bytes(b"duration: 1\nmechanism: \xff\xfe")
-    large = write(tmp_path, "# " + "x" * 1_000_000, "large.yaml")
-    pipe = tmp_path / "pipe.yaml"
-    os.mkfifo(pipe)
-    for path, part in [
-        (binary, "line 2: is not UTF-8"),
-        (large, "larger than 100 kB"),
-        (tmp_path, "is not a file"),
-        (pipe, "is not a file"),
-        (tmp_path / "none.yaml", "no file"),
-    ]:
-        with pytest.raises(ConfigError, match=part) as caught:
-            load_scenario(path)
-        one_line(caught)
 
 
 def test_a_file_may_end_in_yml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,8 @@ from stewart_drake.loop.experiment import prepare
 from stewart_drake.reporting.csv_file import signals_csv, write_csv
 from stewart_drake.scenario.reference_files import read_csv
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 SHORT = ("--set", "plant.kind=exact", "--set", "duration=0.3")
 

@@ -51,6 +51,8 @@ from stewart_drake.tuning.data import (
 from stewart_drake.tuning.training import curves_of, labels
 from tests.screen import too_long
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 # The paper's own controller costs little, keeps a small motion in the workspace at some delays and
 # loses it at others.
 SMALL = (

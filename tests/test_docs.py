@@ -379,14 +379,6 @@ def test_links_lead_somewhere(path: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{path.name}: {link}"
 
 
-def test_the_contents_of_theory_are_its_sections() -> None:
-    text = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
-    sections = re.findall(r"^## (\d+)\. (.*)$", text, re.MULTILINE)
-    assert re.findall(r"^(\d+)\. \[(.*)\]\(#", text, re.MULTILINE) == sections
-    numbers = [int(number) for number, _ in sections]
-    assert numbers == sorted(set(numbers))
-
-
 def test_the_site_has_every_page_once() -> None:
     def leaves(tree: Any) -> Iterator[str]:
         for part in tree if isinstance(tree, list) else tree.values():
@@ -526,15 +518,6 @@ def rows_of(path: Path, heading: str) -> list[list[str]]:
     """Cells of the first table whose head begins so, without its head."""
     table = path.read_text(encoding="utf-8").split(f"\n| {heading}", 1)[1].split("\n\n")[0]
     return [[cell.strip() for cell in row.strip("|").split(" | ")] for row in table.split("\n")[2:]]
-
-
-@pytest.mark.parametrize("path", DOCS, ids=lambda path: path.stem)
-def test_no_document_names_a_folder_of_one_computer(path: Path) -> None:
-    """As a warning does that was printed between the tables of a benchmark."""
-    folder = re.search(
-        r"(?<![\w.])/(home|root|work|tmp|usr|opt|dev/shm)/.*", path.read_text("utf-8")
-    )
-    assert folder is None, folder
 
 
 TRACKING = ROOT / "benchmarks" / "results" / "tracking.md"

@@ -75,12 +75,6 @@ def test_files_of_a_run(written):
             assert ElementTree.parse(path).getroot().tag.endswith("svg")
 
 
-def test_the_same_run_gives_the_same_bytes(run, written, tmp_path):
-    run_figures(run, tmp_path)
-    for path in written[1]:
-        assert path.read_bytes() == (tmp_path / path.name).read_bytes(), path.name
-
-
 def test_figures_of_a_comparison(comparison, drawn):
     comparison_figures(comparison, "unused")
     torques = ["torques_delay_lqr", "torques_delay_lqi", "torques_predictor_lqi"]
@@ -131,27 +125,6 @@ def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(compar
     assert limits(shown)[0] <= crosses[0].get_ydata()[0] <= limits(shown)[1]
     legend = [text.get_text() for text in drawn["states"].legends[0].get_texts()]
     assert legend == ["reference", *(LABELS[name] for name in CONTROLLERS), "run ended"]
-
-
-def test_rounding_does_not_fill_the_axis_of_a_coordinate_that_rests(run, drawn):
-    signals = run.signals.copy(deep=True)
-    signals["reference"][:, 4] = 0.0
-    signals["pose"][:, 4] = 1e-9 * np.sin(signals.time.values)
-    run_figures(dataclasses.replace(run, signals=signals), "unused")
-    axes = drawn["states"].axes
-    labels = [ax.get_ylabel() for ax in axes]
-    low, high = limits(axes[labels.index("y  [mm]")])
-    widest = 1e3 * np.ptp(signals.reference.values[:, 5])
-    assert low < 0 < high and 0.01 * widest < high - low < 0.05 * widest
-
-
-def test_where_all_runs_diverge_they_are_shown_whole(comparison, drawn):
-    run_figures(comparison["lqr"], "unused")
-    for name, signal in (("states", "pose"), ("errors", "error")):
-        ax = drawn[name].axes[0]
-        values = np.rad2deg(comparison["lqr"].signals[signal].values[:, 0])
-        assert limits(ax)[0] < values.min() and values.max() < limits(ax)[1]
-        assert 0.43 < ax.get_xlim()[1] < 0.6
 
 
 def test_a_run_stopped_before_its_first_sample_can_be_drawn(run, drawn):

@@ -1,6 +1,5 @@
 """Reading up to a limit, writing whole or not: kinds of file, temporary names, permissions."""
 
-import csv
 import errno
 import os
 import stat
@@ -8,14 +7,11 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import read_bytes, remove_partials, replacing
 from stewart_drake.files.jsonio import write_json
-from stewart_drake.scenario.reference_config import CsvConfig
-from stewart_drake.scenario.trajectories import make_reference
 from stewart_drake.studies.jobs import run_jobs
 from tests.copies import copied, kill
 from tests.faults import tree
@@ -138,33 +134,3 @@ def test_what_kill_9_leaves_is_removed(tmp_path):
 
 
 # ---------------------------------------------------------------- a long file of samples
-
-
-def test_a_long_csv_file_takes_little_more_than_its_parsing(tmp_path):
-    """A million rows took 45 s to read and 35 s and 4 GB to make a trajectory of."""
-    path, rows = tmp_path / "long.csv", 100_000
-    time_s = np.arange(rows) * 1e-3
-    poses = np.column_stack([0.1 * np.sin(time_s + k) for k in range(5)] + [0.38 + 0 * time_s])
-    with path.open("w") as file:
-        file.write("time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]\n")
-        np.savetxt(file, np.column_stack([time_s, poses]), fmt="%.5f", delimiter=",")
-
-    def parse() -> None:
-        for row in csv.reader(path.read_text().splitlines()):
-            len([cell.strip() for cell in row])
-
-    def seconds(work: object) -> float:
-        start = time.process_time()
-        work()  # type: ignore[operator]
-        return time.process_time() - start
-
-    config = CsvConfig(file=str(path))
-    make_reference(config, 1.0)
-    ours, plain = (
-        min(seconds(work) for _ in range(3))
-        for work in (lambda: make_reference(config, 1.0), parse)
-    )
-    assert ours < 12 * plain, f"{ours:.2f} s against {plain:.2f} s"
-    at = rows // 2
-    value = make_reference(config, 1.0).value(time_s[at])[:, 0]
-    assert np.allclose(value, np.round(poses[at], 5), rtol=0, atol=1e-12)

@@ -1,7 +1,6 @@
 """Wrong and random files: a loader returns the thing itself or raises a one-line ConfigError."""
 
 import json
-import pickle
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -172,32 +171,13 @@ def fuzz(name: str, folder: Path, examples: int, number: int | None = None) -> N
 
 @pytest.mark.parametrize("name", LOADERS)
 def test_a_random_file_loads_or_is_refused(name, tmp_path):
-    fuzz(name, tmp_path, examples=20 if name in ("signals", "data set") else 40)
+    fuzz(name, tmp_path, examples=10 if name in ("signals", "data set") else 40)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("name", LOADERS)
 def test_two_thousand_random_files_of_each_kind(name, tmp_path):
     fuzz(name, tmp_path, examples=2000, number=1)
-
-
-OTHERS: dict[str, bytes] = {
-    "empty": b"",
-    "binary": bytes(range(256)) * 4,
-    "a pickle": pickle.dumps(json.dumps),
-    "too large": b"#" * 60_000_000,
-    "html": b"<!doctype html><html><body>404</body></html>",
-    "a list": b"[1, 2]",
-}
-
-
-@pytest.mark.parametrize(
-    "kind", ["scenario", "controller", "mechanism", "waypoints", "csv", "network"]
-)
-@pytest.mark.parametrize("content", OTHERS)
-def test_what_is_no_such_file(content, kind, tmp_path):
-    load, name, _ = LOADERS[kind]
-    complaint(load, written(tmp_path / name, OTHERS[content]))
 
 
 YAML_THAT_ACTS = [

@@ -17,6 +17,8 @@ from stewart_drake.scenario.calibration import load_calibration
 from tests.mechanisms import PAPER
 from tests.screen import too_long
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 HEADER = [
     "time[s]",
     *(f"torque_{leg}[N m]" for leg in range(1, 7)),
@@ -134,12 +136,6 @@ def broken(signals: xr.Dataset, how: str) -> xr.Dataset:
         signals.attrs["scenario"] = text.replace(old, new, 1)
     elif how == "log_period":
         return signals.isel(time=slice(None, None, 9))
-    elif how == "time is missing":
-        return signals.isel(time=slice(0))
-    elif how == "a step of":
-        return signals.isel(time=[-1])
-    elif how == "longer than":
-        return signals.assign_coords(time=1e300 * (1 + signals.time))
     elif how == "at 5 instants":
         return signals.isel(time=signals.time < 0.45)
     else:
@@ -149,9 +145,8 @@ def broken(signals: xr.Dataset, how: str) -> xr.Dataset:
 
 @pytest.mark.parametrize(
     "how",
-    ["scenario", "network", "sensor.delay", "log_period", "at 5 instants", "measurement",
-     "torque_commanded", "time is missing", "a step of", "longer than"],
-)  # fmt: skip
+    ["scenario", "network", "sensor.delay", "log_period", "at 5 instants", "measurement"],
+)
 def test_a_run_that_is_no_log_is_told_in_one_line(lost, tmp_path, how):
     with xr.open_dataset(lost, engine="h5netcdf") as signals:
         broken(signals.load(), how).to_netcdf(tmp_path / "bad.nc", engine="h5netcdf")
@@ -167,22 +162,15 @@ def test_a_run_that_is_no_log_is_told_in_one_line(lost, tmp_path, how):
         ([], "LOG, --plan"),
         (["LOG", "--plan", "paper"], "LOG, --plan"),
         (["LOG"], "--mechanism"),
-        (["LOG", "--mechanism", "nothing"], "nothing"),
         (["LOG", "--mechanism", "paper"], "does not move"),
-        (["no.csv", "--mechanism", "paper"], "no.csv"),
         (["LOG", "--mechanism", "paper", "--tolerance", "lengths"], "--tolerance"),
         (["LOG", "--mechanism", "paper", "--tolerance", "lengths=-1"], "lengths"),
-        (["LOG", "--mechanism", "paper", "--tolerance", "width=1"], "width"),
         (["LOG", "--mechanism", "paper", "--tolerance", "delay=null"], "delay"),
         (["LOG", "--mechanism", "paper", "--delay", "-1"], "--delay"),
-        (["LOG", "--mechanism", "paper", "--delay", "nan"], "--delay"),
         (["LOG", "--mechanism", "paper", "--bits", "0"], "--bits"),
-        (["LOG", "--mechanism", "paper", "--pose-std", "1e-4"], "--pose-std"),
         (["LOG", "--mechanism", "paper", "--pose-std", "1e-4,0"], "--pose-std"),
         (["LOG", "--mechanism", "paper", "--set", "duration=1"], "--set"),
         (["LEGLESS", "--mechanism", "paper"], "at 0 instants; expected at least 8"),
-        (["--plan", "nothing"], "nothing"),
-        (["--plan", "paper", "--set", "plant.gravitas=true"], "gravitas"),
     ],
 )
 def test_a_bad_command_is_told_in_one_line(tmp_path, capsys, arguments, named):

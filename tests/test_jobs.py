@@ -1,7 +1,6 @@
 """The resumable parallel runner: nothing that has finished is lost, nothing is done twice."""
 
 import errno
-import json
 import os
 import signal
 import subprocess
@@ -150,12 +149,6 @@ def test_a_folder_with_a_bad_manifest_is_refused(tmp_path, manifest):
     assert (tmp_path / "job0.json").read_text() == "{}"
 
 
-def test_the_manifest_says_what_the_settings_were(tmp_path):
-    run_jobs({}, text, tmp_path, settings=SETTINGS)
-    manifest = json.loads((tmp_path / MANIFEST).read_text())
-    assert manifest == {"hash": settings_hash(SETTINGS), "settings": SETTINGS}
-
-
 def test_two_processes_do_not_share_a_folder(tmp_path):
     with (
         module._locked(tmp_path),
@@ -272,17 +265,6 @@ def test_a_cluster_gives_the_same_files(tmp_path, cluster):
     run_jobs(numbered(6), text, tmp_path / "cluster", settings=SETTINGS, scheduler=cluster)
     run_jobs(numbered(6), text, tmp_path / "here", settings=SETTINGS, workers=1)
     assert contents(tmp_path / "cluster") == contents(tmp_path / "here")
-
-
-def test_a_cluster_of_one_worker_is_used_too(tmp_path):
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50
-    ) as made:
-        address = made.scheduler_address
-        paths = run_jobs(numbered(3), process, tmp_path, settings=SETTINGS, scheduler=address)
-    (there,) = {path.read_text() for path in paths.values()}
-    assert int(there) != os.getpid()
 
 
 @pytest.mark.slow

@@ -47,6 +47,8 @@ from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.screen import too_long
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 SPEC = mechanism_spec("paper")
 OWN = Arrangement((5, 0, 1, 2, 3, 4), (-1, 1) * 3, 60.0)
 QUICK = ("plant.kind=exact", "duration=1.5")

@@ -68,13 +68,10 @@ def third_leg(**changes: Any) -> dict[str, Any]:
 
 # edits, how the message names field and value, what it says is allowed
 INVALID = [
-    ({"rod.length": "long"}, "rod.length: got 'long'", "positive"),
     ({"rod.length": [0.4] * 5}, "rod.length: got [0.4, 0.4, 0.4, 0.4, 0.4]", "list of six"),
     ({"rod.length": [-0.4] + [0.4] * 5}, "rod.length: got [-0.4, 0.4,", "positive"),
     ({"rod.length": 0.11}, "rod.length: got 0.11 m for leg 1", "longer than its crank"),
     ({"rod.length": [0.404] * 5 + [0.1]}, "rod.length: got 0.1 m for leg 6", "longer than its"),
-    ({"crank.mass": -0.04}, "crank.mass: got -0.04 kg", "positive"),
-    ({"rod.mass": 0}, "rod.mass: got 0 kg", "positive"),
     ({"plate.mass": "4 kg"}, "plate.mass: got '4 kg'", "number"),
     ({"plate.inertia": [0, 30e-4, 30e-4]}, "plate.inertia: got [0, 0.003, 0.003]", "positive"),
     ({"rod.inertia": [-1e-6, 1e-4, 1e-4]}, "rod.inertia: got [-1e-06, 0.0001,", "positive"),
@@ -85,9 +82,7 @@ INVALID = [
         "at most the sum of the other two",
     ),
     ({"base.inertia": [1.0, 1.0, 3.0]}, "base.inertia: got [1, 1, 3]", "sum of the other two"),
-    ({"motor.effort_limit": 0}, "motor.effort_limit: got 0 N m", "positive torque or null"),
     ({"pattern.branches": [-1, 1, -1, 0, -1, 1]}, "pattern.branches[3]: got 0", "-1 or 1"),
-    ({"pattern.branches": [2, 1, -1, 1, -1, 1]}, "pattern.branches[0]: got 2", "-1 or 1"),
     ({"pattern.branches": [1] * 5}, "pattern.branches: got [1, 1, 1, 1, 1]", "6 items"),
     (
         {"pattern.plate_order": [0, 0, 1, 2, 3, 4]},
@@ -112,13 +107,11 @@ INVALID = [
     (third_leg(crank_zero=[1, 1, 0]), "legs[2].crank_zero: got 45 degrees", "perpendicular"),
     (third_leg(crank_zero=[0.005, 1, 0]), "legs[2].crank_zero: got 89.7", "perpendicular"),
     (third_leg(crank_zero=[2, 0, 0]), "legs[2].crank_zero: got 0 degrees", "perpendicular"),
-    (third_leg(branch=0), "legs[2].branch: got 0", "-1 or 1"),
     (third_leg(branch=0.5), "legs[2].branch: got 0.5", "-1 or 1"),
     (third_leg(plate_joint=[0.1, 0]), "legs[2].plate_joint: got [0.1, 0]", "3 items"),
     ({"name": "world"}, "name: got 'world'", "none of world, "),
     ({"name": "DefaultModelInstance"}, "name: got 'DefaultModelInstance'", "none of "),
     ({"name": "my robot"}, "name: got 'my robot'", "letters, digits"),
-    ({"name": "a::b"}, "name: got 'a::b'", "letters, digits"),
     ({"name": "ab\n"}, r"name: got 'ab\n'", "letters, digits"),
     ({"name": ""}, "name: got ''", "letters, digits"),
     ({"name": 3}, "name: got 3", "valid string"),

@@ -26,6 +26,8 @@ from tests.mechanisms import PAPER
 from tests.screen import too_long
 from tests.singular import parallel_rods, stretched, write_mechanism
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 HOME_VALUES = PAPER.home * ([180 / np.pi] * 3 + [1e3] * 3)
 
 

@@ -153,63 +153,6 @@ def test_a_file_comes_back_to_the_last_bit(
     assert [p.name for p in path.parent.iterdir()] == ["one.json"]
 
 
-def _set(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
-    return lambda data: data.update({key: value})
-
-
-WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
-    "missing": (lambda d: d.pop("b1") and None, ["b1", "missing"]),
-    "unknown": (_set("W3", [1.0]), ["W3: unknown key"]),
-    "misspelt": (_set("bound", []), ["did you mean bounds?"]),
-    "text": (lambda d: d["b2"].__setitem__(0, "1"), ["b2[0]: got '1'", "a valid number"]),
-    "truth": (lambda d: d["b2"].__setitem__(0, True), ["b2[0]: got True", "a valid number"]),
-    "null": (lambda d: d["W1"][3].__setitem__(2, None), ["W1[3][2]: got None", "a valid number"]),
-    "huge whole number": (lambda d: d["b2"].__setitem__(0, 10**400), ["b2[0]", "finite number"]),
-    "ragged": (lambda d: d["W1"][3].pop() and None, ["W1: got rows of different lengths"]),
-    "one input less": (_set("input_mean", [0.0] * 17), ["input_mean: got shape (17,)", "(18,)"]),
-    "one neuron less": (lambda d: d["b1"].pop() and None, ["W1: got shape (10, 18)", "(9, 18)"]),
-    "no neuron": (_set("b1", []), ["b1: got shape (0,)"]),
-    "an output more": (_set("b2", [0.0] * 3), ["b2: got shape (3,)", "(2,)"]),
-    "a scale of zero": (_set("input_scale", [0.0] * 18), ["input_scale: got", "above 0"]),
-    "a bound of zero": (_set("bounds", [[0.0, 0.1], [4.0, 4.0]]), ["bounds: got", "0 < lower"]),
-    "bounds the wrong way": (_set("bounds", [[4.0, 4.0], [0.1, 0.1]]), ["bounds: got"]),
-    "another output": (_set("output", "ratio"), ["output: got 'ratio'", "log_weights"]),
-    "another density": (_set("density", "log"), ["density: got 'log'", "magnitude"]),
-    "no card": (_set("card", None), ["card: got None", "an object"]),
-    "a list": (lambda d: [d], ["expected a JSON object"]),
-}
-
-
-@pytest.mark.parametrize(("change", "parts"), WRONG.values(), ids=WRONG.keys())
-def test_a_wrong_file_is_refused_in_one_line(
-    tmp_path: Path, change: Callable[[dict[str, Any]], Any], parts: list[str]
-) -> None:
-    path = written(tmp_path, change)
-    with pytest.raises(ConfigError) as caught:
-        load_network(path)
-    message = str(caught.value)
-    assert message.startswith(str(path)) and "\n" not in message
-    for part in parts:
-        assert part in message
-
-
-@pytest.mark.parametrize(
-    ("text", "part"),
-    [
-        (b'{"b1": [NaN]}', "b1[0]: got nan; expected a finite number"),
-        (b'{"b1": [1], "b1": [2]}', "key 'b1' given more than once"),
-        (b'{"card": {"a": 1, "a": 1}}', "key 'a' given more than once"),
-        (b"[" * 100_000, "is not readable as JSON (nested too deep)"),
-    ],
-)
-def test_what_is_not_strict_json_is_refused(tmp_path: Path, text: bytes, part: str) -> None:
-    path = tmp_path / "w.json"
-    path.write_bytes(text)
-    with pytest.raises(ConfigError) as caught:
-        load_network(path)
-    assert part in str(caught.value)
-
-
 def test_a_missing_file_or_name_and_a_directory_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no file"):
         load_network(tmp_path / "none.json")

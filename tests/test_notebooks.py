@@ -51,6 +51,7 @@ def test_the_first_hour_shows_figures_and_pages(capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_an_own_controller_holds_without_delay_and_not_with_it(capsys):
     names, _ = run("own_controller.ipynb")
     prompt, errors, late = (names[name] for name in ("prompt", "errors", "late"))
@@ -67,6 +68,7 @@ def test_an_own_controller_holds_without_delay_and_not_with_it(capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_a_lost_log_leads_to_full_amplitude(capsys):
     names, _ = run("lost_log.ipynb")
     assert names["lost"].status == "left_workspace"

@@ -7,7 +7,6 @@ from pathlib import Path
 from urllib.parse import unquote
 from xml.etree import ElementTree
 
-import pytest
 from matplotlib.figure import Figure
 
 from stewart_drake.reporting.document import (
@@ -21,7 +20,7 @@ from stewart_drake.reporting.document import (
     Table,
     Values,
 )
-from stewart_drake.reporting.page import Provenance, command_line, html, write_page
+from stewart_drake.reporting.page import Provenance, command_line, html
 from stewart_drake.reporting.style import figure_style
 
 
@@ -121,11 +120,6 @@ def test_names_from_files_are_text_and_not_markup() -> None:
     assert "stewart-drake analyze hautus 'a b'" in outline.words
 
 
-def test_a_row_of_another_length_is_refused() -> None:
-    with pytest.raises(ValueError, match="row 2 has 1 cells; expected 2"):
-        Table(("a", "b"), [("1", "2"), ("3",)])
-
-
 def test_a_terminal_gets_what_is_brief_in_80_columns():
     """The verdict, and of open sections the brief blocks."""
     long = "a reason that is told at some length, " * 4
@@ -181,12 +175,6 @@ def test_a_figure_is_drawn_when_a_page_needs_it_and_is_sent_drawn():
     assert isinstance(sent.sections[0].blocks[0].figure, Figure)
     assert html(sent, MADE).count("<img") == 1 and html(shown, MADE).count("<img") == 1
     assert len(drawn) == 1
-
-
-def test_the_same_page_gives_the_same_bytes(tmp_path: Path) -> None:
-    first, second = (write_page(document(), MADE, tmp_path / f"{k}.html") for k in range(2))
-    assert first.read_bytes() == second.read_bytes()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.html", "1.html"]
 
 
 def test_command_lines_are_quoted_for_a_shell() -> None:

@@ -3,29 +3,29 @@
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
+
+import pytest
+
+from stewart_drake.reporting import terminal
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def said_by(script: str, stderr: int | None = subprocess.PIPE) -> str:
-    """What a few lines of Python print to stderr."""
-    lines = (
-        f"import time\nfrom stewart_drake.reporting import terminal as t\nt.EVERY = 0.05\n{script}"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", lines], stderr=stderr, stdout=subprocess.PIPE, text=True, cwd=ROOT
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stderr or ""
+@pytest.fixture(autouse=True)
+def often(monkeypatch):
+    monkeypatch.setattr(terminal, "EVERY", 0.05)
 
 
-def test_a_pipe_gets_a_line_now_and_then():
-    said = said_by(
-        "with t.count_bar('runs', False) as show:\n"
-        "    time.sleep(0.12)\n    show(40, 200)\n    time.sleep(0.2)\n"
-        "    show(60, 200)\n    time.sleep(0.2)\n"
-    )
+def test_a_pipe_gets_a_line_now_and_then(capsys):
+    with terminal.count_bar("runs", False) as show:
+        time.sleep(0.12)
+        show(40, 200)
+        time.sleep(0.2)
+        show(60, 200)
+        time.sleep(0.2)
+    said = capsys.readouterr().err
     lines = said.splitlines()
     assert lines[0] == "runs: preparing, after 0 s"
     assert any(re.fullmatch(r"runs: 40 of 200, after 0 s", line) for line in lines)
@@ -34,20 +34,22 @@ def test_a_pipe_gets_a_line_now_and_then():
     assert "\r" not in said and "\x1b" not in said
 
 
-def test_simulations_tell_their_time():
-    said = said_by(
-        "with t.progress_bars(['lqr', 'lqi'], 20.0, False) as show:\n"
-        "    time.sleep(0.12)\n    show['lqr'](1.5, 0.1)\n    time.sleep(0.12)\n"
-        "    show['lqi'](2.0, 0.1)\n    time.sleep(0.12)\n"
-    )
-    lines = said.splitlines()
+def test_simulations_tell_their_time(capsys):
+    with terminal.progress_bars(["lqr", "lqi"], 20.0, False) as show:
+        time.sleep(0.12)
+        show["lqr"](1.5, 0.1)
+        time.sleep(0.12)
+        show["lqi"](2.0, 0.1)
+        time.sleep(0.12)
+    lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "lqr, lqi: preparing, after 0 s"
     assert "lqr 1.5 of 20 s, after 0 s" in lines and "lqr 1.5, lqi 2.0 of 20 s" in lines[-1]
 
 
-def test_quiet_is_quiet():
-    for_both = "with t.count_bar('a', True), t.progress_bars(['a'], 1.0, True):\n"
-    assert said_by(f"{for_both}    time.sleep(0.3)\n") == ""
+def test_quiet_is_quiet(capsys):
+    with terminal.count_bar("a", True), terminal.progress_bars(["a"], 1.0, True):
+        time.sleep(0.3)
+    assert capsys.readouterr().err == ""
 
 
 def test_a_closed_stderr_costs_nothing():

@@ -373,22 +373,6 @@ def test_figure_6_and_the_tuned_rows_are_of_the_tuners_runs(tmp_path):
     assert not any("weights are not shown" in one.text for one in section.all(Paragraph))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["papper"], ["papper", "paper"]),
-        (["--set", "plant.knd=exact"], ["plant.knd", "did you mean plant.kind?"]),
-        (["--out", "/proc/nothing"], ["--out", "expected a directory that can be written"]),
-    ],
-)
-def test_bad_input_is_refused_in_one_line(arguments, said, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["report", *arguments]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and err.startswith("error: ") and err.count("\n") == 1
-    assert all(words in err for words in said)
-
-
 # ---------------------------------------------------------------- in a browser
 
 

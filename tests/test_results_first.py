@@ -21,6 +21,8 @@ from stewart_drake.reporting import (
 from stewart_drake.reporting import report as report_document
 from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, LABELS, SERVOS
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.3", "--set", "delay.steps=1")
 
 
@@ -97,11 +99,10 @@ def test_nothing_of_an_earlier_comparison_stays_beside_new_results(tmp_path, mon
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("redirection", ["2>&-", "<&- >&- 2>&-"])
-def test_a_closed_stream_costs_its_text_only(redirection: str, tmp_path) -> None:
+def test_a_closed_stream_costs_its_text_only(tmp_path) -> None:
     """Run `simulate` from a shell that also asks for a backend that does not exist."""
     arguments = " ".join(("simulate", *EXACT, "--out", str(tmp_path)))
-    line = f'"$0" -m stewart_drake {arguments} {redirection}'
+    line = f'"$0" -m stewart_drake {arguments} <&- >&- 2>&-'
     done = subprocess.run(
         ["bash", "-o", "pipefail", "-c", line, sys.executable],
         capture_output=True,
@@ -112,4 +113,3 @@ def test_a_closed_stream_costs_its_text_only(redirection: str, tmp_path) -> None
     assert done.returncode == 0 and "Traceback" not in done.stderr
     assert names(tmp_path) >= {"summary.json", "signals.nc", "states.png"}
     assert json.loads((tmp_path / "summary.json").read_text())["status"] == "completed"
-    assert ("E_ac" in done.stdout) == (redirection == "2>&-")

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.resources import shipped
 from stewart_drake.files.schema import spelling
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.calibration import DELAY, Calibration, save_calibration
 from stewart_drake.scenario.config import ESTIMATED, PriorConfig, Scenario
-from stewart_drake.scenario.dependencies import NEEDS, idle_fields
+from stewart_drake.scenario.dependencies import NEEDS
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import shown
 
@@ -375,14 +374,6 @@ def test_a_comparison_refuses_what_no_row_uses(tmp_path: Path) -> None:
     mine.write_text("compare: {delay_lqr: {integral_weight: 3.0}}\n")
     with pytest.raises(ConfigError, match=r"compare\.delay_lqr: controller\.integral_weight"):
         shown(mine)
-
-
-@pytest.mark.parametrize("name", shipped("scenario"))
-@pytest.mark.parametrize("controller", [None, *shipped("controller")])
-def test_everything_shipped_goes_together(name: str, controller: str | None) -> None:
-    servos = ("actuator.kind=servo",) if (controller or "").startswith("servo") else ()
-    scenario = load_scenario(name, controller, servos)
-    assert not idle_fields(scenario)
 
 
 def test_what_is_accepted_without_an_effect_stands_in_the_docs() -> None:

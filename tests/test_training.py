@@ -32,6 +32,8 @@ from stewart_drake.tuning.training import (
 )
 from tests.screen import too_long
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 pytest.importorskip("torch")
 
 rng = np.random.default_rng

@@ -51,15 +51,6 @@ def test_a_scenario_of_0_1_is_todays_with_all_that_is_new_at_its_default(old):
     assert dataclasses.replace(old(ALL_FIELDS), reference=Scenario().reference) == Scenario()
 
 
-@pytest.mark.parametrize("section", ["reference: {kind: hold", "tuner: {kind: fixed"])
-def test_fields_of_another_kind_are_read_as_null_and_refused_otherwise(old, section):
-    field = "frequency" if "hold" in section else "weights"
-    assert old(f"{section}, {field}: null}}")
-    with pytest.raises(ConfigError, match=f"{field}.*expected") as refused:
-        old(f"{section}, {field}: 2.0}}")
-    assert "\n" not in str(refused.value)
-
-
 def test_a_fraction_below_1e_9_is_none():
     assert load_scenario("paper", settings=["delay.fraction=1e-10"]).eta == 8 * 0.1
 

@@ -45,6 +45,8 @@ from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.screen import too_long
 from tests.singular import parallel_rods, stretched, write_mechanism
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 seeds = st.integers(0, 2**32 - 1)
 seeded = settings(max_examples=30, deadline=None, derandomize=True)
 

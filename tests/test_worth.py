@@ -31,6 +31,8 @@ from stewart_drake.tuning.worth import (
 )
 from tests.screen import too_long
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 FIXED = tuple(GAINS_OF_FAMILIES)
 NAMES = ("a", "b", TUNER)
 SMALL = (
