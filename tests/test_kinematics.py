@@ -11,7 +11,11 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.optimize import minimize_scalar
 
+from stewart_drake.core.layout import geometry_of
+from stewart_drake.core.library import core
+from stewart_drake.dynamics.workspace import margin
 from stewart_drake.mechanism.assembly import joint_state
+from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import (
     ForwardKinematicsError,
@@ -368,3 +372,49 @@ def test_plain_lists_are_accepted() -> None:
     np.testing.assert_array_equal(PAPER.jacobian(pose), PAPER.jacobian(np.array(pose)))
     np.testing.assert_array_equal(PAPER.reach_margins(pose), PAPER.reach_margins(np.array(pose)))
     np.testing.assert_allclose(PAPER.forward_kinematics(list(angles), pose), pose, atol=1e-12)
+
+
+# ------------------------------------------------------------------ the compiled core
+
+
+def joined_to_home(mechanism: Mechanism, number: int) -> list[Array]:
+    """Poses at the ends of straight lines from home that stay within the workspace."""
+    rng, scale = np.random.default_rng(1), np.repeat([3.0, 4 * mechanism.crank_lengths.max()], 3)
+    found = []
+    while len(found) < number:
+        way, last = rng.normal(size=6), None
+        for share in np.linspace(0, 1, 61)[1:]:
+            pose = mechanism.home + share * scale * way / np.linalg.norm(way)
+            if not (margin(mechanism, pose) > 0 and mechanism.reach_margins(pose).min() > 0):
+                break
+            last = pose
+        if last is not None:
+            found.append(last)
+    return found
+
+
+@pytest.mark.parametrize("name", ["desktop", "motion_base", "paper", "paper_clear"])
+def test_the_core_has_the_same_kinematics(name: str) -> None:
+    """Angles and Jacobian; and every pose up to a singularity, from the guess of home."""
+    mechanism, c = load_mechanism(name), core()
+    legs, angles, J = np.array(geometry_of(mechanism)), np.empty(6), np.empty((6, 6))
+    for pose in joined_to_home(mechanism, 100):
+        c.lib.stewart_crank_angles(c.at(legs), c.at(pose), c.at(angles))
+        assert c.lib.stewart_crank_jacobian(c.at(legs), c.at(pose), c.at(J))
+        np.testing.assert_allclose(angles, mechanism.crank_angles(pose), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(J, mechanism.jacobian(pose), rtol=1e-9, atol=1e-9)
+        found = mechanism.home.copy()
+        given = (c.at(legs), c.at(angles), c.at(found), c.scratch(48))
+        assert c.lib.stewart_forward_kinematics(*given)
+        np.testing.assert_allclose(found, pose, rtol=0, atol=1e-8)
+
+
+def test_the_core_refuses_what_no_pose_has() -> None:
+    c, legs, J = core(), np.array(geometry_of(PAPER)), np.empty((6, 6))
+    angles, away = np.array([0.0, 3, 0, 3, 0, 3]), PAPER.home + [0, 0, 0, 0, 0, 1.0]
+    found = PAPER.home.copy()
+    given = (c.at(legs), c.at(angles), c.at(found), c.scratch(48))
+    assert not c.lib.stewart_forward_kinematics(*given)
+    assert not c.lib.stewart_crank_jacobian(c.at(legs), c.at(away), c.at(J))
+    c.lib.stewart_crank_angles(c.at(legs), c.at(away), c.at(angles))
+    assert np.isnan(J).all() and np.isnan(angles).all()

@@ -1,11 +1,14 @@
 /* See kinematics.h. */
 
+#include "dynamics.h"
 #include "kinematics.h"
 
 #define LEGS 6
 #define NEWTON_STEPS 50
 #define LEAST_STEP ((real)1e-3) /* share of Newton's */
 #define WRONG_BRANCH ((real)1e-5)
+#define MOST_PIECES 16 /* of the way of the cranks from the guess, where one leads across a singularity */
+#define TURN ((real)6.283185307179586)
 #ifdef STEWART_FLOAT
 #define TOLERANCE ((real)5e-7)   /* of a rod's length, relative */
 #define DEAD_CENTRE ((real)5e-4)
@@ -139,8 +142,8 @@ static void misfit(const Leg *legs, real (*tips)[3], const real *pose, Misfit *m
     }
 }
 
-int stewart_forward_kinematics(const real *geometry, const real *angles, real *pose,
-                               stewart_scratch scratch)
+/* Newton's method from a guess in the place of the pose. */
+static int newton(const real *geometry, const real *angles, real *pose, stewart_scratch scratch)
 {
     Leg legs[LEGS];
     Misfit at, next;
@@ -183,4 +186,43 @@ int stewart_forward_kinematics(const real *geometry, const real *angles, real *p
         if (legs[i].branch * dot(at.along[i], tangents[i]) > WRONG_BRANCH * legs[i].rod)
             return 0;
     return 1;
+}
+
+/* Sign of the measure of parallel singularity. */
+static int side_of(const real *geometry, const real *pose)
+{
+    real measures[STEWART_MEASURES];
+    stewart_measures(geometry, pose, NULL, measures);
+    return (measures[LEGS] > 0) - (measures[LEGS] < 0);
+}
+
+static real turned(real angle, real near)
+{
+    return angle - TURN * REAL(floor)((angle - near) / TURN + (real)0.5);
+}
+
+int stewart_forward_kinematics(const real *geometry, const real *angles, real *pose,
+                               stewart_scratch scratch)
+{
+    real guess[LEGS], first[LEGS], next[LEGS];
+    const int side = side_of(geometry, pose);
+    stewart_copy(LEGS, pose, guess);
+    stewart_crank_angles(geometry, pose, first);
+    for (int pieces = 1; pieces <= MOST_PIECES; pieces *= 2) {
+        int found = 1;
+        stewart_copy(LEGS, guess, pose);
+        for (int piece = 1; piece <= pieces && found; piece++) {
+            for (int i = 0; i < LEGS; i++)
+                next[i] = angles[i] + (real)(pieces - piece) / (real)pieces
+                                          * (first[i] - turned(angles[i], first[i]));
+            found = newton(geometry, piece < pieces ? next : angles, pose, scratch);
+        }
+        for (int i = 0; i < 3 && found; i++)
+            pose[i] = turned(pose[i], guess[i]);
+        if (found && side_of(geometry, pose) * side >= 0)
+            return 1;
+        if (!stewart_all_finite(LEGS, first)) /* the guess is out of reach */
+            return 0;
+    }
+    return 0;
 }

@@ -27,8 +27,9 @@ int stewart_crank_jacobian(const real *geometry, const real *pose, real *J);
 
 /* The pose (6) with these crank angles (6), from a guess in its place. Newton's method with halving
    steps on f_i = |p_TQ|^2 / l^2 - 1 from crank tip to plate joint, which stays smooth through dead
-   centres and outside the workspace. Returns 0 where it finds none, or one of another branch.
-   Scratch: 48 numbers. */
+   centres and outside the workspace. A pose on the other side of a parallel singularity than the guess
+   is another assembly: the cranks then turn there in 2, 4, 8, 16 pieces. Returns 0 where that finds
+   none, or one of another crank branch. Scratch: 48 numbers. */
 int stewart_forward_kinematics(const real *geometry, const real *angles, real *pose,
                                stewart_scratch scratch);
 
