@@ -46,6 +46,8 @@ SOURCES: Final = (
 )
 CONTROLLER: Final = (*(name for name in SOURCES if name.endswith(".c")), "stewart_config.c")
 """What is compiled of them, with the configuration."""
+MACHINE: Final = ("link.h", "link.c")
+"""What the example of a machine takes beside those."""
 TEMPLATES: Final = Path(__file__).with_name("templates")
 MOST_SAMPLES: Final = 100
 """Of a run that the test replays."""
@@ -179,6 +181,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         values["PREVIEW_ROWS" if name == "preview" else name.upper()] = ",\n    ".join(rows)
     for name in ("age", "status"):
         values[name.upper()] = ", ".join(str(getattr(step, name)) for step in law.steps)
+    files |= {name: (FOLDER / name).read_text("utf-8") for name in MACHINE}
     for path in sorted(TEMPLATES.iterdir()):
         files[path.name] = _filled(path.read_text("utf-8"), values)
     files["README.md"] = _filled(

@@ -12,6 +12,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "link.h"
 #include "stewart_config.h"
 #include "stewart_motion.h"
 #include "udp.h"
@@ -24,11 +25,7 @@
 #define RECENT (10ull * SECOND) /* for which a fault counts as what came before the next one */
 #define LAST_WORDS 3         /* datagrams at the end: some may be lost */
 
-typedef struct {
-    uint64_t at;
-    uint32_t sequence; /* of the plan, 0 of what was in flight at the start */
-    double torque[6];
-} row;
+enum { LINK = STEWART_LINK_COMMANDS + 7 * STEWART_HISTORY + 9 * WAITING }; /* numbers of its memory */
 
 typedef struct {
     int socket;
@@ -41,15 +38,12 @@ typedef struct {
     uint64_t told_refusal; /* session of it */
     int driven, stopped;
     /* what acts, and what waits */
-    row waiting[WAITING];
-    int rows;
-    double torque[6], acted[STEWART_HISTORY][6];
-    int history;
-    uint64_t acted_from, changed, begin, sample;
-    int running, safe, counts_dry, left;
+    stewart_link buffer;
+    double link[LINK];
+    uint64_t begin, sample;
+    int running, safe, left;
     stewart_reason reason, before; /* why torques do not act, and the fault before that */
     uint64_t preceded, told_until; /* when that was; until when the machine stood still */
-    uint32_t played, dry;
     unsigned refused[STEWART_REFUSALS], sent, silences;
     /* the simulated plate */
     uint64_t time;
@@ -119,7 +113,7 @@ static void plate_follow(machine *m, uint64_t time)
     stewart_plant plant = {c->geometry, c->parameters, &c->gravity};
     real torque[6];
     for (int i = 0; i < 6; i++)
-        torque[i] = (real)m->torque[i];
+        torque[i] = (real)stewart_link_acting(m->link)[i];
     while (m->running && !m->left && m->time < time) {
         uint64_t h = time - m->time < FINEST ? time - m->time : FINEST;
         stewart_move(&plant, torque, (real)(1e-9 * (double)h), m->state);
@@ -143,85 +137,29 @@ static void plate_read(const machine *m, double *state)
 
 /* ---------------------------------------------------------------- torques */
 
-static double limited(double torque)
-{
-    double limit = (double)stewart_configuration.torque_limit;
-    return fmax(-limit, fmin(limit, torque));
-}
-
-static void act(machine *m, const double *torque, uint64_t time)
-{
-    memmove(m->acted[1], m->acted[0], (STEWART_HISTORY - 1) * sizeof m->acted[0]);
-    memcpy(m->torque, torque, sizeof m->torque);
-    memcpy(m->acted[0], m->torque, sizeof m->torque);
-    m->history += m->history < STEWART_HISTORY;
-    m->acted_from = time;
-}
-
-static void keep(machine *m, uint64_t at, uint32_t sequence, const double *torque)
-{
-    int i = 0;
-    while (i < m->rows && m->waiting[i].at != at)
-        i++;
-    if (i == WAITING || (i < m->rows && m->waiting[i].sequence > sequence))
-        return;
-    m->rows += i == m->rows;
-    m->waiting[i].at = at;
-    m->waiting[i].sequence = sequence;
-    for (int j = 0; j < 6; j++)
-        m->waiting[i].torque[j] = limited(torque[j]);
-}
-
-/* The row that is next, or -1. */
-static int next_row(const machine *m)
-{
-    int next = -1;
-    for (int i = 0; i < m->rows; i++)
-        if (next < 0 || m->waiting[i].at < m->waiting[next].at)
-            next = i;
-    return next;
-}
-
 static uint64_t next_change(const machine *m)
 {
-    int next = next_row(m);
-    if (!m->running || m->left)
-        return STEWART_NEVER;
-    if (m->counts_dry && (next < 0 || m->changed + m->period < m->waiting[next].at))
-        return m->changed + m->period;
-    return next < 0 ? STEWART_NEVER : m->waiting[next].at;
+    double next = m->running && !m->left ? stewart_link_next(&m->buffer, m->link) : INFINITY;
+    return isfinite(next) ? (uint64_t)next : STEWART_NEVER;
 }
 
 static void change(machine *m, uint64_t time)
 {
-    int next = next_row(m);
     plate_follow(m, time);
-    m->changed = time;
-    m->counts_dry = 1;
-    if (next < 0 || m->waiting[next].at > time) {
-        m->dry++;
-        act(m, m->torque, time); /* held */
-        return;
-    }
-    m->played += m->waiting[next].sequence > 0;
-    if (m->safe && m->waiting[next].sequence > 0) {
+    stewart_link_change(&m->buffer, m->link, (double)time);
+    if (m->safe && m->link[STEWART_LINK_FED] > 0) {
         stewart_reason none = {0, 0, 0};
         precede(m, m->reason, time);
         m->reason = none;
         m->safe = 0;
     }
-    act(m, m->waiting[next].torque, time);
-    m->waiting[next] = m->waiting[--m->rows];
 }
 
 static void go_safe(machine *m, uint64_t time)
 {
-    static const double zero[6];
     plate_follow(m, time);
-    m->rows = m->counts_dry = 0;
+    stewart_link_safe(&m->buffer, m->link, (double)time, 0);
     m->safe = 1;
-    m->changed = time > m->changed ? time : m->changed;
-    act(m, zero, time);
 }
 
 /* ---------------------------------------------------------------- the run */
@@ -229,11 +167,10 @@ static void go_safe(machine *m, uint64_t time)
 static void put_back(machine *m)
 {
     memcpy(m->state, stewart_start, sizeof m->state);
-    memset(m->torque, 0, sizeof m->torque);
-    m->begin = m->acted_from = STEWART_NEVER;
-    m->rows = m->history = m->running = m->safe = m->left = m->counts_dry = 0;
-    m->played = m->dry = 0;
-    m->changed = m->preceded = 0;
+    stewart_link_start(&m->buffer, m->link);
+    m->begin = STEWART_NEVER;
+    m->running = m->safe = m->left = 0;
+    m->preceded = 0;
     memset(&m->reason, 0, sizeof m->reason);
     memset(&m->before, 0, sizeof m->before);
 }
@@ -253,14 +190,12 @@ static void begin(machine *m)
     const stewart_config *c = &stewart_configuration;
     int number = stewart_rows;
     double early = ((double)c->fraction - (number > c->steps)) * (double)m->period;
-    double torque[6];
+    static double torques[6 * WAITING];
     m->time = m->begin;
     m->running = 1;
-    for (int i = 0; i < number; i++) { /* what is in flight: a real machine has nothing */
-        for (int j = 0; j < 6; j++)
-            torque[j] = (double)stewart_queue[6 * i + j];
-        keep(m, (uint64_t)((double)m->begin + early + 0.5) + (uint64_t)i * m->period, 0, torque);
-    }
+    for (int i = 0; i < 6 * number; i++) /* what is in flight: a real machine has nothing */
+        torques[i] = (double)stewart_queue[i];
+    stewart_link_begin(&m->buffer, m->link, floor((double)m->begin + early + 0.5), number, torques);
     printf("the run began at %.3f s\n", 1e-9 * (double)m->begin);
 }
 
@@ -279,8 +214,8 @@ static void describe(const machine *m, uint64_t sampled, stewart_measured *s)
     s->watchdog = WATCHDOG;
     s->rate = 1;
     s->torque_limit = (double)stewart_configuration.torque_limit;
-    s->played = m->played;
-    s->dry = m->dry;
+    s->played = (uint32_t)m->link[STEWART_LINK_PLAYED];
+    s->dry = (uint32_t)m->link[STEWART_LINK_DRY];
     for (int i = 1; i < STEWART_REFUSALS; i++)
         s->refused += m->refused[i];
     s->reason = m->reason;
@@ -296,12 +231,13 @@ static void say(machine *m, uint64_t sampled)
     s.head = stewart_next(&m->session, machine_now(m), s.head.flags);
     s.kind = STEWART_STATE;
     s.samples = 1;
-    s.history = (uint8_t)m->history;
+    s.history = (uint8_t)m->link[STEWART_LINK_ACTED];
     s.begin = m->begin;
     s.arrived = m->session.window.newest ? m->session.window.seen : 0;
-    s.acted_from = m->history ? m->acted_from : STEWART_NEVER;
+    s.acted_from = s.history ? (uint64_t)m->link[STEWART_LINK_COMMANDS] : STEWART_NEVER;
     plate_read(m, s.state);
-    memcpy(s.acted, m->acted, sizeof m->acted[0] * (size_t)m->history);
+    for (int i = 0; i < s.history; i++)
+        memcpy(s.acted[i], m->link + STEWART_LINK_COMMANDS + 7 * i + 1, sizeof s.acted[i]);
     m->sent += (unsigned)udp_put(m->socket, data, stewart_write_measured(&s, m->key, data), &m->driver);
 }
 
@@ -355,13 +291,11 @@ static int plan_ahead(machine *m, const stewart_plan *plan, uint64_t now)
         uint64_t asked = plan->begin > now + 1 ? plan->begin : now + 1;
         m->begin = (asked + m->period - 1) / m->period * m->period;
     }
-    uint64_t last = plan->playout + (plan->rows ? plan->rows - 1u : 0u) * m->period;
-    if (plan->rows && (last < now || last <= m->changed))
-        return STEWART_LATE;
-    for (unsigned i = 0; i < plan->rows && !m->left; i++)
-        if (plan->playout + i * m->period > m->changed)
-            keep(m, plan->playout + i * m->period, plan->head.sequence, plan->torques[i]);
-    return STEWART_TAKEN;
+    static const int causes[] = {STEWART_TAKEN, STEWART_MALFORMED, STEWART_LATE};
+    if (m->left)
+        return STEWART_TAKEN;
+    return causes[stewart_link_take(&m->buffer, m->link, (double)now, (double)plan->head.sequence, 0,
+                                    (double)plan->playout, (int)plan->rows, plan->torques[0])];
 }
 
 static int obey(machine *m, const stewart_plan *plan, uint64_t now)
@@ -483,6 +417,8 @@ int main(int argc, char **argv)
     m.offers.tokens = STEWART_AT_ONCE;
     m.started = udp_now();
     m.period = (uint64_t)((double)stewart_configuration.period * SECOND + 0.5);
+    m.buffer = (stewart_link){6, WAITING, STEWART_HISTORY, 0, 1, (double)m.period, 0,
+                              stewart_configuration.torque_limit};
     put_back(&m);
     printf("a simulated machine at port %s, every %.4g ms; Ctrl-C ends it\n", argv[1],
            1e-6 * (double)m.period);
@@ -499,7 +435,8 @@ int main(int argc, char **argv)
     for (int i = 0; i < LAST_WORDS && m.driven; i++)
         say(&m, now);
     printf("ended after %.1f s: %u measurements sent, %u torques played, %u periods dry, %u silences\n",
-           1e-9 * (double)now, m.sent, (unsigned)m.played, (unsigned)m.dry, m.silences);
+           1e-9 * (double)now, m.sent, (unsigned)m.link[STEWART_LINK_PLAYED],
+           (unsigned)m.link[STEWART_LINK_DRY], m.silences);
     udp_tell(m.refused);
     return 0;
 }
