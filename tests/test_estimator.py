@@ -12,7 +12,6 @@ from scipy.stats import chi2
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law import parameter_filter
 from stewart_drake.law.belief import Estimate
 from stewart_drake.law.compiled import machine_of
 from stewart_drake.law.filter_settings import FilterSettings, ParameterSet, filter_settings
@@ -20,7 +19,7 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import ParameterObserver
-from stewart_drake.law.parameter_filter import PATIENCE, ParameterFilter, Period
+from stewart_drake.law.parameter_filter import ParameterFilter, Period
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.delay import Delay
@@ -47,6 +46,7 @@ SETTINGS = FilterSettings(
     timing_std=0.0,
 )
 PLANT = StewartDynamics(PAPER, gravity=False)
+PATIENCE = core().lib.STEWART_PATIENCE
 
 
 def filter_of(noise_std: Array, settings: FilterSettings = SETTINGS) -> ParameterFilter:
@@ -67,6 +67,28 @@ def advance(
 ) -> Estimate:
     """A period, and a measurement (12,) or none at its end."""
     return assumed.advance(estimate, period, None if y is None else Measurement.of(y))
+
+
+def transition(dynamics: StewartDynamics, xi: Array, period: Period) -> tuple[Array, Array]:
+    """State (12,) after the torques, and F (20, 20) of [state; parameters], of the core."""
+    c, number = core(), len(period.torques)
+    states, H, F = np.empty((number, 12)), np.empty((number, 12, 20)), np.eye(20)
+    acting = [number, c.at(period.torques), c.at(period.durations), period.substeps]
+    given = (c.at(xi), c.ffi.new("stewart_acting *", acting), 1, c.at(states), c.at(H))
+    scratch = c.scratch(c.lib.stewart_transitions_scratch(8))
+    assert c.lib.stewart_transitions(machine_of(dynamics).it, *given, scratch)
+    F[:12] = H[-1]
+    return states[-1], F
+
+
+def within_bounds(mean: Array, covariance: Array, box: ParameterSet) -> Array:
+    """The mean (20,) that the core finds."""
+    c, n, free, moved = core(), len(mean), np.full(12, np.inf), np.empty(len(mean))
+    root = np.linalg.cholesky(covariance)
+    bounds = np.concatenate([-free, box.lower]), np.concatenate([free, box.upper])
+    given = map(c.at, (mean, root, *bounds, moved))
+    assert c.lib.stewart_within_bounds(n, *given, c.scratch(n + c.lib.STEWART_MAX_BOUNDED**2))
+    return moved
 
 
 class Run(NamedTuple):
@@ -161,7 +183,7 @@ def test_transition_equals_central_differences(t: float, gravity: bool) -> None:
 
     def error(period: float) -> float:
         durations = period * np.array([0.3, 0.7])
-        after, F = parameter_filter.transition(dynamics, point, acted(torques, durations, 4))
+        after, F = transition(dynamics, point, acted(torques, durations, 4))
         expected = central_difference(
             lambda p: dynamics.predict(p[:12], torques, durations, 16, p[12:])[-1], point
         )
@@ -374,7 +396,7 @@ def test_bounds_are_kept_by_the_nearest_mean_there_is(seed: int, width: float) -
     mean = rng.normal(0, 1, 20)
     lower, upper = -width * rng.uniform(0, 1, 8), width * rng.uniform(0, 1, 8)
     box = dataclasses.replace(KNOWN, lower=lower, upper=upper)
-    found = parameter_filter.within_bounds(mean, covariance, box)
+    found = within_bounds(mean, covariance, box)
     metric = np.linalg.inv(np.linalg.cholesky(covariance))
     free = np.full(12, np.inf)
     limits = (np.concatenate([-free, lower]), np.concatenate([free, upper]))
@@ -389,7 +411,7 @@ def test_what_was_learnt_about_combinations_survives_a_bound() -> None:
     covariance[12, 18] = covariance[18, 12] = -0.9e-6
     mean = np.zeros(20)
     mean[12], mean[18] = 1e-3, -2e-3
-    found = parameter_filter.within_bounds(mean, covariance, KNOWN)
+    found = within_bounds(mean, covariance, KNOWN)
     assert found[18] == 0
     assert found[12] == pytest.approx(1e-3 - 0.9 * 2e-3, rel=1e-12)
 

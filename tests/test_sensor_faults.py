@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import stewart_drake.loop.kinds as kinds_module
+from stewart_drake.core.library import core
 from stewart_drake.files.yamlio import parse_yaml
 from stewart_drake.law.filter_settings import FilterSettings
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.observers import ParameterObserver
-from stewart_drake.law.parameter_filter import PATIENCE
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.sensor import Sensor
@@ -21,6 +21,7 @@ from stewart_drake.scenario.loading import load_scenario, scenario_to_dict, scen
 from stewart_drake.types import Array
 from tests.test_control_law import HOME, Loop, law_of, nominal_queue, sine, step
 
+PATIENCE = core().lib.STEWART_PATIENCE
 CONTROLLERS = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
 SHIPPED = ("paper", "gravity", "desktop", "motion_base")
 COUNT = {

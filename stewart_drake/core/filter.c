@@ -11,7 +11,6 @@
 #define SMALL ((real)0.1)  /* a correction of so many standard deviations needs no second iteration */
 #define KNOWN ((real)0.01) /* a parameter is known when its deviation is this share of the usual one */
 #define LEARNT ((real)0.3) /* the same, for parameters that are good enough over a few periods */
-#define PATIENCE 3         /* outliers in a row that agree with each other */
 #ifdef STEWART_FLOAT
 #define ROUNDING ((real)1e-5) /* of a time, as a share of the period */
 #else
@@ -525,7 +524,7 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_acted *p
     const real unseen = *now.unseen + 1, *theta = now.mean + X;
     real outliers = 1;
     if (values && attempt(filter, period, &now, values, history, &after, scratch)) {
-        const int lost = *now.unseen >= PATIENCE && !is_known(filter, now.root, LEARNT);
+        const int lost = *now.unseen >= STEWART_PATIENCE && !is_known(filter, now.root, LEARNT);
         if (!lost || !stewart_filter_start(filter, values, theta, after.mean, estimate, scratch))
             accept(n, m, &after, &now);
         return;
@@ -535,7 +534,7 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_acted *p
         && attempt(filter, period, &before, values, history, &after, scratch))
         outliers += *now.outliers;
     const int alone = attempt(filter, period, &now, NULL, history, &after, scratch);
-    if (values && (!alone || outliers >= PATIENCE)
+    if (values && (!alone || outliers >= STEWART_PATIENCE)
         && stewart_filter_start(filter, values, theta, alone ? after.mean : now.mean, estimate,
                                 scratch))
         return;

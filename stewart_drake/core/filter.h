@@ -17,6 +17,8 @@
 
 #define STEWART_LEG_GATE 30 /* squared residual of a leg, per variance, from which it is left out */
 
+#define STEWART_PATIENCE 3 /* outliers in a row, that agree with each other, after which they are believed */
+
 /* An estimate of xi = [x; theta] (n = 12 + p), from measurements (m): views of one vector of
    `stewart_posterior_size` numbers, in this order. */
 typedef struct {

@@ -11,8 +11,7 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Estimate
 from stewart_drake.law.compiled import Compiled, Once, machine_of, numbers
-from stewart_drake.law.filter_settings import FilterSettings, ParameterSet
-from stewart_drake.law.holds import GAUSS_NODES
+from stewart_drake.law.filter_settings import FilterSettings
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.sensing import FAULTS, Sensing, causes, compiled_sensing
 from stewart_drake.scenario.calibration import OFFSETS
@@ -21,13 +20,6 @@ from stewart_drake.types import Array
 
 OUTLIER = 1e-6
 """Share of the measurements, were all as the filter believes, that are taken for outliers."""
-MIDPOINT = np.array([0.5])
-SMALL = 0.1
-"""A correction so many standard deviations long needs no second look."""
-KNOWN = 0.01
-"""A parameter is known when its standard deviation is this share of the prior's."""
-PATIENCE = 3
-"""After so many outliers in a row that bear each other out the plate must be where they say."""
 
 
 class Period(NamedTuple):
@@ -158,46 +150,3 @@ def _estimate(memory: Array, n: int, m: int) -> Estimate:
     mean, root, outlier, counts = np.split(memory, [n, n + n * n, n + n * n + m])
     L, (outliers, unseen, bits) = root.reshape(n, n), counts.astype(int)
     return Estimate(mean, L @ L.T, outlier, outliers, unseen, causes(bits), L)
-
-
-def transition(
-    dynamics: StewartDynamics, xi: Array, period: Period, nodes: Array = GAUSS_NODES
-) -> tuple[Array, Array]:
-    """Return the state (12,) after the torques, and F (12 + p, 12 + p) of [state; parameters].
-
-    Raises:
-        LinAlgError: there is none.
-    """
-    c, n, number = core(), len(xi), len(period.torques)
-    given = [numbers(a) for a in (xi, period.torques, period.durations)]
-    acting = c.ffi.new(
-        "stewart_acting *", [number, c.at(given[1]), c.at(given[2]), period.substeps]
-    )
-    states, F = np.empty((number, NUM_STATE)), np.eye(n)
-    H = np.empty((number, NUM_STATE, n))
-    scratch = c.scratch(c.lib.stewart_transitions_scratch(n - NUM_STATE))
-    machine, exact = machine_of(dynamics).it, int(len(nodes) > 1)
-    if not c.lib.stewart_transitions(
-        machine, c.at(given[0]), acting, exact, c.at(states), c.at(H), scratch
-    ):
-        raise np.linalg.LinAlgError("no derivatives")
-    F[:NUM_STATE] = H[-1]
-    return states[-1], F
-
-
-def within_bounds(mean: Array, covariance: Array, parameters: ParameterSet) -> Array:
-    """The mean nearest to `mean`, as the covariance measures it, with each parameter in bounds.
-
-    Raises:
-        LinAlgError: the covariance is not positive, or numbers are not finite.
-    """
-    c, n = core(), len(mean)
-    free = np.full(NUM_STATE, np.inf)
-    lower = np.concatenate([-free, parameters.lower])
-    upper = np.concatenate([free, parameters.upper])
-    mean, root, moved = np.array(mean), np.array(covariance), np.empty(n)
-    scratch = c.scratch(n + c.lib.STEWART_MAX_BOUNDED**2)
-    given = (c.at(mean), c.at(root), c.at(lower), c.at(upper), c.at(moved))
-    if not (c.lib.stewart_root(n, c.at(root)) and c.lib.stewart_within_bounds(n, *given, scratch)):
-        raise np.linalg.LinAlgError("the covariance is not positive definite")
-    return moved
