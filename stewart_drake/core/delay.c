@@ -79,18 +79,40 @@ static stewart_arrivals arriving(const stewart_period *t, const real *xi)
     return view;
 }
 
-/* Torques that act between two instants, their durations, and their number; 0 for too many. */
-static int acting(const stewart_period *t, const real *xi, real begin, real end, real *torques,
-                  real *durations)
+/* What acts, one torque after the other, and where it leads to. */
+typedef struct {
+    int number;
+    real *torques, *durations;
+    real states[X * MOST]; /* after each of them */
+} Way;
+
+static Way take_way(const stewart_period *t, stewart_scratch *scratch)
 {
-    const stewart_arrivals view = arriving(t, xi);
-    const int number = stewart_within(&view, t->flights, t->in_flight, begin, end, t->newest,
-                                      torques, durations);
-    return number <= MOST ? number : 0;
+    const int most = t->flights + 3;
+    Way way = {.torques = stewart_take(scratch, U * most)};
+    way.durations = stewart_take(scratch, most);
+    return way;
 }
 
-/* Numbers that what acts in a period takes. */
-static int acting_scratch(const stewart_period *t) { return (U + 1) * (t->flights + 3); }
+/* What acts between two instants; 0 for too many torques. */
+static int act(const stewart_period *t, const real *xi, real begin, real end, Way *way)
+{
+    const stewart_arrivals view = arriving(t, xi);
+    way->number = stewart_within(&view, t->flights, t->in_flight, begin, end, t->newest,
+                                 way->torques, way->durations);
+    return way->number <= MOST;
+}
+
+/* The way of a period from xi, and its end; 0 where there is none. */
+static int predict(const stewart_period *t, const real *xi, Way *way, real *state)
+{
+    if (!act(t, xi, 0, t->delay->period, way))
+        return 0;
+    const stewart_acting acting = {way->number, way->torques, way->durations, 0};
+    stewart_predict(t->delay->machine, xi + X, &acting, xi, way->states);
+    stewart_copy(X, way->states + X * (way->number - 1), state);
+    return 1;
+}
 
 int stewart_period_scratch(int p, int flights)
 {
@@ -100,7 +122,7 @@ int stewart_period_scratch(int p, int flights)
 
 int stewart_delay_advance_scratch(int p, int m, int flights)
 {
-    const int n = X + p + 2, own = (4 * n + MOST + X + 1 + m) * n + (m + 2 * X + 2) * m;
+    const int n = X + p + 2, own = (4 * n + MOST + 2 * X + 1 + m) * n + (m + 2 * X + 2) * m + X;
     const int tried = (X + 1) * n + (X + 1 + n) * m, judged = (n + m + MOST) * m;
     const int update = stewart_kalman_scratch(n, m);
     const int more = tried > update ? tried : update, period = stewart_period_scratch(p, flights);
@@ -110,34 +132,22 @@ int stewart_delay_advance_scratch(int p, int m, int flights)
 int stewart_period_end(const stewart_period *t, const real *xi, real *state,
                        stewart_scratch scratch)
 {
-    real *torques = stewart_take(&scratch, acting_scratch(t));
-    real *durations = torques + U * (t->flights + 3), states[X * MOST];
-    const int number = acting(t, xi, 0, t->delay->period, torques, durations);
-    const stewart_acting all = {number, torques, durations, 0};
-    if (!number)
-        return 0;
-    stewart_predict(t->delay->machine, xi + X, &all, xi, states);
-    stewart_copy(X, states + X * (number - 1), state);
-    return 1;
+    Way way = take_way(t, &scratch);
+    return predict(t, xi, &way, state);
 }
 
-int stewart_period_at(const stewart_period *t, const real *xi, int exact, real *state, real *H,
-                      stewart_scratch scratch)
+/* H (12, n) along the way of a period from xi. */
+static int linearize_along(const stewart_period *t, const real *xi, const Way *way, int exact, real *H,
+                           stewart_scratch scratch)
 {
-    const stewart_machine *machine = t->delay->machine;
     const int n = size_of(t->delay), known = n - 2;
-    const real dt = t->delay->period;
-    real *torques = stewart_take(&scratch, acting_scratch(t));
-    real *durations = torques + U * (t->flights + 3);
+    const stewart_acting acting = {way->number, way->torques, way->durations, 0};
     real *all = stewart_take(&scratch, MOST * X * known), *moved = stewart_take(&scratch, n);
-    real states[X * MOST], later[X], sooner[X];
-    const int number = acting(t, xi, 0, dt, torques, durations);
-    const stewart_acting acts = {number, torques, durations, 0};
-    if (!number || !stewart_transitions(machine, xi, &acts, exact, states, all, scratch))
+    real later[X], sooner[X];
+    if (!stewart_transitions_along(t->delay->machine, xi, &acting, exact, way->states, all, scratch))
         return 0;
-    stewart_copy(X, states + X * (number - 1), state);
     for (int i = 0; i < X; i++) {
-        stewart_copy(known, all + X * known * (number - 1) + known * i, H + n * i);
+        stewart_copy(known, all + X * known * (way->number - 1) + known * i, H + n * i);
         H[n * i + n - 2] = H[n * i + n - 1] = 0;
     }
     if (!(xi[n - 2] < STEWART_NEVER))
@@ -151,9 +161,16 @@ int stewart_period_at(const stewart_period *t, const real *xi, int exact, real *
         return 0;
     for (int i = 0; i < X; i++) {
         H[n * i + n - 2] = (later[i] - sooner[i]) / (2 * DIFFERENCE);
-        H[n * i + n - 1] = dt / 2 * H[n * i + n - 2];
+        H[n * i + n - 1] = t->delay->period / 2 * H[n * i + n - 2];
     }
     return 1;
+}
+
+int stewart_period_at(const stewart_period *t, const real *xi, int exact, real *state, real *H,
+                      stewart_scratch scratch)
+{
+    Way way = take_way(t, &scratch);
+    return predict(t, xi, &way, state) && linearize_along(t, xi, &way, exact, H, scratch);
 }
 
 /* Probability that a normal error of this standard deviation lies between two bounds. */
@@ -175,32 +192,31 @@ int stewart_period_late(const stewart_period *t, const real *xi, const real *sta
 {
     const real dt = t->delay->period;
     const stewart_arrivals view = arriving(t, xi);
-    real *torques = stewart_take(&scratch, acting_scratch(t));
-    real *durations = torques + U * (t->flights + 3), before[6], after[6], at = -EDGE * dt;
-    const int number = acting(t, xi, at, dt - at, torques, durations);
+    real before[6], after[6], at = -EDGE * dt;
+    Way way = take_way(t, &scratch);
     const real first = ((real)(t->newest + 1 - view.sent) * dt + view.eta) * (1 + view.rate);
     stewart_belief belief;
     stewart_believe(t->delay->machine, xi + X, &belief);
     *others = 0;
-    if (!number)
+    if (!act(t, xi, at, dt - at, &way))
         return -1;
-    stewart_accelerate(&belief, state, torques, before);
-    for (int k = 0; k + 1 < number; k++, K += X) {
+    stewart_accelerate(&belief, state, way.torques, before);
+    for (int k = 0; k + 1 < way.number; k++, K += X) {
         real left, share = REAL(sqrt)(BEFORE) * dt;
-        at += durations[k];
+        at += way.durations[k];
         left = dt - at < 0 ? 0 : dt - at < dt ? dt - at : dt;
         if (view.sent > 0 && at >= first - STEWART_INSTANT)
             share = std * REAL(sqrt)(REAL(fmax)(between(-at, dt - at, std), 0));
         else
             ++*others;
-        stewart_accelerate(&belief, state, torques + U * (k + 1), after);
+        stewart_accelerate(&belief, state, way.torques + U * (k + 1), after);
         for (int i = 0; i < 6; i++) {
             K[6 + i] = share * (after[i] - before[i]);
             K[i] = left * K[6 + i];
             before[i] = after[i];
         }
     }
-    return number - 1;
+    return way.number - 1;
 }
 
 /* ---- a measurement at its end ----------------------------------------------------------------- */
@@ -212,6 +228,7 @@ typedef struct {
     int m, n, exact, rows, others;
     real state[X];
     real *H;             /* (12, n) */
+    real *first;         /* state and H about the prior, for all attempts */
     real K[X * MOST];    /* see stewart_period_late */
     real drift[X];       /* standard deviations of the model's other errors */
     real *C;             /* (m, m) root of the covariance of the noise, the model's error too */
@@ -303,7 +320,8 @@ static int settle(void *about, const real *xi, const real *better, stewart_scrat
         stewart_copy(X, linear, a->state);
         return 1;
     }
-    if (!stewart_period_end(a->period, better, end, scratch))
+    Way way = take_way(a->period, &scratch);
+    if (!predict(a->period, better, &way, end))
         return -1;
     for (int i = 0; i < X; i++)
         shift[i] = end[i] - linear[i];
@@ -311,7 +329,8 @@ static int settle(void *about, const real *xi, const real *better, stewart_scrat
         stewart_copy(X, end, a->state);
         return 1;
     }
-    return stewart_period_at(a->period, better, a->exact, a->state, a->H, scratch) ? 0 : -1;
+    stewart_copy(X, end, a->state);
+    return linearize_along(a->period, better, &way, a->exact, a->H, scratch) ? 0 : -1;
 }
 
 int stewart_seen_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
@@ -348,12 +367,10 @@ static real deviation(int n, const real *L, int i)
     return REAL(sqrt)(square);
 }
 
-/* Linearise at xi, with the noise of torques early or late by a variance `used` and of the model. */
-static int linearize(Model *a, const real *xi, real used, stewart_scratch scratch)
+/* Noise of the model, and of torques early or late by a variance `used`, where it is linearised. */
+static int set_noise(Model *a, const real *xi, real used, stewart_scratch scratch)
 {
     const stewart_delay *d = a->period->delay;
-    if (!stewart_period_at(a->period, xi, a->exact, a->state, a->H, scratch))
-        return 0;
     a->rows = stewart_period_late(a->period, xi, a->state, REAL(sqrt)(used), a->K, &a->others,
                                     scratch);
     if (a->rows < 0)
@@ -487,7 +504,9 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
     real *lower = stewart_take(&scratch, n), *upper = stewart_take(&scratch, n);
     real distance, spread;
     if (std > d->period / 10) {
-        if (!best_of_many(a, guess, L, std, xi, scratch) || !linearize(a, xi, used, scratch))
+        if (!best_of_many(a, guess, L, std, xi, scratch)
+            || !stewart_period_at(a->period, xi, a->exact, a->state, a->H, scratch)
+            || !set_noise(a, xi, used, scratch))
             return 0;
     }
     if (!stewart_seen_root(d->sensing, a->state, a->rows, a->K, a->drift, a->C, scratch))
@@ -531,35 +550,27 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
 
 /* `after` (but its root, which is L's) a period after a hypothesis with the root L (n, n), with a
    variance of the timing of at least `least` (s^2); y may be NULL. 0 where it does not fit. */
-static int attempt(const stewart_period *t, const stewart_guess *guess, const real *L, const real *y,
-                   real least, stewart_guess *after, stewart_scratch scratch)
+static int attempt(Model *a, const stewart_guess *guess, const real *L, const real *y, real least,
+                   stewart_guess *after, stewart_scratch scratch)
 {
-    const stewart_delay *d = t->delay;
-    const int n = size_of(d), p = n - X - 2, m = d->sensing->size;
+    const stewart_delay *d = a->period->delay;
+    const int n = a->n;
     const real dt = d->period, std = deviation(n, L, n - 2), timing = timing_of(d, guess);
     const real used = timing > least ? timing : least;
     real *xi = stewart_take(&scratch, n), *posterior = stewart_take(&scratch, n * n);
     real *R = stewart_take(&scratch, n * n), *W = stewart_take(&scratch, n * (n + MOST));
-    Model a = {.period = t, .y = y, .mean = guess->numbers, .m = m, .n = n, .exact = 0};
-    a.H = stewart_take(&scratch, X * n);
-    a.C = stewart_take(&scratch, m * m);
-    a.small = stewart_take(&scratch, m);
-    a.J = stewart_take(&scratch, m * X);
-    a.seen = stewart_take(&scratch, m * X);
-    a.white = stewart_take(&scratch, m * n);
-    a.nu = stewart_take(&scratch, m);
-    for (int i = 0; i < p; i++)
-        if (!(deviation(n, L, X + i) <= KNOWN * d->usual_std[i])) /* or NaN */
-            a.exact = 1;
+    a->y = y;
     stewart_copy(n, guess->numbers, xi);
-    if (!linearize(&a, xi, used, scratch))
+    stewart_copy(X, a->first, a->state);
+    stewart_copy(X * n, a->first + X, a->H);
+    if (!set_noise(a, xi, used, scratch))
         return 0;
     for (int i = 0; i < STEWART_GUESS; i++)
         ((real *)after)[i] = ((const real *)guess)[i];
     after->log_likelihood = 0;
     after->fits = 1;
     if (y) {
-        if (!correct(&a, guess, L, std, used, xi, posterior, after, scratch))
+        if (!correct(a, guess, L, std, used, xi, posterior, after, scratch))
             return 0;
         L = posterior;
     }
@@ -571,7 +582,7 @@ static int attempt(const stewart_period *t, const stewart_guess *guess, const re
     /* QR of [noise; (F L)'; kicks] */
     stewart_fill(n * n, 0, R);
     for (int i = 0; i < X; i++)
-        R[(n + 1) * i] = a.drift[i];
+        R[(n + 1) * i] = a->drift[i];
     if (guess->numbers[n - 2] < STEWART_NEVER) {
         R[n * n - n - 2] = REAL(sqrt)(less_sure + d->walk * d->walk * dt);
         R[n * n - 1] = d->rate_walk * REAL(sqrt)(dt);
@@ -584,17 +595,17 @@ static int attempt(const stewart_period *t, const stewart_guess *guess, const re
         for (int i = 0; i < X; i++) {
             real sum = 0;
             for (int k = 0; k < n; k++)
-                sum += a.H[n * i + k] * L[n * k + j];
+                sum += a->H[n * i + k] * L[n * k + j];
             w[i] = sum;
         }
     }
-    for (int k = 0; k < a.rows; k++) {
+    for (int k = 0; k < a->rows; k++) {
         real *w = W + n * (n + k);
         stewart_fill(n, 0, w);
-        stewart_copy(X, a.K + X * k, w);
+        stewart_copy(X, a->K + X * k, w);
     }
-    stewart_absorb(n, n + a.rows, R, W, scratch);
-    stewart_copy(X, a.state, after->numbers);
+    stewart_absorb(n, n + a->rows, R, W, scratch);
+    stewart_copy(X, a->state, after->numbers);
     stewart_copy(n - X, xi + X, after->numbers + X);
     after->numbers[n - 2] += dt * xi[n - 1];
     real *packed = after->numbers + n;
@@ -621,24 +632,37 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
                            stewart_guess *after, stewart_scratch scratch)
 {
     const stewart_delay *d = t->delay;
-    const int n = size_of(d), size = stewart_guess_size(n - X - 2);
+    const int n = size_of(d), p = n - X - 2, m = d->sensing->size;
+    Model a = {.period = t, .mean = guess->numbers, .m = m, .n = n};
     real *L = stewart_take(&scratch, n * n);
+    a.first = stewart_take(&scratch, X + X * n);
+    a.H = stewart_take(&scratch, X * n);
+    a.C = stewart_take(&scratch, m * m);
+    a.small = stewart_take(&scratch, m);
+    a.J = stewart_take(&scratch, m * X);
+    a.seen = stewart_take(&scratch, m * X);
+    a.white = stewart_take(&scratch, m * n);
+    a.nu = stewart_take(&scratch, m);
     stewart_guess_root(guess, n, L);
-    if (y) {
-        if (attempt(t, guess, L, y, 0, after, scratch))
+    for (int i = 0; i < p; i++)
+        if (!(deviation(n, L, X + i) <= KNOWN * d->usual_std[i])) /* or NaN */
+            a.exact = 1;
+    const int goes = stewart_period_at(t, guess->numbers, a.exact, a.first, a.first + X, scratch);
+    if (y && goes) {
+        if (attempt(&a, guess, L, y, 0, after, scratch))
             return;
         if (is_precise(d, guess, n, stewart_guess_std(guess, n))) {
             const real most = UNTIMELY * d->period;
             jerk(n, JERKED * d->period, L);
-            if (attempt(t, guess, L, y, most * most, after, scratch)) {
+            if (attempt(&a, guess, L, y, most * most, after, scratch)) {
                 after->outliers = guess->outliers + 1; /* one more of these may be a jump */
                 return;
             }
             stewart_guess_root(guess, n, L);
         }
     }
-    if (!attempt(t, guess, L, NULL, 0, after, scratch)) /* astray: it explains nothing any more */
-        stewart_copy(size, (const real *)guess, (real *)after);
+    if (!goes || !attempt(&a, guess, L, NULL, 0, after, scratch)) /* it explains nothing any more */
+        stewart_copy(stewart_guess_size(p), (const real *)guess, (real *)after);
     if (y) {
         after->fits = 0;
         after->outliers = guess->outliers + 1;

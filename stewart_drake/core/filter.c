@@ -157,13 +157,21 @@ static void seen_change(const Step *s, const real *change, real *y)
         y[i] = s->J ? dot(X, s->J + X * i, change) : change[i];
 }
 
+static void predict(Step *s, const real *xi)
+{
+    const stewart_acting *acting = &s->period->acting;
+    stewart_predict(s->filter->machine, xi + X, acting, xi, s->states);
+    stewart_copy(X, s->states + X * (acting->number - 1), s->end);
+}
+
+/* Linearise at xi, after `predict` from there. */
 static int linearize(Step *s, const real *xi, stewart_scratch scratch)
 {
     const stewart_filter *f = s->filter;
     const int n = size_of(f), last = s->period->acting.number - 1;
-    if (!stewart_transitions(f->machine, xi, &s->period->acting, s->exact, s->states, s->H, scratch))
+    if (!stewart_transitions_along(f->machine, xi, &s->period->acting, s->exact, s->states, s->H,
+                                   scratch))
         return 0;
-    stewart_copy(X, s->states + X * last, s->end);
     s->last = s->H + X * n * last;
     if (s->J)
         f->sensing->jacobian(f->sensing, s->end, s->J);
@@ -232,7 +240,7 @@ static int settle_sample(void *model, const real *xi, const real *better, stewar
 {
     Step *s = model;
     const stewart_filter *f = s->filter;
-    const int n = size_of(f), end = s->period->acting.number - 1;
+    const int n = size_of(f);
     real shift[X], linear[X];
     for (int i = 0; i < X; i++) {
         shift[i] = 0;
@@ -245,8 +253,7 @@ static int settle_sample(void *model, const real *xi, const real *better, stewar
         stewart_copy(X, linear, s->end);
         return 1;
     }
-    stewart_predict(f->machine, better + X, &s->period->acting, better, s->states);
-    stewart_copy(X, s->states + X * end, s->end);
+    predict(s, better);
     if (s->J)
         f->sensing->jacobian(f->sensing, s->end, s->J);
     for (int i = 0; i < X; i++)
@@ -436,6 +443,8 @@ static int attempt(const stewart_filter *f, const stewart_acted *period,
     scratch = prepare(&s, scratch);
     stewart_copy(n, prior->mean, xi);
     /* Corrections of parameters that are known already are too small to need F to fourth order. */
+    if (!f->encoders)
+        predict(&s, xi);
     if (!(f->encoders ? along(&s, xi, scratch) : linearize(&s, xi, scratch)))
         return 0;
     set_drift(&s, xi + X);

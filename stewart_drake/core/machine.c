@@ -243,15 +243,21 @@ static int transition_of_hold(const stewart_machine *machine, const stewart_beli
 int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_acting *acting,
                         int exact, real *states, real *H, stewart_scratch scratch)
 {
-    const int p = machine->estimated, n = X + p, substeps = substeps_of(machine, acting);
+    stewart_predict(machine, xi + X, acting, xi, states);
+    return stewart_transitions_along(machine, xi, acting, exact, states, H, scratch);
+}
+
+int stewart_transitions_along(const stewart_machine *machine, const real *xi,
+                              const stewart_acting *acting, int exact, const real *states, real *H,
+                              stewart_scratch scratch)
+{
+    const int p = machine->estimated, n = X + p;
     real *Phi = stewart_take(&scratch, X * X), *S = stewart_take(&scratch, X * p);
     const real *start = xi, *before = NULL;
     stewart_belief belief;
     stewart_believe(machine, xi + X, &belief);
     for (int k = 0; k < acting->number; k++, before = H, start = states, states += X, H += X * n) {
         const real *torque = acting->torques + U * k, h = acting->durations[k];
-        stewart_copy(X, start, states);
-        move(&belief, torque, h, substeps, states);
         if (!transition_of_hold(machine, &belief, torque, h, exact, start, states, Phi, S, scratch))
             return 0;
         if (before) /* [Phi S; 0 1] [H; 0 1] */

@@ -76,6 +76,11 @@ void stewart_within_hold(const real *start, const real *end, real h, real s, rea
 int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_acting *acting,
                         int exact, real *states, real *H, stewart_scratch scratch);
 
+/* The same H along states that `stewart_predict` gave from xi. */
+int stewart_transitions_along(const stewart_machine *machine, const real *xi,
+                              const stewart_acting *acting, int exact, const real *states, real *H,
+                              stewart_scratch scratch);
+
 int stewart_transitions_scratch(int estimated);
 
 #endif
