@@ -28,7 +28,6 @@ PACKAGES: Final = {
     "make": "make",
 }
 """Debian's package of each command."""
-CONTROLLER: Final = tuple(name.replace(".c", ".o") for name in export_c.CONTROLLER)
 OPTIMISED: Final = "-O2 -ffunction-sections -fdata-sections"
 HEADER: Final = (
     *("controller", "processor", "flash, kB", "state, B", "workspace, B", "stack, B"),
@@ -134,13 +133,15 @@ def counted(row: Row, folder: Path) -> Counted:
         f"qemu-system-arm -M {processor.machine} -icount shift=0 -display none -monitor none "
         "-serial none -semihosting-config enable=on,target=native -kernel"
     )
-    made(
-        folder,
-        " ".join(CONTROLLER),
+    sizes = made(
+        *(folder, "size"),
         CC=compiler,
+        SIZE="arm-none-eabi-size",
         CFLAGS=f"{OPTIMISED} -Wdouble-promotion -Wundef",
-    )
-    listed = subprocess.check_output(["arm-none-eabi-nm", "-u", *CONTROLLER], cwd=folder, text=True)
+    ).splitlines()
+    flash = sum(int(size) for size in sizes[-1].split()[:2])  # text and data of the totals
+    objects = [line.split()[-1] for line in sizes[1:-1]]
+    listed = subprocess.check_output(["arm-none-eabi-nm", "-u", *objects], cwd=folder, text=True)
     if processor.single and "__aeabi_d" in listed:
         sys.exit(f"{row.name}: computes a double in software\n{listed}")
     made(folder, "board_startup.o stewart_motion.o", CC=compiler, CFLAGS=OPTIMISED)
@@ -152,11 +153,10 @@ def counted(row: Row, folder: Path) -> Counted:
         METER="board_meter.o",
         EMULATOR=emulator,
     )
-    sizes = made(folder, "size", CC=compiler, SIZE="arm-none-eabi-size").splitlines()[-1].split()
     steps = re.findall(r"^step \d+: instructions (\d+), stack (\d+) B$", said, re.MULTILINE)
     instructions = [int(number) / 1e6 for number, _ in steps]
     return Counted(
-        int(sizes[0]) + int(sizes[1]),
+        flash,
         int(said.split("state ")[1].split()[0]),
         int(said.split("workspace ")[1].split()[0]),
         max(int(depth) for _, depth in steps),
