@@ -225,10 +225,12 @@ void stewart_exponential(int n, int m, const real *A, const real *B, real *Phi, 
         A1[i] = scale * A[i];
     stewart_multiply(n, n, n, A1, A1, A2);
     stewart_multiply(n, n, n, A2, A1, A3);
-    stewart_fill(n * n, 0, sum);
     for (int block = 9; block >= 0; block -= 3) {
-        stewart_multiply(n, n, n, sum, A3, next);
         const real *f = factorials + block;
+        if (block < 9)
+            stewart_multiply(n, n, n, sum, A3, next);
+        else
+            stewart_fill(n * n, 0, next);
         for (int i = 0; i < n * n; i++)
             sum[i] = next[i] + A1[i] / f[1] + A2[i] / f[2];
         for (int i = 0; i < n; i++)

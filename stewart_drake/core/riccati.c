@@ -37,11 +37,11 @@ static void mirror(int n, real *S)
             S[n * j + i] = S[n * i + j];
 }
 
-/* S <- S + X'Y of (n, n), where X'Y is symmetric. */
-static void add_symmetric(int n, const real *X, const real *Y, real *S)
+/* S <- S + X'Y of (k, n), where X'Y is symmetric. */
+static void add_symmetric(int n, int k, const real *X, const real *Y, real *S)
 {
     for (int i = 0; i < n; i += 2)
-        stewart_two_rows(STEWART_ADD, n, X + i, X + i + 1, n, Y, n, columns_below(i), S + n * i,
+        stewart_two_rows(STEWART_ADD, k, X + i, X + i + 1, n, Y, n, columns_below(i), S + n * i,
                          S + n * (i + 1));
     mirror(n, S);
 }
@@ -141,15 +141,98 @@ static real norm(int n, const real *A)
     return REAL(sqrt)(sum);
 }
 
-/* H from A, G and H, of which A and G are lost: the number of doublings, or 0.
+/* X <- L^-1 X (6, n), of a lower triangular L. */
+static void solve_lower(int n, const real *L, real *X)
+{
+    for (int i = 0; i < INPUTS; i++) {
+        for (int k = 0; k < i; k++)
+            reduce(n, 1, L[INPUTS * i + k], X + n * k, X + n * i);
+        reduce(n, 1 / L[(INPUTS + 1) * i], 0, X, X + n * i);
+    }
+}
+
+/* X <- L'^-1 X (6, n) */
+static void solve_upper(int n, const real *L, real *X)
+{
+    for (int i = INPUTS - 1; i >= 0; i--) {
+        for (int k = i + 1; k < INPUTS; k++)
+            reduce(n, 1, L[INPUTS * k + i], X + n * k, X + n * i);
+        reduce(n, 1 / L[(INPUTS + 1) * i], 0, X, X + n * i);
+    }
+}
+
+/* (R + B'P B) K = B'P A, with PA = P A and L L' = R + B'P B; returns 0 where there is no K. */
+static int gain(int n, const real *A, const real *B, const real *P, const real *R, real *PA,
+                real *L, real *K, stewart_scratch scratch)
+{
+    real *PB = stewart_take(&scratch, n * INPUTS);
+    stewart_multiply_transpose(n, n, INPUTS, P, B, PB);
+    stewart_multiply_transpose(INPUTS, n, INPUTS, B, PB, L);
+    for (int i = 0; i < INPUTS * INPUTS; i++)
+        L[i] += R[i];
+    if (!stewart_cholesky(INPUTS, L))
+        return 0;
+    stewart_multiply_transpose(n, n, n, P, A, PA);
+    stewart_multiply_transpose(INPUTS, n, n, B, PA, K);
+    solve_lower(n, L, K);
+    solve_upper(n, L, K);
+    return 1;
+}
+
+/* F = A - B K */
+static void close_loop(int n, const real *A, const real *B, const real *K, real *F)
+{
+    stewart_copy(n * n, A, F);
+    for (int i = 0; i < n; i += 2)
+        stewart_two_rows(STEWART_SUBTRACT, INPUTS, B + INPUTS * i, B + INPUTS * (i + 1), 1, K, n, n,
+                         F + n * i, F + n * (i + 1));
+}
+
+/* A_1, G_1 and H_1. As G_0 = B R^-1 B' is of rank 6, (R + B'Q B) K = B'Q A gives
+
+       W^-1 A = A - B K,   W^-1 G_0 = B (R + B'Q B)^-1 B'.
+
+   K is lost; returns 0 where R is not positive definite. */
+static int double_once(int n, const real *A, const real *B, const real *Q, const real *R, real *K,
+                       real *next, real *G, real *H, stewart_scratch scratch)
+{
+    real L[INPUTS * INPUTS], *QA = stewart_take(&scratch, n * n), *V = stewart_take(&scratch, n * n);
+    stewart_copy(INPUTS * INPUTS, R, L);
+    if (!stewart_cholesky(INPUTS, L))
+        return 0;
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < INPUTS; j++)
+            K[n * j + i] = B[INPUTS * i + j];
+    solve_lower(n, L, K);
+    stewart_fill(n * n, 0, G);
+    add_symmetric(n, INPUTS, K, K, G);
+    stewart_copy(n * n, Q, H);
+    if (!gain(n, A, B, Q, R, QA, L, K, scratch))
+        return 0;
+    close_loop(n, A, B, K, V);
+    add_symmetric(n, n, QA, V, H);
+    stewart_multiply(n, n, n, A, V, next);
+    stewart_multiply(n, n, INPUTS, A, B, V);
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < INPUTS; j++)
+            K[n * j + i] = V[INPUTS * i + j];
+    solve_lower(n, L, K);
+    add_symmetric(n, INPUTS, K, K, G);
+    return 1;
+}
+
+/* H from A_1, G_1 and H_1 in the place of A, G and H, of which A and G are lost: the number of
+   doublings, or 0.
 
    P - H_k = A_k' P (I + G_k P)^-1 A_k: no digit of P is missing once |A_k|^2 is that small. */
 static int doubled(int n, real *A, real *G, real *H, stewart_scratch scratch)
 {
     real *W = stewart_take(&scratch, n * n), *V = stewart_take(&scratch, n * n);
-    real *next = stewart_take(&scratch, n * n);
-    int pivot[STEWART_MAX_ORDER];
-    for (int count = 1; count <= DOUBLINGS; count++) {
+    real *next = stewart_take(&scratch, n * n), left = norm(n, A);
+    int pivot[STEWART_MAX_ORDER], count = 1;
+    for (; !(left < VANISHED); count++) {
+        if (!isfinite(left) || count == DOUBLINGS)
+            return 0;
         stewart_multiply_transpose(n, n, n, G, H, W);
         for (int i = 0; i < n; i++)
             W[(n + 1) * i] += 1;
@@ -158,44 +241,26 @@ static int doubled(int n, real *A, real *G, real *H, stewart_scratch scratch)
         stewart_copy(n * n, A, V);
         solve(n, W, pivot, 0, V); /* W^-1 A */
         stewart_multiply_transpose(n, n, n, H, V, next);
-        add_symmetric(n, A, next, H);
+        add_symmetric(n, n, A, next, H);
         transpose(n, A);
         stewart_multiply_transpose(n, n, n, A, V, next);
-        const real left = norm(n, next);
-        if (left < VANISHED)
-            return count;
-        if (!isfinite(left))
-            return 0;
+        left = norm(n, next);
+        if (left < VANISHED) /* G is not needed any more */
+            continue;
         stewart_copy(n * n, G, V);
         solve(n, W, pivot, 1, V); /* W^-1 G */
         stewart_multiply_transpose(n, n, n, V, A, W);
-        add_symmetric(n, A, W, G);
+        add_symmetric(n, n, A, W, G);
         stewart_copy(n * n, next, A);
     }
-    return 0;
-}
-
-/* (R + B'P B) K = B'P A and PA = P A; returns 0 where there is no K. */
-static int gain(int n, const real *A, const real *B, const real *P, const real *R, real *PA,
-                real *K, stewart_scratch scratch)
-{
-    real *PB = stewart_take(&scratch, n * INPUTS), *M = stewart_take(&scratch, INPUTS * INPUTS);
-    stewart_multiply_transpose(n, n, INPUTS, P, B, PB);
-    stewart_multiply_transpose(INPUTS, n, INPUTS, B, PB, M);
-    for (int i = 0; i < INPUTS * INPUTS; i++)
-        M[i] += R[i];
-    stewart_multiply_transpose(n, n, n, P, A, PA);
-    stewart_multiply_transpose(INPUTS, n, n, B, PA, K);
-    return stewart_solve(INPUTS, n, M, K);
+    return count;
 }
 
 /* |E| / |P|, E = Q + A'P F - P, and F = A - B K. */
 static real residual(int n, const real *A, const real *B, const real *Q, const real *P,
                      const real *PA, const real *K, real *F, real *E)
 {
-    stewart_multiply(n, INPUTS, n, B, K, F);
-    for (int i = 0; i < n * n; i++)
-        F[i] = A[i] - F[i];
+    close_loop(n, A, B, K, F);
     stewart_multiply_transpose(n, n, n, PA, F, E);
     for (int i = 0; i < n * n; i++)
         E[i] += Q[i] - P[i];
@@ -212,7 +277,7 @@ static void correct(int n, real *F, real *E, real *P, stewart_scratch scratch)
             E[n * j + i] = E[n * i + j] = (E[n * i + j] + E[n * j + i]) / 2;
     for (int count = 0; count < DOUBLINGS && norm(n, F) > (real)1e-3; count++) {
         stewart_multiply_transpose(n, n, n, E, F, product);
-        add_symmetric(n, F, product, E);
+        add_symmetric(n, n, F, product, E);
         stewart_multiply(n, n, n, F, F, product);
         stewart_copy(n * n, product, F);
     }
@@ -220,37 +285,30 @@ static void correct(int n, real *F, real *E, real *P, stewart_scratch scratch)
         P[i] += E[i];
 }
 
-int stewart_lqr_scratch(int n) { return 6 * n * n + INPUTS * INPUTS; }
+int stewart_lqr_scratch(int n) { return 6 * n * n; }
 
 int stewart_lqr(int n, const real *A, const real *B, const real *Q, const real *R, real *K, real *P,
                 stewart_scratch scratch)
 {
-    real *H = stewart_take(&scratch, n * n), *M = stewart_take(&scratch, INPUTS * INPUTS);
+    real L[INPUTS * INPUTS], *H = stewart_take(&scratch, n * n);
     stewart_scratch rest = scratch;
     real *G = stewart_take(&rest, n * n), *power = stewart_take(&rest, n * n);
-    for (int i = 0; i < n; i++) /* K as a place for R^-1 B' */
-        for (int j = 0; j < INPUTS; j++)
-            K[n * j + i] = B[INPUTS * i + j];
-    stewart_copy(INPUTS * INPUTS, R, M);
-    if (!stewart_solve(INPUTS, n, M, K))
+    if (!double_once(n, A, B, Q, R, K, power, G, H, rest))
         return 0;
-    stewart_multiply(n, INPUTS, n, B, K, G);
-    stewart_copy(n * n, A, power);
-    stewart_copy(n * n, Q, H);
     const int count = doubled(n, power, G, H, rest);
     if (!count)
         return 0;
     rest = scratch;
     real *PA = stewart_take(&rest, n * n), *F = stewart_take(&rest, n * n);
     real *E = stewart_take(&rest, n * n);
-    if (!gain(n, A, B, H, R, PA, K, rest))
+    if (!gain(n, A, B, H, R, PA, L, K, rest))
         return 0;
     const real left = residual(n, A, B, Q, H, PA, K, F, E);
     if (!(left <= LARGEST_RESIDUAL)) /* or NaN */
         return 0;
     if (left > NOTED_RESIDUAL) {
         correct(n, F, E, H, rest);
-        if (!gain(n, A, B, H, R, PA, K, rest))
+        if (!gain(n, A, B, H, R, PA, L, K, rest))
             return 0;
     }
     if (P)
