@@ -7,7 +7,7 @@ import pytest
 
 from stewart_drake.reporting import terminal
 from tests.browser import Browser, browser
-from tests.pictures import leave_blank
+from tests.shorter import leave_blank
 
 # A shell that runs the tests in the background lets them ignore Ctrl-C, and the commands that they
 # start would inherit that; those are tested for what they do on Ctrl-C.

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.shorter import judge_few_delays
+
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
 FOLDER = Path(__file__).resolve().parents[1] / "analysis"
@@ -27,7 +29,8 @@ def check(folder, answer):
 @pytest.mark.parametrize(
     ("name", "less"), [("delay", {"simulations": False}), ("hautus", {}), ("workspace", {})]
 )
-def test_a_script_answers_its_question(name, less, tmp_path, capsys):
+def test_a_script_answers_its_question(name, less, tmp_path, capsys, monkeypatch):
+    judge_few_delays(monkeypatch)
     small = ("plant.kind=exact", "duration=0.5", "delay.steps=2", "controller.catch_up=0")
     answer = script(name).main("paper", *small, out=str(tmp_path), **less)
     assert str(answer) in capsys.readouterr().out

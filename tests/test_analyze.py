@@ -2,7 +2,6 @@
 
 import json
 import math
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,12 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.scenario.reference_config import HoldConfig, SineConfig, WaypointsConfig
 from stewart_drake.studies import delay_limits, delay_map, hautus
-from stewart_drake.studies.delay_loop import loop_margins
 from stewart_drake.studies.delay_map import Cell, map_delays, scaled_motion
 from stewart_drake.studies.runs import run_scenario
 from stewart_drake.studies.verdict import delay_verdict
 from tests.mechanisms import PAPER
 from tests.screen import too_long
+from tests.shorter import judge_few_delays
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -32,8 +31,7 @@ TOO_FAR = "reference.amplitude=[0.26, 0.26, 0.26, 0.02, 0.02, 0.2]"
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three delays instead of thirty, and no simulations; those have their own tests."""
-    monkeypatch.setattr(hautus, "LONGEST", 2)
-    monkeypatch.setattr(delay_limits, "loop_margins", partial(loop_margins, delays=()))
+    judge_few_delays(monkeypatch)
     cells = [Cell(8, 1.0, "completed", 21.0, math.nan), Cell(0, 1.0, "left_workspace", math.nan, 1)]
     cells += [
         Cell(0, 1.25, "out_of_reach", math.nan, 1),

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from tests.shorter import judge_few_delays
+
 FOLDER = Path(__file__).resolve().parents[1] / "analysis"
 NOTEBOOKS = ("first_hour.ipynb", "lost_log.ipynb", "own_controller.ipynb")
 
@@ -41,7 +43,8 @@ def test_outputs_are_not_committed(name):
 
 
 @pytest.mark.slow
-def test_the_first_hour_shows_figures_and_pages(capsys):
+def test_the_first_hour_shows_figures_and_pages(capsys, monkeypatch):
+    judge_few_delays(monkeypatch)
     names, shown = run("first_hour.ipynb")
     assert len(shown) >= 6
     assert sum("<img" in text for text in shown) == 1

@@ -20,6 +20,7 @@ from stewart_drake.reporting import (
 )
 from stewart_drake.reporting import report as report_document
 from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, LABELS, SERVOS
+from tests.shorter import judge_few_delays
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -55,7 +56,7 @@ def test_a_failure_while_drawing_costs_the_figures_only(
     arguments, module, name, kept, tmp_path, monkeypatch, capsys
 ) -> None:
     monkeypatch.setattr(joblib, "cpu_count", lambda: 1)  # so that no process has to start
-    monkeypatch.setattr("stewart_drake.studies.hautus.LONGEST", 2)
+    judge_few_delays(monkeypatch)
     monkeypatch.setattr(module, name, broken(tmp_path))
     assert main([*arguments, "--quiet", "--out", str(tmp_path)]) == 0
     out, err = capsys.readouterr()

@@ -16,7 +16,7 @@ from stewart_drake.cli import main
 from stewart_drake.reporting import report
 from stewart_drake.studies import delay_limits
 from tests import test_docs
-from tests.pictures import leave_blank
+from tests.shorter import judge_few_delays, leave_blank
 from tests.test_report import BLANK
 
 TUTORIAL = test_docs.ROOT / "docs" / "tutorial.md"
@@ -36,6 +36,7 @@ def do(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     # Its simulations over delay and amplitude have tests of their own, and take a while.
     monkeypatch.setattr(delay_limits, "delay_map", lambda *_: ([], False))
+    judge_few_delays(monkeypatch)
     # The report's pieces in this process, which has loaded everything: tests/test_report_stopped.py
     # has processes.
     monkeypatch.setattr(joblib, "cpu_count", lambda: 1)

@@ -1,0 +1,40 @@
+"""Work that a test leaves out where it looks at other results."""
+
+import io
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+
+@cache
+def blank(kind: str) -> bytes:
+    """Return an empty picture."""
+    from matplotlib.figure import Figure
+
+    stream = io.BytesIO()
+    Figure((3, 2)).savefig(stream, format=kind)
+    return stream.getvalue()
+
+
+def leave_blank(patch: pytest.MonkeyPatch) -> None:
+    """Save figures without drawing them, which takes four seconds for one run."""
+    pictures = {kind: blank(kind) for kind in ("png", "svg")}
+
+    def save(_: object, to: Any, format: str, **options: Any) -> None:
+        if isinstance(to, str | Path):
+            Path(to).write_bytes(pictures[format])
+        else:
+            to.write(pictures[format])
+
+    patch.setattr("matplotlib.figure.Figure.savefig", save)
+
+
+def judge_few_delays(patch: pytest.MonkeyPatch) -> None:
+    """Analyse the loop for three delays and for its own, in the place of thirty."""
+    from stewart_drake.studies.delay_loop import loop_margins
+
+    patch.setattr("stewart_drake.studies.hautus.LONGEST", 2)
+    few = partial(loop_margins, delays=())
+    patch.setattr("stewart_drake.studies.delay_limits.loop_margins", few)
