@@ -14,11 +14,12 @@ from pydrake.systems.framework import (
     State,
 )
 
+from stewart_drake.core.link import Link
 from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import crank_angles_along
 from stewart_drake.scenario.fault_config import SPIKE
-from stewart_drake.scenario.link import newest_measurements
+from stewart_drake.scenario.link import TOGETHER
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, NUM_STATE, POSE
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
@@ -173,7 +174,7 @@ class LateMeasurements(LeafSystem):
     With y_j what is measured at j dt, which takes tau_j, and n_k the newest j with
     j dt + tau_j <= k dt:
 
-    Update:  at k dt  taken <- [taken without its oldest; y_k].
+    Update:  at k dt  y_k is under way.
     Output:  measurement = y_{n_k}, age = (k - n_k) dt, where n_k is newer than n_{k-1}; else all
              NaN and age = 0. One that was overtaken is dropped.
 
@@ -191,40 +192,46 @@ class LateMeasurements(LeafSystem):
 
     def __init__(self, period: float, times: Array, size: int) -> None:
         super().__init__()
-        self._period, self._size = period, size
-        self._given = newest_measurements(np.asarray(times, dtype=np.float64), period)
-        ages = np.where(self._given >= 0, np.arange(len(self._given)) - self._given, 0)
-        self._kept = max(1, int(ages.max(initial=0)))
-        self._taken = self.DeclareDiscreteState(np.full(self._kept * size, np.nan))
+        self._times, self._period = np.asarray(times, dtype=np.float64), period
+        longest = self._times.max(initial=0.0, where=np.isfinite(self._times))
+        kept, together = int(longest / period) + 2, TOGETHER * period
+        self._link = Link(size, kept, period, wire=True, together=together)
+        self._memory = self.DeclareDiscreteState(self._link.start())
         self._measured = self.DeclareVectorInputPort("measured", size)
         self.DeclareVectorOutputPort("measurement", size, weak(self._measurement))
-        self.DeclareVectorOutputPort("age", 1, weak(self._age), {self.time_ticket()})
+        self.DeclareVectorOutputPort("age", 1, weak(self._age))
         update_every(self, period, self._take)
 
-    def _take(self, context: Context, state: State) -> None:
-        taken = context.get_discrete_state(self._taken).value()
-        moved = np.concatenate([taken[self._size :], self._measured.Eval(context)])
-        state.get_mutable_discrete_state(self._taken).SetFromVector(moved)
-
-    def _periods(self, context: Context) -> int | None:
-        """How old what is handed on is, in samples; None for nothing."""
+    def _now(self, context: Context) -> Array:
+        """Return the memory of the link, with what is measured now whether or not it is taken."""
+        memory = np.array(context.get_discrete_state(self._memory).value())
         k = round(context.get_time() / self._period)
-        if k >= len(self._given) or self._given[k] < 0:
-            return None
-        return int(k - self._given[k])
+        if self._link.number(memory, "taken") == k:
+            waits = self._times[k] if k < len(self._times) else np.inf
+            now, y = k * self._period, np.asarray(self._measured.Eval(context))
+            self._link.take(memory, now, k + 1, now + waits, y[None])
+            if self._link.next_change(memory) <= now + TOGETHER * self._period:
+                self._link.change(memory, now)
+        return memory
+
+    def _take(self, context: Context, state: State) -> None:
+        state.get_mutable_discrete_state(self._memory).SetFromVector(self._now(context))
+
+    def _given(self, memory: Array) -> Array | None:
+        """Return what arrived in the last period, or None."""
+        arrived, begun = self._link.acted(memory)[0], self._link.number(memory, "taken") - 2
+        there = self._link.number(memory, "acted") > 0
+        new = arrived[0] > (begun + TOGETHER) * self._period
+        return arrived[1:] if there and new else None
 
     def _measurement(self, context: Context, output: BasicVector) -> None:
-        periods = self._periods(context)
-        if periods is None:
-            output.SetFromVector(np.full(self._size, np.nan))
-        elif periods == 0:
-            output.SetFromVector(self._measured.Eval(context))
-        else:
-            taken = context.get_discrete_state(self._taken).value()
-            output.SetFromVector(taken.reshape(-1, self._size)[-periods])
+        given = self._given(self._now(context))
+        output.SetFromVector(np.full(self._link.size, np.nan) if given is None else given)
 
     def _age(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([self._period * (self._periods(context) or 0)])
+        memory = self._now(context)
+        behind = self._link.number(memory, "taken") - self._link.number(memory, "newest")
+        output.SetFromVector([0.0 if self._given(memory) is None else behind * self._period])
 
 
 _PHASES: Final = 7

@@ -115,22 +115,6 @@ def measurement_times(scenario: Scenario) -> Array:
     return sensor_times(scenario, n) + return_times(scenario, n)
 
 
-def newest_measurements(times: Array, period: float) -> NDArray[np.int64]:
-    """(n,) which measurement the controller gets at each of n samples, -1 for none.
-
-    It is the newest that has arrived by then, and none where that was given before: measurements
-    that were overtaken are dropped.
-    """
-    n = len(times)
-    # In samples; the tolerance is that of times which are whole numbers of periods.
-    ready = np.arange(n) + np.ceil(times / period - 1e-9)
-    newest = np.full(n, -1)
-    there = np.flatnonzero(ready < n)
-    np.maximum.at(newest, ready[there].astype(int), there)
-    so_far = np.maximum.accumulate(newest)
-    return np.where(newest > np.append(-1, so_far[:-1]), newest, -1)
-
-
 def link_text(scenario: Scenario) -> str | None:
     """Return the assumed network in a few words, None for a wire."""
     link = scenario.assumed_link
