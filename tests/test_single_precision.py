@@ -1,0 +1,121 @@
+"""The filters compiled in single precision against themselves in double, along a recorded run."""
+
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cffi import FFI
+
+import stewart_drake as sd
+from stewart_drake.core import build, library
+from stewart_drake.core.layout import geometry_of
+from stewart_drake.law.encoder_sensing import EncoderSensing
+from stewart_drake.law.parameter_filter import ParameterFilter, gate
+from stewart_drake.types import Array
+
+SOURCES = ("dynamics", "machine", "matrix", "kalman", "kinematics", "sensing", "filter")
+
+
+class Single:
+    """The core in single precision, and numbers for it."""
+
+    def __init__(self, folder: Path) -> None:
+        made = folder / "single.so"
+        sources = [str(build.FOLDER / f"{name}.c") for name in SOURCES]
+        compiler = build.compiler() or pytest.skip("needs a C compiler")
+        options = ["-std=c99", "-O1", "-DSTEWART_FLOAT", "-fPIC", "-shared", "-o", str(made)]
+        subprocess.run([*compiler, *options, *sources, "-lm"], check=True)
+        self.ffi, self._kept = FFI(), list[Array]()
+        self.ffi.cdef(library.declarations().replace("typedef double real", "typedef float real"))
+        self.lib: Any = self.ffi.dlopen(os.fspath(made))
+
+    def at(self, values: Any) -> Any:
+        """Pointer to numbers that stay."""
+        self._kept.append(np.array(values, np.float32, order="C"))
+        return self.ffi.from_buffer("float[]", self._kept[-1])
+
+    def filter(self, one: ParameterFilter) -> Any:
+        """`stewart_filter` of a filter of eight parameters."""
+        new, dynamics, known = self.ffi.new, one.dynamics, one.settings.parameters
+        machine, sensing = new("stewart_machine *"), one.sensing
+        machine.geometry = list(geometry_of(dynamics.mechanism))
+        machine.parameters, machine.gravity = list(dynamics.plant_parameters), dynamics.gravity
+        machine.estimated, machine.place = 8, list(range(8))
+        it, free = new("stewart_filter *"), np.full(12, np.inf)
+        if isinstance(sensing, EncoderSensing):
+            sensor = new("stewart_encoders *")
+            sensor.geometry = self.at(geometry_of(dynamics.mechanism))
+            sensor.noise_std = self.at(sensing.noise_std)
+            sensor.samples, sensor.nodes = sensing.samples, len(sensing.shares)
+            sensor.quantum, sensor.std = sensing.quantum, sensing.std
+            for name in ("shares", "declared", "rates_std", "motion", "offset"):
+                setattr(sensor, name, list(getattr(sensing, name)))
+            made, it.encoders = self.lib.stewart_encoder_sensing(sensor), sensor
+        else:
+            sensor = new("stewart_state_sensor *")
+            sensor.noise_std = list(sensing.noise_std)
+            made = self.lib.stewart_state_sensing(sensor)
+        seen = new("stewart_sensing *", made)
+        self._kept += [machine, sensor, seen]
+        it.machine, it.sensing, it.offsets, it.gate = machine, seen, -1, gate(sensing.size)
+        it.timing_std, it.model_std = one.settings.timing_std, self.at(one.settings.model_std)
+        it.prior_root, it.usual_std = self.at(np.diag(known.std)), self.at(known.usual_std)
+        it.lower = self.at([*-free, *known.lower])
+        it.upper = self.at([*free, *known.upper])
+        return it
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory: pytest.TempPathFactory) -> Single:
+    """Compiled once."""
+    return Single(tmp_path_factory.mktemp("single"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        ("sensor.loss=0.001", "plant.payload_mass=0.3"),
+        ("sensor.kind=encoders",),
+        ("sensor.kind=encoders", "sensor.bits=null"),
+        ("sensor.kind=encoders", "sensor.bits=16", "sensor.samples=20"),
+    ],
+)
+def test_a_filter_is_right_to_a_share_of_its_deviation(
+    sensor: tuple[str, ...], single: Single, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every estimate to 3 % of its standard deviation, which is that of double to 0.1 %."""
+    calls: list[tuple[Any, ...]] = []
+    advance = ParameterFilter.advance
+
+    def recorded(one: ParameterFilter, *given: Any) -> Any:
+        calls.append((one, *given, advance(one, *given)))
+        return calls[-1][-1]
+
+    monkeypatch.setattr(ParameterFilter, "advance", recorded)
+    sd.simulate(sd.load_scenario("paper", None, ("duration=4", *sensor)), judge_stability=False)
+    before = None
+    filter_, m = single.filter(calls[0][0]), calls[0][0].sensing.size
+    for one, estimate, period, measurement, after in calls:
+        if before is None or estimate.mean is not before:  # another run: the law warms up
+            n = len(estimate.mean)
+            root = np.linalg.cholesky(estimate.covariance + 1e-30 * np.eye(n))
+            counts = (estimate.outliers, estimate.unseen, 0)
+            memory = np.array([*estimate.mean, *root.ravel(), *estimate.outlier, *counts], "f4")
+        acting = [len(period.torques), *map(single.at, period[:2]), period.substeps]
+        acted = single.ffi.new("stewart_acted *", [acting, single.at(period.following)])
+        history = single.ffi.new("stewart_history *", list(map(single.at, one._before())))
+        values = single.ffi.NULL if measurement is None else single.at(measurement.known(m))
+        number = single.lib.stewart_filter_scratch(filter_, len(period.torques))
+        given = (filter_, acted, values, history, single.ffi.from_buffer("float[]", memory))
+        single.lib.stewart_filter_advance(*given, [single.ffi.new("float[]", number)])
+        L = memory[n : n + n * n].reshape(n, n).astype(np.float64)
+        std = np.sqrt(np.diag(after.covariance))
+        assert np.all(np.abs(memory[:n] - after.mean) <= 0.03 * std)
+        assert np.sqrt(np.sum(L**2, axis=1)) == pytest.approx(std, rel=1e-3)
+        assert memory[-3] == after.outliers
+        before = after.mean
+    assert len(calls) > 30
