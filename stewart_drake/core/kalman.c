@@ -11,13 +11,68 @@
 #define ROUNDING ((real)1e-13)
 #endif
 
+/* A reflection of one column x of [row; W], rows of W being n numbers apart, by v = [v; f]:
+
+       s = v'x / beta,   x <- x - s v. */
+static void reflect(int n, int m, real v, const real *f, real beta, real *row, real *W)
+{
+    real s = v * *row;
+    for (int i = 0; i < m; i++)
+        s += f[n * i] * W[n * i];
+    s /= beta;
+    *row -= v * s;
+    for (int i = 0; i < m; i++)
+        W[n * i] -= f[n * i] * s;
+}
+
+/* The same of six columns, with sums that have names: see stewart_two_rows. */
+static void reflect_six(int n, int m, real v, const real *f, real beta, real *row, real *W)
+{
+    const real *last = f + n * (m - 1), *g = f, *w = W;
+    real s0 = v * row[0], s1 = v * row[1], s2 = v * row[2];
+    real s3 = v * row[3], s4 = v * row[4], s5 = v * row[5];
+    for (;; g += n, w += n) {
+        s0 += *g * w[0];
+        s1 += *g * w[1];
+        s2 += *g * w[2];
+        s3 += *g * w[3];
+        s4 += *g * w[4];
+        s5 += *g * w[5];
+        if (g == last)
+            break;
+    }
+    s0 /= beta;
+    s1 /= beta;
+    s2 /= beta;
+    s3 /= beta;
+    s4 /= beta;
+    s5 /= beta;
+    row[0] -= v * s0;
+    row[1] -= v * s1;
+    row[2] -= v * s2;
+    row[3] -= v * s3;
+    row[4] -= v * s4;
+    row[5] -= v * s5;
+    for (;; f += n, W += n) {
+        const real g0 = *f;
+        W[0] -= g0 * s0;
+        W[1] -= g0 * s1;
+        W[2] -= g0 * s2;
+        W[3] -= g0 * s3;
+        W[4] -= g0 * s4;
+        W[5] -= g0 * s5;
+        if (f == last)
+            break;
+    }
+}
+
 /* Householder reflections of row k of R and all rows of W make column k of W zero. */
 void stewart_absorb(int n, int m, real *R, real *W, stewart_scratch scratch)
 {
-    real *restrict product = stewart_take(&scratch, n);
-    for (int k = 0; k < n; k++) {
-        real *restrict row = R + n * k;
-        real square = row[k] * row[k];
+    (void)scratch;
+    for (int k = 0; k < n && m > 0; k++) {
+        real *row = R + n * k, square = row[k] * row[k];
+        int j = k + 1;
         for (int i = 0; i < m; i++)
             square += W[n * i + k] * W[n * i + k];
         real alpha = REAL(sqrt)(square);
@@ -26,24 +81,10 @@ void stewart_absorb(int n, int m, real *R, real *W, stewart_scratch scratch)
         const real v = row[k] - alpha, beta = -v * alpha; /* |v|^2 / 2 of v = column - alpha e1 */
         if (beta == 0) /* the column is 0 already; NaN stays NaN */
             continue;
-        for (int j = k + 1; j < n; j++)
-            product[j] = v * row[j];
-        for (int i = 0; i < m; i++) {
-            const real *restrict w = W + n * i;
-            const real f = w[k];
-            for (int j = k + 1; j < n; j++)
-                product[j] += f * w[j];
-        }
-        for (int j = k + 1; j < n; j++) {
-            product[j] /= beta;
-            row[j] -= v * product[j];
-        }
-        for (int i = 0; i < m; i++) {
-            real *restrict w = W + n * i;
-            const real f = w[k];
-            for (int j = k + 1; j < n; j++)
-                w[j] -= f * product[j];
-        }
+        for (; j + 6 <= n; j += 6)
+            reflect_six(n, m, v, W + k, beta, row + j, W + j);
+        for (; j < n; j++)
+            reflect(n, m, v, W + k, beta, row + j, W + j);
         row[k] = alpha;
     }
 }
@@ -223,19 +264,15 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
         const int m = filter->rows(filter->model, xi, e, H, scratch);
         if (m < 0)
             return 0;
-        for (int i = 0; i < m; i++) {
-            const real *h = H + n * i;
-            real *w = W + N * i;
-            stewart_fill(N, 0, w);
-            w[n] = e[i];
-            for (int k = 0; k < n; k++) {
-                if (h[k] == 0)
-                    continue;
-                w[n] += h[k] * (xi[k] - filter->mean[k]);
-                for (int j = 0; j < n; j++)
-                    w[j] += h[k] * filter->root[n * k + j];
-            }
+        for (int k = 0; k < n; k++)
+            moved[k] = xi[k] - filter->mean[k];
+        for (int i = 0; i < m; i += 2) { /* the last of an odd number of rows twice */
+            const real *h = H + n * i, *next = i + 1 < m ? h + n : h;
+            real *w = W + N * i, *other = i + 1 < m ? w + N : w;
+            stewart_two_rows(STEWART_SET, n, h, next, 1, filter->root, n, n, w, other);
         }
+        for (int i = 0; i < m; i++)
+            W[N * i + n] = e[i] + dot(n, H + n * i, moved);
         stewart_fill(N * N, 0, R);
         for (int i = 0; i < n; i++)
             R[(N + 1) * i] = 1;
