@@ -264,34 +264,21 @@ def changed(row: int, text: str) -> str:
 BAD_CSV = {
     "empty": ("", ["is empty", "time[s]"]),
     "no header": ("\n".join(GOOD_ROWS), ["row 1", "'0.0'", "a header time[s]"]),
-    "header only": (HEADER, ["got 0 samples", "at least 4"]),
     "three rows": ("\n".join([HEADER, *GOOD_ROWS[:3]]), ["got 3 samples", "at least 4"]),
-    "one row": ("\n".join([HEADER, GOOD_ROWS[0]]), ["got 1 sample;", "at least 4"]),
     "semicolons": (HEADER.replace(",", ";"), ["row 1", "separated by ';'", "expected commas"]),
-    "tabs": (HEADER.replace(",", "\t"), ["row 1", "separated by '\\t'", "expected commas"]),
     "decimal commas": (changed(1, "0,1,0,0,0,0,0,0,38"), ["row 3", "got 9 cells", "a point for"]),
     "no units": ("time,roll,pitch,yaw,x,y,z", ["row 1", "unknown column 'time'"]),
     "odd unit": (HEADER.replace("x[m]", "x[ft]"), ["row 1", "'x[ft]'", "x in m or mm"]),
-    "odd time unit": (HEADER.replace("[s]", "[ms]"), ["row 1", "'time[ms]'", "time in s"]),
     "missing column": (HEADER.replace(",z[m]", ""), ["row 1", "column z is missing"]),
     "column twice": (HEADER.replace("y[m]", "x[mm]"), ["row 1", "a second column 'x[mm]'"]),
     "extra column": (HEADER + ",w[m]", ["row 1", "unknown column 'w[m]'"]),
     "short row": (changed(2, "0.2,0,0"), ["row 4", "got 3 cells", "7"]),
-    "long row": (changed(2, "0.2,0,0,0,0,0,0.38,"), ["row 4", "got 8 cells"]),
     "text": (changed(2, "0.2,0,abc,0,0,0,0.38"), ["row 4", "pitch[rad]", "'abc'", "a number"]),
-    "empty cell": (changed(2, "0.2,0,,0,0,0,0.38"), ["row 4", "pitch[rad]", "''"]),
     "nan": (changed(3, "0.3,0,0,nan,0,0,0.38"), ["row 5", "yaw[rad]", "nan", "finite"]),
-    "inf": (changed(3, "0.3,0,0,0,0,0,-inf"), ["row 5", "z[m]", "-inf", "finite"]),
-    "nan time": (changed(3, "nan,0,0,0,0,0,0.38"), ["row 5", "time[s]", "nan", "finite"]),
     "late start": (changed(0, "0.05,0,0,0,0,0,0.38"), ["row 2", "time[s]", "0.05", "subtract"]),
     "time twice": (changed(2, "0.1,0,0,0,0,0,0.38"), ["row 4", "time[s]", "0.1 after 0.1"]),
-    "time back": (changed(2, "-1,0,0,0,0,0,0.38"), ["row 4", "time[s]", "-1.0 after 0.1"]),
     "gap": (changed(5, "9,0,0,0,0,0,0.38"), ["row 7", "time[s]", "8.6 s", "resampling"]),
     "pitch in degrees": (changed(1, "0.1,0,5,0,0,0,0.38"), ["row 3", "pitch[rad]", "90 degrees"]),
-    "pitch of 95 degrees": (
-        changed(1, "0.1,0,95,0,0,0,0.38").replace("pitch[rad]", "pitch[deg]"),
-        ["row 3", "pitch[deg]: got 95 deg; expected a pitch within 90 deg"],
-    ),
     "yaw jumps in degrees": (
         changed(1, "0.1,0,0,355,0,0,0.38").replace("yaw[rad]", "yaw[deg]"),
         ["row 3", "yaw[deg]: got 355 deg after 0; expected no jump by a turn"],
@@ -300,7 +287,6 @@ BAD_CSV = {
         changed(1, "0.1,0,0,0,0,0,-2e6").replace("z[m]", "z[mm]"),
         ["row 3", "z[mm]: got -2000000.0; expected a finite number below 1e+06 mm"],
     ),
-    "yaw jumps": (changed(1, "0.1,0,0,6.2,0,0,0.38"), ["row 3", "yaw[rad]", "unwrap"]),
     "open quote": (changed(1, '"0.1,0,0,0,0,0,0.38'), ["row 7", "is not CSV"]),
     "moving end": (MOVING, ["last row", " x at 0.5 s", "duration"]),
     "glitch": (
@@ -310,15 +296,6 @@ BAD_CSV = {
     "jump": (
         "\n".join([HEADER, *(f"{t / 10},0,{0.2 * (t > 5)},0,0,0,0.38" for t in range(12))]),
         ["pitch[rad]", "0.1 rad off", "smooth"],
-    ),
-    "jump in degrees": (
-        "\n".join(
-            [
-                HEADER.replace("pitch[rad]", "pitch [ deg ]"),
-                *(f"{t / 10},0,{8 * (t > 5)},0,0,0,0.38" for t in range(12)),
-            ]
-        ),
-        ["pitch [ deg ]", "got 4 deg off", "smooth"],
     ),
     "too few samples": (
         "\n".join([HEADER, *(f"{t},0,0,0,{math.sin(1.5 * t)},0,0" for t in range(20))]),
