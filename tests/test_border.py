@@ -1,7 +1,6 @@
 """The public border: shapes and values that are refused, and what can be copied and sent."""
 
 import copy
-import multiprocessing
 import pickle
 from pathlib import Path
 
@@ -99,13 +98,6 @@ def test_a_copy_of_the_dynamics_is_as_good(again) -> None:
             np.testing.assert_array_equal(a, b)
         other.parameters[0] = 7.0
         assert dynamics.parameters[0] == 0.0
-
-
-def test_the_dynamics_can_be_sent_to_another_process() -> None:
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        (sent,) = pool.map(work, [DYNAMICS])
-    for a, b in zip(work(DYNAMICS), sent, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_a_mechanism_that_was_sent_is_the_same() -> None:
