@@ -23,7 +23,6 @@
 #define FEW 4        /* once it is known */
 #define TRIED 15     /* values of the delay that are tried before the iterations of a vague one */
 #define DIFFERENCE ((real)1e-3) /* s */
-#define SMALL ((real)0.1)  /* standard deviations; a shorter correction ends the iterations */
 #define KNOWN ((real)0.01) /* a parameter is known at this share of its usual standard deviation */
 #define MEMORY 5           /* s over which the timing of single torques is judged */
 #define UNTIMELY ((real)0.05) /* periods by which a torque may come early or late at the most */
@@ -122,7 +121,8 @@ int stewart_period_scratch(int p, int flights)
 
 int stewart_delay_advance_scratch(int p, int m, int flights)
 {
-    const int n = X + p + 2, own = (4 * n + MOST + 2 * X + 1 + m) * n + (m + 2 * X + 2) * m + X;
+    const int n = X + p + 2, own = (4 * n + MOST + 2 * X + 1 + m) * n + (m + X + 1 + MOST) * m
+        + 2 * X + (U + 1) * (flights + 3); /* L, the model and `attempt` */
     const int tried = (X + 1) * n + (X + 1 + n) * m, judged = (n + m + MOST) * m;
     const int update = stewart_kalman_scratch(n, m);
     const int more = tried > update ? tried : update, period = stewart_period_scratch(p, flights);
@@ -223,65 +223,34 @@ int stewart_period_late(const stewart_period *t, const real *xi, const real *sta
 
 /* A period linearised at xi, and how its end is seen. */
 typedef struct {
+    stewart_instant instant;
     const stewart_period *period;
-    const real *y, *mean; /* (m) measured; (n) prior */
+    const real *mean;    /* (n) prior */
+    Way way;             /* the last one */
     int m, n, exact, rows, others;
-    real state[X];
-    real *H;             /* (12, n) */
     real *first;         /* state and H about the prior, for all attempts */
     real K[X * MOST];    /* see stewart_period_late */
     real drift[X];       /* standard deviations of the model's other errors */
-    real *C;             /* (m, m) root of the covariance of the noise, the model's error too */
-    real *small;         /* (m) */
-    real *J;             /* (m, 12) */
-    real *seen, *white;  /* (m, n) C^-1 J H, and (m) C^-1 nu, nu the innovation about the prior */
-    real *nu;
+    real *seen;          /* (m, rows) J K' where the noise is taken */
+    real *white, *nu;    /* (m, n) C^-1 J H, and (m) C^-1 nu, nu the innovation about the prior */
 } Model;
 
-static const stewart_sensing *sensing_of(const Model *a) { return a->period->delay->sensing; }
-
-void stewart_seen_jacobian(const stewart_sensing *sensing, const real *state, real *J)
+static int predict_model(void *about, const real *xi, real *state)
 {
-    if (sensing->seen) {
-        sensing->jacobian(sensing, state, J);
-        return;
-    }
-    stewart_fill(X * X, 0, J);
-    for (int i = 0; i < X; i++)
-        J[(X + 1) * i] = 1;
+    Model *a = about;
+    return predict(a->period, xi, &a->way, state);
 }
 
-void stewart_seen(const stewart_sensing *sensing, const real *state, real *y)
+static int linearize_model(void *about, const real *xi, real *H, stewart_scratch scratch)
 {
-    if (sensing->seen)
-        sensing->seen(sensing, state, y);
-    else
-        stewart_copy(X, state, y);
-}
-
-void stewart_whiten(int m, int n, const real *C, real *B)
-{
-    for (int i = 0; i < m; i++) {
-        real *row = B + n * i;
-        for (int k = 0; k < i; k++)
-            for (int j = 0; j < n; j++)
-                row[j] -= C[m * i + k] * B[n * k + j];
-        for (int j = 0; j < n; j++)
-            row[j] /= C[m * i + i];
-    }
+    Model *a = about;
+    return linearize_along(a->period, xi, &a->way, a->exact, H, scratch);
 }
 
 static int rows(void *about, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
     Model *a = about;
-    (void)scratch;
-    stewart_seen(sensing_of(a), a->state, e);
-    stewart_seen_jacobian(sensing_of(a), a->state, a->J);
-    stewart_multiply(a->m, X, a->n, a->J, a->H, H);
-    for (int i = 0; i < a->m; i++)
-        e[i] = a->y[i] - e[i];
-    stewart_whiten(a->m, a->n, a->C, H);
-    stewart_whiten(a->m, 1, a->C, e);
+    stewart_instant_rows(&a->instant, xi, e, H, scratch);
     stewart_copy(a->m * a->n, H, a->white);
     for (int i = 0; i < a->m; i++) {
         a->nu[i] = e[i];
@@ -289,68 +258,6 @@ static int rows(void *about, const real *xi, real *e, real *H, stewart_scratch s
             a->nu[i] += H[a->n * i + j] * (xi[j] - a->mean[j]);
     }
     return a->m;
-}
-
-/* Whether a difference of states is small as the sensor sees it. */
-static int is_small(Model *a, const real *state, const real *difference)
-{
-    stewart_seen_jacobian(sensing_of(a), state, a->J);
-    for (int i = 0; i < a->m; i++) {
-        real sum = 0;
-        for (int j = 0; j < X; j++)
-            sum += a->J[X * i + j] * difference[j];
-        if (!(REAL(fabs)(sum) <= a->small[i])) /* or NaN */
-            return 0;
-    }
-    return 1;
-}
-
-/* What linearising leaves out is of second order: negligible for a small correction. */
-static int settle(void *about, const real *xi, const real *better, stewart_scratch scratch)
-{
-    Model *a = about;
-    real shift[X], linear[X], end[X];
-    for (int i = 0; i < X; i++) {
-        shift[i] = 0;
-        for (int j = 0; j < a->n; j++)
-            shift[i] += a->H[a->n * i + j] * (better[j] - xi[j]);
-        linear[i] = a->state[i] + shift[i];
-    }
-    if (is_small(a, a->state, shift)) {
-        stewart_copy(X, linear, a->state);
-        return 1;
-    }
-    Way way = take_way(a->period, &scratch);
-    if (!predict(a->period, better, &way, end))
-        return -1;
-    for (int i = 0; i < X; i++)
-        shift[i] = end[i] - linear[i];
-    if (is_small(a, end, shift)) {
-        stewart_copy(X, end, a->state);
-        return 1;
-    }
-    stewart_copy(X, end, a->state);
-    return linearize_along(a->period, better, &way, a->exact, a->H, scratch) ? 0 : -1;
-}
-
-int stewart_seen_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
-                      const real *std, real *C, stewart_scratch scratch)
-{
-    const int m = sensing->size;
-    real *J = stewart_take(&scratch, m * X), *JA = stewart_take(&scratch, m * k);
-    stewart_seen_jacobian(sensing, state, J);
-    stewart_multiply_by_transpose(m, X, k, J, A, JA);
-    stewart_multiply_by_transpose(m, k, m, JA, JA, C);
-    for (int i = 0; i < m; i++)
-        for (int l = 0; l < X; l++)
-            J[X * i + l] *= std[l];
-    for (int i = 0; i < m; i++) {
-        for (int j = 0; j < m; j++)
-            for (int l = 0; l < X; l++)
-                C[m * i + j] += J[X * i + l] * J[X * j + l];
-        C[(m + 1) * i] += sensing->noise_std[i] * sensing->noise_std[i];
-    }
-    return stewart_cholesky(m, C);
 }
 
 static real timing_of(const stewart_delay *d, const stewart_guess *guess)
@@ -371,8 +278,8 @@ static real deviation(int n, const real *L, int i)
 static int set_noise(Model *a, const real *xi, real used, stewart_scratch scratch)
 {
     const stewart_delay *d = a->period->delay;
-    a->rows = stewart_period_late(a->period, xi, a->state, REAL(sqrt)(used), a->K, &a->others,
-                                    scratch);
+    a->rows = stewart_period_late(a->period, xi, a->instant.state, REAL(sqrt)(used), a->K,
+                                  &a->others, scratch);
     if (a->rows < 0)
         return 0;
     for (int i = 0; i < X; i++) {
@@ -402,10 +309,10 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
         for (int j = 0; j < known; j++) {
             A[X * j + i] = 0;
             for (int k = j; k < known; k++)
-                A[X * j + i] += a->H[n * i + k] * L[n * k + j];
+                A[X * j + i] += a->instant.H[n * i + k] * L[n * k + j];
         }
     /* Seen from where the period begins. */
-    if (!stewart_seen_root(sensing_of(a), a->mean, known, A, d->model_std, a->C, scratch))
+    if (!stewart_seen_root(d->sensing, a->mean, known, A, d->model_std, a->instant.C, scratch))
         return 0;
     stewart_copy(n, a->mean, trial);
     for (int k = 0; k < TRIED; k++) {
@@ -413,10 +320,10 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
         trial[n - 2] = k < TRIED - 1 ? low + (high - low) / (TRIED - 1) * (real)k : high;
         if (!stewart_period_end(a->period, trial, end, scratch))
             return 0;
-        stewart_seen(sensing_of(a), end, miss);
+        stewart_seen(d->sensing, end, miss);
         for (int i = 0; i < m; i++)
-            miss[i] = a->y[i] - miss[i];
-        stewart_whiten(m, 1, a->C, miss);
+            miss[i] = a->instant.values[i] - miss[i];
+        stewart_whiten(m, 1, a->instant.C, miss);
         for (int i = 0; i < m; i++)
             cost += miss[i] * miss[i];
         if (cost < least) {
@@ -456,13 +363,11 @@ static int judge_timing(Model *a, const real *L, real used, stewart_guess *after
         return 0;
     for (int i = 0; i < m; i++)
         for (int j = 0; j < k - 1; j++) {
-            B[k * i + j] = 0;
-            for (int l = 0; l < X; l++)
-                B[k * i + j] += a->seen[X * i + l] * a->K[X * (a->others + j) + l];
+            B[k * i + j] = a->seen[a->rows * i + a->others + j];
         }
     for (int i = 0; i < m; i++)
         B[k * i + k - 1] = 0;
-    stewart_whiten(m, k, a->C, B);
+    stewart_whiten(m, k, a->instant.C, B);
     for (int i = 0; i < m; i++)
         B[k * i + k - 1] = a->nu[i];
     stewart_whiten(m, k, S, B); /* T = B' B, its last column B' S^-1 nu */
@@ -502,18 +407,18 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
     const int n = a->n, m = a->m, p = d->machine->estimated;
     const int free_eta = deviation(n, L, n - 2) > 0, free_rate = deviation(n, L, n - 1) > 0;
     real *lower = stewart_take(&scratch, n), *upper = stewart_take(&scratch, n);
-    real distance, spread;
+    real *C = a->instant.C, distance, spread;
     if (std > d->period / 10) {
         if (!best_of_many(a, guess, L, std, xi, scratch)
-            || !stewart_period_at(a->period, xi, a->exact, a->state, a->H, scratch)
+            || !predict(a->period, xi, &a->way, a->instant.state)
+            || !linearize_along(a->period, xi, &a->way, a->exact, a->instant.H, scratch)
             || !set_noise(a, xi, used, scratch))
             return 0;
     }
-    if (!stewart_seen_root(d->sensing, a->state, a->rows, a->K, a->drift, a->C, scratch))
+    stewart_seen_jacobian(d->sensing, a->instant.state, a->instant.J);
+    stewart_seen_changes(d->sensing, a->instant.J, a->rows, a->K, a->seen);
+    if (!stewart_seen_root(d->sensing, a->instant.state, a->rows, a->K, a->drift, C, scratch))
         return 0;
-    stewart_seen_jacobian(d->sensing, a->state, a->seen);
-    for (int i = 0; i < m; i++)
-        a->small[i] = SMALL * deviation(m, a->C, i);
     for (int i = 0; i < n; i++) {
         lower[i] = -(real)INFINITY;
         upper[i] = (real)INFINITY;
@@ -529,13 +434,14 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
         upper[n - 1] = LARGEST_RATE;
     }
     const stewart_kalman filter = {
-        n, m, std > d->period / 100 ? ITERATIONS : FEW, a->mean, L, lower, upper, a, rows, settle};
+        n, m, std > d->period / 100 ? ITERATIONS : FEW, a->mean, L, lower, upper, a, rows,
+                                   stewart_instant_settle};
     if (!stewart_kalman_update(&filter, xi, root, &distance, &spread, scratch))
         return 0;
     if (!(distance <= d->gate)) /* or NaN */
         return 0;
     for (int i = 0; i < m; i++)
-        spread += 2 * REAL(log)(a->C[(m + 1) * i]);
+        spread += 2 * REAL(log)(C[(m + 1) * i]);
     after->log_likelihood = -(distance + spread) / 2;
     after->outliers = 0;
     after->heard += guess->numbers[n - 2] < STEWART_NEVER;
@@ -559,10 +465,10 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
     const real used = timing > least ? timing : least;
     real *xi = stewart_take(&scratch, n), *posterior = stewart_take(&scratch, n * n);
     real *R = stewart_take(&scratch, n * n), *W = stewart_take(&scratch, n * (n + MOST));
-    a->y = y;
+    a->instant.values = y;
     stewart_copy(n, guess->numbers, xi);
-    stewart_copy(X, a->first, a->state);
-    stewart_copy(X * n, a->first + X, a->H);
+    stewart_copy(X, a->first, a->instant.state);
+    stewart_copy(X * n, a->first + X, a->instant.H);
     if (!set_noise(a, xi, used, scratch))
         return 0;
     for (int i = 0; i < STEWART_GUESS; i++)
@@ -595,7 +501,7 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
         for (int i = 0; i < X; i++) {
             real sum = 0;
             for (int k = 0; k < n; k++)
-                sum += a->H[n * i + k] * L[n * k + j];
+                sum += a->instant.H[n * i + k] * L[n * k + j];
             w[i] = sum;
         }
     }
@@ -605,7 +511,7 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
         stewart_copy(X, a->K + X * k, w);
     }
     stewart_absorb(n, n + a->rows, R, W, scratch);
-    stewart_copy(X, a->state, after->numbers);
+    stewart_copy(X, a->instant.state, after->numbers);
     stewart_copy(n - X, xi + X, after->numbers + X);
     after->numbers[n - 2] += dt * xi[n - 1];
     real *packed = after->numbers + n;
@@ -635,14 +541,17 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
     const int n = size_of(d), p = n - X - 2, m = d->sensing->size;
     Model a = {.period = t, .mean = guess->numbers, .m = m, .n = n};
     real *L = stewart_take(&scratch, n * n);
+    a.way = take_way(t, &scratch);
     a.first = stewart_take(&scratch, X + X * n);
-    a.H = stewart_take(&scratch, X * n);
-    a.C = stewart_take(&scratch, m * m);
-    a.small = stewart_take(&scratch, m);
-    a.J = stewart_take(&scratch, m * X);
-    a.seen = stewart_take(&scratch, m * X);
+    a.seen = stewart_take(&scratch, m * MOST);
     a.white = stewart_take(&scratch, m * n);
     a.nu = stewart_take(&scratch, m);
+    a.instant = (stewart_instant){.sensing = d->sensing, .n = n, .period = &a,
+                                  .predict = predict_model, .linearize = linearize_model};
+    a.instant.state = stewart_take(&scratch, X);
+    a.instant.H = stewart_take(&scratch, X * n);
+    a.instant.C = stewart_take(&scratch, m * m);
+    a.instant.J = stewart_take(&scratch, m * X);
     stewart_guess_root(guess, n, L);
     for (int i = 0; i < p; i++)
         if (!(deviation(n, L, X + i) <= KNOWN * d->usual_std[i])) /* or NaN */

@@ -4,8 +4,7 @@
 #define STEWART_DELAY_H
 
 #include "arrivals.h"
-#include "kalman.h"
-#include "sensing.h"
+#include "instant.h"
 
 #define STEWART_NEVER 1000000 /* s; the delay of torques that do not arrive */
 
@@ -14,17 +13,6 @@ enum {
     STEWART_DELAY_NUMBERS = 16, /* numbers of the memory without its arrays */
     STEWART_MOST_ACTING = 8,  /* torques that act in a period, at a rate of the delay within bounds */
 };
-
-void stewart_seen(const stewart_sensing *sensing, const real *state, real *y);
-void stewart_seen_jacobian(const stewart_sensing *sensing, const real *state, real *J);
-
-/* C (m, m) <- root of J (A'A + diag(std)^2) J' and the sensor's noise, A (k, 12). Returns 0 where it is
-   not positive definite. Scratch: m (12 + k) numbers. */
-int stewart_seen_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
-                      const real *std, real *C, stewart_scratch scratch);
-
-/* B <- C^-1 B, (m, m) lower triangular, (m, n). */
-void stewart_whiten(int m, int n, const real *C, real *B);
 
 /* What is assumed of the state, the parameters theta (p) and the delay. */
 typedef struct {

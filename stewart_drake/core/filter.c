@@ -39,14 +39,6 @@ static real length(int n, const real *x)
     return REAL(sqrt)(sum);
 }
 
-static real dot(int n, const real *x, const real *y)
-{
-    real sum = 0;
-    for (int i = 0; i < n; i++)
-        sum += x[i] * y[i];
-    return sum;
-}
-
 static int is_known(const stewart_filter *filter, const real *root, real share)
 {
     const int n = size_of(filter);
@@ -113,6 +105,7 @@ stewart_acting stewart_cut(const stewart_acting *acting, int n, const real *inst
 
 /* One attempt at a period and a measurement. */
 typedef struct {
+    stewart_instant instant; /* of a measurement of the sample alone */
     const stewart_filter *filter;
     const stewart_acted *period;
     const real *values; /* or NULL */
@@ -122,11 +115,7 @@ typedef struct {
     real end[X];        /* state at the end of the period */
     real drift[X];      /* standard deviation of the model's error there */
     real *states, *H;   /* (number, 12), (number, 12, n) of `stewart_transitions` */
-    const real *last;   /* (12, n) of those, at the end */
-    /* of the sample alone */
-    real *C;            /* (m, m) of the noise, R = C C' */
-    real *J;            /* (m, 12), or NULL where the state itself is measured */
-    real *changes;      /* (m) */
+    real *last;         /* (12, n) of those, at the end */
     /* of legs at several instants */
     stewart_acting coarse, fine; /* cut at nodes and at samples */
     real places[3];
@@ -150,118 +139,22 @@ static void set_drift(Step *s, const real *theta)
 
 /* A measurement of the sample alone. */
 
-/* y (m) = dh/dx (12) of a change of the state. */
-static void seen_change(const Step *s, const real *change, real *y)
+static int predict(void *about, const real *xi, real *end)
 {
-    for (int i = 0; i < s->filter->sensing->size; i++)
-        y[i] = s->J ? dot(X, s->J + X * i, change) : change[i];
-}
-
-static void predict(Step *s, const real *xi)
-{
+    Step *s = about;
     const stewart_acting *acting = &s->period->acting;
     stewart_predict(s->filter->machine, xi + X, acting, xi, s->states);
-    stewart_copy(X, s->states + X * (acting->number - 1), s->end);
-}
-
-/* Linearise at xi, after `predict` from there. */
-static int linearize(Step *s, const real *xi, stewart_scratch scratch)
-{
-    const stewart_filter *f = s->filter;
-    const int n = size_of(f), last = s->period->acting.number - 1;
-    if (!stewart_transitions_along(f->machine, xi, &s->period->acting, s->exact, s->states, s->H,
-                                   scratch))
-        return 0;
-    s->last = s->H + X * n * last;
-    if (s->J)
-        f->sensing->jacobian(f->sensing, s->end, s->J);
+    stewart_copy(X, s->states + X * (acting->number - 1), end);
     return 1;
 }
 
-/* C of R = diag(noise)^2 + J diag(drift)^2 J'. */
-static int set_noise(Step *s)
+/* H along the states of `predict`: those of the end are the last, where the instant has them. */
+static int linearize(void *about, const real *xi, real *last, stewart_scratch scratch)
 {
-    const stewart_sensing *sensing = s->filter->sensing;
-    const int m = sensing->size;
-    for (int i = 0; i < m; i++)
-        for (int j = 0; j <= i; j++) {
-            real sum = i == j ? sensing->noise_std[i] * sensing->noise_std[i] : 0;
-            for (int k = 0; k < X && s->J; k++)
-                sum += s->J[X * i + k] * s->drift[k] * s->drift[k] * s->J[X * j + k];
-            if (!s->J && i == j)
-                sum += s->drift[i] * s->drift[i];
-            s->C[m * i + j] = sum;
-        }
-    return stewart_cholesky(m, s->C);
-}
-
-static int rows_of_sample(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
-{
-    Step *s = model;
-    const stewart_sensing *sensing = s->filter->sensing;
-    const int m = sensing->size, n = size_of(s->filter);
-    (void)xi;
-    (void)scratch;
-    if (s->J) {
-        sensing->seen(sensing, s->end, e);
-        stewart_multiply(m, X, n, s->J, s->last, H);
-    } else {
-        stewart_copy(X, s->end, e);
-        stewart_copy(X * n, s->last, H);
-    }
-    for (int i = 0; i < m; i++) { /* C^-1 */
-        e[i] = s->values[i] - e[i];
-        for (int k = 0; k < i; k++) {
-            const real c = s->C[m * i + k];
-            if (c == 0)
-                continue;
-            e[i] -= c * e[k];
-            for (int j = 0; j < n; j++)
-                H[n * i + j] -= c * H[n * k + j];
-        }
-        e[i] /= s->C[(m + 1) * i];
-        for (int j = 0; j < n; j++)
-            H[n * i + j] /= s->C[(m + 1) * i];
-    }
-    return m;
-}
-
-static int all_small(const Step *s)
-{
-    const int m = s->filter->sensing->size;
-    for (int i = 0; i < m; i++)
-        if (!(REAL(fabs)(s->changes[i]) <= SMALL * length(i + 1, s->C + m * i)))
-            return 0;
-    return 1;
-}
-
-/* What linearising leaves out is of second order: nothing beside a small correction. */
-static int settle_sample(void *model, const real *xi, const real *better, stewart_scratch scratch)
-{
-    Step *s = model;
-    const stewart_filter *f = s->filter;
-    const int n = size_of(f);
-    real shift[X], linear[X];
-    for (int i = 0; i < X; i++) {
-        shift[i] = 0;
-        for (int j = 0; j < n; j++)
-            shift[i] += s->last[n * i + j] * (better[j] - xi[j]);
-        linear[i] = s->end[i] + shift[i];
-    }
-    seen_change(s, shift, s->changes);
-    if (all_small(s)) {
-        stewart_copy(X, linear, s->end);
-        return 1;
-    }
-    predict(s, better);
-    if (s->J)
-        f->sensing->jacobian(f->sensing, s->end, s->J);
-    for (int i = 0; i < X; i++)
-        shift[i] = s->end[i] - linear[i];
-    seen_change(s, shift, s->changes);
-    if (all_small(s))
-        return 1;
-    return linearize(s, better, scratch) ? 0 : -1;
+    Step *s = about;
+    (void)last;
+    return stewart_transitions_along(s->filter->machine, xi, &s->period->acting, s->exact, s->states,
+                                     s->H, scratch);
 }
 
 /* Legs at several instants of a period.
@@ -419,12 +312,14 @@ static stewart_scratch prepare(Step *s, stewart_scratch scratch)
         s->reading.onto = stewart_take(&scratch, LEGS * M * M);
         s->reading.variance = stewart_take(&scratch, LEGS * M);
     } else {
-        s->C = stewart_take(&scratch, m * m);
-        s->changes = stewart_take(&scratch, m);
-        s->J = f->sensing->jacobian ? stewart_take(&scratch, m * X) : NULL;
+        s->instant = (stewart_instant){f->sensing, s->values, n, s->end, NULL, NULL, NULL,
+                                       s,          predict,   linearize};
+        s->instant.C = stewart_take(&scratch, m * m);
+        s->instant.J = stewart_take(&scratch, m * X);
     }
     s->states = stewart_take(&scratch, X * pieces);
     s->H = stewart_take(&scratch, X * n * pieces);
+    s->last = s->instant.H = s->H + X * n * (pieces - 1);
     return scratch;
 }
 
@@ -443,21 +338,20 @@ static int attempt(const stewart_filter *f, const stewart_acted *period,
     scratch = prepare(&s, scratch);
     stewart_copy(n, prior->mean, xi);
     /* Corrections of parameters that are known already are too small to need F to fourth order. */
-    if (!f->encoders)
-        predict(&s, xi);
-    if (!(f->encoders ? along(&s, xi, scratch) : linearize(&s, xi, scratch)))
+    if (f->encoders ? !along(&s, xi, scratch)
+                    : !predict(&s, xi, s.end) || !linearize(&s, xi, s.last, scratch))
         return 0;
     set_drift(&s, xi + X);
     if (values) {
         stewart_kalman update = {n, f->encoders ? LEGS * f->encoders->nodes : f->sensing->size,
                                  f->encoders ? ENCODER_ITERATIONS : ITERATIONS,
                                  prior->mean, prior->root, f->lower, f->upper, &s,
-                                 f->encoders ? rows_of_legs : rows_of_sample,
-                                 f->encoders ? settle_legs : settle_sample};
+                                 f->encoders ? rows_of_legs : stewart_instant_rows,
+                                 f->encoders ? settle_legs : stewart_instant_settle};
         if (f->encoders)
             stewart_read(f->encoders, values, s.shown, history->last, history->still, &s.reading,
                          scratch);
-        else if (!set_noise(&s))
+        else if (!stewart_seen_root(f->sensing, s.end, 0, NULL, s.drift, s.instant.C, scratch))
             return 0;
         if (!stewart_kalman_update(&update, xi, after->root, &distance, &spread, scratch))
             return 0;

@@ -12,8 +12,7 @@
 #ifndef STEWART_FILTER_H
 #define STEWART_FILTER_H
 
-#include "kalman.h"
-#include "sensing.h"
+#include "instant.h"
 
 #define STEWART_LEG_GATE 30 /* squared residual of a leg, per variance, from which it is left out */
 

@@ -1,0 +1,124 @@
+/* See instant.h. */
+
+#include "instant.h"
+
+#define X STEWART_STATES
+#define SMALL ((real)0.1) /* standard deviations; a shorter correction ends the iterations */
+
+void stewart_seen(const stewart_sensing *sensing, const real *state, real *values)
+{
+    if (sensing->seen)
+        sensing->seen(sensing, state, values);
+    else
+        stewart_copy(X, state, values);
+}
+
+void stewart_seen_jacobian(const stewart_sensing *sensing, const real *state, real *J)
+{
+    if (sensing->jacobian)
+        sensing->jacobian(sensing, state, J);
+}
+
+void stewart_seen_changes(const stewart_sensing *sensing, const real *J, int k, const real *A,
+                          real *seen)
+{
+    if (sensing->jacobian) {
+        stewart_multiply_by_transpose(sensing->size, X, k, J, A, seen);
+        return;
+    }
+    for (int i = 0; i < X; i++)
+        for (int j = 0; j < k; j++)
+            seen[k * i + j] = A[X * j + i];
+}
+
+int stewart_seen_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
+                      const real *std, real *C, stewart_scratch scratch)
+{
+    const int m = sensing->size;
+    real *J = stewart_take(&scratch, m * X), *JA = stewart_take(&scratch, m * k);
+    stewart_seen_jacobian(sensing, state, J);
+    stewart_seen_changes(sensing, J, k, A, JA);
+    stewart_multiply_by_transpose(m, k, m, JA, JA, C);
+    for (int i = 0; i < m; i++) {
+        for (int j = 0; j <= i; j++)
+            for (int l = 0; l < X && sensing->jacobian; l++)
+                C[m * i + j] += J[X * i + l] * std[l] * std[l] * J[X * j + l];
+        if (!sensing->jacobian)
+            C[(m + 1) * i] += std[i] * std[i];
+        C[(m + 1) * i] += sensing->noise_std[i] * sensing->noise_std[i];
+    }
+    return stewart_cholesky(m, C);
+}
+
+void stewart_whiten(int m, int n, const real *C, real *B)
+{
+    for (int i = 0; i < m; i++) {
+        real *row = B + n * i;
+        for (int k = 0; k < i; k++) {
+            const real c = C[m * i + k];
+            for (int j = 0; j < n && c != 0; j++)
+                row[j] -= c * B[n * k + j];
+        }
+        for (int j = 0; j < n; j++)
+            row[j] /= C[(m + 1) * i];
+    }
+}
+
+int stewart_instant_rows(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
+{
+    const stewart_instant *a = model;
+    const int m = a->sensing->size;
+    (void)xi;
+    (void)scratch;
+    stewart_seen(a->sensing, a->state, e);
+    stewart_seen_jacobian(a->sensing, a->state, a->J);
+    if (a->sensing->jacobian)
+        stewart_multiply(m, X, a->n, a->J, a->H, H);
+    else
+        stewart_copy(X * a->n, a->H, H);
+    for (int i = 0; i < m; i++)
+        e[i] = a->values[i] - e[i];
+    stewart_whiten(m, a->n, a->C, H);
+    stewart_whiten(m, 1, a->C, e);
+    return m;
+}
+
+/* Whether a change of the state, as it is seen, is small. */
+static int is_small(const stewart_instant *a, const real *change, stewart_scratch scratch)
+{
+    const int m = a->sensing->size;
+    real *seen = stewart_take(&scratch, m);
+    stewart_seen_changes(a->sensing, a->J, 1, change, seen);
+    for (int i = 0; i < m; i++) {
+        real variance = 0;
+        for (int j = 0; j <= i; j++)
+            variance += a->C[m * i + j] * a->C[m * i + j];
+        if (!(REAL(fabs)(seen[i]) <= SMALL * REAL(sqrt)(variance))) /* or NaN */
+            return 0;
+    }
+    return 1;
+}
+
+int stewart_instant_settle(void *model, const real *xi, const real *better, stewart_scratch scratch)
+{
+    const stewart_instant *a = model;
+    real shift[X], linear[X];
+    for (int i = 0; i < X; i++) {
+        shift[i] = 0;
+        for (int j = 0; j < a->n; j++)
+            shift[i] += a->H[a->n * i + j] * (better[j] - xi[j]);
+        linear[i] = a->state[i] + shift[i];
+    }
+    if (is_small(a, shift, scratch)) {
+        stewart_copy(X, linear, a->state);
+        return 1;
+    }
+    if (!a->predict(a->period, better, a->state))
+        return -1;
+    for (int i = 0; i < X; i++)
+        shift[i] = a->state[i] - linear[i];
+    stewart_seen_jacobian(a->sensing, a->state, a->J);
+    if (is_small(a, shift, scratch))
+        return 1;
+    return a->linearize(a->period, better, a->H, scratch) ? 0 : -1;
+}
