@@ -9,7 +9,7 @@
 
 /* By which a plan may miss the reference: rad, shares of the reach, and per s. */
 #ifdef STEWART_FLOAT
-#define TOLERANCE ((real)1e-5)
+#define TOLERANCE ((real)1e-4)
 #else
 #define TOLERANCE ((real)1e-10)
 #endif
