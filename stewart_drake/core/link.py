@@ -1,12 +1,15 @@
 """The link of core/link.h: a wire, or a buffer in which commands wait for their times."""
 
 import math
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from stewart_drake.core.library import core
 from stewart_drake.types import Array
+
+FULL: Final = 1
+"""What `Link.take` returns where too much waits already."""
 
 
 class Link:

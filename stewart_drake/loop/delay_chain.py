@@ -5,7 +5,7 @@ from abc import abstractmethod
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from stewart_drake.core.link import Link
+from stewart_drake.core.link import FULL, Link
 from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import TOGETHER
@@ -40,14 +40,15 @@ class LinkSystem(LeafSystem):
         update_every(self, period, self._take)
 
     @abstractmethod
-    def _send(self, memory: Array, number: int, command: Array) -> None:
-        """Let the link take the command of a sample."""
+    def _send(self, memory: Array, number: int, command: Array) -> int:
+        """Let the link take the command of a sample, and return what it says."""
 
     def _take(self, context: Context, state: State) -> None:
         # Of what another event of this instant has left: it may be an arrival.
         memory = self._of(state)
         number = self._taken(memory)
-        self._send(memory, number, self._commanded.Eval(context))
+        said = self._send(memory, number, self._commanded.Eval(context))
+        assert said != FULL, "more commands are under way than there is place for"
         self._change(memory, number * self._period)
 
     def _change(self, memory: Array, time: float) -> None:
@@ -88,9 +89,9 @@ class Wire(LinkSystem):
     def _arrival(self, number: int) -> float:
         """Return when the command of a sample arrives, s."""
 
-    def _send(self, memory: Array, number: int, command: Array) -> None:
+    def _send(self, memory: Array, number: int, command: Array) -> int:
         now, at = number * self._period, self._arrival(number)
-        self._link.take(memory, now, number + 1, at, command[None])
+        return self._link.take(memory, now, number + 1, at, command[None])
 
 
 class DelayChain(Wire):

@@ -80,11 +80,12 @@ class PlayoutBuffer(LinkSystem):
             early, offset = event_time(period), event_time(delay.fraction * period)
             self.DeclarePeriodicUnrestrictedUpdateEvent(early, offset, weak(self._play))
 
-    def _send(self, memory: Array, number: int, command: Array) -> None:
+    def _send(self, memory: Array, number: int, command: Array) -> int:
         arrival = self._arrivals[number] if number < len(self._arrivals) else np.inf
         first = (number - self._repeats + self._delay.periods) * self._period
         packet = command.reshape(self._rows, NUM_TORQUES)
-        self._link.take(memory, number * self._period, number + 1, first, packet, arrival)
+        now = number * self._period
+        return self._link.take(memory, now, number + 1, first, packet, arrival)
 
     def _change(self, memory: Array, time: float) -> None:
         """Begin a period, with a torque or dry."""
