@@ -6,10 +6,9 @@ are projected onto at most three nodes of the period; core/sensing.h computes th
 
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.core.library import core
 from stewart_drake.law.compiled import Compiled, Once, geometry, numbers
@@ -46,30 +45,6 @@ def node_shares(samples: int) -> Array:
     off = np.sqrt(b[1:])
     nodes = np.linalg.eigvalsh(np.diag(a) + np.diag(off, 1) + np.diag(off, -1))
     return np.asarray((nodes + 1) / 2)
-
-
-class Reading(NamedTuple):
-    """What a measurement says, and for how much that counts, beside a motion of its period."""
-
-    encoders: Compiled
-    """What it was read with."""
-    it: Compiled
-    """The `stewart_reading`."""
-    angles: Array
-    """(N, 6) rad, NaN where they are left out."""
-    variance: Array
-    """(M, 6) rad^2 of the values at the nodes, infinite where a leg is left out."""
-
-    @property
-    def odd(self) -> NDArray[np.bool_]:
-        """(6,) legs of which samples stand out of their period."""
-        return np.array(list(self.it.it.odd), dtype=bool)
-
-    def beside(self, shown: Array) -> Array:
-        """e (M, 6), the values at the nodes of measured minus shown angles (N, 6)."""
-        c, e, given = core(), np.empty_like(self.variance), numbers(shown)
-        c.lib.stewart_beside(self.encoders.it, self.it.it, c.at(given), c.at(e))
-        return e
 
 
 @dataclass(frozen=True)
@@ -164,24 +139,6 @@ class EncoderSensing:
         scratch = c.scratch(c.lib.stewart_encoder_scratch(encoders_of(self).it))
         given = map(c.at, (values, expected, state, root))
         return FirstState(state, root @ root.T) if it.start(it, *given, scratch) else None
-
-    def reading(self, measurement: Measurement, shown: Array, last: Array, still: Array) -> Reading:
-        """What a measurement says beside a motion, of which it cannot be told what is noise.
-
-        Args:
-            measurement: of 6 N values.
-            shown: (N, 6) angles that the motion shows at the samples.
-            last: (6 N,) the measurement before, NaN for nothing.
-            still: (6,) as of `stood`, with this measurement.
-        """
-        c, encoders, nodes = core(), encoders_of(self), len(self.shares)
-        angles = np.empty((self.samples, NUM_LEGS))
-        onto, variance = np.empty((NUM_LEGS, nodes, nodes)), np.empty((nodes, NUM_LEGS))
-        it = c.ffi.new("stewart_reading *", list(map(c.at, (angles, onto, variance))))
-        given = [numbers(a) for a in (measurement.known(self.size), shown, last, still)]
-        scratch = c.scratch(c.lib.stewart_encoder_scratch(encoders.it))
-        c.lib.stewart_read(encoders.it, *map(c.at, given), it, scratch)
-        return Reading(encoders, Compiled(it, (onto,)), angles, variance)
 
     def compiled(self) -> Compiled:
         """Return the `stewart_sensing`."""
