@@ -16,7 +16,8 @@ from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.parameter_filter import ParameterFilter, gate
 from stewart_drake.types import Array
 
-SOURCES = ("dynamics", "machine", "matrix", "kalman", "kinematics", "sensing", "filter")
+HOST = ("dop853", "packed", "packed_law", "plant")
+"""Sources for the host alone, in double precision."""
 
 
 class Single:
@@ -24,7 +25,7 @@ class Single:
 
     def __init__(self, folder: Path) -> None:
         made = folder / "single.so"
-        sources = [str(build.FOLDER / f"{name}.c") for name in SOURCES]
+        sources = [str(c) for c in build.FOLDER.glob("*.c") if c.stem not in HOST]
         compiler = build.compiler() or pytest.skip("needs a C compiler")
         options = ["-std=c99", "-O1", "-DSTEWART_FLOAT", "-fPIC", "-shared", "-o", str(made)]
         subprocess.run([*compiler, *options, *sources, "-lm"], check=True)
