@@ -24,10 +24,10 @@ PAGE: Final = HERE.parents[1] / "docs" / "howto" / "board.md"
 MARKS: Final = ("<!-- make board -->\n", "\n<!-- end of make board -->")
 PACKAGES: Final = {
     "qemu-system-arm": "qemu-system-arm",
-    "arm-none-eabi-gcc": "gcc-arm-none-eabi",
+    "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
     "make": "make",
 }
-"""Debian's package of each command."""
+"""Debian's packages of each command."""
 OPTIMISED: Final = "-O2 -ffunction-sections -fdata-sections"
 HEADER: Final = (
     *("controller", "processor", "flash, kB", "state, B", "workspace, B", "stack, B"),
@@ -97,9 +97,12 @@ class Counted:
 def missing() -> list[str]:
     """Return Debian's packages of what is not installed."""
     packages = [package for command, package in PACKAGES.items() if shutil.which(command) is None]
-    if "gcc-arm-none-eabi" not in packages:
+    if shutil.which("arm-none-eabi-gcc") is not None:
         command = "arm-none-eabi-gcc -E -x c -o /dev/null -"
-        if subprocess.run(shlex.split(command), input=b"#include <math.h>\n").returncode != 0:
+        done = subprocess.run(
+            shlex.split(command), input=b"#include <math.h>\n", capture_output=True
+        )
+        if done.returncode != 0:
             packages.append("libnewlib-arm-none-eabi")
     return packages
 
@@ -191,7 +194,7 @@ def main() -> int:
     """Replay every row, print the table and write it into the page."""
     packages = missing()
     if packages:
-        print(f"make board: not installed: {', '.join(packages)} (apt-get install)")
+        print(f"make board: missing, expected from apt-get install {' '.join(packages)}")
         return 1
     lines = [f"| {' | '.join(HEADER)} |", "| --- | --- |" + " ---: |" * (len(HEADER) - 2)]
     exceeded: list[str] = []
