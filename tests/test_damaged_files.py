@@ -134,6 +134,3 @@ def test_a_damaged_run_is_done_again_with_a_word(tmp_path, caplog):
     said = record.getMessage()
     assert "run000000.json" in said and "has no checksum" in said
     assert "done again (and 2 more)" in said and "\n" not in said
-
-
-# ---------------------------------------------------------------- arrays

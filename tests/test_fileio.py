@@ -131,6 +131,3 @@ def test_what_kill_9_leaves_is_removed(tmp_path):
     assert len(hidden(tmp_path)) == 2 and not (tmp_path / "out.json").exists()
     remove_partials(tmp_path)
     assert hidden(tmp_path) == [mine.name]
-
-
-# ---------------------------------------------------------------- a long file of samples

@@ -380,6 +380,3 @@ def test_wrong_commands_are_one_line(capfd: pytest.CaptureFixture[str], tmp_path
         error = capfd.readouterr().err
         assert error.count("\n") == 1 and expected in error, error
     busy.close()
-
-
-# ---------------------------------------------------------------- clocks

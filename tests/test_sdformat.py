@@ -397,6 +397,3 @@ def test_shapes_change_no_run_of_the_machine_alone() -> None:
         simulator.AdvanceTo(0.3)
         states.append(plant.GetPositionsAndVelocities(context))
     np.testing.assert_array_equal(*states)
-
-
-# ------------------------------------------------------------------ Drake's viewer
