@@ -323,11 +323,30 @@ static stewart_scratch prepare(Step *s, stewart_scratch scratch)
     return scratch;
 }
 
-/* Mean and root `after` a period and values, or NULL; returns 0 for an outlier, or where there is no
-   finite result. */
+/* A period linearised about the prior. */
+typedef struct {
+    real end[X], drift[X];
+    real *H; /* (12, n) at the end */
+    int exists;
+} Linear;
+
+/* The prediction `after` a period, from a prior, by the model alone; returns 0 where it is not finite. */
+static int go_on(int n, const stewart_posterior *prior, const Linear *linear,
+                 stewart_posterior *after, stewart_scratch scratch)
+{
+    stewart_copy(n, prior->mean, after->mean);
+    stewart_copy(X, linear->end, after->mean);
+    stewart_copy(n * n, prior->root, after->root);
+    stewart_root_of_prediction(n, linear->H, linear->drift, after->root, scratch);
+    *after->partly = 0;
+    return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
+}
+
+/* Mean and root `after` a period and values; `linear`, unless it is NULL, is about the prior, and all
+   that is found without values. Returns 0 for an outlier, or where there is no finite result. */
 static int attempt(const stewart_filter *f, const stewart_acted *period,
                    const stewart_posterior *prior, const real *values,
-                   const stewart_history *history, stewart_posterior *after,
+                   const stewart_history *history, Linear *linear, stewart_posterior *after,
                    stewart_scratch scratch)
 {
     const int n = size_of(f);
@@ -342,27 +361,30 @@ static int attempt(const stewart_filter *f, const stewart_acted *period,
                     : !predict(&s, xi, s.end) || !linearize(&s, xi, s.last, scratch))
         return 0;
     set_drift(&s, xi + X);
-    if (values) {
-        stewart_kalman update = {n, f->encoders ? LEGS * f->encoders->nodes : f->sensing->size,
-                                 f->encoders ? ENCODER_ITERATIONS : ITERATIONS,
-                                 prior->mean, prior->root, f->lower, f->upper, &s,
-                                 f->encoders ? rows_of_legs : stewart_instant_rows,
-                                 f->encoders ? settle_legs : stewart_instant_settle};
-        if (f->encoders)
-            stewart_read(f->encoders, values, s.shown, history->last, history->still, &s.reading,
-                         scratch);
-        else if (!stewart_seen_root(f->sensing, s.end, 0, NULL, s.drift, s.instant.C, scratch))
-            return 0;
-        if (!stewart_kalman_update(&update, xi, after->root, &distance, &spread, scratch))
-            return 0;
-        if (!f->encoders && !(distance <= f->gate)) /* or NaN */
-            return 0;
-        if (f->encoders) {
-            stewart_predict(f->machine, xi + X, acting, xi, s.seen);
-            stewart_copy(X, s.seen + X * (acting->number - 1), s.end);
-        }
-    } else {
-        stewart_copy(n * n, prior->root, after->root);
+    if (linear) {
+        stewart_copy(X, s.end, linear->end);
+        stewart_copy(X, s.drift, linear->drift);
+        stewart_copy(X * n, s.last, linear->H);
+        linear->exists = 1;
+    }
+    if (!values)
+        return 1;
+    if (f->encoders)
+        stewart_read(f->encoders, values, s.shown, history->last, history->still, &s.reading, scratch);
+    else if (!stewart_seen_root(f->sensing, s.end, 0, NULL, s.drift, s.instant.C, scratch))
+        return 0;
+    stewart_kalman update = {n, f->encoders ? LEGS * f->encoders->nodes : f->sensing->size,
+                             f->encoders ? ENCODER_ITERATIONS : ITERATIONS,
+                             prior->mean, prior->root, f->lower, f->upper, &s,
+                             f->encoders ? rows_of_legs : stewart_instant_rows,
+                             f->encoders ? settle_legs : stewart_instant_settle};
+    if (!stewart_kalman_update(&update, xi, after->root, &distance, &spread, scratch))
+        return 0;
+    if (!f->encoders && !(distance <= f->gate)) /* or NaN */
+        return 0;
+    if (f->encoders) {
+        stewart_predict(f->machine, xi + X, acting, xi, s.seen);
+        stewart_copy(X, s.seen + X * (acting->number - 1), s.end);
     }
     stewart_root_of_prediction(n, s.last, s.drift, after->root, scratch);
     stewart_copy(X, s.end, xi);
@@ -424,9 +446,10 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_acted *p
     stewart_posterior now = stewart_posterior_at(estimate, n, m);
     stewart_posterior after = stewart_posterior_at(first, n, m);
     stewart_posterior before = stewart_posterior_at(second, n, m);
+    Linear linear = {.H = stewart_take(&scratch, X * n)};
     const real unseen = *now.unseen + 1, *theta = now.mean + X;
     real outliers = 1;
-    if (values && attempt(filter, period, &now, values, history, &after, scratch)) {
+    if (attempt(filter, period, &now, values, history, &linear, &after, scratch) && values) {
         const int lost = *now.unseen >= STEWART_PATIENCE && !is_known(filter, now.root, LEARNT);
         if (!lost || !stewart_filter_start(filter, values, theta, after.mean, estimate, scratch))
             accept(n, m, &after, &now);
@@ -434,9 +457,9 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_acted *p
     }
     if (values && *now.outliers > 0
         && stewart_filter_start(filter, now.outlier, theta, now.mean, second, scratch)
-        && attempt(filter, period, &before, values, history, &after, scratch))
+        && attempt(filter, period, &before, values, history, NULL, &after, scratch))
         outliers += *now.outliers;
-    const int alone = attempt(filter, period, &now, NULL, history, &after, scratch);
+    const int alone = linear.exists && go_on(n, &now, &linear, &after, scratch);
     if (values && (!alone || outliers >= STEWART_PATIENCE)
         && stewart_filter_start(filter, values, theta, alone ? after.mean : now.mean, estimate,
                                 scratch))
@@ -461,5 +484,5 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques)
     const int update = stewart_kalman_scratch(n, encoders ? LEGS * M : m);
     const int within = step + update + stewart_transitions_scratch(p) + 2 * n * n + n + N;
     const int start = X * X + m + LEGS * (6 + p) + (encoders ? stewart_encoder_scratch(encoders) : 0);
-    return 2 * stewart_posterior_size(n, m) + (within > start ? within : start);
+    return 2 * stewart_posterior_size(n, m) + X * n + (within > start ? within : start);
 }
