@@ -21,7 +21,7 @@ from stewart_drake.types import Array
 NODES = 3
 """Of a period, at the most."""
 FINEST = 1e-7
-"""rad; to so much the crank angles of the model itself are right, its standard deviation."""
+"""rad; standard deviation of the crank angles of the model itself."""
 
 
 @cache
@@ -91,7 +91,7 @@ class EncoderSensing:
         return node_shares(self.samples)
 
     def seen(self, state: Array) -> Array:
-        """What all samples show of a plate that stands still there."""
+        """Return the angles (6 N,) of a plate at rest there."""
         return self._filled(state, np.empty(self.size), compiled_sensing(self).it.seen)
 
     def through(self, state: Array, changes: Array) -> Array:

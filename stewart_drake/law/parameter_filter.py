@@ -23,7 +23,7 @@ OUTLIER = 1e-6
 
 
 class Period(NamedTuple):
-    """What acted between two samples, as far as the delay is what it is believed to be."""
+    """Torques that acted between two samples, if the delay is the assumed one."""
 
     torques: Array
     """(n, 6) N m, one after the other."""
@@ -37,7 +37,7 @@ class Period(NamedTuple):
 
 @cache
 def gate(size: int) -> float:
-    """Squared innovation of so many values, in units of its covariance, that makes an outlier."""
+    """Return the squared normalised innovation beyond which `size` values are an outlier."""
     return float(chdtri(size, OUTLIER))
 
 

@@ -1,10 +1,9 @@
-"""What is measured, y = h(x) + noise: how to begin from it, and what of it is no use.
+"""The measurement y = h(x) + noise: its model, first states from it, and its faults.
 
-The law and its observers know a sensor by `Sensing` alone. Which measurements are no use shows by
-what they say themselves and by what was said before. One that is *missing* says so. One that is
-*frozen* repeats what was measured before, bit for bit, which is a fault only where it cannot be so.
-One that the machine cannot have is *rejected*. What needs a model of the motion, an outlier or a
-sensor that froze while the plate was at rest, is for the filter to find (`law.parameter_filter`).
+The law and its observers know a sensor by `Sensing` alone. A measurement that is *missing* is
+marked so. One that is *frozen* repeats the last one bit for bit, where that cannot be. One that
+the machine cannot have is *rejected*. An outlier, or a sensor that froze while the plate was at
+rest, is found by the filter (`law.parameter_filter`), which has a model of the motion.
 The numbers are those of core/sensing.h.
 """
 
@@ -25,7 +24,7 @@ FAULTS = ("measurements_missing", "measurements_frozen", "measurements_rejected"
 
 
 class FirstState(NamedTuple):
-    """What one measurement alone tells of the state."""
+    """State that follows from one measurement alone."""
 
     state: Array
     """(12,)."""
@@ -57,7 +56,7 @@ class Sensing(Protocol):
     def fault(
         self, measurement: Measurement, last: Array, period: float, mechanism: Mechanism
     ) -> str | None:
-        """What is wrong with a measurement, as the name of a count, or None.
+        """Return the fault of a measurement, as the name of a count, or None.
 
         Args:
             measurement: of m values.
@@ -81,7 +80,7 @@ class Sensing(Protocol):
         ...
 
     def stood(self, measurement: Measurement, last: Array, still: Array) -> Array:
-        """For how many periods things have stood still, for a sensor that minds it.
+        """Return the number of periods for which each code has been constant, for encoders.
 
         Args:
             measurement: of m values.
@@ -91,7 +90,7 @@ class Sensing(Protocol):
         ...
 
     def now(self, measurement: Measurement) -> "tuple[Sensing, Measurement]":
-        """What of a measurement is of its own instant, not of the period before, and its sensing.
+        """Return the part of a measurement that was taken at the sample itself, and its sensing.
 
         For an observer that compares it with the state at the sample alone.
         """
@@ -145,7 +144,7 @@ class StateSensing:
         return still
 
     def now(self, measurement: Measurement) -> tuple[Sensing, Measurement]:
-        """All of it."""
+        """Return both: all values are of the sample."""
         return self, measurement
 
     def compiled(self) -> Compiled:
