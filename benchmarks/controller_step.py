@@ -23,10 +23,10 @@ from _page import table, write
 
 import stewart_drake as sd
 from stewart_drake.dynamics.stewart import plant_parameters
+from stewart_drake.law.core_law import Serving
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
-from stewart_drake.law.native_law import Serving
 from stewart_drake.law.observers import NoObserver, ParameterObserver
 from stewart_drake.law.predictors import NonlinearPredictor
 from stewart_drake.loop import controller

@@ -7,7 +7,6 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -17,14 +16,13 @@ from _page import write
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 
 import stewart_drake as sd
-from stewart_drake.core.library import core_library
-from stewart_drake.export.controller import recorded_law
+from stewart_drake.export.recording import record
+from stewart_drake.law.core_law import CoreLqi
 from stewart_drake.law.delay_model import delayed_model
 from stewart_drake.law.doubling import Doubling
 from stewart_drake.law.error_model import linear_model
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
-from stewart_drake.law.native_law import NativeLqi
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import lqr, reduced_gain
 
@@ -45,18 +43,19 @@ def replayed_steps(name: str, samples: int = 60, repeats: int = 8) -> dict[str, 
     Both are given what happened in a run, in turns, and use the compiled dynamics.
     """
     scenario = sd.load_scenario(name, settings=["plant.kind=exact", f"duration={samples / 10}"])
-    recorded = recorded_law(scenario)
-    law = PredictiveLqi(**{f.name: getattr(recorded, f.name) for f in fields(PredictiveLqi)})
-    steppers: dict[str, Any] = {"python": law, "c": NativeLqi(law, core_library())}
+    recorded = record(scenario)
+    law = recorded.law
+    assert isinstance(law, PredictiveLqi)
+    steppers: dict[str, Any] = {"python": law, "c": CoreLqi(law)}
     least = {which: [np.inf] * len(recorded.steps) for which in steppers}
     for which, stepper in [*steppers.items()] * repeats:
-        memory = stepper.initial_memory(recorded.queue[0])
+        memory = stepper.initial_memory(recorded.first)
         for k, step in enumerate(recorded.steps):
             given = Measurement.of(step.measurement), Preview(law.preview_times, step.preview)
             started = time.perf_counter()
             memory = stepper.step(memory, *given, step.weights)
             least[which][k] = min(least[which][k], time.perf_counter() - started)
-            memory.in_flight[-1] = step.sent
+            memory.in_flight[-1] = step.sent[:6]
     return least
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from stewart_drake.law.native_law import Serving
+from stewart_drake.law.core_law import Serving
 from stewart_drake.loop import controller
 
 

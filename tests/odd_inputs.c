@@ -15,8 +15,9 @@ static const real odd[] = {NAN, INFINITY, -INFINITY, (real)1e30, (real)-1e30, 0}
 static const int places[] = {INT_MIN, INT_MIN + 1, -MANY / 2, -1, 0, 1, 2, MANY, INT_MAX - 1, INT_MAX};
 enum { ODD = sizeof odd / sizeof *odd, PLACES = sizeof places / sizeof *places };
 
-static stewart_memory memory;
-static stewart_workspace work;
+static real memory[STEWART_MEMORY], scratch[STEWART_SCRATCH];
+static real times[STEWART_PREVIEW], preview[STEWART_PREVIEW * STEWART_REFERENCE];
+static int rows, asked_at;
 static real many[MANY * STEWART_MOTORS];
 static int failed;
 
@@ -37,50 +38,81 @@ typedef struct {
 
 static const oddity none = {-1, 0, 1, 0, -1, -1, -1, -1, 0, 0};
 
+/* The motion at instants from a sample on. */
+static void look_ahead(int k)
+{
+    for (int i = 0; i < rows; i++)
+        stewart_reference((double)((real)k * stewart_configuration.period + times[i]),
+                          preview + STEWART_REFERENCE * i);
+}
+
+/* Remembers the instants that are asked for. */
+static void ask(void *about, int number, const real *at, real *wanted)
+{
+    (void)about;
+    rows = number;
+    for (int i = 0; i < number; i++)
+        times[i] = at[i];
+    look_ahead(asked_at);
+    stewart_given_rows(preview, number, at, wanted);
+}
+
+static void start(void)
+{
+    stewart_start(&stewart_configuration, memory, stewart_queue_rows, stewart_queue);
+}
+
 static void run(oddity o)
 {
-    const stewart_config *c = &stewart_configuration;
-    real times[STEWART_PREVIEW], preview[STEWART_PREVIEW * STEWART_REFERENCE];
-    int rows = stewart_preview_times(c, times), counted = 0, status = 0;
-    stewart_init(c, &memory, stewart_queue);
+    const stewart_law *law = &stewart_configuration;
+    const stewart_layout *l = &law->layout;
+    int counted = 0, status = 0;
+    start();
     for (int k = 0; k < SAMPLES; k++) {
-        real torque[STEWART_MOTORS], weights[2] = {1, 1}, measurement[STEWART_REFERENCE];
-        for (int i = 0; i < rows; i++)
-            stewart_reference((double)(k * c->period + times[i]), preview + STEWART_REFERENCE * i);
-        stewart_reference((double)(k * c->period), measurement);
+        real torque[STEWART_MOTORS], measurement[STEWART_REFERENCE];
+        stewart_sample sample = {.measurement = measurement, .reference = stewart_given_rows};
+        sample.about = preview;
+        sample.weights[0] = sample.weights[1] = 1;
+        look_ahead(k);
+        stewart_reference((double)((real)k * law->period), measurement);
         if (k == o.sample) {
+            sample.age = o.age;
             if (o.measurement >= 0)
                 measurement[o.measurement] = o.value;
             if (o.reference >= 0)
                 preview[o.reference] = o.value;
             if (o.weight >= 0)
-                weights[o.weight] = o.value;
+                sample.weights[o.weight] = o.value;
             for (int i = 0; i < MANY * STEWART_MOTORS; i++)
                 many[i] = o.acted >= 0 && i % STEWART_MOTORS == o.acted ? o.value : 0;
-            stewart_acted(c, &memory, o.ago, o.number, many);
+            stewart_note_acted(law, memory, o.ago, o.number, many);
             if (o.acted >= 0)
-                stewart_sent(c, &memory, many);
+                stewart_note_acted(law, memory, 1, 1, many);
         }
         for (int i = 0; o.lost && i < rows * STEWART_REFERENCE; i++)
             if (k >= o.sample && k < o.sample + o.lost)
                 preview[i] = o.value;
-        status = stewart_step(c, &memory, &work, measurement, k == o.sample ? o.age : 0, preview,
-                              weights, torque);
+        status = stewart_step(law, memory, scratch, &sample, torque);
         counted += (status & STEWART_REFERENCE_MISSING) != 0;
         for (int i = 0; i < STEWART_MOTORS; i++) {
             expect(isfinite(torque[i]), "a torque is no number", k);
-            expect(isfinite(memory.integral[i]), "the integral is no number", k);
-            expect(isfinite(memory.error[i]), "the error is no number", k);
+            expect(isfinite(memory[l->integral.at + i]), "the integral is no number", k);
+            expect(isfinite(memory[l->error.at + i]), "the error is no number", k);
         }
     }
     expect(counted == (isfinite(o.value) ? 0 : o.lost + (o.reference >= 0)), "references are miscounted", -1);
-    expect(isfinite(memory.state[0]), "the state is no number at the end", -1);
+    expect(isfinite(memory[l->state.at]), "the state is no number at the end", -1);
 }
 
 int main(void)
 {
-    real times[STEWART_PREVIEW], row[STEWART_REFERENCE];
-    int rows = stewart_preview_times(&stewart_configuration, times);
+    const stewart_law *law = &stewart_configuration;
+    real torque[STEWART_MOTORS], row[STEWART_REFERENCE], measurement[STEWART_MEASURED];
+    stewart_sample first = {.measurement = measurement, .reference = ask, .weights = {1, 1}};
+    for (int i = 0; i < STEWART_MEASURED; i++)
+        measurement[i] = (real)NAN;
+    start();
+    stewart_step(law, memory, scratch, &first, torque);
     for (int v = 0; v < ODD; v++)
         for (int at = 0; at < 2; at++) {
             oddity o = none;
@@ -107,16 +139,17 @@ int main(void)
         o.sample = 5;
         o.age = places[i];
         run(o);
-        stewart_init(&stewart_configuration, &memory, stewart_queue);
+        start();
         for (int j = 0; j < PLACES; j++)
-            stewart_acted(&stewart_configuration, &memory, places[i], places[j], many);
+            stewart_note_acted(law, memory, places[i], places[j], many);
     }
     for (int v = 0; v < ODD; v++) {
         for (int i = 0; i < MANY * STEWART_MOTORS; i++)
             many[i] = odd[v];
-        stewart_init(&stewart_configuration, &memory, many);
-        for (int i = 0; i < STEWART_IN_FLIGHT; i++)
-            expect(isfinite(memory.in_flight[i][0]), "a torque in flight is no number", i);
+        stewart_start(law, memory, MANY, many);
+        for (int i = 0; i < law->layout.in_flight.rows; i++)
+            expect(isfinite(memory[law->layout.in_flight.at + STEWART_MOTORS * i]),
+                   "a torque in flight is no number", i);
         stewart_reference((double)odd[v], row);
         for (int i = 0; i < STEWART_REFERENCE; i++)
             expect(isfinite(row[i]), "the motion is no number", i);

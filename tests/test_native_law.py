@@ -1,7 +1,5 @@
 """The law in C against the law in Python, step by step, and the Riccati equation behind it."""
 
-import ctypes
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -9,15 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import stewart_drake as sd
-from stewart_drake.core import library as core_library_module
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.core_law import CoreLqi, serving, uncovered
 from stewart_drake.law.delay_model import DelayedModel, delayed_model
 from stewart_drake.law.doubling import Doubling
 from stewart_drake.law.error_model import linear_model
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
-from stewart_drake.law.native_law import NativeLqi, serving, uncovered
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError, lqr, reduced_gain
 from stewart_drake.loop.experiment import prepare, torques_in_flight
@@ -36,12 +33,6 @@ DIRTY = (
     "plant.joint_damping=1e-4",
     "plant.torque_bias=[1e-3,-1e-3,2e-3,0,1e-3,-2e-3]",
 )
-
-
-@pytest.fixture(scope="module")
-def library() -> ctypes.CDLL:
-    """The compiled one."""
-    return core_library_module.core_library()
 
 
 # The Riccati equation.
@@ -79,7 +70,7 @@ def exact_gain(A: Array, B: Array, Q: Array, R: Array, P: Array) -> Array:
     return riccati_gain(p, a, b, r).astype(np.float64)
 
 
-def assert_exact(library: ctypes.CDLL, seed: int) -> None:
+def assert_exact(seed: int) -> None:
     """1e-12 of the largest entry from the exact gain, and from Drake's as far as that is exact."""
     model, Q, R = problem(seed)
     given: list[Array] = []
@@ -100,20 +91,20 @@ def assert_exact(library: ctypes.CDLL, seed: int) -> None:
 
 
 @pytest.mark.parametrize("part", range(3))
-def test_gains_are_exact(library, part: int) -> None:
+def test_gains_are_exact(part: int) -> None:
     for seed in range(10 * part, 10 * part + 10):
-        assert_exact(library, seed)
+        assert_exact(seed)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("part", range(20))
-def test_gains_of_a_thousand_machines_are_exact(library, part: int) -> None:
+def test_gains_of_a_thousand_machines_are_exact(part: int) -> None:
     for seed in range(50 * part, 50 * part + 50):
-        assert_exact(library, seed)
+        assert_exact(seed)
 
 
 @pytest.mark.parametrize("order", [6, 12, 18, 24])
-def test_the_cost_of_a_run_is_what_the_solution_says(library, order: int) -> None:
+def test_the_cost_of_a_run_is_what_the_solution_says(order: int) -> None:
     """Brute force: x'Px is what the loop costs from x on."""
     rng = np.random.default_rng(order)
     A = rng.normal(0, 1.2 / np.sqrt(order), (order, order))
@@ -129,7 +120,7 @@ def test_the_cost_of_a_run_is_what_the_solution_says(library, order: int) -> Non
     assert cost == pytest.approx(first @ P @ first, rel=1e-11)
 
 
-def test_what_has_no_solution_is_a_failure(library) -> None:
+def test_what_has_no_solution_is_a_failure() -> None:
     one, nothing = np.eye(12), np.zeros((12, 6))
     B = np.vstack([np.eye(6), np.zeros((6, 6))])
     doubling = Doubling(12)
@@ -216,11 +207,11 @@ RECORDED: tuple[tuple[Callable[[Any], Array], float, float], ...] = (
 class Pair:
     """Both laws in one loop with the plant as it is: what the one in Python says acts."""
 
-    def __init__(self, library: ctypes.CDLL, name: str, settings: tuple[str, ...]) -> None:
+    def __init__(self, name: str, settings: tuple[str, ...]) -> None:
         self.scenario = load_scenario(name, settings=("plant.kind=exact", *settings))
         experiment = prepare(self.scenario)
         self.law, self.planned, _ = control_law(experiment)
-        self.native = NativeLqi(self.law, library)
+        self.native = CoreLqi(self.law)
         queue = torques_in_flight(experiment, self.law.timeline.delay)
         self.one: Any = self.law.initial_memory(queue)
         self.other: Any = self.native.initial_memory(queue)
@@ -246,17 +237,17 @@ class Pair:
         self.one = law.step(self.one, *given)
         self.other = self.native.step(self.other, *given)
         gap = float(np.abs(self.one.torque - self.other.torque).max())
-        self.other.data["in_flight"][: self.other.length] = self.one.in_flight
+        self.other.in_flight[:] = self.one.in_flight
         (torques, durations), _ = law.timeline.last_period(self.one.in_flight)
         self.states.append(self.truth.predict(self.states[-1], torques, durations, 8)[-1])
         return gap
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_step_by_step_the_torques_are_those_of_python(library, case: str) -> None:
+def test_step_by_step_the_torques_are_those_of_python(case: str) -> None:
     """1e-9 of the peak torque; and all that is recorded."""
     name, settings, spoil = CASES[case]
-    pair, rng = Pair(library, name, settings), np.random.default_rng(7)
+    pair, rng = Pair(name, settings), np.random.default_rng(7)
     noise = np.array(pair.scenario.sensor.noise_std)
     gaps, peak = [], 0.0
     for k in range(70):
@@ -307,35 +298,29 @@ def lost_in_a_row(first: int, number: int) -> Spoil:
 
 @pytest.mark.parametrize("case", ["paper", "a fraction of a period", "no delay", "gravity"])
 @pytest.mark.parametrize(("first", "number"), [(0, 1), (0, 3), (1, 5), (2, 5), (0, 10), (8, 10)])
-def test_after_a_gap_the_way_back_is_that_of_python(
-    library, case: str, first: int, number: int
-) -> None:
+def test_after_a_gap_the_way_back_is_that_of_python(case: str, first: int, number: int) -> None:
     """From rest; the same torques, counts and memory."""
     name, settings, _ = CASES[case]
-    pair, gaps, peak = Pair(library, name, settings), [], 0.0
+    pair, gaps, peak = Pair(name, settings), [], 0.0
     for k in range(32):
         gaps.append(pair.step(k, np.zeros(12), None, lost_in_a_row(first, number)))
         one, other = pair.one, pair.other
         peak = max(peak, float(np.abs(one.torque).max()))
         assert one.counts == other.counts, k
-        back, data = one.back, other.data
-        assert (one.gap, back.holds, back.samples) == (
-            data["gap"], data["return_holds"], data["return_samples"]
-        ), k  # fmt: skip
+        back = one.back
+        assert [one.gap, back.holds, back.samples] == [*other.gap, *other.way_back], k
         if back.holds:
-            assert np.allclose(back.offset, data["offset"], rtol=1e-6, atol=1e-8), k
+            assert np.allclose(back.offset, other.offset, rtol=1e-6, atol=1e-8), k
     assert max(gaps) <= 1e-8 * peak
     assert pair.one.counts.references_missing == number + 1
 
 
 @pytest.mark.parametrize("case", ["paper", "a fraction of a period", "no delay", "gravity"])
 @pytest.mark.parametrize("start", ["measured", "unmeasured"])
-def test_a_reference_that_is_missing_is_continued_as_in_python(
-    library, case: str, start: str
-) -> None:
+def test_a_reference_that_is_missing_is_continued_as_in_python(case: str, start: str) -> None:
     """The same torques, counts and memory; with weights that are no numbers, too."""
     name, settings, _ = CASES[case]
-    pair = Pair(library, name, (*settings, "start=on_reference", "queue=reference"))
+    pair = Pair(name, (*settings, "start=on_reference", "queue=reference"))
     gaps, peak = [], 0.0
     for k in range(40):
         blind = np.full(12, np.nan) if start == "unmeasured" and k < 2 else np.zeros(12)
@@ -350,18 +335,32 @@ def test_a_reference_that_is_missing_is_continued_as_in_python(
     assert pair.one.counts.references_missing == 12
 
 
-def test_what_was_sent_in_its_place_is_in_flight(library) -> None:
-    pair = Pair(library, "paper", ())
+def test_what_was_sent_in_its_place_is_in_flight() -> None:
+    pair = Pair("paper", ())
     for k in range(3):
         pair.step(k, np.zeros(12), None)
-    torque, data = np.arange(6.0), pair.other.data
-    config = pair.native._config
-    library.law_sent(*(ctypes.c_void_p(a.ctypes.data) for a in (config, data, torque)))
+    torque, c = np.arange(6.0), core()
+    law, memory = pair.other.compiled.data, pair.other.data
+    c.lib.stewart_note_acted(law, c.at(memory), 1, 1, c.at(torque))
     assert np.array_equal(pair.other.in_flight[-1], torque)
     assert np.array_equal(pair.other.in_flight[:-1], pair.one.in_flight[:-1])
 
 
 # Which of them steps.
+
+
+COVERED = (
+    (),
+    ("controller.estimate=[]",),
+    ("controller.estimate=[payload]",),
+    ("controller.feedforward=none",),
+    ("controller.integral=false",),
+    ("controller.delay_estimator=constant",),
+    ("controller.period=0.01", "delay.steps=80"),
+    ("controller.period=0.01", "sensor.delay=0.3"),
+    ("link.kind=network",),
+    ("sensor.kind=encoders",),
+)
 
 
 def law_of(*settings: str, controller: str | None = None) -> PredictiveLqi:
@@ -372,22 +371,15 @@ def law_of(*settings: str, controller: str | None = None) -> PredictiveLqi:
     ("settings", "field"),
     [
         (("controller.prediction=linear",), "controller.prediction"),
-        (("controller.feedforward=none",), "controller.feedforward"),
         (("controller.model=paper",), "controller.model"),
-        (("controller.integral=false",), "controller.integral"),
-        (("controller.delay_estimator=constant",), "controller.delay_estimator"),
-        (("controller.period=0.01", "delay.steps=80"), "controller.delay_steps"),
-        (("controller.period=0.01", "sensor.delay=0.3"), "sensor.delay"),
-        (("link.kind=network",), "link.kind"),
-        (("controller.estimate=[]",), None),
-        ((), None),
+        *((settings, None) for settings in COVERED),
     ],
 )
 def test_what_the_law_in_c_has_not_is_named(settings: tuple[str, ...], field: str | None) -> None:
     assert uncovered(law_of(*settings)) == field
 
 
-def test_a_part_of_ones_own_is_stepped_in_python(library) -> None:
+def test_a_part_of_ones_own_is_stepped_in_python() -> None:
     class Mine(PredictiveLqi):
         pass
 
@@ -397,28 +389,19 @@ def test_a_part_of_ones_own_is_stepped_in_python(library) -> None:
     assert uncovered(Mine(**{name: getattr(law, name) for name in law.__dataclass_fields__})) == (
         "law"
     )
-    settings = law.observer.settings
-    wary = replace(settings.parameters, usual=2 * settings.parameters.std)
-    observer = replace(law.observer, settings=replace(settings, parameters=wary))
-    assert uncovered(replace(law, observer=observer)) == "controller.calibration"  # C knows one std
     assert serving(law).backend == "native"
     assert serving(mine) == (mine, "python (controller.replan)")
 
 
-def test_the_summary_says_which(library) -> None:
-    for setting, expected in (
-        ("controller.estimate=[torque_bias,payload,damping]", "native"),
-        ("controller.prediction=linear", "python (controller.prediction)"),
-    ):
-        scenario = load_scenario("paper", settings=["duration=0.3", setting])
-        summary = sd.simulate(scenario, judge_stability=False).summary
-        assert summary["controller_backend"] == expected
-        assert json.dumps(summary["controller_backend"])
+def test_a_law_of_the_paper_is_stepped_in_python() -> None:
+    assert serving(law_of("controller.prediction=linear")).backend == (
+        "python (controller.prediction)"
+    )
 
 
-def test_shapes_that_do_not_fit_are_refused(library) -> None:
+def test_shapes_that_do_not_fit_are_refused() -> None:
     law = law_of()
-    native = NativeLqi(law, library)
+    native = CoreLqi(law)
     with pytest.raises(ValueError, match=r"queue: got shape \(2, 6\); expected \(8, 6\)"):
         native.initial_memory(np.zeros((2, 6)))
     memory = native.initial_memory(np.zeros((8, 6)))

@@ -92,11 +92,9 @@ IN_PYTHON = {
     "blind": "native, law in Python (controller.prediction)",
     "linear": "native, law in Python (controller.prediction)",
     "printed": "native, law in Python (controller.model)",
-    "adaptive": "native, law in Python (controller.delay_estimator)",
-    "rule": "native, weights in Python (tuner.kind)",
-    "network": "native, weights in Python (tuner.kind)",
+    "adaptive": "native, reference in Python (controller.delay_estimator)",
 }
-"""What the law in C has not."""
+"""What the core has not."""
 
 
 def drake(one: Scenario, truth: sd.Mechanism | None = None) -> Ending:

@@ -19,9 +19,9 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.core_law import serving
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
-from stewart_drake.law.native_law import serving
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.delay_chain import DelayChain

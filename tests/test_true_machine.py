@@ -18,7 +18,7 @@ from stewart_drake.loop.experiment import prepare, simulated_machine
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.simulation import make_simulator
-from stewart_drake.scenario.signals import COULOMB
+from stewart_drake.scenario.signals import COULOMB, NUM_PARAMETERS, PAYLOAD
 from tests.mechanisms import PAPER
 
 ON_REFERENCE = ("start=on_reference", "queue=reference")
@@ -170,3 +170,13 @@ def test_a_machine_that_does_not_reach_the_start_is_refused(machine: Path) -> No
 def test_a_machine_that_is_not_there_names_the_field(name: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         prepare(sd.load_scenario("paper", settings=[f"plant.mechanism={name}"]))
+
+
+def test_a_payload_is_found_alone_and_recorded_at_its_place() -> None:
+    """What is not estimated is recorded as it is known, without a standard deviation."""
+    settings = ("plant.kind=exact", "duration=3", "plant.payload_mass=0.02", *ON_REFERENCE)
+    last = run(*settings, "controller.estimate=[payload]").signals.isel(time=-1)
+    others = [i for i in range(NUM_PARAMETERS) if i != PAYLOAD]
+    assert last.parameters[PAYLOAD].item() == pytest.approx(0.02, rel=0.02)
+    assert 0 < last.parameter_std[PAYLOAD].item() < 0.01
+    assert not last.parameters[others].any() and last.parameter_std[others].isnull().all()

@@ -35,7 +35,7 @@ TRIED: Final = """
 #include <stdio.h>
 #include <string.h>
 #include "udp.h"
-#include "stewart_motion.h"
+#include "stewart_example.h"
 const char *const stewart_faults[STEWART_FAULTS];
 int main(int argc, char **argv)
 {

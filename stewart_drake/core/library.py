@@ -16,15 +16,7 @@ from numpy.typing import NDArray
 from stewart_drake.core.build import FOLDER, LIBRARY, source_hash
 from stewart_drake.files.errors import ConfigError
 
-PRIVATE: Final = (
-    "stewart.h",
-    "workspace.h",
-    "stewart_limits.h",
-    "real.h",
-    "equations.h",
-    "dop853.h",
-    "dop853_table.h",
-)
+PRIVATE: Final = ("real.h", "equations.h", "dop853.h", "dop853_table.h")
 """Headers that Python does not call."""
 
 

@@ -1,6 +1,7 @@
 /* Plans: see planning.h. */
 
 #include "planning.h"
+#include "reference.h"
 
 #define X STEWART_STATES
 #define U STEWART_MOTORS
@@ -81,20 +82,6 @@ static real reach(const real *geometry)
 
 /* ---- pieces ------------------------------------------------------------------------------------- */
 
-/* The share s of the way between two rows that are h seconds apart: the polynomial of fifth order. */
-static void quintic(const real *from, const real *to, real h, real s, real *row)
-{
-    for (int i = 0; i < 6; i++) {
-        real v0 = h * from[6 + i], v1 = h * to[6 + i], a0 = h * h * from[12 + i];
-        real a1 = h * h * to[12 + i], c2 = a0 / 2, d = to[i] - from[i] - v0 - c2, e = v1 - v0 - a0;
-        real f = a1 - a0, c3 = 10 * d - 4 * e + f / 2, c4 = -15 * d + 7 * e - f;
-        real c5 = 6 * d - 3 * e + f / 2;
-        row[i] = from[i] + s * (v0 + s * (c2 + s * (c3 + s * (c4 + s * c5))));
-        row[6 + i] = (v0 + s * (2 * c2 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))) / h;
-        row[12 + i] = (2 * c2 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))) / (h * h);
-    }
-}
-
 int stewart_along(int number, const real *pieces, real time, real *row)
 {
     for (int k = 0; k < number; k++, pieces += STEWART_PIECE) {
@@ -102,7 +89,7 @@ int stewart_along(int number, const real *pieces, real time, real *row)
         if (!(time < end))
             continue;
         if (time >= begin) {
-            quintic(first, last, end - begin, (time - begin) / (end - begin), row);
+            stewart_between(first, last, end - begin, (time - begin) / (end - begin), row);
             return 1;
         }
         for (int i = 0; i < 6; i++) {
@@ -249,7 +236,7 @@ static void guess(const stewart_model *model, const real *start, const real *end
     for (int k = 0; k < p->number; k++) {
         for (int node = 0; node < 2; node++) {
             const real time = p->edges[k] + (p->edges[k + 1] - p->edges[k]) * GAUSS_NODES[node];
-            quintic(from, end, duration, time / duration, row);
+            stewart_between(from, end, duration, time / duration, row);
             model->inverse_dynamics(model->about, row, torques[node]);
         }
         for (int j = 0; j < U; j++)
@@ -376,7 +363,7 @@ static real time_of(const plan *p, int state)
     return p->edges[k] + (p->edges[k + 1] - p->edges[k]) / (real)p->pieces * (real)part;
 }
 
-int stewart_plan(const stewart_model *model, const real *start, real begin, real period, int periods,
+int stewart_plan_way(const stewart_model *model, const real *start, real begin, real period, int periods,
                  const real *rows, real *pieces, real *peak, stewart_scratch scratch)
 {
     plan p = {holds_of(periods), pieces_per_hold(period, periods), NULL, NULL, NULL, NULL};

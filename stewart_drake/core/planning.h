@@ -43,7 +43,7 @@ int stewart_plan_scratch(real period, int periods);
 /* Plan over so many periods from a state (12) onto the reference, whose rows (3, 18) are those at
    `stewart_plan_times`. Returns the number of pieces, 0 where there is no such plan; `peak` is the
    largest torque. */
-int stewart_plan(const stewart_model *model, const real *start, real begin, real period, int periods,
+int stewart_plan_way(const stewart_model *model, const real *start, real begin, real period, int periods,
                  const real *rows, real *pieces, real *peak, stewart_scratch scratch);
 
 /* Pieces of the motion through `states` (1 + acting->number, 12) under torques from `begin` s on;

@@ -9,7 +9,7 @@
 
 #include "dop853.h"
 #include "link.h"
-#include "stewart.h"
+#include "tuner.h"
 
 #define EXPORT __attribute__((visibility("default")))
 #define MOTORS 6
@@ -205,36 +205,38 @@ EXPORT int closed_loop(run *r, machine *m, looks *l, loop *o, controller law, vo
     }
 }
 
-/* law.c as a controller. */
+/* law.c as a controller, without Python in between; with a tuner, or fixed weights where that is NULL. */
 typedef struct {
-    const stewart_config *config;
-    stewart_memory memory;
-    stewart_workspace work;
-    const double *previews; /* of each sample one after the other */
-    int rows;               /* of one of them */
-    const double *weights;
+    const stewart_law *law;
+    const stewart_tuner *tuner;
+    double *memory, *tuner_memory, *scratch;
+    double *previews;        /* of each sample one after the other, `rows` each */
+    const double *wanted;    /* (samples, 12) reference, for a tuner */
+    double *weights;         /* (samples, 2): given, or with a tuner the result */
+    double *kept;            /* (samples, columns) result: rows of the tuner's window */
+    long rows, columns;
 } law_in_c;
 
 static int step(void *about, long k, const double *measurement, double *torque)
 {
-    law_in_c *law = about;
-    const double *preview = law->previews + STEWART_REFERENCE * law->rows * k;
-    stewart_step(law->config, &law->memory, &law->work, measurement, 0, preview, law->weights,
-                 torque);
+    law_in_c *in = about;
+    stewart_sample sample = {.measurement = measurement, .reference = stewart_given_rows};
+    sample.about = in->previews + STEWART_REFERENCE * in->rows * k;
+    memcpy(sample.weights, in->weights + 2 * k, sizeof sample.weights);
+    if (!in->tuner) {
+        stewart_step(in->law, in->memory, in->scratch, &sample, torque);
+        return 0;
+    }
+    stewart_tuned_step(in->law, in->tuner, in->memory, in->tuner_memory, in->scratch, &sample,
+                       in->wanted + STATES * k, torque);
+    memcpy(in->weights + 2 * k, sample.weights, sizeof sample.weights);
+    stewart_newest_row(in->tuner, in->tuner_memory, in->kept + in->columns * k);
     return 0;
 }
 
-/* `closed_loop` with the law in C. `queue` is what it believes in flight, counts (STEWART_CAUSES) what
-   went wrong. */
-EXPORT int closed_loop_of_law(run *r, machine *m, looks *l, loop *o, const stewart_config *config,
-                              const double *queue, const double *previews, const double *weights,
-                              int *counts)
+/* `closed_loop` with the law in C; `controller` points to a `law_in_c` whose memories have been
+   started. */
+EXPORT int closed_loop_of_law(run *r, machine *m, looks *l, loop *o, law_in_c *controller)
 {
-    law_in_c law = {.config = config, .previews = previews, .weights = weights};
-    double times[STEWART_PREVIEW];
-    law.rows = stewart_preview_times(config, times);
-    stewart_init(config, &law.memory, queue);
-    int how = closed_loop(r, m, l, o, step, &law);
-    memcpy(counts, law.memory.counts, sizeof law.memory.counts);
-    return how;
+    return closed_loop(r, m, l, o, step, controller);
 }

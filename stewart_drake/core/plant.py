@@ -82,5 +82,23 @@ class LoopStruct(Structure):
     )
 
 
+class LawStruct(Structure):
+    """`law_in_c`."""
+
+    _fields_ = (
+        ("law", c_void_p),
+        ("tuner", c_void_p),
+        ("memory", c_void_p),
+        ("tuner_memory", c_void_p),
+        ("scratch", c_void_p),
+        ("previews", c_void_p),
+        ("wanted", c_void_p),
+        ("weights", c_void_p),
+        ("kept", c_void_p),
+        ("rows", c_long),
+        ("columns", c_long),
+    )
+
+
 Controller: Final = ctypes.CFUNCTYPE(c_int, c_void_p, c_long, _Numbers, _Numbers)
 """(about, sample, measurement (12), torque (6)) -> 0, or anything else to give up."""

@@ -5,7 +5,6 @@
 
 #include <math.h>
 
-#include "stewart_limits.h"
 
 #if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
 #error "compile without -ffast-math and -ffinite-math-only: they remove the checks for NaN and infinity"

@@ -1,7 +1,7 @@
 """The controller of a scenario as a folder of C, with a test that replays a run of it.
 
-The sources are those of core/, as they are; what is written here is what they are compiled with:
-the size of their arrays, the configuration, and what the law in Python was given and answered.
+The sources are those of core/, as they are; what is written here is the configuration, and what the
+law in Python was given and answered. The folder holds only what the law uses.
 """
 
 import os
@@ -11,140 +11,54 @@ import subprocess
 import tempfile
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from stewart_drake.core.build import FOLDER, compiler
-from stewart_drake.core.law_layout import CONFIG_FIELDS, CONFIG_FLAGS
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.workspace import LEAST, home_sign
+from stewart_drake.export.constants import Constants, numbers
 from stewart_drake.export.motion import TOLERANCE, knots
+from stewart_drake.export.recording import Recorded, record
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import replacing
-from stewart_drake.law.channel import Report
-from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.memory import Memory
-from stewart_drake.law.motion import Motion
-from stewart_drake.law.native_law import configuration, uncovered
+from stewart_drake.law.compiled import Compiled
+from stewart_drake.law.core_law import CompiledLaw
 from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.experiment import Experiment, prepare
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import FAULTS, identity_of
-from stewart_drake.loop.simulation import simulate
+from stewart_drake.loop.tuner import weights_source
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_yaml
+from stewart_drake.scenario.signals import NUM_STATE
+from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.tuner.compiled import compiled_tuner
 from stewart_drake.types import Array
 
 SOURCES: Final = (
-    *("stewart_limits.h", "real.h", "scratch.h", "matrix.h", "dynamics.h", "equations.h"),
-    *("riccati.h", "stewart.h", "workspace.h"),
-    *("matrix.c", "dynamics.c", "riccati.c", "law.c"),
+    *("real.h", "scratch.h", "equations.h", "packets.h", "observer.h", "law.h"),
+    *("matrix", "dynamics", "machine", "riccati", "design", "timeline.c"),
 )
-CONTROLLER: Final = (*(name for name in SOURCES if name.endswith(".c")), "stewart_config.c")
-"""What is compiled of them, with the configuration."""
+"""Sources of core/ that every law needs; a name without a suffix stands for header and source."""
 MACHINE: Final = ("link.h", "link.c")
-"""What the example of a machine takes beside those."""
+"""Sources of core/ that the example of a machine takes beside those."""
+EXAMPLES: Final = (
+    *("protocol.c", "protocol.h", "protocol_test.c", "udp.c", "udp.h"),
+    *("stewart_example.c", "stewart_example.h", "stewart_machine.c", "stewart_udp.c", *MACHINE),
+)
+"""Examples over UDP: for a measured state, a known delay, and one torque at a sample."""
 TEMPLATES: Final = Path(__file__).with_name("templates")
-MOST_SAMPLES: Final = 100
-"""Of a run that the test replays."""
-TOLERANCES: Final = {"double": 1e-9, "float": 1e-2}
-"""Of the torque that the replay may differ by, as a share of its peak."""
+TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
+"""Of the answer that the replay may differ by, as a share of its peak."""
 _UNMEASURED: Final = "It was not compiled where it was written: `make size` and `make test` tell.\n"
 
 
-class Step(NamedTuple):
-    """What one sample was given and came to."""
-
-    measurement: Array
-    age: int
-    preview: Array
-    weights: Array
-    torque: Array
-    sent: Array
-    status: int
-
-
-@dataclass(frozen=True)
-class RecordedLqi(PredictiveLqi):
-    """A law, in Python, that remembers what it was asked since its memory was begun.
-
-    Attributes:
-        steps: of it.
-        queue: that it began with.
-    """
-
-    steps: list[Step] = field(default_factory=list)
-    queue: list[Array] = field(default_factory=list)
-
-    def initial_memory(self, queue: Array) -> Memory:
-        """Begins anew."""
-        self.steps.clear()
-        self.queue[:] = [queue]
-        return super().initial_memory(queue)
-
-    def step(
-        self,
-        memory: Memory,
-        measurement: Measurement,
-        motion: Motion,
-        weights: Array,
-        report: Report | None = None,
-    ) -> Memory:
-        """See `PredictiveLqi.step`."""
-        after = super().step(memory, measurement, motion, weights, report)
-        if len(self.steps) < MOST_SAMPLES:
-            said = measurement.after(np.full(self.sensing.size, np.nan))
-            new = np.subtract(after.counts, memory.counts)
-            step = Step(
-                said,
-                round(measurement.age / self.timeline.period),
-                motion(self.preview_times),
-                weights,
-                after.torque,
-                after.in_flight[-1],
-                int(new @ 2 ** np.arange(len(new))),
-            )
-            self.steps.append(step)
-        return after
-
-
-def recorded_law(scenario: Scenario) -> RecordedLqi:
-    """Return the law of a scenario, with what it did in a run on the exact plant.
-
-    The test replays the controller. The steps of a *multibody* plant are an error that some stable
-    loops, such as that of `gravity`, cannot correct.
-
-    Raises:
-        ConfigError: it has what the law in C has not, naming the field; or bad input.
-    """
-    found: list[RecordedLqi] = []
-
-    def recorded(law: PredictiveLqi) -> PredictiveLqi:
-        problem = uncovered(law)
-        if problem is not None:
-            raise ConfigError(
-                f"{problem}: is not exported as it is; expected what predictor_lqi has, whose "
-                "torques go over a wire"
-            )
-        parts = {f.name: getattr(law, f.name) for f in fields(law)}
-        found.append(RecordedLqi(**parts))
-        return found[-1]
-
-    exact = replace(scenario, plant=replace(scenario.plant, kind="exact"))
-    result = simulate(exact, modify_law=recorded, judge_stability=False)
-    if result.failure is not None:
-        raise ConfigError(
-            f"scenario: {result.failure}; expected one whose run the test can replay to its end"
-        )
-    return found[-1]
-
-
 def exported(scenario: Scenario, single: bool = False, measured: bool = True) -> dict[str, str]:
-    """Name -> text of the files of an export.
+    """Return the text of the files of an export, by name.
 
     Args:
         scenario: whose controller it is.
@@ -152,56 +66,188 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         measured: whether it is compiled and run here, for what its README tells.
 
     Raises:
-        ConfigError: see `recorded_law`; single precision with the estimator.
+        ConfigError: see `recording.record`.
     """
-    if single and scenario.controller.estimate:
-        raise ConfigError(
-            f"controller.estimate: got {scenario.controller.estimate} with --single; expected "
-            "[], or double precision: the filter's covariance needs it"
-        )
-    law = recorded_law(scenario)
-    suffix = "f" if single else ""
-    files = {name: (FOLDER / name).read_text("utf-8") for name in SOURCES}
-    files["stewart_limits.h"] = _limits(files["stewart_limits.h"], law, single)
+    recorded, experiment = record(scenario), prepare(scenario)
+    compiled, suffix = CompiledLaw(recorded.law), "f" if single else ""
+    law, tuner = recorded.law, None
+    if isinstance(law, PredictiveLqi):
+        source = weights_source(experiment, law)
+        tuner = None if source is None else compiled_tuner(source)
+        if (source is None) != (tuner is None):
+            raise ConfigError("tuner.kind: is not exported as it is; expected a shipped kind")
+    files = {name: (FOLDER / name).read_text("utf-8") for name in _sources(compiled, tuner)}
+    if single:
+        defined = "#define STEWART_FLOAT\n\n#include"
+        files["real.h"] = files["real.h"].replace("#include", defined, 1)
+    over_udp = _is_example(recorded, tuner)
     values = {
-        "OBJECTS": " ".join(name.replace(".c", ".o") for name in CONTROLLER),
         "SCENARIO": scenario_yaml(scenario).replace("*/", "* /").strip(),
-        "STEPS": str(len(law.steps)),
-        "PREVIEW": str(len(law.preview_times)),
         "PERIOD": f"{law.timeline.period:g}",
         "TOLERANCE": f"{TOLERANCES['float' if single else 'double']:g}",
         "REAL": "float" if single else "double",
         "ESTIMATES": "no" if isinstance(law.observer, NoObserver) else "yes",
+        "TESTS": "stewart_test protocol_test" if over_udp else "stewart_test",
+        "TEST_OBJECTS": "stewart_motion.o" if recorded.moves else "",
     }
-    values["CONFIGURATION"] = _configuration(law, suffix)
-    values |= _surroundings(scenario, law, suffix)
-    values["QUEUE"] = _list(law.queue[0] if law.queue[0].size else [0.0], suffix)
-    for name in ("measurement", "preview", "weights", "torque", "sent"):
-        rows = [_list(getattr(step, name), suffix) for step in law.steps]
-        values["PREVIEW_ROWS" if name == "preview" else name.upper()] = ",\n    ".join(rows)
-    for name in ("age", "status"):
-        values[name.upper()] = ", ".join(str(getattr(step, name)) for step in law.steps)
-    files |= {name: (FOLDER / name).read_text("utf-8") for name in MACHINE}
-    for path in sorted(TEMPLATES.iterdir()):
-        files[path.name] = _filled(path.read_text("utf-8"), values)
+    values |= _configuration(recorded, compiled, tuner, suffix)
+    values |= _replay(recorded, experiment, tuner, suffix)
+    names = {path.name for path in TEMPLATES.iterdir()} - {"replay_torques.h", "replay_servos.h"}
+    if over_udp or recorded.moves:
+        values |= _surroundings(experiment, recorded, suffix)
+    else:
+        names -= {"stewart_motion.c", "stewart_motion.h"}
+    if over_udp:
+        files |= {name: (FOLDER / name).read_text("utf-8") for name in MACHINE}
+    else:
+        names -= set(EXAMPLES)
+    kind = "torques" if isinstance(law, PredictiveLqi) else "servos"
+    texts = {name: (TEMPLATES / name).read_text("utf-8") for name in sorted(names)}
+    texts["replay.h"] = (TEMPLATES / f"replay_{kind}.h").read_text("utf-8")
+    files |= {name: _filled(text, values) for name, text in texts.items()}
+    if not over_udp:
+        files["README.md"] = files["README.md"].partition("## Over UDP")[0].rstrip() + "\n"
     files["README.md"] = _filled(
         files["README.md"], {"SIZES": _sizes(files) if measured else _UNMEASURED}
     )
     return files
 
 
-def _surroundings(scenario: Scenario, law: RecordedLqi, suffix: str) -> dict[str, str]:
-    """What the examples over UDP know of the scenario beside the controller."""
-    experiment = prepare(scenario)
-    motion, c = control_law(experiment)[1], scenario.controller
-    rows = knots(motion, scenario.duration + max(0.0, float(law.preview_times.max())))
+def _is_example(recorded: Recorded, tuner: Compiled | None) -> bool:
+    """Return whether the examples over UDP drive this law."""
+    law = recorded.law
+    if not isinstance(law, PredictiveLqi) or tuner is not None or recorded.moves:
+        return False
+    return law.sensing.size == NUM_STATE and law.channel.torques == 1
+
+
+def _sources(compiled: CompiledLaw, tuner: Compiled | None) -> list[str]:
+    """Return the files of core/ that a law is made of."""
+    found: dict[str, None] = {}
+    for name in (*SOURCES, *compiled.sources, *([] if tuner is None else ["tuner"])):
+        found |= dict.fromkeys([name] if "." in name else [f"{name}.h", f"{name}.c"])
+    return list(found)
+
+
+def objects(files: Mapping[str, str]) -> list[str]:
+    """Return the objects of the controller in an export, as its Makefile names them."""
+    found = re.search(r"^STEWART = (.*)$", files["Makefile"], re.MULTILINE)
+    assert found is not None
+    return found[1].split()
+
+
+def _configuration(
+    recorded: Recorded, compiled: CompiledLaw, tuner: Compiled | None, suffix: str
+) -> dict[str, str]:
+    """Return the constants of a law in C, and the sizes that it needs."""
+    written = Constants(compiled.keep, compiled.tables, suffix)
+    torques, c = isinstance(recorded.law, PredictiveLqi), core()
+    text = written.struct(compiled.data[0], "stewart_law")
+    law = compiled.data if torques else compiled.data.law
+    sources = _sources(compiled, tuner)
+    headers = (name for name in sources if name.endswith(".h") and name != "equations.h")
+    made = [name.replace(".c", ".o") for name in sources if name.endswith(".c")]
+    queue = np.atleast_2d(recorded.first)
+    values = {
+        "INCLUDES": "\n".join(f'#include "{name}"' for name in headers),
+        "OBJECTS": " ".join([*made, "stewart_config.o"]),
+        "KIND": "stewart_law" if torques else "stewart_servo",
+        "CONFIGURATION": text,
+        "MEMORY": str(compiled.data.memory),
+        "SCRATCH": str(compiled.scratch),
+        "ROWS": str(law.rows),
+        "MEASURED": str(law.measured),
+        "QUEUE": numbers(queue if queue.size else [0.0], suffix),
+        "QUEUE_ROWS": str(len(queue) if queue.size else 0),
+        "QUEUE_MEANING": (
+            "torques under way at the start, the oldest first"
+            if torques
+            else "the command that was sent last"
+        ),
+        "TUNER": "",
+        "TUNER_DECLARATION": "",
+    }
+    if tuner is not None:
+        kept = [array for array in tuner.keeps if isinstance(array, np.ndarray)]
+        own = Constants(kept, {}, suffix)
+        text = own.struct(tuner.it[0], "tuner")
+        lines = [*own.before, f"const stewart_tuner stewart_own_tuner = {text};"]
+        values["TUNER"] = "\n" + "\n".join(lines)
+        values["TUNER_DECLARATION"] = (
+            "extern const stewart_tuner stewart_own_tuner;\n#define STEWART_TUNER_MEMORY "
+            f"{c.lib.stewart_tuner_memory(tuner.it)} /* numbers that the tuner remembers */\n"
+        )
+        values["SCRATCH"] = str(c.lib.stewart_tuned_step_scratch(compiled.data))
+    return values | {"CONSTANTS": "\n".join(written.before)}
+
+
+def _replay(
+    recorded: Recorded, experiment: Experiment, tuner: Compiled | None, suffix: str
+) -> dict[str, str]:
+    """Return what the test of an export replays."""
+    steps, period = recorded.steps, recorded.law.timeline.period
+
+    def rows(arrays: Iterable[Array]) -> str:
+        return ",\n    ".join(numbers(array, suffix) for array in arrays)
+
+    values = {
+        "STEPS": str(len(steps)),
+        "MEASUREMENT": rows(step.measurement for step in steps),
+        "AGE": ", ".join(str(step.age) for step in steps),
+        "STATUS": ", ".join(str(step.status) for step in steps),
+        "ANSWERS": rows(step.answer for step in steps),
+        "PREVIEW_ROWS": rows(step.preview for step in steps),
+        "UNIT": "N m",
+    }
+    if not isinstance(recorded.law, PredictiveLqi):
+        reports = [np.asarray(step.report) for step in steps]
+        size = {"REPORT_SIZE": str(reports[0].size), "SERVO_REPORTS": rows(reports)}
+        return values | size | {"UNIT": "rad, rad/s or N m"}
+    wanted = (evaluate(experiment.reference, k * period)[:NUM_STATE] for k in range(len(steps)))
+    return values | {
+        "WEIGHTS": rows(step.weights for step in steps),
+        "SENT": rows(step.sent for step in steps),
+        "TORQUES": str(recorded.law.channel.torques),
+        "REPORTS": _reports([step.report for step in steps], suffix),
+        "MOVES": str(int(recorded.moves)),
+        "TUNED": str(int(tuner is not None)),
+        "WANTED": "" if tuner is None else rows(wanted),
+    }
+
+
+def _reports(reports: list[Any], suffix: str) -> str:
+    """Return the reports of a run, and the function that gives each of them."""
+    head = "static const stewart_report *report_of(int k)"
+    if not any(reports):
+        return f"{head}\n{{\n    (void)k;\n    return NULL;\n}}\n"
+    lines, rows = [], []
+    for k, report in enumerate(reports):
+        if report is None:
+            rows.append("{0, 0, 0, 0, -1}")
+            continue
+        arrived, acted = report.arrived.astype(float), report.acted
+        lines += [f"static const real arrived_{k}[] = {numbers(arrived, suffix)};"]
+        lines += [f"static const real acted_{k}[] = {numbers(acted.ravel(), suffix)};"]
+        sizes = len(arrived), len(acted)
+        rows.append(f"{{{sizes[0]}, arrived_{k}, {sizes[1]}, acted_{k}, {report.age}}}")
+    table = ",\n    ".join(rows)
+    lines += [f"static const stewart_report reports[STEPS] = {{\n    {table}}};\n", head]
+    return "\n".join([*lines, "{\n    return reports[k].age < 0 ? NULL : &reports[k];\n}\n"])
+
+
+def _surroundings(experiment: Experiment, recorded: Recorded, suffix: str) -> dict[str, str]:
+    """Return what the examples know of the scenario beside the controller."""
+    scenario, c = experiment.scenario, experiment.scenario.controller
+    rows = recorded.motion
+    if rows is None:
+        motion, times = control_law(experiment)[1], recorded.law.preview_times
+        rows = knots(motion, scenario.duration + max(0.0, float(times.max())))
     return {
         "DURATION": repr(float(scenario.duration)),
-        "OWN_WEIGHTS": _list([c.w_Q, c.w_R], suffix),
-        "START": _list(experiment.start, suffix),
-        "LEAST": _list(LEAST, suffix),
-        "HOME_SIGN": _list(home_sign(experiment.mechanism), suffix),
-        "QUEUE_ROWS": str(len(law.queue[0])),
+        "OWN_WEIGHTS": numbers([c.w_Q, c.w_R], suffix),
+        "START": numbers(experiment.start, suffix),
+        "LEAST": numbers(LEAST, suffix),
+        "HOME_SIGN": numbers(home_sign(experiment.mechanism), suffix),
         "IDENTITY": ",\n    ".join(
             f'{{{{{", ".join(f"0x{b:02x}" for b in part.digest)}}}, "{part.name}"}}'
             for part in identity_of(scenario)
@@ -210,9 +256,23 @@ def _surroundings(scenario: Scenario, law: RecordedLqi, suffix: str) -> dict[str
             f'"{words.replace("{:", "%").replace("}", "")}"' for words in FAULTS.values()
         ),
         "KNOTS": str(len(rows)),
-        "MOTION": ",\n    ".join(_list(row, "") for row in rows),
+        "MOTION": _table(rows),
+        "GOAL": "" if recorded.goal is None else _goal(recorded.goal),
         "MOTION_TOLERANCE": f"{TOLERANCE:g}",
     }
+
+
+def _table(rows: Array) -> str:
+    return ",\n    ".join(numbers(row, "") for row in rows)
+
+
+def _goal(rows: Array) -> str:
+    number = len(rows)
+    return (
+        f"\nstatic const double goal[{number}][1 + STEWART_REFERENCE] = {{\n"
+        f"    {_table(rows)}}};\n\n"
+        f"void stewart_goal(double t, real *reference) {{ along({number}, goal, t, reference); }}\n"
+    )
 
 
 def write(files: Mapping[str, str], folder: Path) -> list[Path]:
@@ -222,32 +282,6 @@ def write(files: Mapping[str, str], folder: Path) -> list[Path]:
         for path, text in zip(paths, files.values(), strict=True):
             all_of_them.enter_context(replacing(path)).write_text(text, "utf-8")
     return paths
-
-
-def _limits(text: str, law: PredictiveLqi, single: bool) -> str:
-    wanted = {"STEWART_MAX_QUEUE": max(1, law.timeline.queue_length), "STEWART_MAX_KEPT": law.kept}
-    for name, value in wanted.items():
-        text = re.sub(rf"(#define {name}) \d+", rf"\1 {value}", text)
-    return text.replace("\n#define", "\n#define STEWART_FLOAT\n#define", 1) if single else text
-
-
-def _configuration(law: PredictiveLqi, suffix: str) -> str:
-    config = configuration(law)
-    lines = [f".{name} = {_list(config[name], suffix)}" for name in CONFIG_FIELDS]
-    lines += [f".{name} = {int(config[name])}" for name in CONFIG_FLAGS]
-    return ",\n    ".join(lines)
-
-
-def _list(values: ArrayLike, suffix: str) -> str:
-    array = np.asarray(values, dtype=np.float64)
-    numbers = [_number(value, suffix) for value in array.ravel().tolist()]
-    return numbers[0] if array.ndim == 0 else f"{{{', '.join(numbers)}}}"
-
-
-def _number(value: float, suffix: str) -> str:
-    if not np.isfinite(value):
-        return "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
-    return f"{value!r}{suffix}"
 
 
 def _filled(text: str, values: Mapping[str, str]) -> str:

@@ -229,7 +229,7 @@ class Model:
         c.lib.stewart_plan_times(begin, period, periods, c.at(times))
         rows = np.array([evaluate(reference, t) for t in times])
         pieces = np.empty((c.lib.stewart_plan_pieces(period, periods), c.lib.STEWART_PIECE))
-        number = c.lib.stewart_plan(
+        number = c.lib.stewart_plan_way(
             *(self.data, c.at(np.array(start, np.float64)), begin, period, periods, c.at(rows)),
             *(c.at(pieces), c.at(peak), c.scratch(c.lib.stewart_plan_scratch(period, periods))),
         )

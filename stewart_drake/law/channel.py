@@ -9,7 +9,7 @@ probably* play: averaging over what it might play is worse, as it will never pla
 import sys
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,13 +153,11 @@ class Packets:
     ) -> tuple[Sent, Array]:
         """See `Channel.in_flight`."""
         c, channel = core(), structure(self)
-        memory, flying, told = sent.memory.copy(), in_flight.copy(), c.ffi.NULL
-        if report is not None:
-            arrived, acted = report.arrived.astype(np.float64), np.array(report.acted, np.float64)
-            values = len(arrived), c.at(arrived), len(acted), c.at(acted), report.age
-            told = c.ffi.new("stewart_report *", values)
+        memory, flying = sent.memory.copy(), in_flight.copy()
+        told = None if report is None else report_of(report)
+        data = c.ffi.NULL if told is None else told.data
         c.lib.stewart_packets_update(
-            *(channel, c.at(memory), told, timeline.steps, len(flying), c.at(flying)),
+            *(channel, c.at(memory), data, timeline.steps, len(flying), c.at(flying)),
             c.scratch(c.lib.stewart_packets_scratch(channel)),
         )
         return Sent(memory, sent.rows), flying
@@ -174,13 +172,29 @@ class Packets:
         return Sent(memory, sent.rows)
 
 
+class ReportData(NamedTuple):
+    """A `stewart_report *` with what it points to."""
+
+    data: Any
+    arrived: Array
+    acted: Array
+
+
+def report_of(report: Report) -> ReportData:
+    """Return a report as the core reads it."""
+    c = core()
+    arrived, acted = report.arrived.astype(np.float64), np.array(report.acted, np.float64)
+    values = len(arrived), c.at(arrived), len(acted), c.at(acted), report.age
+    return ReportData(c.ffi.new("stewart_report *", values), arrived, acted)
+
+
 def structure(channel: Packets) -> Any:
     """Return the `stewart_packets` of core/packets.h."""
-    return _structure(channel)[0]
+    return structures(channel)[0]
 
 
 @lru_cache(maxsize=64)
-def _structure(channel: Packets) -> tuple[Any, ...]:
+def structures(channel: Packets) -> tuple[Any, ...]:
     """Return it with what it points to."""
     c, kept = core(), len(channel.arrived_by)
     shares = np.array(channel.in_time), np.array(channel.arrived_by)
@@ -195,4 +209,4 @@ def _structure(channel: Packets) -> tuple[Any, ...]:
         "in_time": c.at(shares[0]),
         "arrived_by": c.at(shares[1]),
     }
-    return c.ffi.new("stewart_packets *", values), shares
+    return c.ffi.new("stewart_packets *", values), *shares

@@ -181,10 +181,10 @@ class DelayObserver:
             *(delay.it, flights, c.at(queue), c.at(y), c.at(near), after.memory, scratch)
         )
         delay.require_calm()
-        return _read(after)
+        return read_delay(after)
 
 
-def _read(belief: DelayBelief) -> DelayBelief:
+def read_delay(belief: DelayBelief) -> DelayBelief:
     """Return the belief with what the law reads of its numbers."""
     memory = belief.memory
     first, others = core().lib.STEWART_DELAY_NUMBERS, max(belief.flights - 1, 1)

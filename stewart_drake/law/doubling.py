@@ -4,13 +4,17 @@ The law in C designs with it. The law in Python and the analyses use `law.riccat
 solver, which is the oracle of this one.
 """
 
+from typing import Final
+
 import numpy as np
 
-from stewart_drake.core.law_layout import MAX_ORDER
-from stewart_drake.dynamics.native_functions import NativeFunction
+from stewart_drake.core.library import core
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.types import Array
+
+MAX_ORDER: Final = 24
+"""States of the gain: error, integral, and a torque that is still to act."""
 
 
 class Doubling:
@@ -26,18 +30,19 @@ class Doubling:
     def __init__(self, order: int) -> None:
         if not 0 < order <= MAX_ORDER:
             raise ValueError(f"order: got {order}; expected 1 to {MAX_ORDER}")
-        n, m = order, NUM_TORQUES
-        arguments, results = [(n, n), (n, m), (n, n), (m, m)], [(m, n), (n, n), (1,)]
-        nothing = np.empty(0)
-        self._call = NativeFunction("riccati", nothing, arguments, results, [n])
+        self._order = order
 
     def __call__(self, A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
-        """K (6, n) and P (n, n).
+        """Return K (6, n) and P (n, n).
 
         Raises:
             RiccatiError: there is no stabilising solution, or none was found.
         """
-        K, P, count = self._call(A, B, Q, R)
-        if not count[0]:
+        c, n = core(), self._order
+        kept = [np.ascontiguousarray(matrix, np.float64) for matrix in (A, B, Q, R)]
+        given = [c.at(matrix) for matrix in kept]
+        K, P = np.empty((NUM_TORQUES, n)), np.empty((n, n))
+        work = c.ffi.new("stewart_riccati_work *")
+        if not c.lib.stewart_riccati(n, *given, c.at(K), c.at(P), work):
             raise RiccatiError("Riccati equation: doubling has found no solution")
         return K, P

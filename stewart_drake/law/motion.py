@@ -1,32 +1,22 @@
 """The motion that a law is to follow, as a function of the time from now."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.core.library import core
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.scenario.signals import (
-    ACCELERATIONS,
-    NUM_COORDINATES,
-    NUM_REFERENCE,
-    POSE,
-    RATES,
-)
+from stewart_drake.scenario.signals import NUM_REFERENCE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 Motion = Callable[[Array], Array]
 """The reference (p, 18), pose, rates and accelerations, at instants (p,) in s from now; some of
 them may be negative."""
-
-FURTHER = 1.25
-"""Times as far as to its rest, a motion that is not known any more has to stay within reach."""
-DOUBLINGS = 6
-"""Of the rate at which a motion that is not known any more comes to rest, at the most."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +67,10 @@ class KnownMotion:
         """Return the motion at all of `times`."""
         return np.array([self._at(max(0.0, self.now + t)) for t in times])
 
+    def goal(self, times: Array) -> Array:
+        """Return the reference at all of `times`."""
+        return np.array([evaluate(self.reference, max(0.0, self.now + t)) for t in times])
+
     def _at(self, time: float) -> Array:
         if self.pieces is None:
             return evaluate(self.planned, time)
@@ -99,7 +93,7 @@ class Previewed(NamedTuple):
 
 
 def completed(
-    given: Previewed, last: Previewed, timeline: Timeline, reaches: Callable[[Array], bool]
+    given: Previewed, last: Previewed, timeline: Timeline, geometry: Array | None
 ) -> Array:
     """Return the reference (p, 18), with numbers for what is NaN or infinite in the given one.
 
@@ -110,51 +104,15 @@ def completed(
         given: for this sample.
         last: what `completed` returned for the sample before, with its instants.
         timeline: period and delay.
-        reaches: whether a pose (6,) is one that the plate can be in.
+        geometry: of the machine, or None where any pose is within reach.
     """
-    times, preview = given
-    finite = np.all(np.isfinite(preview), axis=1)
-    if np.all(finite):
-        return preview
-    there = np.all(np.isfinite(last.reference[1:]), axis=1)
-    known = np.append(times[finite], last.times[1:][there] - timeline.period)
-    rows = np.vstack([preview[finite], last.reference[1:][there]])
-    if not len(known):
-        return preview.copy()
-    rate = 2 / (timeline.eta + timeline.period)
-    complete = preview.copy()
-    for i in np.flatnonzero(~finite):
-        gaps = known - times[i]
-        sides = [np.where(gaps <= 0, -gaps, np.inf), np.where(gaps > 0, gaps, np.inf)]
-        nearest = [int(np.argmin(side)) for side in sides if np.isfinite(side).any()]
-        j, k = nearest[0], nearest[-1]
-        if j == k:
-            found = _continued(rows[j], -gaps[j], rate, reaches)
-        else:
-            found = between(rows[j], rows[k], gaps[k] - gaps[j], gaps[j] / (gaps[j] - gaps[k]))
-        v, near = preview[i, RATES], [j, k] if j != k else [j]
-        if np.all(np.isfinite(v)) and np.all(np.abs(gaps[near]) >= timeline.period / 20):
-            # (v1 - v) / h = (a + a1) / 2, to each side
-            slopes = 2 * (rows[near][:, RATES] - v) / gaps[near, None]
-            found[ACCELERATIONS] = np.mean(slopes - rows[near][:, ACCELERATIONS], axis=0)
-        complete[i] = np.where(np.isfinite(preview[i]), preview[i], found)
-    return complete
-
-
-def _continued(row: Array, later: float, w: float, reaches: Callable[[Array], bool]) -> Array:
-    """Return the reference (18,) `later` s after a row, coming to rest with the rate w in 1/s.
-
-    From da/dt = -2 w a - w^2 v, with b = a0 + w v0: v = (v0 + b t) e^(-w t). It comes to rest
-    (2 v0 + a0 / w) / w away; w doubles until the plate could go FURTHER.
-    """
-    x, v, a = row[POSE], row[RATES], row[ACCELERATIONS]
-    for _ in range(DOUBLINGS):
-        if reaches(x + FURTHER * (2 * v + a / w) / w):
-            break
-        w = 2 * w
-    left, b = np.exp(-w * later), a + w * v
-    moved = (v * (1 - left) + b / w * (1 - left * (1 + w * later))) / w
-    return np.concatenate([x + moved, left * (v + b * later), left * (a - w * b * later)])
+    if np.all(np.isfinite(given.reference)):
+        return given.reference
+    c, rows = core(), np.empty((len(given.times), NUM_REFERENCE))
+    previews, where = (_preview(given), _preview(last)), c.at(geometry)
+    times = timeline.period, timeline.eta
+    c.lib.stewart_complete(where, *times, previews[0][0], -math.inf, previews[1][0], c.at(rows))
+    return rows
 
 
 def between(a: Array, b: Array, h: float, s: float) -> Array:
@@ -162,20 +120,21 @@ def between(a: Array, b: Array, h: float, s: float) -> Array:
 
     The polynomial of fifth order with their poses, rates and accelerations.
     """
-    (p0, v0, a0), (p1, v1, a1) = (row.reshape(3, NUM_COORDINATES) for row in (a, b))
-    v0, v1, a0, a1 = h * v0, h * v1, h * h * a0, h * h * a1
-    c2, d = a0 / 2, p1 - p0 - v0 - a0 / 2
-    e, f = v1 - v0 - a0, a1 - a0
-    c3, c4, c5 = 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2
-    pose = p0 + s * (v0 + s * (c2 + s * (c3 + s * (c4 + s * c5))))
-    rates = v0 + s * (2 * c2 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))
-    accelerations = 2 * c2 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))
-    return np.concatenate([pose, rates / h, accelerations / h**2])
+    c, row = core(), np.empty(NUM_REFERENCE)
+    c.lib.stewart_between(c.at(a), c.at(b), h, s, c.at(row))
+    return row
 
 
 def interpolated(times: Array, reference: Array, time: float) -> Array:
     """Return the reference (18,) at `time`, between the rows before and after it."""
-    gaps = times - time
-    j = int(np.argmin(np.where(gaps <= 0, -gaps, np.inf)))
-    k = int(np.argmin(np.where(gaps > 0, gaps, np.inf)))
-    return between(reference[j], reference[k], gaps[k] - gaps[j], gaps[j] / (gaps[j] - gaps[k]))
+    c, row = core(), np.empty(NUM_REFERENCE)
+    known = _preview(Previewed(times, reference))
+    c.lib.stewart_interpolate(known[0], time, c.at(row))
+    return row
+
+
+def _preview(known: Previewed) -> tuple[Any, ...]:
+    """Return the `stewart_preview` of core/reference.h, and what it points to."""
+    c = core()
+    kept = [np.ascontiguousarray(a, np.float64) for a in known]
+    return c.ffi.new("stewart_preview *", [len(kept[0]), *map(c.at, kept)]), kept

@@ -72,7 +72,7 @@ class ParameterFilter:
         expected = None if near is None else numbers(near, NUM_STATE)
         given = map(c.at, (values, theta, expected, memory))
         found = self._call(c.lib.stewart_filter_start, 1, *given)
-        return _estimate(memory, n, m) if found else None
+        return estimate_of(memory, n, m) if found else None
 
     def advance(
         self, estimate: Estimate, period: Period, measurement: Measurement | None
@@ -88,7 +88,7 @@ class ParameterFilter:
         history = c.ffi.new("stewart_history *", list(map(c.at, before)))
         given = (acted, c.at(values), history, c.at(memory))
         self._call(c.lib.stewart_filter_advance, len(torques), *given)
-        return _estimate(memory, n, m)
+        return estimate_of(memory, n, m)
 
     def _before(self) -> tuple[Array, Array]:
         """Return what encoders showed before, `last` and `still`; nothing for another sensor."""
@@ -145,7 +145,7 @@ def _memory(estimate: Estimate) -> Array:
     return np.concatenate([estimate.mean, root.ravel(), estimate.outlier, counts])
 
 
-def _estimate(memory: Array, n: int, m: int) -> Estimate:
+def estimate_of(memory: Array, n: int, m: int) -> Estimate:
     """Return what the vector of a `stewart_posterior` says, for n of xi and m values."""
     mean, root, outlier, counts = np.split(memory, [n, n + n * n, n + n * n + m])
     L, (outliers, unseen, bits) = root.reshape(n, n), counts.astype(int)

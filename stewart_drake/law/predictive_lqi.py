@@ -18,6 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stewart_drake.core.layout import geometry_of
+from stewart_drake.dynamics.frozen_map import FrozenDynamics
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.catch_up import DEFAULT_CATCH_UP
 from stewart_drake.law.channel import Channel, Report, Wire
@@ -293,14 +295,14 @@ class PredictiveLqi:
         return Wanted(Previewed(times, reference), followed_now, missing, gap, back)
 
     def _completed(self, given: Previewed, last: Previewed, timeline: Timeline) -> Array:
-        return completed(given, last, timeline, self._reaches)
+        return completed(given, last, timeline, self._geometry)
 
-    def _reaches(self, pose: Array) -> bool:
-        try:
-            self.plant.dynamics.require_reach(pose)
-        except UnreachablePoseError:
-            return False
-        return True
+    @cached_property
+    def _geometry(self) -> Array | None:
+        """Of a machine, None for a plant that has any pose."""
+        if isinstance(self.plant.dynamics, FrozenDynamics):
+            return None
+        return geometry_of(self.plant.mechanism)
 
     def _predicted(self, memory: Memory, belief: Belief, times: Array) -> tuple[Array, Array]:
         """Return the predicted motion (p, 18), and the state (12,) where the next torque acts."""

@@ -3,28 +3,17 @@
 A preview ends one period after the hold of the next torque, so that a plan that ends on the
 reference (`law.catch_up`) cannot be made from it. Instead the law follows the reference plus an
 offset d = [pose; rates], which begins where the plate will be when the next torque begins to act
-and is zero after n holds of h seconds. With an acceleration a_i in hold i, constant because torques
-are held,
-
-    0 = d_pose + n h d_rates + h^2 sum (n - i - 1/2) a_i,      0 = d_rates + h sum a_i.
-
-The solution with the least sum of a_i^2 is linear in i: with c_i = (n - 1)/2 - i, sum c_i = 0 and
-sum c_i^2 = n (n^2 - 1)/12,
-
-    a_i = -d_rates / (n h) - 12 (d_pose + n h d_rates / 2) c_i / (h^2 n (n^2 - 1)).
-
-What is left after the first hold is solved by the rest of these, so that d and n are all there is
-to remember.
+and is zero after some holds, with the least accelerations: see core/reference.h.
 """
 
-import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from stewart_drake.law.catch_up import DEFAULT_CATCH_UP
+from stewart_drake.core.library import core
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, POSE, RATES
+from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE
 from stewart_drake.types import Array
 
 
@@ -45,8 +34,10 @@ class ReturnPath:
     @classmethod
     def of(cls, offset: Array, timeline: Timeline) -> "ReturnPath":
         """Return the path that takes DEFAULT_CATCH_UP seconds, or two holds."""
-        holds = max(2, math.ceil(DEFAULT_CATCH_UP / timeline.period - 1e-6))
-        return cls(offset, holds, timeline.queue_length + 2)
+        c, way = core(), cls()._in_c()
+        given = c.at(np.array(offset, np.float64)), timeline.period, timeline.queue_length
+        c.lib.stewart_begin_way_back(*given, way)
+        return cls._of(way)
 
     @property
     def active(self) -> bool:
@@ -55,20 +46,20 @@ class ReturnPath:
 
     def after(self, h: float) -> "ReturnPath":
         """Return the rest of it, one hold of `h` s later."""
-        if self.holds == 0:
-            return ReturnPath(samples=max(self.samples - 1, 0))
-        return ReturnPath(self._moved(h, h)[:NUM_STATE], self.holds - 1, self.samples)
+        way = self._in_c()
+        core().lib.stewart_go_on_way_back(way, h)
+        return self._of(way)
 
     def at(self, time: float, h: float) -> Array:
         """Return the offset (18,) of pose, rates and accelerations `time` s after its beginning."""
-        path = self
-        while path.holds and time > h:
-            path, time = path.after(h), time - h
-        return path._moved(time, h) if path.holds else np.zeros(NUM_REFERENCE)
+        c, row = core(), np.zeros(NUM_REFERENCE)
+        c.lib.stewart_add_offset(self._in_c()[0], h, time, c.at(row))
+        return row
 
-    def _moved(self, time: float, h: float) -> Array:
-        n, pose, rates = self.holds, self.offset[POSE], self.offset[RATES]
-        a = -rates / (n * h)
-        if n > 1:  # c_0 = (n - 1)/2
-            a = a - 6 * (pose + n * h / 2 * rates) / (h * h * n * (n + 1))
-        return np.concatenate([pose + time * (rates + time / 2 * a), rates + time * a, a])
+    def _in_c(self) -> Any:
+        values = self.offset.tolist(), self.holds, self.samples
+        return core().ffi.new("stewart_way_back *", values)
+
+    @classmethod
+    def _of(cls, way: Any) -> "ReturnPath":
+        return cls(np.array(list(way.offset)), way.holds, way.samples)

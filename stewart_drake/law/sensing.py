@@ -129,7 +129,7 @@ class StateSensing:
     ) -> str | None:
         """See `Sensing.fault`; one value that is lost loses the others."""
         c, values, before = core(), measurement.known(self.size), numbers(last, self.size)
-        sensor, legs = _state_sensor(self).it, geometry(mechanism)
+        sensor, legs = state_sensor(self).it, geometry(mechanism)
         found = c.lib.stewart_state_fault(
             sensor, *map(c.at, (legs,)), period, c.at(values), c.at(before)
         )
@@ -149,13 +149,13 @@ class StateSensing:
 
     def compiled(self) -> Compiled:
         """Return the `stewart_sensing`."""
-        sensor, noise = _state_sensor(self), numbers(self.noise_std, NUM_STATE)
+        sensor, noise = state_sensor(self), numbers(self.noise_std, NUM_STATE)
         sensing = core().lib.stewart_state_sensing(sensor.it)
         return Compiled(core().ffi.new("stewart_sensing *", sensing), (sensor, noise))
 
 
 @Once
-def _state_sensor(sensing: StateSensing) -> Compiled:
+def state_sensor(sensing: StateSensing) -> Compiled:
     sensor = core().ffi.new("stewart_state_sensor *")
     sensor.noise_std = list(numbers(sensing.noise_std, NUM_STATE))
     sensor.motion = list(numbers(sensing.motion, NUM_COORDINATES))

@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
+from stewart_drake.law.core_law import AnyMemory
 from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.native_law import AnyMemory
 from stewart_drake.live.rows import RowFile
-from stewart_drake.loop.controller import HELD
+from stewart_drake.loop.controller import held_by
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.recording import Record, Table
 from stewart_drake.reporting.csv_file import columns_of
@@ -39,7 +39,6 @@ class LiveRecord(Record):
 
     Args:
         experiment: that is run.
-        backend: what steps the law.
         limit: of each motor, N m.
         path: of the file; None is a temporary one.
         say: prints a line.
@@ -52,12 +51,12 @@ class LiveRecord(Record):
     def __init__(
         self,
         experiment: Experiment,
-        backend: str,
         limit: float,
         path: Path | None,
         say: Callable[[str], None],
     ) -> None:
-        super().__init__(experiment, backend)
+        super().__init__(experiment)
+        self._held = held_by(experiment.nominal)
         self._period, self._limit = experiment.scenario.controller.period, limit
         self._waits = max(1, min(_WAITS, round(_LATEST / self._period)))
         self._eta = experiment.scenario.eta
@@ -117,7 +116,7 @@ class LiveRecord(Record):
             "estimated_s": float(belief.delay[0]),
             "std_s": belief.delay_std,
         }
-        seen = {signal.exported: HELD[signal.name](memory) for signal in _HELD}
+        seen = {signal.exported: self._held[signal.name](memory) for signal in _HELD}
         seen["measurement"] = measurement.after(np.full_like(measurement.values, np.nan))
         row = seen | {
             "state": state,

@@ -18,8 +18,8 @@ import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.channel import Packets, Report, Wire
+from stewart_drake.law.core_law import AnyMemory, serving
 from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.native_law import AnyMemory, serving
 from stewart_drake.law.timeline import Acting, Timeline
 from stewart_drake.live.blind import LONGEST_GAP, stays_within_reach
 from stewart_drake.live.connect import await_free
@@ -212,7 +212,6 @@ class LiveLoop:
         record: of the run.
         pace: see `Pace`.
         memory: of the law, as of the last sample.
-        backend: what steps the law.
         recoveries: how often a new way was planned.
         taken_over: whether the plate was anywhere else than at the scenario's start.
     """
@@ -230,8 +229,8 @@ class LiveLoop:
         self._design, self._steering, self._contact = design, steering, contact
         self._viewer, self._say, self._max_missing = viewer, say, max_missing
         self._law: Any
-        self._law, self.backend = serving(design.law)
-        self.record = LiveRecord(design.experiment, self.backend, design.torque_limit, log, say)
+        self._law = serving(design.law).law
+        self.record = LiveRecord(design.experiment, design.torque_limit, log, say)
         self.pace = Pace()
         self.memory: AnyMemory = self._law.initial_memory(design.queue)
         self.recoveries, self.taken_over = 0, False
@@ -574,7 +573,7 @@ class LiveLoop:
         if message is not None and len(message.acted):
             acts = message.acted[0]
         queue = np.tile(acts, (len(design.queue), 1))
-        self._law, self.backend = serving(replace(law, silence=0))
+        self._law = serving(replace(law, silence=0)).law
         self.memory = self._law.initial_memory(queue)
         anew = self._anew(t, first.state, _until_next(law.timeline, queue), None)
         if isinstance(anew, str):

@@ -12,11 +12,11 @@ import numpy as np
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.dynamics.workspace import Failure, diagnose
-from stewart_drake.law import native_law
+from stewart_drake.law import core_law
+from stewart_drake.law.core_law import AnyMemory
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
-from stewart_drake.law.native_law import AnyMemory
 from stewart_drake.loop.experiment import Experiment, assemble
 from stewart_drake.loop.law_design import first_queue, followed_motion
 from stewart_drake.loop.metrics import Figures, accumulated_error, figures
@@ -34,6 +34,7 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import POSE, TUNER_INPUTS, WEIGHTS
+from stewart_drake.tuner.compiled import compiled_tuner
 from stewart_drake.tuner.source import Decision
 from stewart_drake.types import Array
 
@@ -117,7 +118,6 @@ class SampledLaw:
         tuner: what the tuner remembers, None where weights are fixed.
         weights: (2,) of each sample.
         rows: what the tuner's features keep of each, see `Ending`.
-        backend: what steps the law, see `law.native_law.serving`.
     """
 
     def __init__(self, prepared: Prepared, when: Instants, wanted: Array) -> None:
@@ -126,7 +126,7 @@ class SampledLaw:
         self._law, self._previews, self._when = law, prepared.previews, when
         self._wanted, self._fixed = wanted, Decision(np.array([c.w_Q, c.w_R]), False)
         self._followed = followed_motion(law, prepared.planned, experiment.reference)
-        self._served, self.backend = native_law.serving(law)
+        self._served = core_law.serving(law).law
         self.memory: AnyMemory = self._served.initial_memory(first_queue(experiment, law))
         self._source = prepared.tuner
         self.tuner = None if self._source is None else self._source.start(self.memory)
@@ -153,34 +153,39 @@ class SampledLaw:
 
 def _in_c(preparation: Preparation, prepared: Prepared) -> Ending:
     experiment, law, when = prepared.experiment, prepared.law, preparation.when
-    only_python = native_law.uncovered(law)
-    if only_python is None and prepared.tuner is None:
+    only_python, wanted = core_law.uncovered(law), preparation.references[when.sampled]
+    tuner = None if prepared.tuner is None else compiled_tuner(prepared.tuner)
+    known = followed_motion(law, prepared.planned, experiment.reference) is None
+    if only_python is None and known and (prepared.tuner is None) == (tuner is None):
         c = experiment.scenario.controller
+        weights = np.array([c.w_Q, c.w_R])
         queue = first_queue(experiment, law)
-        in_c = InC(law, queue, prepared.previews, np.array([c.w_Q, c.w_R]))
+        in_c = InC(law, queue, prepared.previews, weights, tuner, wanted)
         course = run_loop(experiment, when, in_c)
-        return _ending(preparation, prepared, course, in_c.counts, "native")
-    sampled = SampledLaw(prepared, when, preparation.references[when.sampled])
+        ending = _ending(preparation, prepared, course, in_c.counts, "native")
+        taken = len(course.asked)
+        return ending._replace(weights=in_c.weights[:taken], rows=in_c.rows[:taken])
+    sampled = SampledLaw(prepared, when, wanted)
     with one_blas_thread:
         course = run_loop(experiment, when, InPython(sampled.torque))
     loop = "native, weights in Python (tuner.kind)"
     if only_python is not None:
         loop = f"native, law in Python ({only_python})"
-    ending = _ending(preparation, prepared, course, sampled.memory.counts, loop)
+    elif not known:
+        loop = "native, reference in Python (controller.delay_estimator)"
+    fallbacks = 0 if sampled.tuner is None else sampled.tuner.fallbacks
+    counts = sampled.memory.counts.summary() | {"tuner_fallbacks": fallbacks}
+    ending = _ending(preparation, prepared, course, counts, loop)
     if sampled.tuner is None:
         return ending
-    return ending._replace(
-        counts=ending.counts | {"tuner_fallbacks": sampled.tuner.fallbacks},
-        weights=np.array(sampled.weights),
-        rows=np.array(sampled.rows),
-    )
+    return ending._replace(weights=np.array(sampled.weights), rows=np.array(sampled.rows))
 
 
 def _ending(
     preparation: Preparation,
     prepared: Prepared,
     course: Course,
-    counts: Counts,
+    counts: dict[str, int],
     loop: str,
 ) -> Ending:
     when, looked = preparation.when, len(course.states)
@@ -201,12 +206,11 @@ def _ending(
     status = "completed" if course.stopped is None else "left_workspace"
     wanted = preparation.references[:looked][sampled]
     samples = np.hstack([course.measured[:taken] - wanted, course.asked[:taken]])
-    told = counts.summary() | {"tuner_fallbacks": 0}
     so_far = accumulated_error(when.nominal[:looked][grid], error[grid], experiment.scale)
     c = experiment.scenario.controller
     weights = np.tile([c.w_Q, c.w_R], (taken, 1))
     rows = np.empty((taken, 0))
-    return Ending(status, course.stopped, found, told, samples, so_far, weights, rows, loop)
+    return Ending(status, course.stopped, found, counts, samples, so_far, weights, rows, loop)
 
 
 def _in_drake(scenario: Scenario, truth: Mechanism | None, field: str) -> Ending:

@@ -1,6 +1,6 @@
 """The control law as a Drake system."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -8,11 +8,12 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.channel import Packets, Report
+from stewart_drake.law.core_law import AnyMemory, serving
 from stewart_drake.law.late import LateObserver
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
-from stewart_drake.law.native_law import AnyMemory, serving
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.sampling import Sample, SteppedLaw, weak
 from stewart_drake.scenario.signals import (
@@ -20,6 +21,7 @@ from stewart_drake.scenario.signals import (
     NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
+    PARAMETERS,
     WEIGHTS,
     ports_of,
 )
@@ -31,12 +33,31 @@ HELD: Final[dict[str, Callable[[AnyMemory], Array]]] = {
     "weights": lambda memory: memory.weights,
     "measurement": lambda memory: memory.measurement,
     "state_estimate": lambda memory: memory.belief.state,
-    "parameters": lambda memory: memory.belief.parameters[:NUM_PARAMETERS],
-    "parameter_std": lambda memory: memory.belief.estimate.parameter_std[:NUM_PARAMETERS],
+    "parameters": lambda memory: memory.belief.parameters,
+    "parameter_std": lambda memory: memory.belief.estimate.parameter_std,
     "delay_estimate": lambda memory: memory.belief.delay,
     "delay_std": lambda memory: np.array([memory.belief.delay_std]),
 }
 """Signal of the table `scenario.signals.SIGNALS` -> what the controller's memory has of it."""
+
+
+def held_by(dynamics: StewartDynamics) -> dict[str, Callable[[AnyMemory], Array]]:
+    """Return HELD for the law of a plant, with its parameters at their places in the record.
+
+    A parameter that is not estimated is recorded as it is known, without a standard deviation.
+    """
+    place = np.array([_place(name, dynamics.free) for name in PARAMETERS])
+    known, unknown = dynamics.plant_parameters[:NUM_PARAMETERS], np.full(NUM_PARAMETERS, np.nan)
+
+    def recorded(signal: str, otherwise: Array) -> Callable[[AnyMemory], Array]:
+        return lambda memory: np.where(place < 0, otherwise, HELD[signal](memory)[place])
+
+    own = {"parameters": known, "parameter_std": unknown}
+    return HELD | {signal: recorded(signal, otherwise) for signal, otherwise in own.items()}
+
+
+def _place(name: str, names: Sequence[str]) -> int:
+    return names.index(name) if name in names else -1
 
 
 def reported(kept: int) -> int:
@@ -45,7 +66,7 @@ def reported(kept: int) -> int:
 
 
 class DelayLqiController(SteppedLaw):
-    """Predictive LQI, whatever parts its law is made of; in C where that is the same (`backend`).
+    """Predictive LQI, whatever parts its law is made of; in C if the core has all of them.
 
     With m the memory (`law.memory.Memory`) and `step` the law (`law.predictive_lqi.PredictiveLqi`):
 
@@ -76,9 +97,6 @@ class DelayLqiController(SteppedLaw):
     | delay_estimate | output | 1 | s | held; as the law believes |
     | delay_std | output | 1 | s | held; NaN without delay estimator |
 
-    Attributes:
-        backend: what steps the law, see `law.native_law.serving`.
-
     Args:
         law: the control law.
         queue: (L, 6) torques in flight at t = 0 in N m, oldest first, as the controller believes.
@@ -94,7 +112,7 @@ class DelayLqiController(SteppedLaw):
     ) -> None:
         super().__init__()
         self._law, self._motion = law, motion
-        self._served, self.backend = serving(law)
+        self._served = serving(law).law
         first = self._served.initial_memory(queue)
         self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
         self._times = law.preview_times
@@ -115,8 +133,9 @@ class DelayLqiController(SteppedLaw):
         if sends:
             size = first.sent.packets[0].size
             self._put_out("plan", size, lambda m: m.sent.packets[-1].ravel(), now=True)
+        held = held_by(law.plant.dynamics)
         for port, signal in ports_of("controller").items():
-            part = HELD[signal.name]  # whose size is the law's: its parameters, what it senses
+            part = held[signal.name]  # whose size is the law's: what it senses
             self._put_out(port, len(part(first)), part)
 
     def memory(self, context: Context) -> AnyMemory:

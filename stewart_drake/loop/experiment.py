@@ -27,7 +27,9 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,
+    DAMPING,
     PARAMETERS,
+    PAYLOAD,
     PLANT_PARAMETERS,
     POSE,
     POSITION,
@@ -227,10 +229,19 @@ def limits_of(experiment: Experiment) -> Limits:
 
 
 def estimated(scenario: Scenario) -> tuple[str, ...]:
-    """Return the names of the estimated parameters, the eight of the record first."""
+    """Return the names of the estimated parameters, those of the plant first.
+
+    Without any they are the eight of the record, which linear models then take as known.
+    """
     chosen = scenario.controller.estimate
-    coulomb = [PLANT_PARAMETERS[COULOMB]] * ("coulomb" in chosen)
-    return (*PARAMETERS, *coulomb, *OFFSETS * ("offsets" in chosen))
+    groups = {
+        "torque_bias": PARAMETERS[BIAS],
+        "payload": (PARAMETERS[PAYLOAD],),
+        "damping": (PARAMETERS[DAMPING],),
+        "coulomb": (PLANT_PARAMETERS[COULOMB],),
+        "offsets": OFFSETS,
+    }
+    return tuple(name for group in chosen for name in groups[group]) or PARAMETERS
 
 
 def with_motors(mechanism: Mechanism, scenario: Scenario) -> Mechanism:

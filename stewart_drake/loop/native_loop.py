@@ -10,14 +10,14 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.core.law_layout import CAUSES, address
+from stewart_drake.core.library import core
 from stewart_drake.core.link import Link
-from stewart_drake.core.plant import Controller, Ended, LoopStruct
+from stewart_drake.core.plant import Controller, Ended, LawStruct, LoopStruct
 from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.dynamics.workspace import Failure, diagnose
-from stewart_drake.law.memory import Counts
-from stewart_drake.law.native_law import configuration
+from stewart_drake.law.compiled import Compiled
+from stewart_drake.law.core_law import CompiledLaw, CoreMemory, address_of
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.experiment import Experiment, torques_in_flight, true_dynamics
 from stewart_drake.loop.sensor import white_noises
@@ -126,32 +126,69 @@ class InPython:
 
 
 class InC:
-    """The law of core/law.c.
+    """The law of core/law.c, and the tuner of core/tuner.c, without Python in between.
 
     Args:
-        law: one of which nothing is `law.native_law.uncovered`.
+        law: one of which nothing is `law.core_law.uncovered`.
         queue: (L, 6) torques in flight at t = 0, as it believes, N m.
         previews: (k, p, 18) the motion that it follows, for each sample.
-        weights: (2,) w_Q and w_R.
+        weights: (2,) w_Q and w_R, without a tuner.
+        tuner: of `tuner.compiled`, or None.
+        wanted: (k, 18) the reference at each sample, for a tuner.
 
     Attributes:
-        counts: what went wrong and was survived, once it has run.
+        weights: (k, 2) of each sample, once it has run.
+        rows: (k, n) what a tuner's features keep of each, as of `Ending`.
     """
 
-    def __init__(self, law: PredictiveLqi, queue: Array, previews: Array, weights: Array) -> None:
-        given = [np.ascontiguousarray(a, np.float64) for a in (queue, previews, weights)]
-        self._given = [configuration(law), *given]
-        self._counts = np.zeros(len(CAUSES), dtype=np.intc)
+    def __init__(
+        self,
+        law: PredictiveLqi,
+        queue: Array,
+        previews: Array,
+        weights: Array,
+        tuner: Compiled | None = None,
+        wanted: Array | None = None,
+    ) -> None:
+        self._compiled, self._tuner, c = CompiledLaw(law), tuner, core()
+        self._memory = self._compiled.start(queue)
+        self._previews = np.ascontiguousarray(previews, np.float64)
+        self.weights, self.rows = np.tile(weights, (len(previews), 1)), np.empty((len(previews), 0))
+        self._scratch, self._tuned = np.empty(self._compiled.scratch), np.empty(0)
+        self._wanted = np.empty((0, NUM_STATE))
+        if tuner is not None and wanted is not None:
+            self._wanted = np.ascontiguousarray(wanted[:, :NUM_STATE])
+            self._tuned = np.empty(c.lib.stewart_tuner_memory(tuner.it))
+            c.lib.stewart_tuner_start(tuner.it, c.at(self._tuned))
+            columns = c.lib.stewart_newest_row(
+                tuner.it, c.at(self._tuned), c.at(self._tuned.copy())
+            )
+            self.rows = np.empty((len(previews), columns))
+            self._scratch = np.empty(c.lib.stewart_tuned_step_scratch(self._compiled.data))
 
     def run(self, plant: NativePlant, loop: LoopStruct) -> Ended:
         """See `Law`."""
-        places = [ctypes.c_void_p(address(a)) for a in (*self._given, self._counts)]
-        return plant.call("closed_loop_of_law", ctypes.byref(loop), *places)
+        law = LawStruct(
+            law=address_of(self._compiled.data),
+            tuner=None if self._tuner is None else address_of(self._tuner.it),
+            memory=self._memory.ctypes.data,
+            tuner_memory=self._tuned.ctypes.data,
+            scratch=self._scratch.ctypes.data,
+            previews=self._previews.ctypes.data,
+            wanted=self._wanted.ctypes.data,
+            weights=self.weights.ctypes.data,
+            kept=self.rows.ctypes.data,
+            rows=self._previews.shape[1],
+            columns=self.rows.shape[1],
+        )
+        return plant.call("closed_loop_of_law", ctypes.byref(loop), ctypes.byref(law))
 
     @property
-    def counts(self) -> Counts:
-        """By cause."""
-        return Counts(**dict(zip(CAUSES, self._counts.tolist(), strict=True)))
+    def counts(self) -> dict[str, int]:
+        """What went wrong and was survived, by cause, once it has run."""
+        fallbacks = int(self._tuned[2]) if len(self._tuned) else 0
+        counts = CoreMemory(self._memory, self._compiled).counts
+        return counts.summary() | {"tuner_fallbacks": fallbacks}
 
 
 COVERED: Final[Accepted] = {

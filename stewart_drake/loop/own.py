@@ -253,9 +253,6 @@ class OwnMemory(NamedTuple):
 class SampledController(SteppedLaw):
     """Reads a controller's torque every period, in the place of `DelayLqiController`.
 
-    Attributes:
-        backend: `own`.
-
     Update:  every period  s <- [T_k; measurement], T_k the torque that the controller puts out
              then, or the last one where that is no number.
     Output:  torque = T_k, to be taken at the samples; the others as of the last sample.
@@ -273,8 +270,6 @@ class SampledController(SteppedLaw):
         period: s.
         torque_limit: of each motor, N m, infinite for none.
     """
-
-    backend = "own"
 
     def __init__(self, period: float, torque_limit: float) -> None:
         super().__init__()

@@ -75,7 +75,6 @@ class Record:
 
     Args:
         experiment: that is run.
-        backend: what steps the law.
 
     Attributes:
         on_grid: time, pose error (6) and reference (6) on the metric's grid, and where a run ended.
@@ -86,12 +85,11 @@ class Record:
         sampled: number of the controller's samples.
         measured: number of those whose measurement it could use.
         tuner_fallbacks: samples at which the tuner passed its network over.
-        controller_backend: what steps the law.
         delay: at the last sample, s: true, as it is believed in or estimated, standard deviation.
     """
 
-    def __init__(self, experiment: Experiment, backend: str) -> None:
-        self._scenario, self.controller_backend = experiment.scenario, backend
+    def __init__(self, experiment: Experiment) -> None:
+        self._scenario = experiment.scenario
         samples = experiment.scenario.sensor.samples
         self._signals, self._dimensions = run_signals(samples), run_dimensions(samples)
         self._recorded = [signal for signal in self._signals.values() if signal.source]
@@ -144,7 +142,7 @@ class Recorder(Record):
 
     def __init__(self, loop: ClosedLoop) -> None:
         controller: Any = loop.GetSubsystemByName("controller")
-        super().__init__(loop.experiment, str(controller.backend))
+        super().__init__(loop.experiment)
         self._loop, self._controller = loop, controller
         self._ports: dict[str, Any] = {}
         tuner = loop.GetSubsystemByName("tuner") if loop.HasSubsystemNamed("tuner") else None
@@ -258,8 +256,6 @@ def summarize(
         },
         "delay": recorder.delay,
         "wall_s": wall,
-        "backend": "native",
-        "controller_backend": recorder.controller_backend,
         "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
         "link": plain(sc.assumed_link),
         "own": experiment.own.names,

@@ -79,10 +79,6 @@ class RunSummary(TypedDict):
     delay: DelaySummary
     wall_s: float
     """Time that the run took, s."""
-    backend: str
-    """What ran the dynamics: always `native`, the compiled core."""
-    controller_backend: str
-    """What stepped the controller: `native`, `own`, or `python`, and the field that C has not."""
     counts: dict[str, int]
     """What went wrong and was survived, by name (`law.memory.Counts`, `tuner_fallbacks`)."""
     link: dict[str, Any]

@@ -13,6 +13,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.catch_up import PIECE, shortest
+from stewart_drake.law.core_law import serving
 from stewart_drake.law.late import LateObserver
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
@@ -22,7 +23,7 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ReportedTimeline, ServoMemory, ServoPreview
 from stewart_drake.law.servos import ReportLayout, ServoLoop, crank_mobility, mean_inertia
 from stewart_drake.law.startup import INSTANTS
-from stewart_drake.loop.controller import HELD
+from stewart_drake.loop.controller import HELD, held_by
 from stewart_drake.loop.experiment import Experiment, planned_limit
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.own import NOTHING
@@ -195,12 +196,11 @@ class ServoController(SteppedLaw):
         command: (18,) that was sent before t = 0.
     """
 
-    backend = "python (controller.command)"
-
     def __init__(self, law: ServoPreview, command: Array) -> None:
         super().__init__()
         self._law = law
-        first = law.initial_memory(command)
+        self._served = serving(law).law
+        first = self._served.initial_memory(command)
         self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
         self._preview = self.DeclareVectorInputPort("preview", NUM_REFERENCE)
         self._report = self.DeclareVectorInputPort("report", law.reports.size)
@@ -209,8 +209,9 @@ class ServoController(SteppedLaw):
         self._put_out("command", NUM_REFERENCE, lambda m: m.command, now=True)
         self._put_out("estimate", NUM_STATE, lambda m: m.belief.state, now=True)
         self._put_out("torque", NUM_TORQUES, HELD["torque_commanded"])
+        held = held_by(law.plant.dynamics)
         for port, signal in ports_of("controller").items():
-            part = HELD[signal.name]
+            part = held[signal.name]
             self._put_out(port, len(part(first)), part)
 
     def _prepared(self, context: Context) -> Callable[[], ServoMemory]:
@@ -219,4 +220,4 @@ class ServoController(SteppedLaw):
         reference = np.reshape(np.asarray(self._preview.Eval(context)), (-1, NUM_REFERENCE))
         motion, report = Preview(self._law.preview_times, reference), self._report.Eval(context)
         memory = self.sample(context).memory
-        return lambda: self._law.step(memory, measurement, motion, np.asarray(report))
+        return lambda: self._served.step(memory, measurement, motion, np.asarray(report))

@@ -157,13 +157,13 @@ class PriorConfig:
 
 
 ESTIMATED: Final = ["torque_bias", "payload", "damping"]
-"""Parameters that an estimator finds in any case."""
+"""Parameters that are estimated by default."""
 
 
 def _check_estimate(names: list[str]) -> list[str]:
     order = [*ESTIMATED, "coulomb", "offsets"]
-    if names and not (len({*names}) == len(names) and {*ESTIMATED} <= {*names} <= {*order}):
-        raise ValueError(f"[], or {', '.join(ESTIMATED)}, and of coulomb, offsets some or none")
+    if not (len({*names}) == len(names) and {*names} <= {*order}):
+        raise ValueError(f"[], or some of {', '.join(order)}")
     return sorted(names, key=order.index)
 
 

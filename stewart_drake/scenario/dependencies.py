@@ -75,9 +75,7 @@ _TORQUE_LAW: Final = (
     *("integral", "integral_weight", "prediction", "model", "weight_scaling", "w_Q", "w_R"),
     *("packet_torques", "packet_repeats", "open_loop_start"),
 )
-_FILTER: Final = (
-    *("prior.torque_bias", "prior.payload", "prior.damping", "prior.rates", "prior.offsets"),
-)
+_ANY: Final = ("torque_bias", "payload", "damping", "coulomb", "offsets")
 
 
 def _of_controller(*names: str) -> tuple[str, ...]:
@@ -87,7 +85,10 @@ def _of_controller(*names: str) -> tuple[str, ...]:
 _DELAY: Final = _of_controller("delay_std", "delay_max", "replan")
 NEEDS: Final = (
     Needs(_of_controller("integral_weight"), "controller.integral", True),
-    Needs(_of_controller(*_FILTER), "controller.estimate", "torque_bias"),
+    Needs(_of_controller("prior.torque_bias"), "controller.estimate", "torque_bias"),
+    Needs(_of_controller("prior.payload"), "controller.estimate", "payload"),
+    Needs(_of_controller("prior.damping"), "controller.estimate", "damping"),
+    Needs(_of_controller("prior.rates"), "controller.estimate", _ANY),
     Needs(_of_controller("prior.rates"), "sensor.kind", "encoders"),
     Needs(_of_controller("prior.offsets"), "controller.estimate", "offsets"),
     Needs(_DELAY, "controller.delay_estimator", _DELAYS),

@@ -26,8 +26,8 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
+from stewart_drake.law.core_law import AnyMemory
 from stewart_drake.law.filter_settings import MODEL_ERROR
-from stewart_drake.law.native_law import AnyMemory
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE, RATES
 from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, density

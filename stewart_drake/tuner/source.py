@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
-from stewart_drake.law.native_law import AnyMemory
+from stewart_drake.law.core_law import AnyMemory
 from stewart_drake.tuner.features import PEAK, Features, empty_window
 from stewart_drake.tuner.network import Network
 from stewart_drake.types import Array

@@ -73,11 +73,21 @@ class Row:
 
 
 OUTLIERS: Final = "sensor.faults=[{kind: spike, size: 0.02, share: 0.3, from: 3.0, to: 10.0}]"
+WITHOUT: Final = ("controller.estimate=[]",)
+ENCODERS: Final = ("sensor.kind=encoders",)
+DELAY: Final = ("controller.delay_estimator=constant", "controller.delay_steps=6")
+NETWORK: Final = ("link.kind=network", "link.loss=0.1")
 ROWS: Final = (
-    Row("ideal", M7),
-    Row("ideal, outliers in measurements", M7, (OUTLIERS,)),
-    Row("ideal, without estimator", M7, ("controller.estimate=[]",)),
-    Row("ideal, without estimator", M4, ("controller.estimate=[]",), median=1.8),
+    Row("ideal", M7, median=2.1, workspace=67248),
+    Row("ideal, outliers in measurements", M7, (OUTLIERS,), most=5),
+    Row("ideal, without estimator", M7, WITHOUT),
+    Row("ideal, without estimator", M4, WITHOUT, median=1.8),
+    Row("ideal", M4, median=4),
+    Row("encoders", M7, ENCODERS, median=4),
+    Row("encoders", M4, ENCODERS),
+    Row("delay estimator", M7, DELAY, most=20),
+    Row("delay estimator", M4, DELAY),
+    Row("network", M7, NETWORK),
 )
 
 

@@ -16,7 +16,7 @@
 #define STEWART_HISTORY 16
 #define STEWART_SAMPLES 16
 #define STEWART_BITS 30
-#define STEWART_MISSING INT32_MIN /* a code that was not read */
+#define STEWART_UNREAD INT32_MIN /* a code that was not read */
 #define STEWART_PARTS 4           /* of an identity: mechanism, period, sensor, actuator */
 #define STEWART_DIGEST 8
 #define STEWART_NAME 32

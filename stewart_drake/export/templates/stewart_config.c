@@ -7,8 +7,10 @@
 
 #include "stewart_config.h"
 
-const stewart_config stewart_configuration = {
-    @CONFIGURATION@
-};
+@CONSTANTS@
+
+const @KIND@ stewart_configuration = @CONFIGURATION@;
 
 const real stewart_queue[] = @QUEUE@;
+const int stewart_queue_rows = @QUEUE_ROWS@;
+@TUNER@

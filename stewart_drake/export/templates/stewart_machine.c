@@ -14,7 +14,7 @@
 
 #include "link.h"
 #include "stewart_config.h"
-#include "stewart_motion.h"
+#include "stewart_example.h"
 #include "udp.h"
 
 #define WAITING 1024         /* torques that wait for their time, at the most */
@@ -93,7 +93,7 @@ static uint8_t plate_fault(const machine *m, uint8_t *leg)
     for (int i = 0; i < STEWART_STATES; i++)
         if (!isfinite(m->state[i]))
             return STEWART_NOT_FINITE;
-    stewart_measures(stewart_configuration.geometry, m->state, NULL, measures);
+    stewart_measures(stewart_configuration.machine.geometry, m->state, NULL, measures);
     measures[6] *= stewart_home_sign;
     for (int i = 1; i < STEWART_MOTORS; i++)
         worst = measures[i] < measures[worst] ? i : worst;
@@ -109,8 +109,8 @@ static uint8_t plate_fault(const machine *m, uint8_t *leg)
 /* On to an instant under the torque that acts; brakes hold before the run. */
 static void plate_follow(machine *m, uint64_t time)
 {
-    const stewart_config *c = &stewart_configuration;
-    stewart_plant plant = {c->geometry, c->parameters, &c->gravity};
+    const stewart_law *c = &stewart_configuration;
+    stewart_plant plant = {c->machine.geometry, c->machine.parameters, &c->machine.gravity};
     real torque[6];
     for (int i = 0; i < 6; i++)
         torque[i] = (real)stewart_link_acting(m->link)[i];
@@ -166,7 +166,7 @@ static void go_safe(machine *m, uint64_t time)
 
 static void put_back(machine *m)
 {
-    memcpy(m->state, stewart_start, sizeof m->state);
+    memcpy(m->state, stewart_first_state, sizeof m->state);
     stewart_link_start(&m->buffer, m->link);
     m->begin = STEWART_NEVER;
     m->running = m->safe = m->left = 0;
@@ -187,8 +187,8 @@ static void begin(machine *m)
         m->begin = STEWART_NEVER;
         return;
     }
-    const stewart_config *c = &stewart_configuration;
-    int number = stewart_rows;
+    const stewart_law *c = &stewart_configuration;
+    int number = stewart_queue_rows;
     double early = ((double)c->fraction - (number > c->steps)) * (double)m->period;
     static double torques[6 * WAITING];
     m->time = m->begin;
@@ -213,7 +213,7 @@ static void describe(const machine *m, uint64_t sampled, stewart_measured *s)
     s->period = m->period;
     s->watchdog = WATCHDOG;
     s->rate = 1;
-    s->torque_limit = (double)stewart_configuration.torque_limit;
+    s->torque_limit = (double)stewart_configuration.machine.torque_limit;
     s->played = (uint32_t)m->link[STEWART_LINK_PLAYED];
     s->dry = (uint32_t)m->link[STEWART_LINK_DRY];
     for (int i = 1; i < STEWART_REFUSALS; i++)
@@ -418,7 +418,7 @@ int main(int argc, char **argv)
     m.started = udp_now();
     m.period = (uint64_t)((double)stewart_configuration.period * SECOND + 0.5);
     m.buffer = (stewart_link){6, WAITING, STEWART_HISTORY, 0, 1, (double)m.period, 0,
-                              stewart_configuration.torque_limit};
+                              stewart_configuration.machine.torque_limit};
     put_back(&m);
     printf("a simulated machine at port %s, every %.4g ms; Ctrl-C ends it\n", argv[1],
            1e-6 * (double)m.period);

@@ -4,23 +4,14 @@
 #include "stewart_motion.h"
 
 const double stewart_duration = @DURATION@;
-const real stewart_weights[2] = @OWN_WEIGHTS@;
-const real stewart_start[STEWART_STATES] = @START@;
-const real stewart_least[STEWART_MEASURES] = @LEAST@;
-const real stewart_home_sign = @HOME_SIGN@;
-const int stewart_rows = @QUEUE_ROWS@;
-const stewart_identity stewart_own_identity = {{
-    @IDENTITY@}};
-const char *const stewart_faults[STEWART_FAULTS] = {
-    @FAULTS@};
-
 #define KNOTS @KNOTS@
-static const double knots[KNOTS][1 + STEWART_REFERENCE] = {
+static const double motion[KNOTS][1 + STEWART_REFERENCE] = {
     @MOTION@};
 
-void stewart_reference(double t, real *reference)
+/* The row at t of a number of knots. */
+static void along(int number, const double (*knots)[1 + STEWART_REFERENCE], double t, real *reference)
 {
-    int low = 0, high = KNOTS - 1;
+    int low = 0, high = number - 1;
     t = t > knots[low][0] ? t : knots[low][0]; /* and for NaN */
     t = t < knots[high][0] ? t : knots[high][0];
     while (high - low > 1) {
@@ -40,3 +31,6 @@ void stewart_reference(double t, real *reference)
         reference[12 + i] = (real)((2 * c2 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))) / (h * h));
     }
 }
+
+void stewart_reference(double t, real *reference) { along(KNOTS, motion, t, reference); }
+@GOAL@

@@ -16,7 +16,7 @@
 #include <string.h>
 
 #include "stewart_config.h"
-#include "stewart_motion.h"
+#include "stewart_example.h"
 #include "udp.h"
 
 #define TRIPS 64
@@ -42,8 +42,7 @@ typedef struct {
     uint64_t begin, used;  /* of the machine's clock; that of the measurement used last, plus 1 */
     uint32_t flags;
     unsigned refused[STEWART_REFUSALS];
-    stewart_memory memory, ahead;
-    stewart_workspace work;
+    real memory[STEWART_MEMORY], ahead[STEWART_MEMORY], scratch[STEWART_SCRATCH];
     real said[REPEATS + 1 + PLANNED][STEWART_MOTORS]; /* the last torques, and those that would follow */
     unsigned samples, missing, missed;
     double seconds;
@@ -158,8 +157,8 @@ static void note(const controller *c, double t, const real *measurement, const r
 /* From a sample to its torque, ns. */
 static uint64_t eta(const controller *c)
 {
-    const stewart_config *config = &stewart_configuration;
-    return (uint64_t)((config->steps + (double)config->fraction) * (double)c->last.period + 0.5);
+    const stewart_law *law = &stewart_configuration;
+    return (uint64_t)((law->steps + (double)law->fraction) * (double)c->last.period + 0.5);
 }
 
 /* The machine says what has acted: where torques came too late, or never, not what was sent. */
@@ -173,25 +172,33 @@ static void correct(controller *c, unsigned k)
         for (int i = 0; i < STEWART_MOTORS; i++)
             acted[row][i] = (real)c->last.acted[row][i];
     double since = (double)(c->begin + eta(c)) - (double)c->last.acted_from;
-    stewart_acted(&stewart_configuration, &c->memory, (int)k + (int)lround(since / period),
+    stewart_note_acted(&stewart_configuration, c->memory, (int)k + (int)lround(since / period),
                   c->last.history, acted[0]);
 }
 
-/* The law at sample k, its torque within the machine's limit. */
-static void compute(const controller *c, stewart_memory *memory, stewart_workspace *work, unsigned k,
-                    const real *measurement, int age, real *torque)
+/* Rows of the motion at instants from a sample on. */
+static void look_ahead(void *about, int number, const real *times, real *rows)
 {
-    const stewart_config *config = &stewart_configuration;
-    real times[STEWART_PREVIEW], preview[STEWART_PREVIEW * STEWART_REFERENCE];
-    real limit = (real)fmin(c->last.torque_limit, (double)config->torque_limit);
-    int rows = stewart_preview_times(config, times);
-    for (int i = 0; i < rows; i++)
-        stewart_reference(fmax(0, k * (double)config->period + (double)times[i]),
-                          preview + i * STEWART_REFERENCE);
-    stewart_step(config, memory, work, measurement, age, preview, stewart_weights, torque);
+    const double now = *(const double *)about;
+    for (int i = 0; i < number; i++)
+        stewart_reference(fmax(0, now + (double)times[i]), rows + i * STEWART_REFERENCE);
+}
+
+/* The law at sample k, its torque within the machine's limit. */
+static void compute(controller *c, real *memory, unsigned k, const real *measurement, int age,
+                    real *torque)
+{
+    const stewart_law *law = &stewart_configuration;
+    double now = k * (double)law->period;
+    real limit = (real)fmin(c->last.torque_limit, (double)law->machine.torque_limit);
+    stewart_sample sample = {.measurement = measurement, .age = age, .reference = look_ahead};
+    sample.about = &now;
+    sample.weights[0] = stewart_weights[0];
+    sample.weights[1] = stewart_weights[1];
+    stewart_step(law, memory, c->scratch, &sample, torque);
     for (int i = 0; i < STEWART_MOTORS; i++)
         torque[i] = (real)fmax(-limit, fmin(limit, torque[i]));
-    stewart_sent(config, memory, torque);
+    stewart_note_acted(law, memory, 1, 1, torque);
 }
 
 /* What would follow if no more measurements came: the model stands in for them. */
@@ -200,9 +207,9 @@ static void plan(controller *c, unsigned k)
     real nothing[STEWART_STATES];
     for (int i = 0; i < STEWART_STATES; i++)
         nothing[i] = (real)NAN;
-    c->ahead = c->memory;
+    memcpy(c->ahead, c->memory, sizeof c->ahead);
     for (unsigned i = 1; i <= PLANNED; i++)
-        compute(c, &c->ahead, &c->work, k + i, nothing, 0, c->said[REPEATS + i]);
+        compute(c, c->ahead, k + i, nothing, 0, c->said[REPEATS + i]);
 }
 
 static void step(controller *c, unsigned k)
@@ -217,7 +224,7 @@ static void step(controller *c, unsigned k)
     memmove(c->said[0], c->said[1], REPEATS * sizeof c->said[0]);
     if (waits)
         correct(c, k);
-    compute(c, &c->memory, &c->work, k, measurement, age, torque);
+    compute(c, c->memory, k, measurement, age, torque);
     if (waits)
         plan(c, k);
     say(c, 0, sampled, sampled + eta(c) - repeats * period, c->said + REPEATS - repeats,
@@ -366,7 +373,7 @@ int main(int argc, char **argv)
         return 2;
     c.session.number += c.session.number == 0;
     c.begin = c.last.begin = STEWART_NEVER;
-    stewart_init(&stewart_configuration, &c.memory, stewart_queue);
+    stewart_start(&stewart_configuration, c.memory, stewart_queue_rows, stewart_queue);
     const char *problem = c.socket < 0 ? "no socket" : greet(&c);
     if (!problem) {
         printf("begins at %.3f s of the machine, round trip %.2f ms\n", 1e-9 * (double)c.begin,

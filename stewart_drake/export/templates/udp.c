@@ -10,7 +10,7 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "stewart_motion.h"
+#include "stewart_example.h"
 #include "udp.h"
 
 #define SHORTEST_KEY 16

@@ -1,0 +1,19 @@
+/* The observer of an unknown delay. `sensing` of the law is `stewart_state_sensor` or
+   `stewart_encoders`, `estimation` is `stewart_delay_settings`. */
+
+#ifndef STEWART_DELAY_OBSERVER_H
+#define STEWART_DELAY_OBSERVER_H
+
+#include "delay.h"
+#include "law.h"
+
+/* `delay` without machine and sensing, which are the law's. */
+typedef struct {
+    stewart_delay delay;
+    int encoders; /* whether the sensing is of encoders; the angles of a sample alone count */
+    int most;     /* torques that act until the next one does, at the most */
+} stewart_delay_settings;
+
+extern const stewart_observer stewart_delay_observer;
+
+#endif

@@ -1,0 +1,171 @@
+/* A predictive LQI controller with delay compensation for a rotary Stewart platform.
+
+   Once:           stewart_start(&law, memory, number, queue);
+   every period:   status = stewart_step(&law, memory, scratch, &sample, torque);
+   and only if something else was sent than `torque`, limited:   stewart_note_acted(&law, memory, 1, 1, sent);
+
+   A pose is roll, pitch, yaw (rad) and x, y, z (m) of the plate's centre of mass, a state the pose
+   and its rates, a reference the pose, its rates and its accelerations. Matrices are stored by rows.
+   Nothing is allocated, nothing kept but in the memory that the caller hands over: one vector of
+   numbers, counts and flags too, whose fields `law.layout` names. */
+
+#ifndef STEWART_LAW_H
+#define STEWART_LAW_H
+
+#define STEWART_REPORTED 10 /* periods of which a machine reports torques, at the most */
+
+#include "design.h"
+#include "observer.h"
+#include "packets.h"
+
+/* A field of the memory: a matrix of so many rows and columns from a place on. */
+typedef struct {
+    int at, rows, columns;
+} stewart_field;
+
+typedef struct {
+    stewart_field in_flight;   /* torques as limited, the oldest first */
+    stewart_field observer;    /* of the observer, at the last measurement that it took */
+    stewart_field behind;      /* periods since that was taken */
+    stewart_field state;       /* now */
+    stewart_field parameters;  /* estimated, or as they are known beforehand */
+    stewart_field measurement; /* the last, as it came */
+    stewart_field error;       /* of the pose */
+    stewart_field integral;
+    stewart_field gain;        /* the last good one; NaN before there is any */
+    stewart_field torque;      /* the last, as asked for */
+    stewart_field feedforward; /* and how much of it takes no measurement */
+    stewart_field weights;
+    stewart_field silence;     /* samples that are still to go on without feedback */
+    stewart_field times;       /* of the last preview, s from its sample */
+    stewart_field reference;   /* the last preview, with numbers for what was missing */
+    stewart_field followed;    /* the same with the way back after a gap */
+    stewart_field gap;         /* whether the last row of the last preview was missing */
+    stewart_field offset;      /* from the reference where the next torque acts, after a gap in it */
+    stewart_field way_back;    /* holds until the offset is zero; then samples until it has acted */
+    stewart_field channel;     /* of what was sent */
+    stewart_field planner;
+    stewart_field counts;
+} stewart_layout;
+
+/* Where the next torque acts, and how it comes about; what further ones would be, go on from there. */
+typedef struct {
+    real state[STEWART_STATES], error[STEWART_STATES], integral[6];
+    real limited[STEWART_MOTORS]; /* the torque, as limited */
+    const real *theta;            /* parameters that it is computed with, NULL: as known beforehand */
+    const real *gain;             /* or NULL without feedback */
+    const real *rows;             /* of the reference, at further instants of the preview */
+} stewart_ahead;
+
+/* A kind of channel to the motors, with which more than one torque is sent at a sample. */
+typedef struct {
+    int (*memory)(const stewart_law *law);
+    int (*scratch)(const stewart_law *law);
+    int (*torques)(const stewart_law *law); /* that are planned at each sample */
+    void (*start)(const stewart_law *law, real *memory);
+    /* Puts what most probably is in flight in the place of what seemed to be. */
+    void (*update)(const stewart_law *law, real *memory, const stewart_report *report,
+                   real *in_flight, stewart_scratch scratch);
+    /* Remembers what is sent: this torque and further ones, for `in_flight` before it. */
+    void (*send)(const stewart_law *law, real *memory, const stewart_told *told,
+                 const stewart_ahead *ahead, const real *in_flight, stewart_scratch scratch);
+} stewart_channel;
+
+extern const stewart_channel stewart_network;
+
+typedef struct stewart_sample stewart_sample;
+
+/* A kind of planner of what is followed. */
+typedef struct {
+    int (*memory)(const stewart_law *law);
+    int (*scratch)(const stewart_law *law);
+    void (*start)(const stewart_law *law, real *memory);
+    /* Plans anew where that is of use, once at each sample. Returns whether it did. */
+    int (*follow)(const stewart_law *law, real *memory, const stewart_told *told,
+                  const stewart_sample *sample, stewart_scratch scratch);
+    /* Rows (number, 18) of what is followed, at instants in s from now. */
+    void (*look)(const stewart_law *law, const real *memory, const stewart_sample *sample, int number,
+                 const real *times, real *rows);
+} stewart_planner;
+
+/* The constants of one controller. */
+struct stewart_law {
+    stewart_machine machine;
+    stewart_cost cost;
+    real period;       /* s */
+    real fraction;     /* of a period, that the assumed delay is beyond `steps` */
+    int steps;         /* of the assumed delay, whole periods */
+    int kept;          /* torques that are remembered beyond the delay's */
+    int longest_wait;  /* for a late measurement, periods */
+    int silence;       /* samples at the start at which nothing is fed back */
+    int measured;      /* numbers of a measurement */
+    int parts;         /* torques that a machine reports of each period; 0: they are the law's own */
+    int rows;          /* of a preview, at the most */
+    int memory;        /* numbers of the memory, and the place of each field: `stewart_prepare` */
+    stewart_layout layout;
+    const stewart_observer *observer;
+    const void *sensing, *estimation; /* what the observer knows beside the machine */
+    const stewart_channel *channel;   /* NULL: every torque arrives, after the delay */
+    const stewart_packets *packets;   /* what the channel knows */
+    const stewart_planner *planner;   /* NULL: what the caller asks for is followed */
+    const void *planning;             /* what the planner knows */
+};
+
+/* Rows (number, 18) of the reference at instants in s from now, some of them negative. */
+typedef void (*stewart_preview_function)(void *about, int number, const real *times, real *rows);
+
+/* What a sample brings. */
+struct stewart_sample {
+    const real *measurement; /* (measured); what is lost is NaN */
+    int age;                 /* of it in periods; negative for a lost one */
+    /* What is NaN or infinite in the reference continues from the rows next to it and from the last
+       preview; after a gap the law goes back onto it. Without a complete row until now the torque is
+       the last one in flight. */
+    stewart_preview_function reference;
+    stewart_preview_function goal; /* what a planner leads back to, or NULL for a law without one */
+    void *about;
+    const stewart_report *report; /* that came with the measurement, or NULL */
+    real weights[2]; /* of errors and of torques; with others than finite ones the last gain is used */
+};
+
+/* Fills in `memory` and `layout` of a law whose other fields are set. */
+void stewart_prepare(stewart_law *law);
+
+/* Numbers of scratch memory that a step takes at the most. */
+int stewart_step_scratch(const stewart_law *law);
+
+/* Torques in flight at a sample, by the assumed delay. */
+int stewart_queue_length(const stewart_law *law);
+
+/* Instants (s from now) at which the reference is asked for under the assumed delay; how many. */
+int stewart_preview_times(const stewart_law *law, real *times);
+
+/* Before the first step; `queue` (number, 6) has the torques that are under way, the oldest first. */
+void stewart_start(const stewart_law *law, real *memory, int number, const real *queue);
+
+/* One sample: the torque (6) to send, as asked for; the motors' limit stands behind it. Returns what
+   went wrong, bits of `stewart_status`. `scratch` has place for `stewart_step_scratch` numbers. */
+int stewart_step(const stewart_law *law, real *memory, real *scratch, const stewart_sample *sample,
+                 real *torque);
+
+/* What has acted, where that may not be what was sent: `number` torques, the newest first, the first
+   in the place of the one computed `ago` >= 1 samples before the next step. Torques that are older than
+   the memory, or not finite, change nothing. */
+void stewart_note_acted(const stewart_law *law, real *memory, int ago, int number, const real *torques);
+
+/* A `stewart_preview_function`: `about` points to all rows that are asked for. */
+void stewart_given_rows(void *about, int number, const real *times, real *rows);
+
+/* The torque as the motors let it through; whether that is another one. */
+int stewart_limit(const stewart_machine *machine, const real *torque, real *limited);
+
+/* What acts in whole periods that begin with the oldest of `periods` + 1 torques. */
+stewart_acting stewart_acting_of(const stewart_law *law, int periods, const real *torques,
+                                 stewart_scratch *scratch);
+
+/* For observers of a fixed delay: what acted in the last `periods` of torques (number, 6), and the
+   torque that acts next. */
+void stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
+                          stewart_acting *acting, const real **following, stewart_scratch *scratch);
+
+#endif

@@ -1,0 +1,187 @@
+/* See reference.h. */
+
+#include "reference.h"
+
+#define X STEWART_STATES
+#define ROW STEWART_REFERENCE
+#define FURTHER ((real)1.25) /* times as far as to its rest, a continued motion stays within reach */
+#define DOUBLINGS 6          /* of the rate at which it comes to rest, at the most */
+#define CATCH_UP ((real)0.3) /* s, of a way back */
+
+void stewart_between(const real *from, const real *to, real h, real s, real *row)
+{
+    for (int i = 0; i < 6; i++) {
+        real v0 = h * from[6 + i], v1 = h * to[6 + i], a0 = h * h * from[12 + i];
+        real a1 = h * h * to[12 + i], c2 = a0 / 2, d = to[i] - from[i] - v0 - c2, e = v1 - v0 - a0;
+        real f = a1 - a0, c3 = 10 * d - 4 * e + f / 2, c4 = -15 * d + 7 * e - f;
+        real c5 = 6 * d - 3 * e + f / 2;
+        row[i] = from[i] + s * (v0 + s * (c2 + s * (c3 + s * (c4 + s * c5))));
+        row[6 + i] = (v0 + s * (2 * c2 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))) / h;
+        row[12 + i] = (2 * c2 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))) / (h * h);
+    }
+}
+
+/* The reference `later` s after a row of it (negative: before). It comes to rest with the rate w:
+   da/dt = -2 w a - w^2 v, of accelerations a and rates v. That is (2 v + a / w) / w away; w doubles
+   until the plate could go FURTHER. With b = a + w v:  v(t) = (v + b t) exp(-w t). */
+static void continued(const real *geometry, const real *from, real later, real w, real *row)
+{
+    for (int doubled = 0; doubled < DOUBLINGS; doubled++, w *= 2) {
+        real pose[6];
+        for (int i = 0; i < 6; i++)
+            pose[i] = from[i] + FURTHER * (2 * from[6 + i] + from[12 + i] / w) / w;
+        if (!geometry || stewart_is_workable(geometry, pose))
+            break;
+    }
+    real left = REAL(exp)(-w * later);
+    for (int i = 0; i < 6; i++) {
+        real v = from[6 + i], a = from[12 + i], b = a + w * v;
+        row[i] = from[i] + (v * (1 - left) + b / w * (1 - left * (1 + w * later))) / w;
+        row[6 + i] = left * (v + b * later);
+        row[12 + i] = left * (a - w * b * later);
+    }
+}
+
+/* Accelerations from rates v and the rows before and after, `later` s away, unless one is next to it:
+   (v1 - v) / h = (a + a1) / 2. */
+static void slopes(const real *const next[2], const real later[2], const real *v, real closest,
+                   real *accelerations)
+{
+    int sides = 0;
+    real sum[6] = {0};
+    for (int side = 0; side < 2; side++)
+        if (next[side] && REAL(fabs)(later[side]) < closest)
+            return;
+        else if (next[side] && ++sides)
+            for (int i = 0; i < 6; i++)
+                sum[i] += 2 * (next[side][6 + i] - v[i]) / later[side] - next[side][12 + i];
+    for (int i = 0; i < 6; i++)
+        accelerations[i] = sum[i] / (real)sides;
+}
+
+/* The rows next to an instant among those that are complete, and how much later they are. */
+typedef struct {
+    const real *next[2]; /* before and after, or NULL */
+    real later[2];
+} neighbours;
+
+static void look(neighbours *n, real gap, const real *row)
+{
+    const int side = gap > 0;
+    if ((side ? gap < n->later[1] : gap > n->later[0]) && stewart_all_finite(ROW, row)) {
+        n->next[side] = row;
+        n->later[side] = gap;
+    }
+}
+
+void stewart_complete(const real *geometry, real period, real eta, const stewart_preview *given,
+                      real since, const stewart_preview *last, real *rows)
+{
+    real found[ROW];
+    for (int i = 0; i < given->number; i++)
+        if (given->times[i] < since)
+            stewart_fill(ROW, (real)NAN, rows + ROW * i);
+        else
+            stewart_copy(ROW, given->rows + ROW * i, rows + ROW * i);
+    for (int i = 0; i < given->number; i++) {
+        real *row = rows + ROW * i;
+        if (stewart_all_finite(ROW, row))
+            continue;
+        neighbours n = {{NULL, NULL}, {-(real)HUGE_VAL, (real)HUGE_VAL}};
+        for (int j = 0; j < given->number; j++)
+            if (given->times[j] >= since)
+                look(&n, given->times[j] - given->times[i], given->rows + ROW * j);
+        for (int j = 1; j < last->number; j++)
+            look(&n, last->times[j] - given->times[i] - period, last->rows + ROW * j);
+        const real *const *next = n.next;
+        const real *later = n.later;
+        if (next[0] && next[1])
+            stewart_between(next[0], next[1], later[1] - later[0], later[0] / (later[0] - later[1]),
+                            found);
+        else if (next[0] || next[1])
+            continued(geometry, next[!next[0]], -later[!next[0]], 2 / (eta + period), found);
+        else
+            return;
+        if (stewart_all_finite(6, row + 6))
+            slopes(next, later, row + 6, period / 20, found + 12);
+        for (int k = 0; k < ROW; k++)
+            if (!isfinite(row[k]))
+                row[k] = found[k];
+    }
+}
+
+void stewart_interpolate(const stewart_preview *reference, real time, real *row)
+{
+    int before = 0, after = 0;
+    real earlier = -(real)HUGE_VAL, later = (real)HUGE_VAL;
+    for (int i = 0; i < reference->number; i++) {
+        real gap = reference->times[i] - time;
+        if (gap <= 0 && gap > earlier) {
+            earlier = gap;
+            before = i;
+        } else if (gap > 0 && gap < later) {
+            later = gap;
+            after = i;
+        }
+    }
+    stewart_between(reference->rows + ROW * before, reference->rows + ROW * after, later - earlier,
+                    earlier / (earlier - later), row);
+}
+
+/* The offset d = [pose; rates] is zero after n holds of h seconds with accelerations a_i, constant
+   because torques are held, if
+
+       0 = d_pose + n h d_rates + h^2 sum (n - i - 1/2) a_i,      0 = d_rates + h sum a_i.
+
+   The solution with the least sum of a_i^2 is linear in i: with c_i = (n - 1)/2 - i, sum c_i = 0 and
+   sum c_i^2 = n (n^2 - 1)/12,
+
+       a_i = -d_rates / (n h) - 12 (d_pose + n h d_rates / 2) c_i / (h^2 n (n^2 - 1)).
+
+   What is left after the first hold is solved by the rest of these, so that d and n are all there is
+   to remember. */
+static void move_offset(stewart_way_back *way, real h, real time, real *accelerations)
+{
+    const real n = (real)way->holds;
+    for (int i = 0; i < 6; i++) {
+        real *pose = way->offset + i, *rate = pose + 6, a = -*rate / (n * h);
+        if (way->holds > 1)
+            a -= 6 * (*pose + n * h / 2 * *rate) / (h * h * n * (n + 1));
+        *pose += time * (*rate + time / 2 * a);
+        *rate += time * a;
+        accelerations[i] = a;
+    }
+}
+
+void stewart_begin_way_back(const real *offset, real period, int queue, stewart_way_back *way)
+{
+    int holds = (int)REAL(ceil)(CATCH_UP / period - (real)1e-6);
+    stewart_copy(X, offset, way->offset);
+    way->holds = holds > 2 ? holds : 2;
+    way->samples = queue + 2;
+}
+
+void stewart_go_on_way_back(stewart_way_back *way, real period)
+{
+    real a[6];
+    if (way->holds > 0) {
+        move_offset(way, period, period, a);
+        way->holds--;
+    } else if (way->samples > 0) {
+        way->samples--;
+    }
+}
+
+void stewart_add_offset(stewart_way_back way, real period, real time, real *row)
+{
+    real a[6];
+    for (; way.holds > 0 && time > period; way.holds--, time -= period)
+        move_offset(&way, period, period, a);
+    if (way.holds == 0)
+        return;
+    move_offset(&way, period, time, a);
+    for (int i = 0; i < X; i++)
+        row[i] += way.offset[i];
+    for (int i = 0; i < 6; i++)
+        row[X + i] += a[i];
+}

@@ -1,0 +1,46 @@
+/* The reference between the instants at which it is known, and the way back onto it after a gap.
+   A row has 18 numbers: pose, rates and accelerations. */
+
+#ifndef STEWART_REFERENCE_H
+#define STEWART_REFERENCE_H
+
+#include "design.h"
+
+/* A reference at some instants, s from a sample. */
+typedef struct {
+    int number;
+    const real *times; /* (number) */
+    const real *rows;  /* (number, 18) */
+} stewart_preview;
+
+/* Offset from the reference that is zero after some holds; and further samples at which torques of
+   the way back are in flight. */
+typedef struct {
+    real offset[STEWART_STATES];
+    int holds, samples;
+} stewart_way_back;
+
+/* The share s of the way between two rows that are h seconds apart, by the polynomial of fifth order. */
+void stewart_between(const real *from, const real *to, real h, real s, real *row);
+
+/* The row at an instant, between those before and after it. */
+void stewart_interpolate(const stewart_preview *reference, real time, real *row);
+
+/* `rows`: the given reference with numbers for what is missing of it from `since` s on; before that
+   all of it counts as missing. What is missing lies between the rows next to it in time, of this
+   preview or of the last one, a period earlier, or continues one of them. As long as there is no
+   complete row it stays missing. `eta`: s until the next torque acts; `geometry` NULL: any pose is
+   within reach. */
+void stewart_complete(const real *geometry, real period, real eta, const stewart_preview *given,
+                      real since, const stewart_preview *last, real *rows);
+
+/* The way back over so many holds of h seconds and `queue` torques in flight. */
+void stewart_begin_way_back(const real *offset, real period, int queue, stewart_way_back *way);
+
+/* The rest of it, one hold later. */
+void stewart_go_on_way_back(stewart_way_back *way, real period);
+
+/* Adds the offset `time` s after its beginning to a row. */
+void stewart_add_offset(stewart_way_back way, real period, real time, real *row);
+
+#endif

@@ -1,0 +1,157 @@
+/* See servo.h. */
+
+#include "servo.h"
+
+#define X STEWART_STATES
+#define U STEWART_MOTORS
+#define ROW STEWART_REFERENCE
+#define SATURATED 6 /* place of this cause among the counts */
+
+static int width(const stewart_servo *servo) { return U * servo->law.parts + 1; }
+
+int stewart_servo_report(const stewart_servo *servo) { return servo->periods * width(servo) + U; }
+
+static stewart_field place(stewart_servo *servo, int columns)
+{
+    stewart_field field = {servo->memory, 1, columns};
+    servo->memory += columns;
+    return field;
+}
+
+void stewart_servo_prepare(stewart_servo *servo)
+{
+    const stewart_law *law = &servo->law;
+    stewart_servo_layout *l = &servo->layout;
+    servo->memory = 0;
+    l->command = place(servo, STEWART_COMMAND);
+    l->observer = place(servo, law->observer->memory(law));
+    l->behind = place(servo, 1);
+    l->state = place(servo, X);
+    l->parameters = place(servo, law->machine.estimated);
+    l->measurement = place(servo, law->measured);
+    l->torque = place(servo, U);
+    l->in_flight = place(servo, U);
+    l->counts = place(servo, STEWART_CAUSES);
+}
+
+int stewart_servo_scratch(const stewart_servo *servo)
+{
+    const stewart_law *law = &servo->law;
+    return U * law->parts * servo->periods + U + law->observer->scratch(law);
+}
+
+/* Takes state and parameters from the observer. */
+static void take_estimate(const stewart_servo *servo, real *memory)
+{
+    const stewart_law *law = &servo->law;
+    const stewart_servo_layout *l = &servo->layout;
+    stewart_told told;
+    law->observer->tell(law, memory + l->observer.at, 0, NULL, &told, NULL);
+    stewart_copy(X, told.state, memory + l->state.at);
+    stewart_copy(law->machine.estimated, told.theta, memory + l->parameters.at);
+}
+
+void stewart_servo_start(const stewart_servo *servo, real *memory, const real *command)
+{
+    const stewart_servo_layout *l = &servo->layout;
+    stewart_fill(servo->memory, 0, memory);
+    stewart_copy(STEWART_COMMAND, command, memory + l->command.at);
+    servo->law.observer->start(&servo->law, memory + l->observer.at);
+    stewart_fill(servo->law.measured, (real)NAN, memory + l->measurement.at);
+    take_estimate(servo, memory);
+}
+
+/* The torques that acted over so many periods, from a report; how many, 0 where it does not tell. */
+static int read_report(const stewart_servo *servo, const real *report, int periods, real *torques,
+                       int *saturated)
+{
+    const int columns = width(servo), size = columns - 1;
+    const real *rows = report + columns * (servo->periods - periods);
+    if (periods > servo->periods || !stewart_all_finite(columns * periods, rows))
+        return 0;
+    *saturated = 0;
+    for (int i = 0; i < periods; i++) {
+        stewart_copy(size, rows + columns * i, torques + size * i);
+        *saturated += rows[columns * i + size] > 0;
+    }
+    return servo->law.parts * periods;
+}
+
+/* Moves the observer to a measurement, of which the report tells what acted since the one before. Where
+   that got lost too, the observer begins anew. */
+static int observe(const stewart_servo *servo, real *memory, const stewart_sample *sample,
+                   const real *report, int periods, stewart_scratch scratch)
+{
+    const stewart_law *law = &servo->law;
+    const stewart_servo_layout *l = &servo->layout;
+    real *torques = stewart_take(&scratch, U * law->parts * servo->periods + U);
+    real *observer = memory + l->observer.at;
+    int saturated = 0, number = read_report(servo, report, periods, torques, &saturated);
+    if (number > 0) {
+        const real *asked = report + stewart_servo_report(servo) - U;
+        stewart_copy(U, asked, memory + l->torque.at);
+        memory[l->counts.at + SATURATED] += (real)saturated;
+    } else {
+        if (stewart_all_finite(X, memory + l->state.at))
+            law->observer->restart(law, observer);
+        stewart_fill(U, 0, torques);
+        number = 1;
+    }
+    int status = law->observer->observe(law, observer, number, torques, sample->measurement, scratch);
+    take_estimate(servo, memory);
+    return status;
+}
+
+/* [crank angles; their rates; torque] for a row of the reference; what went wrong. */
+static int command_for(const stewart_servo *servo, const real *theta, const real *row, real *command)
+{
+    const stewart_law *law = &servo->law;
+    static const real still[12] = {0};
+    const int moves = law->cost.feedforward == STEWART_INVERSE_DYNAMICS;
+    const real *geometry = law->machine.geometry;
+    real J[36], found[STEWART_COMMAND] = {0};
+    stewart_belief belief;
+    stewart_crank_angles(geometry, row, found);
+    if (!stewart_all_finite(6, row) || !stewart_all_finite(6, found) ||
+        !stewart_crank_jacobian(geometry, row, J))
+        return stewart_all_finite(6, row) ? STEWART_UNREACHABLE : STEWART_NONFINITE_TORQUE;
+    stewart_multiply(6, 6, 1, J, row + 6, found + 6);
+    stewart_believe(&law->machine, theta, &belief);
+    if (law->cost.feedforward != STEWART_NO_FEEDFORWARD)
+        stewart_inverse_dynamics(&belief.plant, row, moves ? row + 6 : still,
+                                 moves ? row + 12 : still, found + 12);
+    if (!stewart_all_finite(STEWART_COMMAND, found))
+        return STEWART_NONFINITE_TORQUE;
+    stewart_copy(STEWART_COMMAND, found, command);
+    return 0;
+}
+
+int stewart_servo_step(const stewart_servo *servo, real *memory, real *scratch_memory,
+                       const stewart_sample *sample, const real *report, real *command)
+{
+    const stewart_law *law = &servo->law;
+    const stewart_servo_layout *l = &servo->layout;
+    const stewart_scratch scratch = {scratch_memory};
+    const real time = ((real)law->steps + law->fraction + 1) * law->period;
+    const int behind = (int)memory[l->behind.at] + 1;
+    real row[ROW], *last = memory + l->command.at;
+    int there = 0, status = STEWART_MEASUREMENT_MISSING;
+    for (int i = 0; i < law->measured; i++)
+        there |= isfinite(sample->measurement[i]) != 0;
+    if (there && sample->age >= 0 && sample->age < behind)
+        status = observe(servo, memory, sample, report, behind - sample->age, scratch);
+    else
+        there = 0;
+    memory[l->behind.at] = (real)(there ? sample->age : behind);
+    sample->reference(sample->about, 1, &time, row);
+    int trouble = command_for(servo, memory + l->parameters.at, row, last);
+    if (trouble) /* the cranks stop where they are */
+        stewart_fill(6, 0, last + 6);
+    stewart_copy(STEWART_COMMAND, last, command);
+    stewart_copy(law->measured, sample->measurement, memory + l->measurement.at);
+    stewart_limit(&law->machine, memory + l->torque.at, memory + l->in_flight.at);
+    status |= trouble;
+    for (int i = 0; i < STEWART_CAUSES; i++)
+        memory[l->counts.at + i] += (real)(status >> i & 1);
+    return status;
+}

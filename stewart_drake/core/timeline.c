@@ -1,0 +1,58 @@
+/* A delay that is known: which torque acts when, and what the motors let through. See law.h. */
+
+#include "law.h"
+
+#define U STEWART_MOTORS
+
+int stewart_queue_length(const stewart_law *law) { return law->steps + (law->fraction > 0); }
+
+int stewart_limit(const stewart_machine *machine, const real *torque, real *limited)
+{
+    const real most = machine->torque_limit;
+    int saturated = 0;
+    for (int i = 0; i < U; i++) {
+        limited[i] = torque[i] > most ? most : torque[i] < -most ? -most : torque[i];
+        saturated |= limited[i] != torque[i];
+    }
+    return saturated;
+}
+
+/* What acts in whole periods that begin with the oldest of `periods` + 1 torques: with a fraction each
+   torque acts for the end of one period and the beginning of the next. */
+stewart_acting stewart_acting_of(const stewart_law *law, int periods, const real *torques,
+                                 stewart_scratch *scratch)
+{
+    const int parts = 1 + (law->fraction > 0), number = parts * periods;
+    real *durations = stewart_take(scratch, number), *each = stewart_take(scratch, U * number);
+    for (int i = 0; i < number; i++) {
+        const real split = i % 2 ? 1 - law->fraction : law->fraction;
+        durations[i] = (parts == 1 ? 1 : split) * law->period;
+        stewart_copy(U, torques + U * (parts == 1 ? i : (i + 1) / 2), each + U * i);
+    }
+    stewart_acting acting = {number, each, durations, 0};
+    return acting;
+}
+
+void stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
+                          stewart_acting *acting, const real **following, stewart_scratch *scratch)
+{
+    const int queue = stewart_queue_length(law);
+    const real *first = torques + U * (number - queue - periods);
+    if (law->parts > 0) { /* what acts next the motors decide: the last torque stands for it */
+        real *durations = stewart_take(scratch, number);
+        stewart_fill(number, law->period / (real)law->parts, durations);
+        *acting = (stewart_acting){number, torques, durations, 0};
+        if (following)
+            *following = torques + U * (number - 1);
+        return;
+    }
+    *acting = stewart_acting_of(law, periods, first, scratch);
+    if (following) /* without a delay it is still to be computed: no change is known */
+        *following = queue > 0 ? first + U * periods : first + U * (periods - 1);
+}
+
+void stewart_given_rows(void *about, int number, const real *times, real *rows)
+{
+    (void)times;
+    stewart_copy(STEWART_REFERENCE * number, about, rows);
+}

@@ -1,0 +1,397 @@
+/* See tuner.h.
+
+   Densities (45) relate each signal to its own mean over the window,
+
+       rho(k) = |eps(k)| / mean |eps(i)|,  or with signs,  i = k - 30, ..., k,
+
+   over the samples that are known; 1 where nothing but zeros is.
+
+   Features of health relate timing, surprise, error and feedback to their usual size. A torque that
+   arrives tau late leaves the rates off by -tau kappa at the next sample, kappa the change of the
+   accelerations with which it arrives. With the innovation nu of the rates and its floor f,
+
+       n = sum nu kappa / f^2,   d = sum kappa^2 / f^2,   E n^2 = tau^2 d^2 + d,
+
+   hence over a window tau^2 = sum (n^2 - d) / sum d^2. One that comes early acts by the change at the
+   end of the period instead. */
+
+#include <string.h>
+
+#include "tuner.h"
+
+#define X STEWART_STATES
+#define U STEWART_MOTORS
+#define N STEWART_WINDOW
+#define MODEL_ERROR ((real)2e-4) /* law/filter_settings.py */
+#define HUGEST ((real)1e6)       /* of what has no limit, in units of what is usual */
+#define SIGNED_LIMIT ((real)1e6)
+#define LOWEST ((real)-6) /* logarithms among the features */
+#define HIGHEST ((real)4)
+#define LONGEST_DETECTABLE ((real)0.1) /* s */
+#define MAX_FACTOR ((real)1.5)         /* of a weight per sample */
+#define FALL ((real)0.35)              /* decades of w_Q / w_R per sample */
+#define RISE ((real)0.15)
+#define LEAST ((real)-4) /* ratios */
+#define MOST ((real)2)
+
+/* A row of the window: mean squares over what is known, else NaN, n and d of torques that come late or
+   early, log10(w_Q / w_R), variance of the parameters over that of their prior; then the torque (6)
+   that acted last. */
+enum {
+    ERROR, FEEDBACK, CHANGE, SURPRISE, MISSED, LATE, LATE_WEIGHT, EARLY, EARLY_WEIGHT, RATIO, DOUBT,
+    ACTED, HEALTH_ROW = ACTED + U
+};
+enum { SURPRISE_PEAK = 11 }; /* place of the feature that the rule goes by */
+
+static int columns_of(const stewart_tuner *t) { return t->health ? HEALTH_ROW : X + U; }
+
+int stewart_tuner_memory(const stewart_tuner *t) { return 3 + N * columns_of(t); }
+
+void stewart_tuner_start(const stewart_tuner *t, real *memory)
+{
+    stewart_fill(stewart_tuner_memory(t), (real)NAN, memory);
+    stewart_copy(2, t->first, memory);
+    memory[2] = 0;
+}
+
+int stewart_newest_row(const stewart_tuner *t, const real *memory, real *row)
+{
+    const int columns = columns_of(t);
+    stewart_copy(columns, memory + 3 + columns * (N - 1), row);
+    return columns;
+}
+
+static real between(real low, real x, real high) { return x < low ? low : x > high ? high : x; }
+
+static real decades(real x)
+{
+    return x > 0 ? between(LOWEST, REAL(log10)(x), HIGHEST) : LOWEST; /* NaN too */
+}
+
+static real mean_square(int n, const real *x)
+{
+    real sum = 0;
+    int known = 0;
+    for (int i = 0; i < n; i++)
+        if (isfinite(x[i])) {
+            sum += x[i] * x[i];
+            known++;
+        }
+    return known ? sum / (real)known : (real)NAN;
+}
+
+/* ---- densities -------------------------------------------------------------------------------- */
+
+/* In units of the largest of the window, so that no sum overflows. */
+static real density(const stewart_tuner *t, const real *window, int column)
+{
+    const int columns = X + U;
+    const real newest = window[columns * (N - 1) + column];
+    real largest = 0, total = 0;
+    int known = 0;
+    for (int i = 0; i < N; i++) {
+        const real x = window[columns * i + column];
+        if (!isfinite(x))
+            continue;
+        known++;
+        if (REAL(fabs)(x) > largest)
+            largest = REAL(fabs)(x);
+    }
+    if (!isfinite(newest) || !(largest > 0))
+        return 1;
+    for (int i = 0; i < N; i++) {
+        const real x = window[columns * i + column] / largest;
+        if (isfinite(x))
+            total += t->is_signed ? x : REAL(fabs)(x);
+    }
+    const real last = newest / largest;
+    if (!t->is_signed)
+        return (real)known * (REAL(fabs)(last) / total);
+    if (last == 0)
+        return 0;
+    return between(-SIGNED_LIMIT, (real)known * (last / total), SIGNED_LIMIT);
+}
+
+/* ---- health ----------------------------------------------------------------------------------- */
+
+/* Sum of a column over rows `first` to `last`, counted from the newest, of what is known. */
+static real sum_of(const real *window, int column, int first, int last, int *known)
+{
+    real sum = 0;
+    *known = 0;
+    for (int i = first; i < last; i++) {
+        const real x = window[HEALTH_ROW * (N - 1 - i) + column];
+        if (!isnan(x)) {
+            sum += x;
+            ++*known;
+        }
+    }
+    return sum;
+}
+
+static real rms(const real *window, int column, int first, int last)
+{
+    int known;
+    const real sum = sum_of(window, column, first, last, &known);
+    return known ? REAL(sqrt)((sum > 0 ? sum : 0) / (real)known) : 0;
+}
+
+static real newest(const real *window, int column)
+{
+    const real x = window[HEALTH_ROW * (N - 1) + column];
+    return isnan(x) ? 0 : x;
+}
+
+/* tau in s over so many rows, 0 where it cannot be told from none; `weight` is d's column after n's. */
+static real timing(const real *window, int column, int number)
+{
+    real squares = 0, excess = 0;
+    for (int i = 0; i < number; i++) {
+        const real *row = window + HEALTH_ROW * (N - 1 - i) + column;
+        const real n = isnan(row[0]) ? 0 : row[0], d = isnan(row[1]) ? 0 : row[1];
+        squares += d * d;
+        excess += n * n - d;
+    }
+    return squares > 0 && excess > 0 ? REAL(sqrt)(excess / squares) : 0;
+}
+
+static void health(const stewart_tuner *t, const real *window, real *values)
+{
+    const real late_31 = timing(window, LATE, 31), late_10 = timing(window, LATE, 10);
+    const real early = timing(window, EARLY, 31);
+    int known;
+    const real information = sum_of(window, LATE_WEIGHT, 0, N, &known);
+    real detectable = 1 / REAL(sqrt)(information > (real)1e-30 ? information : (real)1e-30);
+    detectable = detectable < LONGEST_DETECTABLE ? detectable : LONGEST_DETECTABLE;
+    real latest = late_31 > late_10 ? late_31 : late_10, peak = 0, growth = 1, noise = 0;
+    latest = latest > early ? latest : early;
+    sum_of(window, FEEDBACK, 5, 15, &known);
+    if (known)
+        growth = (rms(window, FEEDBACK, 0, 5) + (real)1e-5) /
+                 (rms(window, FEEDBACK, 5, 15) + (real)1e-5);
+    for (int i = 0; i < N; i++) {
+        const real x = window[HEALTH_ROW * i + SURPRISE];
+        peak = x > peak ? x : peak;
+    }
+    for (int i = 0; i < X; i++)
+        noise += t->noise[i] / t->motion[i] * (t->noise[i] / t->motion[i]) / X;
+    const real found[STEWART_FEATURES] = {
+        decades(1000 * late_31 + (real)0.05),
+        decades(1000 * late_10 + (real)0.05),
+        decades(1000 * REAL(hypot)(latest, 2 * detectable) + (real)0.05),
+        decades(1000 * detectable),
+        decades(rms(window, ERROR, 0, 10) + (real)1e-3),
+        decades(rms(window, ERROR, 0, 31) + (real)1e-3),
+        decades(rms(window, FEEDBACK, 0, 4) + (real)1e-4),
+        decades(rms(window, FEEDBACK, 0, 20) + (real)1e-4),
+        decades(rms(window, SURPRISE, 0, 3) + (real)0.1),
+        decades(rms(window, SURPRISE, 0, 15) + (real)0.1),
+        decades(rms(window, MISSED, 0, 10) + (real)1e-4),
+        decades(REAL(sqrt)(peak) + (real)0.1),
+        newest(window, RATIO),
+        decades(REAL(sqrt)(noise) + (real)1e-4),
+        t->delay,
+        decades(REAL(sqrt)(newest(window, DOUBT)) + (real)1e-3),
+        decades(rms(window, CHANGE, 0, 10) + (real)1e-4),
+        decades(growth),
+    };
+    stewart_copy(STEWART_FEATURES, found, values);
+}
+
+/* ---- the decision ----------------------------------------------------------------------------- */
+
+/* Raw weights: W2 sigmoid(W1 (x - mean) / scale + b1) + b2. */
+static void network(const stewart_tuner *t, const real *values, real *weights)
+{
+    stewart_copy(2, t->b2, weights);
+    for (int i = 0; i < t->hidden; i++) {
+        real sum = t->b1[i];
+        for (int j = 0; j < STEWART_FEATURES; j++)
+            sum += t->W1[STEWART_FEATURES * i + j] * ((values[j] - t->input_mean[j]) / t->input_scale[j]);
+        for (int k = 0; k < 2; k++)
+            weights[k] += t->W2[t->hidden * k + i] / (1 + REAL(exp)(-sum));
+    }
+    for (int k = 0; t->logarithms && k < 2; k++)
+        weights[k] = REAL(exp)(weights[k]);
+}
+
+static real ratio_of(const real *weights) { return REAL(log10)(weights[0] / weights[1]); }
+
+int stewart_decide(const stewart_tuner *t, const real *memory, real *weights)
+{
+    const real *last = memory, *window = memory + 3, *row = window + columns_of(t) * (N - 1);
+    real values[STEWART_FEATURES], goal[2], ratio;
+    int any = 0, usable;
+    for (int i = 0; i < columns_of(t); i++)
+        any |= !isnan(row[i]);
+    stewart_copy(2, t->first, weights);
+    if (!any) /* nothing is known before the first sample */
+        return 0;
+    if (t->health)
+        health(t, window, values);
+    else
+        for (int i = 0; i < STEWART_FEATURES; i++)
+            values[i] = density(t, window, i);
+    if (t->policy == STEWART_RULE) {
+        real above = values[SURPRISE_PEAK] - t->knee;
+        ratio = t->ratio - t->slope * (above > 0 ? above : 0);
+        usable = isfinite(ratio);
+        ratio = usable ? between(LEAST, ratio, MOST) : t->ratio;
+    } else {
+        network(t, values, goal);
+        usable = stewart_all_finite(2, goal);
+        for (int k = 0; k < 2; k++)
+            goal[k] = usable ? between(t->bounds[k], goal[k], t->bounds[2 + k]) : t->first[k];
+        if (t->policy == STEWART_PAPER_NETWORK) {
+            for (int k = 0; k < 2; k++)
+                weights[k] = between(last[k] / MAX_FACTOR, goal[k], last[k] * MAX_FACTOR);
+            return !usable;
+        }
+        ratio = ratio_of(goal);
+    }
+    ratio = between(ratio_of(last) - FALL, ratio, ratio_of(last) + RISE);
+    weights[0] = REAL(pow)(10, ratio / 2);
+    weights[1] = REAL(pow)(10, -ratio / 2);
+    return !usable;
+}
+
+/* ---- what a sample adds ----------------------------------------------------------------------- */
+
+/* Measurement less prediction (12), changes (6) of the accelerations at the beginning and at the end of
+   the last period, and in `acted` the torque (6) that acted last for the one of the period before. NaN
+   and zeros before there is a state. */
+static void innovate(const stewart_law *law, const real *before, const real *after, real *innovation,
+                     real *late, real *early, real *acted, stewart_scratch scratch)
+{
+    const stewart_layout *l = &law->layout;
+    const real *state = before + l->state.at, *theta = before + l->parameters.at, *following;
+    real a[3][U];
+    stewart_belief belief;
+    stewart_acting acting;
+    stewart_fill(U, 0, late);
+    stewart_fill(U, 0, early);
+    if (!stewart_all_finite(X, state)) {
+        stewart_fill(X, (real)NAN, innovation);
+        stewart_fill(U, (real)NAN, acted);
+        return;
+    }
+    law->observer->last_period(law, before + l->observer.at, l->in_flight.rows,
+                               before + l->in_flight.at, &acting, &following, &scratch);
+    real *states = stewart_take(&scratch, X * acting.number);
+    const real *last = acting.torques + U * (acting.number - 1);
+    stewart_predict(&law->machine, theta, &acting, state, states);
+    stewart_believe(&law->machine, theta, &belief);
+    if (acting.number > 1)
+        stewart_copy(U, last - U, acted);
+    else if (!stewart_all_finite(U, acted))
+        stewart_copy(U, last, acted);
+    const real *torques[3] = {acted, last, following};
+    for (int k = 0; k < 3; k++)
+        stewart_accelerations(&belief.plant, state, state + 6, torques[k], a[k]);
+    for (int i = 0; i < U; i++) {
+        late[i] = a[1][i] - a[0][i];
+        early[i] = a[2][i] - a[1][i];
+    }
+    for (int i = 0; i < X; i++)
+        innovation[i] = after[l->measurement.at + i] - states[X * (acting.number - 1) + i];
+    stewart_copy(U, last, acted);
+}
+
+/* x . y, 0 where that is no number. */
+static real known_product(const real *x, const real *y)
+{
+    real sum = 0;
+    for (int i = 0; i < 6; i++)
+        sum += x[i] * y[i];
+    return isfinite(sum) ? sum : 0;
+}
+
+static real doubt_of(const stewart_law *law, const stewart_tuner *t, const real *after)
+{
+    real theta[STEWART_MAX_ESTIMATED], std[STEWART_MAX_ESTIMATED];
+    if (!t->doubts)
+        return 0;
+    law->observer->parameters(law, after + law->layout.observer.at, theta, std);
+    for (int i = 0; i < law->machine.estimated; i++)
+        std[i] /= t->prior[i];
+    return mean_square(law->machine.estimated, std);
+}
+
+/* A row of health, after the last one in its place. */
+static void health_row(const stewart_law *law, const stewart_tuner *t, const real *before,
+                       const real *after, const real *wanted, const real *weights, real *row,
+                       stewart_scratch scratch)
+{
+    const stewart_layout *l = &law->layout;
+    real innovation[X], over_floor[X], late[U], early[U], fed[2][U], change[U], error[6];
+    real *acted = row + ACTED;
+    innovate(law, before, after, innovation, late, early, acted, scratch);
+    for (int i = 0; i < X; i++) {
+        const real noise = t->noise[i], model = MODEL_ERROR * t->motion[i];
+        const real floor = REAL(sqrt)(2 * noise * noise + model * model);
+        innovation[i] = between(-HUGEST * floor, innovation[i], HUGEST * floor);
+        over_floor[i] = innovation[i] / floor;
+        innovation[i] /= t->tolerance[i];
+        if (i >= 6) {
+            late[i - 6] = between(-HUGEST, late[i - 6] / floor, HUGEST);
+            early[i - 6] = between(-HUGEST, early[i - 6] / floor, HUGEST);
+        }
+    }
+    for (int i = 0; i < U; i++) {
+        const real *memories[2] = {after, before};
+        for (int k = 0; k < 2; k++) {
+            const real *m = memories[k];
+            real back = m[l->torque.at + i] - m[l->feedforward.at + i];
+            fed[k][i] = between(-HUGEST, back / t->torque, HUGEST);
+        }
+        change[i] = fed[0][i] - fed[1][i];
+        error[i] = (after[l->measurement.at + i] - wanted[i]) / t->tolerance[i];
+        error[i] = between(-HUGEST, error[i], HUGEST);
+    }
+    row[ERROR] = mean_square(6, error);
+    row[FEEDBACK] = mean_square(U, fed[0]);
+    row[CHANGE] = mean_square(U, change);
+    row[SURPRISE] = mean_square(X, over_floor);
+    row[MISSED] = mean_square(X, innovation);
+    row[LATE] = known_product(over_floor + 6, late);
+    row[LATE_WEIGHT] = known_product(late, late);
+    row[EARLY] = known_product(over_floor + 6, early);
+    row[EARLY_WEIGHT] = known_product(early, early);
+    row[RATIO] = ratio_of(weights);
+    row[DOUBT] = doubt_of(law, t, after);
+}
+
+/* [measured or estimated state less the reference; torque]. */
+static void density_row(const stewart_law *law, const real *after, const real *wanted, real *row)
+{
+    const stewart_layout *l = &law->layout;
+    const real *state = after + (law->measured == X ? l->measurement.at : l->state.at);
+    for (int i = 0; i < X; i++)
+        row[i] = state[i] - wanted[i];
+    stewart_copy(U, after + l->torque.at, row + X);
+}
+
+int stewart_tuned_step_scratch(const stewart_law *law)
+{
+    return law->memory + stewart_step_scratch(law);
+}
+
+int stewart_tuned_step(const stewart_law *law, const stewart_tuner *t, real *memory,
+                       real *tuner_memory, real *scratch_memory, stewart_sample *sample,
+                       const real *wanted, real *torque)
+{
+    const int columns = columns_of(t);
+    real *before = scratch_memory, *window = tuner_memory + 3, *row = window + columns * (N - 1);
+    stewart_scratch scratch = {scratch_memory + law->memory};
+    int fell_back = stewart_decide(t, tuner_memory, sample->weights);
+    stewart_copy(law->memory, memory, before);
+    int status = stewart_step(law, memory, scratch.next, sample, torque);
+    memmove(window, window + columns, (size_t)(columns * (N - 1)) * sizeof(real));
+    if (t->health)
+        health_row(law, t, before, memory, wanted, sample->weights, row, scratch);
+    else
+        density_row(law, memory, wanted, row);
+    stewart_copy(2, sample->weights, tuner_memory);
+    tuner_memory[2] += (real)fell_back;
+    return status;
+}

@@ -1,0 +1,212 @@
+"""Laws in Python that remember what they were asked, for a replay in C."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from pydrake.trajectories import Trajectory
+
+from stewart_drake.export.motion import knots
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.channel import Report
+from stewart_drake.law.core_law import most_acting, uncovered
+from stewart_drake.law.delay_observer import DelayObserver
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.memory import Memory
+from stewart_drake.law.motion import KnownMotion, Motion
+from stewart_drake.law.planner import Rejoin
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.trajectories import through_states
+from stewart_drake.types import Array
+
+MOST_SAMPLES: Final = 100
+"""Of a run that the test replays."""
+
+
+class Step(NamedTuple):
+    """Input and result of one sample.
+
+    Attributes:
+        measurement: (m,), NaN where it is missing.
+        age: of it, periods.
+        preview: (p, 18) rows of the reference that were asked for; none where the law finds the
+            instants itself.
+        answer: (6,) torque as asked for, or (18,) command.
+        status: bits of the causes that were counted.
+        weights: (2,) w_Q and w_R.
+        sent: (6 N,) torques as limited, of this sample and of further ones.
+        report: that came with the measurement: packets, or (r,) of servos.
+    """
+
+    measurement: Array
+    age: int
+    preview: Array
+    answer: Array
+    status: int
+    weights: Array
+    sent: Array
+    report: Report | Array | None
+
+
+@dataclass
+class Recorded:
+    """A recorded run.
+
+    Attributes:
+        law: the law, without what records it.
+        steps: of it, MOST_SAMPLES at the most.
+        first: (n, 6) torques in flight, or (18,) the command before the first sample.
+        motion: (k, 19) times and rows of what the law followed, where it asks at any instant.
+        goal: the same of the reference that it leads back to.
+    """
+
+    law: PredictiveLqi | ServoPreview
+    steps: list[Step] = field(default_factory=list)
+    first: Array = field(default_factory=lambda: np.empty(0))
+    motion: Array | None = None
+    goal: Array | None = None
+    _along: tuple[Trajectory, Trajectory] | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether the law asks for the reference at instants that it finds itself."""
+        law = self.law
+        return isinstance(law, PredictiveLqi) and (
+            isinstance(law.observer, DelayObserver) or isinstance(law.planner, Rejoin)
+        )
+
+    def tabulated(self, motion: Motion, duration: float) -> Motion:
+        """Return the motion as its knots have it, which is what C follows."""
+        if not (self.moves and isinstance(motion, KnownMotion)):
+            return motion
+        if self._along is None:
+            end = duration + self._furthest
+            self.motion, self.goal = knots(motion.planned, end), knots(motion.reference, end)
+            pairs = (self.motion, motion.planned), (self.goal, motion.reference)
+            self._along = tuple(_trajectory(rows, then) for rows, then in pairs)  # type: ignore[assignment]
+        planned, reference = self._along  # type: ignore[misc]
+        return replace(motion, planned=planned, reference=reference)
+
+    @property
+    def _furthest(self) -> float:
+        """Instant from a sample on, s, beyond which no law asks for the reference."""
+        law, period = self.law, self.law.timeline.period
+        assert isinstance(law, PredictiveLqi)
+        most = law.timeline.queue_length
+        if isinstance(law.observer, DelayObserver):
+            most = most_acting(law.observer, period)
+        plan = law.planner.duration if isinstance(law.planner, Rejoin) else 0.0
+        return plan + (most + 4) * period
+
+
+def _trajectory(rows: Array, then: Trajectory) -> Trajectory:
+    pieces = [(float(a[0]), a[1:], float(b[0]), b[1:]) for a, b in pairwise(rows)]
+    return through_states(pieces, then)
+
+
+@dataclass(frozen=True)
+class RecordedLqi(PredictiveLqi):
+    """A law that remembers what it was asked since its memory was begun."""
+
+    record: Recorded = field(kw_only=True)
+    duration: float = field(kw_only=True)
+
+    def initial_memory(self, queue: Array) -> Memory:
+        """Begin anew."""
+        self.record.steps.clear()
+        self.record.first = queue
+        return super().initial_memory(queue)
+
+    def step(
+        self,
+        memory: Memory,
+        measurement: Measurement,
+        motion: Motion,
+        weights: Array,
+        report: Report | None = None,
+    ) -> Memory:
+        """Take one sample and remember it."""
+        motion = self.record.tabulated(motion, self.duration)
+        after = super().step(memory, measurement, motion, weights, report)
+        if len(self.record.steps) < MOST_SAMPLES:
+            rows = np.empty(0) if self.record.moves else motion(self.preview_times)
+            given = _given(self, measurement, memory, after)
+            sent = after.plan.ravel()
+            step = Step(*given[:2], rows, after.torque, given[2], weights, sent, report)
+            self.record.steps.append(step)
+        return after
+
+
+@dataclass(frozen=True)
+class RecordedServo(ServoPreview):
+    """A law for servos that remembers what it was asked since its memory was begun."""
+
+    record: Recorded = field(kw_only=True)
+
+    def initial_memory(self, command: Array) -> ServoMemory:
+        """Begin anew."""
+        self.record.steps.clear()
+        self.record.first = command
+        return super().initial_memory(command)
+
+    def step(
+        self, memory: ServoMemory, measurement: Measurement, motion: Motion, report: Array
+    ) -> ServoMemory:
+        """Take one sample and remember it."""
+        after = super().step(memory, measurement, motion, report)
+        if len(self.record.steps) < MOST_SAMPLES:
+            rows, given = motion(self.preview_times), _given(self, measurement, memory, after)
+            nothing = np.full(2, np.nan), np.full(6, np.nan)
+            step = Step(*given[:2], rows, after.command, given[2], *nothing, np.array(report))
+            self.record.steps.append(step)
+        return after
+
+
+def _given(law: Any, measurement: Measurement, before: Any, after: Any) -> tuple[Array, int, int]:
+    """Return values, age in periods, and the causes that were counted, as bits."""
+    new = np.subtract(after.counts, before.counts)
+    bits = int((new > 0) @ 2 ** np.arange(len(new)))
+    age = round(measurement.age / law.timeline.period)
+    return measurement.known(law.sensing.size), age, bits
+
+
+def record(scenario: Scenario) -> Recorded:
+    """Return the law of a scenario with what it did in a run on the exact plant.
+
+    The test replays the controller. The steps of a *multibody* plant are an error that some stable
+    loops, such as that of `gravity`, cannot correct.
+
+    Raises:
+        ConfigError: it has a part that the core has not, naming the field; or bad input.
+    """
+    found: list[Recorded] = []
+
+    def recorded(law: Any) -> Any:
+        problem = uncovered(law)
+        if problem is not None:
+            raise ConfigError(
+                f"{problem}: is not exported as it is; expected what predictor_lqi, adaptive_lqi "
+                "or the controllers of servos have"
+            )
+        found.append(Recorded(law))
+        parts = {f.name: getattr(law, f.name) for f in fields(law)}
+        if isinstance(law, PredictiveLqi):
+            return RecordedLqi(**parts, record=found[-1], duration=scenario.duration)
+        return RecordedServo(**parts, record=found[-1])
+
+    exact: Callable[..., Any] = replace
+    result = simulate(
+        replace(scenario, plant=exact(scenario.plant, kind="exact")),
+        modify_law=recorded,
+        judge_stability=False,
+    )
+    if result.failure is not None:
+        raise ConfigError(
+            f"scenario: {result.failure}; expected one whose run the test can replay to its end"
+        )
+    return found[-1]
