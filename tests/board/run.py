@@ -157,7 +157,8 @@ def counted(row: Row, folder: Path) -> Counted:
     listed = subprocess.check_output(["arm-none-eabi-nm", "-u", *objects], cwd=folder, text=True)
     if processor.single and "__aeabi_d" in listed:
         sys.exit(f"{row.name}: computes a double in software\n{listed}")
-    made(folder, "board_startup.o stewart_motion.o", CC=compiler, CFLAGS=OPTIMISED)
+    examples = [f"{name}.o" for name in ("stewart_motion",) if (folder / f"{name}.c").exists()]
+    made(folder, " ".join(["board_startup.o", *examples]), CC=compiler, CFLAGS=OPTIMISED)
     said = made(
         folder,
         "test",
