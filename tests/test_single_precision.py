@@ -87,7 +87,8 @@ class Single:
             sensor.quantum, sensor.std = sensing.quantum, sensing.std
             for name in ("shares", "declared", "rates_std", "motion", "offset"):
                 setattr(sensor, name, list(getattr(sensing, name)))
-            made, it.encoders = self.lib.stewart_encoder_sensing(sensor), sensor
+            made = self.lib.stewart_encoder_sensing(sensor)
+            it.legs = self.ffi.addressof(self.lib, "stewart_encoder_legs")
         else:
             made, sensor = self.state_sensing(sensing), None
         seen = new("stewart_sensing *", made)

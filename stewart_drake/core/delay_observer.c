@@ -3,11 +3,10 @@
 
 #include <stdint.h>
 
-#include "delay_observer.h"
+#include "delay_observing.h"
 
 #define X STEWART_STATES
 #define U STEWART_MOTORS
-#define LEGS 6
 #define CAUSES_AT 3 /* a cause of stewart_sensing is so many bits further to the left in a status */
 
 static int estimated(const stewart_law *law) { return law->machine.estimated; }
@@ -18,7 +17,7 @@ static int flights_of(const stewart_law *law) { return 1 + law->kept + stewart_q
 static int size_of(const stewart_law *law)
 {
     const stewart_delay_settings *settings = law->estimation;
-    return settings->encoders ? LEGS : X;
+    return settings->values;
 }
 
 static int believed_numbers(const stewart_law *law)
@@ -26,9 +25,9 @@ static int believed_numbers(const stewart_law *law)
     return stewart_delay_size(estimated(law), size_of(law), flights_of(law));
 }
 
-static int delay_memory(const stewart_law *law) { return believed_numbers(law) + size_of(law) + X; }
+int stewart_delayed_memory(const stewart_law *law) { return believed_numbers(law) + size_of(law) + X; }
 
-static int delay_scratch(const stewart_law *law)
+int stewart_delayed_scratch(const stewart_law *law)
 {
     return stewart_delay_scratch(estimated(law), size_of(law), flights_of(law)) + size_of(law);
 }
@@ -42,55 +41,41 @@ static stewart_arrivals arrivals_of(const stewart_law *law, const real *memory)
                               flights > 1 ? flights - 1 : 1, m->numbers};
 }
 
-/* What a hypothesis needs, in one place because its parts point to each other. */
-typedef struct {
-    stewart_delay delay;
-    stewart_sensing sensing;
-    stewart_encoders newest;
-} searching;
-
-static void prepare(const stewart_law *law, searching *s)
+static stewart_delay delay_of(const stewart_law *law, const stewart_sensing *sensing)
 {
     const stewart_delay_settings *settings = law->estimation;
-    s->delay = settings->delay;
-    s->delay.machine = &law->machine;
-    if (settings->encoders) {
-        s->newest = *(const stewart_encoders *)law->sensing;
-        s->newest.samples = s->newest.nodes = 1;
-        s->sensing = stewart_encoder_sensing(&s->newest);
-    } else {
-        s->sensing = stewart_state_sensing(law->sensing);
-    }
-    s->delay.sensing = &s->sensing;
+    stewart_delay delay = settings->delay;
+    delay.machine = &law->machine;
+    delay.sensing = sensing;
+    return delay;
 }
 
-static void delay_start(const stewart_law *law, real *memory)
+void stewart_delayed_start(const stewart_law *law, const stewart_sensing *sensing, real *memory)
 {
-    searching s;
-    prepare(law, &s);
-    stewart_fill(delay_memory(law), (real)NAN, memory);
-    stewart_delay_start(&s.delay, flights_of(law), (stewart_delay_memory *)memory);
+    const stewart_delay delay = delay_of(law, sensing);
+    stewart_fill(stewart_delayed_memory(law), (real)NAN, memory);
+    stewart_delay_start(&delay, flights_of(law), (stewart_delay_memory *)memory);
 }
 
-static int delay_observe(const stewart_law *law, real *memory, int number, const real *torques,
-                         const real *values, stewart_scratch scratch)
+real *stewart_delayed_last(const stewart_law *law, real *memory)
 {
-    const int m = size_of(law);
-    const real *now = values + law->measured - m;
-    real *last = memory + believed_numbers(law), *state = last + m;
+    return memory + believed_numbers(law);
+}
+
+int stewart_delayed_observe(const stewart_law *law, const stewart_sensing *sensing, int fault,
+                            real *memory, int number, const real *torques, const real *values,
+                            stewart_scratch scratch)
+{
+    const int m = sensing->size;
+    real *last = stewart_delayed_last(law, memory), *state = last + m;
     stewart_delay_memory *believed = (stewart_delay_memory *)memory;
-    searching s;
-    prepare(law, &s);
-    const stewart_delay_settings *settings = law->estimation;
-    int fault = settings->encoders
-                    ? stewart_encoder_fault(&s.newest, now)
-                    : stewart_state_fault(law->sensing, law->machine.geometry, law->period, now, last);
-    if (!fault && !stewart_all_finite(m, now))
+    const stewart_delay delay = delay_of(law, sensing);
+    if (!fault && !stewart_all_finite(m, values))
         fault = STEWART_MISSING;
     for (int i = 0; i < m; i++)
-        if (isfinite(now[i]))
-            last[i] = now[i];
-    stewart_delay_observe(&s.delay, number, torques, fault ? NULL : now, state, believed, scratch);
+        if (isfinite(values[i]))
+            last[i] = values[i];
+    stewart_delay_observe(&delay, number, torques, fault ? NULL : values, state, believed, scratch);
     if (believed->known > 0)
         stewart_copy(X, stewart_delay_guess(estimated(law), m, flights_of(law), believed,
                                             (int)believed->best)->numbers, state);
@@ -103,7 +88,7 @@ static const stewart_guess *best_of(const stewart_law *law, const real *memory)
     return stewart_delay_guess(estimated(law), size_of(law), flights_of(law), m, (int)m->best);
 }
 
-static void delay_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
+void stewart_delayed_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
 {
     const stewart_delay_settings *settings = law->estimation;
     const int n = X + estimated(law) + 2;
@@ -122,8 +107,8 @@ static void delay_parameters(const stewart_law *law, const real *memory, real *t
     }
 }
 
-static void delay_tell(const stewart_law *law, const real *memory, int number, const real *torques,
-                       stewart_told *told, stewart_scratch *scratch)
+void stewart_delayed_tell(const stewart_law *law, const real *memory, int number,
+                          const real *torques, stewart_told *told, stewart_scratch *scratch)
 {
     const stewart_delay_settings *settings = law->estimation;
     const stewart_delay_memory *m = (const stewart_delay_memory *)memory;
@@ -133,7 +118,7 @@ static void delay_tell(const stewart_law *law, const real *memory, int number, c
     real *times = stewart_take(scratch, most);
     stewart_copy(X, memory + believed_numbers(law) + size_of(law), told->state);
     real std[STEWART_MAX_ESTIMATED];
-    delay_parameters(law, memory, told->theta, std);
+    stewart_delayed_parameters(law, memory, told->theta, std);
     told->feeds_back = m->feeds_back > 0;
     told->settled = m->settled > 0;
     told->found = m->found > 0;
@@ -151,9 +136,9 @@ static void delay_tell(const stewart_law *law, const real *memory, int number, c
     told->limited = stewart_at_limit(&law->machine, last.number, last.torques);
 }
 
-static void delay_last_period(const stewart_law *law, const real *memory, int number,
-                              const real *torques, stewart_acting *acting, const real **following,
-                              stewart_scratch *scratch)
+void stewart_delayed_last_period(const stewart_law *law, const real *memory, int number,
+                                 const real *torques, stewart_acting *acting,
+                                 const real **following, stewart_scratch *scratch)
 {
     const stewart_arrivals arrivals = arrivals_of(law, memory);
     real *each = stewart_take(scratch, U * STEWART_MOST_ACTING);
@@ -167,14 +152,32 @@ static void delay_last_period(const stewart_law *law, const real *memory, int nu
     }
 }
 
-static void delay_assume(const stewart_law *law, real *memory, const real *state)
+void stewart_delayed_assume(const stewart_law *law, real *memory, const real *state)
 {
     stewart_copy(X, state, memory + believed_numbers(law) + size_of(law));
 }
 
-static void delay_restart(const stewart_law *law, real *memory) { delay_start(law, memory); }
+/* ---- of the measured state ----------------------------------------------------------------------- */
+
+static void start(const stewart_law *law, real *memory)
+{
+    const stewart_sensing sensing = stewart_state_sensing(law->sensing);
+    stewart_delayed_start(law, &sensing, memory);
+}
+
+static int observe(const stewart_law *law, real *memory, int number, const real *torques,
+                   const real *values, stewart_scratch scratch)
+{
+    const stewart_sensing sensing = stewart_state_sensing(law->sensing);
+    const real *last = stewart_delayed_last(law, memory);
+    const int fault =
+        stewart_state_fault(law->sensing, law->machine.geometry, law->period, values, last);
+    return stewart_delayed_observe(law, &sensing, fault, memory, number, torques, values, scratch);
+}
 
 const stewart_observer stewart_delay_observer = {
-    delay_memory, delay_scratch, delay_start,      delay_observe,     delay_tell,
-    delay_assume, delay_restart, delay_parameters, delay_last_period, 0,
+    stewart_delayed_memory, stewart_delayed_scratch,    start,
+    observe,                stewart_delayed_tell,       stewart_delayed_assume,
+    start,                  stewart_delayed_parameters, stewart_delayed_last_period,
+    0,
 };

@@ -1,4 +1,4 @@
-/* The observer of an unknown delay. `sensing` of the law is `stewart_state_sensor` or
+/* Observers of an unknown delay. `sensing` of the law is `stewart_state_sensor` or
    `stewart_encoders`, `estimation` is `stewart_delay_settings`. */
 
 #ifndef STEWART_DELAY_OBSERVER_H
@@ -10,10 +10,11 @@
 /* `delay` without machine and sensing, which are the law's. */
 typedef struct {
     stewart_delay delay;
-    int encoders; /* whether the sensing is of encoders; the angles of a sample alone count */
-    int most;     /* torques that act until the next one does, at the most */
+    int values; /* of a sample alone: 12, or 6 of encoders */
+    int most;   /* torques that act until the next one does, at the most */
 } stewart_delay_settings;
 
-extern const stewart_observer stewart_delay_observer;
+extern const stewart_observer stewart_delay_observer; /* of the measured state */
+extern const stewart_observer stewart_encoder_delay_observer;
 
 #endif

@@ -1,21 +1,13 @@
 /* See filter.h. */
 
-#include "filter.h"
+#include "filter_attempt.h"
 
 #define X STEWART_STATES
 #define U STEWART_MOTORS
 #define LEGS 6
-#define MAX_ROWS 18  /* six legs at three nodes */
 #define ITERATIONS 4 /* at the most; one does once the parameters are roughly known */
-#define ENCODER_ITERATIONS 6
-#define SMALL ((real)0.1)  /* a correction of so many standard deviations needs no second iteration */
 #define KNOWN ((real)0.01) /* a parameter is known when its deviation is this share of the usual one */
 #define LEARNT ((real)0.3) /* the same, for parameters that are good enough over a few periods */
-#ifdef STEWART_FLOAT
-#define ROUNDING ((real)1e-5) /* of a time, as a share of the period */
-#else
-#define ROUNDING 1e-9
-#endif
 
 int stewart_posterior_size(int n, int m)
 {
@@ -73,77 +65,45 @@ void stewart_kicks(const stewart_machine *machine, const stewart_acted *period, 
     }
 }
 
-stewart_acting stewart_cut(const stewart_acting *acting, int n, const real *instants, real *torques,
-                           real *durations, real *places)
+void stewart_attempt_predicted(stewart_attempt *a)
 {
-    stewart_acting pieces = {0, torques, durations, 0};
-    real total = 0, longest = 0, most = 0, passed = 0, end = 0;
-    int next = 0;
-    for (int k = 0; k < acting->number; k++) {
-        total += acting->durations[k];
-        most = acting->durations[k] > most ? acting->durations[k] : most;
-    }
-    const real apart = ROUNDING * total;
-    for (int k = 0; k < acting->number; k++) {
-        end += acting->durations[k];
-        while (end - passed > apart) {
-            int piece = pieces.number++;
-            real until = next < n && instants[next] < end - apart ? instants[next] : end;
-            stewart_copy(U, acting->torques + U * k, torques + U * piece);
-            durations[piece] = until - passed;
-            longest = durations[piece] > longest ? durations[piece] : longest;
-            for (; next < n && instants[next] <= until + apart; next++)
-                places[next] = (real)piece;
-            passed = until;
-        }
-    }
-    for (; next < n; next++) /* beyond the end by rounding */
-        places[next] = (real)(pieces.number - 1);
-    pieces.substeps = (int)REAL(ceil)((real)acting->substeps * longest / most - ROUNDING);
-    return pieces;
+    const stewart_filter *f = a->filter;
+    real squares[X];
+    stewart_kicks(f->machine, a->period, a->end, a->after->mean + X, squares);
+    for (int i = 0; i < X; i++)
+        a->drift[i] = REAL(sqrt)(f->model_std[i] * f->model_std[i]
+                                 + f->timing_std * f->timing_std * squares[i]);
+    if (!a->linear)
+        return;
+    stewart_copy(X, a->end, a->linear->end);
+    stewart_copy(X, a->drift, a->linear->drift);
+    stewart_copy(X * a->n, a->last, a->linear->H);
+    a->linear->exists = 1;
 }
 
-/* One attempt at a period and a measurement. */
-typedef struct {
-    stewart_instant instant; /* of a measurement of the sample alone */
-    const stewart_filter *filter;
-    const stewart_acted *period;
-    const real *values; /* or NULL */
-    const stewart_history *history;
-    const real *root;   /* of the prior */
-    int exact;
-    real end[X];        /* state at the end of the period */
-    real drift[X];      /* standard deviation of the model's error there */
-    real *states, *H;   /* (number, 12), (number, 12, n) of `stewart_transitions` */
-    real *last;         /* (12, n) of those, at the end */
-    /* of legs at several instants */
-    stewart_acting coarse, fine; /* cut at nodes and at samples */
-    real places[3];
-    real *samples;      /* (N) pieces of `fine` */
-    real *shown;        /* (N, 6) */
-    real *seen;         /* (number, 12) states of `fine` */
-    stewart_reading reading;
-    int round, there, partly, number, kept[MAX_ROWS];
-    const real *rows;   /* (number, n) whitened, of those kept */
-} Step;
-
-static void set_drift(Step *s, const real *theta)
+int stewart_attempt_ended(stewart_attempt *a, stewart_scratch scratch)
 {
-    const stewart_filter *f = s->filter;
-    real squares[X];
-    stewart_kicks(f->machine, s->period, s->end, theta, squares);
-    for (int i = 0; i < X; i++)
-        s->drift[i] = REAL(sqrt)(f->model_std[i] * f->model_std[i]
-                                 + f->timing_std * f->timing_std * squares[i]);
+    const int n = a->n;
+    const stewart_posterior *after = a->after;
+    stewart_root_of_prediction(n, a->last, a->drift, after->root, scratch);
+    stewart_copy(X, a->end, after->mean);
+    *after->partly = (real)a->partly;
+    return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
 }
 
 /* A measurement of the sample alone. */
+typedef struct {
+    stewart_instant instant;
+    const stewart_attempt *attempt;
+    int exact;
+    real *states, *H; /* (number, 12), (number, 12, n) of `stewart_transitions` */
+} Sample;
 
 static int predict(void *about, const real *xi, real *end)
 {
-    Step *s = about;
-    const stewart_acting *acting = &s->period->acting;
-    stewart_predict(s->filter->machine, xi + X, acting, xi, s->states);
+    Sample *s = about;
+    const stewart_acting *acting = &s->attempt->period->acting;
+    stewart_predict(s->attempt->filter->machine, xi + X, acting, xi, s->states);
     stewart_copy(X, s->states + X * (acting->number - 1), end);
     return 1;
 }
@@ -151,187 +111,43 @@ static int predict(void *about, const real *xi, real *end)
 /* H along the states of `predict`: those of the end are the last, where the instant has them. */
 static int linearize(void *about, const real *xi, real *last, stewart_scratch scratch)
 {
-    Step *s = about;
+    Sample *s = about;
     (void)last;
-    return stewart_transitions_along(s->filter->machine, xi, &s->period->acting, s->exact, s->states,
-                                     s->H, scratch);
+    return stewart_transitions_along(s->attempt->filter->machine, xi, &s->attempt->period->acting,
+                                     s->exact, s->states, s->H, scratch);
 }
 
-/* Legs at several instants of a period.
-
-   xi = [x_{k-1}; theta] is corrected by the residuals e_j (`stewart_beside`) at the M nodes s_j of the
-   period. With F_j from xi to the state there and J = dh/dq,
-
-       H_j = J(q_j) F_j[pose],   R_j = diag(var_j) + diag(s_j^2 J Q J'),
-
-   Q the drift of the pose over a period, which counts as noise here as it does there. Each leg is
-   judged by itself at each node: one with e^2 > 30 S, S = H P H' + R, is left out, and the step goes on
-   with the rest; if that is less than half, the measurement is an outlier. */
-
-static int along(Step *s, const real *xi, stewart_scratch scratch)
+static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
 {
-    const stewart_filter *f = s->filter;
-    const stewart_encoders *encoders = f->encoders;
-    const int n = size_of(f), last = s->coarse.number - 1;
-    if (!stewart_transitions(f->machine, xi, &s->coarse, s->coarse.number <= 2, s->states, s->H,
-                             scratch))
+    const stewart_filter *f = a->filter;
+    const stewart_posterior *prior = a->prior;
+    const int n = a->n, m = f->sensing->size, pieces = a->period->acting.number;
+    /* Corrections of parameters that are known already are too small to need F to fourth order. */
+    Sample s = {.attempt = a, .exact = !is_known(f, prior->root, KNOWN)};
+    real *xi = a->after->mean, distance = 0, spread;
+    s.instant = (stewart_instant){f->sensing, a->values, n,  a->end,  NULL,
+                                  NULL,       NULL,      &s, predict, linearize};
+    s.instant.C = stewart_take(&scratch, m * m);
+    s.instant.J = stewart_take(&scratch, m * X);
+    s.states = stewart_take(&scratch, X * pieces);
+    s.H = stewart_take(&scratch, X * n * pieces);
+    a->last = s.instant.H = s.H + X * n * (pieces - 1);
+    if (!predict(&s, xi, a->end) || !linearize(&s, xi, s.instant.H, scratch))
         return 0;
-    stewart_copy(X, s->states + X * last, s->end);
-    s->last = s->H + X * n * last;
-    if (!s->values)
+    stewart_attempt_predicted(a);
+    if (!a->values)
         return 1;
-    stewart_predict(f->machine, xi + X, &s->fine, xi, s->seen);
-    for (int k = 0; k < encoders->samples; k++) {
-        real *angles = s->shown + LEGS * k;
-        stewart_crank_angles(encoders->geometry, s->seen + X * (int)s->samples[k], angles);
-        for (int leg = 0; leg < LEGS && f->offsets >= 0; leg++)
-            angles[leg] += xi[X + f->offsets + leg];
-    }
-    return 1;
+    if (!stewart_seen_root(f->sensing, a->end, 0, NULL, a->drift, s.instant.C, scratch))
+        return 0;
+    const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
+                                   stewart_instant_rows, stewart_instant_settle};
+    if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &spread, scratch))
+        return 0;
+    return distance <= f->gate && stewart_attempt_ended(a, scratch); /* NaN is not */
 }
-
-/* Causes for which legs were left out in part or wholly. */
-static int left_out(const Step *s, const int *there)
-{
-    int causes = s->reading.missing ? STEWART_MISSING : 0;
-    for (int leg = 0; leg < LEGS; leg++) {
-        int gated = 0;
-        for (int row = leg; row < LEGS * s->filter->encoders->nodes; row += LEGS)
-            gated = gated || (there[row] && !s->kept[row]);
-        const int stuck = gated && s->history->still[leg] > 0 && !s->reading.odd[leg];
-        if (stuck)
-            causes |= STEWART_FROZEN;
-        if (s->reading.odd[leg] || (gated && !stuck))
-            causes |= STEWART_REJECTED;
-    }
-    return causes;
-}
-
-static int rows_of_legs(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
-{
-    Step *s = model;
-    const stewart_filter *f = s->filter;
-    const stewart_encoders *encoders = f->encoders;
-    const int n = size_of(f), rows = LEGS * encoders->nodes;
-    real variance[MAX_ROWS], residual[MAX_ROWS], J[LEGS * 6];
-    int there[MAX_ROWS], number = 0, kept = 0, given = 0;
-    (void)xi;
-    (void)scratch;
-    stewart_beside(encoders, &s->reading, s->shown, residual);
-    for (int node = 0; node < encoders->nodes; node++) {
-        const int place = (int)s->places[node];
-        const real *F = s->H + X * n * place, share = encoders->shares[node];
-        stewart_crank_jacobian(encoders->geometry, s->states + X * place, J);
-        stewart_multiply(LEGS, 6, n, J, F, H + LEGS * n * node);
-        for (int leg = 0; leg < LEGS; leg++) {
-            const int row = LEGS * node + leg;
-            variance[row] = s->reading.variance[row];
-            for (int i = 0; i < 6; i++) {
-                const real moved = share * J[6 * leg + i] * s->drift[i];
-                variance[row] += moved * moved;
-            }
-            if (f->offsets >= 0)
-                H[n * row + X + f->offsets + leg] += 1;
-        }
-    }
-    if (s->round++ == 0) {
-        for (int row = 0; row < rows; row++) {
-            real S = variance[row];
-            for (int j = 0; j < n; j++) {
-                real seen = 0;
-                for (int i = 0; i < n; i++)
-                    seen += H[n * row + i] * s->root[n * i + j];
-                S += seen * seen;
-            }
-            there[row] = isfinite(variance[row]) != 0;
-            s->kept[row] = there[row] && residual[row] * residual[row] <= STEWART_LEG_GATE * S;
-            kept += s->kept[row];
-            given += there[row];
-        }
-        if (!(2 * kept > given))
-            return -1;
-        s->partly = left_out(s, there);
-    }
-    for (int row = 0; row < rows; row++) {
-        if (!s->kept[row])
-            continue;
-        const real std = REAL(sqrt)(variance[row]);
-        e[number] = residual[row] / std;
-        for (int j = 0; j < n; j++)
-            H[n * number + j] = H[n * row + j] / std;
-        number++;
-    }
-    s->rows = H;
-    return s->number = number;
-}
-
-static int settle_legs(void *model, const real *xi, const real *better, stewart_scratch scratch)
-{
-    Step *s = model;
-    const int n = size_of(s->filter);
-    int small = 1;
-    for (int row = 0; row < s->number; row++) {
-        real change = 0;
-        for (int j = 0; j < n; j++)
-            change += s->rows[n * row + j] * (better[j] - xi[j]);
-        small = small && REAL(fabs)(change) <= SMALL;
-    }
-    if (small)
-        return 1;
-    return along(s, better, scratch) ? 0 : -1;
-}
-
-/* Take the scratch memory of a step, and cut the period for legs. */
-static stewart_scratch prepare(Step *s, stewart_scratch scratch)
-{
-    const stewart_filter *f = s->filter;
-    const stewart_acting *acting = &s->period->acting;
-    const stewart_encoders *encoders = f->encoders;
-    const int n = size_of(f), m = f->sensing->size;
-    int pieces = acting->number;
-    if (encoders) {
-        const int N = encoders->samples, M = encoders->nodes, fine = acting->number + N;
-        real total = 0, *instants = stewart_take(&scratch, N);
-        real *torques = stewart_take(&scratch, U * (acting->number + M));
-        real *durations = stewart_take(&scratch, acting->number + M);
-        for (int k = 0; k < acting->number; k++)
-            total += acting->durations[k];
-        for (int j = 0; j < M; j++)
-            instants[j] = total * encoders->shares[j];
-        s->coarse = stewart_cut(acting, M, instants, torques, durations, s->places);
-        pieces = s->coarse.number;
-        torques = stewart_take(&scratch, U * fine);
-        durations = stewart_take(&scratch, fine);
-        s->samples = stewart_take(&scratch, N);
-        for (int k = 0; k < N; k++)
-            instants[k] = total * (real)(k + 1) / (real)N;
-        s->fine = stewart_cut(acting, N, instants, torques, durations, s->samples);
-        s->shown = stewart_take(&scratch, LEGS * N);
-        s->seen = stewart_take(&scratch, X * fine);
-        s->reading.angles = stewart_take(&scratch, LEGS * N);
-        s->reading.onto = stewart_take(&scratch, LEGS * M * M);
-        s->reading.variance = stewart_take(&scratch, LEGS * M);
-    } else {
-        s->instant = (stewart_instant){f->sensing, s->values, n, s->end, NULL, NULL, NULL,
-                                       s,          predict,   linearize};
-        s->instant.C = stewart_take(&scratch, m * m);
-        s->instant.J = stewart_take(&scratch, m * X);
-    }
-    s->states = stewart_take(&scratch, X * pieces);
-    s->H = stewart_take(&scratch, X * n * pieces);
-    s->last = s->instant.H = s->H + X * n * (pieces - 1);
-    return scratch;
-}
-
-/* A period linearised about the prior. */
-typedef struct {
-    real end[X], drift[X];
-    real *H; /* (12, n) at the end */
-    int exists;
-} Linear;
 
 /* The prediction `after` a period, from a prior, by the model alone; returns 0 where it is not finite. */
-static int go_on(int n, const stewart_posterior *prior, const Linear *linear,
+static int go_on(int n, const stewart_posterior *prior, const stewart_linear *linear,
                  stewart_posterior *after, stewart_scratch scratch)
 {
     stewart_copy(n, prior->mean, after->mean);
@@ -346,50 +162,13 @@ static int go_on(int n, const stewart_posterior *prior, const Linear *linear,
    that is found without values. Returns 0 for an outlier, or where there is no finite result. */
 static int attempt(const stewart_filter *f, const stewart_acted *period,
                    const stewart_posterior *prior, const real *values,
-                   const stewart_history *history, Linear *linear, stewart_posterior *after,
-                   stewart_scratch scratch)
+                   const stewart_history *history, stewart_linear *linear,
+                   stewart_posterior *after, stewart_scratch scratch)
 {
-    const int n = size_of(f);
-    const stewart_acting *acting = &period->acting;
-    Step s = {.filter = f, .period = period, .values = values, .history = history,
-              .root = prior->root, .exact = !is_known(f, prior->root, KNOWN)};
-    real *xi = after->mean, distance = 0, spread;
-    scratch = prepare(&s, scratch);
-    stewart_copy(n, prior->mean, xi);
-    /* Corrections of parameters that are known already are too small to need F to fourth order. */
-    if (f->encoders ? !along(&s, xi, scratch)
-                    : !predict(&s, xi, s.end) || !linearize(&s, xi, s.last, scratch))
-        return 0;
-    set_drift(&s, xi + X);
-    if (linear) {
-        stewart_copy(X, s.end, linear->end);
-        stewart_copy(X, s.drift, linear->drift);
-        stewart_copy(X * n, s.last, linear->H);
-        linear->exists = 1;
-    }
-    if (!values)
-        return 1;
-    if (f->encoders)
-        stewart_read(f->encoders, values, s.shown, history->last, history->still, &s.reading, scratch);
-    else if (!stewart_seen_root(f->sensing, s.end, 0, NULL, s.drift, s.instant.C, scratch))
-        return 0;
-    stewart_kalman update = {n, f->encoders ? LEGS * f->encoders->nodes : f->sensing->size,
-                             f->encoders ? ENCODER_ITERATIONS : ITERATIONS,
-                             prior->mean, prior->root, f->lower, f->upper, &s,
-                             f->encoders ? rows_of_legs : stewart_instant_rows,
-                             f->encoders ? settle_legs : stewart_instant_settle};
-    if (!stewart_kalman_update(&update, xi, after->root, &distance, &spread, scratch))
-        return 0;
-    if (!f->encoders && !(distance <= f->gate)) /* or NaN */
-        return 0;
-    if (f->encoders) {
-        stewart_predict(f->machine, xi + X, acting, xi, s.seen);
-        stewart_copy(X, s.seen + X * (acting->number - 1), s.end);
-    }
-    stewart_root_of_prediction(n, s.last, s.drift, after->root, scratch);
-    stewart_copy(X, s.end, xi);
-    *after->partly = (real)s.partly;
-    return stewart_all_finite(n, xi) && stewart_all_finite(n * n, after->root);
+    stewart_attempt a = {.filter = f, .n = size_of(f), .period = period, .prior = prior,
+                         .values = values, .history = history, .linear = linear, .after = after};
+    stewart_copy(a.n, prior->mean, after->mean);
+    return f->legs ? f->legs->attempt(&a, scratch) : attempt_sample(&a, scratch);
 }
 
 int stewart_filter_start(const stewart_filter *filter, const real *values, const real *theta,
@@ -399,17 +178,15 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
     const int n = size_of(filter), p = n - X, m = sensing->size, offsets = filter->offsets;
     stewart_posterior e = stewart_posterior_at(estimate, n, m);
     real *root = stewart_take(&scratch, X * X), *known = stewart_take(&scratch, m);
-    real *J = stewart_take(&scratch, LEGS * 6), *back = stewart_take(&scratch, LEGS * p), state[X];
+    real *back = stewart_take(&scratch, LEGS * p), state[X];
     stewart_copy(m, values, known);
     for (int i = 0; i < m && offsets >= 0; i++)
         known[i] -= theta[offsets + i % LEGS];
     if (!sensing->start(sensing, known, near, state, root, scratch))
         return 0;
     if (offsets >= 0) { /* to first order dq = J^-1 (dy - do): as uncertain as the offsets make it */
-        if (!stewart_crank_jacobian(filter->encoders->geometry, state, J))
-            return 0;
         stewart_copy(LEGS * p, filter->prior_root + p * offsets, back);
-        if (!stewart_solve(LEGS, p, J, back))
+        if (!filter->legs->moved(filter, state, back, scratch))
             return 0;
     }
     stewart_fill(n * n, 0, e.root);
@@ -446,7 +223,7 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_acted *p
     stewart_posterior now = stewart_posterior_at(estimate, n, m);
     stewart_posterior after = stewart_posterior_at(first, n, m);
     stewart_posterior before = stewart_posterior_at(second, n, m);
-    Linear linear = {.H = stewart_take(&scratch, X * n)};
+    stewart_linear linear = {.H = stewart_take(&scratch, X * n)};
     const real unseen = *now.unseen + 1, *theta = now.mean + X;
     real outliers = 1;
     if (attempt(filter, period, &now, values, history, &linear, &after, scratch) && values) {
@@ -475,14 +252,11 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_acted *p
 
 int stewart_filter_scratch(const stewart_filter *filter, int torques)
 {
-    const stewart_encoders *encoders = filter->encoders;
+    const stewart_legs *legs = filter->legs;
     const int n = size_of(filter), p = n - X, m = filter->sensing->size;
-    const int N = encoders ? encoders->samples : 0, M = encoders ? encoders->nodes : 0;
-    const int coarse = torques + M, fine = torques + N;
-    const int legs = (U + 1) * (coarse + fine) + 14 * N + X * fine + LEGS * M * (M + 1);
-    const int step = (encoders ? legs : m * (m + 1 + X)) + X * (n + 1) * coarse;
-    const int update = stewart_kalman_scratch(n, encoders ? LEGS * M : m);
-    const int within = step + update + stewart_transitions_scratch(p) + 2 * n * n + n + N;
-    const int start = X * X + m + LEGS * (6 + p) + (encoders ? stewart_encoder_scratch(encoders) : 0);
+    const int sample = m * (m + 1 + X) + X * (n + 1) * torques + stewart_kalman_scratch(n, m);
+    const int step = legs ? legs->scratch(filter, torques) : sample;
+    const int within = step + stewart_transitions_scratch(p) + 2 * n * n + n;
+    const int start = X * X + m + LEGS * (6 + p) + (legs ? legs->start_scratch(filter) : 0);
     return 2 * stewart_posterior_size(n, m) + X * n + (within > start ? within : start);
 }

@@ -14,8 +14,6 @@
 
 #include "instant.h"
 
-#define STEWART_LEG_GATE 30 /* squared residual of a leg, per variance, from which it is left out */
-
 #define STEWART_PATIENCE 3 /* outliers in a row, that agree with each other, after which they are believed */
 
 /* An estimate of xi = [x; theta] (n = 12 + p), from measurements (m): views of one vector of
@@ -32,12 +30,15 @@ typedef struct {
 int stewart_posterior_size(int n, int m);
 stewart_posterior stewart_posterior_at(real *numbers, int n, int m);
 
+/* Legs at several instants of a period, see filter_attempt.h. */
+typedef struct stewart_legs stewart_legs;
+
 /* What the filter assumes; standard deviations in SI units. */
 typedef struct {
-    const stewart_machine *machine;   /* its p estimated parameters are theta */
+    const stewart_machine *machine; /* its p estimated parameters are theta */
     const stewart_sensing *sensing;
-    const stewart_encoders *encoders; /* of that sensing, for legs at several instants of a period; or
-                                         NULL, for a measurement of the sample alone */
+    const stewart_legs *legs; /* how that sensing, of encoders, is read within a period; or NULL, for a
+                                 measurement of the sample alone */
     int offsets;            /* first of theta that are offsets of six encoders, or -1 for none */
     real gate;              /* nu' S^-1 nu of m values from which on they are an outlier */
     real timing_std;        /* s by which a torque may come early or late */
@@ -57,7 +58,7 @@ typedef struct {
 /* What was known of a sensor before a measurement; encoders look at it. */
 typedef struct {
     const real *last;  /* (m) the values before, NaN for nothing */
-    const real *still; /* (6) as of `stewart_encoders_stood`, with this measurement */
+    const real *still; /* (6) periods of each leg without a change of code, with this one */
 } stewart_history;
 
 /* The estimate from values (m) alone, with parameters theta (p) for a guess; `near` (12) or NULL as of
@@ -92,10 +93,5 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques);
    moves the pose for what is left of the period. */
 void stewart_kicks(const stewart_machine *machine, const stewart_acted *period, const real *state,
                    const real *theta, real *squares);
-
-/* Cut what acts (number) at instants (n) in s too, ascending and within it: `pieces` takes number + n of
-   torques and durations, and `places` (n) which piece ends at each instant. */
-stewart_acting stewart_cut(const stewart_acting *acting, int n, const real *instants, real *torques,
-                           real *durations, real *places);
 
 #endif

@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 from stewart_drake.core.build import FOLDER, LIBRARY, source_hash
 from stewart_drake.files.errors import ConfigError
 
-PRIVATE: Final = ("real.h", "equations.h", "dop853.h", "dop853_table.h")
+PRIVATE: Final = (
+    *("real.h", "equations.h", "dop853.h", "dop853_table.h"),
+    *("filter_attempt.h", "observing.h", "delay_observing.h"),
+)
 """Headers that Python does not call."""
 
 

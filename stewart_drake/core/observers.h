@@ -7,16 +7,19 @@
 #include "filter.h"
 #include "law.h"
 
-/* `filter` without machine, sensing and encoders, which are the law's. */
+/* `filter` without machine, sensing and legs, which are the law's. */
 typedef struct {
     stewart_filter filter;
-    int encoders;      /* whether the sensing is of encoders */
     const real *prior; /* (p) of the parameters */
 } stewart_filter_settings;
 
-extern const stewart_observer stewart_state_observer;       /* the measured state, without a filter */
-extern const stewart_observer stewart_differences_observer; /* encoders without a filter */
+/* Of the measured state. */
+extern const stewart_observer stewart_state_observer; /* without a filter */
 extern const stewart_observer stewart_filter_observer;
 extern const stewart_observer stewart_gap_observer; /* a filter for measurements that get lost */
+
+/* Of encoders. */
+extern const stewart_observer stewart_differences_observer; /* without a filter */
+extern const stewart_observer stewart_encoder_observer;
 
 #endif

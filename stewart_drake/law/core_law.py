@@ -49,6 +49,7 @@ from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
+    NUM_LEGS,
     NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
@@ -83,9 +84,19 @@ class Part(NamedTuple):
     sensing: Compiled
     estimation: Compiled | None
     belief: Callable[["CoreMemory"], Belief]
-    sources: tuple[str, ...] = (
-        *("observers", "filter", "instant", "kalman", "sensing", "kinematics"),
-    )
+    sources: tuple[str, ...]
+
+
+_STATE: Final[tuple[str, ...]] = ("instant", "kalman", "sensing")
+_ENCODERS: Final[tuple[str, ...]] = ("encoders", "kinematics")
+_KNOWN: Final[tuple[str, ...]] = ("observers", "observing.h", "filter", "filter_attempt.h", *_STATE)
+_WITHIN: Final[tuple[str, ...]] = (*_KNOWN, *_ENCODERS, "encoder_observers.c", "encoder_filter")
+_UNKNOWN: Final[tuple[str, ...]] = (
+    *("delay_observer", "delay_observing.h", "delay", "delay_search.c", "arrivals"),
+    *_STATE,
+)
+"""Sources: what all observers need; encoders; observers of the state with a known delay,
+of encoders with one, which are read within periods, of the state with an unknown one."""
 
 
 def _sensor(sensing: Sensing) -> Compiled | None:
@@ -98,20 +109,29 @@ def _plain(law: PredictiveLqi | ServoPreview) -> Part | None:
     sensing = _sensor(law.sensing)
     if sensing is None:
         return None
-    kind = "state" if isinstance(law.sensing, StateSensing) else "differences"
-    return Part(f"stewart_{kind}_observer", sensing, None, _nothing_estimated)
+    kind, sources = "state", _KNOWN
+    if isinstance(law.sensing, EncoderSensing):
+        kind, sources = "differences", _WITHIN
+    return Part(f"stewart_{kind}_observer", sensing, None, _nothing_estimated, sources)
 
 
 def _filter(law: PredictiveLqi | ServoPreview) -> Part | None:
     sensing, observer = _sensor(law.sensing), observer_of(law)
     if sensing is None or law.plant.dynamics.free != observer.settings.parameters.names:
         return None
-    kind = "gap" if isinstance(observer, GapObserver) else "filter"
+    kind, sources = "filter", _KNOWN
+    if isinstance(law.sensing, EncoderSensing):
+        if isinstance(observer, GapObserver):
+            return None
+        kind, sources = "encoder", _WITHIN
+    elif isinstance(observer, GapObserver):
+        kind, sources = "gap", (*_KNOWN, "gap_observer.c")
     return Part(
         f"stewart_{kind}_observer",
         sensing,
         filter_settings_of(law.plant.dynamics, law.sensing, observer.settings),
         _estimated,
+        sources,
     )
 
 
@@ -125,20 +145,12 @@ def _delay(law: PredictiveLqi | ServoPreview) -> Part | None:
     it = c.ffi.new("stewart_delay_settings *")
     it.delay = compiled.it[0]
     it.delay.machine = it.delay.sensing = c.ffi.NULL  # the law's
-    it.encoders, it.most = isinstance(law.sensing, EncoderSensing), most_acting(observer, period)
-    return Part(
-        *("stewart_delay_observer", sensing, Compiled(it, (compiled,)), _delay_believed),
-        (
-            "delay_observer",
-            "delay",
-            "delay_search.c",
-            "arrivals",
-            "instant",
-            "kalman",
-            "sensing",
-            "kinematics",
-        ),
-    )
+    it.values, it.most = NUM_STATE, most_acting(observer, period)
+    name, sources = "stewart_delay_observer", _UNKNOWN
+    if isinstance(law.sensing, EncoderSensing):
+        name, it.values = "stewart_encoder_delay_observer", NUM_LEGS
+        sources = (*_UNKNOWN, *_ENCODERS, "encoder_delay_observer.c")
+    return Part(name, sensing, Compiled(it, (compiled,)), _delay_believed, sources)
 
 
 def most_acting(observer: DelayObserver, period: float) -> int:
@@ -168,8 +180,8 @@ def filter_settings_of(
     compiled = compiled_filter(dynamics, sensing, settings)
     it, prior = c.ffi.new("stewart_filter_settings *"), numbers(settings.parameters.prior)
     it.filter = compiled.it[0]
-    it.filter.machine = it.filter.sensing = it.filter.encoders = c.ffi.NULL  # the law's
-    it.encoders, it.prior = isinstance(sensing, EncoderSensing), c.at(prior)
+    it.filter.machine = it.filter.sensing = it.filter.legs = c.ffi.NULL  # the law's
+    it.prior = c.at(prior)
     return Compiled(it, (compiled, prior))
 
 
@@ -273,7 +285,7 @@ class CompiledLaw:
             c.lib.stewart_prepare(self.data)
         else:
             self.data = c.ffi.new("stewart_servo *")
-            self.sources = ("servo", *part.sources)
+            self.sources = ("servo", "kinematics", *part.sources)
             self._fill(self.data.law)
             self.data.law.parts, self.data.periods = law.reports.parts, law.reports.periods
             c.lib.stewart_servo_prepare(self.data)

@@ -1,9 +1,9 @@
-"""The filter of core/filter.h for encoders: legs at several instants of a period."""
+"""The filter of core/encoder_filter.h for encoders: legs at several instants of a period."""
 
 from dataclasses import dataclass
 
 from stewart_drake.law.compiled import Compiled
-from stewart_drake.law.encoder_sensing import EncoderSensing, encoders_of
+from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.parameter_filter import ParameterFilter, compiled_filter
 from stewart_drake.types import Array
 
@@ -25,5 +25,4 @@ class EncoderFilter(ParameterFilter):
 
     def _compiled(self) -> Compiled:
         assert isinstance(self.sensing, EncoderSensing)
-        encoders = encoders_of(self.sensing)
-        return compiled_filter(self.dynamics, self.sensing, self.settings, encoders)
+        return compiled_filter(self.dynamics, self.sensing, self.settings, True)

@@ -1,7 +1,7 @@
 """Motor encoders, y = h(q) + o: what six crank angles, sampled N times a period, tell of a motion.
 
 Between two controller samples the legs are read N times. The residuals beside a predicted motion
-are projected onto at most three nodes of the period; core/sensing.h computes that, and says how.
+are projected onto at most three nodes of the period; core/encoders.h computes that, and says how.
 """
 
 from dataclasses import dataclass, replace

@@ -110,9 +110,16 @@ def compiled_filter(
     dynamics: StewartDynamics,
     sensing: Sensing,
     settings: FilterSettings,
-    encoders: Compiled | None = None,
+    within: bool = False,
 ) -> Compiled:
-    """Return the `stewart_filter` for one plant and sensor; `encoders` are read within periods."""
+    """Return the `stewart_filter` for one plant and sensor.
+
+    Args:
+        dynamics: of the plant.
+        sensing: what is measured of it.
+        settings: what else is assumed.
+        within: whether these are encoders, to be read within periods.
+    """
     c, known, p = core(), settings.parameters, len(dynamics.free)
     machine, seen = machine_of(dynamics), compiled_sensing(sensing)
     free = np.full(NUM_STATE, np.inf)
@@ -125,7 +132,7 @@ def compiled_filter(
     }
     it = c.ffi.new("stewart_filter *")
     it.machine, it.sensing, it.gate = machine.it, seen.it, gate(sensing.size)
-    it.encoders = c.ffi.NULL if encoders is None else encoders.it
+    it.legs = c.ffi.addressof(c.lib, "stewart_encoder_legs") if within else c.ffi.NULL
     it.timing_std = settings.timing_std
     it.offsets = known.names.index(OFFSETS[0]) if OFFSETS[0] in known.names else -1
     for name, array in arrays.items():

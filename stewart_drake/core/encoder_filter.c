@@ -1,0 +1,265 @@
+/* See encoder_filter.h. */
+
+#include "encoder_filter.h"
+#include "filter_attempt.h"
+
+#define X STEWART_STATES
+#define U STEWART_MOTORS
+#define LEGS 6
+#define MAX_ROWS 18 /* six legs at three nodes */
+#define ITERATIONS 6
+#define SMALL ((real)0.1) /* a correction of so many standard deviations needs no second iteration */
+#ifdef STEWART_FLOAT
+#define ROUNDING ((real)1e-5) /* of a time, as a share of the period */
+#else
+#define ROUNDING 1e-9
+#endif
+
+/* Cut what acts (number) at instants (n) in s too, ascending and within it: `pieces` takes number + n of
+   torques and durations, and `places` (n) which piece ends at each instant. */
+static stewart_acting cut(const stewart_acting *acting, int n, const real *instants,
+                          real *torques, real *durations, real *places)
+{
+    stewart_acting pieces = {0, torques, durations, 0};
+    real total = 0, longest = 0, most = 0, passed = 0, end = 0;
+    int next = 0;
+    for (int k = 0; k < acting->number; k++) {
+        total += acting->durations[k];
+        most = acting->durations[k] > most ? acting->durations[k] : most;
+    }
+    const real apart = ROUNDING * total;
+    for (int k = 0; k < acting->number; k++) {
+        end += acting->durations[k];
+        while (end - passed > apart) {
+            int piece = pieces.number++;
+            real until = next < n && instants[next] < end - apart ? instants[next] : end;
+            stewart_copy(U, acting->torques + U * k, torques + U * piece);
+            durations[piece] = until - passed;
+            longest = durations[piece] > longest ? durations[piece] : longest;
+            for (; next < n && instants[next] <= until + apart; next++)
+                places[next] = (real)piece;
+            passed = until;
+        }
+    }
+    for (; next < n; next++) /* beyond the end by rounding */
+        places[next] = (real)(pieces.number - 1);
+    pieces.substeps = (int)REAL(ceil)((real)acting->substeps * longest / most - ROUNDING);
+    return pieces;
+}
+
+/* Legs at several instants of a period.
+
+   xi = [x_{k-1}; theta] is corrected by the residuals e_j (`stewart_beside`) at the M nodes s_j of the
+   period. With F_j from xi to the state there and J = dh/dq,
+
+       H_j = J(q_j) F_j[pose],   R_j = diag(var_j) + diag(s_j^2 J Q J'),
+
+   Q the drift of the pose over a period, which counts as noise here as it does there. Each leg is
+   judged by itself at each node: one with e^2 > 30 S, S = H P H' + R, is left out, and the step goes on
+   with the rest; if that is less than half, the measurement is an outlier. */
+
+typedef struct {
+    stewart_attempt *attempt;
+    const stewart_encoders *encoders;
+    real *states, *H;            /* (number, 12), (number, 12, n) of `stewart_transitions` */
+    stewart_acting coarse, fine; /* cut at nodes and at samples */
+    real places[3];
+    real *samples;    /* (N) pieces of `fine` */
+    real *shown;      /* (N, 6) */
+    real *seen;       /* (number, 12) states of `fine` */
+    stewart_reading reading;
+    int round, number, kept[MAX_ROWS];
+    const real *rows; /* (number, n) whitened, of those kept */
+} Legs;
+
+static int along(Legs *s, const real *xi, stewart_scratch scratch)
+{
+    stewart_attempt *a = s->attempt;
+    const stewart_filter *f = a->filter;
+    const stewart_encoders *encoders = s->encoders;
+    const int n = a->n, last = s->coarse.number - 1;
+    if (!stewart_transitions(f->machine, xi, &s->coarse, s->coarse.number <= 2, s->states, s->H,
+                             scratch))
+        return 0;
+    stewart_copy(X, s->states + X * last, a->end);
+    a->last = s->H + X * n * last;
+    if (!a->values)
+        return 1;
+    stewart_predict(f->machine, xi + X, &s->fine, xi, s->seen);
+    for (int k = 0; k < encoders->samples; k++) {
+        real *angles = s->shown + LEGS * k;
+        stewart_crank_angles(encoders->geometry, s->seen + X * (int)s->samples[k], angles);
+        for (int leg = 0; leg < LEGS && f->offsets >= 0; leg++)
+            angles[leg] += xi[X + f->offsets + leg];
+    }
+    return 1;
+}
+
+/* Causes for which legs were left out in part or wholly. */
+static int left_out(const Legs *s, const int *there)
+{
+    int causes = s->reading.missing ? STEWART_MISSING : 0;
+    for (int leg = 0; leg < LEGS; leg++) {
+        int gated = 0;
+        for (int row = leg; row < LEGS * s->encoders->nodes; row += LEGS)
+            gated = gated || (there[row] && !s->kept[row]);
+        const int stuck = gated && s->attempt->history->still[leg] > 0 && !s->reading.odd[leg];
+        if (stuck)
+            causes |= STEWART_FROZEN;
+        if (s->reading.odd[leg] || (gated && !stuck))
+            causes |= STEWART_REJECTED;
+    }
+    return causes;
+}
+
+static int rows_of_legs(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
+{
+    Legs *s = model;
+    stewart_attempt *a = s->attempt;
+    const stewart_encoders *encoders = s->encoders;
+    const int n = a->n, rows = LEGS * encoders->nodes, offsets = a->filter->offsets;
+    real variance[MAX_ROWS], residual[MAX_ROWS], J[LEGS * 6];
+    int there[MAX_ROWS], number = 0, kept = 0, given = 0;
+    (void)xi;
+    (void)scratch;
+    stewart_beside(encoders, &s->reading, s->shown, residual);
+    for (int node = 0; node < encoders->nodes; node++) {
+        const int place = (int)s->places[node];
+        const real *F = s->H + X * n * place, share = encoders->shares[node];
+        stewart_crank_jacobian(encoders->geometry, s->states + X * place, J);
+        stewart_multiply(LEGS, 6, n, J, F, H + LEGS * n * node);
+        for (int leg = 0; leg < LEGS; leg++) {
+            const int row = LEGS * node + leg;
+            variance[row] = s->reading.variance[row];
+            for (int i = 0; i < 6; i++) {
+                const real moved = share * J[6 * leg + i] * a->drift[i];
+                variance[row] += moved * moved;
+            }
+            if (offsets >= 0)
+                H[n * row + X + offsets + leg] += 1;
+        }
+    }
+    if (s->round++ == 0) {
+        for (int row = 0; row < rows; row++) {
+            real S = variance[row];
+            for (int j = 0; j < n; j++) {
+                real seen = 0;
+                for (int i = 0; i < n; i++)
+                    seen += H[n * row + i] * a->prior->root[n * i + j];
+                S += seen * seen;
+            }
+            there[row] = isfinite(variance[row]) != 0;
+            s->kept[row] = there[row] && residual[row] * residual[row] <= STEWART_LEG_GATE * S;
+            kept += s->kept[row];
+            given += there[row];
+        }
+        if (!(2 * kept > given))
+            return -1;
+        a->partly = left_out(s, there);
+    }
+    for (int row = 0; row < rows; row++) {
+        if (!s->kept[row])
+            continue;
+        const real std = REAL(sqrt)(variance[row]);
+        e[number] = residual[row] / std;
+        for (int j = 0; j < n; j++)
+            H[n * number + j] = H[n * row + j] / std;
+        number++;
+    }
+    s->rows = H;
+    return s->number = number;
+}
+
+static int settle_legs(void *model, const real *xi, const real *better, stewart_scratch scratch)
+{
+    Legs *s = model;
+    const int n = s->attempt->n;
+    int small = 1;
+    for (int row = 0; row < s->number; row++) {
+        real change = 0;
+        for (int j = 0; j < n; j++)
+            change += s->rows[n * row + j] * (better[j] - xi[j]);
+        small = small && REAL(fabs)(change) <= SMALL;
+    }
+    if (small)
+        return 1;
+    return along(s, better, scratch) ? 0 : -1;
+}
+
+/* Take the scratch memory of an attempt, and cut the period. */
+static stewart_scratch prepare(Legs *s, stewart_scratch scratch)
+{
+    const stewart_acting *acting = &s->attempt->period->acting;
+    const stewart_encoders *encoders = s->encoders;
+    const int n = s->attempt->n, N = encoders->samples, M = encoders->nodes;
+    const int fine = acting->number + N;
+    real total = 0, *instants = stewart_take(&scratch, N);
+    real *torques = stewart_take(&scratch, U * (acting->number + M));
+    real *durations = stewart_take(&scratch, acting->number + M);
+    for (int k = 0; k < acting->number; k++)
+        total += acting->durations[k];
+    for (int j = 0; j < M; j++)
+        instants[j] = total * encoders->shares[j];
+    s->coarse = cut(acting, M, instants, torques, durations, s->places);
+    torques = stewart_take(&scratch, U * fine);
+    durations = stewart_take(&scratch, fine);
+    s->samples = stewart_take(&scratch, N);
+    for (int k = 0; k < N; k++)
+        instants[k] = total * (real)(k + 1) / (real)N;
+    s->fine = cut(acting, N, instants, torques, durations, s->samples);
+    s->shown = stewart_take(&scratch, LEGS * N);
+    s->seen = stewart_take(&scratch, X * fine);
+    s->reading.angles = stewart_take(&scratch, LEGS * N);
+    s->reading.onto = stewart_take(&scratch, LEGS * M * M);
+    s->reading.variance = stewart_take(&scratch, LEGS * M);
+    s->states = stewart_take(&scratch, X * s->coarse.number);
+    s->H = stewart_take(&scratch, X * n * s->coarse.number);
+    return scratch;
+}
+
+static int attempt(stewart_attempt *a, stewart_scratch scratch)
+{
+    const stewart_filter *f = a->filter;
+    const stewart_acting *acting = &a->period->acting;
+    const stewart_history *history = a->history;
+    Legs s = {.attempt = a, .encoders = f->sensing->kind};
+    real *xi = a->after->mean, distance = 0, spread;
+    scratch = prepare(&s, scratch);
+    if (!along(&s, xi, scratch))
+        return 0;
+    stewart_attempt_predicted(a);
+    if (!a->values)
+        return 1;
+    stewart_read(s.encoders, a->values, s.shown, history->last, history->still, &s.reading, scratch);
+    const stewart_kalman update = {a->n,     LEGS * s.encoders->nodes, ITERATIONS, a->prior->mean,
+                                   a->prior->root, f->lower, f->upper, &s, rows_of_legs, settle_legs};
+    if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &spread, scratch))
+        return 0;
+    stewart_predict(f->machine, xi + X, acting, xi, s.seen);
+    stewart_copy(X, s.seen + X * (acting->number - 1), a->end);
+    return stewart_attempt_ended(a, scratch);
+}
+
+static int attempt_scratch(const stewart_filter *filter, int torques)
+{
+    const stewart_encoders *encoders = filter->sensing->kind;
+    const int N = encoders->samples, M = encoders->nodes, n = X + filter->machine->estimated;
+    const int coarse = torques + M, fine = torques + N;
+    const int legs = (U + 1) * (coarse + fine) + 14 * N + X * fine + LEGS * M * (M + 1);
+    return legs + X * (n + 1) * coarse + stewart_kalman_scratch(n, LEGS * M) + N;
+}
+
+static int moved(const stewart_filter *filter, const real *state, real *B, stewart_scratch scratch)
+{
+    const stewart_encoders *encoders = filter->sensing->kind;
+    real *J = stewart_take(&scratch, LEGS * 6);
+    return stewart_crank_jacobian(encoders->geometry, state, J)
+           && stewart_solve(LEGS, filter->machine->estimated, J, B);
+}
+
+static int start_scratch(const stewart_filter *filter)
+{
+    return stewart_encoder_scratch(filter->sensing->kind);
+}
+
+const stewart_legs stewart_encoder_legs = {attempt, attempt_scratch, moved, start_scratch};

@@ -1,0 +1,319 @@
+/* See encoders.h. */
+
+#include "encoders.h"
+
+#define X STEWART_STATES
+#define LEGS 6
+#define MAX_NODES 3
+#define ENOUGH ((real)0.3)  /* share of a leg's samples that are needed for it to count */
+#define STANDS_OUT 8        /* median absolute deviations by which a residual stands out (Hampel) */
+#define CURVED 3            /* the same in spans from the 10th to the 90th percentile */
+#define FINEST ((real)1e-7) /* rad; to so much the crank angles of the model itself are right */
+#define LAST_FEW 9          /* samples that fix the angle at the last of them */
+#define PAIRS (LAST_FEW * (LAST_FEW - 1) / 2)
+
+static int is_enough(const stewart_encoders *encoders, int number)
+{
+    return number >= encoders->nodes && (real)number >= ENOUGH * (real)encoders->samples;
+}
+
+/* Instant of a sample in [-1, 1]. */
+static real instant(const stewart_encoders *encoders, int n)
+{
+    return 2 * (real)(n + 1) / (real)encoders->samples - 1;
+}
+
+static void legendre(real t, real *v)
+{
+    v[0] = 1;
+    v[1] = t;
+    v[2] = (3 * t * t - 1) / 2;
+}
+
+static void sort(int n, real *x)
+{
+    for (int gap = n / 2; gap > 0; gap /= 2)
+        for (int i = gap; i < n; i++) {
+            const real value = x[i];
+            int j = i;
+            for (; j >= gap && x[j - gap] > value; j -= gap)
+                x[j] = x[j - gap];
+            x[j] = value;
+        }
+}
+
+/* The share of sorted numbers (n), with a line between two of them. */
+static real quantile(int n, const real *sorted, real share)
+{
+    const real place = share * (real)(n - 1);
+    int below = (int)place;
+    if (below > n - 2)
+        below = n > 1 ? n - 2 : 0;
+    const real next = n > 1 ? sorted[below + 1] : sorted[below];
+    return sorted[below] + (place - (real)below) * (next - sorted[below]);
+}
+
+static real median(int n, const real *sorted)
+{
+    return n % 2 ? sorted[n / 2] : (sorted[n / 2 - 1] + sorted[n / 2]) / 2;
+}
+
+static void seen_of_encoders(const stewart_sensing *sensing, const real *state, real *values)
+{
+    const stewart_encoders *encoders = sensing->kind;
+    stewart_crank_angles(encoders->geometry, state, values);
+    for (int i = 0; i < LEGS; i++)
+        values[i] += encoders->offset[i];
+    for (int n = 1; n < encoders->samples; n++)
+        stewart_copy(LEGS, values, values + LEGS * n);
+}
+
+static void jacobian_of_encoders(const stewart_sensing *sensing, const real *state, real *J)
+{
+    const stewart_encoders *encoders = sensing->kind;
+    real one[LEGS * 6];
+    stewart_crank_jacobian(encoders->geometry, state, one);
+    stewart_fill(LEGS * encoders->samples * X, 0, J);
+    for (int row = 0; row < LEGS * encoders->samples; row++)
+        stewart_copy(6, one + 6 * (row % LEGS), J + X * row);
+}
+
+/* Angle (rad) of a leg at the last sample; NaN for none. With more than M of them by the line through
+   the last few whose slope and height are medians (Theil and Sen): a few wrong ones do no harm. */
+static real last_angle(const stewart_encoders *encoders, const real *values, int leg)
+{
+    real t[LAST_FEW], y[LAST_FEW], slopes[PAIRS];
+    int number = 0, pairs = 0;
+    for (int n = encoders->samples - 1; n >= 0 && number < LAST_FEW; n--)
+        if (isfinite(values[LEGS * n + leg])) {
+            t[number] = (real)(n + 1) / (real)encoders->samples - 1;
+            y[number++] = values[LEGS * n + leg];
+        }
+    if (number <= MAX_NODES)
+        return number && t[0] == 0 ? y[0] : (real)NAN;
+    for (int i = 0; i < number; i++)
+        for (int j = 0; j < i; j++)
+            slopes[pairs++] = (y[j] - y[i]) / (t[j] - t[i]);
+    sort(pairs, slopes);
+    for (int i = 0; i < number; i++)
+        y[i] -= median(pairs, slopes) * t[i];
+    sort(number, y);
+    return median(number, y);
+}
+
+/* Pose by forward kinematics, rates as they are expected. To first order the pose is as uncertain as
+   the angles, P = J^-1 R J^-T. A leg that is silent is taken to be where it is expected, to within the
+   motion. */
+static int start_of_encoders(const stewart_sensing *sensing, const real *values, const real *near,
+                             real *state, real *root, stewart_scratch scratch)
+{
+    const stewart_encoders *encoders = sensing->kind;
+    real *J = stewart_take(&scratch, LEGS * 6), *inverse = stewart_take(&scratch, LEGS * 6);
+    real angles[LEGS], std[LEGS];
+    int known[LEGS];
+    const real *expected = near && stewart_all_finite(X, near) ? near : encoders->declared;
+    stewart_crank_angles(encoders->geometry, expected, angles);
+    for (int leg = 0; leg < LEGS; leg++) {
+        const real angle = last_angle(encoders, values, leg);
+        known[leg] = isfinite(angle);
+        if (known[leg])
+            angles[leg] = angle - encoders->offset[leg];
+    }
+    stewart_copy(X, expected, state);
+    if (!stewart_all_finite(LEGS, angles)
+        || !stewart_forward_kinematics(encoders->geometry, angles, state, scratch)
+        || !stewart_crank_jacobian(encoders->geometry, state, J))
+        return 0;
+    stewart_fill(LEGS * 6, 0, inverse);
+    for (int leg = 0; leg < LEGS; leg++) {
+        std[leg] = encoders->std;
+        for (int i = 0; i < 6 && !known[leg]; i++)
+            std[leg] = (i ? std[leg] : 0) + REAL(fabs)(J[6 * leg + i]) * encoders->motion[i];
+        inverse[7 * leg] = 1;
+    }
+    if (!stewart_solve(6, LEGS, J, inverse))
+        return 0;
+    stewart_fill(X * X, 0, root);
+    for (int i = 0; i < 6; i++) {
+        for (int leg = 0; leg < LEGS; leg++)
+            root[X * i + leg] = inverse[LEGS * i + leg] * std[leg];
+        root[(X + 1) * (6 + i)] = encoders->rates_std[i];
+    }
+    return 1;
+}
+
+stewart_sensing stewart_encoder_sensing(const stewart_encoders *encoders)
+{
+    return (stewart_sensing){LEGS * encoders->samples, encoders->noise_std, encoders,
+                             seen_of_encoders,        jacobian_of_encoders, start_of_encoders};
+}
+
+int stewart_encoder_fault(const stewart_encoders *encoders, const real *values)
+{
+    for (int leg = 0; leg < LEGS; leg++) {
+        int number = 0;
+        for (int n = 0; n < encoders->samples; n++)
+            number += isfinite(values[LEGS * n + leg]) != 0;
+        if (is_enough(encoders, number))
+            return 0;
+    }
+    return STEWART_MISSING;
+}
+
+/* How often the codes of a leg changed, since the last of the period before. */
+static int changes_of(const stewart_encoders *encoders, const real *values, const real *last, int leg)
+{
+    real before = last[LEGS * (encoders->samples - 1) + leg];
+    int changes = 0;
+    for (int n = 0; n < encoders->samples; n++) {
+        const real value = values[LEGS * n + leg];
+        if (!isfinite(value))
+            continue;
+        changes += isfinite(before) && value != before;
+        before = value;
+    }
+    return changes;
+}
+
+void stewart_encoders_stood(const stewart_encoders *encoders, const real *values, const real *last,
+                            real *still)
+{
+    for (int leg = 0; leg < LEGS; leg++) {
+        int silent = 1;
+        for (int n = 0; n < encoders->samples; n++)
+            silent = silent && !isfinite(values[LEGS * n + leg]);
+        if (!silent)
+            still[leg] = changes_of(encoders, values, last, leg) ? 0 : still[leg] + 1;
+    }
+}
+
+/* NaN in the place of those values of a leg that stand out of their period (Hampel); whether any do. */
+static int reject(const stewart_encoders *encoders, const real *shown, int leg, real *values,
+                  stewart_scratch scratch)
+{
+    real *sorted = stewart_take(&scratch, encoders->samples), middle, bound, least;
+    int number = 0, odd = 0;
+    for (int n = 0; n < encoders->samples; n++) {
+        real *value = values + LEGS * n + leg;
+        const real residual = *value - encoders->offset[leg] - shown[LEGS * n + leg];
+        if (isfinite(residual))
+            sorted[number++] = residual;
+        else if (isfinite(*value)) { /* the model is out of reach */
+            *value = (real)NAN;
+            odd = 1;
+        }
+    }
+    if (!number)
+        return odd;
+    sort(number, sorted);
+    middle = median(number, sorted);
+    bound = CURVED * (quantile(number, sorted, (real)0.9) - quantile(number, sorted, (real)0.1));
+    for (int i = 0; i < number; i++)
+        sorted[i] = REAL(fabs)(sorted[i] - middle);
+    sort(number, sorted);
+    least = CURVED * (encoders->quantum > CURVED * FINEST ? encoders->quantum : CURVED * FINEST);
+    if (!(bound >= least))
+        bound = least;
+    if (STANDS_OUT * median(number, sorted) > bound)
+        bound = STANDS_OUT * median(number, sorted);
+    for (int n = 0; n < encoders->samples; n++) {
+        real *value = values + LEGS * n + leg;
+        const real residual = *value - encoders->offset[leg] - shown[LEGS * n + leg];
+        if (isfinite(*value) && !(REAL(fabs)(residual - middle) <= bound)) {
+            *value = (real)NAN;
+            odd = 1;
+        }
+    }
+    return odd;
+}
+
+/* K (M, M) = V(s) (V'V)^-1 of the samples of a leg that are there, and sum_n G_jn^2 (M) of G = K V'. */
+static int project(const stewart_encoders *encoders, const real *values, int leg, real *K,
+                   real *squares)
+{
+    const int M = encoders->nodes;
+    real gram[MAX_NODES * MAX_NODES] = {0}, v[MAX_NODES], nodes[MAX_NODES * MAX_NODES];
+    for (int n = 0; n < encoders->samples; n++) {
+        if (!isfinite(values[LEGS * n + leg]))
+            continue;
+        legendre(instant(encoders, n), v);
+        for (int a = 0; a < M; a++)
+            for (int b = 0; b < M; b++)
+                gram[M * a + b] += v[a] * v[b];
+    }
+    for (int j = 0; j < M; j++) {
+        legendre(2 * encoders->shares[j] - 1, v);
+        for (int a = 0; a < M; a++)
+            nodes[M * a + j] = v[a];
+    }
+    real left[MAX_NODES * MAX_NODES];
+    stewart_copy(M * M, nodes, left);
+    if (!stewart_solve(M, M, gram, nodes))
+        return 0;
+    for (int j = 0; j < M; j++) {
+        squares[j] = 0;
+        for (int a = 0; a < M; a++) {
+            K[M * j + a] = nodes[M * a + j];
+            squares[j] += left[M * a + j] * nodes[M * a + j];
+        }
+    }
+    return 1;
+}
+
+void stewart_read(const stewart_encoders *encoders, const real *values, const real *shown,
+                  const real *last, const real *still, stewart_reading *reading,
+                  stewart_scratch scratch)
+{
+    const int N = encoders->samples, M = encoders->nodes;
+    real *angles = reading->angles, squares[MAX_NODES];
+    reading->missing = !stewart_all_finite(LEGS * N, values);
+    stewart_copy(LEGS * N, values, angles);
+    for (int leg = 0; leg < LEGS; leg++) {
+        real *K = reading->onto + M * M * leg, share = 1;
+        int number = 0, changes;
+        reading->odd[leg] = N > MAX_NODES && reject(encoders, shown, leg, angles, scratch);
+        for (int n = 0; n < N; n++)
+            number += isfinite(angles[LEGS * n + leg]) != 0;
+        const int counts = is_enough(encoders, number) && project(encoders, angles, leg, K, squares);
+        changes = changes_of(encoders, angles, last, leg);
+        if (encoders->quantum > 0 && number) {
+            share = (real)changes / (real)number; /* independent samples over samples */
+            if (!changes)
+                share = 1 / ((1 + still[leg]) * (1 + still[leg]) * (real)number);
+            share = share < 1 ? share : 1;
+        }
+        for (int j = 0; j < M; j++)
+            reading->variance[LEGS * j + leg]
+                = counts ? encoders->std * encoders->std * squares[j] / share : (real)INFINITY;
+        for (int n = 0; n < N; n++)
+            angles[LEGS * n + leg] -= encoders->offset[leg];
+    }
+}
+
+void stewart_beside(const stewart_encoders *encoders, const stewart_reading *reading,
+                    const real *shown, real *e)
+{
+    const int N = encoders->samples, M = encoders->nodes;
+    for (int leg = 0; leg < LEGS; leg++) {
+        const real *K = reading->onto + M * M * leg;
+        real sums[MAX_NODES] = {0}, v[MAX_NODES];
+        for (int n = 0; n < N; n++) {
+            const real angle = reading->angles[LEGS * n + leg];
+            if (!isfinite(angle))
+                continue;
+            legendre(instant(encoders, n), v);
+            for (int a = 0; a < M; a++)
+                sums[a] += v[a] * (angle - shown[LEGS * n + leg]);
+        }
+        for (int j = 0; j < M; j++) {
+            e[LEGS * j + leg] = 0;
+            for (int a = 0; a < M && isfinite(reading->variance[LEGS * j + leg]); a++)
+                e[LEGS * j + leg] += K[M * j + a] * sums[a];
+        }
+    }
+}
+
+int stewart_encoder_scratch(const stewart_encoders *encoders)
+{
+    return 2 * LEGS * 6 + 48 + encoders->samples;
+}
