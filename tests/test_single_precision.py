@@ -18,6 +18,7 @@ from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.parameter_filter import ParameterFilter, gate
 from stewart_drake.law.sensing import Sensing
+from tests.backends import stepped_in_python
 
 HOST = ("dop853", "packed", "packed_law", "plant")
 """Sources for the host alone, in double precision."""
@@ -128,6 +129,7 @@ def test_a_filter_is_right_to_a_share_of_its_deviation(
         calls.append((one, *given, advance(one, *given)))
         return calls[-1][-1]
 
+    stepped_in_python(monkeypatch)  # which calls the filter by itself
     monkeypatch.setattr(ParameterFilter, "advance", recorded)
     sd.simulate(sd.load_scenario("paper", None, ("duration=4", *sensor)), judge_stability=False)
     before = None
@@ -180,6 +182,7 @@ def test_the_delay_is_found_to_microseconds_of_that_in_double(
         calls.append((one, *given, observe(one, *given)))
         return calls[-1][-1]
 
+    stepped_in_python(monkeypatch)
     monkeypatch.setattr(DelayObserver, "observe", recorded)
     scenario = sd.load_scenario("paper", "adaptive_lqi", ("plant.kind=exact", *settings))
     sd.simulate(scenario, judge_stability=False)
