@@ -160,7 +160,7 @@ def export_c(
         directory: of the files; it is made.
         controller: laid over the scenario's own; for a name or a path.
         settings: as `load_scenario` takes them; for a name or a path.
-        single: whether numbers have single precision; then without an estimator.
+        single: whether numbers have single precision.
 
     Returns:
         The paths of the files.

@@ -179,9 +179,7 @@ def export_c(
     ),
     controller: Controller = None,
     settings: Settings = None,
-    single: Annotated[
-        bool, typer.Option("--single", help="Use single precision; without estimator.")
-    ] = False,
+    single: Annotated[bool, typer.Option("--single", help="Use single precision.")] = False,
 ) -> None:
     """Write the controller as C, for a board.
 
