@@ -108,7 +108,7 @@ void stewart_delayed_parameters(const stewart_law *law, const real *memory, real
 }
 
 void stewart_delayed_tell(const stewart_law *law, const real *memory, int number,
-                          const real *torques, stewart_told *told, stewart_scratch *scratch)
+                          const real *torques, stewart_outlook *outlook, stewart_scratch *scratch)
 {
     const stewart_delay_settings *settings = law->estimation;
     const stewart_delay_memory *m = (const stewart_delay_memory *)memory;
@@ -116,24 +116,24 @@ void stewart_delayed_tell(const stewart_law *law, const real *memory, int number
     const int most = settings->most;
     real *acting = stewart_take(scratch, U * most), *durations = stewart_take(scratch, most);
     real *times = stewart_take(scratch, most);
-    stewart_copy(X, memory + believed_numbers(law) + size_of(law), told->state);
+    stewart_copy(X, memory + believed_numbers(law) + size_of(law), outlook->state);
     real std[STEWART_MAX_ESTIMATED];
-    stewart_delayed_parameters(law, memory, told->theta, std);
-    told->feeds_back = m->feeds_back > 0;
-    told->settled = m->settled > 0;
-    told->found = m->found > 0;
-    told->caution = m->caution;
-    told->eta = m->eta * (1 + m->rate);
-    told->fraction = 0;
-    told->pending = 0;
-    const int pieces = stewart_within(&arrivals, number, torques, 0, told->eta, -1, acting, durations);
-    told->until = told->horizon = (stewart_acting){pieces, acting, durations, 0};
-    told->samples = stewart_switches(&arrivals, 0, told->eta, -1, times);
-    times[told->samples++] = told->eta;
-    told->times = times;
+    stewart_delayed_parameters(law, memory, outlook->theta, std);
+    outlook->feeds_back = m->feeds_back > 0;
+    outlook->settled = m->settled > 0;
+    outlook->found = m->found > 0;
+    outlook->caution = m->caution;
+    outlook->eta = m->eta * (1 + m->rate);
+    outlook->fraction = 0;
+    outlook->pending = 0;
+    const int pieces = stewart_within(&arrivals, number, torques, 0, outlook->eta, -1, acting, durations);
+    outlook->until = outlook->horizon = (stewart_acting){pieces, acting, durations, 0};
+    outlook->samples = stewart_switches(&arrivals, 0, outlook->eta, -1, times);
+    times[outlook->samples++] = outlook->eta;
+    outlook->times = times;
     stewart_acting last;
     law->observer->last_period(law, memory, number, torques, &last, NULL, scratch);
-    told->limited = stewart_at_limit(&law->machine, last.number, last.torques);
+    outlook->limited = stewart_at_limit(&law->machine, last.number, last.torques);
 }
 
 void stewart_delayed_last_period(const stewart_law *law, const real *memory, int number,

@@ -20,7 +20,7 @@ int stewart_delayed_observe(const stewart_law *law, const stewart_sensing *sensi
                             stewart_scratch scratch);
 
 void stewart_delayed_tell(const stewart_law *law, const real *memory, int number,
-                          const real *torques, stewart_told *told, stewart_scratch *scratch);
+                          const real *torques, stewart_outlook *outlook, stewart_scratch *scratch);
 void stewart_delayed_assume(const stewart_law *law, real *memory, const real *state);
 void stewart_delayed_parameters(const stewart_law *law, const real *memory, real *theta, real *std);
 void stewart_delayed_last_period(const stewart_law *law, const real *memory, int number,

@@ -107,8 +107,8 @@ void stewart_note_acted(const stewart_law *law, real *memory, int ago, int numbe
 
 /* ---- estimation ------------------------------------------------------------------------------- */
 
-/* What of `told` follows from the delay alone. */
-static void tell_fixed_delay(const stewart_law *law, const real *in_flight, stewart_told *told,
+/* What of `outlook` follows from the delay alone. */
+static void fixed_delay_outlook(const stewart_law *law, const real *in_flight, stewart_outlook *outlook,
                              stewart_scratch *scratch)
 {
     const int queue = stewart_queue_length(law), pending = law->fraction > 0;
@@ -121,21 +121,21 @@ static void tell_fixed_delay(const stewart_law *law, const real *in_flight, stew
         times[k] = law->period * (real)(k + 1);
     for (int k = 0; k < queue; k++)
         durations[k] = (k == 0 && pending ? law->fraction : 1) * law->period;
-    told->eta = ((real)law->steps + law->fraction) * law->period;
-    told->fraction = law->fraction;
-    told->until = (stewart_acting){queue, torques, durations, 0};
-    told->horizon = stewart_acting_of(law, law->steps, torques, scratch);
-    told->samples = law->steps;
-    told->times = times;
-    told->pending = pending;
+    outlook->eta = ((real)law->steps + law->fraction) * law->period;
+    outlook->fraction = law->fraction;
+    outlook->until = (stewart_acting){queue, torques, durations, 0};
+    outlook->horizon = stewart_acting_of(law, law->steps, torques, scratch);
+    outlook->samples = law->steps;
+    outlook->times = times;
+    outlook->pending = pending;
     stewart_last_periods(law, length, in_flight, 1, &last, NULL, scratch);
-    told->limited = stewart_at_limit(&law->machine, last.number, last.torques);
+    outlook->limited = stewart_at_limit(&law->machine, last.number, last.torques);
 }
 
 /* Moves the observer on to the last measurement there is and predicts the state of now from there:
    a measurement may be `age` periods old. */
 static void estimate(const stewart_law *law, real *memory, const stewart_sample *sample,
-                     stewart_told *told, stewart_scratch *scratch)
+                     stewart_outlook *outlook, stewart_scratch *scratch)
 {
     const stewart_layout *l = &law->layout;
     const stewart_observer *observer = law->observer;
@@ -149,28 +149,28 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
     }
     there &= sample->age >= 0;
     const int wanted = there && sample->age < longest ? sample->age : longest;
-    told->status = there ? 0 : STEWART_MEASUREMENT_MISSING;
+    outlook->status = there ? 0 : STEWART_MEASUREMENT_MISSING;
     while (behind > wanted) {
         behind--;
         const int fresh = there && behind == sample->age;
         int status = observer->observe(law, observed, length - behind, in_flight,
                                        fresh ? y : missing, *scratch);
         if (fresh)
-            told->status = status;
+            outlook->status = status;
     }
     memory[l->behind.at] = (real)behind;
-    told->feeds_back = told->settled = 1;
-    told->found = 0;
-    told->caution = 1;
+    outlook->feeds_back = outlook->settled = 1;
+    outlook->found = 0;
+    outlook->caution = 1;
     if (observer->fixed)
-        tell_fixed_delay(law, in_flight, told, scratch);
-    observer->tell(law, observed, length, in_flight, told, scratch);
-    if (behind > 0 && stewart_all_finite(X, told->state)) {
+        fixed_delay_outlook(law, in_flight, outlook, scratch);
+    observer->tell(law, observed, length, in_flight, outlook, scratch);
+    if (behind > 0 && stewart_all_finite(X, outlook->state)) {
         stewart_acting acting;
         stewart_last_periods(law, length, in_flight, behind, &acting, NULL, scratch);
         real *states = stewart_take(scratch, X * acting.number);
-        stewart_predict(&law->machine, told->theta, &acting, told->state, states);
-        stewart_copy(X, states + X * (acting.number - 1), told->state);
+        stewart_predict(&law->machine, outlook->theta, &acting, outlook->state, states);
+        stewart_copy(X, states + X * (acting.number - 1), outlook->state);
     }
 }
 
@@ -178,17 +178,17 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
 
 /* Instants of a preview: now, those of the prediction, and two nodes in each hold; the last of the
    prediction and the nodes again for each further torque that is planned. */
-static int preview_times(const stewart_law *law, const stewart_told *told, real *times)
+static int preview_times(const stewart_law *law, const stewart_outlook *outlook, real *times)
 {
     const int torques = law->channel ? law->channel->torques(law) : 1;
     int n = 0;
     times[n++] = 0;
-    for (int k = 0; k < told->samples; k++)
-        times[n++] = told->times[k];
+    for (int k = 0; k < outlook->samples; k++)
+        times[n++] = outlook->times[k];
     const int again = n - 1;
-    for (int hold = -told->pending - 1; hold <= 1; hold++)
+    for (int hold = -outlook->pending - 1; hold <= 1; hold++)
         for (int node = 0; node < 2; node++)
-            times[n++] = told->eta + law->period * ((real)hold + GAUSS_NODES[node]);
+            times[n++] = outlook->eta + law->period * ((real)hold + GAUSS_NODES[node]);
     for (int i = 1, number = n - again; i < torques; i++)
         for (int k = 0; k < number; k++)
             times[n++] = times[again + k] + law->period * (real)i;
@@ -212,15 +212,15 @@ static int is_quiet(const stewart_law *law, const real *memory)
 }
 
 /* Rows of the predicted motion, and the state (12) where the next torque acts. */
-static void predict_way(const stewart_law *law, const stewart_told *told, const course *c, real *way,
+static void predict_way(const stewart_law *law, const stewart_outlook *outlook, const course *c, real *way,
                         real *state, stewart_scratch scratch)
 {
-    const stewart_acting *until = &told->until;
+    const stewart_acting *until = &outlook->until;
     real *states = stewart_take(&scratch, X * (until->number + 1)), ends[2][ROW], begin = 0;
     stewart_belief belief;
-    stewart_believe(&law->machine, told->theta, &belief);
-    stewart_copy(X, told->state, states);
-    stewart_predict(&law->machine, told->theta, until, states, states + X);
+    stewart_believe(&law->machine, outlook->theta, &belief);
+    stewart_copy(X, outlook->state, states);
+    stewart_predict(&law->machine, outlook->theta, until, states, states + X);
     stewart_copy(X, states + X * until->number, state);
     for (int i = 0; i < c->number; i++) {
         stewart_copy(X, state, way + ROW * i);
@@ -242,12 +242,12 @@ static void predict_way(const stewart_law *law, const stewart_told *told, const 
 /* After a gap: up to the instant at which the next torque begins to act, what was followed before, at
    the first preview ever, and as long as nothing is fed back, the predicted motion; from then on the
    way back. */
-static void return_after_gap(const stewart_law *law, const real *memory, const stewart_told *told,
+static void return_after_gap(const stewart_law *law, const real *memory, const stewart_outlook *outlook,
                              int ended, stewart_way_back *back, const course *c,
                              stewart_scratch scratch)
 {
     const stewart_layout *l = &law->layout;
-    const real h = law->period, eta = told->eta, acts = eta - (real)1e-6 * h;
+    const real h = law->period, eta = outlook->eta, acts = eta - (real)1e-6 * h;
     const real *geometry = law->machine.geometry, *last_times = memory + l->times.at;
     const real *followed = memory + l->followed.at;
     real *way = stewart_take(&scratch, ROW * c->number), wanted[ROW], reached[ROW] = {0};
@@ -271,8 +271,8 @@ static void return_after_gap(const stewart_law *law, const real *memory, const s
             for (int i = 0; i < X; i++)
                 reached[i] += wanted[i];
         }
-    } else if (stewart_all_finite(X, told->state)) {
-        predict_way(law, told, c, way, reached, scratch);
+    } else if (stewart_all_finite(X, outlook->state)) {
+        predict_way(law, outlook, c, way, reached, scratch);
     } else { /* nothing else to go on with */
         back->holds = back->samples = 0;
         return;
@@ -297,14 +297,14 @@ static void return_after_gap(const stewart_law *law, const real *memory, const s
 
 /* Asks for the reference and finds what is followed. */
 static int follow(const stewart_law *law, real *memory, const stewart_sample *sample,
-                  const stewart_told *told, course *c, stewart_scratch *scratch)
+                  const stewart_outlook *outlook, course *c, stewart_scratch *scratch)
 {
     const stewart_layout *l = &law->layout;
     real *given = stewart_take(scratch, ROW * law->rows);
     c->times = stewart_take(scratch, law->rows);
     c->reference = stewart_take(scratch, ROW * law->rows);
     c->followed = stewart_take(scratch, ROW * law->rows);
-    c->number = preview_times(law, told, c->times);
+    c->number = preview_times(law, outlook, c->times);
     if (law->planner)
         law->planner->look(law, memory + l->planner.at, sample, c->number, c->times, given);
     else
@@ -314,7 +314,7 @@ static int follow(const stewart_law *law, real *memory, const stewart_sample *sa
         last++;
     const stewart_preview now = {c->number, c->times, given};
     const stewart_preview before = {last, memory + l->times.at, memory + l->reference.at};
-    stewart_complete(law->machine.geometry, law->period, told->eta, &now, -(real)HUGE_VAL, &before,
+    stewart_complete(law->machine.geometry, law->period, outlook->eta, &now, -(real)HUGE_VAL, &before,
                      c->reference);
     c->missing = !stewart_all_finite(ROW * c->number, given);
     stewart_copy(ROW * c->number, c->reference, c->followed);
@@ -326,7 +326,7 @@ static int follow(const stewart_law *law, real *memory, const stewart_sample *sa
     back.samples = (int)memory[l->way_back.at + 1];
     stewart_go_on_way_back(&back, law->period);
     if (ended || back.holds + back.samples > 0)
-        return_after_gap(law, memory, told, ended, &back, c, *scratch);
+        return_after_gap(law, memory, outlook, ended, &back, c, *scratch);
     memory[l->gap.at] = (real)gap;
     memory[l->way_back.at] = (real)back.holds;
     memory[l->way_back.at + 1] = (real)back.samples;
@@ -347,18 +347,18 @@ static void remember_course(const stewart_law *law, real *memory, const course *
 /* ---- feedback --------------------------------------------------------------------------------- */
 
 /* The exact equations until then. The integral waits in every part in which a motor is at its limit. */
-static void predict(const stewart_law *law, const stewart_told *told, const real *followed,
+static void predict(const stewart_law *law, const stewart_outlook *outlook, const real *followed,
                     const real *integral, stewart_ahead *a, stewart_scratch scratch)
 {
-    const stewart_acting *acting = &told->horizon;
+    const stewart_acting *acting = &outlook->horizon;
     real *states = stewart_take(&scratch, X * (acting->number + 1)), before[6];
-    const int each = told->samples > 0 ? acting->number / told->samples : 1;
-    stewart_copy(X, told->state, states);
+    const int each = outlook->samples > 0 ? acting->number / outlook->samples : 1;
+    stewart_copy(X, outlook->state, states);
     stewart_copy(6, integral, a->integral);
     for (int i = 0; i < 6; i++)
-        before[i] = told->state[i] - followed[i];
-    stewart_predict(&law->machine, told->theta, acting, states, states + X);
-    for (int k = 0; k < told->samples; k++) {
+        before[i] = outlook->state[i] - followed[i];
+    stewart_predict(&law->machine, outlook->theta, acting, states, states + X);
+    for (int k = 0; k < outlook->samples; k++) {
         const real *wanted = followed + ROW * (k + 1), *end = states + X * each * (k + 1);
         const int waits = stewart_at_limit(&law->machine, each, acting->torques + U * each * k);
         real h = 0;
@@ -373,39 +373,39 @@ static void predict(const stewart_law *law, const stewart_told *told, const real
     }
     stewart_copy(X, states + X * acting->number, a->state);
     for (int i = 0; i < X; i++)
-        a->error[i] = a->state[i] - followed[ROW * told->samples + i];
+        a->error[i] = a->state[i] - followed[ROW * outlook->samples + i];
 }
 
 /* A torque that regulates the error where it acts, and what went wrong. */
-static int feed_back(const stewart_law *law, real *memory, const stewart_told *told,
+static int feed_back(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                      const real *followed, const real *weights, stewart_ahead *a, real *torque,
                      stewart_scratch scratch)
 {
     const stewart_layout *l = &law->layout;
-    const int pending = told->pending, n = U * stewart_order(&law->cost, pending);
-    const real *nodes = followed + ROW * (1 + told->samples), h = law->period;
+    const int pending = outlook->pending, n = U * stewart_order(&law->cost, pending);
+    const real *nodes = followed + ROW * (1 + outlook->samples), h = law->period;
     const real *newest = memory + l->in_flight.at + U * (in_flight_length(law) - 1);
     real *error = memory + l->error.at, *integral = memory + l->integral.at;
     real *gain = memory + l->gain.at, *K = stewart_take(&scratch, n);
     real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U);
-    const real cautious[2] = {weights[0], weights[1] * told->caution};
+    const real cautious[2] = {weights[0], weights[1] * outlook->caution};
     const int had_state = stewart_all_finite(X, memory + l->state.at);
     stewart_held held;
     for (int i = 0; i < 6; i++) {
-        real now = told->state[i] - followed[i];
-        if (law->cost.integrates && had_state && !told->limited)
+        real now = outlook->state[i] - followed[i];
+        if (law->cost.integrates && had_state && !outlook->limited)
             integral[i] += h / 2 * (error[i] + now);
         error[i] = now;
     }
-    predict(law, told, followed, integral, a, scratch);
-    stewart_hold(&law->machine, &law->cost, told->theta, pending, nodes, &held);
+    predict(law, outlook, followed, integral, a, scratch);
+    stewart_hold(&law->machine, &law->cost, outlook->theta, pending, nodes, &held);
     stewart_copy(U, held.torque[pending], torque);
     stewart_copy(U, torque, memory + l->feedforward.at);
-    int trouble = stewart_linearize(&law->machine, told->theta, h, told->fraction, a->state, &held, A, B,
+    int trouble = stewart_linearize(&law->machine, outlook->theta, h, outlook->fraction, a->state, &held, A, B,
                                     a->error, scratch);
     if (trouble == STEWART_UNREACHABLE) /* nothing to regulate: the feedforward goes on alone */
         return trouble;
-    if (!trouble && stewart_gain(&law->cost, h, told->fraction, A, B, cautious, K, scratch))
+    if (!trouble && stewart_gain(&law->cost, h, outlook->fraction, A, B, cautious, K, scratch))
         stewart_copy(n, K, gain);
     else
         trouble = STEWART_RICCATI_FAILURE;
@@ -419,25 +419,25 @@ static int feed_back(const stewart_law *law, real *memory, const stewart_told *t
 /* ---- a sample --------------------------------------------------------------------------------- */
 
 /* A torque for what is followed, and what went wrong. */
-static int respond(const stewart_law *law, real *memory, const stewart_told *told, const course *c,
+static int respond(const stewart_law *law, real *memory, const stewart_outlook *outlook, const course *c,
                    int waiting, const real *weights, stewart_ahead *a, real *torque,
                    stewart_scratch scratch)
 {
     const stewart_layout *l = &law->layout;
-    const real *nodes = c->followed + ROW * (1 + told->samples);
-    const int feeds_back = told->feeds_back && !is_quiet(law, memory);
+    const real *nodes = c->followed + ROW * (1 + outlook->samples);
+    const int feeds_back = outlook->feeds_back && !is_quiet(law, memory);
     a->gain = NULL;
-    a->theta = feeds_back ? told->theta : NULL;
-    a->rows = nodes + ROW * 2 * (3 + told->pending);
+    a->theta = feeds_back ? outlook->theta : NULL;
+    a->rows = nodes + ROW * 2 * (3 + outlook->pending);
     if (!waiting && feeds_back)
-        return feed_back(law, memory, told, c->followed, weights, a, torque, scratch);
+        return feed_back(law, memory, outlook, c->followed, weights, a, torque, scratch);
     if (waiting) { /* nothing to follow yet: hold the torque */
-        a->theta = told->theta;
+        a->theta = outlook->theta;
         stewart_copy(U, memory + l->torque.at, torque);
     } else { /* by what is known beforehand */
         stewart_held held;
-        stewart_hold(&law->machine, &law->cost, NULL, told->pending, nodes, &held);
-        stewart_copy(U, held.torque[told->pending], torque);
+        stewart_hold(&law->machine, &law->cost, NULL, outlook->pending, nodes, &held);
+        stewart_copy(U, held.torque[outlook->pending], torque);
     }
     stewart_copy(X, nodes - ROW, a->state);
     stewart_fill(X, 0, a->error);
@@ -473,29 +473,29 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     const int length = in_flight_length(law);
     stewart_scratch scratch = {scratch_memory};
     real *in_flight = memory + l->in_flight.at, *sent = memory + l->channel.at;
-    stewart_told told;
+    stewart_outlook outlook;
     stewart_ahead ahead;
     course c;
     if (law->channel)
         law->channel->update(law, sent, sample->report, in_flight, scratch);
-    estimate(law, memory, sample, &told, &scratch);
+    estimate(law, memory, sample, &outlook, &scratch);
     if (law->planner &&
-        law->planner->follow(law, memory + l->planner.at, &told, sample, scratch)) {
+        law->planner->follow(law, memory + l->planner.at, &outlook, sample, scratch)) {
         stewart_fill(6, 0, memory + l->error.at); /* there is none left to feed back */
         stewart_fill(6, 0, memory + l->integral.at);
     }
-    const int gap = follow(law, memory, sample, &told, &c, &scratch);
-    int status = told.status | (c.missing ? STEWART_REFERENCE_MISSING : 0);
-    const real *nodes = c.followed + ROW * (1 + told.samples);
-    const int waiting = !stewart_all_finite(ROW * 2 * (3 + told.pending), nodes);
+    const int gap = follow(law, memory, sample, &outlook, &c, &scratch);
+    int status = outlook.status | (c.missing ? STEWART_REFERENCE_MISSING : 0);
+    const real *nodes = c.followed + ROW * (1 + outlook.samples);
+    const int waiting = !stewart_all_finite(ROW * 2 * (3 + outlook.pending), nodes);
     if (c.missing && !gap && !waiting) /* which spoils the plan as a limit does */
         memory[l->silence.at] = 0;
-    if (!stewart_all_finite(X, told.state)) { /* nothing else to go on with */
-        stewart_copy(X, c.followed, told.state);
+    if (!stewart_all_finite(X, outlook.state)) { /* nothing else to go on with */
+        stewart_copy(X, c.followed, outlook.state);
         if (law->longest_wait == 0)
-            law->observer->assume(law, memory + l->observer.at, told.state);
+            law->observer->assume(law, memory + l->observer.at, outlook.state);
     }
-    status |= respond(law, memory, &told, &c, waiting, sample->weights, &ahead, torque, scratch);
+    status |= respond(law, memory, &outlook, &c, waiting, sample->weights, &ahead, torque, scratch);
     if (!stewart_all_finite(U, torque)) {
         status |= STEWART_NONFINITE_TORQUE;
         stewart_copy(U, memory + l->torque.at, torque);
@@ -503,12 +503,12 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     if (stewart_limit(&law->machine, torque, ahead.limited))
         status |= STEWART_SATURATED;
     if (law->channel)
-        law->channel->send(law, sent, &told, &ahead, in_flight, scratch);
+        law->channel->send(law, sent, &outlook, &ahead, in_flight, scratch);
     memmove(in_flight, in_flight + U, (size_t)(U * (length - 1)) * sizeof(real));
     stewart_copy(U, ahead.limited, in_flight + U * (length - 1));
     remember_course(law, memory, &c);
-    stewart_copy(X, told.state, memory + l->state.at);
-    stewart_copy(law->machine.estimated, told.theta, memory + l->parameters.at);
+    stewart_copy(X, outlook.state, memory + l->state.at);
+    stewart_copy(law->machine.estimated, outlook.theta, memory + l->parameters.at);
     stewart_copy(U, torque, memory + l->torque.at);
     stewart_copy(law->measured, sample->measurement, memory + l->measurement.at);
     stewart_copy(2, sample->weights, memory + l->weights.at);

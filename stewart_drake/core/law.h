@@ -18,7 +18,7 @@
 #include "observer.h"
 #include "packets.h"
 
-/* A field of the memory: a matrix of so many rows and columns from a place on. */
+/* A field of the memory: its place, and its size as a matrix. */
 typedef struct {
     int at, rows, columns;
 } stewart_field;
@@ -43,7 +43,7 @@ typedef struct {
     stewart_field gap;         /* whether the last row of the last preview was missing */
     stewart_field offset;      /* from the reference where the next torque acts, after a gap in it */
     stewart_field way_back;    /* holds until the offset is zero; then samples until it has acted */
-    stewart_field channel;     /* of what was sent */
+    stewart_field channel;     /* packets that were sent */
     stewart_field planner;
     stewart_field counts;
 } stewart_layout;
@@ -63,11 +63,11 @@ typedef struct {
     int (*scratch)(const stewart_law *law);
     int (*torques)(const stewart_law *law); /* that are planned at each sample */
     void (*start)(const stewart_law *law, real *memory);
-    /* Puts what most probably is in flight in the place of what seemed to be. */
+    /* Replaces the torques in flight by the most probable ones. */
     void (*update)(const stewart_law *law, real *memory, const stewart_report *report,
                    real *in_flight, stewart_scratch scratch);
     /* Remembers what is sent: this torque and further ones, for `in_flight` before it. */
-    void (*send)(const stewart_law *law, real *memory, const stewart_told *told,
+    void (*send)(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                  const stewart_ahead *ahead, const real *in_flight, stewart_scratch scratch);
 } stewart_channel;
 
@@ -75,15 +75,15 @@ extern const stewart_channel stewart_network;
 
 typedef struct stewart_sample stewart_sample;
 
-/* A kind of planner of what is followed. */
+/* A kind of planner: it chooses the motion to follow. */
 typedef struct {
     int (*memory)(const stewart_law *law);
     int (*scratch)(const stewart_law *law);
     void (*start)(const stewart_law *law, real *memory);
     /* Plans anew where that is of use, once at each sample. Returns whether it did. */
-    int (*follow)(const stewart_law *law, real *memory, const stewart_told *told,
+    int (*follow)(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                   const stewart_sample *sample, stewart_scratch scratch);
-    /* Rows (number, 18) of what is followed, at instants in s from now. */
+    /* Rows (number, 18) of that motion, at instants in s from now. */
     void (*look)(const stewart_law *law, const real *memory, const stewart_sample *sample, int number,
                  const real *times, real *rows);
 } stewart_planner;
@@ -104,11 +104,11 @@ struct stewart_law {
     int memory;        /* numbers of the memory, and the place of each field: `stewart_prepare` */
     stewart_layout layout;
     const stewart_observer *observer;
-    const void *sensing, *estimation; /* what the observer knows beside the machine */
+    const void *sensing, *estimation; /* assumptions of the observer */
     const stewart_channel *channel;   /* NULL: every torque arrives, after the delay */
-    const stewart_packets *packets;   /* what the channel knows */
+    const stewart_packets *packets;   /* assumptions of the channel */
     const stewart_planner *planner;   /* NULL: what the caller asks for is followed */
-    const void *planning;             /* what the planner knows */
+    const void *planning;             /* assumptions of the planner */
 };
 
 /* Rows (number, 18) of the reference at instants in s from now, some of them negative. */

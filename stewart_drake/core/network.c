@@ -32,10 +32,10 @@ static void network_update(const stewart_law *law, real *memory, const stewart_r
 
 /* The torques (N, 6) of this sample and of further ones, if all went as predicted: the machine as it is
    believed to be goes on from where the prediction ended, and is regulated by the same gain. */
-static void plan_ahead(const stewart_law *law, const stewart_told *told, const stewart_ahead *ahead,
+static void plan_ahead(const stewart_law *law, const stewart_outlook *outlook, const stewart_ahead *ahead,
                        const real *newest, real *plan, stewart_scratch scratch)
 {
-    const int nodes = 2 * (3 + told->pending), pending = told->pending;
+    const int nodes = 2 * (3 + outlook->pending), pending = outlook->pending;
     real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U);
     real flying[2][U], state[X], error[X], integral[6], before[X], ends[2][X];
     const real *rows = ahead->rows;
@@ -62,7 +62,7 @@ static void plan_ahead(const stewart_law *law, const stewart_told *told, const s
         stewart_hold(&law->machine, &law->cost, ahead->theta, pending, rows + ROW, &held);
         stewart_copy(U, held.torque[pending], torque);
         stewart_copy(X, error, before); /* without what held torques put there */
-        if (ahead->gain && !stewart_linearize(&law->machine, ahead->theta, law->period, told->fraction,
+        if (ahead->gain && !stewart_linearize(&law->machine, ahead->theta, law->period, outlook->fraction,
                                               state, &held, A, B, before, rest))
             stewart_feed_back(&law->cost, ahead->gain, before, integral, pending ? flying[0] : NULL,
                               &held, torque);
@@ -73,12 +73,12 @@ static void plan_ahead(const stewart_law *law, const stewart_told *told, const s
     }
 }
 
-static void network_send(const stewart_law *law, real *memory, const stewart_told *told,
+static void network_send(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                          const stewart_ahead *ahead, const real *in_flight, stewart_scratch scratch)
 {
     const int number = law->layout.in_flight.rows;
     real *plan = stewart_take(&scratch, U * law->packets->torques);
-    plan_ahead(law, told, ahead, in_flight + U * (number - 1), plan, scratch);
+    plan_ahead(law, outlook, ahead, in_flight + U * (number - 1), plan, scratch);
     stewart_packets_send(law->packets, memory, plan, number, in_flight);
 }
 

@@ -1,4 +1,4 @@
-/* What the law wants to be told of plate and delay at a sample, whoever estimates them. */
+/* The interface of observers: state, parameters and delay at a sample, as they are estimated. */
 
 #ifndef STEWART_OBSERVER_H
 #define STEWART_OBSERVER_H
@@ -36,12 +36,12 @@ typedef struct {
     const real *times;      /* (samples) s from now */
     int pending;            /* 1 where the newest torque has not acted wholly by then */
     int limited;            /* whether what acted since the last sample was at the limit */
-} stewart_told;
+} stewart_outlook;
 
 /* A kind of observer. Its memory is a vector of numbers within the law's. */
 typedef struct {
     int (*memory)(const stewart_law *law);  /* how many numbers */
-    int (*scratch)(const stewart_law *law); /* the same of what `observe` takes */
+    int (*scratch)(const stewart_law *law); /* numbers that `observe` computes in */
     void (*start)(const stewart_law *law, real *memory);
     /* One period, then a measurement (m) at its end, NaN where it is missing; `torques` (number, 6) in
        flight, the oldest first. Returns what was wrong with it, bits of `stewart_status`. */
@@ -50,7 +50,7 @@ typedef struct {
     /* Fills in `state` and `theta`; without a fixed delay also what follows from the estimated one, from
        torques (number, 6) in flight now. */
     void (*tell)(const stewart_law *law, const real *memory, int number, const real *torques,
-                 stewart_told *told, stewart_scratch *scratch);
+                 stewart_outlook *outlook, stewart_scratch *scratch);
     /* The state (12) is this one, for want of any other. */
     void (*assume)(const stewart_law *law, real *memory, const real *state);
     /* Begins anew, with the parameters that it has found and the last measurement. */
@@ -60,7 +60,7 @@ typedef struct {
     /* What acted since the last sample of torques (number, 6) in flight, and what acts next. */
     void (*last_period)(const stewart_law *law, const real *memory, int number, const real *torques,
                         stewart_acting *acting, const real **following, stewart_scratch *scratch);
-    int fixed; /* whether the delay is the law's, so that the law tells what follows from it */
+    int fixed; /* whether the delay is the one that the law assumes, which then fills in what follows */
 } stewart_observer;
 
 #endif

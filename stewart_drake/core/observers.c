@@ -63,12 +63,12 @@ void stewart_plain_start(const stewart_law *law, real *memory)
 }
 
 void stewart_plain_tell(const stewart_law *law, const real *memory, int number, const real *torques,
-                        stewart_told *told, stewart_scratch *scratch)
+                        stewart_outlook *outlook, stewart_scratch *scratch)
 {
     real std[STEWART_MAX_ESTIMATED];
     (void)number, (void)torques, (void)scratch;
-    stewart_copy(X, memory, told->state);
-    stewart_known_parameters(law, memory, told->theta, std);
+    stewart_copy(X, memory, outlook->state);
+    stewart_known_parameters(law, memory, outlook->theta, std);
 }
 
 void stewart_plain_assume(const stewart_law *law, real *memory, const real *state)
@@ -133,11 +133,11 @@ void stewart_filtered_restart(const stewart_law *law, real *memory)
 }
 
 void stewart_filtered_tell(const stewart_law *law, const real *memory, int number,
-                           const real *torques, stewart_told *told, stewart_scratch *scratch)
+                           const real *torques, stewart_outlook *outlook, stewart_scratch *scratch)
 {
     (void)number, (void)torques, (void)scratch;
-    stewart_copy(X, memory, told->state);
-    stewart_copy(estimated(law), memory + X, told->theta);
+    stewart_copy(X, memory, outlook->state);
+    stewart_copy(estimated(law), memory + X, outlook->theta);
 }
 
 void stewart_filtered_parameters(const stewart_law *law, const real *memory, real *theta,

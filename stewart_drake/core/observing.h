@@ -25,7 +25,7 @@ void stewart_known_last_period(const stewart_law *law, const real *memory, int n
 int stewart_plain_memory(const stewart_law *law);
 void stewart_plain_start(const stewart_law *law, real *memory);
 void stewart_plain_tell(const stewart_law *law, const real *memory, int number, const real *torques,
-                        stewart_told *told, stewart_scratch *scratch);
+                        stewart_outlook *outlook, stewart_scratch *scratch);
 void stewart_plain_assume(const stewart_law *law, real *memory, const real *state);
 void stewart_plain_restart(const stewart_law *law, real *memory);
 
@@ -35,7 +35,7 @@ int stewart_filtered_memory(const stewart_law *law);
 void stewart_filtered_start(const stewart_law *law, real *memory);
 void stewart_filtered_restart(const stewart_law *law, real *memory);
 void stewart_filtered_tell(const stewart_law *law, const real *memory, int number,
-                           const real *torques, stewart_told *told, stewart_scratch *scratch);
+                           const real *torques, stewart_outlook *outlook, stewart_scratch *scratch);
 void stewart_filtered_parameters(const stewart_law *law, const real *memory, real *theta,
                                  real *std);
 

@@ -43,20 +43,20 @@ static void look(const stewart_law *law, const real *memory, const stewart_sampl
 }
 
 /* A new path: the predicted motion, through `states`, then a plan back. Returns 0 where there is none. */
-static int plan(const stewart_law *law, const stewart_told *told, const stewart_sample *sample,
+static int plan(const stewart_law *law, const stewart_outlook *outlook, const stewart_sample *sample,
                 const real *states, real *memory, stewart_scratch scratch)
 {
     const stewart_replan *replan = law->planning;
     real times[3], rows[3 * ROW], peak, *pieces = stewart_take(&scratch, PIECE * most_pieces(law));
-    const real *last = states + X * told->until.number;
+    const real *last = states + X * outlook->until.number;
     stewart_belief belief;
     stewart_model model;
-    stewart_believe(&law->machine, told->theta, &belief);
+    stewart_believe(&law->machine, outlook->theta, &belief);
     stewart_plant_model(&belief.plant, replan->sign, &model);
-    stewart_plan_times(told->eta, law->period, replan->periods, times);
+    stewart_plan_times(outlook->eta, law->period, replan->periods, times);
     sample->goal(sample->about, 3, times, rows);
-    int number = stewart_predicted_pieces(&model, &told->until, states, 0, pieces);
-    int further = stewart_plan_way(&model, last, told->eta, law->period, replan->periods, rows,
+    int number = stewart_predicted_pieces(&model, &outlook->until, states, 0, pieces);
+    int further = stewart_plan_way(&model, last, outlook->eta, law->period, replan->periods, rows,
                                pieces + PIECE * number, &peak, scratch);
     if (further == 0)
         return 0;
@@ -66,20 +66,20 @@ static int plan(const stewart_law *law, const stewart_told *told, const stewart_
     return 1;
 }
 
-static int replan_follow(const stewart_law *law, real *memory, const stewart_told *told,
+static int replan_follow(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                          const stewart_sample *sample, stewart_scratch scratch)
 {
     const stewart_replan *replan = law->planning;
-    real *states = stewart_take(&scratch, X * (told->until.number + 1)), wanted[ROW];
+    real *states = stewart_take(&scratch, X * (outlook->until.number + 1)), wanted[ROW];
     memory[0] += 1;
-    if (!sample->goal || !told->settled || !stewart_all_finite(X, told->state))
+    if (!sample->goal || !outlook->settled || !stewart_all_finite(X, outlook->state))
         return 0;
-    stewart_copy(X, told->state, states);
-    stewart_predict(&law->machine, told->theta, &told->until, states, states + X);
-    look(law, memory, sample, 1, &told->eta, wanted);
-    if (!stewart_is_off(replan->size, states + X * told->until.number, wanted, told->found))
+    stewart_copy(X, outlook->state, states);
+    stewart_predict(&law->machine, outlook->theta, &outlook->until, states, states + X);
+    look(law, memory, sample, 1, &outlook->eta, wanted);
+    if (!stewart_is_off(replan->size, states + X * outlook->until.number, wanted, outlook->found))
         return 0;
-    return plan(law, told, sample, states, memory, scratch);
+    return plan(law, outlook, sample, states, memory, scratch);
 }
 
 const stewart_planner stewart_replanner = {replan_memory, replan_scratch, replan_start, replan_follow,

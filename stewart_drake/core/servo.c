@@ -45,10 +45,10 @@ static void take_estimate(const stewart_servo *servo, real *memory)
 {
     const stewart_law *law = &servo->law;
     const stewart_servo_layout *l = &servo->layout;
-    stewart_told told;
-    law->observer->tell(law, memory + l->observer.at, 0, NULL, &told, NULL);
-    stewart_copy(X, told.state, memory + l->state.at);
-    stewart_copy(law->machine.estimated, told.theta, memory + l->parameters.at);
+    stewart_outlook outlook;
+    law->observer->tell(law, memory + l->observer.at, 0, NULL, &outlook, NULL);
+    stewart_copy(X, outlook.state, memory + l->state.at);
+    stewart_copy(law->machine.estimated, outlook.theta, memory + l->parameters.at);
 }
 
 void stewart_servo_start(const stewart_servo *servo, real *memory, const real *command)

@@ -142,7 +142,7 @@ static real newest(const real *window, int column)
     return isnan(x) ? 0 : x;
 }
 
-/* tau in s over so many rows, 0 where it cannot be told from none; `weight` is d's column after n's. */
+/* tau in s over so many rows, 0 where it cannot be outlook from none; `weight` is d's column after n's. */
 static real timing(const real *window, int column, int number)
 {
     real squares = 0, excess = 0;

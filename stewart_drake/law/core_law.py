@@ -1,7 +1,7 @@
 """The whole step of a law in C, core/law.c, in the place of `PredictiveLqi.step`.
 
-`serving` chooses: a law all of whose parts the core has is stepped there, any other one in Python,
-which composes the same kernels. Memory is one flat vector; `CoreMemory` reads its fields by the
+`serving` chooses. If the core has every part of a law, C steps it; otherwise Python composes the
+same kernels. Memory is one flat vector; `CoreMemory` reads its fields by the
 names of `law.memory.Memory`.
 """
 
@@ -70,12 +70,12 @@ _FEEDFORWARDS: Final = {
 
 
 class Part(NamedTuple):
-    """What the core has of an observer.
+    """An observer as the core has it.
 
     Attributes:
         name: of its table of functions.
         sensing: C structure of the sensor.
-        estimation: C structure of what it assumes, or None.
+        estimation: C structure of its assumptions, or None.
         belief: what it believes, from a memory of the law.
         sources: of the core that it is made of, see `export.controller.SOURCES`.
     """
@@ -259,7 +259,7 @@ class CompiledLaw:
     """The constants of a law as the core has them.
 
     Args:
-        law: one of which nothing is `uncovered`.
+        law: one without an `uncovered` part.
 
     Attributes:
         law: the same.
@@ -607,7 +607,7 @@ AnyMemory = Memory | CoreMemory
 
 
 class Serving(NamedTuple):
-    """What steps a law, and how that is said in a summary."""
+    """A law with the code that steps it."""
 
     law: Any
     """The law, or the same in C."""
