@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import stewart_drake as sd
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.core_law import CoreLqi, serving, uncovered
+from stewart_drake.law import core_law
+from stewart_drake.law.core_law import CompiledLaw, CoreLqi, serving, uncovered
 from stewart_drake.law.delay_model import DelayedModel, delayed_model
 from stewart_drake.law.doubling import Doubling
 from stewart_drake.law.error_model import linear_model
@@ -397,6 +399,52 @@ def test_a_law_of_the_paper_is_stepped_in_python() -> None:
     assert serving(law_of("controller.prediction=linear")).backend == (
         "python (controller.prediction)"
     )
+
+
+SPARE, UNTOUCHED = 500, 12345.678
+
+
+class Painted:
+    """numpy for `law.core_law`: new arrays are painted, and kept."""
+
+    def __init__(self) -> None:
+        self.kept: list[Array] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(np, name)
+
+    def empty(self, shape: Any) -> Array:
+        """Return an array that shows what was written."""
+        self.kept.append(np.full(shape, UNTOUCHED))
+        return self.kept[-1]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        (),
+        ("controller.estimate=[]", "controller.integral=false", "delay.steps=0"),
+        ("delay.fraction=0.4", "sensor.delay=0.2", "sensor.loss=0.2"),
+        ("sensor.kind=encoders", "sensor.samples=20", "sensor.bits=14"),
+        ("link.kind=network", "link.loss=0.1"),
+        (
+            *("controller.delay_estimator=drifting", "controller.estimate=[payload]"),
+            *("delay.steps=1", "controller.delay_max=0.3", "controller.delay_std=0.05"),
+        ),
+    ],
+)
+def test_a_step_takes_no_more_scratch_than_stated(
+    settings: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing behind the stated number of numbers is written; most of them are."""
+    stated = CompiledLaw(law_of(*settings)).scratch
+    monkeypatch.setattr(CompiledLaw, "scratch", stated + SPARE)
+    painted = Painted()
+    monkeypatch.setattr(core_law, "np", painted)
+    sd.simulate(load_scenario("paper", settings=("duration=2", *settings)), judge_stability=False)
+    used = [array for array in painted.kept if array.shape == (stated + SPARE,)]
+    assert used and all((array[stated:] == UNTOUCHED).all() for array in used)
+    assert max(np.count_nonzero(array != UNTOUCHED) for array in used) > stated / 5
 
 
 def test_shapes_that_do_not_fit_are_refused() -> None:

@@ -134,7 +134,7 @@ static void sample(const stewart_cost *cost, real period, real fraction, const r
 
 /* The gain (6, n). Each state is measured in the size that costs one now and at the next sample
    together, each torque in that which costs one, so that no unit makes a matrix look singular. */
-static int solve_gain(sampled *m, int torques, real *K, stewart_riccati_work *work)
+static int solve_gain(sampled *m, int torques, real *K, stewart_scratch scratch)
 {
     const int n = m->n;
     real x[STEWART_MAX_ORDER], u[U], *A = m->A, *B = m->B, *Q = m->Q, *R = m->R;
@@ -165,17 +165,12 @@ static int solve_gain(sampled *m, int torques, real *K, stewart_riccati_work *wo
     if (!stewart_all_finite(n * n, A) || !stewart_all_finite(n * U, B) ||
         !stewart_all_finite(n * n, Q))
         return 0;
-    if (!stewart_riccati(n, A, B, Q, R, K, NULL, work) || !stewart_all_finite(U * n, K))
+    if (!stewart_lqr(n, A, B, Q, R, K, NULL, scratch) || !stewart_all_finite(U * n, K))
         return 0;
     for (int i = 0; i < U; i++)
         for (int j = 0; j < n; j++)
             K[n * i + j] *= u[i] / x[j];
     return 1;
-}
-
-static int riccati_numbers(void)
-{
-    return (int)(sizeof(stewart_riccati_work) / sizeof(real)) + 1;
 }
 
 int stewart_linearize_scratch(void) { return 6 * (X + STEWART_PARAMETERS + X + U); }
@@ -194,9 +189,10 @@ int stewart_linearize(const stewart_machine *machine, const real *theta, real pe
     return 0;
 }
 
-int stewart_gain_scratch(void)
+int stewart_gain_scratch(const stewart_cost *cost, int pending)
 {
-    const int n = STEWART_MAX_ORDER, sampling = 9 * X * X + 3 * X * U, solving = riccati_numbers();
+    const int n = stewart_order(cost, pending), sampling = 9 * X * X + 3 * X * U;
+    const int solving = stewart_lqr_scratch(n);
     return 2 * n * n + n * U + U * U + (sampling > solving ? sampling : solving);
 }
 
@@ -210,8 +206,7 @@ int stewart_gain(const stewart_cost *cost, real period, real fraction, const rea
     m.Q = stewart_take(&scratch, n * n);
     m.R = stewart_take(&scratch, U * U);
     sample(cost, period, fraction, weights, A, B, &m, scratch);
-    stewart_riccati_work *work = (stewart_riccati_work *)stewart_take(&scratch, riccati_numbers());
-    return solve_gain(&m, fraction > 0, K, work);
+    return solve_gain(&m, fraction > 0, K, scratch);
 }
 
 void stewart_feed_back(const stewart_cost *cost, const real *K, const real *error,

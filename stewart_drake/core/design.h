@@ -49,6 +49,6 @@ void stewart_feed_back(const stewart_cost *cost, const real *K, const real *erro
                        real *torque);
 
 int stewart_linearize_scratch(void);
-int stewart_gain_scratch(void);
+int stewart_gain_scratch(const stewart_cost *cost, int pending);
 
 #endif

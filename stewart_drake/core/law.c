@@ -455,7 +455,8 @@ int stewart_step_scratch(const stewart_law *law)
     const int behind = (X + U + 1) * 2 * (law->longest_wait + 1);
     const int following = 2 * rows + X * (queue + 2);
     int channelled = channel ? channel->scratch(law) : 0;
-    const int designing = stewart_linearize_scratch() + stewart_gain_scratch();
+    const int gaining = stewart_gain_scratch(&law->cost, law->fraction > 0);
+    const int designing = stewart_linearize_scratch() + gaining;
     const int feeding = U * STEWART_MAX_ORDER + X * (X + U) + X * (parts + 1) + designing;
     const int used = feeding > following ? feeding : following;
     const int planned = law->planner ? law->planner->scratch(law) : 0;
@@ -463,7 +464,9 @@ int stewart_step_scratch(const stewart_law *law)
         channelled = planned;
     const int acting = 3 * rows + law->rows + (used > channelled ? used : channelled);
     const int observing = law->observer->scratch(law);
-    return law->measured + telling + behind + (acting > observing ? acting : observing);
+    /* An estimated delay has its own instants and torques, of the preview and of the last period. */
+    const int outlook = law->observer->fixed ? telling : (U + 2) * law->rows + 2 * (U + 1) * 8;
+    return law->measured + outlook + behind + (acting > observing ? acting : observing);
 }
 
 int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,

@@ -315,9 +315,3 @@ int stewart_lqr(int n, const real *A, const real *B, const real *Q, const real *
         stewart_copy(n * n, H, P);
     return count;
 }
-
-int stewart_riccati(int n, const real *A, const real *B, const real *Q, const real *R, real *K,
-                    real *P, stewart_riccati_work *work)
-{
-    return stewart_lqr(n, A, B, Q, R, K, P, (stewart_scratch){work->numbers});
-}

@@ -19,12 +19,4 @@ int stewart_lqr(int n, const real *A, const real *B, const real *Q, const real *
 
 int stewart_lqr_scratch(int n);
 
-/* The same with a place for every n. */
-typedef struct {
-    real numbers[6 * STEWART_MAX_ORDER * STEWART_MAX_ORDER];
-} stewart_riccati_work;
-
-int stewart_riccati(int n, const real *A, const real *B, const real *Q, const real *R, real *K,
-                    real *P, stewart_riccati_work *work);
-
 #endif

@@ -42,7 +42,7 @@ class Doubling:
         kept = [np.ascontiguousarray(matrix, np.float64) for matrix in (A, B, Q, R)]
         given = [c.at(matrix) for matrix in kept]
         K, P = np.empty((NUM_TORQUES, n)), np.empty((n, n))
-        work = c.ffi.new("stewart_riccati_work *")
-        if not c.lib.stewart_riccati(n, *given, c.at(K), c.at(P), work):
+        scratch = c.scratch(c.lib.stewart_lqr_scratch(n))
+        if not c.lib.stewart_lqr(n, *given, c.at(K), c.at(P), scratch):
             raise RiccatiError("Riccati equation: doubling has found no solution")
         return K, P
