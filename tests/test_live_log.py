@@ -215,7 +215,7 @@ def test_ten_minutes_keep_no_more_than_a_minute():
     measurement = Measurement.of(wanted[:12])
     motion = KnownMotion(planned, planned, 0.0)
     memory = law.step(memory, measurement, motion, np.ones(2))
-    record, held = LiveRecord(experiment, "python", 10.0, None, print), {}
+    record, held = LiveRecord(experiment, 10.0, None, print), {}
     tracemalloc.start()
     try:
         for k in range(6_001):
