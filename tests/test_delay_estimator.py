@@ -76,10 +76,10 @@ def test_what_acts_is_what_arrived_last(eta: float, rate: float, sent: int, newe
     before = -np.arange(1.0, 8)[:, None] * np.ones(6)
     arrivals = Arrivals(DT, Delay(0), eta, rate, sent, before)
     end = min(arrivals.eta, 0.7)
-    acting = arrivals.within(torques, 0.0, end, newest)
-    assert acting.durations.sum() == pytest.approx(end) and np.all(acting.durations >= 0)
+    schedule = arrivals.within(torques, 0.0, end, newest)
+    assert schedule.durations.sum() == pytest.approx(end) and np.all(schedule.durations >= 0)
     t = 0.0
-    for torque, duration in zip(acting.torques, acting.durations, strict=True):
+    for torque, duration in zip(schedule.torques, schedule.durations, strict=True):
         for share in (0.01, 0.5, 0.99) if duration > 1e-6 else ():
             assert torque[0] == acting_at(arrivals, torques, t + share * duration, newest)
         t += duration
@@ -91,9 +91,9 @@ def test_whole_and_real_delays_agree(steps: int, fraction: float) -> None:
     torques, whole = rng.normal(0, 0.02, (9, 6)), Timeline(DT, Delay(steps, fraction))
     real = Arrivals(DT, Delay(0), whole.eta, 0.0, 9, np.zeros((1, 6)))
     for t in (whole, real):
-        acting = t.until_next(t.queue(torques))
+        schedule = t.until_next(t.queue(torques))
         # The exact dynamics tell whether both let the same act for as long.
-        end = PLANT.predict(HOME, acting)[-1]
+        end = PLANT.predict(HOME, schedule)[-1]
         assert end == pytest.approx(PLANT.predict(HOME, real.until_next(torques))[-1], abs=1e-12)
     assert real.holds(-1, 1) == pytest.approx(whole.holds(-1, 1))
 

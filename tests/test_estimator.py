@@ -73,8 +73,8 @@ def transition(dynamics: StewartDynamics, xi: Array, period: Period) -> tuple[Ar
     """State (12,) after the torques, and F (20, 20) of [state; parameters], of the core."""
     c, number = core(), len(period.torques)
     states, H, F = np.empty((number, 12)), np.empty((number, 12, 20)), np.eye(20)
-    acting = [number, c.at(period.torques), c.at(period.durations), period.substeps]
-    given = (c.at(xi), c.ffi.new("stewart_acting *", acting), 1, c.at(states), c.at(H))
+    schedule = [number, c.at(period.torques), c.at(period.durations), period.substeps]
+    given = (c.at(xi), c.ffi.new("stewart_schedule *", schedule), 1, c.at(states), c.at(H))
     scratch = c.scratch(c.lib.stewart_transitions_scratch(8))
     assert c.lib.stewart_transitions(machine_of(dynamics).it, *given, scratch)
     F[:12] = H[-1]
@@ -232,8 +232,8 @@ def test_kicks_are_what_early_and_late_torques_do(
     torques = three[: len(durations)].copy()
     after = PLANT.predict(x, torques, durations, 8, theta)[-1]
     c, kick, following = core(), np.empty(12), three[1].copy()  # one change alone
-    acting = [len(torques), c.at(torques), c.at(durations), 8]
-    period = c.ffi.new("stewart_acted *", [acting, c.at(following)])
+    schedule = [len(torques), c.at(torques), c.at(durations), 8]
+    period = c.ffi.new("stewart_interval *", [schedule, c.at(following)])
     machine = machine_of(PLANT).it
     c.lib.stewart_kicks(machine, period, c.at(after), c.at(theta), c.at(kick))
     kick = np.sqrt(kick)

@@ -56,7 +56,9 @@ def test_a_csv_log_is_read(tmp_path):
     np.testing.assert_allclose(log.torques[:3, 0], [0.0, 0.1, 0.2])
     np.testing.assert_allclose(log.values[5, ANGLES], np.deg2rad(HOME), atol=1e-8)
     np.testing.assert_allclose(log.values[5, POSE], [np.deg2rad(1.5), 0.1, np.nan, 2e-3, 0, 0.38])
-    np.testing.assert_allclose(log.acting(np.array([0.0, 0.19, 0.21]), 0.1)[:, 0], [0, 0, 0.1])
+    np.testing.assert_allclose(
+        log.applied_torque(np.array([0.0, 0.19, 0.21]), 0.1)[:, 0], [0, 0, 0.1]
+    )
 
 
 def test_measurements_come_at_100_hz_at_most(tmp_path):

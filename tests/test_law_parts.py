@@ -71,7 +71,7 @@ def test_what_acts_when_is_what_the_delay_says(steps: int, fraction: float) -> N
 
     # One torque more than fly covers the last period too.
     begin = -dt
-    torques, durations = timeline.acting(in_flight)
+    torques, durations = timeline.schedule(in_flight)
     assert len(torques) == len(durations)
     for torque, duration in zip(torques, durations, strict=True):
         for share in (0.01, 0.5, 0.99):
@@ -116,7 +116,7 @@ def test_strong_torques_are_integrated_in_finer_steps() -> None:
         torques[1, 4] = -size
         assert PLANT.substeps_for(torques) == steps
         expected = HEAVY.predict(HOME[:12], torques, np.full(3, 0.02), steps)
-        found = PLANT.predict(HOME[:12], Timeline(0.02, Delay(3, 0.0)).acting(torques))
+        found = PLANT.predict(HOME[:12], Timeline(0.02, Delay(3, 0.0)).schedule(torques))
         assert np.array_equal(found, expected)
     assert PLANT.substeps_for(np.zeros((0, 6))) == 2
 
@@ -406,8 +406,8 @@ class Blend:
     ) -> Belief:
         if not belief.has_state:
             return belief.at(measurement.values) if measurement.complete else belief
-        acting, _ = belief.timeline.last_period(in_flight)
-        x = plant.predict(belief.state, acting)[-1]
+        schedule, _ = belief.timeline.last_period(in_flight)
+        x = plant.predict(belief.state, schedule)[-1]
         beside = np.where(measurement.valid, measurement.values - x, 0.0)
         return belief.at(x + self.share * beside)
 

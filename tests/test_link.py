@@ -16,7 +16,7 @@ from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.loop.varying_delay import VaryingDelay
 from stewart_drake.scenario.config import DelayConfig
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.link import acting, delay_at, torque_delays
+from stewart_drake.scenario.link import delay_at, takes_effect, torque_delays
 from stewart_drake.types import Array
 
 PERIOD = 0.1
@@ -110,8 +110,8 @@ def test_a_constant_delay_is_the_delay_chain(steps: int, fraction: float) -> Non
 
 def test_a_torque_that_was_overtaken_never_acts() -> None:
     # Sent at 0, 1, 2, 3 s: the second comes after the third, the fourth together with the third.
-    assert acting(np.array([0.5, 4.0, 3.5, 3.5])).tolist() == [True, False, False, True]
-    assert acting(np.array([0.5, np.inf, 3.5])).tolist() == [True, False, True]
+    assert takes_effect(np.array([0.5, 4.0, 3.5, 3.5])).tolist() == [True, False, False, True]
+    assert takes_effect(np.array([0.5, np.inf, 3.5])).tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize("wrong", [np.array([0.1, -0.1]), np.array([np.nan]), np.empty(0)])

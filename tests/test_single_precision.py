@@ -140,8 +140,8 @@ def test_a_filter_is_right_to_a_share_of_its_deviation(
             root = np.linalg.cholesky(estimate.covariance + 1e-30 * np.eye(n))
             counts = (estimate.outliers, estimate.unseen, 0)
             memory = np.array([*estimate.mean, *root.ravel(), *estimate.outlier, *counts], "f4")
-        acting = [len(period.torques), *map(single.at, period[:2]), period.substeps]
-        acted = single.ffi.new("stewart_acted *", [acting, single.at(period.following)])
+        schedule = [len(period.torques), *map(single.at, period[:2]), period.substeps]
+        acted = single.ffi.new("stewart_interval *", [schedule, single.at(period.following)])
         history = single.ffi.new("stewart_history *", list(map(single.at, one._before())))
         values = single.ffi.NULL if measurement is None else single.at(measurement.known(m))
         number = single.lib.stewart_filter_scratch(filter_, len(period.torques))

@@ -17,7 +17,7 @@
 
 #define X STEWART_STATES
 #define U STEWART_MOTORS
-#define MOST STEWART_MOST_ACTING
+#define MOST STEWART_MAX_SCHEDULE
 
 #define ITERATIONS 6 /* at the most, while the delay is hardly known */
 #define FEW 4        /* once it is known */
@@ -107,8 +107,8 @@ static int predict(const stewart_period *t, const real *xi, Way *way, real *stat
 {
     if (!act(t, xi, 0, t->delay->period, way))
         return 0;
-    const stewart_acting acting = {way->number, way->torques, way->durations, 0};
-    stewart_predict(t->delay->machine, xi + X, &acting, xi, way->states);
+    const stewart_schedule schedule = {way->number, way->torques, way->durations, 0};
+    stewart_predict(t->delay->machine, xi + X, &schedule, xi, way->states);
     stewart_copy(X, way->states + X * (way->number - 1), state);
     return 1;
 }
@@ -141,10 +141,10 @@ static int linearize_along(const stewart_period *t, const real *xi, const Way *w
                            stewart_scratch scratch)
 {
     const int n = size_of(t->delay), known = n - 2;
-    const stewart_acting acting = {way->number, way->torques, way->durations, 0};
+    const stewart_schedule schedule = {way->number, way->torques, way->durations, 0};
     real *all = stewart_take(&scratch, MOST * X * known), *moved = stewart_take(&scratch, n);
     real later[X], sooner[X];
-    if (!stewart_transitions_along(t->delay->machine, xi, &acting, exact, way->states, all, scratch))
+    if (!stewart_transitions_along(t->delay->machine, xi, &schedule, exact, way->states, all, scratch))
         return 0;
     for (int i = 0; i < X; i++) {
         stewart_copy(known, all + X * known * (way->number - 1) + known * i, H + n * i);

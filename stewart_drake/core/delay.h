@@ -11,7 +11,7 @@
 enum {
     STEWART_GUESS = 9,        /* numbers of a hypothesis without its mean and root */
     STEWART_DELAY_NUMBERS = 16, /* numbers of the memory without its arrays */
-    STEWART_MOST_ACTING = 8,  /* torques that act in a period, at a rate of the delay within bounds */
+    STEWART_MAX_SCHEDULE = 8,  /* torques that act in a period, at a rate of the delay within bounds */
 };
 
 /* What is assumed of the state, the parameters theta (p) and the delay. */
@@ -75,7 +75,7 @@ int stewart_period_at(const stewart_period *period, const real *xi, int exact, r
 
 /* Rows K (k, 12) by which the state at the end differs where single torques are early or late: the
    first `others` by one standard deviation of those before the controller's own, the rest by that of
-   the own ones, `std` in s. K'K is the covariance. Returns k, at most STEWART_MOST_ACTING, or -1. */
+   the own ones, `std` in s. K'K is the covariance. Returns k, at most STEWART_MAX_SCHEDULE, or -1. */
 int stewart_period_late(const stewart_period *period, const real *xi, const real *state, real std,
                         real *K, int *others, stewart_scratch scratch);
 

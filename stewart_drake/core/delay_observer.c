@@ -114,7 +114,7 @@ void stewart_delayed_tell(const stewart_law *law, const real *memory, int number
     const stewart_delay_memory *m = (const stewart_delay_memory *)memory;
     const stewart_arrivals arrivals = arrivals_of(law, memory);
     const int most = settings->most;
-    real *acting = stewart_take(scratch, U * most), *durations = stewart_take(scratch, most);
+    real *each = stewart_take(scratch, U * most), *durations = stewart_take(scratch, most);
     real *times = stewart_take(scratch, most);
     stewart_copy(X, memory + believed_numbers(law) + size_of(law), outlook->state);
     real std[STEWART_MAX_ESTIMATED];
@@ -126,27 +126,27 @@ void stewart_delayed_tell(const stewart_law *law, const real *memory, int number
     outlook->eta = m->eta * (1 + m->rate);
     outlook->fraction = 0;
     outlook->pending = 0;
-    const int pieces = stewart_within(&arrivals, number, torques, 0, outlook->eta, -1, acting, durations);
-    outlook->until = outlook->horizon = (stewart_acting){pieces, acting, durations, 0};
+    const int pieces = stewart_within(&arrivals, number, torques, 0, outlook->eta, -1, each, durations);
+    outlook->until = outlook->horizon = (stewart_schedule){pieces, each, durations, 0};
     outlook->samples = stewart_switches(&arrivals, 0, outlook->eta, -1, times);
     times[outlook->samples++] = outlook->eta;
     outlook->times = times;
-    stewart_acting last;
+    stewart_schedule last;
     law->observer->last_period(law, memory, number, torques, &last, NULL, scratch);
     outlook->limited = stewart_at_limit(&law->machine, last.number, last.torques);
 }
 
 void stewart_delayed_last_period(const stewart_law *law, const real *memory, int number,
-                                 const real *torques, stewart_acting *acting,
+                                 const real *torques, stewart_schedule *schedule,
                                  const real **following, stewart_scratch *scratch)
 {
     const stewart_arrivals arrivals = arrivals_of(law, memory);
-    real *each = stewart_take(scratch, U * STEWART_MOST_ACTING);
-    real *durations = stewart_take(scratch, STEWART_MOST_ACTING);
+    real *each = stewart_take(scratch, U * STEWART_MAX_SCHEDULE);
+    real *durations = stewart_take(scratch, STEWART_MAX_SCHEDULE);
     const int pieces = stewart_within(&arrivals, number, torques, -law->period, 0, -1, each, durations);
-    *acting = (stewart_acting){pieces, each, durations, 0};
+    *schedule = (stewart_schedule){pieces, each, durations, 0};
     if (following) {
-        real *next = stewart_take(scratch, U * STEWART_MOST_ACTING), *h = stewart_take(scratch, STEWART_MOST_ACTING);
+        real *next = stewart_take(scratch, U * STEWART_MAX_SCHEDULE), *h = stewart_take(scratch, STEWART_MAX_SCHEDULE);
         stewart_within(&arrivals, number, torques, 0, law->period, -1, next, h);
         *following = next;
     }

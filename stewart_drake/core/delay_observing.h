@@ -24,7 +24,7 @@ void stewart_delayed_tell(const stewart_law *law, const real *memory, int number
 void stewart_delayed_assume(const stewart_law *law, real *memory, const real *state);
 void stewart_delayed_parameters(const stewart_law *law, const real *memory, real *theta, real *std);
 void stewart_delayed_last_period(const stewart_law *law, const real *memory, int number,
-                                 const real *torques, stewart_acting *acting,
+                                 const real *torques, stewart_schedule *schedule,
                                  const real **following, stewart_scratch *scratch);
 
 #endif

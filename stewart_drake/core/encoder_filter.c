@@ -17,23 +17,23 @@
 
 /* Cut what acts (number) at instants (n) in s too, ascending and within it: `pieces` takes number + n of
    torques and durations, and `places` (n) which piece ends at each instant. */
-static stewart_acting cut(const stewart_acting *acting, int n, const real *instants,
+static stewart_schedule cut(const stewart_schedule *schedule, int n, const real *instants,
                           real *torques, real *durations, real *places)
 {
-    stewart_acting pieces = {0, torques, durations, 0};
+    stewart_schedule pieces = {0, torques, durations, 0};
     real total = 0, longest = 0, most = 0, passed = 0, end = 0;
     int next = 0;
-    for (int k = 0; k < acting->number; k++) {
-        total += acting->durations[k];
-        most = acting->durations[k] > most ? acting->durations[k] : most;
+    for (int k = 0; k < schedule->number; k++) {
+        total += schedule->durations[k];
+        most = schedule->durations[k] > most ? schedule->durations[k] : most;
     }
     const real apart = ROUNDING * total;
-    for (int k = 0; k < acting->number; k++) {
-        end += acting->durations[k];
+    for (int k = 0; k < schedule->number; k++) {
+        end += schedule->durations[k];
         while (end - passed > apart) {
             int piece = pieces.number++;
             real until = next < n && instants[next] < end - apart ? instants[next] : end;
-            stewart_copy(U, acting->torques + U * k, torques + U * piece);
+            stewart_copy(U, schedule->torques + U * k, torques + U * piece);
             durations[piece] = until - passed;
             longest = durations[piece] > longest ? durations[piece] : longest;
             for (; next < n && instants[next] <= until + apart; next++)
@@ -43,7 +43,7 @@ static stewart_acting cut(const stewart_acting *acting, int n, const real *insta
     }
     for (; next < n; next++) /* beyond the end by rounding */
         places[next] = (real)(pieces.number - 1);
-    pieces.substeps = (int)REAL(ceil)((real)acting->substeps * longest / most - ROUNDING);
+    pieces.substeps = (int)REAL(ceil)((real)schedule->substeps * longest / most - ROUNDING);
     return pieces;
 }
 
@@ -62,7 +62,7 @@ typedef struct {
     stewart_attempt *attempt;
     const stewart_encoders *encoders;
     real *states, *H;            /* (number, 12), (number, 12, n) of `stewart_transitions` */
-    stewart_acting coarse, fine; /* cut at nodes and at samples */
+    stewart_schedule coarse, fine; /* cut at nodes and at samples */
     real places[3];
     real *samples;    /* (N) pieces of `fine` */
     real *shown;      /* (N, 6) */
@@ -189,24 +189,24 @@ static int settle_legs(void *model, const real *xi, const real *better, stewart_
 /* Take the scratch memory of an attempt, and cut the period. */
 static stewart_scratch prepare(Legs *s, stewart_scratch scratch)
 {
-    const stewart_acting *acting = &s->attempt->period->acting;
+    const stewart_schedule *schedule = &s->attempt->period->schedule;
     const stewart_encoders *encoders = s->encoders;
     const int n = s->attempt->n, N = encoders->samples, M = encoders->nodes;
-    const int fine = acting->number + N;
+    const int fine = schedule->number + N;
     real total = 0, *instants = stewart_take(&scratch, N);
-    real *torques = stewart_take(&scratch, U * (acting->number + M));
-    real *durations = stewart_take(&scratch, acting->number + M);
-    for (int k = 0; k < acting->number; k++)
-        total += acting->durations[k];
+    real *torques = stewart_take(&scratch, U * (schedule->number + M));
+    real *durations = stewart_take(&scratch, schedule->number + M);
+    for (int k = 0; k < schedule->number; k++)
+        total += schedule->durations[k];
     for (int j = 0; j < M; j++)
         instants[j] = total * encoders->shares[j];
-    s->coarse = cut(acting, M, instants, torques, durations, s->places);
+    s->coarse = cut(schedule, M, instants, torques, durations, s->places);
     torques = stewart_take(&scratch, U * fine);
     durations = stewart_take(&scratch, fine);
     s->samples = stewart_take(&scratch, N);
     for (int k = 0; k < N; k++)
         instants[k] = total * (real)(k + 1) / (real)N;
-    s->fine = cut(acting, N, instants, torques, durations, s->samples);
+    s->fine = cut(schedule, N, instants, torques, durations, s->samples);
     s->shown = stewart_take(&scratch, LEGS * N);
     s->seen = stewart_take(&scratch, X * fine);
     s->reading.angles = stewart_take(&scratch, LEGS * N);
@@ -220,7 +220,7 @@ static stewart_scratch prepare(Legs *s, stewart_scratch scratch)
 static int attempt(stewart_attempt *a, stewart_scratch scratch)
 {
     const stewart_filter *f = a->filter;
-    const stewart_acting *acting = &a->period->acting;
+    const stewart_schedule *schedule = &a->period->schedule;
     const stewart_history *history = a->history;
     Legs s = {.attempt = a, .encoders = f->sensing->kind};
     real *xi = a->after->mean, distance = 0, spread;
@@ -235,8 +235,8 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
                                    a->prior->root, f->lower, f->upper, &s, rows_of_legs, settle_legs};
     if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &spread, scratch))
         return 0;
-    stewart_predict(f->machine, xi + X, acting, xi, s.seen);
-    stewart_copy(X, s.seen + X * (acting->number - 1), a->end);
+    stewart_predict(f->machine, xi + X, schedule, xi, s.seen);
+    stewart_copy(X, s.seen + X * (schedule->number - 1), a->end);
     return stewart_attempt_ended(a, scratch);
 }
 

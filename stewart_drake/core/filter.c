@@ -40,22 +40,22 @@ static int is_known(const stewart_filter *filter, const real *root, real share)
     return 1;
 }
 
-void stewart_kicks(const stewart_machine *machine, const stewart_acted *period, const real *state,
+void stewart_kicks(const stewart_machine *machine, const stewart_interval *period, const real *state,
                    const real *theta, real *squares)
 {
-    const stewart_acting *acting = &period->acting;
+    const stewart_schedule *schedule = &period->schedule;
     stewart_belief belief;
     real before[6], after[6], left = 0;
     stewart_believe(machine, theta, &belief);
     stewart_fill(X, 0, squares);
-    for (int k = 0; k < acting->number; k++)
-        left += acting->durations[k];
-    stewart_accelerate(&belief, state, acting->torques, before);
-    for (int k = 0; k < acting->number; k++) {
-        const int last = k + 1 == acting->number;
-        stewart_accelerate(&belief, state, last ? period->following : acting->torques + U * (k + 1),
+    for (int k = 0; k < schedule->number; k++)
+        left += schedule->durations[k];
+    stewart_accelerate(&belief, state, schedule->torques, before);
+    for (int k = 0; k < schedule->number; k++) {
+        const int last = k + 1 == schedule->number;
+        stewart_accelerate(&belief, state, last ? period->following : schedule->torques + U * (k + 1),
                            after);
-        left = last ? 0 : left - acting->durations[k];
+        left = last ? 0 : left - schedule->durations[k];
         for (int i = 0; i < 6; i++) {
             const real change = after[i] - before[i];
             squares[i] += left * change * left * change;
@@ -102,9 +102,9 @@ typedef struct {
 static int predict(void *about, const real *xi, real *end)
 {
     Sample *s = about;
-    const stewart_acting *acting = &s->attempt->period->acting;
-    stewart_predict(s->attempt->filter->machine, xi + X, acting, xi, s->states);
-    stewart_copy(X, s->states + X * (acting->number - 1), end);
+    const stewart_schedule *schedule = &s->attempt->period->schedule;
+    stewart_predict(s->attempt->filter->machine, xi + X, schedule, xi, s->states);
+    stewart_copy(X, s->states + X * (schedule->number - 1), end);
     return 1;
 }
 
@@ -113,7 +113,7 @@ static int linearize(void *about, const real *xi, real *last, stewart_scratch sc
 {
     Sample *s = about;
     (void)last;
-    return stewart_transitions_along(s->attempt->filter->machine, xi, &s->attempt->period->acting,
+    return stewart_transitions_along(s->attempt->filter->machine, xi, &s->attempt->period->schedule,
                                      s->exact, s->states, s->H, scratch);
 }
 
@@ -121,7 +121,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
 {
     const stewart_filter *f = a->filter;
     const stewart_posterior *prior = a->prior;
-    const int n = a->n, m = f->sensing->size, pieces = a->period->acting.number;
+    const int n = a->n, m = f->sensing->size, pieces = a->period->schedule.number;
     /* Corrections of parameters that are known already are too small to need F to fourth order. */
     Sample s = {.attempt = a, .exact = !is_known(f, prior->root, KNOWN)};
     real *xi = a->after->mean, distance = 0, spread;
@@ -160,7 +160,7 @@ static int go_on(int n, const stewart_posterior *prior, const stewart_linear *li
 
 /* Mean and root `after` a period and values; `linear`, unless it is NULL, is about the prior, and all
    that is found without values. Returns 0 for an outlier, or where there is no finite result. */
-static int attempt(const stewart_filter *f, const stewart_acted *period,
+static int attempt(const stewart_filter *f, const stewart_interval *period,
                    const stewart_posterior *prior, const real *values,
                    const stewart_history *history, stewart_linear *linear,
                    stewart_posterior *after, stewart_scratch scratch)
@@ -214,7 +214,7 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
     *now->partly = *found->partly;
 }
 
-void stewart_filter_advance(const stewart_filter *filter, const stewart_acted *period,
+void stewart_filter_advance(const stewart_filter *filter, const stewart_interval *period,
                             const real *values, const stewart_history *history, real *estimate,
                             stewart_scratch scratch)
 {

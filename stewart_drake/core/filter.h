@@ -51,9 +51,9 @@ typedef struct {
 
 /* What acted between two samples, as far as the delay is what it is believed to be. */
 typedef struct {
-    stewart_acting acting; /* with its substeps */
+    stewart_schedule schedule; /* with its substeps */
     const real *following; /* (6) N m, acts next */
-} stewart_acted;
+} stewart_interval;
 
 /* What was known of a sensor before a measurement; encoders look at it. */
 typedef struct {
@@ -81,7 +81,7 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
    go on, the measurement is believed. So is the first one that fits after three or more periods
    without any, if little of the parameters was known by then: linearised along a way that is only
    guessed, the covariance means nothing. */
-void stewart_filter_advance(const stewart_filter *filter, const stewart_acted *period,
+void stewart_filter_advance(const stewart_filter *filter, const stewart_interval *period,
                             const real *values, const stewart_history *history, real *estimate,
                             stewart_scratch scratch);
 
@@ -91,7 +91,7 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques);
 /* Changes (12) of the last state per s by which one of the changes of torque comes early, their squares
    summed. To first order: for that time the acceleration differs by B dT, which stays in the rates, and
    moves the pose for what is left of the period. */
-void stewart_kicks(const stewart_machine *machine, const stewart_acted *period, const real *state,
+void stewart_kicks(const stewart_machine *machine, const stewart_interval *period, const real *state,
                    const real *theta, real *squares);
 
 #endif

@@ -15,7 +15,7 @@ typedef struct {
 typedef struct {
     const stewart_filter *filter;
     int n;
-    const stewart_acted *period;
+    const stewart_interval *period;
     const stewart_posterior *prior;
     const real *values; /* or NULL */
     const stewart_history *history;

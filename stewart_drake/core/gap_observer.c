@@ -53,26 +53,26 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
         stewart_state_fault(law->sensing, law->machine.geometry, law->period, values, last);
     const int status = stewart_state_filter_observe(law, memory, number, torques, values, scratch);
     const int had_anchor = *periods > 0, parts = (int)*pieces;
-    stewart_acted period = stewart_acted_last(law, number, torques, &scratch);
+    stewart_interval period = stewart_last_interval(law, number, torques, &scratch);
     const stewart_history history = {last, NULL};
     const int gone = isnan(before.root[0]) || *before.outliers > 0 || *periods >= LONGEST_GAP;
     const int unseen = *now.unseen > *before.unseen && !(*now.outliers > 0);
     if (!gone && (unseen || had_anchor)) {
         if (!had_anchor)
             stewart_copy(size, known, anchor);
-        stewart_copy(U * period.acting.number, period.acting.torques, since + U * parts);
-        stewart_copy(period.acting.number, period.acting.durations, durations + parts);
-        *pieces += (real)period.acting.number;
+        stewart_copy(U * period.schedule.number, period.schedule.torques, since + U * parts);
+        stewart_copy(period.schedule.number, period.schedule.durations, durations + parts);
+        *pieces += (real)period.schedule.number;
         *periods += 1;
     }
     if (!gone && unseen)
         return status;
     const real passed = *periods, h = law->period;
-    period.acting = (stewart_acting){(int)*pieces, since, durations, 0};
+    period.schedule = (stewart_schedule){(int)*pieces, since, durations, 0};
     *periods = *pieces = 0;
     if (gone || !had_anchor || fault)
         return status;
-    period.acting.substeps = stewart_substeps(&law->machine, period.acting.number, since);
+    period.schedule.substeps = stewart_substeps(&law->machine, period.schedule.number, since);
     for (int i = 0; i < 6; i++) {
         const real pose = settings->filter.model_std[i], rate = settings->filter.model_std[6 + i];
         const real drifts = (passed - 1) * passed * (2 * passed - 1) / 6 * h * h;

@@ -116,15 +116,15 @@ static void fixed_delay_outlook(const stewart_law *law, const real *in_flight, s
     const real *torques = in_flight + U * (length - queue);
     real *times = stewart_take(scratch, law->steps + 1);
     real *durations = stewart_take(scratch, queue + 1);
-    stewart_acting last;
+    stewart_schedule last;
     for (int k = 0; k < law->steps; k++)
         times[k] = law->period * (real)(k + 1);
     for (int k = 0; k < queue; k++)
         durations[k] = (k == 0 && pending ? law->fraction : 1) * law->period;
     outlook->eta = ((real)law->steps + law->fraction) * law->period;
     outlook->fraction = law->fraction;
-    outlook->until = (stewart_acting){queue, torques, durations, 0};
-    outlook->horizon = stewart_acting_of(law, law->steps, torques, scratch);
+    outlook->until = (stewart_schedule){queue, torques, durations, 0};
+    outlook->horizon = stewart_schedule_of(law, law->steps, torques, scratch);
     outlook->samples = law->steps;
     outlook->times = times;
     outlook->pending = pending;
@@ -166,11 +166,11 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
         fixed_delay_outlook(law, in_flight, outlook, scratch);
     observer->tell(law, observed, length, in_flight, outlook, scratch);
     if (behind > 0 && stewart_all_finite(X, outlook->state)) {
-        stewart_acting acting;
-        stewart_last_periods(law, length, in_flight, behind, &acting, NULL, scratch);
-        real *states = stewart_take(scratch, X * acting.number);
-        stewart_predict(&law->machine, outlook->theta, &acting, outlook->state, states);
-        stewart_copy(X, states + X * (acting.number - 1), outlook->state);
+        stewart_schedule schedule;
+        stewart_last_periods(law, length, in_flight, behind, &schedule, NULL, scratch);
+        real *states = stewart_take(scratch, X * schedule.number);
+        stewart_predict(&law->machine, outlook->theta, &schedule, outlook->state, states);
+        stewart_copy(X, states + X * (schedule.number - 1), outlook->state);
     }
 }
 
@@ -215,7 +215,7 @@ static int is_quiet(const stewart_law *law, const real *memory)
 static void predict_way(const stewart_law *law, const stewart_outlook *outlook, const course *c, real *way,
                         real *state, stewart_scratch scratch)
 {
-    const stewart_acting *until = &outlook->until;
+    const stewart_schedule *until = &outlook->until;
     real *states = stewart_take(&scratch, X * (until->number + 1)), ends[2][ROW], begin = 0;
     stewart_belief belief;
     stewart_believe(&law->machine, outlook->theta, &belief);
@@ -350,20 +350,20 @@ static void remember_course(const stewart_law *law, real *memory, const course *
 static void predict(const stewart_law *law, const stewart_outlook *outlook, const real *followed,
                     const real *integral, stewart_ahead *a, stewart_scratch scratch)
 {
-    const stewart_acting *acting = &outlook->horizon;
-    real *states = stewart_take(&scratch, X * (acting->number + 1)), before[6];
-    const int each = outlook->samples > 0 ? acting->number / outlook->samples : 1;
+    const stewart_schedule *schedule = &outlook->horizon;
+    real *states = stewart_take(&scratch, X * (schedule->number + 1)), before[6];
+    const int each = outlook->samples > 0 ? schedule->number / outlook->samples : 1;
     stewart_copy(X, outlook->state, states);
     stewart_copy(6, integral, a->integral);
     for (int i = 0; i < 6; i++)
         before[i] = outlook->state[i] - followed[i];
-    stewart_predict(&law->machine, outlook->theta, acting, states, states + X);
+    stewart_predict(&law->machine, outlook->theta, schedule, states, states + X);
     for (int k = 0; k < outlook->samples; k++) {
         const real *wanted = followed + ROW * (k + 1), *end = states + X * each * (k + 1);
-        const int waits = stewart_at_limit(&law->machine, each, acting->torques + U * each * k);
+        const int waits = stewart_at_limit(&law->machine, each, schedule->torques + U * each * k);
         real h = 0;
         for (int i = 0; i < each; i++)
-            h += acting->durations[each * k + i];
+            h += schedule->durations[each * k + i];
         for (int i = 0; i < 6; i++) {
             real error = end[i] - wanted[i];
             if (!waits)
@@ -371,7 +371,7 @@ static void predict(const stewart_law *law, const stewart_outlook *outlook, cons
             before[i] = error;
         }
     }
-    stewart_copy(X, states + X * acting->number, a->state);
+    stewart_copy(X, states + X * schedule->number, a->state);
     for (int i = 0; i < X; i++)
         a->error[i] = a->state[i] - followed[ROW * outlook->samples + i];
 }
@@ -462,11 +462,11 @@ int stewart_step_scratch(const stewart_law *law)
     const int planned = law->planner ? law->planner->scratch(law) : 0;
     if (planned > channelled)
         channelled = planned;
-    const int acting = 3 * rows + law->rows + (used > channelled ? used : channelled);
+    const int holding = 3 * rows + law->rows + (used > channelled ? used : channelled);
     const int observing = law->observer->scratch(law);
     /* An estimated delay has its own instants and torques, of the preview and of the last period. */
     const int outlook = law->observer->fixed ? telling : (U + 2) * law->rows + 2 * (U + 1) * 8;
-    return law->measured + outlook + behind + (acting > observing ? acting : observing);
+    return law->measured + outlook + behind + (holding > observing ? holding : observing);
 }
 
 int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,

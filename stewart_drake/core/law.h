@@ -160,12 +160,12 @@ void stewart_given_rows(void *about, int number, const real *times, real *rows);
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited);
 
 /* What acts in whole periods that begin with the oldest of `periods` + 1 torques. */
-stewart_acting stewart_acting_of(const stewart_law *law, int periods, const real *torques,
+stewart_schedule stewart_schedule_of(const stewart_law *law, int periods, const real *torques,
                                  stewart_scratch *scratch);
 
 /* For observers of a fixed delay: what acted in the last `periods` of torques (number, 6), and the
    torque that acts next. */
 void stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
-                          stewart_acting *acting, const real **following, stewart_scratch *scratch);
+                          stewart_schedule *schedule, const real **following, stewart_scratch *scratch);
 
 #endif

@@ -27,7 +27,7 @@ void stewart_link_start(const stewart_link *link, double *memory)
     memory[STEWART_LINK_LAST] = memory[STEWART_LINK_NEWEST] = -(double)HUGE_VAL;
 }
 
-const double *stewart_link_acting(const double *memory) { return memory + STEWART_LINK_COMMANDS + 1; }
+const double *stewart_link_current(const double *memory) { return memory + STEWART_LINK_COMMANDS + 1; }
 
 /* `command` NULL is zero; it may be the one that acts. */
 static void act(const stewart_link *link, double *memory, const double *command, double time)
@@ -152,7 +152,7 @@ void stewart_link_change(const stewart_link *link, double *memory, double time)
     } else if (!link->wire) {
         memory[STEWART_LINK_DRY]++;
         memory[STEWART_LINK_FED] = 0;
-        act(link, memory, link->holds ? stewart_link_acting(memory) : NULL, time);
+        act(link, memory, link->holds ? stewart_link_current(memory) : NULL, time);
     }
     memory[STEWART_LINK_COUNTS] = 1;
     for (int i = (int)memory[STEWART_LINK_WAITING] - 1; i >= 0; i--) {
@@ -168,5 +168,5 @@ void stewart_link_safe(const stewart_link *link, double *memory, double time, in
     memory[STEWART_LINK_NEWEST] = -(double)HUGE_VAL; /* a new session counts anew */
     if (time > memory[STEWART_LINK_LAST])
         memory[STEWART_LINK_LAST] = time;
-    act(link, memory, holds ? stewart_link_acting(memory) : NULL, time);
+    act(link, memory, holds ? stewart_link_current(memory) : NULL, time);
 }

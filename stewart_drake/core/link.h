@@ -71,6 +71,6 @@ void stewart_link_change(const stewart_link *link, double *memory, double time);
 void stewart_link_safe(const stewart_link *link, double *memory, double time, int holds);
 
 /* The command (size) that acts. */
-const double *stewart_link_acting(const double *memory);
+const double *stewart_link_current(const double *memory);
 
 #endif

@@ -115,22 +115,22 @@ static void move(const stewart_belief *belief, const real *torque, real duration
     }
 }
 
-static int substeps_of(const stewart_machine *machine, const stewart_acting *acting)
+static int substeps_of(const stewart_machine *machine, const stewart_schedule *schedule)
 {
-    if (acting->substeps)
-        return acting->substeps;
-    return stewart_substeps(machine, acting->number, acting->torques);
+    if (schedule->substeps)
+        return schedule->substeps;
+    return stewart_substeps(machine, schedule->number, schedule->torques);
 }
 
-void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_acting *acting,
+void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_schedule *schedule,
                      const real *state, real *states)
 {
-    const int substeps = substeps_of(machine, acting);
+    const int substeps = substeps_of(machine, schedule);
     stewart_belief belief;
     stewart_believe(machine, theta, &belief);
-    for (int k = 0; k < acting->number; k++, state = states, states += X) {
+    for (int k = 0; k < schedule->number; k++, state = states, states += X) {
         stewart_copy(X, state, states);
-        move(&belief, acting->torques + U * k, acting->durations[k], substeps, states);
+        move(&belief, schedule->torques + U * k, schedule->durations[k], substeps, states);
     }
 }
 
@@ -240,15 +240,15 @@ static int transition_of_hold(const stewart_machine *machine, const stewart_beli
     return 1;
 }
 
-int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_acting *acting,
+int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
                         int exact, real *states, real *H, stewart_scratch scratch)
 {
-    stewart_predict(machine, xi + X, acting, xi, states);
-    return stewart_transitions_along(machine, xi, acting, exact, states, H, scratch);
+    stewart_predict(machine, xi + X, schedule, xi, states);
+    return stewart_transitions_along(machine, xi, schedule, exact, states, H, scratch);
 }
 
 int stewart_transitions_along(const stewart_machine *machine, const real *xi,
-                              const stewart_acting *acting, int exact, const real *states, real *H,
+                              const stewart_schedule *schedule, int exact, const real *states, real *H,
                               stewart_scratch scratch)
 {
     const int p = machine->estimated, n = X + p;
@@ -256,8 +256,8 @@ int stewart_transitions_along(const stewart_machine *machine, const real *xi,
     const real *start = xi, *before = NULL;
     stewart_belief belief;
     stewart_believe(machine, xi + X, &belief);
-    for (int k = 0; k < acting->number; k++, before = H, start = states, states += X, H += X * n) {
-        const real *torque = acting->torques + U * k, h = acting->durations[k];
+    for (int k = 0; k < schedule->number; k++, before = H, start = states, states += X, H += X * n) {
+        const real *torque = schedule->torques + U * k, h = schedule->durations[k];
         if (!transition_of_hold(machine, &belief, torque, h, exact, start, states, Phi, S, scratch))
             return 0;
         if (before) /* [Phi S; 0 1] [H; 0 1] */

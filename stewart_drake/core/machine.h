@@ -24,13 +24,13 @@ typedef struct {
     const real *map; /* (6, 6), or NULL: accelerations = map (torque + bias), whatever the pose */
 } stewart_machine;
 
-/* What acts, one torque after the other. */
+/* Torque schedule: torques that act one after the other, each for its duration. */
 typedef struct {
     int number;
     const real *torques;   /* (number, 6) N m */
     const real *durations; /* (number) s */
     int substeps;          /* for each of them; 0: by the largest torque */
-} stewart_acting;
+} stewart_schedule;
 
 /* A machine with estimated parameters in the place of those known beforehand. */
 typedef struct {
@@ -58,7 +58,7 @@ void stewart_accelerate(const stewart_belief *belief, const real *state, const r
                         real *accelerations);
 
 /* States (number, 12) after each of the torques, from a state (12). */
-void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_acting *acting,
+void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_schedule *schedule,
                      const real *state, real *states);
 
 /* d[accelerations]/d[state, torque, theta] at a point: A (12, 12), B (12, 6), G (12, p) of the state;
@@ -73,12 +73,12 @@ void stewart_within_hold(const real *start, const real *end, real h, real s, rea
 /* States (number, 12) after each of the torques, and the first 12 rows H (number, 12, 12 + p) of
    F = [Phi S; 0 1] from xi = [state; theta] to there. `exact`: Magnus steps of fourth order, else the
    midpoint's of second. Returns 0 where they do not exist. */
-int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_acting *acting,
+int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
                         int exact, real *states, real *H, stewart_scratch scratch);
 
 /* The same H along states that `stewart_predict` gave from xi. */
 int stewart_transitions_along(const stewart_machine *machine, const real *xi,
-                              const stewart_acting *acting, int exact, const real *states, real *H,
+                              const stewart_schedule *schedule, int exact, const real *states, real *H,
                               stewart_scratch scratch);
 
 int stewart_transitions_scratch(int estimated);

@@ -49,14 +49,14 @@ static void plan_ahead(const stewart_law *law, const stewart_outlook *outlook, c
         stewart_scratch rest = scratch;
         stewart_held held;
         stewart_copy(U, torque - U, flying[pending]);
-        const stewart_acting acting = stewart_acting_of(law, 1, flying[0], &rest);
-        stewart_predict(&law->machine, ahead->theta, &acting, state, ends[0]);
-        stewart_copy(X, ends[acting.number - 1], state);
+        const stewart_schedule schedule = stewart_schedule_of(law, 1, flying[0], &rest);
+        stewart_predict(&law->machine, ahead->theta, &schedule, state, ends[0]);
+        stewart_copy(X, ends[schedule.number - 1], state);
         stewart_copy(U, flying[pending], flying[0]); /* still to act, where a part of it is */
         stewart_copy(X, error, before);
         for (int i = 0; i < X; i++)
             error[i] = state[i] - rows[i];
-        if (!stewart_at_limit(&law->machine, acting.number, acting.torques))
+        if (!stewart_at_limit(&law->machine, schedule.number, schedule.torques))
             for (int i = 0; i < 6; i++)
                 integral[i] += law->period / 2 * (before[i] + error[i]);
         stewart_hold(&law->machine, &law->cost, ahead->theta, pending, rows + ROW, &held);

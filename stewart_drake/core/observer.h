@@ -30,8 +30,8 @@ typedef struct {
     real theta[STEWART_MAX_ESTIMATED];
     real eta;               /* s until the torque that is computed now begins to act */
     real fraction;          /* of a period, of `eta` beyond the last of `times` */
-    stewart_acting until;   /* what acts until then */
-    stewart_acting horizon; /* what acts until the last of `times`, the same number of pieces each */
+    stewart_schedule until;   /* what acts until then */
+    stewart_schedule horizon; /* what acts until the last of `times`, the same number of pieces each */
     int samples;            /* instants of the prediction */
     const real *times;      /* (samples) s from now */
     int pending;            /* 1 where the newest torque has not acted wholly by then */
@@ -59,7 +59,7 @@ typedef struct {
     void (*parameters)(const stewart_law *law, const real *memory, real *theta, real *std);
     /* What acted since the last sample of torques (number, 6) in flight, and what acts next. */
     void (*last_period)(const stewart_law *law, const real *memory, int number, const real *torques,
-                        stewart_acting *acting, const real **following, stewart_scratch *scratch);
+                        stewart_schedule *schedule, const real **following, stewart_scratch *scratch);
     int fixed; /* whether the delay is the one that the law assumes, which then fills in what follows */
 } stewart_observer;
 

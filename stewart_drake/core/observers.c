@@ -16,11 +16,11 @@ int stewart_estimate_numbers(const stewart_law *law)
 void stewart_move_on(const stewart_law *law, int number, const real *torques, real *state,
                      stewart_scratch scratch)
 {
-    stewart_acting acting;
-    stewart_last_periods(law, number, torques, 1, &acting, NULL, &scratch);
-    real *states = stewart_take(&scratch, X * acting.number);
-    stewart_predict(&law->machine, NULL, &acting, state, states);
-    stewart_copy(X, states + X * (acting.number - 1), state);
+    stewart_schedule schedule;
+    stewart_last_periods(law, number, torques, 1, &schedule, NULL, &scratch);
+    real *states = stewart_take(&scratch, X * schedule.number);
+    stewart_predict(&law->machine, NULL, &schedule, state, states);
+    stewart_copy(X, states + X * (schedule.number - 1), state);
 }
 
 int stewart_moving_scratch(const stewart_law *law)
@@ -46,11 +46,11 @@ void stewart_known_parameters(const stewart_law *law, const real *memory, real *
 }
 
 void stewart_known_last_period(const stewart_law *law, const real *memory, int number,
-                               const real *torques, stewart_acting *acting, const real **following,
+                               const real *torques, stewart_schedule *schedule, const real **following,
                                stewart_scratch *scratch)
 {
     (void)memory;
-    stewart_last_periods(law, number, torques, 1, acting, following, scratch);
+    stewart_last_periods(law, number, torques, 1, schedule, following, scratch);
 }
 
 /* ---- without a filter ---------------------------------------------------------------------------- */
@@ -165,13 +165,13 @@ stewart_filter stewart_filter_of(const stewart_law *law, const stewart_sensing *
     return filter;
 }
 
-stewart_acted stewart_acted_last(const stewart_law *law, int number, const real *torques,
+stewart_interval stewart_last_interval(const stewart_law *law, int number, const real *torques,
                                  stewart_scratch *scratch)
 {
-    stewart_acted period;
-    stewart_last_periods(law, number, torques, 1, &period.acting, &period.following, scratch);
-    period.acting.substeps =
-        stewart_substeps(&law->machine, period.acting.number, period.acting.torques);
+    stewart_interval period;
+    stewart_last_periods(law, number, torques, 1, &period.schedule, &period.following, scratch);
+    period.schedule.substeps =
+        stewart_substeps(&law->machine, period.schedule.number, period.schedule.torques);
     return period;
 }
 
@@ -183,7 +183,7 @@ int stewart_filtered_observe(const stewart_law *law, const stewart_sensing *sens
     const stewart_posterior e = stewart_posterior_at(memory, n, m);
     real *kept = memory + stewart_estimate_numbers(law), *last = stewart_take(&scratch, m);
     const stewart_filter filter = stewart_filter_of(law, sensing, legs);
-    const stewart_acted period = stewart_acted_last(law, number, torques, &scratch);
+    const stewart_interval period = stewart_last_interval(law, number, torques, &scratch);
     const stewart_history history = {last, kept + m};
     int same = 1;
     stewart_copy(m, kept, last);

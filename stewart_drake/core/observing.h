@@ -18,7 +18,7 @@ void stewart_keep_last(const stewart_law *law, const real *values, real *last);
 
 void stewart_known_parameters(const stewart_law *law, const real *memory, real *theta, real *std);
 void stewart_known_last_period(const stewart_law *law, const real *memory, int number,
-                               const real *torques, stewart_acting *acting, const real **following,
+                               const real *torques, stewart_schedule *schedule, const real **following,
                                stewart_scratch *scratch);
 
 /* Without a filter: the memory is a state and the last measurement. */
@@ -44,7 +44,7 @@ stewart_filter stewart_filter_of(const stewart_law *law, const stewart_sensing *
                                  const stewart_legs *legs);
 
 /* What acted in the last period, for the filter. */
-stewart_acted stewart_acted_last(const stewart_law *law, int number, const real *torques,
+stewart_interval stewart_last_interval(const stewart_law *law, int number, const real *torques,
                                  stewart_scratch *scratch);
 
 /* `observe` with such a filter, of a measurement with this fault or 0, and the scratch memory. */

@@ -117,16 +117,16 @@ static void add_piece(const stewart_model *model, real begin, real end, const re
     end_row(model, states + X, torque, piece + 2 + ROW);
 }
 
-int stewart_predicted_pieces(const stewart_model *model, const stewart_acting *acting,
+int stewart_predicted_pieces(const stewart_model *model, const stewart_schedule *schedule,
                              const real *states, real begin, real *pieces)
 {
     int number = 0;
     real passed = 0;
-    for (int k = 0; k < acting->number; k++) {
-        const real from = begin + passed, h = acting->durations[k];
+    for (int k = 0; k < schedule->number; k++) {
+        const real from = begin + passed, h = schedule->durations[k];
         passed += h;
         if (h > SHORTEST)
-            add_piece(model, from, begin + passed, states + X * k, acting->torques + U * k,
+            add_piece(model, from, begin + passed, states + X * k, schedule->torques + U * k,
                       pieces + STEWART_PIECE * number++);
     }
     return number;

@@ -46,9 +46,9 @@ int stewart_plan_scratch(real period, int periods);
 int stewart_plan_way(const stewart_model *model, const real *start, real begin, real period, int periods,
                  const real *rows, real *pieces, real *peak, stewart_scratch scratch);
 
-/* Pieces of the motion through `states` (1 + acting->number, 12) under torques from `begin` s on;
+/* Pieces of the motion through `states` (1 + schedule->number, 12) under torques from `begin` s on;
    their number. */
-int stewart_predicted_pieces(const stewart_model *model, const stewart_acting *acting,
+int stewart_predicted_pieces(const stewart_model *model, const stewart_schedule *schedule,
                              const real *states, real begin, real *pieces);
 
 /* Whether a predicted state (12) is so far off the one that is wanted that a new plan is worth while,

@@ -174,7 +174,7 @@ static int sample(dop853 *s, loop *o, long k, controller law, void *about)
 
 static void apply(machine *m, const loop *o)
 {
-    const double *torque = stewart_link_acting(o->memory);
+    const double *torque = stewart_link_current(o->memory);
     for (int i = 0; i < MOTORS; i++)
         m->torque[i] = torque[i] + o->bias[i];
 }

@@ -19,7 +19,7 @@ int stewart_limit(const stewart_machine *machine, const real *torque, real *limi
 
 /* What acts in whole periods that begin with the oldest of `periods` + 1 torques: with a fraction each
    torque acts for the end of one period and the beginning of the next. */
-stewart_acting stewart_acting_of(const stewart_law *law, int periods, const real *torques,
+stewart_schedule stewart_schedule_of(const stewart_law *law, int periods, const real *torques,
                                  stewart_scratch *scratch)
 {
     const int parts = 1 + (law->fraction > 0), number = parts * periods;
@@ -29,24 +29,24 @@ stewart_acting stewart_acting_of(const stewart_law *law, int periods, const real
         durations[i] = (parts == 1 ? 1 : split) * law->period;
         stewart_copy(U, torques + U * (parts == 1 ? i : (i + 1) / 2), each + U * i);
     }
-    stewart_acting acting = {number, each, durations, 0};
-    return acting;
+    stewart_schedule schedule = {number, each, durations, 0};
+    return schedule;
 }
 
 void stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
-                          stewart_acting *acting, const real **following, stewart_scratch *scratch)
+                          stewart_schedule *schedule, const real **following, stewart_scratch *scratch)
 {
     const int queue = stewart_queue_length(law);
     const real *first = torques + U * (number - queue - periods);
     if (law->parts > 0) { /* what acts next the motors decide: the last torque stands for it */
         real *durations = stewart_take(scratch, number);
         stewart_fill(number, law->period / (real)law->parts, durations);
-        *acting = (stewart_acting){number, torques, durations, 0};
+        *schedule = (stewart_schedule){number, torques, durations, 0};
         if (following)
             *following = torques + U * (number - 1);
         return;
     }
-    *acting = stewart_acting_of(law, periods, first, scratch);
+    *schedule = stewart_schedule_of(law, periods, first, scratch);
     if (following) /* without a delay it is still to be computed: no change is known */
         *following = queue > 0 ? first + U * periods : first + U * (periods - 1);
 }

@@ -267,7 +267,7 @@ static void innovate(const stewart_law *law, const real *before, const real *aft
     const real *state = before + l->state.at, *theta = before + l->parameters.at, *following;
     real a[3][U];
     stewart_belief belief;
-    stewart_acting acting;
+    stewart_schedule schedule;
     stewart_fill(U, 0, late);
     stewart_fill(U, 0, early);
     if (!stewart_all_finite(X, state)) {
@@ -276,12 +276,12 @@ static void innovate(const stewart_law *law, const real *before, const real *aft
         return;
     }
     law->observer->last_period(law, before + l->observer.at, l->in_flight.rows,
-                               before + l->in_flight.at, &acting, &following, &scratch);
-    real *states = stewart_take(&scratch, X * acting.number);
-    const real *last = acting.torques + U * (acting.number - 1);
-    stewart_predict(&law->machine, theta, &acting, state, states);
+                               before + l->in_flight.at, &schedule, &following, &scratch);
+    real *states = stewart_take(&scratch, X * schedule.number);
+    const real *last = schedule.torques + U * (schedule.number - 1);
+    stewart_predict(&law->machine, theta, &schedule, state, states);
     stewart_believe(&law->machine, theta, &belief);
-    if (acting.number > 1)
+    if (schedule.number > 1)
         stewart_copy(U, last - U, acted);
     else if (!stewart_all_finite(U, acted))
         stewart_copy(U, last, acted);
@@ -293,7 +293,7 @@ static void innovate(const stewart_law *law, const real *before, const real *aft
         early[i] = a[2][i] - a[1][i];
     }
     for (int i = 0; i < X; i++)
-        innovation[i] = after[l->measurement.at + i] - states[X * (acting.number - 1) + i];
+        innovation[i] = after[l->measurement.at + i] - states[X * (schedule.number - 1) + i];
     stewart_copy(U, last, acted);
 }
 

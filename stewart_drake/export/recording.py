@@ -11,7 +11,7 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.export.motion import knots
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Report
-from stewart_drake.law.core_law import most_acting, uncovered
+from stewart_drake.law.core_law import max_schedule_length, uncovered
 from stewart_drake.law.delay_observer import DelayObserver
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
@@ -99,7 +99,7 @@ class Recorded:
         assert isinstance(law, PredictiveLqi)
         most = law.timeline.queue_length
         if isinstance(law.observer, DelayObserver):
-            most = most_acting(law.observer, period)
+            most = max_schedule_length(law.observer, period)
         plan = law.planner.duration if isinstance(law.planner, Rejoin) else 0.0
         return plan + (most + 4) * period
 

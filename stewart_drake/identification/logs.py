@@ -81,7 +81,7 @@ class Log:
     delay: float | None = None
     before: Array | None = None
 
-    def acting(self, times: Array, delay: float) -> Array:
+    def applied_torque(self, times: Array, delay: float) -> Array:
         """Return the torques (k, 6) at instants (k,) in s; before any arrived, the first one."""
         last = np.searchsorted(self.sent + delay, times, side="right") - 1
         return self.torques[np.maximum(last, 0)]

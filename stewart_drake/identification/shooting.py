@@ -94,9 +94,9 @@ def _steps_of(segment: Segment, delay: float, longest_step: float) -> Plan:
     sample[ends[np.searchsorted(events, samples - _INSTANT)]] = np.arange(len(samples))
     # The torque within a step, and just after it.
     middle = np.repeat(np.maximum(events - gaps / 2, start + 2 * _INSTANT), parts)
-    acting = log.acting(middle, delay)
-    after = np.vstack([acting[1:], log.acting(samples[-1:] + 2 * _INSTANT, delay)])
-    return Plan(np.repeat(gaps / parts, parts), acting, after, sample)
+    applied = log.applied_torque(middle, delay)
+    after = np.vstack([applied[1:], log.applied_torque(samples[-1:] + 2 * _INSTANT, delay)])
+    return Plan(np.repeat(gaps / parts, parts), applied, after, sample)
 
 
 def integrate(

@@ -112,8 +112,8 @@ def _misfit(
     if there.sum() < _LEAST_WINDOWS:
         return np.inf
     instants = middles[there, None] + span
-    acting = log.acting(instants.ravel(), delay).reshape(*instants.shape, NUM_TORQUES)
-    apart = needed[there] - np.einsum("s,nsj->nj", weights, acting)
+    applied = log.applied_torque(instants.ravel(), delay).reshape(*instants.shape, NUM_TORQUES)
+    apart = needed[there] - np.einsum("s,nsj->nj", weights, applied)
     left, whole = (np.var(one, axis=0).sum() for one in (apart, needed[there]))
     return float(left / whole) if whole > 0 else np.inf
 
@@ -125,7 +125,7 @@ def segment_length(log: Log, poses: Array, mechanism: Mechanism, delay: float) -
     fastest = 1e-9
     for row in known[:: max(1, len(known) // _LOOKS)]:
         rates = first_state(log, poses, row)[STATE_RATES]
-        torque = log.acting(log.times[row : row + 1], delay)[0]
+        torque = log.applied_torque(log.times[row : row + 1], delay)[0]
         A = dynamics.derivatives(poses[row], rates, torque).A
         fastest = max(fastest, float(np.linalg.eigvals(A).real.max()))
     return float(np.clip(_GROWTHS / fastest, SHORTEST, LONGEST))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from stewart_drake.core.library import core
-from stewart_drake.law.timeline import Acting, Timeline
+from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.types import Array
 
@@ -52,16 +52,18 @@ class Arrivals(Timeline):
         """All of them: which acts when is for `until_next`."""
         return in_flight
 
-    def until_next(self, queue: Array) -> Acting:
+    def until_next(self, queue: Array) -> TorqueSchedule:
         """What acts from now until the next torque does."""
         return self.within(queue, 0.0, self.eta)
 
-    def last_period(self, in_flight: Array) -> tuple[Acting, Array]:
+    def last_period(self, in_flight: Array) -> tuple[TorqueSchedule, Array]:
         """What acted since the last sample, and what acts next."""
-        acting = self.within(in_flight, -self.period, 0.0)
-        return acting, self.within(in_flight, 0.0, self.period).torques[0]
+        schedule = self.within(in_flight, -self.period, 0.0)
+        return schedule, self.within(in_flight, 0.0, self.period).torques[0]
 
-    def within(self, in_flight: Array, begin: float, end: float, newest: int = -1) -> Acting:
+    def within(
+        self, in_flight: Array, begin: float, end: float, newest: int = -1
+    ) -> TorqueSchedule:
         """What acts between two instants, s from now.
 
         Args:
@@ -76,7 +78,7 @@ class Arrivals(Timeline):
             *(self.compiled(), len(queue), c.at(queue), begin, end, newest),
             *(c.at(torques), c.at(durations)),
         )
-        return Acting(torques[:number], durations[:number])
+        return TorqueSchedule(torques[:number], durations[:number])
 
     def later(self, kept: int) -> "Arrivals":
         """The same a period later with one more torque sent, of the `kept` that are in flight."""

@@ -15,7 +15,7 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.timeline import Acting
+from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     NUM_REFERENCE,
@@ -235,11 +235,11 @@ class Model:
         )
         return Plan(pieces, float(peak[0])) if number else None
 
-    def way(self, acting: Acting, states: Array, begin: float) -> Array:
+    def way(self, schedule: TorqueSchedule, states: Array, begin: float) -> Array:
         """Return the pieces (n, 38) of the motion through states (1 + n, 12) from `begin` s on."""
-        c, number = core(), len(acting.torques)
-        kept = [np.array(a, np.float64) for a in (*acting, states)]
-        what = c.ffi.new("stewart_acting *", [number, *map(c.at, kept[:2]), 0])
+        c, number = core(), len(schedule.torques)
+        kept = [np.array(a, np.float64) for a in (*schedule, states)]
+        what = c.ffi.new("stewart_schedule *", [number, *map(c.at, kept[:2]), 0])
         pieces = np.empty((number, c.lib.STEWART_PIECE))
         given = self.data, what, c.at(kept[2]), begin, c.at(pieces)
         return pieces[: c.lib.stewart_predicted_pieces(*given)]

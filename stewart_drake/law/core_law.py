@@ -145,7 +145,7 @@ def _delay(law: PredictiveLqi | ServoPreview) -> Part | None:
     it = c.ffi.new("stewart_delay_settings *")
     it.delay = compiled.it[0]
     it.delay.machine = it.delay.sensing = c.ffi.NULL  # the law's
-    it.values, it.most = NUM_STATE, most_acting(observer, period)
+    it.values, it.most = NUM_STATE, max_schedule_length(observer, period)
     name, sources = "stewart_delay_observer", _UNKNOWN
     if isinstance(law.sensing, EncoderSensing):
         name, it.values = "stewart_encoder_delay_observer", NUM_LEGS
@@ -153,7 +153,7 @@ def _delay(law: PredictiveLqi | ServoPreview) -> Part | None:
     return Part(name, sensing, Compiled(it, (compiled,)), _delay_believed, sources)
 
 
-def most_acting(observer: DelayObserver, period: float) -> int:
+def max_schedule_length(observer: DelayObserver, period: float) -> int:
     """Return the most torques that act one after the other until the next one does.
 
     Changes come a period apart, up to 1.5 times the longest delay where that grows the fastest.
@@ -317,7 +317,7 @@ class CompiledLaw:
         d.kept, d.silence = law.kept, law.silence
         if isinstance(law.observer, DelayObserver):  # which finds steps and fraction itself
             d.kept, d.steps, d.fraction = law.kept + law.observer.kept(d.period), 0, 0.0
-            d.rows = 1 + most_acting(law.observer, d.period) + 6
+            d.rows = 1 + max_schedule_length(law.observer, d.period) + 6
         if isinstance(law.observer, LateObserver):
             d.longest_wait = law.observer.longest
         if isinstance(law.channel, Packets):
@@ -333,7 +333,7 @@ class CompiledLaw:
         c, d, law = core(), self.data, self.law
         plan, until = c.ffi.new("stewart_replan *"), law.timeline.queue_length
         if isinstance(law.observer, DelayObserver):
-            until = most_acting(law.observer, d.period)
+            until = max_schedule_length(law.observer, d.period)
         plan.periods, plan.until = periods_of(planner.duration, d.period), until
         plan.size, plan.sign = planner.size.tolist(), home_sign(law.plant.mechanism)
         d.planner, d.planning = c.ffi.addressof(c.lib, "stewart_replanner"), plan

@@ -23,13 +23,13 @@ from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.parameter_filter import ParameterFilter, Period
 from stewart_drake.law.sensing import Sensing
-from stewart_drake.law.timeline import Acting, Timeline
+from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.scenario.signals import POSE, RATES
 from stewart_drake.types import Array
 
 LONGEST = 10
 """Periods of a gap that are worth the time; after more the filter goes on by itself."""
-NOTHING = Acting(np.empty((0, 6)), np.empty(0))
+NOTHING = TorqueSchedule(np.empty((0, 6)), np.empty(0))
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class GapBelief(Belief):
     """
 
     anchor: Estimate | None = None
-    since: Acting = NOTHING
+    since: TorqueSchedule = NOTHING
     periods: int = 0
 
 
@@ -68,8 +68,10 @@ class GapObserver(ParameterObserver):
         assert isinstance(belief, GapBelief)
         after = super().observe(belief, measurement, in_flight, sensing, plant)
         assert isinstance(after, GapBelief)
-        acting, following = belief.timeline.last_period(in_flight)
-        since = Acting(*(np.concatenate(pair) for pair in zip(belief.since, acting, strict=True)))
+        schedule, following = belief.timeline.last_period(in_flight)
+        since = TorqueSchedule(
+            *(np.concatenate(pair) for pair in zip(belief.since, schedule, strict=True))
+        )
         periods = belief.periods + 1
         gone = replace(after, anchor=None, since=NOTHING, periods=0)
         known, found = belief.estimate, after.estimate

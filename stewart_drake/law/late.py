@@ -78,8 +78,8 @@ class LateObserver:
             fault, partly = (past.fault, past.partly) if fresh else (fault, partly)
         estimate = past.estimate
         if past.has_state and behind:
-            acting = past.timeline.last_periods(in_flight, behind)
-            now = plant.predict(past.state, acting, past.parameters)[-1]
+            schedule = past.timeline.last_periods(in_flight, behind)
+            now = plant.predict(past.state, schedule, past.parameters)[-1]
             estimate = past.at(now).estimate
         told = _told(past) | {"estimate": estimate}
         return LateBelief(**told, fault=fault, partly=partly, past=past, behind=behind)

@@ -6,7 +6,7 @@ import numpy as np
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.motors import TorqueLimit
-from stewart_drake.law.timeline import Acting
+from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.types import Array
 
@@ -39,8 +39,10 @@ class NominalPlant:
         vigorous = np.abs(torques).max(initial=0.0) > self.gentle_torque
         return self.substeps * (VIGOROUS if vigorous else 1)
 
-    def predict(self, state: Array, acting: Acting, parameters: Array | None = None) -> Array:
+    def predict(
+        self, state: Array, schedule: TorqueSchedule, parameters: Array | None = None
+    ) -> Array:
         """States (n, 12) after each of n torques, from a state (12,); None is as known before."""
-        torques, durations = acting
+        torques, durations = schedule
         substeps = self.substeps_for(torques)
         return self.dynamics.predict(state, torques, durations, substeps, parameters)

@@ -103,8 +103,8 @@ class ParameterObserver:
             if first is not None:
                 return replace(after, estimate=first, partly=first.partly)
             return after.at(moved(belief, in_flight, plant)) if belief.has_state else after
-        acting, following = belief.timeline.last_period(in_flight)
-        period = Period(*acting, following, plant.substeps_for(acting.torques))
+        schedule, following = belief.timeline.last_period(in_flight)
+        period = Period(*schedule, following, plant.substeps_for(schedule.torques))
         estimate, fault = ekf.advance(belief.estimate, period, usable), after.fault
         if estimate.outliers > 0:
             fault = "measurements_rejected"
@@ -141,5 +141,5 @@ def told(
 
 def moved(belief: Belief, in_flight: Array, plant: NominalPlant) -> Array:
     """The state (12,) a period later, by the model alone."""
-    acting, _ = belief.timeline.last_period(in_flight)
-    return plant.predict(belief.state, acting)[-1]
+    schedule, _ = belief.timeline.last_period(in_flight)
+    return plant.predict(belief.state, schedule)[-1]

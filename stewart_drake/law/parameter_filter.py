@@ -81,8 +81,8 @@ class ParameterFilter:
         c, n, m = core(), len(estimate.mean), self.sensing.size
         memory = _memory(estimate)
         torques, durations, following = map(numbers, period[:3])
-        acting = [len(torques), c.at(torques), c.at(durations), period.substeps]
-        acted = c.ffi.new("stewart_acted *", [acting, c.at(following)])
+        schedule = [len(torques), c.at(torques), c.at(durations), period.substeps]
+        acted = c.ffi.new("stewart_interval *", [schedule, c.at(following)])
         values = None if measurement is None else measurement.known(m)
         before = [numbers(a) for a in self._before()]
         history = c.ffi.new("stewart_history *", list(map(c.at, before)))

@@ -98,8 +98,8 @@ class Rejoin:
         if not (belief.has_state and belief.settled):
             return before
         timeline, c = belief.timeline, core()
-        acting = timeline.until_next(timeline.queue(in_flight))
-        states = np.vstack([belief.state, plant.predict(belief.state, acting, belief.parameters)])
+        schedule = timeline.until_next(timeline.queue(in_flight))
+        states = np.vstack([belief.state, plant.predict(belief.state, schedule, belief.parameters)])
         wanted = followed(np.array([timeline.eta]))[0, :NUM_STATE].copy()
         where = c.at(np.array(self.size, np.float64)), c.at(states[-1]), c.at(wanted)
         if not c.lib.stewart_is_off(*where, belief.found):
@@ -109,5 +109,5 @@ class Rejoin:
         plan = model.plan(motion.reference, states[-1], begin, timeline.period, periods)
         if plan is None:
             return before  # there is none from here; the next sample may see another
-        pieces = np.vstack([model.way(acting, states, motion.now), plan.pieces])
+        pieces = np.vstack([model.way(schedule, states, motion.now), plan.pieces])
         return Followed(replace(motion, pieces=pieces), pieces, True)

@@ -307,16 +307,16 @@ class PredictiveLqi:
     def _predicted(self, memory: Memory, belief: Belief, times: Array) -> tuple[Array, Array]:
         """Return the predicted motion (p, 18), and the state (12,) where the next torque acts."""
         timeline, dynamics, theta = belief.timeline, self.plant.dynamics, belief.parameters
-        acting = timeline.until_next(timeline.queue(memory.in_flight))
-        states = np.vstack([belief.state, self.plant.predict(belief.state, acting, theta)])
-        edges = np.append(0.0, np.cumsum(acting.durations))
+        schedule = timeline.until_next(timeline.queue(memory.in_flight))
+        states = np.vstack([belief.state, self.plant.predict(belief.state, schedule, theta)])
+        edges = np.append(0.0, np.cumsum(schedule.durations))
         way = np.tile(np.concatenate([states[-1], np.zeros(NUM_COORDINATES)]), (len(times), 1))
-        for i, torque in enumerate(acting.torques):
+        for i, torque in enumerate(schedule.torques):
             start, end = (
                 np.append(x, dynamics.accelerations(x[POSE], x[RATES], torque, theta))
                 for x in states[i : i + 2]
             )
-            h = acting.durations[i]
+            h = schedule.durations[i]
             for j in np.flatnonzero((times >= edges[i]) & (times < edges[i + 1])):
                 way[j] = between(start, end, h, (times[j] - edges[i]) / h)
         return way, states[-1]
@@ -394,10 +394,10 @@ class PredictiveLqi:
         pending = queue[len(queue) - self.predictor.pending(timeline) :]
         for rows in np.split(preview, self.channel.torques - 1) if len(preview) else ():
             flying = np.vstack([pending, plan[-1:]])
-            acting = timeline.next_period(flying)
-            state, pending = plant.predict(state, acting, belief.parameters)[-1], flying[1:]
+            schedule = timeline.next_period(flying)
+            state, pending = plant.predict(state, schedule, belief.parameters)[-1], flying[1:]
             before, error = error, state - rows[0, :NUM_STATE]
-            if not plant.motors.reached(acting.torques):
+            if not plant.motors.reached(schedule.torques):
                 integral = integral + timeline.period / 2 * (before[POSE] + error[POSE])
             held, changes = self.feedforward.held(rows[1:], plant.dynamics, belief.parameters)
             torque = held[-1]
@@ -445,8 +445,8 @@ class PredictiveLqi:
         """z_k = z_{k-1} + dt/2 (e_{k-1} + e_k), but not while a motor is at its limit."""
         if not self.cost.integrates or not memory.belief.has_state:
             return memory.integral
-        acting, _ = timeline.last_period(memory.in_flight)
-        if self.plant.motors.reached(acting.torques):
+        schedule, _ = timeline.last_period(memory.in_flight)
+        if self.plant.motors.reached(schedule.torques):
             return memory.integral
         return memory.integral + timeline.period / 2 * (memory.error + error)
 

@@ -124,13 +124,13 @@ class NonlinearPredictor:
         if timeline.steps == 0:
             return Ahead(x, x - wanted[0], integral)
         # The queue ends with the torque that is still to act for eta0 after the last sample.
-        acting = timeline.acting(queue)
+        schedule = timeline.schedule(queue)
         each = timeline.per_period
-        ends = plant.predict(x, acting, belief.parameters)[each - 1 :: each]
+        ends = plant.predict(x, schedule, belief.parameters)[each - 1 :: each]
         states = np.vstack([x, ends])
         errors = states - wanted
         added = timeline.period / 2 * (errors[:-1, POSE] + errors[1:, POSE])
-        held = [plant.motors.reached(t) for t in acting.torques.reshape(timeline.steps, -1)]
+        held = [plant.motors.reached(t) for t in schedule.torques.reshape(timeline.steps, -1)]
         integral = integral + added[~np.array(held)].sum(axis=0)
         return Ahead(states[-1], errors[-1], integral)
 
@@ -163,9 +163,9 @@ class ArrivalPredictor(NonlinearPredictor):
         self, belief: Belief, integral: Array, queue: Array, wanted: Array, plant: NominalPlant
     ) -> Ahead:
         """The integral goes on from one change of torque to the next."""
-        acting = belief.timeline.until_next(queue)
-        states = np.vstack([belief.state, plant.predict(belief.state, acting, belief.parameters)])
+        schedule = belief.timeline.until_next(queue)
+        states = np.vstack([belief.state, plant.predict(belief.state, schedule, belief.parameters)])
         errors = states - wanted
-        added = acting.durations[:, None] / 2 * (errors[:-1, POSE] + errors[1:, POSE])
-        held = [plant.motors.reached(torque) for torque in acting.torques]
+        added = schedule.durations[:, None] / 2 * (errors[:-1, POSE] + errors[1:, POSE])
+        held = [plant.motors.reached(torque) for torque in schedule.torques]
         return Ahead(states[-1], errors[-1], integral + added[~np.array(held)].sum(axis=0))

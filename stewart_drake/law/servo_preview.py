@@ -25,7 +25,7 @@ from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import Observer
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.servos import Reported, ReportLayout
-from stewart_drake.law.timeline import Acting, Timeline
+from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.signals import (
     MODEL_TORQUE,
@@ -49,13 +49,13 @@ class ReportedTimeline(Timeline):
 
     parts: int
 
-    def last_period(self, in_flight: Array) -> tuple[Acting, Array]:
+    def last_period(self, in_flight: Array) -> tuple[TorqueSchedule, Array]:
         """What acted since the last measurement: all of the torques (n, 6), a part of dt each.
 
         What acts next the servos decide; the last torque stands for it.
         """
         durations = np.full(len(in_flight), self.period / self.parts)
-        return Acting(in_flight, durations), in_flight[-1]
+        return TorqueSchedule(in_flight, durations), in_flight[-1]
 
 
 @dataclass(frozen=True)

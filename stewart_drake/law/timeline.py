@@ -14,7 +14,7 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.types import Array
 
 
-class Acting(NamedTuple):
+class TorqueSchedule(NamedTuple):
     """Torques (n, 6) in N m that act one after the other, for `durations` (n,) s each."""
 
     torques: Array
@@ -67,14 +67,14 @@ class Timeline:
         """Beginnings, s from now, of the holds `first` to `last`; 0 is that of the next torque."""
         return np.asarray(self.eta + self.period * np.arange(first, last + 1))
 
-    def acting(self, in_flight: Array) -> Acting:
+    def schedule(self, in_flight: Array) -> TorqueSchedule:
         """What acts in all whole periods that torques (n, 6), the oldest first, cover."""
         if self.fraction == 0:
-            return Acting(in_flight, np.full(len(in_flight), self.period))
+            return TorqueSchedule(in_flight, np.full(len(in_flight), self.period))
         # Each torque acts for the end of one period and the beginning of the next.
         split = np.array([self.fraction, 1 - self.fraction]) * self.period
         torques = np.repeat(in_flight, 2, axis=0)[1:-1]
-        return Acting(torques, np.tile(split, len(in_flight) - 1))
+        return TorqueSchedule(torques, np.tile(split, len(in_flight) - 1))
 
     def queue(self, in_flight: Array) -> Array:
         """(L, 6) of torques (n > L, 6), the oldest first, those that are still to act.
@@ -94,14 +94,14 @@ class Timeline:
             )
         return in_flight[longest - self.queue_length :]
 
-    def until_next(self, queue: Array) -> Acting:
+    def until_next(self, queue: Array) -> TorqueSchedule:
         """What acts from now until the next torque does, of torques in flight (L, 6)."""
         holds = np.full(len(queue), self.period)
         if self.fraction > 0:
             holds[0] = self.fraction * self.period  # the oldest has acted for the rest of its hold
-        return Acting(queue, holds)
+        return TorqueSchedule(queue, holds)
 
-    def last_periods(self, in_flight: Array, number: int) -> Acting:
+    def last_periods(self, in_flight: Array, number: int) -> TorqueSchedule:
         """What acted in the last `number` >= 1 periods, of torques (n, 6), the oldest first.
 
         Raises:
@@ -113,17 +113,17 @@ class Timeline:
                 f"delay: {len(in_flight)} torques are kept; expected at least "
                 f"{self.queue_length + number}"
             )
-        torques, durations = self.acting(in_flight[longest - self.queue_length :])
+        torques, durations = self.schedule(in_flight[longest - self.queue_length :])
         n = number * self.per_period
-        return Acting(torques[:n], durations[:n])
+        return TorqueSchedule(torques[:n], durations[:n])
 
-    def next_period(self, queue: Array) -> Acting:
+    def next_period(self, queue: Array) -> TorqueSchedule:
         """What acts in the period in which the oldest of torques (n, 6) begins it."""
-        torques, durations = self.acting(queue)
+        torques, durations = self.schedule(queue)
         n = self.per_period
-        return Acting(torques[:n], durations[:n])
+        return TorqueSchedule(torques[:n], durations[:n])
 
-    def last_period(self, in_flight: Array) -> tuple[Acting, Array]:
+    def last_period(self, in_flight: Array) -> tuple[TorqueSchedule, Array]:
         """What acted since the last sample, and the torque (6,) that acts next.
 
         Without a delay that one is still to be computed: no change is known.
@@ -131,6 +131,6 @@ class Timeline:
         Args:
             in_flight: (n > L, 6) torques, the oldest first.
         """
-        torques, durations = self.acting(self._since_last_sample(in_flight))
+        torques, durations = self.schedule(self._since_last_sample(in_flight))
         n = self.per_period
-        return Acting(torques[:n], durations[:n]), torques[min(n, len(torques) - 1)]
+        return TorqueSchedule(torques[:n], durations[:n]), torques[min(n, len(torques) - 1)]

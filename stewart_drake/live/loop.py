@@ -20,7 +20,7 @@ from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.channel import Packets, Report, Wire
 from stewart_drake.law.core_law import AnyMemory, serving
 from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.timeline import Acting, Timeline
+from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.live.blind import LONGEST_GAP, stays_within_reach
 from stewart_drake.live.connect import await_free
 from stewart_drake.live.contact import Contact
@@ -591,34 +591,36 @@ class LiveLoop:
             return
         in_flight = self.memory.in_flight
         until = _until_next(belief.timeline, in_flight[:-1])
-        acting = Acting(
+        schedule = TorqueSchedule(
             np.vstack([until.torques, in_flight[-1:]]), np.append(until.durations, self._period)
         )
         t = k * self._period
-        ahead = law.plant.predict(belief.state, acting, belief.parameters)[-1]
+        ahead = law.plant.predict(belief.state, schedule, belief.parameters)[-1]
         wanted = self._steering.way.at(t + belief.timeline.eta + self._period)[:NUM_STATE]
         away = np.abs(ahead - wanted) / np.tile(self._size, 2)
         if not away.max() > OFF:  # or NaN
             return
-        anew = self._anew(t, belief.state, acting, belief.parameters)
+        anew = self._anew(t, belief.state, schedule, belief.parameters)
         if isinstance(anew, str):
             return  # the next sample may see another
         self._steering, self.memory = anew, self.memory.without_error()
         self.recoveries += 1
 
     def _anew(
-        self, t: float, state: Array, acting: Acting, parameters: Array | None
+        self, t: float, state: Array, schedule: TorqueSchedule, parameters: Array | None
     ) -> Steering | str:
         plant = self._design.law.plant
         dynamics = plant.dynamics if parameters is None else plant.dynamics.assuming(parameters)
-        states = np.vstack([state, plant.predict(state, acting, parameters)])
+        states = np.vstack([state, plant.predict(state, schedule, parameters)])
         if not np.all(np.isfinite(states)):
             return "the plate leaves its workspace before a torque can act"
         for x in states:
             failure = diagnose(plant.mechanism, t, x[POSE])
             if failure is not None:
                 return f"{failure.reason} before a torque can act"
-        torques = np.vstack([acting.torques[:1], acting.torques]) if len(acting.torques) else None
+        torques = (
+            np.vstack([schedule.torques[:1], schedule.torques]) if len(schedule.torques) else None
+        )
         if torques is None:
             torques = np.zeros((1, NUM_TORQUES))
         full = np.array(
@@ -627,7 +629,7 @@ class LiveLoop:
                 for x, torque in zip(states, torques, strict=True)
             ]
         )
-        times = t + np.append(0.0, np.cumsum(acting.durations))
+        times = t + np.append(0.0, np.cumsum(schedule.durations))
         return self._steering.anew(times, full)
 
     def _seen(self, k: int, wanted: Array) -> Seen:
@@ -650,6 +652,6 @@ class LiveLoop:
         )
 
 
-def _until_next(timeline: Timeline, flying: Array) -> Acting:
+def _until_next(timeline: Timeline, flying: Array) -> TorqueSchedule:
     """What acts from now until the next torque does, of torques (n >= L, 6) that are under way."""
     return timeline.until_next(timeline.queue(np.vstack([np.zeros(NUM_TORQUES), flying])))

@@ -56,7 +56,7 @@ def torque_delays(scenario: Scenario) -> Array:
     return eta
 
 
-def acting(arrivals: Array, together: float = 0.0) -> NDArray[np.bool_]:
+def takes_effect(arrivals: Array, together: float = 0.0) -> NDArray[np.bool_]:
     """Return which of (n,) torques ever act: those that arrive before every newer one.
 
     The motors take the newest torque that has arrived, whatever comes after it: one that was
@@ -83,7 +83,7 @@ def releases(period: float, delays: Array, delay: Delay) -> tuple[NDArray[np.int
     numbers = np.arange(-length, len(delays))
     earlier = (numbers[:length] + delay.periods) * period
     arrivals = np.concatenate([earlier, period * numbers[length:] + waits])
-    acts = acting(arrivals, TOGETHER * period)
+    acts = takes_effect(arrivals, TOGETHER * period)
     return numbers[acts], arrivals[acts]
 
 

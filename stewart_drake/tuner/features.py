@@ -255,11 +255,11 @@ class HealthFeatures:
         if not belief.has_state:
             nothing = np.zeros(NUM_TORQUES)
             return np.full(NUM_STATE, np.nan), nothing, nothing, np.full(NUM_TORQUES, np.nan)
-        acting, following = belief.timeline.last_period(before.in_flight)
+        schedule, following = belief.timeline.last_period(before.in_flight)
         state, theta = belief.state, belief.parameters
-        predicted = self.plant.predict(state, acting, theta)[-1]
-        newest = acting.torques[-1]
-        older = acting.torques[-2] if len(acting.torques) > 1 else acted
+        predicted = self.plant.predict(state, schedule, theta)[-1]
+        newest = schedule.torques[-1]
+        older = schedule.torques[-2] if len(schedule.torques) > 1 else acted
         torques = (newest if np.isnan(older).any() else older, newest, following)
         a = [
             self.plant.dynamics.accelerations(state[POSE], state[RATES], T, theta) for T in torques

@@ -113,7 +113,7 @@ static void plate_follow(machine *m, uint64_t time)
     stewart_plant plant = {c->machine.geometry, c->machine.parameters, &c->machine.gravity};
     real torque[6];
     for (int i = 0; i < 6; i++)
-        torque[i] = (real)stewart_link_acting(m->link)[i];
+        torque[i] = (real)stewart_link_current(m->link)[i];
     while (m->running && !m->left && m->time < time) {
         uint64_t h = time - m->time < FINEST ? time - m->time : FINEST;
         stewart_move(&plant, torque, (real)(1e-9 * (double)h), m->state);
