@@ -3,7 +3,6 @@
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +28,7 @@ TOO_FAR = "reference.amplitude=[0.26, 0.26, 0.26, 0.02, 0.02, 0.2]"
 
 
 @pytest.fixture(autouse=True)
-def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+def _short(monkeypatch):
     """Three delays instead of thirty, and no simulations; those have their own tests."""
     judge_few_delays(monkeypatch)
     cells = [Cell(8, 1.0, "completed", 21.0, math.nan), Cell(0, 1.0, "left_workspace", math.nan, 1)]
@@ -40,17 +39,17 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(delay_limits, "delay_map", lambda *_: (cells, False))
 
 
-def analyze(kind: str, out: Path, *arguments: str) -> tuple[dict[str, Any], str]:
+def analyze(kind, out, *arguments):
     assert main(["analyze", kind, *arguments, "--out", str(out)]) == 0
     summary = json.loads((out / "summary.json").read_text())
     return summary, (out / "report.html").read_text()
 
 
-def settings(*values: str) -> list[str]:
+def settings(*values):
     return [part for value in values for part in ("--set", value)]
 
 
-def test_hautus_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_hautus_of_the_paper(tmp_path, capsys):
     summary, page = analyze("hautus", tmp_path / "out")
     systems = {system["name"]: system for system in summary["systems"]}
     assert len(systems) == 1 + 3 * 3 + 2 * 10
@@ -79,7 +78,7 @@ def test_hautus_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert page.count("<img") == 2
 
 
-def test_drake_disagrees_where_powers_lose_the_digits(tmp_path: Path) -> None:
+def test_drake_disagrees_where_powers_lose_the_digits(tmp_path):
     summary, page = analyze("hautus", tmp_path / "out")
     noted = {system["name"]: system for system in summary["systems"] if system["note"]}
     plant = noted["plant under gravity, t = 5.00 s"]
@@ -92,7 +91,7 @@ def test_drake_disagrees_where_powers_lose_the_digits(tmp_path: Path) -> None:
         assert system["drake"] == {word: system[word] for word in hautus.QUESTIONS}
 
 
-def test_delay_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_delay_of_the_paper(tmp_path, capsys):
     summary, page = analyze("delay", tmp_path / "out")
     assert summary["error_floor"] == pytest.approx(50 * (1 - math.cos(0.8)), rel=1e-6)
     assert summary["error_floor_applies"]
@@ -113,7 +112,7 @@ def test_delay_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert page.count("<img") == 3
 
 
-def test_delay_under_gravity(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_delay_under_gravity(tmp_path, capsys):
     summary, _ = analyze("delay", tmp_path / "out", *settings("plant.gravity=true"))
     assert summary["beatable"] == "no"
     assert "The delay of 0.8 s alone, under any controller, beatable: no," in " ".join(
@@ -128,9 +127,7 @@ def test_delay_under_gravity(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 @pytest.mark.parametrize("kind", ["hautus", "delay"])
 @pytest.mark.parametrize("gravity", ["plant.gravity=true", "plant.gravity=false"])
-def test_a_motion_out_of_reach_gets_a_verdict(
-    kind: str, gravity: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_motion_out_of_reach_gets_a_verdict(kind, gravity, tmp_path, capsys):
     summary, page = analyze(kind, tmp_path / "out", *settings(TOO_FAR, gravity))
     opening = "The reference cannot be followed: leg 2 reached the end of its reach at t = 0.54 s"
     assert summary["obstacles"][0].startswith(opening)
@@ -142,10 +139,10 @@ def test_a_motion_out_of_reach_gets_a_verdict(
         assert len(summary["skipped"]) == 12
 
 
-def singular_mechanism(folder: Path) -> Path:
+def singular_mechanism(folder):
     """The paper's machine, assembled where its rods cannot hold it against one motion."""
 
-    def rolled(angle: float) -> np.ndarray:
+    def rolled(angle):
         return np.concatenate([[angle], PAPER.home[1:]])
 
     roll = brentq(lambda a: standing(PAPER, rolled(a)).parallel, -1.39, -1.42, xtol=1e-15)
@@ -156,9 +153,7 @@ def singular_mechanism(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("gravity", ["plant.gravity=true", "plant.gravity=false"])
-def test_a_singular_home_pose_gets_a_verdict(
-    gravity: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_singular_home_pose_gets_a_verdict(gravity, tmp_path, capsys):
     mechanism = f"mechanism={singular_mechanism(tmp_path)}"
     summary, _ = analyze("hautus", tmp_path / "hautus", *settings(mechanism, gravity))
     told = capsys.readouterr().out
@@ -175,7 +170,7 @@ def test_a_singular_home_pose_gets_a_verdict(
     assert summary["poses"] == []
 
 
-def test_a_home_pose_at_a_dead_centre_gets_a_verdict(tmp_path: Path) -> None:
+def test_a_home_pose_at_a_dead_centre_gets_a_verdict(tmp_path):
     height = brentq(
         lambda z: PAPER.reach_margins(np.concatenate([PAPER.home[:5], [z]])).min() - 1e-12, 0.4, 0.6
     )
@@ -188,7 +183,7 @@ def test_a_home_pose_at_a_dead_centre_gets_a_verdict(tmp_path: Path) -> None:
     assert len(summary["skipped"]) == 3
 
 
-def test_json_and_quiet(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_and_quiet(capsys):
     assert main(["analyze", "delay", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["error_floor"] > 15
     assert main(["analyze", "delay", "--quiet"]) == 0
@@ -198,12 +193,12 @@ def test_json_and_quiet(capsys: pytest.CaptureFixture[str]) -> None:
 # ------------------------------------------------------------------ the map
 
 
-def test_cells_are_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_are_simulations(monkeypatch):
     """On a short run: one that completes, one that leaves, one that is out of reach."""
     monkeypatch.setattr(delay_map, "FACTORS", (0.5, 1.25))
     monkeypatch.setattr(delay_map, "map_delays", lambda _: [0, 8])
     scenario = sd.load_scenario("paper", settings=("duration=1.1", "controller.estimate=[]"))
-    seen: list[tuple[int, int]] = []
+    seen = []
     cells, interrupted = delay_map.delay_map(scenario, lambda done, all_: seen.append((done, all_)))
     assert not interrupted
     assert [(cell.steps, cell.factor) for cell in cells] == [
@@ -230,8 +225,8 @@ def test_cells_are_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     assert math.isnan(cells[1].error)
 
 
-def test_ctrl_c_keeps_the_cells_that_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted_jobs(jobs: Any, function: Any, folder: Any, **_: Any) -> None:
+def test_ctrl_c_keeps_the_cells_that_are_there(monkeypatch):
+    def interrupted_jobs(jobs, function, folder, **_):
         key = next(iter(jobs))
         (Path(folder) / f"{key}.json").write_bytes(function(*jobs[key]))
         raise KeyboardInterrupt
@@ -244,7 +239,7 @@ def test_ctrl_c_keeps_the_cells_that_are_there(monkeypatch: pytest.MonkeyPatch) 
     assert {cell.status for cell in cells[1:]} == {"not_run"}
 
 
-def test_a_run_that_leaves_the_workspace_says_when() -> None:
+def test_a_run_that_leaves_the_workspace_says_when():
     scenario = sd.load_scenario(
         "paper", "delay_lqi", ("plant.kind=exact", "duration=3.0", "controller.catch_up=0")
     )
@@ -254,7 +249,7 @@ def test_a_run_that_leaves_the_workspace_says_when() -> None:
     assert 1 < outcome["time"] < 2
 
 
-def test_motions_are_scaled_about_their_start() -> None:
+def test_motions_are_scaled_about_their_start():
     sine = scaled_motion(SineConfig(), 0.5)
     assert sine is not None
     assert sine.amplitude == pytest.approx(np.array(SineConfig().amplitude) / 2)
@@ -269,7 +264,7 @@ def test_motions_are_scaled_about_their_start() -> None:
     assert scaled_motion(HoldConfig(), 1.0) is not None
 
 
-def test_delays_of_the_map_lie_around_the_own_one() -> None:
+def test_delays_of_the_map_lie_around_the_own_one():
     assert map_delays(8) == [0, 4, 8, 12, 16]
     assert map_delays(0) == [0, 1, 2, 4]
     assert map_delays(1) == [0, 1, 2, 4]

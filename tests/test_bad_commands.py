@@ -12,7 +12,7 @@ from tests.faults import refusal, tree, written
 
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.1", "--set", "delay.steps=1")
 
-WITH_OUT: dict[str, list[str]] = {
+WITH_OUT = {
     "simulate": ["simulate", *EXACT],
     "compare": ["compare", *EXACT],
     "report": ["report", *EXACT],
@@ -144,6 +144,6 @@ def test_standard_output_that_is_full_is_one_line(capsys, monkeypatch):
         monkeypatch.setattr(sys, "stdout", full)
         assert main(["model", "sdf", "paper"]) == 2
         monkeypatch.undo()
-        full.close = lambda: None  # type: ignore[method-assign]
+        full.close = lambda: None
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "No space left on device (standard output" in said

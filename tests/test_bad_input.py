@@ -1,7 +1,5 @@
 """Fields of scenarios and mechanisms out of their ranges, and numbers in other units."""
 
-from typing import Any
-
 import pytest
 from ruamel.yaml import YAML
 
@@ -13,7 +11,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from tests.faults import complaint, put, written, yaml_text
 
-SCENARIO_RANGES: dict[str, list[float]] = {
+SCENARIO_RANGES = {
     "duration": [0, -1.0],
     "log_period": [0, -1.0, 1e-9],
     "reference.frequency": [0, -1.0],
@@ -75,7 +73,7 @@ SCENARIO_RANGES: dict[str, list[float]] = {
     "tuner.slope": [-1.0, 101.0],
     "tuner.knee": [-7.0, 5.0],
 }
-KINDS: dict[str, Any] = {
+KINDS = {
     **{f"tuner.{name}": {"kind": "rule"} for name in ("ratio", "slope", "knee")},
     **{f"sensor.{name}": {"kind": "encoders"} for name in ("bits", "samples")},
     **{
@@ -89,7 +87,7 @@ KINDS: dict[str, Any] = {
 """Fields that a section needs beside the one that is wrong."""
 
 PAPER = YAML(typ="safe").load((data_root() / "models" / "paper.yaml").read_text())
-MECHANISM_RANGES: dict[str, list[float]] = {
+MECHANISM_RANGES = {
     "base.mass": [-1.0],
     "plate.mass": [0, -1.0],
     "crank.mass": [0, -1.0],

@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import cloudpickle
 import pytest
@@ -15,7 +14,7 @@ import pytest
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 
 
-def script(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def script(name, monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
     return importlib.import_module(name)
 
@@ -36,7 +35,7 @@ def test_a_script_finds_what_it_imports(name, monkeypatch):
     assert script(name, monkeypatch).__doc__
 
 
-def sent(path: Path) -> set[str]:
+def sent(path):
     """Names of the functions that a script hands to `delayed`."""
     return set(re.findall(r"\bdelayed\(([a-zA-Z_]+)\)", path.read_text(encoding="utf-8")))
 

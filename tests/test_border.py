@@ -2,14 +2,12 @@
 
 import copy
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.mechanism.geometry import Mechanism
 from tests.mechanisms import PAPER
 
 HOME, REST = PAPER.home, np.zeros(6)
@@ -32,7 +30,7 @@ DYNAMICS = sd.StewartDynamics(PAPER, gravity=True, parameters=np.linspace(0.0, 0
         ("predict", (np.append(HOME, REST), np.zeros((2, 6)), [0.1, 0.1])),
     ],
 )
-def test_one_number_does_not_stand_for_six(method, good, wrong) -> None:
+def test_one_number_does_not_stand_for_six(method, good, wrong):
     call = getattr(DYNAMICS, method)
     call(*good)
     call(*(np.asarray(argument).tolist() for argument in good))
@@ -45,25 +43,25 @@ def test_one_number_does_not_stand_for_six(method, good, wrong) -> None:
 
 
 @pytest.mark.parametrize("method", ["accelerations", "inverse_dynamics", "derivatives"])
-def test_parameters_are_eight(method) -> None:
+def test_parameters_are_eight(method):
     with pytest.raises(ValueError, match=r"parameters: got shape \(\); expected \(8,\)"):
         getattr(DYNAMICS, method)(HOME, REST, REST, 0.0)
 
 
 @pytest.mark.parametrize("gravity", [np.nan, np.inf, [9.81, 0.0], "down", None])
-def test_a_gravity_that_is_none_is_refused(gravity) -> None:
+def test_a_gravity_that_is_none_is_refused(gravity):
     with pytest.raises(ConfigError, match=r"^gravity: got .*; expected"):
         sd.StewartDynamics(PAPER, gravity=gravity)
 
 
 @pytest.mark.parametrize("parameters", [0.0, np.zeros(7), np.full(8, np.nan), "none"])
-def test_parameters_of_the_machine_are_checked(parameters) -> None:
+def test_parameters_of_the_machine_are_checked(parameters):
     with pytest.raises(ConfigError, match=r"^parameters: got .*; expected"):
         sd.StewartDynamics(PAPER, parameters=parameters)
 
 
 @pytest.mark.parametrize("wrong", [[0, 0, 0.18], 0.38, np.zeros((2, 6)), []])
-def test_a_pose_has_six_coordinates(wrong) -> None:
+def test_a_pose_has_six_coordinates(wrong):
     for method in (PAPER.crank_angles, PAPER.reach_margins, PAPER.jacobian):
         with pytest.raises(ValueError, match=r"^pose: got shape .*; expected \(6,\), \[roll"):
             method(wrong)
@@ -76,7 +74,7 @@ def test_a_pose_has_six_coordinates(wrong) -> None:
 # Copies.
 
 
-def work(dynamics: sd.StewartDynamics) -> list[np.ndarray]:
+def work(dynamics):
     rates, torque = np.linspace(-0.1, 0.1, 6), np.linspace(0.0, 0.5, 6)
     return [
         dynamics.accelerations(HOME, rates, torque),
@@ -89,7 +87,7 @@ def work(dynamics: sd.StewartDynamics) -> list[np.ndarray]:
 @pytest.mark.parametrize(
     "again", [copy.copy, copy.deepcopy, lambda d: pickle.loads(pickle.dumps(d))]
 )
-def test_a_copy_of_the_dynamics_is_as_good(again) -> None:
+def test_a_copy_of_the_dynamics_is_as_good(again):
     for dynamics in (DYNAMICS, sd.StewartDynamics(PAPER, gravity=1.62)):
         other = again(dynamics)
         assert other is not dynamics and other.mechanism == PAPER
@@ -100,15 +98,15 @@ def test_a_copy_of_the_dynamics_is_as_good(again) -> None:
         assert dynamics.parameters[0] == 0.0
 
 
-def test_a_mechanism_that_was_sent_is_the_same() -> None:
-    sent: Mechanism = pickle.loads(pickle.dumps(PAPER))
+def test_a_mechanism_that_was_sent_is_the_same():
+    sent = pickle.loads(pickle.dumps(PAPER))
     assert sent == PAPER and hash(sent) == hash(PAPER)
 
 
 # simulate
 
 
-def test_simulate_takes_a_name_or_a_path(tmp_path: Path) -> None:
+def test_simulate_takes_a_name_or_a_path(tmp_path):
     text = "duration: 0.1\nplant: {kind: exact}\n"
     path = tmp_path / "short.yaml"
     path.write_text(text)
@@ -120,6 +118,6 @@ def test_simulate_takes_a_name_or_a_path(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("given", [None, 3, {"duration": 1.0}])
-def test_simulate_says_what_it_takes(given) -> None:
+def test_simulate_says_what_it_takes(given):
     with pytest.raises(TypeError, match=r"^scenario: got a .*; expected a Scenario, or the name"):
         sd.simulate(given)

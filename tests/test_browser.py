@@ -1,14 +1,13 @@
 """The replay in a real browser: it shows something, it moves, it says what is true, offline."""
 
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import stewart_drake as sd
 from stewart_drake.reporting.replay import write_replay
-from tests.browser import Browser, needs_chromium
+from tests.browser import needs_chromium
 
 pytestmark = [needs_chromium, pytest.mark.slow]
 
@@ -16,24 +15,24 @@ SETTINGS = ("plant.kind=exact", "duration=3.0")  # from rest: the plate is far o
 
 
 @pytest.fixture(scope="module")
-def run() -> sd.SimulationResult:
+def run():
     return sd.simulate(sd.load_scenario("paper", settings=SETTINGS), judge_stability=False)
 
 
 @pytest.fixture(scope="module")
-def page(run, tmp_path_factory) -> Path:
+def page(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("replay") / "replay.html"
     return write_replay(run, sd.load_mechanism("paper"), path, "paper, from rest")
 
 
 @pytest.fixture
-def replay(tab: Browser, page: Path) -> Browser:
+def replay(tab, page):
     tab.open(page)
     tab.wait("viewer.animator.actions.length > 0 && document.querySelector('canvas') !== null")
     return tab
 
 
-def seek(tab: Browser, time: float) -> None:
+def seek(tab, time):
     """Go to a time by the page's own slider, and let it draw."""
     tab.evaluate(f"slider.value = {time}; slider.dispatchEvent(new Event('input'))")
     frames = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
@@ -41,7 +40,7 @@ def seek(tab: Browser, time: float) -> None:
         tab.evaluate(frames)
 
 
-def scene(tab: Browser) -> np.ndarray:
+def scene(tab):
     """The middle of the canvas, where no panel covers the machine."""
     return tab.screenshot()[60:620, 380:900]
 

@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from stewart_drake.core.library import core
 from stewart_drake.law.channel import Packets, structure
@@ -16,17 +15,16 @@ from stewart_drake.scenario.packets import (
     torque_missing,
     usual_bound,
 )
-from stewart_drake.types import Array
 
 PERIOD = 0.1
 COUNTED = 400_000
 
 
-def network(burst: int, loss: float = 0.1) -> PacketsConfig:
+def network(burst, loss=0.1):
     return PacketsConfig(low=0.3, high=0.6, loss=loss, burst=burst)
 
 
-def share_and_error(events: NDArray[np.bool_]) -> tuple[float, float]:
+def share_and_error(events):
     """Share of correlated events and its standard error, from the means of 200 batches."""
     batches = events[: len(events) // 200 * 200].reshape(200, -1).mean(axis=1)
     return float(batches.mean()), float(batches.std(ddof=1) / np.sqrt(200))
@@ -35,9 +33,7 @@ def share_and_error(events: NDArray[np.bool_]) -> tuple[float, float]:
 @pytest.mark.parametrize("bound", [0.4, 0.5, 0.6])
 @pytest.mark.parametrize("repeats", [0, 1, 6])
 @pytest.mark.parametrize("burst", [1, 4, 12])
-def test_the_share_of_missing_torques_is_what_counting_gives(
-    burst: int, repeats: int, bound: float
-) -> None:
+def test_the_share_of_missing_torques_is_what_counting_gives(burst, repeats, bound):
     config = network(burst)
     times = packet_times(config, COUNTED + repeats, seed=11)
     missing = np.all(
@@ -53,7 +49,7 @@ def test_the_share_of_missing_torques_is_what_counting_gives(
     assert abs(counted - stated) <= max(0.05 * stated, 3 * error)
 
 
-def test_single_losses_are_independent() -> None:
+def test_single_losses_are_independent():
     """A burst of one: the product of the packets' own probabilities."""
     for loss, repeats, bound in itertools.product((0.0, 0.05, 0.5), (0, 1, 6), (0.3, 0.45, 0.7)):
         due = bound + PERIOD * np.arange(repeats + 1)
@@ -62,19 +58,19 @@ def test_single_losses_are_independent() -> None:
         assert stated == pytest.approx(product, rel=1e-9, abs=1e-18)
 
 
-def test_the_usual_bound_knows_bursts() -> None:
+def test_the_usual_bound_knows_bursts():
     """Both packets of a torque are often lost together, which no bound mends."""
     assert usual_bound(network(1), 1, PERIOD) == pytest.approx(0.6)
     assert usual_bound(network(12), 1, PERIOD) == pytest.approx(0.5)
 
 
-def test_the_first_packets_are_lost_as_often_as_later_ones() -> None:
+def test_the_first_packets_are_lost_as_often_as_later_ones():
     runs = [losses(30, 0.2, 20, np.random.default_rng(seed)) for seed in range(4000)]
     share = np.mean(runs, axis=0)
     assert np.all(np.abs(share - 0.2) < 4.5 * np.sqrt(0.2 * 0.8 / 4000))
 
 
-def chances(channel: Packets, arrived: NDArray[np.bool_], since: int, last: int) -> Array:
+def chances(channel, arrived, since, last):
     """(last, n + 1) probabilities of the sources of the last torques, see core/packets.h."""
     c, packets, known = core(), structure(channel), len(arrived)
     flags, rows = arrived.astype(np.float64), np.empty((last, known + 1))
@@ -88,7 +84,7 @@ def chances(channel: Packets, arrived: NDArray[np.bool_], since: int, last: int)
 
 @pytest.mark.parametrize("burst", [1, 2, 3])
 @pytest.mark.parametrize("seed", range(6))
-def test_packets_are_weighed_by_every_course_of_the_losses(burst: int, seed: int) -> None:
+def test_packets_are_weighed_by_every_course_of_the_losses(burst, seed):
     """Against the sum over all courses of bursts and times that agree with a report."""
     rng = np.random.default_rng(seed)
     rows, repeats, n, since, last = 4, 1, 7, int(rng.integers(0, 3)), 4
@@ -127,7 +123,7 @@ def test_packets_are_weighed_by_every_course_of_the_losses(burst: int, seed: int
     assert found[:, -1] == pytest.approx(expected[:, -1], abs=1e-7)
 
 
-def test_a_lost_neighbour_makes_a_packet_unlikely() -> None:
+def test_a_lost_neighbour_makes_a_packet_unlikely():
     """Packet 1 came late for no reason but loss: with bursts the next one is probably lost too."""
     told = (0.0, 0.0, 1.0, 1.0, 1.0, 1.0)
     by_burst = {

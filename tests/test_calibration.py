@@ -1,8 +1,6 @@
 """What is known of a machine: the file, and what the law makes of it."""
 
 import dataclasses
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +10,9 @@ from hypothesis import strategies as st
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import yaml_text
-from stewart_drake.law.filter_settings import CHANCE, EXACT, ParameterSet, usual_parameters
+from stewart_drake.law.filter_settings import CHANCE, EXACT, usual_parameters
 from stewart_drake.law.observers import ParameterObserver
-from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.experiment import Experiment, believed_delay, prepare
+from stewart_drake.loop.experiment import believed_delay, prepare
 from stewart_drake.loop.law_design import GENTLE, compose_law
 from stewart_drake.mechanism.geometry import Body, fingerprint
 from stewart_drake.scenario.calibration import (
@@ -41,9 +38,7 @@ ON_REFERENCE = ("plant.kind=exact", "start=on_reference", "queue=reference")
 
 @settings(max_examples=50, deadline=None)
 @given(st.sets(st.sampled_from(KNOWABLE)), st.integers(0, 2**32 - 1))
-def test_a_file_is_read_back_to_the_last_digit(
-    tmp_path_factory: pytest.TempPathFactory, names: set[str], seed: int
-) -> None:
+def test_a_file_is_read_back_to_the_last_digit(tmp_path_factory, names, seed):
     rng, n, path = np.random.default_rng(seed), len(names), tmp_path_factory.mktemp("k") / "k.yaml"
     spread = rng.normal(0, 1, (n, max(0, n - 1)))  # of less than full rank
     known = Calibration("abc", tuple(sorted(names)), rng.uniform(1e-3, 1, n), spread @ spread.T)
@@ -74,9 +69,7 @@ def test_a_file_is_read_back_to_the_last_digit(
         ({"mechanism": 3}, "mechanism: got 3; expected a valid string"),
     ],
 )
-def test_a_wrong_file_is_refused_in_one_line(
-    tmp_path: Path, wrong: dict[str, Any], message: str
-) -> None:
+def test_a_wrong_file_is_refused_in_one_line(tmp_path, wrong, message):
     right = {
         "mechanism": "abc",
         "names": ["payload_mass", "delay"],
@@ -93,13 +86,13 @@ def test_a_wrong_file_is_refused_in_one_line(
     assert "\n" not in str(refused.value)
 
 
-def test_a_fingerprint_is_of_the_numbers_that_a_machine_moves_by() -> None:
+def test_a_fingerprint_is_of_the_numbers_that_a_machine_moves_by():
     own = fingerprint(PAPER)
     same = ({"name": "other"}, {"effort_limit": 1.0}, {"home": PAPER.home + 1e-3})
     rounded = ({"p_WS": PAPER.p_WS + 1e-13}, {"plate": _heavier(1e-12)})
     for change in (*same, *rounded):
         assert fingerprint(dataclasses.replace(PAPER, **change)) == own
-    others: tuple[dict[str, Any], ...] = (
+    others = (
         {"p_WS": PAPER.p_WS + 1e-8},
         {"p_PQ": PAPER.p_PQ - 1e-8},
         {"rod_lengths": PAPER.rod_lengths + 1e-8},
@@ -112,18 +105,18 @@ def test_a_fingerprint_is_of_the_numbers_that_a_machine_moves_by() -> None:
     assert own not in prints
 
 
-def _heavier(share: float) -> Body:
+def _heavier(share):
     return Body(PAPER.plate.mass * (1 + share), PAPER.plate.inertia)
 
 
 # What it is taken for.
 
 
-def usual(free: tuple[str, ...] = PARAMETERS) -> ParameterSet:
+def usual(free=PARAMETERS):
     return usual_parameters(4.0, 0.1, None, 0.2, free)
 
 
-def test_what_is_known_is_the_prior_of_what_is_estimated() -> None:
+def test_what_is_known_is_the_prior_of_what_is_estimated():
     before, after = usual(), usual().knowing(KNOWN)
     assert np.array_equal(after.prior, [0, 0, 0, 0, 0, 0, 0.4, 1e-3])
     expected = np.diag(before.std**2)
@@ -134,7 +127,7 @@ def test_what_is_known_is_the_prior_of_what_is_estimated() -> None:
     assert np.array_equal(after.upper, before.upper)
 
 
-def test_what_is_known_exactly_is_nearly_so() -> None:
+def test_what_is_known_exactly_is_nearly_so():
     exactly = Calibration("abc", ("payload_mass", "delay"), np.array([0.4, 1.0]), np.zeros((2, 2)))
     found = usual().knowing(exactly)
     assert found.std[PAYLOAD] == EXACT * usual().std[PAYLOAD]
@@ -142,7 +135,7 @@ def test_what_is_known_exactly_is_nearly_so() -> None:
 
 
 @pytest.mark.parametrize(("off", "taken"), [(0.9 * CHANCE, True), (1.1 * CHANCE, False)])
-def test_a_mean_is_beyond_a_bound_by_chance_or_refused(off: float, taken: bool) -> None:
+def test_a_mean_is_beyond_a_bound_by_chance_or_refused(off, taken):
     names, std = ("joint_damping",), 1e-4
     found = Calibration("abc", names, np.array([-off * std]), np.array([[std**2]]))
     if taken:
@@ -152,7 +145,7 @@ def test_a_mean_is_beyond_a_bound_by_chance_or_refused(off: float, taken: bool) 
         usual().knowing(found)
 
 
-def test_a_standard_deviation_that_is_said_goes_together_with_nothing() -> None:
+def test_a_standard_deviation_that_is_said_goes_together_with_nothing():
     found = usual().knowing(KNOWN).trusting({"joint_damping": 5e-4})
     assert found.std[DAMPING] == 5e-4
     assert found.covariance[PAYLOAD, DAMPING] == 0
@@ -161,7 +154,7 @@ def test_a_standard_deviation_that_is_said_goes_together_with_nothing() -> None:
     assert usual().trusting({}).correlation is None
 
 
-def test_every_parameter_can_be_free() -> None:
+def test_every_parameter_can_be_free():
     every = usual((*PLANT_PARAMETERS, *OFFSETS))
     assert every.names == (*PLANT_PARAMETERS, *OFFSETS)
     assert set(every.units) == {"N m", "kg", "N m s/rad", "rad/s", "m", "rad"}
@@ -175,22 +168,22 @@ def test_every_parameter_can_be_free() -> None:
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
+def file(tmp_path):
     path = tmp_path / "calibration.yaml"
     save_calibration(path, KNOWN)
     return path
 
 
-def experiment(*given: str) -> Experiment:
+def experiment(*given):
     return prepare(sd.load_scenario("paper", "predictor_lqi", (*ON_REFERENCE, *given)))
 
 
-def observer(law: PredictiveLqi) -> ParameterObserver:
+def observer(law):
     assert isinstance(law.observer, ParameterObserver)
     return law.observer
 
 
-def test_the_law_begins_with_what_is_known(file: Path) -> None:
+def test_the_law_begins_with_what_is_known(file):
     found = experiment(f"controller.calibration={file}", "controller.prior={payload: 0.2}")
     nominal = found.nominal
     known = dict(zip(PLANT_PARAMETERS, nominal.plant_parameters, strict=True))
@@ -206,7 +199,7 @@ def test_the_law_begins_with_what_is_known(file: Path) -> None:
     assert np.array_equal(belief.parameters, nominal.parameters)
 
 
-def test_without_a_file_the_law_is_as_machine_and_motion_say() -> None:
+def test_without_a_file_the_law_is_as_machine_and_motion_say():
     found = experiment()
     assert found.calibration is None
     law = compose_law(found)
@@ -216,14 +209,14 @@ def test_without_a_file_the_law_is_as_machine_and_motion_say() -> None:
     assert prior.std == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_known_delay_is_believed_where_nothing_else_is_said(file: Path) -> None:
+def test_a_known_delay_is_believed_where_nothing_else_is_said(file):
     known = f"controller.calibration={file}"
     assert believed_delay(experiment(known).scenario) == Delay.of(0.73, 0.1)
     assert believed_delay(experiment(known, "controller.delay_steps=6").scenario) == Delay(6)
     assert believed_delay(experiment().scenario) == Delay(8)
 
 
-def test_a_path_starts_from_the_file_that_says_it(file: Path) -> None:
+def test_a_path_starts_from_the_file_that_says_it(file):
     scenario, controller = file.parent / "my.yaml", file.parent / "law.yaml"
     scenario.write_text("controller: {calibration: calibration.yaml}\nplant: {mechanism: ./m.yaml}")
     controller.write_text("calibration: calibration.yaml")
@@ -249,20 +242,18 @@ def test_a_path_starts_from_the_file_that_says_it(file: Path) -> None:
         ),
     ],
 )
-def test_what_cannot_be_used_is_refused_in_one_line(
-    file: Path, change: dict[str, Any], given: tuple[str, ...], message: str
-) -> None:
+def test_what_cannot_be_used_is_refused_in_one_line(file, change, given, message):
     save_calibration(file, dataclasses.replace(KNOWN, **change))
     with pytest.raises(ConfigError, match=message):
         compose_law(experiment(f"controller.calibration={file}", *given))
 
 
-def test_a_file_that_is_not_there_names_the_field() -> None:
+def test_a_file_that_is_not_there_names_the_field():
     with pytest.raises(ConfigError, match=r"^controller\.calibration: .*nowhere"):
         experiment("controller.calibration=/nowhere/calibration.yaml")
 
 
-def test_what_is_known_is_worth_something(file: Path) -> None:
+def test_what_is_known_is_worth_something(file):
     """Friction that the estimator does not have, and parameters that it has to learn otherwise."""
     true = ("plant.payload_mass=0.4", "plant.joint_damping=1e-3", "plant.coulomb_friction=5e-4")
     save_calibration(file, dataclasses.replace(KNOWN, mean=np.array([0.4, 1e-3, 5e-4, 0.8])))

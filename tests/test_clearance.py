@@ -3,7 +3,6 @@
 import dataclasses
 import json
 from itertools import combinations, product
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +23,6 @@ from stewart_drake.mechanism.clearance import (
     segment_distances,
 )
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import (
     leg_geometry,
     legs_along,
@@ -33,8 +31,7 @@ from stewart_drake.mechanism.kinematics import (
 )
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.clearance import clearance_along, study_clearance
-from stewart_drake.studies.workspace_map import Section, Travel, sections, travel
-from stewart_drake.types import Array
+from stewart_drake.studies.workspace_map import sections, travel
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -44,7 +41,7 @@ seeded = settings(max_examples=25, deadline=None, derandomize=True)
 LEG = ("1", "2", "3", "4", "5", "6")
 
 
-def distance(p: Array, u: Array, q: Array, v: Array) -> float:
+def distance(p, u, q, v):
     """Of two segments: least squares between bounds."""
     found = lsq_linear(np.column_stack([u, -v]), q - p, (0.0, 1.0), tol=1e-14)
     return float(np.linalg.norm(p + found.x[0] * u - q - found.x[1] * v))
@@ -55,7 +52,7 @@ def distance(p: Array, u: Array, q: Array, v: Array) -> float:
 
 @given(seed=seeds)
 @seeded
-def test_segments_are_as_far_apart_as_least_squares_says(seed: int) -> None:
+def test_segments_are_as_far_apart_as_least_squares_says(seed):
     rng = np.random.default_rng(seed)
     p, u, q, v = rng.normal(size=(4, 20, 3)) * rng.choice([0.1, 1.0, 3.0], (4, 20, 1))
     found = segment_distances(p, u, q, v)
@@ -73,7 +70,7 @@ def test_segments_are_as_far_apart_as_least_squares_says(seed: int) -> None:
         ([-3, 4, 0], [0, 9, 0], 5),  # end to end
     ],
 )
-def test_segments_in_the_plane(q: list[float], v: list[float], wanted: float) -> None:
+def test_segments_in_the_plane(q, v, wanted):
     axis = np.array([1.0, 0, 0])
     found = segment_distances(np.zeros(3), axis, np.array(q, float), np.array(v, float))
     assert found == pytest.approx(wanted, abs=1e-12)
@@ -81,7 +78,7 @@ def test_segments_in_the_plane(q: list[float], v: list[float], wanted: float) ->
 
 @given(seed=seeds)
 @seeded
-def test_legs_along_a_motion_are_those_of_each_pose(seed: int) -> None:
+def test_legs_along_a_motion_are_those_of_each_pose(seed):
     rng = np.random.default_rng(seed)
     mechanism = random_mechanism(rng)
     poses = np.array([random_pose(rng, mechanism) for _ in range(3)])
@@ -96,7 +93,7 @@ def test_legs_along_a_motion_are_those_of_each_pose(seed: int) -> None:
         np.testing.assert_allclose(margins, reach_margins(mechanism, pose), atol=1e-15)
 
 
-def test_out_of_reach_there_are_no_legs() -> None:
+def test_out_of_reach_there_are_no_legs():
     far = PAPER.home + [0, 0, 0, 0, 0, 1.0]
     legs = legs_along(PAPER, np.array([PAPER.home, far]))
     assert np.isfinite(legs.rod[0]).all() and np.isnan(legs.rod[1]).all()
@@ -105,7 +102,7 @@ def test_out_of_reach_there_are_no_legs() -> None:
 # ------------------------------------------------------------------ shapes
 
 
-def test_every_pair_is_looked_at_but_those_that_meet_in_a_joint() -> None:
+def test_every_pair_is_looked_at_but_those_that_meet_in_a_joint():
     names = {frozenset(pair) for pair in ClearanceScene(PAPER).pairs}
     links = {frozenset(pair) for pair in ClearanceScene(PAPER, base=False).pairs}
     assert links == {p for p in names if not Pair(*sorted(p)).fixed}
@@ -122,7 +119,7 @@ def test_every_pair_is_looked_at_but_those_that_meet_in_a_joint() -> None:
 
 @given(seed=seeds)
 @seeded
-def test_rods_are_as_far_apart_as_least_squares_says(seed: int) -> None:
+def test_rods_are_as_far_apart_as_least_squares_says(seed):
     """Capsules: their lines' distance less two radii, along the common normal."""
     rng = np.random.default_rng(seed)
     mechanism = random_mechanism(rng)
@@ -137,7 +134,7 @@ def test_rods_are_as_far_apart_as_least_squares_says(seed: int) -> None:
         assert found[Pair(f"rod {i + 1}", f"rod {j + 1}")] == pytest.approx(apart, abs=1e-6)
 
 
-def test_lines_that_cross_are_two_radii_deep() -> None:
+def test_lines_that_cross_are_two_radii_deep():
     """In the reference mechanism, at home, the legs of a pair are mirror images of each other."""
     scene = ClearanceScene(PAPER, base=False)
     found = dict(zip(scene.pairs, scene.distances(PAPER.home), strict=True))
@@ -146,21 +143,21 @@ def test_lines_that_cross_are_two_radii_deep() -> None:
         assert crossing == pytest.approx(-2 * proportions(PAPER).rod_radius, abs=1e-6)
 
 
-def nearest_in_box(point: Array, half: Array) -> Array:
+def nearest_in_box(point, half):
     return np.clip(point, -half, half)
 
 
-def nearest_in_capsule(point: Array, radius: float, half: float) -> Array:
+def nearest_in_capsule(point, radius, half):
     on_axis = np.array([np.clip(point[0], -half, half), 0, 0])
     off = point - on_axis
     return on_axis + off * min(1.0, radius / max(float(np.linalg.norm(off)), 1e-300))
 
 
-def by_projections(mechanism: Mechanism, pose: Array, first: str, second: str) -> float:
+def by_projections(mechanism, pose, first, second):
     """Distance of two links: projected from one onto the other until nothing changes."""
     size, home = proportions(mechanism), assemble(mechanism, pose)
 
-    def onto(name: str, point: Array) -> Array:
+    def onto(name, point):
         kind, leg = name.split()[0], int(name.split()[1]) - 1
         if kind == "crank":
             R, half = home.R_WC[leg], mechanism.crank_lengths[leg] / 2
@@ -182,7 +179,7 @@ def by_projections(mechanism: Mechanism, pose: Array, first: str, second: str) -
 
 
 @pytest.mark.parametrize("name", ["paper_clear", "desktop"])
-def test_cranks_and_rods_are_as_far_apart_as_by_projections(name: str) -> None:
+def test_cranks_and_rods_are_as_far_apart_as_by_projections(name):
     experiment = made(load_scenario("paper" if name == "paper_clear" else name))
     mechanism = load_mechanism(name)
     scene = ClearanceScene(mechanism, base=False)
@@ -201,7 +198,7 @@ def test_cranks_and_rods_are_as_far_apart_as_by_projections(name: str) -> None:
 
 @given(seed=seeds)
 @seeded
-def test_capsules_are_never_further_apart_than_the_links_in_them(seed: int) -> None:
+def test_capsules_are_never_further_apart_than_the_links_in_them(seed):
     rng = np.random.default_rng(seed)
     mechanism = random_mechanism(rng)
     pose = random_pose(rng, mechanism)
@@ -216,14 +213,14 @@ def test_capsules_are_never_further_apart_than_the_links_in_them(seed: int) -> N
 # ------------------------------------------------------------------ along a motion, around home
 
 
-def along(name: str, machine: str | None = None) -> tuple[Mechanism, Array, Array]:
+def along(name, machine=None):
     experiment = made(load_scenario(name))
     mechanism = load_mechanism(machine or name)
     time = np.linspace(0, 10, 101)
     return mechanism, time, np.array([experiment.reference.value(t)[:, 0] for t in time])
 
 
-def test_the_reference_mechanism_crosses_and_paper_clear_does_not() -> None:
+def test_the_reference_mechanism_crosses_and_paper_clear_does_not():
     mechanism, time, poses = along("paper")
     crossing = clearance_along(ClearanceScene(mechanism), mechanism, time, poses).touching
     names = {str(one.pair) for one in crossing}
@@ -238,7 +235,7 @@ def test_the_reference_mechanism_crosses_and_paper_clear_does_not() -> None:
     assert of_motors[0].distance > 0  # its motors and posts stand free too, the drawn disc does not
 
 
-def test_paper_clear_has_what_the_paper_publishes() -> None:
+def test_paper_clear_has_what_the_paper_publishes():
     clear = load_mechanism("paper_clear")
     for lengths in ("crank_lengths", "rod_lengths"):
         np.testing.assert_array_equal(getattr(clear, lengths), getattr(PAPER, lengths))
@@ -252,7 +249,7 @@ def test_paper_clear_has_what_the_paper_publishes() -> None:
             assert ours == pytest.approx(theirs, abs=1e-12)
 
 
-def sorted_gaps(points: Array) -> list[float]:
+def sorted_gaps(points):
     """What does not change as a pattern is turned: radii, and distances of all pairs."""
     radii = np.hypot(points[:, 0], points[:, 1])
     gaps = np.linalg.norm(points[:, None] - points[None], axis=2)
@@ -260,7 +257,7 @@ def sorted_gaps(points: Array) -> list[float]:
 
 
 @pytest.mark.parametrize("name", shipped("mechanism"))
-def test_travel_ends_where_two_links_touch(name: str) -> None:
+def test_travel_ends_where_two_links_touch(name):
     mechanism = load_mechanism(name)
     scene, ways = ClearanceScene(mechanism, base=False), travel(mechanism)
     found = study_clearance(mechanism, np.zeros(1), mechanism.home[None], ways, [])
@@ -282,10 +279,10 @@ def test_travel_ends_where_two_links_touch(name: str) -> None:
                 assert min(beyond.values()) < 0
 
 
-def test_sections_tell_where_links_touch() -> None:
+def test_sections_tell_where_links_touch():
     clear = load_mechanism("paper_clear")
-    parts: list[Section] = sections(clear, points=13)
-    ways: list[Travel] = travel(clear)
+    parts = sections(clear, points=13)
+    ways = travel(clear)
     found = study_clearance(clear, np.zeros(1), clear.home[None], ways, parts)
     scene = ClearanceScene(clear, base=False)
     for section, part in zip(found.sections, parts, strict=True):
@@ -298,16 +295,14 @@ def test_sections_tell_where_links_touch() -> None:
     assert 0 < found.sections[2].touching < 1  # tilted far enough, rods of two pairs meet
 
 
-def test_out_of_reach_nothing_is_said_to_be_clear() -> None:
+def test_out_of_reach_nothing_is_said_to_be_clear():
     far = np.array([PAPER.home + [0, 0, 0, 0, 0, 1.0]])
     found = study_clearance(PAPER, np.zeros(1), far, [], [])
     assert found.along.nearest == [] and found.summary["least"] is None
     assert "nothing is known" in found.verdict
 
 
-def test_the_command_names_the_links_that_cross(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_names_the_links_that_cross(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("stewart_drake.studies.workspace_map.POINTS", 15)
     monkeypatch.setattr("stewart_drake.studies.workspace_map._ROUGH", 15)
     assert main(["analyze", "workspace", "paper", "--out", str(tmp_path)]) == 0

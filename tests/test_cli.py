@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import joblib
 import numpy as np
@@ -36,11 +35,11 @@ RUN_FILES = {
 }
 
 
-def command(*arguments: str) -> list[str]:
+def command(*arguments):
     return [sys.executable, "-m", "stewart_drake", *arguments]
 
 
-def files(folder: Path) -> set[str]:
+def files(folder):
     return {path.name for path in folder.iterdir()}
 
 
@@ -48,7 +47,7 @@ def files(folder: Path) -> set[str]:
 
 
 @pytest.mark.slow
-def test_a_scenario_is_prepared_once(tmp_path, monkeypatch) -> None:
+def test_a_scenario_is_prepared_once(tmp_path, monkeypatch):
     """Its reference is looked at over all of its duration, and its mechanism is read."""
     prepared = []
 
@@ -133,7 +132,7 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys, monkeyp
 # ---------------------------------------------------------------- Ctrl-C
 
 
-def interrupted(arguments: list[str], wait: float, group: bool) -> tuple[int, str]:
+def interrupted(arguments, wait, group):
     """Exit status and stderr of a command that gets Ctrl-C some time after its first line.
 
     Without the lines of progress that a busy machine gives it time for.

@@ -17,7 +17,7 @@ ON_REFERENCE = ("start=on_reference", "queue=reference")
 BIAS = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
 
 
-def run(*settings: str, controller: str | None = None) -> sd.SimulationResult:
+def run(*settings, controller=None):
     """The paper's scenario with settings."""
     return sd.simulate(
         sd.load_scenario("paper", controller=controller, settings=settings), judge_stability=False
@@ -29,7 +29,7 @@ def run(*settings: str, controller: str | None = None) -> sd.SimulationResult:
     [(*ON_REFERENCE, "duration=10.0"), ("plant.time_step=0.0005", "duration=2.0")],
     ids=["on the reference", "from rest, 0.5 ms"],
 )
-def test_joints_stay_closed_through_a_multibody_run(settings: tuple[str, ...]) -> None:
+def test_joints_stay_closed_through_a_multibody_run(settings):
     """The engine's gap is of second order in its step: 2.5e-6 m from rest at 1 ms."""
     loop = build_closed_loop(sd.load_scenario("paper", settings=settings))
     end = loop.experiment.scenario.duration
@@ -50,7 +50,7 @@ def test_joints_stay_closed_through_a_multibody_run(settings: tuple[str, ...]) -
 
 
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
-def test_torques_arrive_after_the_delay_and_not_before(plant: str) -> None:
+def test_torques_arrive_after_the_delay_and_not_before(plant):
     result = run(f"plant.kind={plant}", "duration=1.6")
     time = result.signals.time.values
     commanded = result.signals["torque_commanded"].values
@@ -69,16 +69,14 @@ def test_torques_arrive_after_the_delay_and_not_before(plant: str) -> None:
         ("delay_lqi", ON_REFERENCE, 1.20),
     ],
 )
-def test_the_tuner_does_not_save_the_faithful_controllers(
-    controller: str, start: tuple[str, ...], seconds: float
-) -> None:
+def test_the_tuner_does_not_save_the_faithful_controllers(controller, start, seconds):
     """As docs/figures.md says beside the paper's figures, which were reached with a tuner."""
     result = run(*start, "tuner.kind=ann", "duration=2.0", controller=controller)
     assert result.status == "left_workspace" and result.stopped is not None
     assert result.stopped.time == pytest.approx(seconds, abs=0.0051)
 
 
-def test_theory_tells_what_corrected_holds_reach() -> None:
+def test_theory_tells_what_corrected_holds_reach():
     """Rows "corrected" of section 12, four of their columns; tolerance a is w_R = (a/0.03)^2."""
     text = (data_root() / "docs" / "theory.md").read_text(encoding="utf-8")
     cells = [row.split("|")[2:-1] for row in text.splitlines() if row.startswith("| corrected |")]
@@ -90,7 +88,7 @@ def test_theory_tells_what_corrected_holds_reach() -> None:
     assert slow.accumulated_error == pytest.approx(periods[0], abs=5.1e-4)
 
 
-def test_nonlinear_prediction_previews_the_reference() -> None:
+def test_nonlinear_prediction_previews_the_reference():
     """Without feedforward, with true dynamics: the figures of docs/theory.md, section 11."""
     law = (EXACT, *ON_REFERENCE, "controller.model=multibody")
     small = ",".join(f"{0.05 * a}" for a in [np.pi / 12] * 3 + [0.02, 0.02, 0.08])
@@ -106,7 +104,7 @@ def test_nonlinear_prediction_previews_the_reference() -> None:
     assert lost.status == "left_workspace"
 
 
-def test_the_floor_from_rest_is_the_area_above_one_minus_cosine() -> None:
+def test_the_floor_from_rest_is_the_area_above_one_minus_cosine():
     """Integral of |sin t| / 2 * 100 over 0.8 s; the trapezoid on 20 ms loses h^2/12 of it."""
     time = np.arange(0, 10.01, 0.02)
     reference = np.tile(np.sin(time)[:, None], 6)
@@ -117,7 +115,7 @@ def test_the_floor_from_rest_is_the_area_above_one_minus_cosine() -> None:
 
 
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
-def test_a_run_that_leaves_the_workspace_says_when_and_which_leg(plant: str) -> None:
+def test_a_run_that_leaves_the_workspace_says_when_and_which_leg(plant):
     result = run(f"plant.kind={plant}", controller="lqr")
     assert result.status == "left_workspace"
     assert np.isnan(result.accumulated_error)
@@ -130,7 +128,7 @@ def test_a_run_that_leaves_the_workspace_says_when_and_which_leg(plant: str) -> 
     assert result.signals.time.values[-1] <= stopped.time
 
 
-def test_the_predictor_beats_the_delay_on_both_plants() -> None:
+def test_the_predictor_beats_the_delay_on_both_plants():
     """The floor from rest is 15.16; the paper reports 80."""
     exact = run(EXACT)
     assert exact.accumulated_error <= 22 and exact.summary["peak_torque"] <= 1.0
@@ -148,7 +146,7 @@ def test_the_predictor_beats_the_delay_on_both_plants() -> None:
         ((BIAS, "plant.payload_mass=0.4", "plant.joint_damping=3e-4"), 1.5),
     ],
 )
-def test_an_unknown_plant_is_found(unknown: tuple[str, ...], bound: float) -> None:
+def test_an_unknown_plant_is_found(unknown, bound):
     result = run(EXACT, *ON_REFERENCE, *unknown)
     assert result.accumulated_error <= bound
     if len(unknown) == 3:
@@ -158,7 +156,7 @@ def test_an_unknown_plant_is_found(unknown: tuple[str, ...], bound: float) -> No
 
 
 @pytest.mark.parametrize("late", [-1.5e-3, -1e-3, 1e-3, 1.5e-3])
-def test_a_delay_a_little_off_is_survived_from_rest(late: float) -> None:
+def test_a_delay_a_little_off_is_survived_from_rest(late):
     """The catch-up's large torques come at other times than the estimator believes (in s)."""
     periods = 8 + late / 0.1
     steps = int(periods)
@@ -173,11 +171,11 @@ def test_a_delay_a_little_off_is_survived_from_rest(late: float) -> None:
     assert np.abs(result.signals.parameters.values[-1]).max() < 1e-2
 
 
-def test_full_amplitude_under_gravity_on_the_exact_plant() -> None:
+def test_full_amplitude_under_gravity_on_the_exact_plant():
     scenario = sd.load_scenario("gravity", settings=(EXACT, "duration=3.0"))
     assert sd.simulate(scenario, judge_stability=False).accumulated_error <= 0.05
 
 
-def test_a_tuner_that_does_not_exist_is_refused() -> None:
+def test_a_tuner_that_does_not_exist_is_refused():
     with pytest.raises(sd.ConfigError, match=r"tuner\.weights: got 'nobody'"):
         run("tuner.kind=ann", "tuner.weights=nobody")

@@ -92,7 +92,7 @@ def test_a_refused_controller_is_named(monkeypatch):
 # ---------------------------------------------------------------- the verdict
 
 
-def verdict(*settings: str, scenario: str = "paper") -> Verdict:
+def verdict(*settings, scenario="paper"):
     return delay_verdict(prepare(load_scenario(scenario, settings=settings)))
 
 

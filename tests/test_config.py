@@ -48,13 +48,13 @@ from stewart_drake.scenario.timing import step_problem
 SINE = [0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]
 
 
-def write(folder: Path, text: str, name: str = "mine.yaml") -> Path:
+def write(folder, text, name="mine.yaml"):
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def one_line(caught: pytest.ExceptionInfo[ConfigError]) -> str:
+def one_line(caught):
     message = str(caught.value)
     assert len(message.splitlines()) == 1
     return message
@@ -63,11 +63,11 @@ def one_line(caught: pytest.ExceptionInfo[ConfigError]) -> str:
 # Defaults and shipped files
 
 
-def test_the_paper_scenario_spells_the_defaults_out() -> None:
+def test_the_paper_scenario_spells_the_defaults_out():
     assert load_scenario("paper") == Scenario()
 
 
-def test_the_paper_scenario_lists_every_field_of_its_kinds() -> None:
+def test_the_paper_scenario_lists_every_field_of_its_kinds():
     data = load_yaml(resolve("scenario", "paper"))
     for section, fields in scenario_to_dict(Scenario()).items():
         if isinstance(fields, dict):
@@ -75,7 +75,7 @@ def test_the_paper_scenario_lists_every_field_of_its_kinds() -> None:
         assert section in data
 
 
-def test_the_gravity_scenario_is_short_delayed_and_starts_on_the_reference() -> None:
+def test_the_gravity_scenario_is_short_delayed_and_starts_on_the_reference():
     scenario = load_scenario("gravity")
     assert scenario.plant == PlantConfig(gravity=True)
     assert scenario.delay == DelayConfig(steps=16)
@@ -85,9 +85,7 @@ def test_the_gravity_scenario_is_short_delayed_and_starts_on_the_reference() -> 
 
 @pytest.mark.parametrize("scenario", shipped("scenario"))
 @pytest.mark.parametrize("controller", shipped("controller"))
-def test_every_shipped_controller_fits_every_shipped_scenario(
-    scenario: str, controller: str
-) -> None:
+def test_every_shipped_controller_fits_every_shipped_scenario(scenario, controller):
     servos = load_controller(controller).get("command") == "cranks"
     settings = ("actuator.kind=servo",) if servos else ()
     plain = load_understood(scenario, settings=settings)
@@ -107,7 +105,7 @@ def test_every_shipped_controller_fits_every_shipped_scenario(
     ("name", "integral", "delay_steps"),
     [("lqr", False, 0), ("lqi", True, 0), ("delay_lqr", False, None), ("delay_lqi", True, None)],
 )
-def test_the_papers_controllers(name: str, integral: bool, delay_steps: int | None) -> None:
+def test_the_papers_controllers(name, integral, delay_steps):
     assert load_scenario("paper", controller=name).controller == ControllerConfig(
         integral=integral,
         delay_steps=delay_steps,
@@ -121,21 +119,21 @@ def test_the_papers_controllers(name: str, integral: bool, delay_steps: int | No
     )
 
 
-def test_the_predictor_is_the_default_controller() -> None:
+def test_the_predictor_is_the_default_controller():
     assert load_scenario("paper", controller="predictor_lqi") == Scenario()
 
 
 # Layers
 
 
-def test_a_file_sets_only_what_it_lists(tmp_path: Path) -> None:
+def test_a_file_sets_only_what_it_lists(tmp_path):
     path = write(tmp_path, "delay: {steps: 3}\nplant: {accuracy: 1e-9, gravity: true}\n")
     expected = Scenario(delay=DelayConfig(steps=3), plant=PlantConfig(accuracy=1e-9, gravity=True))
     assert load_scenario(path) == expected
     assert load_scenario(write(tmp_path, "{}")) == Scenario()
 
 
-def test_settings_beat_the_controller_which_beats_the_scenario(tmp_path: Path) -> None:
+def test_settings_beat_the_controller_which_beats_the_scenario(tmp_path):
     path = write(tmp_path, "controller: {period: 0.05, w_Q: 2.0, w_R: 3.0, model: multibody}")
     overlay = write(tmp_path, "w_R: 5.0\nmodel: paper\n", "overlay.yaml")
     scenario = load_scenario(path, overlay, ["controller.model=multibody", "duration=1e1"])
@@ -143,7 +141,7 @@ def test_settings_beat_the_controller_which_beats_the_scenario(tmp_path: Path) -
     assert scenario.duration == 10.0
 
 
-def test_a_setting_is_yaml_and_the_last_one_counts() -> None:
+def test_a_setting_is_yaml_and_the_last_one_counts():
     scenario = load_scenario(
         "paper",
         settings=[
@@ -159,7 +157,7 @@ def test_a_setting_is_yaml_and_the_last_one_counts() -> None:
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_a_new_kind_drops_what_the_file_says_for_the_old_one(order: int, tmp_path: Path) -> None:
+def test_a_new_kind_drops_what_the_file_says_for_the_old_one(order, tmp_path):
     changes = ["reference.kind=csv", f"reference.file={tmp_path}/a.csv"][::order]
     scenario = load_scenario("paper", settings=changes)
     assert scenario.reference == CsvConfig(file=f"{tmp_path}/a.csv")
@@ -167,7 +165,7 @@ def test_a_new_kind_drops_what_the_file_says_for_the_old_one(order: int, tmp_pat
     assert hold.reference.offset == [0, 0, 0, 0, 0, 0.38]
 
 
-def test_settings_are_checked_for_the_kind_that_the_file_has(tmp_path: Path) -> None:
+def test_settings_are_checked_for_the_kind_that_the_file_has(tmp_path):
     path = write(
         tmp_path,
         "reference: {kind: waypoints, times: [0, 1], poses: [[0, 0, 0, 0, 0, 0.4], "
@@ -185,24 +183,24 @@ def test_settings_are_checked_for_the_kind_that_the_file_has(tmp_path: Path) -> 
     assert load_scenario(path, settings=["reference={kind: hold}"]).reference == HoldConfig()
 
 
-def test_a_null_for_a_field_of_another_kind_says_nothing(tmp_path: Path) -> None:
+def test_a_null_for_a_field_of_another_kind_says_nothing(tmp_path):
     path = write(tmp_path, "tuner: {kind: fixed, weights: null}\nreference: {file: null}\n")
     assert load_scenario(path, settings=["reference.times=null"]) == Scenario()
     with pytest.raises(ConfigError, match=r"reference\.fil: unknown key"):
         load_scenario(write(tmp_path, "reference: {fil: null}"))
 
 
-def test_what_a_kind_does_not_have_cannot_be_read_from_it() -> None:
+def test_what_a_kind_does_not_have_cannot_be_read_from_it():
     hold = load_scenario("paper", settings=["reference.kind=hold"]).reference
     with pytest.raises(AttributeError):
-        hold.amplitude  # type: ignore[union-attr]  # noqa: B018
+        hold.amplitude  # noqa: B018
     with pytest.raises(ValidationError):
-        hold.kind = "sine"  # type: ignore[assignment]
+        hold.kind = "sine"
     scenario = Scenario()
     with pytest.raises(ValidationError):
-        scenario.reference = PlantConfig()  # type: ignore[assignment]
+        scenario.reference = PlantConfig()
     with pytest.raises(ValidationError):
-        scenario.tuner = HoldConfig()  # type: ignore[assignment]
+        scenario.tuner = HoldConfig()
 
 
 @dataclass(config=STRICT)
@@ -224,7 +222,7 @@ class Machine:
     spare: Annotated[Loud, ByKind()] = dataclasses.field(default_factory=Loud)
 
 
-def test_a_kind_is_one_more_class_in_a_union() -> None:
+def test_a_kind_is_one_more_class_in_a_union():
     assert validate(Machine, {}, "m") == Machine()
     assert validate(Machine, {"voice": {"level": 3.0}}, "m") == Machine(voice=Quiet(level=3.0))
     loud = validate(Machine, {"voice": {"kind": "loud", "horns": 2}}, "m")
@@ -250,9 +248,7 @@ def test_a_kind_is_one_more_class_in_a_union() -> None:
         validate(Machine, {"horns": 2}, "m")
 
 
-def test_paths_start_where_they_were_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_paths_start_where_they_were_written(tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     path = write(
@@ -368,7 +364,7 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("case", BAD_FILES)
-def test_a_bad_file_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
+def test_a_bad_file_is_refused_in_one_line(case, tmp_path):
     text, parts = BAD_FILES[case]
     path = write(tmp_path, text)
     with pytest.raises(ConfigError) as caught:
@@ -396,7 +392,7 @@ def test_a_bad_file_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
         ("controller.period=0.1234567", ["with settings", "controller.period", "nearest 0.123"]),
     ],
 )
-def test_a_bad_setting_is_refused_in_one_line(setting: str, parts: list[str]) -> None:
+def test_a_bad_setting_is_refused_in_one_line(setting, parts):
     with pytest.raises(ConfigError) as caught:
         load_scenario("paper", settings=[setting])
     message = one_line(caught)
@@ -468,7 +464,7 @@ TOGETHER = [
 
 
 @pytest.mark.parametrize("row", TOGETHER, ids=lambda row: " ".join(row[:-1])[:60])
-def test_settings_that_do_not_go_together_are_refused_in_one_line(row: tuple[str, ...]) -> None:
+def test_settings_that_do_not_go_together_are_refused_in_one_line(row):
     *settings, said = row
     with pytest.raises(ConfigError) as caught:
         load_scenario("paper", settings=settings)
@@ -492,19 +488,19 @@ def test_settings_that_do_not_go_together_are_refused_in_one_line(row: tuple[str
         ("3", "[0]: got 3; expected an object"),
     ],
 )
-def test_faults_of_a_sensor_that_cannot_be_are_refused_in_one_line(text: str, said: str) -> None:
+def test_faults_of_a_sensor_that_cannot_be_are_refused_in_one_line(text, said):
     with pytest.raises(ConfigError) as caught:
         load_scenario("paper", settings=[f"sensor.faults=[{text}]"])
     assert f"sensor.faults{said}" in one_line(caught)
 
 
-def test_a_file_may_end_in_yml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_may_end_in_yml(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("own.yml").write_text("duration: 3.0\n")
     assert load_scenario("own.yml").duration == 3.0
 
 
-def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+def test_a_file_with_a_byte_order_mark_is_read(tmp_path):
     path = tmp_path / "bom.yaml"
     path.write_bytes(b"\xef\xbb\xbfduration: 3\n")
     assert load_scenario(path).duration == 3
@@ -513,7 +509,7 @@ def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
 # Changes in memory
 
 
-def test_an_assignment_is_checked() -> None:
+def test_an_assignment_is_checked():
     scenario = Scenario()
     scenario.duration = 5.0
     scenario.delay.steps = 3
@@ -521,13 +517,13 @@ def test_an_assignment_is_checked() -> None:
     scenario.check()
     for bad in (-1.0, float("nan"), "5"):
         with pytest.raises(ValidationError):
-            scenario.duration = bad  # type: ignore[assignment]
+            scenario.duration = bad
     with pytest.raises(ValidationError):
-        scenario.plant.mass = 1.0  # type: ignore[attr-defined]
+        scenario.plant.mass = 1.0
     assert scenario.duration == 5.0
 
 
-def test_check_sees_changes_that_assignment_does_not() -> None:
+def test_check_sees_changes_that_assignment_does_not():
     scenario = Scenario()
     scenario.check()
     scenario.plant.torque_bias[2] = float("nan")
@@ -542,7 +538,7 @@ def test_check_sees_changes_that_assignment_does_not() -> None:
     scenario.check()
 
 
-def test_a_scenario_can_be_copied_and_sent_to_another_process() -> None:
+def test_a_scenario_can_be_copied_and_sent_to_another_process():
     scenario = load_scenario("gravity")
     assert pickle.loads(pickle.dumps(scenario)) == scenario
     twin = copy.deepcopy(scenario)
@@ -551,7 +547,7 @@ def test_a_scenario_can_be_copied_and_sent_to_another_process() -> None:
     assert dataclasses.replace(scenario, duration=3.0).duration == 3.0
 
 
-def test_two_scenarios_share_no_list() -> None:
+def test_two_scenarios_share_no_list():
     first, second = Scenario(), Scenario()
     first.reference.amplitude[0] = 9.0
     assert second.reference.amplitude == SINE
@@ -615,7 +611,7 @@ scenarios = st.builds(
     max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(scenario=scenarios)
-def test_a_scenario_survives_json_and_yaml(scenario: Scenario, tmp_path: Path) -> None:
+def test_a_scenario_survives_json_and_yaml(scenario, tmp_path):
     for idle in idle_fields(scenario):  # a file may not set these
         reset(scenario, idle.field)
     plain = json.loads(json.dumps(scenario_to_dict(scenario)))
@@ -634,7 +630,7 @@ YAML_LIKE = st.text(
 
 @settings(max_examples=200, deadline=None)
 @given(setting=YAML_LIKE | st.builds("{}={}".format, KEYS, YAML_LIKE))
-def test_any_setting_is_taken_or_is_refused(setting: str) -> None:
+def test_any_setting_is_taken_or_is_refused(setting):
     try:
         assert isinstance(load_scenario("gravity", settings=[setting]), Scenario)
     except ConfigError as error:
@@ -645,7 +641,7 @@ def test_any_setting_is_taken_or_is_refused(setting: str) -> None:
     time_step=st.floats(1e-6, 0.02),
     period=st.sampled_from([0.1, 0.05, 0.01, 0.02, 0.003, 0.25]),
 )
-def test_the_step_that_a_message_suggests_is_accepted(time_step: float, period: float) -> None:
+def test_the_step_that_a_message_suggests_is_accepted(time_step, period):
     problem = step_problem(time_step, period, 0.0)
     if problem and problem.startswith("plant.time_step"):
         suggested = float(problem.rpartition("nearest ")[2])
@@ -657,9 +653,7 @@ def test_the_step_that_a_message_suggests_is_accepted(time_step: float, period: 
     period=st.floats(1e-4, 10),
     fraction=st.floats(0, 1, exclude_max=True),
 )
-def test_the_period_and_fraction_that_messages_suggest_are_accepted(
-    steps: int, period: float, fraction: float
-) -> None:
+def test_the_period_and_fraction_that_messages_suggest_are_accepted(steps, period, fraction):
     time_step = 0.02 / steps
     problem = step_problem(time_step, period, 0.0)
     if problem:

@@ -2,8 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from stewart_drake.law import cost as cost_module
 from stewart_drake.law.delay_model import delayed_model
 from stewart_drake.law.design_models import MultibodyModel
 from stewart_drake.law.error_model import (
-    ContinuousModel,
     double_integrators,
     linear_model,
 )
@@ -28,8 +25,7 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.motors import TorqueLimit
-from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.predictors import Ahead, LinearPredictor, NonlinearPredictor
+from stewart_drake.law.predictors import LinearPredictor, NonlinearPredictor
 from stewart_drake.law.riccati import RiccatiError, full_gain
 from stewart_drake.law.startup import weight_scales
 from stewart_drake.loop.experiment import assemble, motion_scale, prepare
@@ -37,7 +33,6 @@ from stewart_drake.loop.law_design import control_law
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate, make_reference
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 
@@ -51,9 +46,7 @@ PLAIN = (
 LINEAR = (*PLAIN, "controller.prediction=linear")
 
 
-def law_of(
-    *settings: str, controller: str | None = None, limit: float | None = None, **plant: Any
-) -> PredictiveLqi:
+def law_of(*settings, controller=None, limit=None, **plant):
     """The law of the paper's scenario, started on the reference, with settings.
 
     `limit` is the motors', N m; `plant` changes what is believed of the plant.
@@ -64,25 +57,23 @@ def law_of(
     return dataclasses.replace(law, plant=dataclasses.replace(law.plant, **plant))
 
 
-def step(
-    law: PredictiveLqi, memory: Memory, y: Array, preview: Array, weights: Array = WEIGHTS
-) -> Memory:
+def step(law, memory, y, preview, weights=WEIGHTS):
     """One sample, from a measurement (12,), NaN where lost, and the reference (p, 18)."""
     return law.step(memory, Measurement.of(y), Preview(law.preview_times, preview), weights)
 
 
 @functools.cache
-def _law(settings: tuple[str, ...], controller: str | None) -> PredictiveLqi:
+def _law(settings, controller):
     usual = ["start=on_reference", "duration=2.0"]
     return control_law(prepare(load_scenario("paper", controller, [*usual, *settings])))[0]
 
 
-def at_home(law: PredictiveLqi) -> Array:
+def at_home(law):
     """A preview that asks to stay at home."""
     return np.tile(HOME, (len(law.preview_times), 1))
 
 
-def sampled(law: PredictiveLqi, **parts: Any) -> Memory:
+def sampled(law, **parts):
     """A memory after some sample, with random parts where none are given."""
     rng = np.random.default_rng(1)
     length = law.timeline.queue_length
@@ -102,13 +93,7 @@ class Loop:
     The torque of sample k acts from k + mu + fraction periods on, for one period.
     """
 
-    def __init__(
-        self,
-        law: PredictiveLqi,
-        reference: Callable[[float], Array],
-        truth: Array | None = None,
-        queue: Array | None = None,
-    ) -> None:
+    def __init__(self, law, reference, truth=None, queue=None):
         self.law, self.reference = law, reference
         self.delay = law.timeline
         length = law.timeline.queue_length
@@ -120,7 +105,7 @@ class Loop:
         self.states = [reference(0.0)[:12]]
         self.memories: list[Memory] = []
 
-    def acting(self, k: int) -> tuple[Array, Array]:
+    def acting(self, k):
         """Torques and durations in the period after sample k."""
         o, nothing = self.delay, np.zeros(6)
         newer = self.torques.get(k - o.steps, nothing)
@@ -129,14 +114,14 @@ class Loop:
         older = self.torques.get(k - o.steps - 1, nothing)
         return np.array([older, newer]), o.period * np.array([o.fraction, 1 - o.fraction])
 
-    def run(self, samples: int, seen: Callable[[int, Array], Array] = lambda k, x: x) -> "Loop":
+    def run(self, samples, seen=lambda k, x: x):
         """Go on; `seen` makes the measurement of the state."""
         plant, period = self.law.plant, self.delay.period
         for _ in range(samples):
             k, x = len(self.memories), self.states[-1]
             now = k * period
 
-            def motion(times: Array, now: float = now) -> Array:
+            def motion(times, now=now):
                 return np.array([self.reference(max(0.0, t)) for t in now + times])
 
             measurement = Measurement.of(seen(k, x))
@@ -152,13 +137,13 @@ class Loop:
 PAPERS = make_reference(load_scenario("paper").reference, 10.0)
 
 
-def sine(size: float = 1.0) -> Callable[[float], Array]:
+def sine(size=1.0):
     """The trajectory (46) at a share of its amplitude."""
     rest = evaluate(PAPERS, 0.0) * np.repeat([1.0, 0, 0], 6)
     return lambda t: rest + size * (evaluate(PAPERS, t) - rest)
 
 
-def nominal_queue(law: PredictiveLqi, reference: Callable[[float], Array]) -> Array:
+def nominal_queue(law, reference):
     """Mean torques along the reference for all that are in flight at the start."""
     o = law.timeline
     ends = (o.steps + o.fraction) * o.period - o.period * np.arange(o.queue_length)[::-1]
@@ -175,9 +160,7 @@ def nominal_queue(law: PredictiveLqi, reference: Callable[[float], Array]) -> Ar
 @pytest.mark.parametrize("integral", [True, False])
 @pytest.mark.parametrize("model", ["paper", "multibody"])
 @pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (8, 0.0), (3, 0.5), (0, 0.3)])
-def test_linear_law_is_the_full_gain_times_the_augmented_error(
-    steps: int, fraction: float, model: str, integral: bool
-) -> None:
+def test_linear_law_is_the_full_gain_times_the_augmented_error(steps, fraction, model, integral):
     law = law_of(
         *LINEAR,
         f"controller.model={model}",
@@ -212,9 +195,7 @@ def test_linear_law_is_the_full_gain_times_the_augmented_error(
 
 @pytest.mark.parametrize("gravity", [False, True])
 @pytest.mark.parametrize(("steps", "fraction"), [(4, 0.0), (4, 0.5), (1, 0.3)])
-def test_nonlinear_law_is_the_linear_one_where_errors_are_small(
-    steps: int, fraction: float, gravity: bool
-) -> None:
+def test_nonlinear_law_is_the_linear_one_where_errors_are_small(steps, fraction, gravity):
     """Their torques differ in the second order of the error's size."""
     settings = (
         f"plant.gravity={str(gravity).lower()}",
@@ -232,7 +213,7 @@ def test_nonlinear_law_is_the_linear_one_where_errors_are_small(
     random = rng.normal(0, 0.02, (steps + 2, 6))
     error, z, dx = rng.normal(0, 0.1, 6), rng.normal(0, 0.1, 6), rng.normal(0, 0.1, 12)
 
-    def torque(law: PredictiveLqi, size: float) -> Array:
+    def torque(law, size):
         in_flight = held + size * random[: law.timeline.queue_length + 1]
         memory = sampled(law, in_flight=in_flight, error=size * error, integral=size * z)
         return step(law, memory, HOME[:12] + size * dx, at_home(law)).torque - held
@@ -245,7 +226,7 @@ def test_nonlinear_law_is_the_linear_one_where_errors_are_small(
 
 
 @pytest.mark.parametrize("feedforward", ["none", "inverse_dynamics"])
-def test_only_feedforward_makes_the_linear_law_see_a_moving_reference(feedforward: str) -> None:
+def test_only_feedforward_makes_the_linear_law_see_a_moving_reference(feedforward):
     """Without it the laws differ by K [x_d(t + eta) - x_d - eta x_d'; x_d'(t + eta) - x_d'].
 
     Motion and errors are small, so that both are linear; the plate is on the reference, with the
@@ -256,19 +237,19 @@ def test_only_feedforward_makes_the_linear_law_see_a_moving_reference(feedforwar
     size, now, eta, dt = 1e-3, 0.7, 0.8, 0.1
     amplitude = size * np.array([np.pi / 12] * 3 + [0.02, 0.02, 0.08])
 
-    def wanted(t: float) -> Array:
+    def wanted(t):
         wave = np.concatenate(
             [np.sin(t) * amplitude, np.cos(t) * amplitude, -np.sin(t) * amplitude]
         )
         return HOME + wave
 
-    def takes(t: float) -> Array:
+    def takes(t):
         pose, rates, accelerations = np.split(wanted(t), 3)
         return nonlinear.plant.dynamics.inverse_dynamics(pose, rates, accelerations)
 
     in_flight = np.array([takes(now + (i - 0.5) * dt) for i in range(9)])
 
-    def after(law: PredictiveLqi) -> Memory:
+    def after(law):
         memory = sampled(law, in_flight=in_flight, state=wanted(now - dt)[:12], error=np.zeros(6))
         preview = np.array([wanted(now + t) for t in law.preview_times])
         return step(law, memory, wanted(now)[:12], preview)
@@ -286,13 +267,13 @@ def test_only_feedforward_makes_the_linear_law_see_a_moving_reference(feedforwar
 
 
 @pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (8, 0.0), (3, 0.5), (1, 0.3), (0, 0.3)])
-def test_state_is_predicted_through_the_torques_in_flight(steps: int, fraction: float) -> None:
+def test_state_is_predicted_through_the_torques_in_flight(steps, fraction):
     """What the gain is designed for at sample k is where the plant is at sample k + mu."""
     law = law_of(f"delay.steps={steps}", f"delay.fraction={fraction}", "controller.estimate=[]")
-    points: list[Array] = []
+    points = []
 
     class Spy(MultibodyModel):
-        def about(self, state: Array, *rest: Any) -> ContinuousModel:
+        def about(self, state, *rest):
             points.append(state)
             return super().about(state, *rest)
 
@@ -312,7 +293,7 @@ def test_state_is_predicted_through_the_torques_in_flight(steps: int, fraction: 
 
 
 @pytest.mark.parametrize("passed", [0.0, 0.3, 0.5, 0.8])
-def test_held_torques_meet_a_sine_at_fourth_order(passed: float) -> None:
+def test_held_torques_meet_a_sine_at_fourth_order(passed):
     """Double integrators under held torques, integrated by hand.
 
     With (hold), and rates that start by (rates), the pose at the samples is off by O(dt^4), and
@@ -322,10 +303,10 @@ def test_held_torques_meet_a_sine_at_fourth_order(passed: float) -> None:
     B = np.diag([0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
     omega, phase = np.array([1.0, 1.5, 2.0, 0.7, 1.2, 1.0]), np.arange(6.0)
 
-    def motion(t: float, order: int) -> Array:
+    def motion(t, order):
         return omega**order * np.sin(omega * t + phase + order * np.pi / 2)
 
-    def worst(dt: float, corrected: bool) -> tuple[float, float]:
+    def worst(dt, corrected):
         starts = dt * np.arange(-1, round(3.0 / dt) + 1)
         nodes = [[motion(s + dt * g, 2) / np.diag(B) for g in GAUSS_NODES] for s in starts]
         means, changes = means_and_changes(np.array(nodes))
@@ -351,7 +332,7 @@ def test_held_torques_meet_a_sine_at_fourth_order(passed: float) -> None:
     plain = np.array([worst(dt, False) for dt in periods])
     held = np.array([worst(dt, True) for dt in periods])
 
-    def order(errors: Array) -> float:
+    def order(errors):
         return float(np.polyfit(np.log(periods), np.log(errors), 1)[0])
 
     assert order(plain[:, 0]) == pytest.approx(2.0, abs=0.15)
@@ -365,12 +346,10 @@ def test_held_torques_meet_a_sine_at_fourth_order(passed: float) -> None:
 
 @pytest.mark.parametrize("prediction", ["nonlinear", "linear"])
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.5])
-def test_a_known_reference_is_followed_at_a_high_order_of_the_period(
-    fraction: float, prediction: str
-) -> None:
+def test_a_known_reference_is_followed_at_a_high_order_of_the_period(fraction, prediction):
     """On the reference, with its torques in flight, feedback has next to nothing to do."""
 
-    def worst(period: float) -> float:
+    def worst(period):
         law = law_of(
             f"controller.period={period}",
             f"controller.prediction={prediction}",
@@ -398,7 +377,7 @@ def test_a_known_reference_is_followed_at_a_high_order_of_the_period(
 
 
 @pytest.mark.parametrize("prediction", ["nonlinear", "linear"])
-def test_what_flies_keeps_the_limit_and_saturated_steps_are_counted(prediction: str) -> None:
+def test_what_flies_keeps_the_limit_and_saturated_steps_are_counted(prediction):
     """The law asks as if there were no limit, and believes in what that lets through."""
     law = law_of(f"controller.prediction={prediction}", "controller.estimate=[]", limit=0.02)
     rng, memory, preview = np.random.default_rng(4), sampled(law), at_home(law)
@@ -421,7 +400,7 @@ def test_what_flies_keeps_the_limit_and_saturated_steps_are_counted(prediction: 
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.5])
-def test_integral_waits_while_a_motor_is_at_its_limit(fraction: float) -> None:
+def test_integral_waits_while_a_motor_is_at_its_limit(fraction):
     """The torque that acted during the last period decides, or the two that did."""
     law = law_of(*PLAIN, "delay.steps=3", f"delay.fraction={fraction}", limit=0.1)
     o = law.timeline
@@ -441,7 +420,7 @@ def test_integral_waits_while_a_motor_is_at_its_limit(fraction: float) -> None:
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.5])
-def test_predicted_integral_waits_in_the_same_periods(fraction: float) -> None:
+def test_predicted_integral_waits_in_the_same_periods(fraction):
     """What the law predicts now is what it will have integrated when the torque acts."""
     law = law_of(
         *PLAIN,
@@ -449,10 +428,10 @@ def test_predicted_integral_waits_in_the_same_periods(fraction: float) -> None:
         f"delay.fraction={fraction}",
         limit=5e-4,
     )
-    predicted: list[Array] = []
+    predicted = []
 
     class Spy(NonlinearPredictor):
-        def ahead(self, *arguments: Any) -> Ahead:
+        def ahead(self, *arguments):
             result = super().ahead(*arguments)
             predicted.append(result.integral)
             return result
@@ -480,14 +459,12 @@ FILTERS = ["controller.estimate=[torque_bias,payload,damping]", "controller.esti
     [(0,), (0, 1, 2), (5,), (3, 4, 5, 6, 7), (0, 4, 5, 9), tuple(range(12))],
     ids=["first", "first three", "one", "five", "some", "all"],
 )
-def test_torque_is_finite_whatever_the_sensor_says(
-    bad: Sequence[int], prediction: str, estimator: str
-) -> None:
+def test_torque_is_finite_whatever_the_sensor_says(bad, prediction, estimator):
     law = law_of(estimator, f"controller.prediction={prediction}", "delay.steps=2")
     reference = sine(0.3)
     nonsense = [np.nan, np.inf, -np.inf]
 
-    def seen(k: int, x: Array) -> Array:
+    def seen(k, x):
         y = x.copy()
         if k in bad:
             y[k % 12 if k % 2 else slice(None)] = nonsense[k % 3]
@@ -506,7 +483,7 @@ def test_torque_is_finite_whatever_the_sensor_says(
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
 @pytest.mark.parametrize("steps", [0, 1, 4])
-def test_without_a_measurement_the_state_goes_on_by_the_model(steps: int, fraction: float) -> None:
+def test_without_a_measurement_the_state_goes_on_by_the_model(steps, fraction):
     """The right torques act in the right periods: the state is the plant's to rounding."""
     law = law_of(f"delay.steps={steps}", f"delay.fraction={fraction}", "controller.estimate=[]")
     reference = sine(0.5)
@@ -520,13 +497,11 @@ def test_without_a_measurement_the_state_goes_on_by_the_model(steps: int, fracti
 
 @pytest.mark.parametrize("size", [1.0, 1e6, 1e300])
 @pytest.mark.parametrize("channel", [0, 3, 5, 11, slice(None)])
-def test_a_finite_but_absurd_measurement_does_no_lasting_harm(
-    channel: int | slice, size: float
-) -> None:
+def test_a_finite_but_absurd_measurement_does_no_lasting_harm(channel, size):
     law = law_of("delay.steps=2", "controller.estimate=[torque_bias,payload,damping]", limit=1.0)
     reference = sine(0.3)
 
-    def seen(k: int, x: Array) -> Array:
+    def seen(k, x):
         y = x.copy()
         if k == 6:
             y[channel] = y[channel] + size
@@ -539,7 +514,7 @@ def test_a_finite_but_absurd_measurement_does_no_lasting_harm(
     assert np.abs(loop.states[-1] - well.states[-1]).max() < 1e-4
 
 
-def test_a_plate_out_of_reach_gets_the_feedforward_alone() -> None:
+def test_a_plate_out_of_reach_gets_the_feedforward_alone():
     law = law_of("controller.estimate=[]", "delay.steps=0")
     preview = at_home(law)
     far = HOME[:12] + np.eye(12)[5] * 0.3
@@ -551,16 +526,14 @@ def test_a_plate_out_of_reach_gets_the_feedforward_alone() -> None:
     assert after.counts == Counts(unreachable=1, measurements_rejected=1)
 
 
-def test_a_failed_riccati_equation_keeps_the_last_good_gain(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_failed_riccati_equation_keeps_the_last_good_gain(monkeypatch):
     law = law_of("delay.steps=2")
     reference = sine(0.3)
     queue = nominal_queue(law, reference)
     solve = cost_module.reduced_gain
     calls = 0
 
-    def fails_sometimes(*arguments: Any) -> Array:
+    def fails_sometimes(*arguments):
         nonlocal calls
         calls += 1
         if calls in (1, 5, 6, 7):
@@ -580,7 +553,7 @@ def test_a_failed_riccati_equation_keeps_the_last_good_gain(
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
-def test_the_last_good_gain_sees_the_same_errors(fraction: float) -> None:
+def test_the_last_good_gain_sees_the_same_errors(fraction):
     """What held torques leave of the rates is no error to it either."""
     law = law_of("delay.steps=2", f"delay.fraction={fraction}", "controller.estimate=[]")
     preview = np.array([sine(1.0)(max(0.0, 0.3 + t)) for t in law.preview_times])
@@ -594,7 +567,7 @@ def test_the_last_good_gain_sees_the_same_errors(fraction: float) -> None:
 
 
 @pytest.mark.parametrize("weights", [[np.nan, 1.0], [1.0, 0.0], [-1.0, 1.0], [np.inf, 1.0]])
-def test_bad_weights_keep_the_last_good_gain(weights: list[float]) -> None:
+def test_bad_weights_keep_the_last_good_gain(weights):
     law = law_of("delay.steps=2", "controller.estimate=[]")
     good = step(law, sampled(law), HOME[:12], at_home(law))
     after = step(law, good, HOME[:12], at_home(law), np.array(weights))
@@ -604,10 +577,10 @@ def test_bad_weights_keep_the_last_good_gain(weights: list[float]) -> None:
 
 
 @pytest.mark.parametrize("controller", ["lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi"])
-def test_the_same_inputs_give_the_same_bytes(controller: str) -> None:
+def test_the_same_inputs_give_the_same_bytes(controller):
     reference = sine(0.3)
 
-    def outcome() -> list[Memory]:
+    def outcome():
         law = law_of(controller=controller)
         queue = np.zeros((law.timeline.queue_length, 6))
         return Loop(law, reference, queue=queue).run(6).memories
@@ -619,7 +592,7 @@ def test_the_same_inputs_give_the_same_bytes(controller: str) -> None:
         assert one.counts == other.counts
 
 
-def test_a_step_changes_nothing_it_was_given() -> None:
+def test_a_step_changes_nothing_it_was_given():
     law = law_of("delay.steps=2")
     memory, preview = sampled(law), at_home(law)
     x, weights = HOME[:12] + 1e-3, WEIGHTS.copy()
@@ -632,9 +605,7 @@ def test_a_step_changes_nothing_it_was_given() -> None:
 
 
 @pytest.mark.parametrize(("frequency", "whole", "odd"), [("0.5", 200, 203.7), ("0.8", 10, 10.37)])
-def test_a_duration_of_whole_periods_designs_the_same_law(
-    frequency: str, whole: float, odd: float
-) -> None:
+def test_a_duration_of_whole_periods_designs_the_same_law(frequency, whole, odd):
     """Evenly spaced instants would all see the sine at rest, free of torque and of acceleration."""
     motion = (f"reference.frequency={frequency}", "reference.frequency_unit=Hz", "delay.steps=1")
     one, other = (law_of(*motion, f"duration={d}") for d in (whole, odd))
@@ -643,7 +614,7 @@ def test_a_duration_of_whole_periods_designs_the_same_law(
     assert one.plant.substeps == other.plant.substeps
 
 
-def test_a_motion_of_one_radian_peak_to_peak_is_no_constant() -> None:
+def test_a_motion_of_one_radian_peak_to_peak_is_no_constant():
     """Constants are measured against 1, which is also what an amplitude of 0.5 comes to."""
     scales = []
     for amplitude in (0.5, 0.5001):
@@ -657,7 +628,7 @@ def test_a_motion_of_one_radian_peak_to_peak_is_no_constant() -> None:
     assert scales[0] == pytest.approx(scales[1], rel=1e-3)
 
 
-def test_the_nominal_plant_of_the_law_is_the_scenarios() -> None:
+def test_the_nominal_plant_of_the_law_is_the_scenarios():
     assert isinstance(law_of().plant.dynamics, StewartDynamics)
     assert law_of("plant.gravity=true", "delay.steps=0").plant.dynamics.gravity == 9.81
     assert not law_of("plant.payload_mass=1.0").plant.dynamics.parameters.any()

@@ -2,8 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +17,6 @@ from stewart_drake.law.motion import Preview
 from stewart_drake.law.stability import fastest_pole, is_stable, spectral_radius
 from stewart_drake.loop.cautions import cautions_after, cautions_before, coarse_step
 from stewart_drake.loop.controller_margin import (
-    ControllerMargin,
     controller_margin,
     true_model,
 )
@@ -27,24 +24,22 @@ from stewart_drake.loop.experiment import prepare, torques_in_flight, true_dynam
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.mechanism.files import mechanism_yaml
-from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import CONTROLLERS
 from stewart_drake.studies.delay_loop import loop_margins
 from stewart_drake.studies.verdict import basis
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
 HOLD = ("reference.kind=hold", "plant.kind=exact")
 """At rest at home nothing changes with time: what is linearised there is the loop."""
 
 
-def scenario(*settings: str, controller: str | None = None, name: str = "paper") -> Scenario:
+def scenario(*settings, controller=None, name="paper"):
     return sd.load_scenario(name, controller, settings)
 
 
-def judged(sc: Scenario) -> ControllerMargin:
+def judged(sc):
     return controller_margin(prepare(sc))
 
 
@@ -55,7 +50,7 @@ SIZE = 1e-9
 DIRECTION = np.random.default_rng(0).standard_normal(12)
 
 
-def distances(sc: Scenario, periods: int) -> Array:
+def distances(sc, periods):
     """How two runs of the nonlinear law and plant come apart, that begin 2 SIZE apart.
 
     Torque by torque, with nothing of the linear loop: (periods + 1, 12).
@@ -86,7 +81,7 @@ def distances(sc: Scenario, periods: int) -> Array:
     return np.asarray(pair[0] - pair[1])
 
 
-def growth(sc: Scenario, periods: int, last: int) -> float:
+def growth(sc, periods, last):
     """Factor per period over the `last` ones."""
     found = np.linalg.norm(distances(sc, periods), axis=1)
     assert found.max() < 1e-3, "no longer linear"
@@ -121,9 +116,7 @@ ALONE = (
         ("predictor_lqi", (*SHORT_PERIOD, "plant.gravity=true", "queue=equilibrium"), 90),
     ],
 )
-def test_the_linear_loop_is_what_the_law_itself_does(
-    controller: str, settings: tuple[str, ...], periods: int
-) -> None:
+def test_the_linear_loop_is_what_the_law_itself_does(controller, settings, periods):
     sc = scenario(*ALONE, *settings, controller=controller)
     M = judged(sc).loops[0].matrix()
     expected = np.zeros((periods + 1, len(M)))
@@ -146,9 +139,7 @@ def test_the_linear_loop_is_what_the_law_itself_does(
         ("predictor_lqi", ("plant.payload_mass=1.0", "plant.joint_damping=0.01"), 40, 10),
     ],
 )
-def test_the_radius_is_how_the_law_itself_grows(
-    controller: str, settings: tuple[str, ...], periods: int, last: int
-) -> None:
+def test_the_radius_is_how_the_law_itself_grows(controller, settings, periods, last):
     """Of loops whose eigenvalue does not beat."""
     sc = scenario(*ALONE, *settings, controller=controller)
     assert growth(sc, periods, last) == pytest.approx(judged(sc).radius, rel=0.03)
@@ -156,9 +147,7 @@ def test_the_radius_is_how_the_law_itself_grows(
 
 @pytest.mark.parametrize(("share", "stable"), [(0.6, True), (1.6, False)])
 @pytest.mark.parametrize("later", [True, False])
-def test_the_delay_margin_is_where_the_law_itself_begins_to_grow(
-    later: bool, share: float, stable: bool
-) -> None:
+def test_the_delay_margin_is_where_the_law_itself_begins_to_grow(later, share, stable):
     sc = scenario(*ALONE)
     margins = judged(sc).margins
     by = share * (margins.longer if later else -margins.shorter) / sc.controller.period
@@ -169,7 +158,7 @@ def test_the_delay_margin_is_where_the_law_itself_begins_to_grow(
     assert (growth(wrong, 160, 60) < 1) is stable
 
 
-def apart(loop: Any, longer: float, gain: float, periods: int) -> float:
+def apart(loop, longer, gain, periods):
     """What the linear loop has made of an error of 1, by its recurrence, not by its matrix."""
     plant, K = loop.sampled(longer), loop.K
     e = np.ones(len(plant.A))
@@ -184,7 +173,7 @@ def apart(loop: Any, longer: float, gain: float, periods: int) -> float:
     return float(np.abs(e).max())
 
 
-def test_margins_along_the_reference_are_those_of_the_recurrence() -> None:
+def test_margins_along_the_reference_are_those_of_the_recurrence():
     """Just inside no loop along the reference grows, just outside one does."""
     found = judged(scenario("plant.kind=exact"))
     m = found.margins
@@ -193,7 +182,7 @@ def test_margins_along_the_reference_are_those_of_the_recurrence() -> None:
         (m.longer, 1.0), (-m.shorter, 1.0), (0.0, m.gain_up), (0.0, m.gain_down),
     ):  # fmt: skip
 
-        def worst(share: float, longer: float = longer, gain: float = gain) -> float:
+        def worst(share, longer=longer, gain=gain):
             factor = 1 + share * (gain - 1)
             return max(apart(one, share * longer, factor, 1200) for one in found.loops)
 
@@ -201,7 +190,7 @@ def test_margins_along_the_reference_are_those_of_the_recurrence() -> None:
         assert worst(1.15) > 1e3
 
 
-def test_what_is_known_of_the_papers_loops() -> None:
+def test_what_is_known_of_the_papers_loops():
     """At the first pose alone 1.6 and 1.9 ms and 3.5 %; the worst along the way is less."""
     first = next(m for m in loop_margins(basis(scenario("plant.kind=exact")), ()) if m.steps == 8)
     assert 1e3 * first.later == pytest.approx(1.6, abs=0.05)
@@ -218,18 +207,18 @@ def test_what_is_known_of_the_papers_loops() -> None:
     assert light.stable  # but at home only
 
 
-def test_only_the_predictor_is_stable_on_the_papers_experiment() -> None:
+def test_only_the_predictor_is_stable_on_the_papers_experiment():
     verdicts = {name: judged(scenario(controller=name)).stable for name in CONTROLLERS}
     assert verdicts == dict.fromkeys(CONTROLLERS, False) | {"predictor_lqi": True}
 
 
-def test_twice_as_many_instants_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_twice_as_many_instants_tell_the_same(monkeypatch):
     usual = judged(scenario("plant.kind=exact")).margins
     monkeypatch.setattr("stewart_drake.loop.controller_margin.INSTANTS", 60)
     assert usual == pytest.approx(judged(scenario("plant.kind=exact")).margins, rel=0.1)
 
 
-def test_a_delay_of_very_many_periods_is_not_judged_but_told() -> None:
+def test_a_delay_of_very_many_periods_is_not_judged_but_told():
     experiment = prepare(scenario("delay.steps=900", "plant.kind=exact"))
     found = controller_margin(experiment)
     assert found.stable is None and math.isnan(found.radius)
@@ -238,7 +227,7 @@ def test_a_delay_of_very_many_periods_is_not_judged_but_told() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.999, 0.9999999, 1.0000001, 1.001, 3.0])
-def test_stability_by_powers_is_that_of_eigenvalues(scale: float) -> None:
+def test_stability_by_powers_is_that_of_eigenvalues(scale):
     rng = np.random.default_rng(2)
     for _ in range(20):
         A = rng.standard_normal((12, 12)) + np.triu(50 * rng.standard_normal((12, 12)), 1)
@@ -249,7 +238,7 @@ def test_stability_by_powers_is_that_of_eigenvalues(scale: float) -> None:
 # ---------------------------------------------------------------- what is said of it
 
 
-def test_a_run_tells_the_margin_of_its_loop() -> None:
+def test_a_run_tells_the_margin_of_its_loop():
     short = scenario("plant.kind=exact", "duration=0.5")
     told = sd.simulate(short).summary["controller_margin"]
     assert set(told) == {
@@ -264,9 +253,7 @@ def test_a_run_tells_the_margin_of_its_loop() -> None:
     assert sd.simulate(short, judge_stability=False).summary["controller_margin"] is None
 
 
-def test_the_first_line_is_about_the_loop(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_first_line_is_about_the_loop(capsys, monkeypatch):
     # Simulations over delay and amplitude have tests of their own.
     monkeypatch.setattr("stewart_drake.studies.delay_limits.delay_map", lambda *_: ([], False))
     assert main(["analyze", "delay", "paper", "--controller", "lqi", "--set", "duration=2"]) == 0
@@ -281,7 +268,7 @@ def test_the_first_line_is_about_the_loop(
     assert any("left workspace" in line for line in others)
 
 
-def test_an_unstable_loop_that_completes_is_warned_about() -> None:
+def test_an_unstable_loop_that_completes_is_warned_about():
     result = sd.simulate(scenario("plant.kind=exact", "duration=1", controller="lqi"))
     assert result.status == "completed"
     assert any("unstable" in line for line in result.summary["warnings"])
@@ -297,9 +284,7 @@ def test_an_unstable_loop_that_completes_is_warned_about() -> None:
         ("constant", 5.0, 10.1, ["slowest step took 10.1 ms"]),
     ],
 )
-def test_steps_longer_than_the_period_are_told(
-    kind: str, median: float, worst: float, told: list[str]
-) -> None:
+def test_steps_longer_than_the_period_are_told(kind, median, worst, told):
     """Of a search for the delay the slowest counts; the period is 10 ms."""
     experiment = prepare(scenario(f"controller.delay_estimator={kind}", name="gravity"))
     summary = {
@@ -311,7 +296,7 @@ def test_steps_longer_than_the_period_are_told(
     assert len(found) == len(told) and all(map(str.__contains__, found, told))
 
 
-def test_the_fastest_pole_is_told_where_it_is(tmp_path: Path) -> None:
+def test_the_fastest_pole_is_told_where_it_is(tmp_path):
     """On the way to a side that the true machine does not reach, and then up, where it falls."""
     path = tmp_path / "short.yaml"
     path.write_text(mechanism_yaml(replace(PAPER, crank_lengths=0.6 * PAPER.crank_lengths)))
@@ -333,7 +318,7 @@ def test_the_fastest_pole_is_told_where_it_is(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- the engine's step
 
 
-def shrunk(folder: Path, scale: float) -> list[str]:
+def shrunk(folder, scale):
     """Settings of the paper's machine and motion at `scale`, under gravity."""
     data = yaml.safe_load(resolve("mechanism", "paper").read_text())
     data["home"] = [scale * value for value in data["home"]]
@@ -357,7 +342,7 @@ def shrunk(folder: Path, scale: float) -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_small_machine_is_warned_of_the_step_that_loses_it(tmp_path: Path) -> None:
+def test_a_small_machine_is_warned_of_the_step_that_loses_it(tmp_path):
     """A plate of 80 mm: lost at 1 ms, followed at the step that is named."""
     small = shrunk(tmp_path, 1 / 3)
     result = sd.simulate(scenario(*small, name="gravity"))
@@ -374,7 +359,7 @@ def test_a_small_machine_is_warned_of_the_step_that_loses_it(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_shipped_scenarios_are_warned_only_where_the_step_is_too_coarse() -> None:
+def test_shipped_scenarios_are_warned_only_where_the_step_is_too_coarse():
     for name in ("paper", "desktop", "motion_base"):
         sc = scenario(name=name)
         assert sc.plant.kind == "multibody"
@@ -393,7 +378,7 @@ def test_shipped_scenarios_are_warned_only_where_the_step_is_too_coarse() -> Non
     logged.check()
 
 
-def test_one_engine_step_is_semi_implicit_euler() -> None:
+def test_one_engine_step_is_semi_implicit_euler():
     """The multibody plant under a small constant torque, against the linear model in its steps."""
     step, number, torque = 5e-3, 20, 1e-4 * np.array([1.0, -2, 3, 1, 0.5, -1])
     plant = MultibodyStewart(PAPER, step, gravity=False)

@@ -20,12 +20,12 @@ SHORT = ("--set", "plant.kind=exact", "--set", "duration=0.3")
 
 
 @pytest.fixture(scope="module")
-def run() -> sd.SimulationResult:
+def run():
     settings = ("plant.kind=exact", "duration=0.3", "start=on_reference", "queue=reference")
     return sd.simulate(sd.load_scenario("paper", settings=settings), judge_stability=False)
 
 
-def table(text: str) -> dict[str, np.ndarray]:
+def table(text):
     head, *rows = csv.reader(io.StringIO(text))
     assert len(set(head)) == len(head) and {len(row) for row in rows} == {len(head)}
     values = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows])

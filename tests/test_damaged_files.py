@@ -9,11 +9,9 @@ import zlib
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import pytest
-import xarray as xr
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
@@ -34,7 +32,7 @@ RUN_FILE = {
     "draw": {"payload": 0.1},
     "outcome": {**OUTCOME, "peak_torque": 0.6, "tuner_fallbacks": 2},
 }
-RUN_ARRAYS: dict[str, Any] = {
+RUN_ARRAYS = {
     "samples": np.zeros((1, 100, 18)),
     "health": np.zeros((1, 100, 18), dtype=np.float32),
     "status": np.array(["completed"]),
@@ -44,32 +42,32 @@ RUN_ARRAYS: dict[str, Any] = {
 }
 
 
-def read_one_run(path: Path) -> dict[str, Any]:
+def read_one_run(path):
     """Return the content of the file of a condition with one gain."""
     return read_condition(path, 1)
 
 
-def sealed_text(document: Any) -> bytes:
+def sealed_text(document):
     """Return a document with its right checksum, so that a reader goes on to what it says."""
     text = json.dumps(document).encode()
     return b'{"crc32": "%08x", ' % zlib.crc32(text[1:]) + text[1:]
 
 
-def npz_of_a_run() -> bytes:
+def npz_of_a_run():
     stream = io.BytesIO()
-    np.savez(stream, **RUN_ARRAYS)  # type: ignore[arg-type]
+    np.savez(stream, **RUN_ARRAYS)
     return stream.getvalue()
 
 
 @lru_cache(maxsize=1)
-def some_signals() -> xr.Dataset:
+def some_signals():
     """Return the signals of a short run."""
     settings = ("plant.kind=exact", "duration=0.1", "start=on_reference", "queue=reference")
     return sd.simulate(sd.load_scenario("paper", settings=settings), judge_stability=False).signals
 
 
 @lru_cache(maxsize=1)
-def some_data() -> xr.Dataset:
+def some_data():
     """Return a data set of two runs."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "run.npz"
@@ -81,8 +79,8 @@ def some_data() -> xr.Dataset:
         return assemble(family, dict.fromkeys(some, read_one_run(path)), settings)
 
 
-def netcdf(data: xr.Dataset) -> bytes:
-    content: Any = data.to_netcdf(engine="h5netcdf")
+def netcdf(data):
+    content = data.to_netcdf(engine="h5netcdf")
     return bytes(content)
 
 

@@ -66,7 +66,7 @@ def base(*settings, controller="delay_lqi"):
     return load_scenario("paper", controller, (*SMALL, *settings))
 
 
-def shrink(patch: pytest.MonkeyPatch) -> None:
+def shrink(patch):
     """A grid of two delays, one frequency and three pairs."""
     patch.setattr(families, "DELAYS", (0, 3))
     patch.setattr(families, "FREQUENCIES", (2.0,))
@@ -114,7 +114,7 @@ def test_nine_pairs_are_seven_gains():
     model = linear_model(*dynamics.linearize(load_mechanism("paper").home))
     delayed = delayed_model(model, 0.1, 8, integral=True)
     gains = [reduced_gain(delayed, q * np.eye(12), r * np.eye(6)) for q, r in PAIRS]
-    distinct: list[np.ndarray] = []
+    distinct = []
     for K in gains:
         if not any(np.allclose(K, other, rtol=1e-6, atol=1e-9) for other in distinct):
             distinct.append(K)

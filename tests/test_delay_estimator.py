@@ -3,7 +3,6 @@
 import dataclasses
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,16 +26,14 @@ from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.loop.controller_margin import controller_margin
 from stewart_drake.loop.experiment import prepare
-from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.reporting.figures import draw_run
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, shown
 from stewart_drake.studies.verdict import loop_verdict
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
 DT = 0.1
@@ -55,7 +52,7 @@ THETA = np.concatenate([1e-3 * np.array([1, -1, 2, 0, -2, 1.0]), [0.5, 0.002]])
 # What acts when.
 
 
-def acting_at(arrivals: Arrivals, torques: Array, t: float, newest: int) -> float:
+def acting_at(arrivals, torques, t, newest):
     """By definition: the own torque that arrived last, else what acts in that period."""
     arrived = [
         i
@@ -71,7 +68,7 @@ def acting_at(arrivals: Arrivals, torques: Array, t: float, newest: int) -> floa
 @pytest.mark.parametrize("sent", [0, 1, 4, 9])
 @pytest.mark.parametrize("rate", [0.0, 0.05, -0.05])
 @pytest.mark.parametrize("eta", [0.0, 0.03, 0.1, 0.37, 0.8, 1e6])
-def test_what_acts_is_what_arrived_last(eta: float, rate: float, sent: int, newest: int) -> None:
+def test_what_acts_is_what_arrived_last(eta, rate, sent, newest):
     torques = np.arange(1.0, 10)[:, None] * np.ones(6)
     before = -np.arange(1.0, 8)[:, None] * np.ones(6)
     arrivals = Arrivals(DT, Delay(0), eta, rate, sent, before)
@@ -86,7 +83,7 @@ def test_what_acts_is_what_arrived_last(eta: float, rate: float, sent: int, newe
 
 
 @pytest.mark.parametrize(("steps", "fraction"), [(3, 0.0), (3, 0.4), (0, 0.5)])
-def test_whole_and_real_delays_agree(steps: int, fraction: float) -> None:
+def test_whole_and_real_delays_agree(steps, fraction):
     rng = np.random.default_rng(0)
     torques, whole = rng.normal(0, 0.02, (9, 6)), Timeline(DT, Delay(steps, fraction))
     real = Arrivals(DT, Delay(0), whole.eta, 0.0, 9, np.zeros((1, 6)))
@@ -101,7 +98,7 @@ def test_whole_and_real_delays_agree(steps: int, fraction: float) -> None:
 # The filter.
 
 
-def swing(k: int) -> Array:
+def swing(k):
     """Torques that move the plate in all coordinates."""
     return 0.02 * np.sin(0.9 * k + np.arange(6)) + 0.01 * np.cos(0.5 * k * np.arange(1, 7))
 
@@ -115,9 +112,7 @@ class Period:
         plant: as it is known.
     """
 
-    def __init__(
-        self, torques: Array, sent: int | None = None, plant: NominalPlant = PLANT
-    ) -> None:
+    def __init__(self, torques, sent=None, plant=PLANT):
         c = core()
         self.torques, self.before, self.n = torques, np.zeros((1, 6)), 22
         self.delay = compiled_delay(OBSERVER, SENSING, plant, DT)
@@ -125,17 +120,17 @@ class Period:
         numbers = (self.delay.it, view, len(torques), 0, c.at(torques))
         self.it = c.ffi.new("stewart_period *", numbers)
 
-    def scratch(self) -> Any:
+    def scratch(self):
         lib = core().lib
         return core().scratch(lib.stewart_delay_advance_scratch(8, 12, len(self.torques)))
 
-    def end(self, xi: Array) -> Array:
+    def end(self, xi):
         state = np.empty(12)
         given = (self.it, core().at(xi), core().at(state), self.scratch())
         assert core().lib.stewart_period_end(*given)
         return state
 
-    def derivatives(self, xi: Array) -> Array:
+    def derivatives(self, xi):
         """(12, 22) of the state at the end."""
         state, H = np.empty(12), np.empty((12, self.n))
         given = (self.it, core().at(xi), 1, core().at(state), core().at(H), self.scratch())
@@ -143,7 +138,7 @@ class Period:
         assert state == pytest.approx(self.end(xi), abs=1e-14)
         return H
 
-    def late(self, xi: Array, state: Array, std: float) -> Array:
+    def late(self, xi, state, std):
         """Rows (k, 12) of the controller's own torques, which are all here."""
         K, others = np.empty((8, 12)), core().ffi.new("int *")
         given = (core().at(xi), core().at(state), std, core().at(K), others, self.scratch())
@@ -153,19 +148,19 @@ class Period:
 
 
 @pytest.mark.parametrize("eta", [0.137, 0.25, 0.449])
-def test_sensitivity_to_the_delay_equals_a_finer_difference(eta: float) -> None:
+def test_sensitivity_to_the_delay_equals_a_finer_difference(eta):
     """Richardson's extrapolation of the response, with 64 steps per torque."""
     fine = NominalPlant(DYNAMICS, 64, 1.0, TorqueLimit())
     torques = np.array([swing(k) for k in range(12)])
     xi = np.concatenate([HOME, THETA, [eta, 0.0]])
     xi[6:12] = 0.3 * AMPLITUDES
 
-    def end(at: float) -> Array:
+    def end(at):
         moved = xi.copy()
         moved[-2] = at
         return Period(torques, plant=fine).end(moved)
 
-    def slope(h: float) -> Array:
+    def slope(h):
         return (end(eta + h) - end(eta - h)) / (2 * h)
 
     expected = (4 * slope(5e-4) - slope(1e-3)) / 3
@@ -173,9 +168,7 @@ def test_sensitivity_to_the_delay_equals_a_finer_difference(eta: float) -> None:
     assert np.abs(found - expected).max() < 1e-3 * np.abs(expected).max()
 
 
-def record(
-    eta: float, samples: int, seed: int, rate: float = 0.0, jitter: float = 0.0
-) -> tuple[Array, Array, Array]:
+def record(eta, samples, seed, rate=0.0, jitter=0.0):
     """Torques, states and measurements at the samples, by fine integration of its own."""
     torques = np.array([swing(k) for k in range(samples)])
     step, states, x = 5e-3, [HOME], HOME
@@ -195,7 +188,7 @@ def record(
     return torques, truth, truth + noise
 
 
-def observed(torques: Array, measured: Array, believed: float, **changes: Any) -> list[DelayBelief]:
+def observed(torques, measured, believed, **changes):
     """The beliefs at all samples."""
     delay = replace(DELAY, **changes)
     observer = DelayObserver(SETTINGS, delay, believed, quiet=False)
@@ -211,7 +204,7 @@ def observed(torques: Array, measured: Array, believed: float, **changes: Any) -
 
 
 @pytest.mark.parametrize("eta", [0.2, 0.237])
-def test_a_torque_that_is_early_or_late_does_what_the_filter_says(eta: float) -> None:
+def test_a_torque_that_is_early_or_late_does_what_the_filter_says(eta):
     """Second moment over normal errors; next to a sample each period has half of them."""
     torques, std = np.array([swing(k) for k in range(12)]), 2e-3
     model, xi = Period(torques), np.concatenate([HOME, THETA, [eta, 0.0]])
@@ -231,9 +224,7 @@ def test_a_torque_that_is_early_or_late_does_what_the_filter_says(eta: float) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("jitter", "least", "most"), [(0.0, 0.0, 3e-4), (3e-3, 1.5e-3, 4.5e-3)])
-def test_how_early_or_late_single_torques_come_is_found(
-    jitter: float, least: float, most: float
-) -> None:
+def test_how_early_or_late_single_torques_come_is_found(jitter, least, most):
     for seed in range(5):
         torques, _, measured = record(0.337, 30, seed, jitter=jitter)
         [guess] = observed(torques, measured, 0.3)[-1].guesses
@@ -242,7 +233,7 @@ def test_how_early_or_late_single_torques_come_is_found(
         assert guess.std >= 0.5 * jitter / np.sqrt(26)
 
 
-def test_the_first_torques_that_jitter_are_believed() -> None:
+def test_the_first_torques_that_jitter_are_believed():
     """Of ten, each some 3 ms off, hardly one is an outlier, and the delay is as sure as is said.
 
     Taken to be on time, two or three of them were outliers, and the deviation was eight times too
@@ -258,13 +249,13 @@ def test_the_first_torques_that_jitter_are_believed() -> None:
     assert odd <= 8 and np.sqrt(np.mean(np.square(ratios))) < 3
 
 
-def test_the_filter_finds_what_batch_least_squares_finds() -> None:
+def test_the_filter_finds_what_batch_least_squares_finds():
     """One nonlinear least-squares problem over all measurements, its own simulation and weights."""
     eta, samples = 0.337, 14
     torques, _, measured = record(eta, samples, seed=1)
     prior = SETTINGS.parameters
 
-    def simulated(first: Array, theta: Array, delay: float) -> Array:
+    def simulated(first, theta, delay):
         x, states = first, [first]
         for k in range(samples - 1):
             split = np.clip(delay % DT, 0, DT)
@@ -274,7 +265,7 @@ def test_the_filter_finds_what_batch_least_squares_finds() -> None:
             states.append(x)
         return np.array(states)
 
-    def residuals(unknown: Array) -> Array:
+    def residuals(unknown):
         first, theta = unknown[:12] * NOISE + measured[0], unknown[12:20] * prior.std
         misses = (simulated(first, theta, unknown[20]) - measured) / NOISE
         return np.concatenate([misses.ravel(), unknown[12:20]])
@@ -292,7 +283,7 @@ def test_the_filter_finds_what_batch_least_squares_finds() -> None:
 
 
 @pytest.mark.parametrize("size", [3e-4, 5e-4])
-def test_the_search_weighs_as_a_grid_of_filters_does(size: float) -> None:
+def test_the_search_weighs_as_a_grid_of_filters_does(size):
     """Cells against the posterior of filters that each know the delay, on a grid of 10 ms.
 
     The torques are so small that what they do is hardly seen yet.
@@ -315,7 +306,7 @@ def test_the_search_weighs_as_a_grid_of_filters_does(size: float) -> None:
         assert weight == pytest.approx(posterior[inside].sum(), abs=0.06)
 
 
-def small_record(torques: Array, eta: float, samples: int) -> Array:
+def small_record(torques, eta, samples):
     """Measurements of a plate without payload under such torques."""
     x, states = HOME, [HOME]
     view = Arrivals(DT, Delay(0), eta, 0.0, 0, np.zeros((1, 6)))
@@ -327,7 +318,7 @@ def small_record(torques: Array, eta: float, samples: int) -> Array:
     return np.array(states) + noise
 
 
-def known_delay_likelihood(torques: Array, measured: Array, eta: float) -> float:
+def known_delay_likelihood(torques, measured, eta):
     """Log-likelihood of the measurements by a filter that is told the delay."""
     c, prior = core(), SETTINGS.parameters
     size = c.lib.stewart_guess_size(8)
@@ -347,7 +338,7 @@ def known_delay_likelihood(torques: Array, measured: Array, eta: float) -> float
 
 
 @pytest.mark.parametrize("eta", [0.05, 0.337, 0.8, 1.21])
-def test_the_delay_is_found_soon_after_the_first_arrival(eta: float) -> None:
+def test_the_delay_is_found_soon_after_the_first_arrival(eta):
     torques, truth, measured = record(eta, int(eta / DT) + 12, seed=3)
     beliefs = observed(torques, measured, believed=0.6)
     first = int(np.ceil(eta / DT))
@@ -362,7 +353,7 @@ def test_the_delay_is_found_soon_after_the_first_arrival(eta: float) -> None:
     assert beliefs[0].delay_std == pytest.approx(prior.std(), abs=1e-12)
 
 
-def test_a_lost_or_impossible_measurement_is_survived() -> None:
+def test_a_lost_or_impossible_measurement_is_survived():
     torques, _, measured = record(0.337, 16, seed=4)
     measured[0] = np.nan  # there is nothing to begin with
     measured[9] = np.nan
@@ -373,11 +364,11 @@ def test_a_lost_or_impossible_measurement_is_survived() -> None:
     assert beliefs[-1].settled and abs(beliefs[-1].delay_mean - 0.337) < 3e-3
 
 
-def test_the_stated_scratch_memory_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_stated_scratch_memory_is_enough(monkeypatch):
     """A search, a jump of the delay and outliers write nothing beyond it."""
     given, take, spare, mark = [], core().scratch, 100, -1.25
 
-    def marked(numbers: int) -> Any:
+    def marked(numbers):
         scratch = take(numbers + spare)
         for i in range(numbers, numbers + spare):
             scratch[0][i] = mark
@@ -395,7 +386,7 @@ def test_the_stated_scratch_memory_is_enough(monkeypatch: pytest.MonkeyPatch) ->
 # The loop.
 
 
-def looped(*settings: str, kind: str = "constant") -> SimulationResult:
+def looped(*settings, kind="constant"):
     chosen = ("plant.kind=exact", f"controller.delay_estimator={kind}", *settings)
     return simulate(sd.load_scenario("paper", settings=chosen), judge_stability=False)
 
@@ -411,9 +402,7 @@ ON_REFERENCE = ("start=on_reference", "queue=reference")
         (ON_REFERENCE, 0.03),
     ],
 )
-def test_a_delay_believed_wrongly_is_found_in_the_loop(
-    settings: tuple[str, ...], bound: float
-) -> None:
+def test_a_delay_believed_wrongly_is_found_in_the_loop(settings, bound):
     result = looped(*settings)
     assert result.status == "completed" and result.accumulated_error < bound
     assert abs(result.summary["delay"]["estimated_s"] - 0.8) < 5e-5
@@ -423,7 +412,7 @@ def test_a_delay_believed_wrongly_is_found_in_the_loop(
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
 @pytest.mark.parametrize("sensor", ["state", "encoders"])
-def test_a_delay_of_less_than_a_period_may_be_believed_in(fraction: float, sensor: str) -> None:
+def test_a_delay_of_less_than_a_period_may_be_believed_in(fraction, sensor):
     """The torques become those of the law that knows the delay, and those of the reference."""
     settings = (*ON_REFERENCE, "delay.steps=0", f"delay.fraction={fraction}", "duration=3")
     precise = (f"sensor.kind={sensor}", *["sensor.bits=null"] * (sensor == "encoders"))
@@ -438,21 +427,21 @@ def test_a_delay_of_less_than_a_period_may_be_believed_in(fraction: float, senso
 
 
 @pytest.mark.parametrize("true", [0.0, 0.8])
-def test_no_delay_may_be_believed_in(true: float) -> None:
+def test_no_delay_may_be_believed_in(true):
     result = looped("controller.delay_steps=0", f"delay.steps={true / DT:.0f}", "duration=4")
     assert result.status == "completed"
     assert result.summary["delay"]["estimated_s"] == pytest.approx(true, abs=1e-3)
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.37, 0.5, 0.63])
-def test_a_right_belief_of_a_part_of_a_period_is_kept(fraction: float) -> None:
+def test_a_right_belief_of_a_part_of_a_period_is_kept(fraction):
     """What was in flight at t = 0 was held from instants that the controller does not know."""
     run = looped(*ON_REFERENCE, f"delay.fraction={fraction}", "duration=6")
     assert run.stopped is None and run.accumulated_error < 0.5
     assert run.signals.delay_estimate[-1] == pytest.approx(0.8 + 0.1 * fraction, abs=2e-4)
 
 
-def test_a_jump_is_followed() -> None:
+def test_a_jump_is_followed():
     result = looped(*ON_REFERENCE, "delay.jump=0.1", "delay.jump_time=2", "duration=5")
     assert result.status == "completed"
     assert result.summary["delay"]["estimated_s"] == pytest.approx(0.9, abs=1e-4)
@@ -460,7 +449,7 @@ def test_a_jump_is_followed() -> None:
     assert np.all(np.abs(estimates[(time > 1) & (time < 2.8)] - 0.8) < 1e-3)
 
 
-def test_the_figure_has_the_estimate_its_band_and_the_truth() -> None:
+def test_the_figure_has_the_estimate_its_band_and_the_truth():
     result = looped("duration=1.5", "controller.delay_steps=6")
     figure = draw_run(result)["delay"]
     whole, fine = figure.axes
@@ -471,11 +460,11 @@ def test_the_figure_has_the_estimate_its_band_and_the_truth() -> None:
     assert "delay" not in draw_run(looped("duration=0.3", kind="none"))
 
 
-def test_nothing_is_fed_back_before_the_first_torque_has_acted_for_a_period() -> None:
+def test_nothing_is_fed_back_before_the_first_torque_has_acted_for_a_period():
     """From rest the first torques do not depend on what was measured; then they do."""
     noisy = "sensor.noise_std=[" + ",".join(f"{n:g}" for n in 1e-3 * np.tile(AMPLITUDES, 2)) + "]"
 
-    def first(*settings: str) -> Array:
+    def first(*settings):
         run = looped("duration=1.5", *settings, kind="none")
         samples = run.signals.sel(time=np.arange(12) * DT, method="nearest")
         return np.asarray(samples.torque_commanded.values)
@@ -489,7 +478,7 @@ def test_nothing_is_fed_back_before_the_first_torque_has_acted_for_a_period() ->
     assert np.all(loud[0][0] != loud[1][0])
 
 
-def test_the_comparison_shows_it_where_the_delay_is_believed_wrongly() -> None:
+def test_the_comparison_shows_it_where_the_delay_is_believed_wrongly():
     assert tuple(shown("paper")) == CONTROLLERS
     rows = shown("paper", ("controller.delay_steps=6",))
     assert tuple(rows) == (*CONTROLLERS, ADAPTIVE)
@@ -499,7 +488,7 @@ def test_the_comparison_shows_it_where_the_delay_is_believed_wrongly() -> None:
     assert ADAPTIVE not in shown("paper", ("delay.drift=0.01", "sensor.delay=0.1"))
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_what_does_not_fit_is_refused():
     for wrong in ("controller.estimate=[]", "controller.prediction=linear"):
         with pytest.raises(ConfigError, match=r"controller\.delay_estimator: got 'constant'"):
             looped(wrong)
@@ -509,10 +498,10 @@ def test_what_does_not_fit_is_refused() -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("kind", ["constant", "drifting"])
-def test_the_stated_band_covers(kind: str) -> None:
+def test_the_stated_band_covers(kind):
     """95 % +- 5 % of 200 noisy records of random delays."""
     rng, ratios = np.random.default_rng(0), []
-    settings = dataclasses.asdict(delay_settings(kind, 0.3, 1.5))  # type: ignore[arg-type]
+    settings = dataclasses.asdict(delay_settings(kind, 0.3, 1.5))
     for seed in range(200):
         eta = rng.uniform(0.1, 0.7)
         torques, _, measured = record(eta, 30, seed)
@@ -522,10 +511,10 @@ def test_the_stated_band_covers(kind: str) -> None:
     assert 0.9 <= np.mean(np.abs(ratios) < 1.96) <= 1.0
 
 
-def test_the_loop_is_judged_with_the_delay_as_it_will_be_found() -> None:
+def test_the_loop_is_judged_with_the_delay_as_it_will_be_found():
     """Believed wrongly, a law that will find the delay is the law that knew it."""
 
-    def judged(*settings: str) -> ControllerMargin:
+    def judged(*settings):
         settings = ("plant.kind=exact", "start=on_reference", "queue=reference", *settings)
         return controller_margin(prepare(load_scenario("paper", settings=settings)), until=2.0)
 

@@ -18,7 +18,6 @@ from stewart_drake.law.error_model import (
     with_integral,
 )
 from stewart_drake.mechanism.assembly import torque_map
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 
@@ -28,7 +27,7 @@ SAMPLES = 12
 
 
 @st.composite
-def continuous_models(draw: st.DrawFn) -> ContinuousModel:
+def continuous_models(draw):
     """Random A, B, C: stable, unstable, singular or nilpotent, with time constants around 1 s."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     n, m, p = (draw(st.integers(1, most)) for most in (5, 3, 2))
@@ -43,7 +42,7 @@ def continuous_models(draw: st.DrawFn) -> ContinuousModel:
     return ContinuousModel(A, rng.normal(0, 1, (n, m)), rng.normal(0, 1, (p, n)))
 
 
-def platforms() -> dict[str, ContinuousModel]:
+def platforms():
     """The paper's double integrators, and the machine under gravity, which is unstable."""
     return {
         "paper": double_integrators(torque_map(PAPER, PAPER.home)),
@@ -54,12 +53,12 @@ def platforms() -> dict[str, ContinuousModel]:
 # The oracle.
 
 
-def flow(A: Array, B: Array, duration: float) -> tuple[Array, Array]:
+def flow(A, B, duration):
     """How a state and a constant torque show after `duration`, from the differential equation."""
     n, m = B.shape
     start = np.hstack([np.eye(n), np.zeros((n, m))])
 
-    def derivative(t: float, flat: Array) -> Array:
+    def derivative(t, flat):
         change = A @ flat.reshape(n, n + m)
         change[:, n:] += B
         return change.ravel()
@@ -69,14 +68,7 @@ def flow(A: Array, B: Array, duration: float) -> tuple[Array, Array]:
     return end[:, :n], end[:, n:]
 
 
-def simulate_delayed(
-    model: ContinuousModel,
-    period: float,
-    steps: int,
-    fraction: float,
-    start: Array,
-    torques: dict[int, Array],
-) -> tuple[Array, Array]:
+def simulate_delayed(model, period, steps, fraction, start, torques):
     """Errors (SAMPLES + 1, n) and integrals (SAMPLES + 1, p) at the sampling instants.
 
     From event to event: the clock runs in ticks of a tenth of a period; at every tick the torque
@@ -102,15 +94,7 @@ def simulate_delayed(
     return np.array(errors), np.array(integrals)
 
 
-def assert_chain_agrees(
-    model: ContinuousModel,
-    period: float,
-    steps: int,
-    fraction: float,
-    integral: bool,
-    extra: bool,
-    rng: np.random.Generator,
-) -> None:
+def assert_chain_agrees(model, period, steps, fraction, integral, extra, rng):
     """The chain gives the errors and integrals of the oracle, and carries the right queue."""
     n, m = model.B.shape
     torques = {k: rng.normal(0, 1, m) for k in range(-steps - 1, SAMPLES + 1)}
@@ -122,7 +106,7 @@ def assert_chain_agrees(
     size = n + (len(model.C) if integral else 0)
     assert augmented.A.shape == (size + m * length, size + m * length)
 
-    def queue(k: int) -> Array:
+    def queue(k):
         return np.concatenate([np.empty(0), *(torques[j] for j in range(k - length, k))])
 
     x = np.concatenate([start, np.zeros(size - n), queue(0)])
@@ -142,7 +126,7 @@ def assert_chain_agrees(
 
 @settings(max_examples=60, deadline=None)
 @given(model=continuous_models(), duration=st.floats(1e-3, 2.0))
-def test_sample_is_the_integral_of_the_exponential(model: ContinuousModel, duration: float) -> None:
+def test_sample_is_the_integral_of_the_exponential(model, duration):
     transition, push = sample(model.A, model.B, duration)
     expected = flow(model.A, model.B, duration)
     assert relative(transition, expected[0]) < 1e-11
@@ -151,7 +135,7 @@ def test_sample_is_the_integral_of_the_exponential(model: ContinuousModel, durat
     assert relative(push, by_quadrature) < 1e-11
 
 
-def test_sample_of_a_double_integrator_is_in_closed_form() -> None:
+def test_sample_of_a_double_integrator_is_in_closed_form():
     transition, push = sample(np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [3]]), 0.1)
     assert np.allclose(transition, [[1, 0.1], [0, 1]], rtol=0, atol=1e-16)
     assert np.allclose(push, [[3 * 0.1**2 / 2], [0.3]], rtol=1e-15, atol=0)
@@ -165,9 +149,7 @@ def test_sample_of_a_double_integrator_is_in_closed_form() -> None:
 @pytest.mark.parametrize("steps", STEPS)
 @settings(max_examples=25, deadline=None)
 @given(model=continuous_models(), seed=st.integers(0, 2**32 - 1), integral=st.booleans())
-def test_chain_is_the_delayed_continuous_system(
-    steps: int, fraction: float, extra: bool, model: ContinuousModel, seed: int, integral: bool
-) -> None:
+def test_chain_is_the_delayed_continuous_system(steps, fraction, extra, model, seed, integral):
     rng = np.random.default_rng(seed)
     period = rng.uniform(0.05, 0.3)
     assert_chain_agrees(model, period, steps, fraction, integral, extra, rng)
@@ -177,22 +159,20 @@ def test_chain_is_the_delayed_continuous_system(
 @pytest.mark.parametrize("fraction", FRACTIONS)
 @pytest.mark.parametrize("steps", STEPS)
 @pytest.mark.parametrize("name", ["paper", "gravity"])
-def test_chain_of_the_platform_is_its_delayed_system(
-    name: str, steps: int, fraction: float, extra: bool
-) -> None:
+def test_chain_of_the_platform_is_its_delayed_system(name, steps, fraction, extra):
     rng = np.random.default_rng(steps)
     assert_chain_agrees(platforms()[name], 0.1, steps, fraction, True, extra, rng)
 
 
 @pytest.mark.parametrize("fraction", FRACTIONS)
 @pytest.mark.parametrize("steps", [1, 2, 8])
-def test_chain_has_the_blocks_that_the_paper_prints(steps: int, fraction: float) -> None:
+def test_chain_has_the_blocks_that_the_paper_prints(steps, fraction):
     """(35) and (39), with their zero blocks at the sizes that fit."""
     model = platforms()["gravity"]
     found = chain(delayed_model(model, 0.1, steps, fraction, integral=False), always_extra=True)
     N, n, dt, eta0 = 12, 6, 0.1, 0.1 * fraction
 
-    def integral(start: float, end: float) -> Array:
+    def integral(start, end):
         inside, _ = quad_vec(lambda v: expm(model.A * (dt - v)) @ model.B, start, end)
         return inside
 
@@ -213,7 +193,7 @@ def test_chain_has_the_blocks_that_the_paper_prints(steps: int, fraction: float)
     assert np.array_equal(found.C, np.hstack([model.C, zeros((6, n * (steps + 1)))]))
 
 
-def test_the_papers_extra_block_is_seen_by_nothing_without_a_fraction() -> None:
+def test_the_papers_extra_block_is_seen_by_nothing_without_a_fraction():
     delayed = delayed_model(platforms()["paper"], 0.1, 3, 0.0, integral=True)
     plain, extra = chain(delayed), chain(delayed, always_extra=True)
     kept = np.r_[:18, 24 : 24 + 18]
@@ -222,7 +202,7 @@ def test_the_papers_extra_block_is_seen_by_nothing_without_a_fraction() -> None:
     assert not extra.C[:, 18:24].any()
 
 
-def test_integral_states_of_the_error_model_integrate_the_error() -> None:
+def test_integral_states_of_the_error_model_integrate_the_error():
     """(24)-(28), unsampled: z_dot = C e, and the cost sees pose error and integral."""
     model = platforms()["gravity"]
     found = with_integral(model)
@@ -251,8 +231,6 @@ def test_integral_states_of_the_error_model_integrate_the_error() -> None:
         ("delay", (0.1, 1, np.nan)),
     ],
 )
-def test_delays_and_periods_that_cannot_be_are_refused(
-    name: str, arguments: tuple[float, int, float]
-) -> None:
+def test_delays_and_periods_that_cannot_be_are_refused(name, arguments):
     with pytest.raises(ValueError, match=f"{name}: got .* expected"):
         delayed_model(platforms()["paper"], *arguments, integral=True)

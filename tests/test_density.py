@@ -13,16 +13,14 @@ from stewart_drake.tuner.network import (
     NUM_INPUTS,
     SIGNED_LIMIT,
     WINDOW,
-    Kind,
     densities,
     density,
 )
-from stewart_drake.types import Array
 
-KINDS: tuple[Kind, ...] = ("magnitude", "signed")
+KINDS = ("magnitude", "signed")
 
 
-def oracle(column: Array, kind: Kind) -> list[float]:
+def oracle(column, kind):
     """(45) along one signal, in rational numbers."""
     rho = []
     for k in range(len(column)):
@@ -40,13 +38,13 @@ def oracle(column: Array, kind: Kind) -> list[float]:
     return rho
 
 
-def record(*column: float) -> Array:
+def record(*column):
     """Samples (N, 18) whose signals are all the same."""
     return np.tile(np.array(column)[:, None], NUM_INPUTS)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_densities_are_those_of_exact_arithmetic(kind: Kind) -> None:
+def test_densities_are_those_of_exact_arithmetic(kind):
     rng = np.random.default_rng(1)
     samples = rng.normal(0.3, 1, (90, NUM_INPUTS)) * 10.0 ** rng.integers(-9, 9, NUM_INPUTS)
     samples[rng.random(samples.shape) < 0.1] = 0.0
@@ -68,20 +66,20 @@ def test_densities_are_those_of_exact_arithmetic(kind: Kind) -> None:
         elements=st.floats(width=64) | st.sampled_from([0.0, 1.0, -1.0, 5e-324, 1.7e308, np.nan]),
     )
 )
-def test_densities_are_bounded_whatever_comes(kind: Kind, samples: Array) -> None:
+def test_densities_are_bounded_whatever_comes(kind, samples):
     rho = densities(samples, kind)
     assert rho.shape == samples.shape
     low, high = (0, WINDOW) if kind == "magnitude" else (-SIGNED_LIMIT, SIGNED_LIMIT)
     assert np.all((low <= rho) & (rho <= high))  # false for NaN
 
 
-def test_the_bound_is_reached_by_an_impulse_into_a_window_of_zeros() -> None:
+def test_the_bound_is_reached_by_an_impulse_into_a_window_of_zeros():
     rho = densities(record(*[0.0] * 30, -0.3, 0.3, 0.3))
     np.testing.assert_array_equal(rho[:30], 1.0)
     np.testing.assert_allclose(rho[30:, 0], [31, 31 / 2, 31 / 3], rtol=1e-14)
 
 
-def test_signed_densities_are_equation_45_on_a_full_window() -> None:
+def test_signed_densities_are_equation_45_on_a_full_window():
     samples = np.random.default_rng(2).normal(0.5, 1, (60, NUM_INPUTS))
     rho = densities(samples, "signed")
     for k in range(30, 60):
@@ -89,21 +87,21 @@ def test_signed_densities_are_equation_45_on_a_full_window() -> None:
         np.testing.assert_allclose(rho[k], printed, rtol=1e-9)
 
 
-def test_where_the_sum_is_zero_the_signed_density_is_cut_with_the_sign_of_the_signal() -> None:
+def test_where_the_sum_is_zero_the_signed_density_is_cut_with_the_sign_of_the_signal():
     assert densities(record(1.0, -1.0), "signed")[1, 0] == -SIGNED_LIMIT
     assert densities(record(-1.0, 1.0), "signed")[1, 0] == SIGNED_LIMIT
     assert densities(record(1.0, -1.0, 0.0), "signed")[2, 0] == 0.0
     assert densities(record(1.0, -1.0 + 1e-9), "signed")[1, 0] == -SIGNED_LIMIT
 
 
-def test_the_sine_of_the_errata_is_tame_in_magnitude_only() -> None:
+def test_the_sine_of_the_errata_is_tame_in_magnitude_only():
     samples = record(*np.sin(0.1 * np.arange(200)))
     assert np.abs(densities(samples, "signed")).max() > 90
     assert densities(samples).max() <= 2
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_constant_and_a_scale_do_not_matter(kind: Kind) -> None:
+def test_a_constant_and_a_scale_do_not_matter(kind):
     np.testing.assert_allclose(densities(record(*[-0.7] * 50), kind), 1.0, rtol=1e-14)
     samples = np.random.default_rng(3).normal(0, 1, (50, NUM_INPUTS))
     for factor in (-1.0, 2.0**-40, -(2.0**300)):
@@ -113,7 +111,7 @@ def test_a_constant_and_a_scale_do_not_matter(kind: Kind) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_missed_measurement_is_left_out_and_spoils_nothing(kind: Kind) -> None:
+def test_a_missed_measurement_is_left_out_and_spoils_nothing(kind):
     samples = np.random.default_rng(4).normal(1, 0.3, (20, NUM_INPUTS))
     missed = samples.copy()
     missed[7, :12] = np.nan
@@ -124,7 +122,7 @@ def test_a_missed_measurement_is_left_out_and_spoils_nothing(kind: Kind) -> None
     np.testing.assert_allclose(np.delete(rho, 7, axis=0)[:, :12], shorter[:, :12], rtol=1e-12)
 
 
-def test_one_window_and_a_record_agree() -> None:
+def test_one_window_and_a_record_agree():
     samples = np.random.default_rng(5).normal(0, 1, (80, NUM_INPUTS))
     rho = densities(samples)
     for k in range(30, 80):
@@ -132,10 +130,10 @@ def test_one_window_and_a_record_agree() -> None:
     assert densities(np.empty((0, NUM_INPUTS))).shape == (0, NUM_INPUTS)
 
 
-def test_wrong_shapes_and_kinds_are_refused() -> None:
+def test_wrong_shapes_and_kinds_are_refused():
     with pytest.raises(ValueError, match=r"samples: got shape \(5, 12\)"):
         densities(np.zeros((5, 12)))
     with pytest.raises(ValueError, match=r"window: got shape \(30, 18\)"):
         density(np.zeros((30, 18)))
     with pytest.raises(ValueError, match="kind: got 'log'"):
-        density(np.zeros((31, 18)), "log")  # type: ignore[arg-type]
+        density(np.zeros((31, 18)), "log")

@@ -26,9 +26,8 @@ import os
 import re
 import shlex
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -50,7 +49,6 @@ from stewart_drake.scenario.reference_files import read_waypoints
 from stewart_drake.scenario.renames import CONTROLLER
 from stewart_drake.scenario.signals import SIGNALS, exported_ports, ports_of
 from stewart_drake.scenario.trajectories import evaluate, make_reference
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -77,11 +75,11 @@ class Block(NamedTuple):
     language: str
     text: str
 
-    def __str__(self) -> str:
+    def __str__(self):
         return f"{self.path.relative_to(ROOT)}:{self.line}"
 
 
-def blocks(*languages: str) -> list[Block]:
+def blocks(*languages):
     """All fenced blocks in one of these languages."""
     found = []
     for path in DOCS:
@@ -92,17 +90,17 @@ def blocks(*languages: str) -> list[Block]:
     return [block for block in found if block.language in languages]
 
 
-def prose(path: Path) -> str:
+def prose(path):
     """A document without its fenced blocks; of the changelog what is not history."""
     return FENCE.sub("", path.read_text(encoding="utf-8")).split("\n## [0.1.0]")[0]
 
 
-def document(path: Path) -> str:
+def document(path):
     """Its name in a test."""
     return str(path.relative_to(ROOT))
 
 
-def each(found: list[Block]) -> Any:
+def each(found):
     return pytest.mark.parametrize("block", found, ids=str)
 
 
@@ -110,7 +108,7 @@ def each(found: list[Block]) -> Any:
 
 
 @functools.cache
-def words() -> frozenset[str]:
+def words():
     """All identifiers and words of the package, the tests and the data files."""
     folders = (PACKAGE, ROOT / "tests", ROOT / "models", ROOT / "diagrams")
     texts = (
@@ -123,14 +121,14 @@ def words() -> frozenset[str]:
 
 
 @functools.cache
-def functions_in(path: Path) -> frozenset[str]:
+def functions_in(path):
     """Names of the test functions in a file."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     return frozenset(node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
 
 
 @functools.cache
-def sources() -> str:
+def sources():
     """The texts of the package, the Makefile and the data files."""
     package = (path for kind in ("py", "j2", "c", "h") for path in PACKAGE.rglob(f"*.{kind}"))
     paths = (*package, ROOT / "Makefile", ROOT / "mkdocs.yml")
@@ -139,7 +137,7 @@ def sources() -> str:
 
 
 @functools.cache
-def files() -> frozenset[str]:
+def files():
     """Names of the repository's files, but for what is made."""
     folders = (path for path in ROOT.iterdir() if path.is_dir() and path.name != "out")
     kept = [path for path in folders if not path.name.startswith(".")]
@@ -148,7 +146,7 @@ def files() -> frozenset[str]:
 
 
 @functools.cache
-def gone() -> frozenset[str]:
+def gone():
     """What 0.1 and 0.2 had and today's has not, by docs/upgrading.md and the table of renames."""
     table = prose(ROOT / "docs" / "upgrading.md").split("| before | now |")[1]
     modules = re.findall(r"^\| `(?:stewart_drake\.)?([\w.]+)`", table, re.MULTILINE)
@@ -156,13 +154,13 @@ def gone() -> frozenset[str]:
 
 
 @functools.cache
-def commands() -> dict[str, frozenset[str]]:
+def commands():
     """Options by command, such as `analyze delay`; of a family, those of its members."""
     typer = pytest.importorskip("typer")
     cli = pytest.importorskip("stewart_drake.cli")
-    found: dict[str, frozenset[str]] = {}
+    found = {}
 
-    def gather(command: Any, name: str) -> frozenset[str]:
+    def gather(command, name):
         options = {option for p in command.params for option in (*p.opts, *p.secondary_opts)}
         for word, below in getattr(command, "commands", {}).items():
             options |= gather(below, f"{name} {word}".strip())
@@ -173,7 +171,7 @@ def commands() -> dict[str, frozenset[str]]:
     return found
 
 
-def problem_with_command(code: str) -> str | None:
+def problem_with_command(code):
     """What is wrong with a command whose `stewart-drake` may be left out, or with its options."""
     words, known = code.removeprefix("stewart-drake ").split(), commands()
     name = ""
@@ -194,13 +192,13 @@ def problem_with_command(code: str) -> str | None:
     return None
 
 
-def is_field(dotted: str) -> bool:
+def is_field(dotted):
     """Whether this is a section or a field of a scenario."""
     fields = {choice.partition("=")[0] for choice in setting_choices()}
     return dotted in fields or dotted in {field.partition(".")[0] for field in fields}
 
 
-def is_name(dotted: str) -> bool:
+def is_name(dotted):
     """Whether the package has this module, or an attribute of it by this name."""
     parts = ["stewart_drake", *dotted.split(".")]
     for end in range(len(parts), 1, -1):
@@ -210,7 +208,7 @@ def is_name(dotted: str) -> bool:
                 continue
         except ModuleNotFoundError:
             continue
-        value: Any = importlib.import_module(module)
+        value = importlib.import_module(module)
         for part in parts[end:]:
             fields = getattr(value, "__dataclass_fields__", {})
             if part in fields:
@@ -223,13 +221,13 @@ def is_name(dotted: str) -> bool:
 
 
 @functools.cache
-def loop() -> Any:
+def loop():
     """The closed loop of the paper's scenario, with the exact plant."""
     return sd.build_closed_loop(sd.load_scenario("paper", settings=["plant.kind=exact"]))
 
 
 @functools.cache
-def ports() -> frozenset[str]:
+def ports():
     """`system.port` of all systems in the loop."""
     found = set()
     for system in loop().GetSystems():
@@ -240,19 +238,19 @@ def ports() -> frozenset[str]:
 
 
 @functools.cache
-def modules() -> frozenset[str]:
+def modules():
     """Modules and packages directly below the package."""
     return frozenset(path.stem for path in PACKAGE.iterdir() if path.suffix in ("", ".py"))
 
 
 @functools.cache
-def shell() -> str:
+def shell():
     """What the blocks for a shell, the Makefile and the site's settings say."""
     told = "".join(block.text for block in blocks("sh", "bash", "shell", "console"))
     return told + sources()
 
 
-def problem_at_a_shell(program: str, rest: str) -> str | None:
+def problem_at_a_shell(program, rest):
     """What is wrong with `stewart-drake ...`, `make ...` or `python ...`."""
     if program == "stewart-drake":
         return problem_with_command(rest)
@@ -271,7 +269,7 @@ def problem_at_a_shell(program: str, rest: str) -> str | None:
     return None if script is None or (ROOT / script).is_file() else f"{script} does not exist"
 
 
-def problem_with(code: str) -> str | None:
+def problem_with(code):
     """What is wrong with a piece of code type; None where nothing is, or nothing can be told."""
     code = code.strip()
     if code in gone():
@@ -312,7 +310,7 @@ def problem_with(code: str) -> str | None:
 
 
 @pytest.mark.parametrize("path", DOCS, ids=document)
-def test_what_is_named_exists(path: Path) -> None:
+def test_what_is_named_exists(path):
     codes = set(CODE.findall(prose(path)))
     if path.name == "CHANGELOG.md":  # which abbreviates, and names files that are written
         codes = {code for code in codes if not code.startswith("_") and not code.endswith(SUFFIXES)}
@@ -321,7 +319,7 @@ def test_what_is_named_exists(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", DOCS, ids=document)
-def test_files_in_italics_exist_or_are_written(path: Path) -> None:
+def test_files_in_italics_exist_or_are_written(path):
     shown = "".join(match[0] for match in FENCE.finditer(path.read_text(encoding="utf-8")))
     missing = [
         name
@@ -336,12 +334,12 @@ def test_files_in_italics_exist_or_are_written(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", DOCS, ids=document)
-def test_names_for_the_reference_exist(path: Path) -> None:
+def test_names_for_the_reference_exist(path):
     for name in re.findall(r"^::: stewart_drake\.?(.*)$", prose(path), re.MULTILINE):
         assert not name or is_name(name), name
 
 
-def docstrings(path: Path) -> Iterator[str]:
+def docstrings(path):
     """Of a module, and of what is in it."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
@@ -350,7 +348,7 @@ def docstrings(path: Path) -> Iterator[str]:
             yield str(node.value.value)
 
 
-def test_dotted_names_in_docstrings_exist() -> None:
+def test_dotted_names_in_docstrings_exist():
     """The reference is made of them. `plant` may be somebody's own there."""
     problems = {
         f"{document(path)}: {problem_with(code)}"
@@ -362,14 +360,14 @@ def test_dotted_names_in_docstrings_exist() -> None:
     assert not problems, "\n".join(sorted(problems))
 
 
-def anchors(path: Path) -> set[str]:
+def anchors(path):
     """Of the headings of a document, as GitHub and the site make them."""
     titles = re.findall(r"^#+ (.*)$", FENCE.sub("", path.read_text("utf-8")), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
 @pytest.mark.parametrize("path", DOCS, ids=document)
-def test_links_lead_somewhere(path: Path) -> None:
+def test_links_lead_somewhere(path):
     for link in LINK.findall(prose(path)):
         file, _, anchor = link.partition("#")
         if "://" in link or link.startswith("mailto:"):
@@ -379,8 +377,8 @@ def test_links_lead_somewhere(path: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{path.name}: {link}"
 
 
-def test_the_site_has_every_page_once() -> None:
-    def leaves(tree: Any) -> Iterator[str]:
+def test_the_site_has_every_page_once():
+    def leaves(tree):
         for part in tree if isinstance(tree, list) else tree.values():
             yield from [part] if isinstance(part, str) else leaves(part)
 
@@ -390,7 +388,7 @@ def test_the_site_has_every_page_once() -> None:
     assert pages == {document(path).removeprefix("docs/") for path in DOCS}
 
 
-def test_names_of_0_1_that_are_gone_are_gone() -> None:
+def test_names_of_0_1_that_are_gone_are_gone():
     assert len(gone()) > 10
     for name in gone():
         assert importlib.util.find_spec(f"stewart_drake.{name.partition('.')[0]}") is None or not (
@@ -406,7 +404,7 @@ ELSEWHERE = ("extending.md", "tutorial.md")
 
 
 @each([block for block in blocks("python", "py") if block.path.name not in ELSEWHERE])
-def test_python_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_runs(block, tmp_path, monkeypatch):
     """All but those that tests/test_extending.py and tests/test_tutorial.py run and look into."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
@@ -414,7 +412,7 @@ def test_python_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     exec(compile(source, str(block.path), "exec"), {"__name__": "__main__"})
 
 
-def load_any(path: Path) -> None:
+def load_any(path):
     """Load a YAML file as what its keys say it is."""
     keys = set(load_yaml(path))
     if keys & {"crank", "rod", "pattern", "legs"}:
@@ -428,13 +426,13 @@ def load_any(path: Path) -> None:
 
 
 @each(blocks("yaml", "yml"))
-def test_yaml_loads(block: Block, tmp_path: Path) -> None:
+def test_yaml_loads(block, tmp_path):
     path = tmp_path / "block.yaml"
     path.write_text(block.text, encoding="utf-8")
     load_any(path)
 
 
-def command_lines(block: Block) -> Iterator[list[str]]:
+def command_lines(block):
     """Arguments of every `stewart-drake` call in a shell block."""
     for line in re.sub(r"\\\n", " ", block.text).splitlines():
         for part in re.split(r"&&|\|\||;|\|", line.strip().removeprefix("$ ")):
@@ -445,7 +443,7 @@ def command_lines(block: Block) -> Iterator[list[str]]:
                 yield arguments[1:]
 
 
-def parse(arguments: list[str]) -> dict[str, Any]:
+def parse(arguments):
     """The parameters of a call, by the command line's own parser; nothing is run."""
     typer = pytest.importorskip("typer")
     cli = pytest.importorskip("stewart_drake.cli")
@@ -465,7 +463,7 @@ def parse(arguments: list[str]) -> dict[str, Any]:
 
 
 @each(blocks("sh", "bash", "shell", "console"))
-def test_commands_parse(block: Block) -> None:
+def test_commands_parse(block):
     """Options by the parser, shipped names and settings by the loader."""
     for arguments in command_lines(block):
         parameters = parse(arguments)
@@ -480,12 +478,12 @@ def test_commands_parse(block: Block) -> None:
 # ------------------------------------------------------------------ the picture of the loop
 
 
-def test_architecture_shows_the_loop_as_it_is() -> None:
+def test_architecture_shows_the_loop_as_it_is():
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     diagram = loop()
     preview = diagram.GetSubsystemByName("controller").GetInputPort("preview").size()
 
-    def named(system: Any, port: Any) -> str:
+    def named(system, port):
         # Drake's own blocks have one port each way, which the table leaves out.
         one = system.get_name() in ("saturation", "torque_bias", "weights")
         return system.get_name() if one else f"{system.get_name()}.{port.get_name()}"
@@ -503,7 +501,7 @@ def test_architecture_shows_the_loop_as_it_is() -> None:
     assert all(f"`{name}`" in text for name in exported)
 
 
-def test_the_citation_is_of_this_version() -> None:
+def test_the_citation_is_of_this_version():
     cited = load_yaml(ROOT / "CITATION.cff")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert cited["version"] == project["version"]
@@ -514,7 +512,7 @@ def test_the_citation_is_of_this_version() -> None:
 # ------------------------------------------------------------------ figures
 
 
-def rows_of(path: Path, heading: str) -> list[list[str]]:
+def rows_of(path, heading):
     """Cells of the first table whose head begins so, without its head."""
     table = path.read_text(encoding="utf-8").split(f"\n| {heading}", 1)[1].split("\n\n")[0]
     return [[cell.strip() for cell in row.strip("|").split(" | ")] for row in table.split("\n")[2:]]
@@ -523,7 +521,7 @@ def rows_of(path: Path, heading: str) -> list[list[str]]:
 TRACKING = ROOT / "benchmarks" / "results" / "tracking.md"
 
 
-def test_the_readme_s_table_is_that_of_the_benchmark() -> None:
+def test_the_readme_s_table_is_that_of_the_benchmark():
     *others, ours = rows_of(ROOT / "README.md", "controller")
     measured = {tuple(row[:2]): row[2] for row in rows_of(TRACKING, "condition")}
     assert [row[0].split("`")[1] for row in others] == ["lqr", "lqi", "delay_lqr", "delay_lqi"]
@@ -545,7 +543,7 @@ STATISTICS = ("median of all", "completed, %", "median", "mean", "standard devia
 STATISTICS += ("lost", "runs", "AUC")
 
 
-def tables(path: Path) -> Iterator[tuple[list[str], list[list[str]]]]:
+def tables(path):
     """Head and rows of every table of a document."""
     for text in re.findall(r"^\|.*\n\| ?-.*\n(?:\|.*\n)*", path.read_text("utf-8"), re.MULTILINE):
         head, _, *rows = (re.split(r"\s*\|\s*", row)[1:-1] for row in text.splitlines())
@@ -553,16 +551,16 @@ def tables(path: Path) -> Iterator[tuple[list[str], list[list[str]]]]:
 
 
 @functools.cache
-def claims() -> dict[str, dict[str, str]]:
+def claims():
     """Figures of the table of claims by the name of a row and the statistic."""
-    found: dict[str, dict[str, str]] = {}
+    found = {}
     for head, rows in tables(CLAIMS):
         if head[0] == "row":
             found |= {row[0].strip("`"): dict(zip(head, row, strict=True)) for row in rows}
     return found
 
 
-def problem_with_claim(name: str, statistic: str, shown: str) -> str | None:
+def problem_with_claim(name, statistic, shown):
     """Compare a cell with the row that it quotes, rounded to the digits that it shows."""
     if name not in claims():
         return f"no claim is called {name}"
@@ -574,7 +572,7 @@ def problem_with_claim(name: str, statistic: str, shown: str) -> str | None:
     return None if shown == measured else f"{name}, {statistic}: {shown}, measured {measured}"
 
 
-def quoted(path: Path) -> Iterator[tuple[str, str, str]]:
+def quoted(path):
     """Row, statistic and cell of the tables that name rows of the table of claims.
 
     A column's head says the statistic, and in code type what to append to the row's name.
@@ -590,15 +588,15 @@ def quoted(path: Path) -> Iterator[tuple[str, str, str]]:
 
 
 @pytest.mark.parametrize("path", [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")], ids=document)
-def test_figures_of_a_row_are_those_of_the_table_of_claims(path: Path) -> None:
+def test_figures_of_a_row_are_those_of_the_table_of_claims(path):
     problems = {problem_with_claim(*one) for one in quoted(path)} - {None}
     assert not problems, "\n".join(sorted(map(str, problems)))
 
 
-def port_rows(text: str) -> dict[str, tuple[str, str]]:
+def port_rows(text):
     """Port -> size and unit, of the table of output ports in a text; a row may name several."""
     table = text.split("with output ports", 1)[1].split("\n\n", 2)[1]
-    rows: dict[str, tuple[str, str]] = {}
+    rows = {}
     for line in table.splitlines()[2:]:
         names, size, unit, _ = (cell.strip() for cell in line.strip("|").split("|"))
         for name in names.replace("`", "").split(","):
@@ -607,7 +605,7 @@ def port_rows(text: str) -> dict[str, tuple[str, str]]:
     return rows
 
 
-def test_the_page_of_results_has_the_ports_of_the_table_of_signals() -> None:
+def test_the_page_of_results_has_the_ports_of_the_table_of_signals():
     rows = port_rows((ROOT / "docs" / "howto" / "results.md").read_text())
     assert list(rows) != [] and set(rows) == set(exported_ports())
     for name, (size, unit) in rows.items():
@@ -619,13 +617,13 @@ def test_the_page_of_results_has_the_ports_of_the_table_of_signals() -> None:
 
 
 @pytest.mark.parametrize("system", [ClosedLoop, DelayLqiController])
-def test_docstrings_name_the_ports_of_the_table(system: type) -> None:
+def test_docstrings_name_the_ports_of_the_table(system):
     ports = exported_ports() if system is ClosedLoop else ports_of("controller")
     missing = [name for name in ports if not re.search(rf"\b{name}\b", system.__doc__ or "")]
     assert not missing
 
 
-def test_architecture_has_a_row_for_every_part_of_the_package() -> None:
+def test_architecture_has_a_row_for_every_part_of_the_package():
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     parts = {
         f"{path.name}/" if path.is_dir() else path.name
@@ -639,7 +637,7 @@ def test_architecture_has_a_row_for_every_part_of_the_package() -> None:
 # ------------------------------------------------------------------ claims of errata.md
 
 
-def rod_lengths(pose: Array, angles: Array) -> Array:
+def rod_lengths(pose, angles):
     """(6,) m: what the rods of the paper's machine would need with these crank angles."""
     x, y = PAPER.R_WS[:, :, 0], PAPER.R_WS[:, :, 1]
     tips = PAPER.p_WS + PAPER.crank_lengths[:, None] * (
@@ -649,7 +647,7 @@ def rod_lengths(pose: Array, angles: Array) -> Array:
     return np.asarray(np.linalg.norm(joints - tips, axis=1))
 
 
-def test_errata_inverse_kinematics() -> None:
+def test_errata_inverse_kinematics():
     """Entries 5 and 6: without |u|^2, and with acos for the angle of (B, A)."""
     pose, u, rod = PAPER.home, PAPER.crank_lengths, PAPER.rod_lengths
     L = np.einsum("li,lij->lj", pose[3:] + PAPER.p_PQ - PAPER.p_WS, PAPER.R_WS)
@@ -658,7 +656,7 @@ def test_errata_inverse_kinematics() -> None:
     size = np.hypot(A, B)
     assert np.array_equal(np.sign(A), [1, -1, 1, -1, 1, -1])
 
-    def angles(C: Array) -> Array:
+    def angles(C):
         return np.arctan2(B, A) + PAPER.branches * np.arccos(C / size)
 
     assert rod_lengths(pose, angles(right)) == pytest.approx(rod, rel=1e-12)
@@ -675,7 +673,7 @@ def test_errata_inverse_kinematics() -> None:
     assert gaps[::2] == pytest.approx(-0.049, abs=5e-4)
 
 
-def test_errata_desired_acceleration_is_a_disturbance() -> None:
+def test_errata_desired_acceleration_is_a_disturbance():
     """Entry 12: with x on the reference and the torque that keeps it there, B T = -d."""
     scenario = Scenario()
     reference = make_reference(scenario.reference, scenario.duration)
@@ -691,27 +689,27 @@ def test_errata_desired_acceleration_is_a_disturbance() -> None:
     assert peak == pytest.approx([0.2618] * 3 + [0.02, 0.02, 0.08], rel=1e-3)
 
 
-def test_errata_density_is_unbounded() -> None:
+def test_errata_density_is_unbounded():
     """Entry 18: 31 samples of a sine in the window of (45)."""
     error = np.sin(0.1 * np.arange(101))
     density = [31 * error[k] / error[k - 30 : k + 1].sum() for k in range(30, 101)]
     assert np.abs(density).max() == pytest.approx(92, abs=1)
 
 
-def test_errata_seven_ratios_of_weights() -> None:
+def test_errata_seven_ratios_of_weights():
     """Entry 19."""
     weights = (0.1, 1.0, 4.0)
     assert len({round(q / r, 12) for q in weights for r in weights}) == 7
     assert 7 * 5 * 4 == 140
 
 
-def test_errata_six_hertz_is_four() -> None:
+def test_errata_six_hertz_is_four():
     """Entry 20: at 10 Hz they are the same samples but for the sign."""
     t = 0.1 * np.arange(100)
     assert np.sin(2 * np.pi * 6 * t) == pytest.approx(-np.sin(2 * np.pi * 4 * t), abs=1e-12)
 
 
-def test_errata_accumulated_error_is_a_mean_over_six() -> None:
+def test_errata_accumulated_error_is_a_mean_over_six():
     """Entry 21: one coordinate off by its peak to peak for 10 s counts a sixth of 1000 % s."""
     time = np.linspace(0, 10, 501)
     error = np.zeros((501, 6))
@@ -728,9 +726,7 @@ def test_errata_accumulated_error_is_a_mean_over_six() -> None:
         (True, True, 0.914, 1.288),
     ],
 )
-def test_errata_delay_destabilises_what_ignores_it(
-    integral: bool, exact: bool, without_delay: float, delayed: float
-) -> None:
+def test_errata_delay_destabilises_what_ignores_it(integral, exact, without_delay, delayed):
     """Entry 22: spectral radii with equal weights, on the paper's map and on the exact plant."""
     weights = np.eye(12 if integral else 6), np.eye(6)
     believed = double_integrators(torque_map(PAPER, PAPER.home))
@@ -749,7 +745,7 @@ def test_errata_delay_destabilises_what_ignores_it(
         assert f"| {radius:.3f} |" in text
 
 
-def test_errata_cranks_of_a_pair_intersect() -> None:
+def test_errata_cranks_of_a_pair_intersect():
     """The limitation: cranks cross at 28 %, rods at 42 % of their lengths."""
     legs = leg_geometry(PAPER, PAPER.home)
     cranks = PAPER.crank_lengths[:, None] * legs.crank

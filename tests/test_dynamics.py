@@ -52,34 +52,32 @@ all_free = functools.partial(StewartDynamics, free=PLANT_PARAMETERS)
 """Dynamics whose methods take all parameters of the plant (13,)."""
 
 
-def random_parameters(rng: np.random.Generator) -> Array:
+def random_parameters(rng):
     """Torque bias, payload, damping, Coulomb friction and its speed, place of the payload (13,)."""
     friction = rng.uniform([0.1, 0.0, 0.0, 0.05], [2.0, 0.1, 0.1, 1.0])
     return np.concatenate([rng.normal(0, 0.1, 6), friction, rng.normal(0, 0.05, 3)])
 
 
 @functools.cache
-def shared(index: int) -> StewartDynamics:
+def shared(index):
     """Dynamics with gravity of the paper's mechanism (-1) or of a random one (0, 1, ...)."""
     rng = np.random.default_rng(abs(index))
     return all_free(PAPER if index < 0 else random_mechanism(rng))
 
 
-def friction(parameters: Array, crank_rates: Array) -> Array:
+def friction(parameters, crank_rates):
     """Torque (6,) against the cranks."""
     coulomb, speed = parameters[COULOMB], parameters[COULOMB_SPEED]
     return parameters[DAMPING] * crank_rates + coulomb * np.tanh(crank_rates / speed)
 
 
-def trajectory(t: float) -> tuple[Array, Array, Array]:
+def trajectory(t):
     """Pose, rates and accelerations of the trajectory (46)."""
     sine, cosine = AMPLITUDE * np.sin(t), AMPLITUDE * np.cos(t)
     return np.array([0, 0, 0, 0, 0, 0.38]) + sine, cosine, -sine
 
 
-def assert_agrees(
-    dynamics: StewartDynamics, tree: PartitionedTree, rng: np.random.Generator, poses: int
-) -> None:
+def assert_agrees(dynamics, tree, rng, poses):
     """Accelerations, inverse dynamics, equilibrium and energy agree with the oracle's to 1e-9."""
     mechanism = dynamics.mechanism
     for _ in range(poses):
@@ -101,13 +99,13 @@ def assert_agrees(
 
 
 @pytest.mark.parametrize("gravity", [True, False])
-def test_agrees_with_the_oracle_for_the_paper(gravity: bool) -> None:
+def test_agrees_with_the_oracle_for_the_paper(gravity):
     rng = np.random.default_rng(46)
     assert_agrees(all_free(PAPER, gravity), PartitionedTree(PAPER, gravity), rng, 500)
 
 
 @pytest.mark.parametrize("index", range(50))
-def test_agrees_with_the_oracle_for_random_mechanisms(index: int) -> None:
+def test_agrees_with_the_oracle_for_random_mechanisms(index):
     rng = np.random.default_rng(index)
     dynamics = all_free(random_mechanism(rng))
     for gravity in (True, False):
@@ -116,7 +114,7 @@ def test_agrees_with_the_oracle_for_random_mechanisms(index: int) -> None:
         assert_agrees(dynamics, PartitionedTree(dynamics.mechanism, gravity), rng, 4)
 
 
-def test_gravity_is_a_switch_or_a_number() -> None:
+def test_gravity_is_a_switch_or_a_number():
     given_as = (True, np.True_, False, np.False_, 1.62)
     assert [StewartDynamics(PAPER, g).gravity for g in given_as] == [9.81, 9.81, 0.0, 0.0, 1.62]
 
@@ -125,7 +123,7 @@ def test_gravity_is_a_switch_or_a_number() -> None:
 
 
 @pytest.mark.parametrize("index", range(-1, 5))
-def test_energy_is_kept_without_torque_and_gravity(index: int) -> None:
+def test_energy_is_kept_without_torque_and_gravity(index):
     mechanism, rng = shared(index).mechanism, np.random.default_rng(index + 1)
     dynamics = StewartDynamics(mechanism, False)
     rates = rng.normal(0, 1, 6) * size(mechanism) * ([0.1] * 3 + [0.03] * 3)
@@ -137,14 +135,14 @@ def test_energy_is_kept_without_torque_and_gravity(index: int) -> None:
 
 
 @pytest.mark.parametrize("index", range(-1, 3))
-def test_energy_changes_by_the_work_of_torque_bias_and_friction(index: int) -> None:
+def test_energy_changes_by_the_work_of_torque_bias_and_friction(index):
     dynamics, rng = shared(index), np.random.default_rng(index + 1)
     mechanism = dynamics.mechanism
     parameters = np.concatenate([rng.normal(0, 0.05, 6), [0.5, 0.05, 0.03, 0.2]])
     parameters = np.append(parameters, [0.03, -0.02, 0.05])
     span = size(mechanism) * (1.0 if mechanism is PAPER else 0.3)
 
-    def with_work(x: Array) -> Array:
+    def with_work(x):
         """x = [pose; rates; work; time]; the torque pulls the plate after the trajectory (46)."""
         pose, rates, target = x[:6], x[6:12], mechanism.home + span * AMPLITUDE * np.sin(x[13])
         accelerations = 100 * (target - pose) - 20 * rates
@@ -162,7 +160,7 @@ def test_energy_changes_by_the_work_of_torque_bias_and_friction(index: int) -> N
 
 
 @st.composite
-def states(draw: st.DrawFn) -> State:
+def states(draw):
     """Dynamics with a pose well within reach, and rates."""
     dynamics = shared(draw(st.integers(-1, 4)))
     mechanism, unit = dynamics.mechanism, st.floats(-1, 1)
@@ -174,7 +172,7 @@ def states(draw: st.DrawFn) -> State:
 
 @settings(max_examples=200, deadline=None)
 @given(states(), st.floats(0, 5))
-def test_mass_matrix_is_symmetric_positive_definite(state: State, payload: float) -> None:
+def test_mass_matrix_is_symmetric_positive_definite(state, payload):
     dynamics, pose, rates = state
     parameters = np.zeros(13)
     parameters[PAYLOAD], parameters[PAYLOAD_POSITION] = payload, 0.1 * pose[:3]
@@ -187,7 +185,7 @@ def test_mass_matrix_is_symmetric_positive_definite(state: State, payload: float
 
 @settings(max_examples=200, deadline=None)
 @given(states(), st.integers(0, 2**32 - 1))
-def test_inverse_dynamics_inverts_accelerations(state: State, seed: int) -> None:
+def test_inverse_dynamics_inverts_accelerations(state, seed):
     (dynamics, pose, rates), rng = state, np.random.default_rng(seed)
     torque, parameters = rng.normal(0, 1, 6), random_parameters(rng)
     accelerations = dynamics.accelerations(pose, rates, torque, parameters)
@@ -207,7 +205,7 @@ def test_inverse_dynamics_inverts_accelerations(state: State, seed: int) -> None
 
 @pytest.mark.parametrize("gravity", [True, False])
 @pytest.mark.parametrize("t", TIMES)
-def test_derivatives_equal_central_differences_of_the_oracle(t: float, gravity: bool) -> None:
+def test_derivatives_equal_central_differences_of_the_oracle(t, gravity):
     dynamics, tree = all_free(PAPER, gravity), PartitionedTree(PAPER, gravity)
     parameters = np.array([0.01, -0.02, 0.03, 0.01, 0, 0.02, 0.5, 0.01, 0.02, 0.5, 0.1, -0.05, 0.2])
     pose, rates, accelerations = trajectory(t)
@@ -224,7 +222,7 @@ def test_derivatives_equal_central_differences_of_the_oracle(t: float, gravity: 
     "free",
     [("coulomb_friction",), ("payload_position_z", "offset_A1", "payload_mass"), PARAMETERS, ()],
 )
-def test_what_is_free_is_taken_out_of_all_parameters(free: tuple[str, ...]) -> None:
+def test_what_is_free_is_taken_out_of_all_parameters(free):
     """In its order; what the plant does not have changes nothing, and has a column of zeros."""
     rng = np.random.default_rng(1)
     whole, other = random_parameters(rng), random_parameters(rng)
@@ -254,7 +252,7 @@ def test_what_is_free_is_taken_out_of_all_parameters(free: tuple[str, ...]) -> N
     assert np.array_equal(moved.parameters, known)
 
 
-def test_a_point_mass_is_where_it_is_said_to_be() -> None:
+def test_a_point_mass_is_where_it_is_said_to_be():
     """Its weight asks for a moment r x m g more, at rest; turned with the plate."""
     mass, r, pose = 0.7, np.array([0.04, -0.03, 0.1]), trajectory(0.4)[0]
     at_com = all_free(PAPER, True, [*np.zeros(6), mass, 0.0])
@@ -266,7 +264,7 @@ def test_a_point_mass_is_where_it_is_said_to_be() -> None:
     assert at_com.actuation_map(pose) @ torque == pytest.approx(-generalised, abs=1e-12)
 
 
-def test_poles_under_gravity() -> None:
+def test_poles_under_gravity():
     dynamics, tree, fastest = shared(-1), PartitionedTree(PAPER), []
     for t in TIMES:
         pose = trajectory(t)[0]
@@ -284,7 +282,7 @@ def test_poles_under_gravity() -> None:
 
 
 @pytest.mark.parametrize("index", [-1, 0])
-def test_prediction_converges_at_fourth_order(index: int) -> None:
+def test_prediction_converges_at_fourth_order(index):
     dynamics, rng = shared(index), np.random.default_rng(5)
     home = dynamics.mechanism.home
     torques = dynamics.equilibrium_torque(home) + rng.normal(0, 0.1, (4, 6))
@@ -307,7 +305,7 @@ def test_prediction_converges_at_fourth_order(index: int) -> None:
         assert relative(state, expected) < 1e-14
 
 
-def test_prediction_of_nothing() -> None:
+def test_prediction_of_nothing():
     state = np.concatenate([PAPER.home, np.full(6, 0.1)])
     assert shared(-1).predict(state, [], []).shape == (0, 12)
     assert np.array_equal(shared(-1).predict(state, np.ones((2, 6)), 0.0), [state, state])
@@ -317,13 +315,13 @@ def test_prediction_of_nothing() -> None:
 
 
 @pytest.mark.parametrize("index", range(-1, 6))
-def test_continuation_across_the_boundary_is_smooth(index: int) -> None:
+def test_continuation_across_the_boundary_is_smooth(index):
     dynamics, rng = shared(index), np.random.default_rng(index + 1)
     mechanism = dynamics.mechanism
     direction = rng.normal(0, 1, 6) * size(mechanism) * ([1.0] * 3 + [0.2] * 3)
     rates, torque = rng.normal(0, 0.3, 6) * size(mechanism), rng.normal(0, 1, 6)
 
-    def furthest(sine: float) -> float:
+    def furthest(sine):
         """How far along the direction no leg is closer to its dead centre."""
         low, high = 0.0, 0.01
         while off_dead_centre(mechanism, mechanism.home + high * direction) > sine:
@@ -339,7 +337,7 @@ def test_continuation_across_the_boundary_is_smooth(index: int) -> None:
     expected = PartitionedTree(mechanism).accelerations(pose, rates, torque)
     assert relative(dynamics.accelerations(pose, rates, torque), expected) < 1e-8
 
-    def roughness(cells: int) -> float:
+    def roughness(cells):
         """Largest jump of the slope between cells, which shrinks with the cells unless it kinks."""
         along = np.linspace(2 * held - edge, 2 * edge - held, cells + 1)
         poses = mechanism.home + along[:, None] * direction
@@ -351,7 +349,7 @@ def test_continuation_across_the_boundary_is_smooth(index: int) -> None:
 
 
 @pytest.mark.parametrize("index", range(-1, 6))
-def test_derivatives_stay_finite_far_out_of_reach(index: int) -> None:
+def test_derivatives_stay_finite_far_out_of_reach(index):
     dynamics, rng = shared(index), np.random.default_rng(index + 1)
     for distance in np.repeat([0.1, 0.3, 1, 10, 1e3, 1e6], 100):
         pose = dynamics.mechanism.home + rng.normal(0, 1, 6) * ([1.0] * 3 + [distance] * 3)
@@ -362,7 +360,7 @@ def test_derivatives_stay_finite_far_out_of_reach(index: int) -> None:
         dynamics.equilibrium_torque(pose)
 
 
-def test_start_up_needs_no_torch() -> None:
+def test_start_up_needs_no_torch():
     code = """if True:
         import sys, stewart_drake.mechanism.files as files, stewart_drake.dynamics.stewart as plant
         paper = files.load_mechanism("paper")

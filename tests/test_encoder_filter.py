@@ -13,7 +13,7 @@ from stewart_drake.law.belief import Belief, Estimate
 from stewart_drake.law.encoder_filter import EncoderFilter
 from stewart_drake.law.encoder_observers import DifferencesObserver, EncoderObserver
 from stewart_drake.law.encoder_sensing import EncoderSensing, encoders_of, node_shares
-from stewart_drake.law.filter_settings import FilterSettings, filter_settings, usual_parameters
+from stewart_drake.law.filter_settings import filter_settings, usual_parameters
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
@@ -37,17 +37,17 @@ PERIOD = Period(np.array([PUSH, -PUSH]), np.array([0.03, 0.07]), PUSH, 4)
 DYNAMICS = StewartDynamics(PAPER, gravity=False)
 
 
-def sensing(samples: int, bits: int | None = None, offset: float = 0.0) -> EncoderSensing:
+def sensing(samples, bits=None, offset=0.0):
     quantum = 0.0 if bits is None else 2 * np.pi / 2**bits
     return EncoderSensing(PAPER, samples, quantum, START, MOTION, MOTION, np.full(6, offset))
 
 
-def settings(free: tuple[str, ...] = PARAMETERS) -> FilterSettings:
+def settings(free=PARAMETERS):
     parameters = usual_parameters(PAPER.plate.mass, 0.06, None, 0.1, free)
     return filter_settings(MOTION, PAPER.plate.mass, 0.06, None, DT, parameters)
 
 
-def angles_of(state: Array, theta: Array, samples: int) -> Array:
+def angles_of(state, theta, samples):
     """(N, 6) of the cranks within PERIOD, by many small steps of the dynamics."""
     t, shown = np.arange(1, samples + 1) * DT / samples, []
     for end in t:
@@ -61,19 +61,19 @@ def angles_of(state: Array, theta: Array, samples: int) -> Array:
 # Projections.
 
 
-def onto(nodes: Array, t: Array) -> Array:
+def onto(nodes, t):
     """G (M, N) from residuals at t (N,) to values at nodes (M,), both in [-1, 1]."""
     degree = len(nodes) - 1
     return legvander(nodes, degree) @ np.linalg.pinv(legvander(t, degree))
 
 
-def projection(samples: int) -> tuple[Array, Array]:
+def projection(samples):
     """Shares (M,) of the period where the nodes are, and G (M, N) of all samples."""
     shares = node_shares(samples)
     return shares, onto(2 * shares - 1, 2 * np.arange(1, samples + 1) / samples - 1)
 
 
-def test_the_nodes_of_many_samples_are_gauss_nodes() -> None:
+def test_the_nodes_of_many_samples_are_gauss_nodes():
     nodes, weights = leggauss(3)
     shares, G = projection(20000)
     assert np.abs(2 * shares - 1 - nodes).max() < 1e-3
@@ -82,7 +82,7 @@ def test_the_nodes_of_many_samples_are_gauss_nodes() -> None:
 
 
 @pytest.mark.parametrize("samples", [4, 10, 100])
-def test_values_at_the_nodes_are_independent_and_hold_a_parabola(samples: int) -> None:
+def test_values_at_the_nodes_are_independent_and_hold_a_parabola(samples):
     shares, G = projection(samples)
     t = np.arange(1, samples + 1) / samples
     covariance = G @ G.T
@@ -95,7 +95,7 @@ def test_values_at_the_nodes_are_independent_and_hold_a_parabola(samples: int) -
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3])
-def test_few_samples_are_their_own_nodes(samples: int) -> None:
+def test_few_samples_are_their_own_nodes(samples):
     shares, G = projection(samples)
     assert pytest.approx(np.eye(samples), abs=1e-14) == G
     assert shares == pytest.approx(np.arange(1, samples + 1) / samples)
@@ -117,9 +117,7 @@ class Reading(NamedTuple):
     """(M, 6) at the nodes."""
 
 
-def reading(
-    sensing: EncoderSensing, said: Measurement, shown: Array, last: Array, still: Array
-) -> Reading:
+def reading(sensing, said, shown, last, still):
     """Of 6 N values beside the angles (N, 6) that a motion shows."""
     c, encoders, nodes = core(), encoders_of(sensing), len(sensing.shares)
     angles, onto = np.empty((sensing.samples, 6)), np.empty((6, nodes, nodes))
@@ -131,7 +129,7 @@ def reading(
     return Reading(angles, variance, list(it.odd), residuals)
 
 
-def test_angles_along_a_path_are_those_of_each_pose() -> None:
+def test_angles_along_a_path_are_those_of_each_pose():
     poses = PAPER.home + 0.3 * MOTION * RNG.uniform(-1, 1, (50, 6))
     expected = np.array([PAPER.crank_angles(pose) for pose in poses])
     assert np.array_equal(crank_angles_along(PAPER, poses), expected)
@@ -139,7 +137,7 @@ def test_angles_along_a_path_are_those_of_each_pose() -> None:
     assert np.all(np.isnan(crank_angles_along(PAPER, away[None])))
 
 
-def test_the_jacobian_is_that_of_what_is_seen() -> None:
+def test_the_jacobian_is_that_of_what_is_seen():
     one, state = sensing(2, offset=0.3), START.copy()
     h, found = 1e-6, one.through(START, np.eye(12))
     for i in range(12):
@@ -150,7 +148,7 @@ def test_the_jacobian_is_that_of_what_is_seen() -> None:
         assert found[:, i] == pytest.approx(difference, abs=1e-7)
 
 
-def test_a_pose_is_as_uncertain_as_its_angles() -> None:
+def test_a_pose_is_as_uncertain_as_its_angles():
     """Against forward kinematics of angles with noise drawn."""
     one = sensing(1, bits=12)
     truth = PAPER.crank_angles(START[POSE])
@@ -167,7 +165,7 @@ def test_a_pose_is_as_uncertain_as_its_angles() -> None:
     assert np.diag(first.covariance)[RATES] == pytest.approx(MOTION**2)
 
 
-def test_a_start_bears_spikes_and_a_leg_that_is_silent() -> None:
+def test_a_start_bears_spikes_and_a_leg_that_is_silent():
     many = sensing(100)
     poses = START[POSE] + np.linspace(-DT, 0, 101)[1:, None] * START[RATES]
     read = crank_angles_along(PAPER, poses)
@@ -183,11 +181,11 @@ def test_a_start_bears_spikes_and_a_leg_that_is_silent() -> None:
     assert np.delete(spread, 4).max() < 1e-5
 
 
-def test_angles_that_no_pose_has_start_nothing() -> None:
+def test_angles_that_no_pose_has_start_nothing():
     assert sensing(1).start(Measurement.of(np.array([0.0, 3, 0, 3, 0, 3])), START) is None
 
 
-def test_a_code_that_stands_still_is_worth_less_and_less() -> None:
+def test_a_code_that_stands_still_is_worth_less_and_less():
     ten = sensing(10, bits=12)
     shown = np.tile(PAPER.crank_angles(START[POSE]), (10, 1))
     codes = ten.quantum * np.round(shown / ten.quantum)
@@ -204,7 +202,7 @@ def test_a_code_that_stands_still_is_worth_less_and_less() -> None:
         assert variance == pytest.approx(white * np.array([1, 0.5, *[(1 + periods) ** 2] * 4]))
 
 
-def test_samples_that_stand_out_of_their_period_are_left_out() -> None:
+def test_samples_that_stand_out_of_their_period_are_left_out():
     ten = sensing(20, bits=14)
     shown = angles_of(START, THETA, 20)
     t = np.arange(1, 21) / 20
@@ -223,7 +221,7 @@ def test_samples_that_stand_out_of_their_period_are_left_out() -> None:
 
 @pytest.mark.parametrize("samples", [1, 10])
 @pytest.mark.parametrize("free", [PARAMETERS, (*PARAMETERS, *OFFSETS)])
-def test_a_step_is_what_batch_least_squares_finds(samples: int, free: tuple[str, ...]) -> None:
+def test_a_step_is_what_batch_least_squares_finds(samples, free):
     """Minimum of the same sum of squares, found with differences; covariance of its Hessian."""
     offset = np.deg2rad(0.05) if len(free) > len(PARAMETERS) else 0.0
     assumed, encoders = settings(free), sensing(samples)
@@ -251,7 +249,7 @@ def test_a_step_is_what_batch_least_squares_finds(samples: int, free: tuple[str,
     model = (assumed.model_std**2)[POSE]
     early = assumed.timing_std
 
-    def noise(xi: Array) -> Array:
+    def noise(xi):
         """(M, 6) variances: of the projected samples, and of the model's drift, seen by a leg."""
         end = DYNAMICS.predict(xi[:12], PERIOD.torques, PERIOD.durations, 20, xi[12:20])[-1]
         pushes = np.array([*PERIOD.torques, PERIOD.following])
@@ -269,7 +267,7 @@ def test_a_step_is_what_batch_least_squares_finds(samples: int, free: tuple[str,
     # The filter takes the variances where it linearises; they hardly change.
     deviation = np.sqrt(noise(mean))
 
-    def misfit(xi: Array) -> Array:
+    def misfit(xi):
         shown = angles_of(xi[:12], xi[12:20], samples)
         if len(free) > len(PARAMETERS):
             shown = shown + xi[20:]
@@ -289,7 +287,7 @@ def test_a_step_is_what_batch_least_squares_finds(samples: int, free: tuple[str,
     assert np.abs((found.mean[:12] - end) / stated).max() < 0.05
 
 
-def follow(encoders: EncoderSensing, wrong: Array) -> tuple[Estimate, Array, list[str]]:
+def follow(encoders, wrong):
     """Estimate, true state and causes after periods near home; `wrong` (n, N, 6) is added."""
     rng, N = np.random.default_rng(1), encoders.samples
     state = np.concatenate([PAPER.home, np.zeros(6)])
@@ -311,14 +309,14 @@ def follow(encoders: EncoderSensing, wrong: Array) -> tuple[Estimate, Array, lis
     return belief.estimate, state, causes
 
 
-def test_rates_follow_from_exact_angles() -> None:
+def test_rates_follow_from_exact_angles():
     estimate, state, causes = follow(sensing(1), np.zeros((30, 1, 6)))
     assert estimate.state == pytest.approx(state, abs=2e-5)
     assert causes == []
 
 
 @pytest.mark.parametrize("samples", [1, 20])
-def test_a_leg_that_lies_is_left_out_and_the_others_go_on(samples: int) -> None:
+def test_a_leg_that_lies_is_left_out_and_the_others_go_on(samples):
     encoders, wrong = sensing(samples, bits=16), np.zeros((30, samples, 6))
     wrong[10:20, :, 3] = 0.05
     estimate, state, causes = follow(encoders, wrong)
@@ -327,7 +325,7 @@ def test_a_leg_that_lies_is_left_out_and_the_others_go_on(samples: int) -> None:
     assert np.all(np.abs(estimate.state - state) < 4 * stated)
 
 
-def test_more_than_half_of_the_legs_are_an_outlier() -> None:
+def test_more_than_half_of_the_legs_are_an_outlier():
     encoders, wrong = sensing(5, bits=16), np.zeros((30, 5, 6))
     wrong[15, :, :4] = 0.05
     estimate, _, causes = follow(encoders, wrong)
@@ -336,7 +334,7 @@ def test_more_than_half_of_the_legs_are_an_outlier() -> None:
 
 
 @pytest.mark.parametrize(("share", "rejected"), [(0.5, 0), (3.0, 1)])
-def test_what_is_left_out_is_beyond_the_gate(share: float, rejected: int) -> None:
+def test_what_is_left_out_is_beyond_the_gate(share, rejected):
     """Once the state is known S is little more than the variance of the code."""
     encoders, wrong = sensing(1, bits=12), np.zeros((30, 1, 6))
     wrong[29, 0, 2] = share * np.sqrt(core().lib.STEWART_LEG_GATE) * encoders.std
@@ -346,7 +344,7 @@ def test_what_is_left_out_is_beyond_the_gate(share: float, rejected: int) -> Non
 # Without a filter.
 
 
-def test_differences_are_poses_and_their_changes() -> None:
+def test_differences_are_poses_and_their_changes():
     encoders = sensing(2)
     belief = Belief.nothing(Timeline(DT, Delay(0)), 12, np.zeros(8))
     plant = NominalPlant(DYNAMICS, 4, 1.0, TorqueLimit(np.inf))
@@ -365,7 +363,7 @@ def test_differences_are_poses_and_their_changes() -> None:
     assert alone.state == pytest.approx(expected)
 
 
-def test_known_offsets_are_taken_off() -> None:
+def test_known_offsets_are_taken_off():
     at = PAPER.crank_angles(START[POSE]) + 0.01
     first = sensing(1, offset=0.01).start(Measurement.of(at), START)
     assert first is not None

@@ -1,18 +1,16 @@
 """The loop on motor encoders: the sensor as a system, its faults, figures, both plants, record."""
 
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.bulk import samples_of
 from stewart_drake.loop.diagram import build_closed_loop
-from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.sensor import Encoders
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
@@ -21,7 +19,6 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import LEGS, POSE
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import make_reference
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
 ENCODERS = ("plant.kind=exact", "sensor.kind=encoders")
@@ -30,11 +27,11 @@ FINE = ("sensor.samples=100",)
 
 
 @cache
-def run(*settings: str, scenario: str = "paper", controller: str | None = None) -> SimulationResult:
+def run(*settings, scenario="paper", controller=None):
     return simulate(load_scenario(scenario, controller, settings), judge_stability=False)
 
 
-def bad(result: SimulationResult) -> tuple[int, int, int]:
+def bad(result):
     """Measurements of which something was left out: missing, frozen, rejected."""
     counts = result.summary["counts"]
     names = ("missing", "frozen", "rejected")
@@ -48,17 +45,17 @@ def bad(result: SimulationResult) -> tuple[int, int, int]:
 class Moving(LeafSystem):
     """A plate that follows the paper's motion."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.reference = make_reference(Scenario().reference, 10.0)
         self.DeclareVectorOutputPort("state", 12, self.calc)
 
-    def calc(self, context: Context, output: Any) -> None:
+    def calc(self, context, output):
         pose = self.reference.value(context.get_time())[:, 0]
         output.SetFromVector(np.concatenate([pose, np.zeros(6)]))
 
 
-def seen(times: list[float], *arguments: Any, moves: bool = True, **more: Any) -> list[Array]:
+def seen(times, *arguments, moves=True, **more):
     """What encoders measure at times in s, of a plate on the paper's motion or at its start."""
     builder = DiagramBuilder()
     start = np.concatenate([Moving().reference.value(0.0)[:, 0], np.zeros(6)])
@@ -77,20 +74,20 @@ def seen(times: list[float], *arguments: Any, moves: bool = True, **more: Any) -
     return found
 
 
-def angles_at(times: Array) -> Array:
+def angles_at(times):
     reference = Moving().reference
     return np.array([PAPER.crank_angles(reference.value(t)[:, 0]) for t in times])
 
 
 @pytest.mark.parametrize("samples", [1, 4, 100])
-def test_exact_encoders_say_where_the_cranks_were(samples: int) -> None:
+def test_exact_encoders_say_where_the_cranks_were(samples):
     first, later = seen([0.0, 0.7], None, samples, np.full(6, 0.01), 0, 0.1)
     assert first == pytest.approx(np.tile(angles_at(np.zeros(1)) + 0.01, (samples, 1)), abs=1e-12)
     times = 0.6 + 0.1 * np.arange(1, samples + 1) / samples
     assert later == pytest.approx(angles_at(times) + 0.01, abs=1e-9)
 
 
-def test_codes_are_of_their_width_and_begin_anywhere() -> None:
+def test_codes_are_of_their_width_and_begin_anywhere():
     times = [0.1 * k for k in range(1, 60)]
     q, exact = 2 * np.pi / 2**10, angles_at(np.array(times))
     errors = {}
@@ -107,11 +104,11 @@ def test_codes_are_of_their_width_and_begin_anywhere() -> None:
     assert np.array_equal(again - exact[:3], errors[1][:3])
 
 
-def fault(kind: str, start: float = 0.0, end: float = 9.0, **more: Any) -> dict[str, Any]:
+def fault(kind, start=0.0, end=9.0, **more):
     return {"kind": kind, "from": start, "to": end, **more}
 
 
-def test_faults_are_of_their_legs_and_times() -> None:
+def test_faults_are_of_their_legs_and_times():
     faults = [
         fault("missing", 0.25, 0.35, leg=2),
         fault("frozen", 0.28, 0.55, leg=5),
@@ -132,7 +129,7 @@ def test_faults_are_of_their_legs_and_times() -> None:
     assert found[right] == pytest.approx(exact[right], abs=1e-9)
 
 
-def test_a_share_strikes_that_share_from_the_first_sample_on() -> None:
+def test_a_share_strikes_that_share_from_the_first_sample_on():
     times = [0.1 * k for k in range(20)]
     struck = [fault("missing", share=0.05), fault("spike", share=0.01)]
     found = np.array(seen(times, None, 100, np.zeros(6), 3, 0.1, struck, moves=False))
@@ -158,19 +155,19 @@ def test_a_share_strikes_that_share_from_the_first_sample_on() -> None:
         (("sensor.bits=14", "sensor.samples=50", "plant.kind=multibody"), 1.8),
     ],
 )
-def test_the_error_on_the_reference(settings: tuple[str, ...], bound: float) -> None:
+def test_the_error_on_the_reference(settings, bound):
     """Means over seeds: `python benchmarks/encoders.py`; with the state 0.026."""
     assert run(*ON_REFERENCE, *settings).accumulated_error < bound
 
 
 @pytest.mark.slow
-def test_from_rest() -> None:
+def test_from_rest():
     """With the state 21.08."""
     assert run(*ENCODERS, "sensor.bits=14", *FINE).accumulated_error < 21.5
 
 
 @pytest.mark.slow
-def test_what_is_not_known_is_found() -> None:
+def test_what_is_not_known_is_found():
     bias = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
     more = ("plant.payload_mass=0.4", "plant.joint_damping=1e-3")
     result = run(*ON_REFERENCE, "sensor.bits=14", *FINE, bias, *more)
@@ -190,7 +187,7 @@ def test_what_is_not_known_is_found() -> None:
         ("[{kind: missing, share: 0.05, from: 0, to: 100}]", (101, 0, 0)),
     ],
 )
-def test_faults_do_little_and_are_counted(faults: str, counted: tuple[int, int, int]) -> None:
+def test_faults_do_little_and_are_counted(faults, counted):
     """Windows of 0.1 s, of which one more than the fault lasts has a part of it."""
     clean = run(*ON_REFERENCE, *FINE)
     result = run(*ON_REFERENCE, *FINE, f"sensor.faults={faults}")
@@ -200,7 +197,7 @@ def test_faults_do_little_and_are_counted(faults: str, counted: tuple[int, int, 
 
 
 @pytest.mark.parametrize("samples", [1, 100])
-def test_a_frozen_leg_is_called_so(samples: int) -> None:
+def test_a_frozen_leg_is_called_so(samples):
     frozen = "sensor.faults=[{kind: frozen, leg: 3, from: 4, to: 4.4}]"
     missing, stuck, rejected = bad(run(*ON_REFERENCE, f"sensor.samples={samples}", frozen))
     assert (missing, stuck + rejected) == (0, 4)
@@ -208,14 +205,14 @@ def test_a_frozen_leg_is_called_so(samples: int) -> None:
 
 
 @pytest.mark.slow
-def test_measurements_that_come_late_or_get_lost() -> None:
+def test_measurements_that_come_late_or_get_lost():
     late = run(*ON_REFERENCE, *FINE, "sensor.delay=0.1", "sensor.loss=0.1")
     assert late.status == "completed"
     assert late.accumulated_error < 2.0
 
 
 @pytest.mark.slow
-def test_a_delay_that_is_not_known_either() -> None:
+def test_a_delay_that_is_not_known_either():
     wrong = ("controller.delay_estimator=constant", "controller.delay_steps=7")
     for where in (ON_REFERENCE, ENCODERS):
         result = run(*where, *wrong, "sensor.bits=14", *FINE)
@@ -224,7 +221,7 @@ def test_a_delay_that_is_not_known_either() -> None:
 
 
 @pytest.mark.slow
-def test_offsets_are_found() -> None:
+def test_offsets_are_found():
     """A tenth of a degree each; 0.1 mrad are left after 10 s."""
     offsets = np.deg2rad(0.1) * np.array([1, -1, 1, 1, -1, -1])
     known = "controller.prior={torque_bias: 0.003, payload: 0.5, damping: 0.003}"
@@ -239,14 +236,14 @@ def test_offsets_are_found() -> None:
     loop = build_closed_loop(load_scenario("paper", settings=settings))
     simulator = make_simulator(loop)
     simulator.AdvanceTo(10.0)
-    controller: Any = loop.GetSubsystemByName("controller")
+    controller = loop.GetSubsystemByName("controller")
     belief = controller.memory(controller.GetMyContextFromRoot(simulator.get_context())).belief
     assert np.abs(belief.parameters[8:] - offsets).max() < 1.5e-4
     std = np.sqrt(np.diag(belief.estimate.covariance)[20:])
     assert np.all(np.abs(belief.parameters[8:] - offsets) < 3 * std)
 
 
-def test_without_an_estimator_rates_are_differences() -> None:
+def test_without_an_estimator_rates_are_differences():
     """Without a delay, which they would not survive."""
     settings = ("controller.estimate=[]", "delay.steps=0", "controller.period=0.02")
     result = run(*ON_REFERENCE, "sensor.bits=17", *settings)
@@ -258,7 +255,7 @@ def test_without_an_estimator_rates_are_differences() -> None:
 # What is told of it.
 
 
-def test_the_record_has_angles_with_labels(tmp_path: Any) -> None:
+def test_the_record_has_angles_with_labels(tmp_path):
     result = run(*ON_REFERENCE, "sensor.samples=3", "duration=0.5")
     measured = result.signals.measurement
     assert measured.dims == ("time", "encoder") and measured.attrs["units"] == "rad"
@@ -272,7 +269,7 @@ def test_the_record_has_angles_with_labels(tmp_path: Any) -> None:
     assert "measurement_A1[0][rad],measurement_A2[0][rad]" in header
 
 
-def test_densities_and_data_sets_are_of_the_estimate() -> None:
+def test_densities_and_data_sets_are_of_the_estimate():
     result = run(*ON_REFERENCE, "duration=4")
     rows = samples_of(result)
     kept = result.signals.sel(time=1.5)
@@ -284,9 +281,9 @@ def test_densities_and_data_sets_are_of_the_estimate() -> None:
 
 
 @pytest.mark.parametrize("role", ["controller", "sensor"])
-def test_own_systems_that_measure_the_state_are_refused(role: str) -> None:
+def test_own_systems_that_measure_the_state_are_refused(role):
     class Own(LeafSystem):
-        def __init__(self) -> None:
+        def __init__(self):
             super().__init__()
             names = {
                 "controller": ("measurement", "torque", 6),

@@ -49,7 +49,7 @@ PLANT = StewartDynamics(PAPER, gravity=False)
 PATIENCE = core().lib.STEWART_PATIENCE
 
 
-def filter_of(noise_std: Array, settings: FilterSettings = SETTINGS) -> ParameterFilter:
+def filter_of(noise_std, settings=SETTINGS):
     """Of pose and rates, measured with that noise (12,)."""
     return ParameterFilter(PLANT, StateSensing(noise_std, AMPLITUDE), settings)
 
@@ -57,19 +57,17 @@ def filter_of(noise_std: Array, settings: FilterSettings = SETTINGS) -> Paramete
 ASSUMED = filter_of(NOISE)
 
 
-def start(y: Array, assumed: ParameterFilter = ASSUMED) -> Estimate:
+def start(y, assumed=ASSUMED):
     """From a measurement (12,) alone."""
     return assumed.start(Measurement.of(y), np.zeros(8))
 
 
-def advance(
-    estimate: Estimate, period: Period, y: Array | None, assumed: ParameterFilter = ASSUMED
-) -> Estimate:
+def advance(estimate, period, y, assumed=ASSUMED):
     """A period, and a measurement (12,) or none at its end."""
     return assumed.advance(estimate, period, None if y is None else Measurement.of(y))
 
 
-def transition(dynamics: StewartDynamics, xi: Array, period: Period) -> tuple[Array, Array]:
+def transition(dynamics, xi, period):
     """State (12,) after the torques, and F (20, 20) of [state; parameters], of the core."""
     c, number = core(), len(period.torques)
     states, H, F = np.empty((number, 12)), np.empty((number, 12, 20)), np.eye(20)
@@ -81,7 +79,7 @@ def transition(dynamics: StewartDynamics, xi: Array, period: Period) -> tuple[Ar
     return states[-1], F
 
 
-def within_bounds(mean: Array, covariance: Array, box: ParameterSet) -> Array:
+def within_bounds(mean, covariance, box):
     """The mean (20,) that the core finds."""
     c, n, free, moved = core(), len(mean), np.full(12, np.inf), np.empty(len(mean))
     root = np.linalg.cholesky(covariance)
@@ -103,24 +101,18 @@ class Run(NamedTuple):
     estimates: list[Estimate]
 
 
-def acted(torques: Array, durations: Array, substeps: int = SUBSTEPS) -> Period:
+def acted(torques, durations, substeps=SUBSTEPS):
     """A period whose last torque goes on."""
     return Period(torques, durations, torques[-1], substeps)
 
 
-def motion(t: float, size: float = 0.6) -> tuple[Array, Array, Array]:
+def motion(t, size=0.6):
     """Pose, rates, accelerations: the trajectory (46), by default at 60 % of its amplitude."""
     sine, cosine = size * AMPLITUDE * np.sin(t), size * AMPLITUDE * np.cos(t)
     return PAPER.home + sine, cosine, -sine
 
 
-def run(
-    truth: Array,
-    seed: int,
-    assumed: ParameterFilter = ASSUMED,
-    fraction: float = 0.0,
-    steps: int = STEPS,
-) -> Run:
+def run(truth, seed, assumed=ASSUMED, fraction=0.0, steps=STEPS):
     """Follow the motion with feedback from the true state, plus random torques that excite."""
     rng = np.random.default_rng(seed)
     now = rng.uniform(0, 2 * np.pi)
@@ -147,17 +139,17 @@ def run(
     return Run(truth, np.array(states), np.array(measurements), inputs, estimates)
 
 
-def inside(rng: np.random.Generator) -> Array:
+def inside(rng):
     """Parameters (8,) off their bounds."""
     return np.concatenate([rng.normal(0, 0.01, 6), rng.uniform([0.2, 2e-4], [1.0, 1e-3])])
 
 
-def at_bounds(rng: np.random.Generator) -> Array:
+def at_bounds(rng):
     """Parameters (8,) of a plate without payload in frictionless joints."""
     return np.concatenate([rng.normal(0, 0.01, 6), [0.0, 0.0]])
 
 
-def squared(deviation: Array, covariance: Array) -> float:
+def squared(deviation, covariance):
     """Normalised error squared."""
     return float(deviation @ np.linalg.solve(covariance, deviation))
 
@@ -167,7 +159,7 @@ def squared(deviation: Array, covariance: Array) -> float:
 
 @pytest.mark.parametrize("gravity", [False, True])
 @pytest.mark.parametrize("t", [0.0, 0.4, 1.2, 1.6, 3.0, 4.7])
-def test_transition_equals_central_differences(t: float, gravity: bool) -> None:
+def test_transition_equals_central_differences(t, gravity):
     """To 1e-6 for holds of 10 ms, at fourth order in the hold.
 
     Of a hold of 0.1 s nothing but the order is claimed. Measured there, with two torques per
@@ -181,7 +173,7 @@ def test_transition_equals_central_differences(t: float, gravity: bool) -> None:
     torque = dynamics.inverse_dynamics(pose, rates, accelerations)
     torques = np.array([torque, torque + 0.005])
 
-    def error(period: float) -> float:
+    def error(period):
         durations = period * np.array([0.3, 0.7])
         after, F = transition(dynamics, point, acted(torques, durations, 4))
         expected = central_difference(
@@ -199,7 +191,7 @@ def test_transition_equals_central_differences(t: float, gravity: bool) -> None:
         assert np.log2(errors[1] / errors[0]) > 3.5
 
 
-def test_without_a_measurement_the_model_goes_on_alone() -> None:
+def test_without_a_measurement_the_model_goes_on_alone():
     result = run(inside(np.random.default_rng(0)), seed=0)
     estimate, (torques, durations) = result.estimates[-1], result.inputs[-1]
     after = advance(estimate, acted(torques, durations), None)
@@ -219,9 +211,7 @@ def test_without_a_measurement_the_model_goes_on_alone() -> None:
 
 @pytest.mark.parametrize(("split", "tolerance"), [(1.0, 1e-3), (0.7, 0.1)])
 @pytest.mark.parametrize("late", [1e-5, -1e-5])
-def test_kicks_are_what_early_and_late_torques_do(
-    split: float, tolerance: float, late: float
-) -> None:
+def test_kicks_are_what_early_and_late_torques_do(split, tolerance, late):
     """A change at the end exactly; one before the end but for what its kick feeds back by then."""
     rng = np.random.default_rng(5)
     pose, rates, accelerations = motion(0.8)
@@ -251,12 +241,12 @@ def test_kicks_are_what_early_and_late_torques_do(
             assert relative(moved[:6], abs(late) * kick[:6]) < tolerance
 
 
-def test_a_period_of_two_torques_is_two_shorter_ones() -> None:
+def test_a_period_of_two_torques_is_two_shorter_ones():
     """The same torque twice is that torque; a split period is its parts one after the other."""
     result = run(inside(np.random.default_rng(1)), seed=1, fraction=0.3, steps=4)
     estimate, (torques, durations) = result.estimates[-1], result.inputs[-1]
 
-    def after(e: Estimate, torques: Array, durations: Array, y: Array | None) -> Estimate:
+    def after(e, torques, durations, y):
         return advance(e, acted(torques, durations), y)
 
     at_once = after(estimate, torques, durations, None)
@@ -275,7 +265,7 @@ def test_a_period_of_two_torques_is_two_shorter_ones() -> None:
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
-def test_filter_is_the_batch_least_squares_estimate_where_noise_is_small(fraction: float) -> None:
+def test_filter_is_the_batch_least_squares_estimate_where_noise_is_small(fraction):
     """All measurements at once, by scipy; to a fifth of a standard deviation.
 
     What remains grows with the noise: the filter linearises each step about what is known by then.
@@ -285,7 +275,7 @@ def test_filter_is_the_batch_least_squares_estimate_where_noise_is_small(fractio
     assumed = filter_of(noise_std)
     result = run(inside(np.random.default_rng(2)), 2, assumed, fraction)
 
-    def residuals(unknown: Array) -> Array:
+    def residuals(unknown):
         x, theta = unknown[:12], unknown[12:]
         rows = [(result.measurements[0] - x) / noise_std, theta / KNOWN.std]
         for (torques, durations), y in zip(result.inputs, result.measurements[1:], strict=True):
@@ -307,7 +297,7 @@ def test_filter_is_the_batch_least_squares_estimate_where_noise_is_small(fractio
 
 @pytest.mark.slow
 @pytest.mark.parametrize("draw", [inside, at_bounds])
-def test_errors_of_the_parameters_are_as_large_as_the_filter_says(draw) -> None:  # type: ignore[no-untyped-def]
+def test_errors_of_the_parameters_are_as_large_as_the_filter_says(draw):
     """60 runs of 1.5 s, every second one with two torques per period.
 
     Off the bounds the normalised errors squared sum to chi-square of 480 degrees, within its
@@ -330,7 +320,7 @@ def test_errors_of_the_parameters_are_as_large_as_the_filter_says(draw) -> None:
     assert (low if draw is inside else 0.0) < sums < high
 
 
-def test_without_noise_all_parameters_are_found() -> None:
+def test_without_noise_all_parameters_are_found():
     known = filter_settings(AMPLITUDE, PAPER.plate.mass, 0.1, None, PERIOD)
     assumed = filter_of(np.zeros(12), known)
     for fraction in (0.0, 0.3):
@@ -341,7 +331,7 @@ def test_without_noise_all_parameters_are_found() -> None:
         assert error[DAMPING] < 1e-5
 
 
-def test_the_first_estimate_is_measurement_and_prior() -> None:
+def test_the_first_estimate_is_measurement_and_prior():
     y = np.arange(12.0)
     first = start(y)
     assert np.array_equal(first.state, y)
@@ -360,12 +350,12 @@ def test_the_first_estimate_is_measurement_and_prior() -> None:
         ({"lower": np.zeros(7)}, "shorter"),
     ],
 )
-def test_a_prior_that_cannot_be_names_the_parameter(wrong: dict[str, Array], message: str) -> None:
+def test_a_prior_that_cannot_be_names_the_parameter(wrong, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(KNOWN, **wrong)
 
 
-def test_a_prior_other_than_zero_is_where_the_filter_begins() -> None:
+def test_a_prior_other_than_zero_is_where_the_filter_begins():
     """A payload known to 10 g that is not what was measured stays what it is."""
     prior = np.eye(8)[PAYLOAD] * 0.5
     known = dataclasses.replace(KNOWN, prior=prior, std=np.array([0.03] * 6 + [0.01, 0.01]))
@@ -388,7 +378,7 @@ def test_a_prior_other_than_zero_is_where_the_filter_begins() -> None:
 
 @settings(max_examples=300, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), width=st.floats(-2, 0.5).map(lambda x: 10**x))
-def test_bounds_are_kept_by_the_nearest_mean_there_is(seed: int, width: float) -> None:
+def test_bounds_are_kept_by_the_nearest_mean_there_is(seed, width):
     """Nearest in the metric of the covariance: a box-constrained least-squares problem."""
     rng = np.random.default_rng(seed)
     root = rng.normal(0, 1, (20, 20))
@@ -405,7 +395,7 @@ def test_bounds_are_kept_by_the_nearest_mean_there_is(seed: int, width: float) -
     assert np.all((lower <= found[12:]) & (found[12:] <= upper))
 
 
-def test_what_was_learnt_about_combinations_survives_a_bound() -> None:
+def test_what_was_learnt_about_combinations_survives_a_bound():
     """A payload that seems negative: the rest moves to what it is with the payload at zero."""
     covariance = np.diag(np.full(20, 1e-6))
     covariance[12, 18] = covariance[18, 12] = -0.9e-6
@@ -420,7 +410,7 @@ def test_what_was_learnt_about_combinations_survives_a_bound() -> None:
 
 
 @pytest.mark.parametrize("size", [1e-2, 0.3, 1.0, 10.0, 1e3, 1e6, 1e100, 1e300])
-def test_an_outlier_is_passed_over(size: float) -> None:
+def test_an_outlier_is_passed_over(size):
     result = run(inside(np.random.default_rng(4)), 4)
     before, (torques, durations) = result.estimates[-2], result.inputs[-1]
     expected = advance(before, acted(torques, durations), None)
@@ -437,7 +427,7 @@ def test_an_outlier_is_passed_over(size: float) -> None:
         assert squared(again.parameters - result.truth, again.covariance[12:, 12:]) < 40
 
 
-def test_after_patience_the_measurement_is_believed() -> None:
+def test_after_patience_the_measurement_is_believed():
     """A plate that was moved by hand: position off for good."""
     result = run(inside(np.random.default_rng(5)), 5)
     estimate, moved = result.estimates[-1], result.states[-1].copy()
@@ -457,7 +447,7 @@ def test_after_patience_the_measurement_is_believed() -> None:
 
 
 @pytest.mark.parametrize("crazy", [1e3, 1e300])
-def test_a_sensor_gone_crazy_and_well_again_leaves_no_trace(crazy: float) -> None:
+def test_a_sensor_gone_crazy_and_well_again_leaves_no_trace(crazy):
     """Even after nonsense was believed, every estimate is finite and good data bring it back."""
     result = run(inside(np.random.default_rng(6)), 6, steps=12)
     estimate = result.estimates[0]
@@ -476,7 +466,7 @@ def test_a_sensor_gone_crazy_and_well_again_leaves_no_trace(crazy: float) -> Non
     assert squared(final.parameters - result.truth, final.covariance[12:, 12:]) < 40
 
 
-def test_a_payload_put_on_later_is_found() -> None:
+def test_a_payload_put_on_later_is_found():
     before = run(at_bounds(np.random.default_rng(7)), 7)
     truth = before.truth + np.eye(8)[PAYLOAD]
     estimate, x = before.estimates[-1], before.states[-1]

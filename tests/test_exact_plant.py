@@ -10,7 +10,7 @@ from pydrake.systems.analysis import (
     SimulatorConfig,
     SimulatorStatus,
 )
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem, System
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import (
     ConstantVectorSource,
     FirstOrderTaylorApproximation,
@@ -22,7 +22,6 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import (
     PITCH_LIMIT,
     SINGULARITY_LIMIT,
-    Failure,
     diagnose,
     home_sign,
     margin,
@@ -30,25 +29,21 @@ from stewart_drake.dynamics.workspace import (
 )
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.loop.platforms import MultibodyStewart
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.timing import look_time
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.oracles import relative, size
 
 Scheme = tuple[str, float, float, bool]
 """Integrator, accuracy, largest step in s, error control."""
 
-TIGHT: Scheme = ("runge_kutta5", 1e-10, 0.005, True)
-USUAL: Scheme = ("runge_kutta5", 1e-8, 0.02, True)
+TIGHT = ("runge_kutta5", 1e-10, 0.005, True)
+USUAL = ("runge_kutta5", 1e-8, 0.02, True)
 ENDED = SimulatorStatus.ReturnReason.kReachedTerminationCondition
 FREE = StewartDynamics(PAPER, gravity=False)
 AT_HOME = np.concatenate([PAPER.home, np.zeros(6)])
 
 
-def simulator_of(
-    plant: System, state: Array, torque: Array, scheme: Scheme
-) -> tuple[Simulator, Context]:
+def simulator_of(plant, state, torque, scheme):
     """A simulator of one plant from a state, under a constant torque."""
     simulator = Simulator(plant)
     context = simulator.get_mutable_context()
@@ -67,14 +62,14 @@ def simulator_of(
     return simulator, context
 
 
-def state_of(plant: System, context: Context) -> Array:
+def state_of(plant, context):
     return plant.GetOutputPort("state").Eval(context).copy()
 
 
 # Ports and energy.
 
 
-def test_topology() -> None:
+def test_topology():
     plant = ExactPlant(FREE)
     assert plant.GetInputPort("torque").size() == 6
     assert plant.GetOutputPort("state").size() == 12
@@ -89,7 +84,7 @@ def test_topology() -> None:
 
 
 @pytest.mark.parametrize("gravity", [False, True])
-def test_energy_is_kept(gravity: bool) -> None:
+def test_energy_is_kept(gravity):
     """Half a second from moderate rates; constant torques, their work known by the crank angles."""
     for mechanism in (PAPER, random_mechanism(np.random.default_rng(1))):
         dynamics, rng = StewartDynamics(mechanism, gravity), np.random.default_rng(0)
@@ -115,17 +110,17 @@ def test_energy_is_kept(gravity: bool) -> None:
 class Sine(LeafSystem):
     """Torque mean + amplitude * sin(omega t + phase)."""
 
-    def __init__(self, amplitude: Array, omega: float, phase: Array, mean: Array) -> None:
+    def __init__(self, amplitude, omega, phase, mean):
         super().__init__()
 
-        def output(context: Context, result: BasicVector) -> None:
+        def output(context, result):
             result.SetFromVector(mean + amplitude * np.sin(omega * context.get_time() + phase))
 
         self.DeclareVectorOutputPort("torque", 6, output, {self.time_ticket()})
 
 
 @pytest.mark.parametrize("gravity", [False, True])
-def test_multibody_plant_converges_to_it_at_first_order(gravity: bool) -> None:
+def test_multibody_plant_converges_to_it_at_first_order(gravity):
     """0.3 s of a sinusoidal torque with bias, payload and damping: the slope is 0.996."""
     rng = np.random.default_rng(3)
     held = StewartDynamics(PAPER, gravity).equilibrium_torque(PAPER.home)
@@ -135,7 +130,7 @@ def test_multibody_plant_converges_to_it_at_first_order(gravity: bool) -> None:
     # The holding torque comes as a bias.
     parameters = np.concatenate([held, [0.3, 2e-3, *friction.values()], place])
 
-    def motion(plant: System, added: Array) -> Array:
+    def motion(plant, added):
         builder = DiagramBuilder()
         builder.AddSystem(plant)
         torque = builder.AddSystem(Sine(*source, added))
@@ -152,7 +147,7 @@ def test_multibody_plant_converges_to_it_at_first_order(gravity: bool) -> None:
     expected = motion(ExactPlant(StewartDynamics(PAPER, gravity, parameters)), np.zeros(6))
     assert np.abs(expected - start)[:6].max() > 0.02
 
-    def error(step: float) -> float:
+    def error(step):
         loads = {"payload_mass": 0.3, "joint_damping": 2e-3, "payload_position": place} | friction
         found = motion(MultibodyStewart(PAPER, step, gravity=gravity, **loads), held)
         return float(np.abs(found - expected)[:6].max())
@@ -169,7 +164,7 @@ def test_multibody_plant_converges_to_it_at_first_order(gravity: bool) -> None:
 
 @pytest.mark.parametrize("gravity", [False, True])
 @pytest.mark.parametrize("index", range(-1, 2))
-def test_drake_linearises_it_exactly(index: int, gravity: bool) -> None:
+def test_drake_linearises_it_exactly(index, gravity):
     """At rest in equilibrium and on the move, by automatic differentiation of the plant."""
     rng = np.random.default_rng(index + 1)
     mechanism = PAPER if index < 0 else random_mechanism(rng)
@@ -198,7 +193,7 @@ def test_drake_linearises_it_exactly(index: int, gravity: bool) -> None:
 # The ends of its reach.
 
 
-def approach(seed: int) -> Array:
+def approach(seed):
     """From home in a random direction, at a random speed, on to some dead centre within 2 s."""
     rng = np.random.default_rng(seed)
     direction = rng.normal(0, 1, 6)
@@ -210,20 +205,18 @@ def approach(seed: int) -> Array:
 class Counting(StewartDynamics):
     """Counts the evaluations of the derivatives, and refuses to go on without end."""
 
-    def __init__(self, limit: int, gravity: bool = False) -> None:
+    def __init__(self, limit, gravity=False):
         super().__init__(PAPER, gravity)
         self.count, self.limit = 0, limit
 
-    def change(self, state: Array, torque: Array) -> Array:
+    def change(self, state, torque):
         self.count += 1
         if self.count > self.limit:
             raise AssertionError("the integration does not come to an end")
         return super().change(state, torque)
 
 
-def end_of(
-    start: Array, scheme: Scheme, limit: int, torque: Array, gravity: bool = False
-) -> tuple[Failure, Array, str]:
+def end_of(start, scheme, limit, torque, gravity=False):
     """Failure, state and message where a simulation of at most 20 s ended."""
     plant = ExactPlant(Counting(limit, gravity))
     simulator, context = simulator_of(plant, start, torque, scheme)
@@ -240,7 +233,7 @@ NO_TORQUE, PRESSING = np.zeros(6), 0.5 * np.array([1.0, -1, 1, -1, 1, -1])
 
 
 @functools.cache
-def true_end(seed: int) -> Failure:
+def true_end(seed):
     """Of `approach`, every second one under torque."""
     return end_of(approach(seed), TIGHT, 20_000, (NO_TORQUE, PRESSING)[seed % 2])[0]
 
@@ -257,7 +250,7 @@ def true_end(seed: int) -> Failure:
     ],
     ids=lambda s: f"{s[0]}-{s[1]:g}-{s[2]:g}",
 )
-def test_at_a_dead_centre_the_simulation_ends_in_time_and_names_the_leg(scheme: Scheme) -> None:
+def test_at_a_dead_centre_the_simulation_ends_in_time_and_names_the_leg(scheme):
     """Each run against one with 1e-10 and 5 ms: there the same leg, then the same instant."""
     legs = set()
     for seed in range(12):
@@ -277,7 +270,7 @@ def test_at_a_dead_centre_the_simulation_ends_in_time_and_names_the_leg(scheme: 
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_under_gravity_and_strong_torques_the_simulation_ends_too(seed: int) -> None:
+def test_under_gravity_and_strong_torques_the_simulation_ends_too(seed):
     """Where motors press a leg into its dead centre, whatever the integrator."""
     rng = np.random.default_rng(seed)
     start = np.concatenate([PAPER.home, rng.normal(0, [1, 1, 1, 0.2, 0.2, 0.2])])
@@ -308,7 +301,7 @@ def test_under_gravity_and_strong_torques_the_simulation_ends_too(seed: int) -> 
     ],
     ids=lambda s: f"{s[0]}-{s[1]:g}-{s[2]:g}",
 )
-def test_coarse_integration_stays_finite_and_comes_to_an_end(scheme: Scheme) -> None:
+def test_coarse_integration_stays_finite_and_comes_to_an_end(scheme):
     """Whatever else: no NaN, no endless halving of steps, and a reason where it ended.
 
     That it ends at the first dead centre is not shown, nor true: a step may go over it, see
@@ -331,7 +324,7 @@ def test_coarse_integration_stays_finite_and_comes_to_an_end(scheme: Scheme) -> 
     [(("runge_kutta2", 0.0, 0.05, False), 5), (("runge_kutta3", 1e-2, 0.1, True), 7)],
     ids=["fixed", "loose"],
 )
-def test_a_step_over_a_dead_centre_does_not_go_unnoticed(scheme: Scheme, seed: int) -> None:
+def test_a_step_over_a_dead_centre_does_not_go_unnoticed(scheme, seed):
     """What is known not to hold. In pose coordinates a plate touches the end of its reach and turns
     back, on the other branch of the crank; when both ends of a step are within reach, and no stage
     was bad enough for the error control, that looks like a motion on the same branch.
@@ -341,7 +334,7 @@ def test_a_step_over_a_dead_centre_does_not_go_unnoticed(scheme: Scheme, seed: i
     assert found.time < expected.time + scheme[2]
 
 
-def test_absurd_speeds_end_in_the_first_step() -> None:
+def test_absurd_speeds_end_in_the_first_step():
     """A hundred thousand radians per second."""
     for scheme in (USUAL, ("explicit_euler", 0.0, 0.05, False)):
         for seed in range(5):
@@ -352,12 +345,12 @@ def test_absurd_speeds_end_in_the_first_step() -> None:
             assert np.all(np.isfinite(x))
 
 
-def crossing(mechanism: Mechanism, seed: int) -> tuple[Array, Array]:
+def crossing(mechanism, seed):
     """A pose on a parallel singularity well off dead centres, and a direction across it."""
     rng, sign = np.random.default_rng(seed), home_sign(mechanism)
     scale = np.array([1, 1, 1, 0.3, 0.3, 0.3])
 
-    def parallel(distance: float) -> float:
+    def parallel(distance):
         return sign * standing(mechanism, mechanism.home + distance * direction).parallel
 
     while True:
@@ -376,7 +369,7 @@ def crossing(mechanism: Mechanism, seed: int) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("index", [-1, 0, 1])
-def test_at_a_parallel_singularity_the_simulation_ends(index: int) -> None:
+def test_at_a_parallel_singularity_the_simulation_ends(index):
     """Where the determinant of the rods' wrenches changes sign, cranks no longer hold the plate."""
     mechanism = PAPER if index < 0 else random_mechanism(np.random.default_rng(index))
     pose, direction = crossing(mechanism, 2)
@@ -400,7 +393,7 @@ def test_at_a_parallel_singularity_the_simulation_ends(index: int) -> None:
     assert sign * standing(mechanism, x[:6]).parallel == pytest.approx(SINGULARITY_LIMIT, rel=0.1)
 
 
-def test_at_the_limit_of_the_pitch_the_simulation_ends() -> None:
+def test_at_the_limit_of_the_pitch_the_simulation_ends():
     for seed in range(200):
         rng = np.random.default_rng(seed)
         pose = PAPER.home + rng.normal(0, [0.3, 0, 0.3, 0.05, 0.05, 0.05])
@@ -416,7 +409,7 @@ def test_at_the_limit_of_the_pitch_the_simulation_ends() -> None:
     assert "pitch" in failure.reason
 
 
-def test_a_state_without_numbers_is_named_as_such() -> None:
+def test_a_state_without_numbers_is_named_as_such():
     for value in (np.nan, np.inf):
         pose = PAPER.home.copy()
         pose[4] = value
@@ -428,7 +421,7 @@ def test_a_state_without_numbers_is_named_as_such() -> None:
 # In a diagram of one's own.
 
 
-def test_a_diagram_of_ones_own_ends_where_a_plate_leaves() -> None:
+def test_a_diagram_of_ones_own_ends_where_a_plate_leaves():
     """Two machines side by side; the pushed one is found to leave to 1e-8, the other is at home."""
     builder = DiagramBuilder()
     pushed, idle = (builder.AddNamedSystem(name, ExactPlant(FREE)) for name in ("pushed", "idle"))
@@ -452,7 +445,7 @@ def test_a_diagram_of_ones_own_ends_where_a_plate_leaves() -> None:
 
 
 @pytest.mark.parametrize("accuracy", [0.0, -1e-8, 0.1, 1e-13, np.nan, np.inf])
-def test_an_accuracy_that_means_nothing_is_refused(accuracy: float) -> None:
+def test_an_accuracy_that_means_nothing_is_refused(accuracy):
     simulator, _ = simulator_of(ExactPlant(FREE), AT_HOME, np.zeros(6), USUAL)
     with pytest.raises(ValueError, match=r"^accuracy: got .*; expected a number from 1e-12"):
         set_accuracy(simulator, accuracy)

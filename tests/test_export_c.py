@@ -3,7 +3,6 @@
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Final
 
 import pytest
 
@@ -53,27 +52,27 @@ BITS = {"bad measurements and outliers": (8, 16, 32), "saturation, a fraction of
 
 
 @pytest.fixture(autouse=True)
-def compiler() -> list[str]:
+def compiler():
     found = build.compiler()
     if found is None or shutil.which("make") is None:
         pytest.skip("there is no C compiler, or no make")
     return found
 
 
-def exported(folder: Path, name: str, settings: tuple[str, ...], single: bool = False) -> Path:
+def exported(folder, name, settings, single=False):
     """Of a short run, without what is measured for the README."""
     scenario = load_scenario(name, settings=(*SHORT, *settings))
     export_c.write(export_c.exported(scenario, single, measured=False), folder)
     return folder
 
 
-def sources(folder: Path) -> list[str]:
+def sources(folder):
     """Of the controller in an export."""
     makefile = {"Makefile": (folder / "Makefile").read_text()}
     return [name.replace(".o", ".c") for name in export_c.objects(makefile)]
 
 
-def made(folder: Path, target: str, *variables: str) -> str:
+def made(folder, target, *variables):
     """What make says; it must succeed."""
     done = subprocess.run(
         ["make", "-s", *target.split(), *variables], cwd=folder, capture_output=True, text=True
@@ -86,7 +85,7 @@ def made(folder: Path, target: str, *variables: str) -> str:
 @pytest.mark.parametrize(
     "case", [pytest.param(n, marks=() if n in QUICK else pytest.mark.soak) for n in RUNS]
 )
-def test_the_replay_is_exact(case: str, tmp_path: Path) -> None:
+def test_the_replay_is_exact(case, tmp_path):
     """1e-9 of the peak torque, the same statuses; strict, and under the sanitizers."""
     name, settings = RUNS[case]
     folder = exported(tmp_path, name, settings)
@@ -103,7 +102,7 @@ def test_the_replay_is_exact(case: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["state", "encoders"])
-def test_the_replay_of_servos_is_exact(sensor: str, tmp_path: Path) -> None:
+def test_the_replay_of_servos_is_exact(sensor, tmp_path):
     """Commands for position servos; none of the law for torques is in the folder."""
     settings = (*SHORT, "actuator.kind=servo", f"sensor.kind={sensor}")
     scenario = load_scenario("paper", "servo_preview", settings=settings)
@@ -114,7 +113,7 @@ def test_the_replay_of_servos_is_exact(sensor: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_gravity_is_exported_as_it_is_shipped(tmp_path: Path) -> None:
+def test_gravity_is_exported_as_it_is_shipped(tmp_path):
     """The steps of 1 ms of its plant, which lose the loop, are no part of the controller."""
     scenario = load_scenario("gravity", settings=("duration=1.7",))
     assert scenario.plant.kind == "multibody"
@@ -124,9 +123,7 @@ def test_gravity_is_exported_as_it_is_shipped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("option", ["-ffast-math", "-ffinite-math-only"])
-def test_compiling_without_checks_for_nan_is_refused(
-    option: str, tmp_path: Path, compiler: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compiling_without_checks_for_nan_is_refused(option, tmp_path, compiler, monkeypatch):
     """Of every source of the controller, and of the package's own library."""
     for source in ("matrix.c", "dynamics.c", "riccati.c", "law.c", "filter.c", "servo.c"):
         done = subprocess.run(
@@ -143,7 +140,7 @@ def test_compiling_without_checks_for_nan_is_refused(
 
 @pytest.mark.soak
 @pytest.mark.parametrize("compiler", ["clang", "arm-linux-gnueabihf-gcc -static"])
-def test_other_compilers_and_processors(compiler: str, tmp_path: Path) -> None:
+def test_other_compilers_and_processors(compiler, tmp_path):
     emulator = "qemu-arm" if compiler.startswith("arm") else ""
     for needed in (compiler.split()[0], emulator or "make"):
         if shutil.which(needed) is None:
@@ -155,7 +152,7 @@ def test_other_compilers_and_processors(compiler: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_controller_that_is_off_is_told(tmp_path: Path) -> None:
+def test_a_controller_that_is_off_is_told(tmp_path):
     """What the replay says to a change of one weight, and to another fault."""
     folder = exported(tmp_path, "paper", ("duration=2.0",))
     config, test = folder / "stewart_config.c", folder / "stewart_test.c"
@@ -185,7 +182,7 @@ def test_a_controller_that_is_off_is_told(tmp_path: Path) -> None:
     ],
     ids=["estimator", "encoders", "delay", "network"],
 )
-def test_single_precision_is_close(name: str, settings: tuple[str, ...], tmp_path: Path) -> None:
+def test_single_precision_is_close(name, settings, tmp_path):
     """1e-3 of the peak of the replay in double precision, over 10 s where the scenario has them."""
     scenario = load_scenario(name, settings=("plant.kind=exact", *settings))
     export_c.write(export_c.exported(scenario, single=True, measured=False), tmp_path)
@@ -195,7 +192,7 @@ def test_single_precision_is_close(name: str, settings: tuple[str, ...], tmp_pat
 
 
 @pytest.mark.slow
-def test_the_sizes_are_told_and_kept_to(tmp_path: Path) -> None:
+def test_the_sizes_are_told_and_kept_to(tmp_path):
     """For `paper`: text of 180 kB at the most, state of 10.4 kB."""
     files = export_c.exported(load_scenario("paper", settings=(*SHORT, "duration=1.0")))
     readme = files["README.md"]
@@ -216,9 +213,7 @@ def test_the_sizes_are_told_and_kept_to(tmp_path: Path) -> None:
     ],
     ids=["paper", "late", "without estimator", "no delay"],
 )
-def test_odd_inputs_are_survived(
-    name: str, settings: tuple[str, ...], tmp_path: Path, compiler: list[str]
-) -> None:
+def test_odd_inputs_are_survived(name, settings, tmp_path, compiler):
     """NaN, infinity, huge numbers, INT_MIN and INT_MAX, under both sanitizers."""
     folder = exported(tmp_path, name, (*settings, "duration=0.5"))
     shutil.copy(Path(__file__).with_name("odd_inputs.c"), folder)
@@ -230,7 +225,7 @@ def test_odd_inputs_are_survived(
     assert (done.stdout, done.stderr, done.returncode) == ("odd inputs: survived\n", "", 0)
 
 
-PAINTED: Final = """
+PAINTED = """
 #include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -258,7 +253,7 @@ int main(void) {
 
 
 @pytest.mark.slow
-def test_the_stack_is_not_deeper_than_told(tmp_path: Path, compiler: list[str]) -> None:
+def test_the_stack_is_not_deeper_than_told(tmp_path, compiler):
     folder = exported(tmp_path, "paper", ("duration=1.0",))
     (folder / "painted.c").write_text(PAINTED)
     command = [*compiler, "-O2", "-Dmain=replay", "-c", "stewart_test.c"]
@@ -289,9 +284,7 @@ def test_the_stack_is_not_deeper_than_told(tmp_path: Path, compiler: list[str]) 
         (("controller.model=paper",), "controller.model"),
     ],
 )
-def test_what_is_not_exported_is_refused_by_its_field(
-    settings: tuple[str, ...], field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_not_exported_is_refused_by_its_field(settings, field, tmp_path, capsys):
     folder = tmp_path / "board"
     options = [word for setting in settings for word in ("--set", setting)]
     assert main(["export-c", "paper", "--out", str(folder), *options]) == 2
@@ -300,16 +293,14 @@ def test_what_is_not_exported_is_refused_by_its_field(
     assert not folder.exists()
 
 
-def test_a_run_that_does_not_end_is_refused() -> None:
+def test_a_run_that_does_not_end_is_refused():
     scenario = load_scenario("gravity", settings=("plant.kind=exact", "queue=zero"))
     with pytest.raises(ConfigError, match="expected one whose run the test can replay"):
         export_c.exported(scenario, measured=False)
 
 
 @pytest.mark.slow
-def test_the_command_writes_all_files_or_none(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_all_files_or_none(tmp_path, capsys):
     folder = tmp_path / "board"
     command = ["export-c", "paper", "--out", str(folder), "--set", "duration=0.5"]
     assert main(command) == 0

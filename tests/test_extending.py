@@ -2,7 +2,6 @@
 
 import functools
 import re
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,23 +16,23 @@ EXAMPLES = dict(
 
 
 @functools.cache
-def example(title: str) -> dict[str, Any]:
+def example(title):
     """The names that are there when its last line has run."""
-    names: dict[str, Any] = {"__name__": "__main__"}
+    names = {"__name__": "__main__"}
     exec(compile(EXAMPLES[title], f"{GUIDE}: {title}", "exec", dont_inherit=True), names)
     return names
 
 
-def peak_error(result: sd.SimulationResult) -> float:
+def peak_error(result):
     """m or rad."""
     return float(np.abs(result.signals.error.values).max())
 
 
-def plain(*settings: str) -> sd.SimulationResult:
+def plain(*settings):
     return sd.simulate(sd.load_scenario("paper", settings=("plant.kind=exact", *settings)))
 
 
-def test_there_is_one_for_every_kind_of_part() -> None:
+def test_there_is_one_for_every_kind_of_part():
     assert list(EXAMPLES) == [
         "A sensing",
         "An observer",
@@ -43,7 +42,7 @@ def test_there_is_one_for_every_kind_of_part() -> None:
     ]
 
 
-def test_a_camera_that_is_off_is_as_good_as_one_that_is_not() -> None:
+def test_a_camera_that_is_off_is_as_good_as_one_that_is_not():
     names = example("A sensing")
     result = names["result"]
     assert result.summary["own"] == {"sensor": "Camera", "law": "with_camera"}
@@ -54,7 +53,7 @@ def test_a_camera_that_is_off_is_as_good_as_one_that_is_not() -> None:
     assert misled.summary["counts"]["measurements_rejected"] == 21, "1.2 m too high is out of reach"
 
 
-def test_the_blend_is_less_noisy_than_the_measurement() -> None:
+def test_the_blend_is_less_noisy_than_the_measurement():
     names = example("An observer")
     signals = names["result"].signals
     assert names["result"].status == "completed"
@@ -64,13 +63,13 @@ def test_the_blend_is_less_noisy_than_the_measurement() -> None:
     assert np.std(off[0][:, :3]) < 0.8 * np.std(off[1][:, :3])
 
 
-def test_spring_and_damper_hold_the_plate_against_gravity() -> None:
+def test_spring_and_damper_hold_the_plate_against_gravity():
     result = example("A controller")["result"]
     assert result.status == "completed" and peak_error(result) < 2e-3
     assert result.summary["own"] == {"controller": "SpringAndDamper"}
 
 
-def test_the_tuners_weights_are_those_that_act() -> None:
+def test_the_tuners_weights_are_those_that_act():
     result = example("A tuner")["result"]
     weights = result.signals.weights.values
     assert result.status == "completed" and result.summary["own"] == {"tuner": "Cautious"}
@@ -78,7 +77,7 @@ def test_the_tuners_weights_are_those_that_act() -> None:
     assert np.all(weights[np.isfinite(weights[:, 1]), 1] == 1)
 
 
-def test_the_lossy_link_holds_what_it_had() -> None:
+def test_the_lossy_link_holds_what_it_had():
     result = example("A link")["result"]
     assert result.status == "completed" and result.summary["own"] == {"link": "Lossy"}
     assert any("not judged: its link" in text for text in result.summary["warnings"])

@@ -4,7 +4,6 @@ import contextlib
 import json
 import resource
 import signal
-from pathlib import Path
 
 import matplotlib.image
 import numpy as np
@@ -17,7 +16,7 @@ from tests.copies import status_of
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.1", "--set", "delay.steps=1")
 
 
-def check_whole(folder: Path) -> None:
+def check_whole(folder):
     """Every visible file is complete; a summary comes after its signals, what is drawn after it."""
     for path in (p for p in folder.iterdir() if not p.name.startswith(".")):
         if path.suffix == ".json":
@@ -40,7 +39,7 @@ def check_whole(folder: Path) -> None:
 def test_a_full_disk_is_one_line_and_leaves_no_half_file(largest, tmp_path):
     """A limit on the sizes of files stands for the disk; it holds in a copy of a process only."""
 
-    def work() -> int:
+    def work():
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
         with said.open("w") as file, contextlib.redirect_stderr(file):

@@ -5,7 +5,6 @@ import os
 import stat
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 
@@ -18,7 +17,7 @@ from tests.faults import tree
 from tests.test_jobs import SETTINGS, numbered, text
 
 
-def hidden(folder: Path) -> list[str]:
+def hidden(folder):
     return sorted(path.name for path in folder.iterdir() if path.name.startswith("."))
 
 
@@ -52,7 +51,7 @@ def test_a_planted_link_is_not_followed(tmp_path):
 def test_writers_at_the_same_time_do_not_meet(tmp_path):
     contents = [str(number) * 100_000 for number in range(8)]
 
-    def write(content: str) -> None:
+    def write(content):
         for _ in range(10):
             with replacing(tmp_path / "out.json") as partial:
                 partial.write_text(content)
@@ -84,7 +83,7 @@ def test_errors_name_the_file_and_leave_the_old_one(tmp_path, monkeypatch):
     path = tmp_path / "out.json"
     path.write_text("old")
 
-    def full(descriptor: int) -> None:
+    def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
@@ -114,7 +113,7 @@ def test_errors_name_the_file_and_leave_the_old_one(tmp_path, monkeypatch):
 
 
 def test_what_kill_9_leaves_is_removed(tmp_path):
-    def work() -> None:
+    def work():
         with replacing(tmp_path / "out.json") as partial:
             partial.write_text("half")
             (tmp_path / "ready").touch()

@@ -16,7 +16,6 @@ from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.scenario.signals import PLANT_PARAMETERS, POSE, RATES
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism
 from tests.test_printed_law import AMPLITUDE, error
 
@@ -24,19 +23,19 @@ FULL = "overlay=paper_plant"
 
 
 @pytest.fixture(params=["paper", "random"])
-def plant(request: pytest.FixtureRequest) -> FrozenDynamics:
+def plant(request):
     machine = PAPER if request.param == "paper" else random_mechanism(np.random.default_rng(4))
     bias = [1e-3, -2e-3, 0.0, 5e-3, 0.0, -1e-3, 0.0, 0.0]
     return FrozenDynamics(machine, gravity=False, parameters=bias, free=PLANT_PARAMETERS)
 
 
-def somewhere(seed: int) -> tuple[Array, Array, Array]:
+def somewhere(seed):
     """Pose, far beyond anybody's reach, rates and torque."""
     rng = np.random.default_rng(seed)
     return 9 * rng.standard_normal(6), rng.standard_normal(6), 0.1 * rng.standard_normal(6)
 
 
-def test_accelerations_are_the_map_at_home_wherever_the_plate_is(plant: FrozenDynamics) -> None:
+def test_accelerations_are_the_map_at_home_wherever_the_plate_is(plant):
     pose, rates, torque = somewhere(0)
     B = torque_map(plant.mechanism, plant.mechanism.home)
     expected = B @ (torque + plant.plant_parameters[:6])
@@ -49,7 +48,7 @@ def test_accelerations_are_the_map_at_home_wherever_the_plate_is(plant: FrozenDy
     np.testing.assert_array_equal(plant.massless_map(pose), B)
 
 
-def test_derivatives_are_differences_of_accelerations(plant: FrozenDynamics) -> None:
+def test_derivatives_are_differences_of_accelerations(plant):
     pose, rates, torque = somewhere(1)
     found = plant.derivatives(pose, rates, torque)
     h = 1e-3  # the equations are linear
@@ -67,7 +66,7 @@ def test_derivatives_are_differences_of_accelerations(plant: FrozenDynamics) -> 
     assert np.array_equal(found.A[POSE, RATES], np.eye(6)) and not found.A[RATES].any()
 
 
-def test_predictions_are_parabolas(plant: FrozenDynamics) -> None:
+def test_predictions_are_parabolas(plant):
     pose, rates, _ = somewhere(2)
     torques = 0.1 * np.random.default_rng(3).standard_normal((4, 6))
     holds = np.array([0.1, 0.3, 0.05, 0.2])
@@ -78,7 +77,7 @@ def test_predictions_are_parabolas(plant: FrozenDynamics) -> None:
         np.testing.assert_allclose(state, [*pose, *rates], rtol=1e-12, atol=1e-12)
 
 
-def test_the_plate_gets_the_power_of_the_motors(plant: FrozenDynamics) -> None:
+def test_the_plate_gets_the_power_of_the_motors(plant):
     """dE/dt = torque' (crank rates), by a difference of energies, the bias being a torque too."""
     pose, rates, torque = somewhere(5)
     h = 1e-6
@@ -92,7 +91,7 @@ def test_the_plate_gets_the_power_of_the_motors(plant: FrozenDynamics) -> None:
         np.testing.assert_allclose(plant.actuation_map(pose), true.actuation_map(PAPER.home))
 
 
-def test_a_copy_is_of_the_same_kind(plant: FrozenDynamics) -> None:
+def test_a_copy_is_of_the_same_kind(plant):
     again, assumed = copy.deepcopy(plant), plant.assuming(plant.parameters)
     pose, rates, torque = somewhere(6)
     for other in (again, assumed):
@@ -102,7 +101,7 @@ def test_a_copy_is_of_the_same_kind(plant: FrozenDynamics) -> None:
         )
 
 
-def test_the_band_is_ten_peak_to_peaks_about_the_moving_reference() -> None:
+def test_the_band_is_ten_peak_to_peaks_about_the_moving_reference():
     experiment = prepare(sd.load_scenario("table2", settings=[FULL]))
     band = limits_of(experiment)
     assert isinstance(band, Band)
@@ -125,9 +124,7 @@ def test_the_band_is_ten_peak_to_peaks_about_the_moving_reference() -> None:
         ("delay_lqi_200", True, 200.0),
     ],
 )
-def test_the_loop_is_the_one_that_is_written_out_by_hand(
-    row: str, integral: bool, share: float
-) -> None:
+def test_the_loop_is_the_one_that_is_written_out_by_hand(row, integral, share):
     scenario = load_comparison("table2", ("delay_lqr", "delay_lqi"), [FULL])[row]
     result = sd.simulate(scenario, judge_stability=False)
     assert result.status == "completed" and not any(result.summary["counts"].values())
@@ -135,7 +132,7 @@ def test_the_loop_is_the_one_that_is_written_out_by_hand(
     assert result.accumulated_error == pytest.approx(by_hand, rel=2e-4)
 
 
-def test_what_does_not_know_of_the_delay_passes_the_band() -> None:
+def test_what_does_not_know_of_the_delay_passes_the_band():
     scenario = load_comparison("table2", ("lqr",), [FULL])["lqr"]
     result = sd.simulate(scenario, judge_stability=False)
     assert result.status == "left_workspace" and result.stopped is not None
@@ -144,7 +141,7 @@ def test_what_does_not_know_of_the_delay_passes_the_band() -> None:
     assert 8 < error.max() < 10  # the last record is up to 20 ms before
 
 
-def test_it_has_no_limits_but_one_that_is_asked_for() -> None:
+def test_it_has_no_limits_but_one_that_is_asked_for():
     experiment = prepare(sd.load_scenario("table2", settings=[FULL]))
     assert experiment.torque_limit == np.inf
     limited = sd.load_scenario("table2", settings=[FULL, "actuator.torque_limit=0.5"])
@@ -152,7 +149,7 @@ def test_it_has_no_limits_but_one_that_is_asked_for() -> None:
     assert uncovered(compose_law(experiment)) == "plant.kind"
 
 
-def test_the_controllers_of_this_package_follow_there_too() -> None:
+def test_the_controllers_of_this_package_follow_there_too():
     settings = (FULL, "plant.torque_bias=[1e-3,0,0,0,0,-1e-3]")
     result = sd.simulate(
         sd.load_scenario("table2", "predictor_lqi", settings), judge_stability=True
@@ -165,6 +162,6 @@ def test_the_controllers_of_this_package_follow_there_too() -> None:
     np.testing.assert_allclose(found[:6], [1e-3, 0, 0, 0, 0, -1e-3], atol=1e-4)
 
 
-def test_it_is_no_machine_for_a_diagram() -> None:
+def test_it_is_no_machine_for_a_diagram():
     with pytest.raises(sd.ConfigError, match=r"plant\.kind: got 'paper'"):
         sd.AddStewartPlatform(DiagramBuilder(), "paper", PlantConfig(kind="paper"))

@@ -1,10 +1,8 @@
 """Wrong and random files: a loader returns the thing itself or raises a one-line ConfigError."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import pytest
@@ -55,9 +53,9 @@ SCENARIO = {
 YAML_TEXT = st.text(alphabet="ab:0123456789.[]{}-,&*!<>|%?#'\"\\\n\t ~\0\u2028é", max_size=80)
 
 
-def places(document: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+def places(document, at=()):
     """Return the way to everything inside nested dicts and lists."""
-    items: Any = ()
+    items = ()
     if isinstance(document, dict):
         items = document.items()
     elif isinstance(document, list):
@@ -65,7 +63,7 @@ def places(document: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [at, *(way for key, value in items for way in places(value, (*at, key)))]
 
 
-def changed(document: Any, way: tuple[Any, ...], value: Any) -> Any:
+def changed(document, way, value):
     """Return a copy with what is at the end of `way` replaced."""
     if not way:
         return value
@@ -75,7 +73,7 @@ def changed(document: Any, way: tuple[Any, ...], value: Any) -> Any:
 
 
 @st.composite
-def mutants(draw: Any, document: Any) -> Any:
+def mutants(draw, document):
     """Draw a good document with one to three parts replaced by anything."""
     for _ in range(draw(st.integers(1, 3))):
         document = changed(document, draw(st.sampled_from(places(document))), draw(VALUES))
@@ -83,7 +81,7 @@ def mutants(draw: Any, document: Any) -> Any:
 
 
 @st.composite
-def spoiled(draw: Any, raw: bytes) -> bytes:
+def spoiled(draw, raw):
     """Draw a good file with a piece taken out, doubled, or replaced by anything."""
     start = draw(st.integers(0, len(raw)))
     end = draw(st.integers(start, min(len(raw), start + 20)))
@@ -92,7 +90,7 @@ def spoiled(draw: Any, raw: bytes) -> bytes:
 
 
 @st.composite
-def restructured(draw: Any, good: Callable[[], Any]) -> bytes:
+def restructured(draw, good):
     """Draw a sound NetCDF file of another content; HDF5 may crash on one with damaged bytes."""
     data = good()
     name = draw(st.sampled_from(sorted(map(str, data.variables))))
@@ -112,27 +110,27 @@ def restructured(draw: Any, good: Callable[[], Any]) -> bytes:
     return netcdf(data)
 
 
-def csv_motion(path: Path) -> None:
+def csv_motion(path):
     trajectory = make_reference(CsvConfig(file=str(path)), 0.1)
     assert all(abs(value) < 1e12 for value in evaluate(trajectory, 0.05))
 
 
-def waypoint_motion(path: Path) -> None:
+def waypoint_motion(path):
     make_reference(WaypointsConfig(file=str(path)), 0.1)
 
 
-def exported(path: Path) -> None:
+def exported(path):
     rows = signals_csv(read_signals(path)).splitlines()
     assert len({row.count(",") for row in rows}) == 1
 
 
-def network() -> dict[str, Any]:
+def network():
     with TemporaryDirectory() as folder:
         save_network(small_network(2), Path(folder) / "n.json")
         return dict(json.loads((Path(folder) / "n.json").read_text()))
 
 
-LOADERS: dict[str, tuple[Callable[[Path], Any], str, Any]] = {
+LOADERS = {
     "scenario": (load_scenario, "f.yaml", mutants(SCENARIO).map(yaml_text)),
     "text": (load_scenario, "f.yaml", YAML_TEXT | st.binary(max_size=60)),
     "controller": (load_controller, "f.yaml", mutants(SCENARIO["controller"]).map(yaml_text)),
@@ -147,12 +145,12 @@ LOADERS: dict[str, tuple[Callable[[Path], Any], str, Any]] = {
 }
 
 
-def fuzz(name: str, folder: Path, examples: int, number: int | None = None) -> None:
+def fuzz(name, folder, examples, number=None):
     """Load random files of one kind; `number` is the seed, None the usual one."""
     load, file, contents = LOADERS[name]
     path = folder / file
 
-    def attempt(content: bytes | str) -> None:
+    def attempt(content):
         raw = content if isinstance(content, bytes) else content.encode(errors="surrogatepass")
         path.write_bytes(raw)
         try:

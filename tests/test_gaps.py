@@ -1,6 +1,5 @@
 """Measurements that are missing for a while, against a filter that goes on without them."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.belief import THETA, Belief
+from stewart_drake.law.belief import THETA
 from stewart_drake.law.filter_settings import filter_settings
 from stewart_drake.law.gaps import LONGEST, GapObserver
 from stewart_drake.law.measurement import Measurement
@@ -19,7 +18,6 @@ from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
 DT = 0.1
@@ -35,9 +33,7 @@ SENSING = StateSensing(NOISE, AMPLITUDES)
 HOME = np.concatenate([PAPER.home, np.zeros(6)])
 
 
-def watched(
-    observer: ParameterObserver, theta: Array, there: Sequence[bool], seed: int
-) -> tuple[Belief, Array]:
+def watched(observer, theta, there, seed):
     """The belief after samples of which some are there, and the true state."""
     rng, x = np.random.default_rng(seed), HOME
     timeline = Timeline(DT, Delay(0))
@@ -55,12 +51,12 @@ def watched(
 GAP = (True, True, *[False] * 6, True)
 
 
-def drawn(seed: int) -> Array:
+def drawn(seed):
     rng = np.random.default_rng([seed, 7])
     return np.concatenate([rng.normal(0, 1e-3, 6), [rng.uniform(0.1, 0.8), 1e-3]])
 
 
-def test_what_was_learnt_before_a_gap_counts_after_it() -> None:
+def test_what_was_learnt_before_a_gap_counts_after_it():
     """The errors are as large as is said, and what is said is far less than without looking back.
 
     The mean of 40 sums of 20 squares has a standard deviation of 1.
@@ -77,7 +73,7 @@ def test_what_was_learnt_before_a_gap_counts_after_it() -> None:
     assert np.median(narrower, axis=0).min() > 3
 
 
-def test_without_a_gap_nothing_is_other() -> None:
+def test_without_a_gap_nothing_is_other():
     theta = drawn(0)
     one, _ = watched(GapObserver(SETTINGS), theta, (True,) * 8, 0)
     other, _ = watched(ParameterObserver(SETTINGS), theta, (True,) * 8, 0)
@@ -85,7 +81,7 @@ def test_without_a_gap_nothing_is_other() -> None:
     assert np.array_equal(one.estimate.covariance, other.estimate.covariance)
 
 
-def test_a_gap_that_is_too_long_is_left_to_the_filter() -> None:
+def test_a_gap_that_is_too_long_is_left_to_the_filter():
     theta, there = drawn(1), (True, True, *[False] * (LONGEST + 1), True)
     one, _ = watched(GapObserver(SETTINGS), theta, there, 0)
     other, _ = watched(ParameterObserver(SETTINGS), theta, there, 0)
@@ -93,7 +89,7 @@ def test_a_gap_that_is_too_long_is_left_to_the_filter() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 7])
-def test_half_of_the_measurements_suffice(seed: int) -> None:
+def test_half_of_the_measurements_suffice(seed):
     """With noise, bias and payload; without looking back these two runs have 4.6 and 3.6."""
     settings = ("plant.kind=exact", "start=on_reference", "queue=reference", "overlay=dirty")
     settings += ("sensor.loss=0.5", f"sensor.seed={seed}")

@@ -5,7 +5,6 @@ import socket
 import threading
 import time
 import urllib.request
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +35,7 @@ from stewart_drake.live.session import drive, prepare_session
 from stewart_drake.loop.peer import FAULTS, Fault, Part, Reason, identity_of, in_words
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario
-from tests.live_driver import Driver, Together
+from tests.live_driver import Driver
 from tests.test_live import FROM_REST, OVER_A_NETWORK, Running, quiet_machine, scenario_of
 from tests.test_machine import begun, messages, together
 from tests.test_protocol import HEAD, IDENTITY, KEY, OFFER, PLAN, changed
@@ -50,13 +49,13 @@ __all__ = ["quiet_machine"]
 # ---------------------------------------------------------------- requests
 
 
-def request_of(driver: Driver, sequence: int = 1) -> bytes:
+def request_of(driver, sequence=1):
     """A request for a session, as somebody may record it."""
     driver.session._sent = sequence - 1
     return encode(ControllerMessage(driver.session.head(0), identity=driver.identity), KEY)
 
 
-def test_replayed_requests_do_not_keep_a_controller_out() -> None:
+def test_replayed_requests_do_not_keep_a_controller_out():
     """Twenty a second, from another address and without the key: 10 of 10 runs connect."""
     run = together(EXACT, key=KEY)
     period, connected = run.driver.period, 0
@@ -81,7 +80,7 @@ def test_replayed_requests_do_not_keep_a_controller_out() -> None:
     assert connected == run.machine.counts["sessions"] == 10
 
 
-def ask(run: Together, time: int, number: int = 1) -> list[MachineMessage]:
+def ask(run, time, number=1):
     """The answers to so many requests of an address, at a time of the machine's clock."""
     endpoint, said = run.driver.endpoint, []
     run.at(time)
@@ -95,7 +94,7 @@ def ask(run: Together, time: int, number: int = 1) -> list[MachineMessage]:
     return said
 
 
-def test_answers_to_unknown_addresses_have_a_rate_and_are_no_longer_than_requests() -> None:
+def test_answers_to_unknown_addresses_have_a_rate_and_are_no_longer_than_requests():
     run = together(EXACT)
     asked, offers = 0, list[MachineMessage]()
     for k in range(100):
@@ -116,7 +115,7 @@ def test_answers_to_unknown_addresses_have_a_rate_and_are_no_longer_than_request
     assert len(list(driver.endpoint.receive())) == 100
 
 
-def test_an_offer_ends_with_the_next_session() -> None:
+def test_an_offer_ends_with_the_next_session():
     """What was recorded of a confirmation does not begin a session a second time."""
     run = begun(samples=3)
     driver, time = run.driver, run.machine.time()
@@ -126,7 +125,7 @@ def test_an_offer_ends_with_the_next_session() -> None:
     run.driver = other = Driver(run.scenario, run.ear.address)
     period = other.period
     run.greet(run.machine.time() // period * period + period, time // period * period + 9 * period)
-    assert run.machine.session.number == other.session.number  # type: ignore[union-attr]
+    assert run.machine.session.number == other.session.number
     other.say(run.machine.time(), ControllerFlags.STOP)
     run.at(run.machine.time() + 1)
     driver.session._sent = 0
@@ -140,7 +139,7 @@ def test_an_offer_ends_with_the_next_session() -> None:
 # ---------------------------------------------------------------- another version
 
 
-def test_a_controller_of_version_1_is_refused_in_one_line() -> None:
+def test_a_controller_of_version_1_is_refused_in_one_line():
     run = together(EXACT)
     old = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     old.settimeout(5)
@@ -157,14 +156,14 @@ def test_a_controller_of_version_1_is_refused_in_one_line() -> None:
     old.close()
 
 
-def answering(reply: bytes) -> tuple[threading.Thread, threading.Event, tuple[str, int]]:
+def answering(reply):
     """A machine that answers whatever it gets with the same bytes."""
     ear = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     ear.bind(("127.0.0.1", 0))
     ear.settimeout(0.05)
     ends = threading.Event()
 
-    def answer() -> None:
+    def answer():
         while not ends.is_set():
             try:
                 data, address = ear.recvfrom(2000)
@@ -179,11 +178,11 @@ def answering(reply: bytes) -> tuple[threading.Thread, threading.Event, tuple[st
 
 
 @pytest.fixture
-def contact_with() -> Iterator[object]:
+def contact_with():
     """Makes a contact with a machine that always answers the same."""
     made = []
 
-    def contact(reply: bytes) -> Contact:
+    def contact(reply):
         thread, ends, address = answering(reply)
         endpoint = open_endpoint(address, None)
         made.append((thread, ends, endpoint))
@@ -196,7 +195,7 @@ def contact_with() -> Iterator[object]:
         endpoint.close()
 
 
-def test_a_machine_of_version_1_is_refused_in_one_line(contact_with) -> None:  # type: ignore[no-untyped-def]
+def test_a_machine_of_version_1_is_refused_in_one_line(contact_with):
     contact = contact_with(changed(encode(OFFER), 4, b"\1"))
     with pytest.raises(ConfigError) as refused:
         call(contact)
@@ -211,11 +210,11 @@ def test_a_machine_of_version_1_is_refused_in_one_line(contact_with) -> None:  #
 
 
 @pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+def impatient(monkeypatch):
     monkeypatch.setattr(connect, "_PATIENCE", 0.3)
 
 
-def test_a_machine_in_use_is_named(quiet_machine, impatient) -> None:  # type: ignore[no-untyped-def]
+def test_a_machine_in_use_is_named(quiet_machine, impatient):
     with Running(watchdog=0.5) as running:
         first = prepare_session(scenario_of(), running.address)
         await_free(first.contact)
@@ -223,7 +222,7 @@ def test_a_machine_in_use_is_named(quiet_machine, impatient) -> None:  # type: i
         first.contact.send()
         stays = threading.Event()
 
-        def stay() -> None:
+        def stay():
             while not stays.wait(0.1):
                 first.contact.send()
 
@@ -243,7 +242,7 @@ def test_a_machine_in_use_is_named(quiet_machine, impatient) -> None:  # type: i
     )
 
 
-def test_a_sequence_that_restarts_is_named(contact_with, impatient) -> None:  # type: ignore[no-untyped-def]
+def test_a_sequence_that_restarts_is_named(contact_with, impatient):
     """Every answer has sequence 7: only the first is taken."""
     contact = contact_with(encode(replace(OFFER, watchdog=SECOND // 10)))
     contact.ask()
@@ -259,7 +258,7 @@ def test_a_sequence_that_restarts_is_named(contact_with, impatient) -> None:  # 
 
 
 @pytest.mark.parametrize(("off", "word"), [(-1, "early"), (1, "late")])
-def test_reports_that_are_a_period_off_are_named(off: int, word: str) -> None:
+def test_reports_that_are_a_period_off_are_named(off, word):
     check, right = ReportCheck(1.0), ReportCheck(1.0)
     rng = np.random.default_rng(3)
     torques = rng.uniform(-2, 2, (40, 6))
@@ -275,11 +274,11 @@ def test_reports_that_are_a_period_off_are_named(off: int, word: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_machine_that_reports_a_period_too_late_is_refused(quiet_machine, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_a_machine_that_reports_a_period_too_late_is_refused(quiet_machine, monkeypatch):
     message = Machine._message
 
-    def off(self: Machine, *given: object) -> MachineMessage:
-        made = message(self, *given)  # type: ignore[arg-type]
+    def off(self, *given):
+        made = message(self, *given)
         shift = 0 if made.acted_from == NEVER else self.period
         return replace(made, acted_from=made.acted_from + shift)
 
@@ -294,7 +293,7 @@ def test_a_machine_that_reports_a_period_too_late_is_refused(quiet_machine, monk
 # ---------------------------------------------------------------- identity
 
 
-def test_parts_of_one_name_are_told_apart_by_their_numbers() -> None:
+def test_parts_of_one_name_are_told_apart_by_their_numbers():
     other = IDENTITY._replace(mechanism=Part(bytes(8), "paper"))
     assert IDENTITY.differing(IDENTITY) is None
     assert IDENTITY.differing(other) == (
@@ -303,7 +302,7 @@ def test_parts_of_one_name_are_told_apart_by_their_numbers() -> None:
     )
 
 
-def test_long_names_are_cut_to_what_a_datagram_holds(tmp_path: Path) -> None:
+def test_long_names_are_cut_to_what_a_datagram_holds(tmp_path):
     scenario = load_scenario("paper", settings=(EXACT, SAMPLED))
     assert identity_of(scenario).sensor.name == "encoders, 16 samples, 30 bits"
     assert all(len(part.name) <= 32 for part in identity_of(scenario))
@@ -312,7 +311,7 @@ def test_long_names_are_cut_to_what_a_datagram_holds(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- faults
 
 
-def test_every_way_to_leave_the_workspace_has_its_fault() -> None:
+def test_every_way_to_leave_the_workspace_has_its_fault():
     from stewart_drake.live.machine import reason_of
 
     mechanism = load_mechanism("paper")
@@ -331,14 +330,14 @@ def test_every_way_to_leave_the_workspace_has_its_fault() -> None:
     assert reason_of(failure._replace(reason="something else")).fault == Fault.LEFT
 
 
-def test_the_documented_faults_are_those_of_the_table() -> None:
+def test_the_documented_faults_are_those_of_the_table():
     text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split("## Faults")[1]
     rows = dict(re.findall(r"^\| (\d+) \| (.*) \|$", text.split("\n## ")[0], re.MULTILINE))
     words = {f: re.sub("{.*?}", "N", text) for f, text in FAULTS.items()} | {Fault.NONE: "none"}
     assert rows == {str(int(fault)): text for fault, text in words.items()}
 
 
-def test_a_loss_is_said_with_what_came_before_it() -> None:
+def test_a_loss_is_said_with_what_came_before_it():
     """A machine that stood still: the same words in its terminal and in its last datagrams."""
     run = begun("queue=equilibrium", "plant.gravity=true", samples=1, watchdog=20)
     machine = run.machine
@@ -358,7 +357,7 @@ def test_a_loss_is_said_with_what_came_before_it() -> None:
     assert sum(last.why in line for line in run.said) == 1
 
 
-def test_silence_stop_and_end_are_said() -> None:
+def test_silence_stop_and_end_are_said():
     run = begun(samples=5, watchdog=0.35)
     run.at(run.machine.time() + round(0.6 * SECOND))
     assert messages(run)[-1].why == "nothing was heard from the controller for 0.35 s"
@@ -380,15 +379,15 @@ def test_silence_stop_and_end_are_said() -> None:
 class Watching(Nobody):
     """Keeps how it ended."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.words = ""
 
-    def ended(self, words: str) -> None:
+    def ended(self, words):
         self.words = words
 
 
 @pytest.mark.slow
-def test_live_and_machine_say_a_loss_in_the_same_words(quiet_machine) -> None:  # type: ignore[no-untyped-def]
+def test_live_and_machine_say_a_loss_in_the_same_words(quiet_machine):
     """A machine under gravity, of which the controller knows nothing, falls."""
     watching = Watching()
     with Running("plant.gravity=true") as running:
@@ -411,12 +410,12 @@ def test_live_and_machine_say_a_loss_in_the_same_words(quiet_machine) -> None:  
 
 
 @pytest.mark.slow
-def test_a_machine_that_is_ended_ends_the_run_with_its_words() -> None:
+def test_a_machine_that_is_ended_ends_the_run_with_its_words():
     """At once, and not after ten seconds of silence."""
     said = list[str]()
     with Running() as running:
         machine = running.machine
-        running.machine.stop = lambda: None  # type: ignore[method-assign]
+        running.machine.stop = lambda: None
         ready = prepare_session(scenario_of(), running.address)
         ends = threading.Timer(2.0, lambda: Machine.stop(machine))
         ends.start()
@@ -428,7 +427,7 @@ def test_a_machine_that_is_ended_ends_the_run_with_its_words() -> None:
 
 
 @pytest.mark.slow
-def test_the_page_shows_how_a_run_ended() -> None:
+def test_the_page_shows_how_a_run_ended():
     viewer = PageViewer(load_mechanism("paper"), "live: a test")
     url = viewer.opened()
     events = urllib.request.urlopen(url.replace("/?", "/events?"))

@@ -12,20 +12,19 @@ from stewart_drake.law.error_model import double_integrators, with_integral
 from stewart_drake.law.hautus import TOLERANCE, cluster, hautus, scaled
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.studies.hautus import describe, state_labels
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
 PAPER_MODEL = double_integrators(torque_map(PAPER, PAPER.home))
 
 
-def test_margin_of_a_scalar_pair_is_that_of_the_formula() -> None:
+def test_margin_of_a_scalar_pair_is_that_of_the_formula():
     """[a - a, b] has the singular value |b|, ||[a, b]|| is hypot(a, b)."""
     (mode,) = hautus([[3.0]], [[4.0]], discrete=False).modes
     assert mode.eigenvalue == 3
     assert mode.margin == pytest.approx(4 / 5, rel=1e-14)
 
 
-def test_an_uncontrollable_mode_is_named_with_its_direction() -> None:
+def test_an_uncontrollable_mode_is_named_with_its_direction():
     test = hautus(np.diag([-1.0, 2.0, -3.0]), [[1.0], [0.0], [1.0]], discrete=False)
     (mode,) = test.deficient
     assert mode.eigenvalue == 2
@@ -36,7 +35,7 @@ def test_an_uncontrollable_mode_is_named_with_its_direction() -> None:
     assert hautus(np.diag([-1.0, -2.0]), [[1.0], [0.0]], discrete=False).harmless
 
 
-def test_an_unobservable_mode_is_found_by_transposition() -> None:
+def test_an_unobservable_mode_is_found_by_transposition():
     """Of a rotation that only its decaying companion's output shows nothing is seen."""
     A = block_diag([[0.0, 1.0], [-4.0, 0.0]], [[-1.0]])
     C = np.array([[0.0, 0.0, 1.0]])
@@ -51,7 +50,7 @@ def test_an_unobservable_mode_is_found_by_transposition() -> None:
 
 
 @pytest.mark.parametrize(("half_turns", "fails"), [(1.0, True), (2.0, True), (0.5, False)])
-def test_pathological_sampling_of_an_oscillator(half_turns: float, fails: bool) -> None:
+def test_pathological_sampling_of_an_oscillator(half_turns, fails):
     """x'' = -w^2 x + u, held for half a period, reaches one direction only: exp(A dt) = -1."""
     A, B = np.array([[0.0, 1.0], [-9.0, 0.0]]), np.array([[0.0], [1.0]])
     assert hautus(A, B, discrete=False).complete
@@ -68,9 +67,7 @@ def test_pathological_sampling_of_an_oscillator(half_turns: float, fails: bool) 
     growing=st.booleans(),
     discrete=st.booleans(),
 )
-def test_hidden_modes_are_found_in_any_coordinates(
-    seed: int, reached: int, hidden: int, growing: bool, discrete: bool
-) -> None:
+def test_hidden_modes_are_found_in_any_coordinates(seed, reached, hidden, growing, discrete):
     rng = np.random.default_rng(seed)
     A1, B1 = rng.normal(size=(reached, reached)) / 2, rng.normal(size=(reached, 2))
     A2 = np.diag(rng.permutation(np.linspace(1.2, 2.0, hidden) if growing else -np.ones(hidden)))
@@ -89,7 +86,7 @@ def test_hidden_modes_are_found_in_any_coordinates(
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_margin_is_the_size_of_the_change_that_makes_a_mode_fail(seed: int) -> None:
+def test_margin_is_the_size_of_the_change_that_makes_a_mode_fail(seed):
     """Taking the least singular value out of the pencil leaves an uncontrollable pair (Eising)."""
     rng = np.random.default_rng(seed)
     A, B = rng.normal(size=(4, 4)), rng.normal(size=(4, 1))
@@ -103,7 +100,7 @@ def test_margin_is_the_size_of_the_change_that_makes_a_mode_fail(seed: int) -> N
     assert np.linalg.matrix_rank(pencil - change, tol=1e-12 * size) == 3
 
 
-def test_powers_of_the_matrix_are_wrong_where_the_margin_is_right() -> None:
+def test_powers_of_the_matrix_are_wrong_where_the_margin_is_right():
     """Six masses on a line joined by springs, pushed at one end, sampled: controllable."""
     stiffness = 2 * np.eye(6) - np.eye(6, k=1) - np.eye(6, k=-1)
     A = np.block([[np.zeros((6, 6)), np.eye(6)], [-stiffness, np.zeros((6, 6))]])
@@ -122,7 +119,7 @@ def test_powers_of_the_matrix_are_wrong_where_the_margin_is_right() -> None:
 
 
 @pytest.mark.parametrize("steps", [0, 1, 8, 30])
-def test_only_the_papers_chain_has_modes_that_no_output_shows(steps: int) -> None:
+def test_only_the_papers_chain_has_modes_that_no_output_shows(steps):
     """Without a fraction T(k-mu-1) acts on nothing: six zero modes, gone after one step."""
     model = delayed_model(PAPER_MODEL, 0.1, steps, 0.0, integral=True)
     minimal, extra = chain(model), chain(model, always_extra=True)
@@ -141,14 +138,14 @@ def test_only_the_papers_chain_has_modes_that_no_output_shows(steps: int) -> Non
     assert both.complete
 
 
-def test_with_a_fraction_of_a_period_the_papers_chain_is_the_minimal_one() -> None:
+def test_with_a_fraction_of_a_period_the_papers_chain_is_the_minimal_one():
     model = delayed_model(PAPER_MODEL, 0.1, 3, 0.5, integral=True)
     extra = chain(model, always_extra=True)
     assert np.array_equal(extra.A, chain(model).A)
     assert hautus(extra.A.T, extra.C.T, discrete=True).complete
 
 
-def test_answers_do_not_depend_on_units_but_margins_do() -> None:
+def test_answers_do_not_depend_on_units_but_margins_do():
     A, B, C = with_integral(PAPER_MODEL)
     rng = np.random.default_rng(0)
     sizes = [10.0 ** rng.uniform(-1, 1, n) for n in (18, 6, 12)]
@@ -166,7 +163,7 @@ def test_answers_do_not_depend_on_units_but_margins_do() -> None:
 
 
 @pytest.mark.parametrize("size", [2, 3, 5])
-def test_a_spread_defective_eigenvalue_is_one_mode(size: int) -> None:
+def test_a_spread_defective_eigenvalue_is_one_mode(size):
     rng = np.random.default_rng(size)
     T = np.linalg.qr(rng.normal(size=(size, size)))[0]
     A = T @ (np.eye(size) * 2 + np.eye(size, k=1)) @ T.T
@@ -180,7 +177,7 @@ def test_a_spread_defective_eigenvalue_is_one_mode(size: int) -> None:
     assert mode.margin < 1e-12
 
 
-def test_a_slowly_decaying_mode_is_told_from_one_that_stays() -> None:
+def test_a_slowly_decaying_mode_is_told_from_one_that_stays():
     for value, decays in ((1 - 1e-4, True), (1 - 1e-9, False), (1.0, False), (-1.0, False)):
         assert hautus([[value]], [[0.0]], discrete=True).harmless is decays
     system = np.diag([-1e-9, -1.0])
@@ -198,12 +195,12 @@ def test_a_slowly_decaying_mode_is_told_from_one_that_stays() -> None:
         (np.eye(1), np.full((1, 1), np.inf), "not finite"),
     ],
 )
-def test_bad_matrices_are_refused(A: Array, B: Array, message: str) -> None:
+def test_bad_matrices_are_refused(A, B, message):
     with pytest.raises(ValueError, match=message):
         hautus(A, B, discrete=True)
 
 
-def test_directions_in_words() -> None:
+def test_directions_in_words():
     labels = state_labels(30)
     assert [label.group for label in labels[::6]] == [
         "pose error",

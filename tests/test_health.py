@@ -1,27 +1,21 @@
 """What a tuner decides by of what the law remembers; rule, networks of both kinds, limits."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.bulk import ending_of, run_in_bulk
-from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.loop.tuner import RULES, health_of, weights_source
-from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.families import FAMILIES, SAMPLES
 from stewart_drake.tuner.features import (
     HIGHEST,
     LOWEST,
     NAMES,
     DensityFeatures,
-    HealthFeatures,
     Row,
 )
 from stewart_drake.tuner.network import WINDOW, Network, load_network, save_network
@@ -38,29 +32,28 @@ from stewart_drake.tuner.source import (
     weights_of,
 )
 from stewart_drake.tuning.data import FixedPolicy, watched_run, watching
-from stewart_drake.types import Array
 
 FOLLOWS = ("plant.kind=exact", "start=on_reference", "queue=reference")
 BLIND = (*FOLLOWS, "controller.estimate=[]")
 
 
-def scenario(*settings: str) -> Scenario:
+def scenario(*settings):
     return sd.load_scenario("paper", settings=settings)
 
 
-def seen(one: Scenario, ratio: float = -2.0) -> Array:
+def seen(one, ratio=-2.0):
     """(k, 18) features of a run with a fixed ratio, NaN at every second sample."""
     return np.asarray(watched_run(one, watching(*weights_of(ratio)), round(10 * one.duration))[1])
 
 
-def feature(values: Array, name: str) -> Array:
+def feature(values, name):
     return np.asarray(values[:, NAMES.index(name)])
 
 
-def health() -> HealthFeatures:
-    made: list[HealthFeatures] = []
+def health():
+    made = []
 
-    def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
+    def make(experiment, law):
         made.append(health_of(experiment, law))
         return WeightsSource(made[-1], FixedPolicy(np.ones(2)))
 
@@ -68,7 +61,7 @@ def health() -> HealthFeatures:
     return made[0]
 
 
-def window(**columns: Any) -> Array:
+def window(**columns):
     """One of rows in which everything is 0 but these."""
     rows = {name: np.zeros(WINDOW) for name in Row._fields}
     rows |= {name: np.broadcast_to(value, WINDOW) for name, value in columns.items()}
@@ -79,7 +72,7 @@ def window(**columns: Any) -> Array:
 
 
 @pytest.mark.parametrize("late_ms", [2.0, 8.0, 25.0])
-def test_the_timing_error_is_found(late_ms: float) -> None:
+def test_the_timing_error_is_found(late_ms):
     """A delay that is longer than believed shows as what it is, from the loop alone."""
     fraction = late_ms / 100
     one = scenario(f"delay.fraction={fraction}", "controller.delay_steps=8", *BLIND, "duration=6")
@@ -88,21 +81,21 @@ def test_the_timing_error_is_found(late_ms: float) -> None:
     assert np.median(found) == pytest.approx(late_ms, rel=0.15)
 
 
-def test_a_torque_that_comes_early_is_in_the_bound() -> None:
+def test_a_torque_that_comes_early_is_in_the_bound():
     early = scenario("delay.steps=7", "delay.fraction=0.9", "controller.delay_steps=8", *BLIND)
     values = seen(replace(early, duration=6.0), -4.0)
     bound = 10 ** feature(values, "timing_bound")[30::2]
     assert np.median(bound) == pytest.approx(10.0, rel=0.3)
 
 
-def test_where_all_is_as_believed_nothing_surprises() -> None:
+def test_where_all_is_as_believed_nothing_surprises():
     values = seen(scenario("duration=5", *BLIND), 0.0)[::2]
     assert np.all(10 ** feature(values, "surprise_peak") < 0.2)
     assert np.all(10 ** feature(values, "timing_31") < 0.2)
     assert np.all(feature(values, "ratio") == 0.0)
 
 
-def test_noise_that_is_known_surprises_as_much_as_it_should() -> None:
+def test_noise_that_is_known_surprises_as_much_as_it_should():
     """The innovation's floor is its standard deviation: sqrt(2) of the noise, where that rules."""
     noise = [f"{1e-2 * a:g}" for a in (0.26, 0.26, 0.26, 0.02, 0.02, 0.08) * 2]
     one = scenario(f"sensor.noise_std=[{','.join(noise)}]", "duration=8", *BLIND)
@@ -110,7 +103,7 @@ def test_noise_that_is_known_surprises_as_much_as_it_should() -> None:
     assert 0.7 < np.median(surprise) < 1.2
 
 
-def test_timing_is_the_moment_estimate_of_its_derivation() -> None:
+def test_timing_is_the_moment_estimate_of_its_derivation():
     """nu = -tau kappa + noise of unit size: n = -tau d + sqrt(d) e, simulated."""
     rng, tau, values, found = np.random.default_rng(3), 0.012, health().values, []
     for _ in range(400):
@@ -120,7 +113,7 @@ def test_timing_is_the_moment_estimate_of_its_derivation() -> None:
     assert np.mean(found) == pytest.approx(1e3 * tau, rel=0.02)
 
 
-def test_features_are_root_mean_squares_over_their_samples() -> None:
+def test_features_are_root_mean_squares_over_their_samples():
     squares = np.arange(1.0, WINDOW + 1) ** 2
     values = health().values(window(error=squares, feedback=squares))
     for name, number, least in (("error_10", 10, 1e-3), ("feedback_4", 4, 1e-4)):
@@ -130,7 +123,7 @@ def test_features_are_root_mean_squares_over_their_samples() -> None:
     assert values[-1] == pytest.approx(np.log10(growth), abs=1e-5)
 
 
-def test_what_is_lost_is_finite_and_bounded() -> None:
+def test_what_is_lost_is_finite_and_bounded():
     """Also of a run that is being lost, where signals grow without limit."""
     one = scenario("delay.fraction=0.3", "controller.delay_steps=8", *FOLLOWS)
     ending, found = watched_run(one, watching(*weights_of(1.0)), SAMPLES)
@@ -140,7 +133,7 @@ def test_what_is_lost_is_finite_and_bounded() -> None:
     assert np.all((values >= LOWEST) & (values <= HIGHEST))
 
 
-def test_a_missed_measurement_is_left_out() -> None:
+def test_a_missed_measurement_is_left_out():
     features = health()
     some = window(surprise=4.0)
     some[-1] = np.nan
@@ -153,12 +146,12 @@ def test_a_missed_measurement_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("goal", [-4.0, -1.0, 0.1, 2.0])
-def test_weights_go_towards_a_ratio_and_fall_faster_than_they_rise(goal: float) -> None:
+def test_weights_go_towards_a_ratio_and_fall_faster_than_they_rise(goal):
     found = ratio_of(towards(goal, weights_of(0.0)))
     assert found == pytest.approx(min(max(goal, -FALL), RISE))
 
 
-def test_the_rule_is_two_lines() -> None:
+def test_the_rule_is_two_lines():
     rule, values = Rule(-1.0, 2.0, 0.5), np.zeros(18)
     for x, ratio in ((0.2, -1.0), (0.5, -1.0), (0.6, -1.2), (9.0, LEAST)):
         values[NAMES.index("surprise_peak")] = x
@@ -168,9 +161,9 @@ def test_the_rule_is_two_lines() -> None:
     assert rule.first == pytest.approx(weights_of(-1.0))
 
 
-def network(start: Array | None = None, features: Any = "health", **changed: Any) -> Network:
+def network(start=None, features="health", **changed):
     rng = np.random.default_rng(5)
-    given: dict[str, Any] = {
+    given = {
         "input_mean": np.zeros(18),
         "input_scale": np.ones(18),
         "W1": rng.standard_normal((10, 18)),
@@ -184,7 +177,7 @@ def network(start: Array | None = None, features: Any = "health", **changed: Any
     return Network(**given, output="log_weights", features=features, start=start)
 
 
-def test_weights_stay_in_bounds_and_move_as_fast_as_they_may() -> None:
+def test_weights_stay_in_bounds_and_move_as_fast_as_they_may():
     source = WeightsSource(DensityFeatures(), RatioPolicy(network(weights_of(-1.0))))
     rng, last = np.random.default_rng(1), weights_of(-1.0)
     for _ in range(300):
@@ -196,7 +189,7 @@ def test_weights_stay_in_bounds_and_move_as_fast_as_they_may() -> None:
         last = decision.weights
 
 
-def test_what_fails_leads_back_to_the_start_and_is_counted() -> None:
+def test_what_fails_leads_back_to_the_start_and_is_counted():
     policy = RatioPolicy(network(weights_of(-2.0)))
     decision = policy.decide(np.full(18, np.nan), weights_of(0.0))
     assert decision.fell_back
@@ -204,7 +197,7 @@ def test_what_fails_leads_back_to_the_start_and_is_counted() -> None:
 
 
 @pytest.mark.parametrize("tuner", ["rule", "network"])
-def test_drakes_loop_and_the_one_in_c_have_the_same_weights(tuner: str, tmp_path: Path) -> None:
+def test_drakes_loop_and_the_one_in_c_have_the_same_weights(tuner, tmp_path):
     save_network(network(weights_of(-1.0)), tmp_path / "n.json")
     kind = {
         "rule": ("tuner.kind=rule", "tuner.knee=-1", "tuner.ratio=1"),
@@ -218,7 +211,7 @@ def test_drakes_loop_and_the_one_in_c_have_the_same_weights(tuner: str, tmp_path
     assert found.error_so_far == pytest.approx(expected.error_so_far, rel=1e-5)
 
 
-def test_a_failing_network_is_counted_in_both_loops(tmp_path: Path) -> None:
+def test_a_failing_network_is_counted_in_both_loops(tmp_path):
     # A mean that no input can be subtracted from without an overflow.
     broken = network(weights_of(-1.0), W2=np.full((2, 10), 1e308))
     save_network(broken, tmp_path / "n.json")
@@ -228,7 +221,7 @@ def test_a_failing_network_is_counted_in_both_loops(tmp_path: Path) -> None:
     assert found.weights[:, 0] == pytest.approx(weights_of(-1.0)[0])
 
 
-def test_the_first_weights_know_of_no_sample() -> None:
+def test_the_first_weights_know_of_no_sample():
     noisy = "sensor.noise_std=[.01,.01,.01,.001,.001,.001,.01,.01,.01,.001,.001,.001]"
     kind = ("tuner.kind=rule", "tuner.knee=-1", "tuner.ratio=1", "duration=1", *FOLLOWS)
     runs = [run_in_bulk(scenario(noisy, f"sensor.seed={seed}", *kind)).weights for seed in (1, 2)]
@@ -240,29 +233,29 @@ def test_the_first_weights_know_of_no_sample() -> None:
 # ------------------------------------------------------------------------- files and borders
 
 
-def test_a_file_says_features_and_start(tmp_path: Path) -> None:
+def test_a_file_says_features_and_start(tmp_path):
     save_network(network(weights_of(-2.0)), tmp_path / "n.json")
     found = load_network(tmp_path / "n.json")
     assert found.features == "health"
-    assert np.array_equal(found.start, weights_of(-2.0))  # type: ignore[arg-type]
+    assert np.array_equal(found.start, weights_of(-2.0))
 
 
-def test_a_start_outside_the_bounds_is_refused() -> None:
+def test_a_start_outside_the_bounds_is_refused():
     with pytest.raises(ConfigError, match=r"start: got .*; expected \(w_Q, w_R\) within bounds"):
         network(np.array([1e3, 1e-3]))
 
 
 @pytest.mark.parametrize("settings", [("sensor.kind=encoders",), ("sensor.delay=0.1",)])
-def test_predictions_take_a_state_that_is_measured(settings: tuple[str, ...]) -> None:
+def test_predictions_take_a_state_that_is_measured(settings):
     with pytest.raises(ConfigError, match=r"tuner.kind: got 'rule'.*expected 'fixed'"):
         simulate(scenario("plant.kind=exact", "tuner.kind=rule", *settings))
 
 
-def test_what_the_rule_is_depends_on_the_estimator() -> None:
+def test_what_the_rule_is_depends_on_the_estimator():
     assert set(RULES) == {False, True}
     made = []
 
-    def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource | None:
+    def make(experiment, law):
         made.append(weights_source(experiment, law))
         return made[-1]
 
@@ -272,7 +265,7 @@ def test_what_the_rule_is_depends_on_the_estimator() -> None:
 
 
 @pytest.mark.parametrize(("family", "bound"), [("T", 0.05), ("N2", 0.04)])
-def test_shipped_networks_cost_little_where_nothing_is_wrong(family: str, bound: float) -> None:
+def test_shipped_networks_cost_little_where_nothing_is_wrong(family, bound):
     found = load_network(f"health_{family}")
     assert found.features == "health"
     assert found.card["family"] == family
@@ -286,7 +279,7 @@ def test_shipped_networks_cost_little_where_nothing_is_wrong(family: str, bound:
     assert max(ratios) <= MOST + 1e-9
 
 
-def test_a_tuner_saves_a_plate_that_fixed_weights_lose() -> None:
+def test_a_tuner_saves_a_plate_that_fixed_weights_lose():
     late = scenario("delay.fraction=0.2", "controller.delay_steps=8", *BLIND)
     assert run_in_bulk(late).status == "left_workspace"
     for kind in (("tuner.kind=rule",), ("tuner.kind=ann", "tuner.weights=health_N2")):

@@ -1,7 +1,6 @@
 """What the command tells those who ask: help with examples, completion, 80 columns."""
 
 import dataclasses
-from typing import Any
 
 import pytest
 import typer
@@ -19,7 +18,7 @@ from tests import test_docs
 main(["--version"])  # which also puts the examples where they belong
 
 
-def commands(group: Any, words: tuple[str, ...] = ()) -> dict[str, Any]:
+def commands(group, words=()):
     """All commands by the words that call them."""
     found = {}
     for name, command in group.commands.items():
@@ -78,7 +77,7 @@ def test_no_summary_is_cut_off_in_the_list_of_commands(capsys):
 # ---------------------------------------------------------------- completion
 
 
-def asked(typed: str) -> dict[str, str]:
+def asked(typed):
     """How bash asks what to offer after this line."""
     return {
         "_STEWART_DRAKE_COMPLETE": "complete_bash",
@@ -88,7 +87,7 @@ def asked(typed: str) -> dict[str, str]:
 
 
 def test_the_shell_completes_commands_names_and_settings(monkeypatch, capsys):
-    def offered(typed: str) -> list[str]:
+    def offered(typed):
         for name, value in asked(typed).items():
             monkeypatch.setenv(name, value)
         with pytest.raises(SystemExit) as done:

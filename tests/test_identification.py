@@ -1,7 +1,6 @@
 """A machine from its log: every equation against an independent computation, then whole logs."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,11 +47,9 @@ from stewart_drake.identification.unknowns import (
     NAMES,
     NUM_UNKNOWNS,
     OFFSETS,
-    Unknowns,
     unknowns_of,
 )
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
-from stewart_drake.mechanism.geometry import Mechanism
 from tests.mechanisms import PAPER, random_mechanism
 
 STILL = np.zeros(6)
@@ -63,7 +60,7 @@ PARAMETERS = np.array(
 TORQUES = 0.02 * np.array([[1, -2, 1, 0, 2, -1], [-1, 1, 0, 2, -1, 1], [0, 1, -2, 1, 1, 0]])
 
 
-def some_unknowns(mechanism: Mechanism, **tolerances: float) -> Unknowns:
+def some_unknowns(mechanism, **tolerances):
     return unknowns_of(mechanism, Tolerances(**tolerances), 0.23, 0.1, 1.0)
 
 
@@ -165,7 +162,7 @@ def test_the_model_with_drawn_legs_is_the_same():
 # ---------------------------------------------------------------- trajectories
 
 
-def short_log(times, mechanism=PAPER, delay=0.23, gravity=0.0) -> tuple[Log, np.ndarray]:
+def short_log(times, mechanism=PAPER, delay=0.23, gravity=0.0):
     """A log of torques at 0, 0.1, ... s, and the states behind it."""
     first = np.concatenate([mechanism.home, [0.1, -0.1, 0.2, 0.02, -0.01, 0.03]])
     sent = 0.1 * np.arange(8)
@@ -243,7 +240,7 @@ def test_the_delay_s_slope_is_that_of_exact_trajectories():
 # ---------------------------------------------------------------- the fit
 
 
-def few_unknowns() -> tuple[Problem, Guess]:
+def few_unknowns():
     """Two short segments with noise, and little that is not known."""
     times = np.arange(0.25, 0.9, 0.02)
     log, states = short_log(times)
@@ -378,7 +375,7 @@ def test_pose_uncertainty_is_taken_over_the_workspace_of_the_machine_found():
 # ---------------------------------------------------------------- where to begin
 
 
-def sine_log(truth: Mechanism, parameters, delay: float, duration=6.0, seed=0) -> Log:
+def sine_log(truth, parameters, delay, duration=6.0, seed=0):
     """Open loop along a multisine: torques that would follow it, as far as they do; 14 bit.
 
     Torques are those of the true machine with true parameters, sent early by the true delay, and
@@ -404,7 +401,7 @@ def sine_log(truth: Mechanism, parameters, delay: float, duration=6.0, seed=0) -
     return Log("sine", sent, torques, times, values, Precision().std, 0.0, 0.8)
 
 
-def off_drawing(seed: int, size: float = 2e-4) -> Mechanism:
+def off_drawing(seed, size=2e-4):
     rng = np.random.default_rng(seed)
 
     def off(value):
@@ -419,7 +416,7 @@ def off_drawing(seed: int, size: float = 2e-4) -> Mechanism:
     )
 
 
-def truth_of(machine: Mechanism, parameters, delay: float):
+def truth_of(machine, parameters, delay):
     values = np.zeros(NUM_UNKNOWNS)
     legs = [machine.crank_lengths, machine.rod_lengths, machine.p_PQ, machine.p_WS]
     values[DYNAMIC], values[GEOMETRY] = parameters, np.column_stack(legs).ravel()
@@ -505,14 +502,14 @@ def test_the_delay_is_found_in_a_short_log_of_a_lost_run(case):
 
 
 @pytest.fixture(scope="module")
-def short_run_log(tmp_path_factory) -> Log:
+def short_run_log(tmp_path_factory):
     """The first 1.2 s of a log with a delay of 0.8 s and noise; the queue was empty."""
     folder = tmp_path_factory.mktemp("short")
     short_logs.short_run("paper", 0.8, 1e-3, 4000).save(folder)
     return up_to(read_log(folder / "signals.nc", PAPER, Precision()), 1.2)
 
 
-def up_to(log: Log, end: float) -> Log:
+def up_to(log, end):
     kept = log.times <= end + 1e-9
     return dataclasses.replace(log, times=log.times[kept], values=log.values[kept])
 
@@ -546,7 +543,7 @@ def test_a_multisine_rests_at_both_ends_and_stays_inside():
         fitted_multisine(PAPER, PAPER.home, np.full(6, 100.0), 2.0)
 
 
-def test_a_mechanism_s_file_is_read_back(tmp_path: Path):
+def test_a_mechanism_s_file_is_read_back(tmp_path):
     machine = off_drawing(4)
     path = tmp_path / "machine.yaml"
     path.write_text(mechanism_yaml(machine))
@@ -592,7 +589,7 @@ def test_steps_are_halved_until_they_do_not_matter():
 
 @pytest.mark.soak
 @pytest.mark.parametrize("poses", [False, True], ids=["encoders", "pose"])
-def test_fifty_machines_are_found(tmp_path: Path, poses: bool) -> None:
+def test_fifty_machines_are_found(tmp_path, poses):
     """Machines of the robustness study, 14 bit at 50 Hz, 20 s, a delay that is 130 ms off."""
     motion = excitation(tmp_path)
     found = [find("ranges", seed, motion, poses) for seed in range(50)]

@@ -1,7 +1,6 @@
 """`identify`: bad logs and options in one line each; from a lost run to one that is held."""
 
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -31,17 +30,17 @@ ROWS = [
 ]
 
 
-def csv_text(header=HEADER, rows=ROWS) -> str:
+def csv_text(header=HEADER, rows=ROWS):
     return "\n".join(",".join(cells) for cells in [header, *rows]) + "\n"
 
 
-def changed(row: int, column: int, text: str) -> str:
+def changed(row, column, text):
     rows = [list(cells) for cells in ROWS]
     rows[row][column] = text
     return csv_text(rows=rows)
 
 
-def read(path: Path):
+def read(path):
     return read_log(path, PAPER, Precision())
 
 
@@ -99,7 +98,7 @@ def test_a_bad_csv_log_is_told_in_one_line(tmp_path, text, named):
 
 
 @pytest.fixture(scope="module")
-def lost(tmp_path_factory) -> Path:
+def lost(tmp_path_factory):
     """The log of a run whose delay is believed to be 0.8 s and is 0.93 s."""
     folder = tmp_path_factory.mktemp("lost")
     settings = (
@@ -114,7 +113,7 @@ def lost(tmp_path_factory) -> Path:
     return folder / "signals.nc"
 
 
-def broken(signals: xr.Dataset, how: str) -> xr.Dataset:
+def broken(signals, how):
     if how == "scenario":
         signals.attrs.pop("scenario")
     elif how in ("network", "sensor.delay"):

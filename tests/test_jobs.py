@@ -24,50 +24,50 @@ ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = {"gain": 1.0, "names": ["a"]}
 
 
-def text(*parts: object) -> bytes:
+def text(*parts):
     return " ".join(map(str, parts)).encode()
 
 
-def noted(folder: str, *parts: object) -> bytes:
+def noted(folder, *parts):
     """Leaves a trace of every call."""
     with open(folder, "a") as file:
         file.write(f"{parts[0]}\n")
     return text(*parts)
 
 
-def environment(name: str) -> bytes:
+def environment(name):
     return os.environ[name].encode()
 
 
-def process(number: int) -> bytes:
+def process(number):
     return text(os.getpid())
 
 
-def slow(number: int) -> bytes:
+def slow(number):
     time.sleep(0.4)
     return text(number)
 
 
-def refuse(number: int) -> bytes:
+def refuse(number):
     raise ConfigError(f"delay.steps: got {number}")
 
 
-def die_at_three(number: int) -> bytes:
+def die_at_three(number):
     if number == 3:
         time.sleep(0.5)
         os.kill(os.getpid(), signal.SIGKILL)
     return text(number)
 
 
-def lacks_a_module(number: int) -> bytes:
+def lacks_a_module(number):
     raise ModuleNotFoundError("No module named 'nowhere'")
 
 
-def numbered(count: int) -> dict[str, tuple[int]]:
+def numbered(count):
     return {f"job{i}": (i,) for i in range(count)}
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {p.name: p.read_bytes() for p in folder.iterdir() if not p.name.startswith(".")}
 
 
@@ -166,7 +166,7 @@ def test_leftovers_are_removed_and_a_full_disk_spoils_nothing(tmp_path, monkeypa
     run_jobs(numbered(1), text, tmp_path, settings=SETTINGS)
     assert not list(tmp_path.glob(".*.part"))
 
-    def full(descriptor: int) -> None:
+    def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(module.os, "fsync", full)
@@ -186,7 +186,7 @@ def test_a_killed_worker_costs_the_jobs_in_flight_only(tmp_path):
     assert (tmp_path / "job3.json").read_bytes() == b"3"
 
 
-def start(folder: Path) -> "subprocess.Popen[str]":
+def start(folder):
     """A process with two workers on thirty jobs of 0.4 s."""
     code = (
         "import sys\nfrom pathlib import Path\nfrom stewart_drake.studies.jobs import run_jobs\n"
@@ -203,14 +203,14 @@ def start(folder: Path) -> "subprocess.Popen[str]":
     )
 
 
-def wait_for(folder: Path, number: int) -> None:
+def wait_for(folder, number):
     limit = time.monotonic() + 180
     while len(list(folder.glob("job*.json"))) < number:
         assert time.monotonic() < limit
         time.sleep(0.02)
 
 
-def group_is_gone(group: int) -> bool:
+def group_is_gone(group):
     try:
         os.killpg(group, 0)
     except ProcessLookupError:

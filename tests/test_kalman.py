@@ -1,35 +1,23 @@
 """The Kalman update of the core against textbook forms and least squares."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
 from stewart_drake.core.library import core
-from stewart_drake.types import Array
 
 RNG = np.random.default_rng(11)
 N, M = 9, 6
 FREE = np.full(N, np.inf)
 
 
-def update(
-    mean: Array,
-    root: Array,
-    seen: Any,
-    jacobian: Any,
-    y: Array,
-    C: Array,
-    iterations: int = 1,
-    bounds: tuple[Array, Array] = (-FREE, FREE),
-) -> tuple[Array, Array, float, float]:
+def update(mean, root, seen, jacobian, y, C, iterations=1, bounds=(-FREE, FREE)):
     """Mean, covariance, squared innovation and spread, for y = seen(xi) + C noise."""
     c = core()
     n, m = len(mean), len(y)
 
     @c.ffi.callback("int(void *, const real *, real *, real *, stewart_scratch)")
-    def rows(_: Any, xi: Any, e: Any, H: Any, scratch: Any) -> int:
+    def rows(_, xi, e, H, scratch):
         at = np.array([xi[i] for i in range(n)])
         whitened = np.linalg.solve(C, np.column_stack([y - seen(at), jacobian(at)]))
         for i in range(m):
@@ -39,7 +27,7 @@ def update(
         return m
 
     @c.ffi.callback("int(void *, const real *, const real *, stewart_scratch)")
-    def settle(_: Any, xi: Any, better: Any, scratch: Any) -> int:
+    def settle(_, xi, better, scratch):
         return 0
 
     found, P, scalars = mean.copy(), np.empty((n, n)), np.empty(2)
@@ -55,7 +43,7 @@ def update(
 
 @pytest.mark.parametrize("m", [1, M, 15])
 @pytest.mark.parametrize("rank", [4, N])
-def test_a_linear_update_is_kalmans(m: int, rank: int) -> None:
+def test_a_linear_update_is_kalmans(m, rank):
     """Also with exact knowledge of some combinations, and with correlated noise."""
     mean, root = RNG.normal(size=N), np.zeros((N, N))
     root[:, :rank] = RNG.normal(size=(N, rank))
@@ -71,7 +59,7 @@ def test_a_linear_update_is_kalmans(m: int, rank: int) -> None:
     assert spread == pytest.approx(np.linalg.slogdet(S)[1] - np.linalg.slogdet(R)[1])
 
 
-def test_iterations_end_in_the_least_squares_estimate() -> None:
+def test_iterations_end_in_the_least_squares_estimate():
     A, root = RNG.normal(size=(M, N)), np.tril(RNG.normal(size=(N, N))) + 2 * np.eye(N)
     mean, C = 0.1 * RNG.normal(size=N), 0.3 * np.eye(M)
     y = np.sin(A @ (mean + 0.1 * RNG.normal(size=N)))
@@ -79,7 +67,7 @@ def test_iterations_end_in_the_least_squares_estimate() -> None:
         mean, root, lambda x: np.sin(A @ x), lambda x: np.cos(A @ x)[:, None] * A, y, C, 40
     )
 
-    def misfit(x: Array) -> Array:
+    def misfit(x):
         return np.concatenate([np.linalg.solve(root, x - mean), (y - np.sin(A @ x)) / 0.3])
 
     best = least_squares(misfit, mean, xtol=1e-15, ftol=1e-15, gtol=1e-15)
@@ -87,7 +75,7 @@ def test_iterations_end_in_the_least_squares_estimate() -> None:
     assert covariance == pytest.approx(np.linalg.inv(best.jac.T @ best.jac), abs=1e-5)
 
 
-def test_bounds_hold_in_an_update_and_nan_is_no_result() -> None:
+def test_bounds_hold_in_an_update_and_nan_is_no_result():
     H, y = np.eye(N), np.full(N, 5.0)
     lower, upper = -FREE.copy(), FREE.copy()
     upper[3] = 1.0
@@ -101,7 +89,7 @@ def test_bounds_hold_in_an_update_and_nan_is_no_result() -> None:
         )
 
 
-def test_a_prediction_has_the_sum_of_both_covariances() -> None:
+def test_a_prediction_has_the_sum_of_both_covariances():
     c, n = core(), 20
     H, std, L = RNG.normal(size=(12, n)), RNG.uniform(0, 1, 12), RNG.normal(size=(n, n))
     std[3] = 0.0
@@ -115,7 +103,7 @@ def test_a_prediction_has_the_sum_of_both_covariances() -> None:
 
 
 @pytest.mark.parametrize("rank", [0, 4, N])
-def test_a_root_of_a_covariance_that_may_be_singular(rank: int) -> None:
+def test_a_root_of_a_covariance_that_may_be_singular(rank):
     c, half = core(), RNG.normal(size=(N, rank))
     P = half @ half.T
     root = P.copy()

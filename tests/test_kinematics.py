@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import ArrayLike
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.optimize import minimize_scalar
@@ -16,7 +15,6 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.mechanism.assembly import joint_state
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import (
     ForwardKinematicsError,
     SingularPoseError,
@@ -25,7 +23,6 @@ from stewart_drake.mechanism.kinematics import (
     leg_geometry,
     rotation,
 )
-from stewart_drake.types import Array
 from tests import singular
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
@@ -33,12 +30,12 @@ seeds = st.integers(0, 2**32 - 1)
 seeded = settings(max_examples=40, deadline=None, derandomize=True)
 
 
-def random_machine(rng: np.random.Generator) -> Mechanism:
+def random_machine(rng):
     """A random mechanism whose legs use either crank branch."""
     return dataclasses.replace(random_mechanism(rng), branches=rng.choice([-1, 1], 6))
 
 
-def crank_tips(mechanism: Mechanism, angles: ArrayLike) -> Array:
+def crank_tips(mechanism, angles):
     """p_WT (6, 3): the cranks turned by Drake."""
     return np.array(
         [
@@ -50,17 +47,17 @@ def crank_tips(mechanism: Mechanism, angles: ArrayLike) -> Array:
     )
 
 
-def plate_joints(mechanism: Mechanism, pose: ArrayLike) -> Array:
+def plate_joints(mechanism, pose):
     """p_WQ (6, 3): the plate placed by Drake."""
     X_WP = RigidTransform(RollPitchYaw(np.array(pose[:3])), np.array(pose[3:]))
     return X_WP.multiply(mechanism.p_PQ.T).T
 
 
-def rod_lengths(mechanism: Mechanism, pose: ArrayLike, angles: ArrayLike) -> Array:
+def rod_lengths(mechanism, pose, angles):
     return np.linalg.norm(plate_joints(mechanism, pose) - crank_tips(mechanism, angles), axis=1)
 
 
-def turn(a: Array, b: Array) -> Array:
+def turn(a, b):
     """Smallest angles from b to a."""
     return (a - b + np.pi) % (2 * np.pi) - np.pi
 
@@ -69,7 +66,7 @@ def turn(a: Array, b: Array) -> Array:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_rotation_and_angle_rates_are_those_of_drake(seed: int) -> None:
+def test_rotation_and_angle_rates_are_those_of_drake(seed):
     rng = np.random.default_rng(seed)
     rpy, rates = rng.uniform(-np.pi, np.pi, 3), rng.normal(size=3)
     drake = RollPitchYaw(rpy)
@@ -89,7 +86,7 @@ def test_rotation_and_angle_rates_are_those_of_drake(seed: int) -> None:
 
 @seeded
 @given(seeds)
-def test_rods_keep_their_length(seed: int) -> None:
+def test_rods_keep_their_length(seed):
     rng = np.random.default_rng(seed)
     mechanism = random_machine(rng)
     pose = random_pose(rng, mechanism)
@@ -99,7 +96,7 @@ def test_rods_keep_their_length(seed: int) -> None:
 
 @seeded
 @given(seeds)
-def test_branches_are_the_two_solutions_on_either_side_of_the_joint(seed: int) -> None:
+def test_branches_are_the_two_solutions_on_either_side_of_the_joint(seed):
     rng = np.random.default_rng(seed)
     plus = dataclasses.replace(random_mechanism(rng), branches=np.ones(6))
     minus = dataclasses.replace(plus, branches=-np.ones(6))
@@ -117,7 +114,7 @@ def test_branches_are_the_two_solutions_on_either_side_of_the_joint(seed: int) -
 
 @seeded
 @given(seeds)
-def test_leg_geometry_is_that_of_the_assembled_leg(seed: int) -> None:
+def test_leg_geometry_is_that_of_the_assembled_leg(seed):
     rng = np.random.default_rng(seed)
     mechanism = random_machine(rng)
     pose = random_pose(rng, mechanism)
@@ -135,7 +132,7 @@ def test_leg_geometry_is_that_of_the_assembled_leg(seed: int) -> None:
 
 @seeded
 @given(seeds)
-def test_jacobian_is_the_derivative_of_the_crank_angles(seed: int) -> None:
+def test_jacobian_is_the_derivative_of_the_crank_angles(seed):
     rng = np.random.default_rng(seed)
     mechanism = random_machine(rng)
     pose, h = random_pose(rng, mechanism), 1e-6
@@ -151,7 +148,7 @@ def test_jacobian_is_the_derivative_of_the_crank_angles(seed: int) -> None:
 # ------------------------------------------------------------------ cranks -> pose
 
 
-def test_poses_of_the_paper_mechanism_survive_the_round_trip() -> None:
+def test_poses_of_the_paper_mechanism_survive_the_round_trip():
     rng = np.random.default_rng(2021)
     worst = 0.0
     for _ in range(1000):
@@ -163,7 +160,7 @@ def test_poses_of_the_paper_mechanism_survive_the_round_trip() -> None:
 
 @seeded
 @given(seeds)
-def test_poses_of_any_mechanism_survive_the_round_trip(seed: int) -> None:
+def test_poses_of_any_mechanism_survive_the_round_trip(seed):
     rng = np.random.default_rng(seed)
     mechanism = random_machine(rng)
     pose = random_pose(rng, mechanism)
@@ -173,7 +170,7 @@ def test_poses_of_any_mechanism_survive_the_round_trip(seed: int) -> None:
 
 @seeded
 @given(seeds)
-def test_forward_kinematics_returns_an_assembly_or_raises(seed: int) -> None:
+def test_forward_kinematics_returns_an_assembly_or_raises(seed):
     """From any guess and any crank angles; what it returns closes all loops on its branches."""
     rng = np.random.default_rng(seed)
     angles = PAPER.crank_angles(PAPER.home) + rng.uniform(-1.5, 1.5, 6)
@@ -186,7 +183,7 @@ def test_forward_kinematics_returns_an_assembly_or_raises(seed: int) -> None:
     np.testing.assert_allclose(turn(PAPER.crank_angles(pose), angles), 0, atol=1e-6)
 
 
-def test_forward_kinematics_refuses_angles_that_no_pose_has() -> None:
+def test_forward_kinematics_refuses_angles_that_no_pose_has():
     """Two legs whose plate joints are neighbours, their tips further apart than both rods reach."""
     short = dataclasses.replace(
         PAPER,
@@ -206,7 +203,7 @@ def test_forward_kinematics_refuses_angles_that_no_pose_has() -> None:
 
 
 @pytest.mark.parametrize("leg", range(6))
-def test_forward_kinematics_refuses_the_other_crank_branch(leg: int) -> None:
+def test_forward_kinematics_refuses_the_other_crank_branch(leg):
     flipped = PAPER.branches * np.where(np.arange(6) == leg, -1, 1)
     other = dataclasses.replace(PAPER, branches=flipped)
     pose = PAPER.home + [0.1, -0.05, 0.1, 0.01, 0, 0.02]
@@ -217,7 +214,7 @@ def test_forward_kinematics_refuses_the_other_crank_branch(leg: int) -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_numbers_that_are_none_are_refused(bad: float) -> None:
+def test_numbers_that_are_none_are_refused(bad):
     pose = PAPER.home.copy()
     pose[5] = bad
     with pytest.raises(UnreachablePoseError), np.errstate(invalid="ignore"):
@@ -229,11 +226,11 @@ def test_numbers_that_are_none_are_refused(bad: float) -> None:
 # ------------------------------------------------------------------ reach
 
 
-def distance_to_crank_circle(mechanism: Mechanism, leg: int, p_WQ: Array) -> tuple[float, float]:
+def distance_to_crank_circle(mechanism, leg, p_WQ):
     """Smallest and largest distance from a point to the circle of a crank's tip, by search."""
     R, u = mechanism.R_WS[leg], mechanism.crank_lengths[leg]
 
-    def distance(angle: float) -> float:
+    def distance(angle):
         tip = mechanism.p_WS[leg] + u * AngleAxis(angle, R[:, 2]).rotation() @ R[:, 0]
         return float(np.linalg.norm(p_WQ - tip))
 
@@ -253,7 +250,7 @@ def distance_to_crank_circle(mechanism: Mechanism, leg: int, p_WQ: Array) -> tup
 
 @settings(seeded, max_examples=20)
 @given(seeds)
-def test_reach_margins_are_what_a_search_over_the_crank_circle_finds(seed: int) -> None:
+def test_reach_margins_are_what_a_search_over_the_crank_circle_finds(seed):
     """For poses within reach, out of reach, and too close to the base for the rod."""
     rng = np.random.default_rng(seed)
     mechanism = random_machine(rng)
@@ -268,7 +265,7 @@ def test_reach_margins_are_what_a_search_over_the_crank_circle_finds(seed: int) 
 
 @pytest.mark.parametrize("leg", range(6))
 @pytest.mark.parametrize("beyond", [1e-6, 0.012, 0.3])
-def test_error_names_the_legs_and_how_far_each_is_out_of_reach(leg: int, beyond: float) -> None:
+def test_error_names_the_legs_and_how_far_each_is_out_of_reach(leg, beyond):
     rng = np.random.default_rng(leg)
     mechanism = random_machine(rng)
     pose = random_pose(rng, mechanism)
@@ -302,12 +299,12 @@ def test_error_names_the_legs_and_how_far_each_is_out_of_reach(leg: int, beyond:
 
 
 @pytest.fixture
-def stretched() -> Mechanism:
+def stretched():
     """Leg 1 exactly at its dead centre at home."""
     return singular.stretched()
 
 
-def test_dead_centre_is_the_edge_of_reach(stretched: Mechanism) -> None:
+def test_dead_centre_is_the_edge_of_reach(stretched):
     home = stretched.home
     assert stretched.reach_margins(home)[0] == 0
     assert stretched.crank_angles(home)[0] == 0
@@ -322,7 +319,7 @@ def test_dead_centre_is_the_edge_of_reach(stretched: Mechanism) -> None:
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_jacobian_at_a_dead_centre_names_the_leg(stretched: Mechanism) -> None:
+def test_jacobian_at_a_dead_centre_names_the_leg(stretched):
     """A millimetre inside it is there, and large: the crank's angle goes with the square root."""
     with pytest.raises(SingularPoseError, match="dead centre of leg 1") as caught:
         stretched.jacobian(stretched.home)
@@ -338,7 +335,7 @@ def test_jacobian_at_a_dead_centre_names_the_leg(stretched: Mechanism) -> None:
     np.testing.assert_allclose(abs(stretched.jacobian(inside)[0, 3]), expected, rtol=1e-4)
 
 
-def test_forward_kinematics_passes_through_a_dead_centre(stretched: Mechanism) -> None:
+def test_forward_kinematics_passes_through_a_dead_centre(stretched):
     home = stretched.home
     angles = stretched.crank_angles(home)
     for seed in range(10):
@@ -349,7 +346,7 @@ def test_forward_kinematics_passes_through_a_dead_centre(stretched: Mechanism) -
 # ------------------------------------------------------------------ the paper's mechanism
 
 
-def test_trajectory_of_the_paper_is_within_reach_and_well_conditioned() -> None:
+def test_trajectory_of_the_paper_is_within_reach_and_well_conditioned():
     """Equation (46); the angle between rod and crank tangent is taken from Drake's rotations."""
     amplitude = np.array([np.pi / 12, np.pi / 12, np.pi / 12, 0.02, 0.02, 0.08])
     worst, closest = 1.0, np.inf
@@ -365,7 +362,7 @@ def test_trajectory_of_the_paper_is_within_reach_and_well_conditioned() -> None:
     assert closest == pytest.approx(7.4e-3, abs=5e-5)
 
 
-def test_plain_lists_are_accepted() -> None:
+def test_plain_lists_are_accepted():
     pose = [0.1, -0.1, 0.05, 0.01, 0.02, 0.4]
     angles = PAPER.crank_angles(np.array(pose))
     np.testing.assert_array_equal(PAPER.crank_angles(pose), angles)
@@ -377,7 +374,7 @@ def test_plain_lists_are_accepted() -> None:
 # ------------------------------------------------------------------ the compiled core
 
 
-def joined_to_home(mechanism: Mechanism, number: int) -> list[Array]:
+def joined_to_home(mechanism, number):
     """Poses at the ends of straight lines from home that stay within the workspace."""
     rng, scale = np.random.default_rng(1), np.repeat([3.0, 4 * mechanism.crank_lengths.max()], 3)
     found = []
@@ -394,7 +391,7 @@ def joined_to_home(mechanism: Mechanism, number: int) -> list[Array]:
 
 
 @pytest.mark.parametrize("name", ["desktop", "motion_base", "paper", "paper_clear"])
-def test_the_core_has_the_same_kinematics(name: str) -> None:
+def test_the_core_has_the_same_kinematics(name):
     """Angles and Jacobian; and every pose up to a singularity, from the guess of home."""
     mechanism, c = load_mechanism(name), core()
     legs, angles, J = np.array(geometry_of(mechanism)), np.empty(6), np.empty((6, 6))
@@ -409,7 +406,7 @@ def test_the_core_has_the_same_kinematics(name: str) -> None:
         np.testing.assert_allclose(found, pose, rtol=0, atol=1e-8)
 
 
-def test_the_core_refuses_what_no_pose_has() -> None:
+def test_the_core_refuses_what_no_pose_has():
     c, legs, J = core(), np.array(geometry_of(PAPER)), np.empty((6, 6))
     angles, away = np.array([0.0, 3, 0, 3, 0, 3]), PAPER.home + [0, 0, 0, 0, 0, 1.0]
     found = PAPER.home.copy()

@@ -2,12 +2,11 @@
 
 import dataclasses
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Belief
@@ -16,7 +15,6 @@ from stewart_drake.law.design_models import MultibodyModel, PaperModel
 from stewart_drake.law.error_model import double_integrators
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
-    Feedforward,
     InverseDynamicsFeedforward,
     NoFeedforward,
 )
@@ -27,13 +25,12 @@ from stewart_drake.law.motion import Preview
 from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import VIGOROUS, NominalPlant
 from stewart_drake.law.observers import NoObserver, ParameterObserver
-from stewart_drake.law.sensing import FirstState, Sensing, StateSensing
+from stewart_drake.law.sensing import FirstState, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.mechanism.assembly import torque_map
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
@@ -53,7 +50,7 @@ ZERO = np.zeros(8)
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
 @pytest.mark.parametrize("steps", [0, 1, 4])
-def test_what_acts_when_is_what_the_delay_says(steps: int, fraction: float) -> None:
+def test_what_acts_when_is_what_the_delay_says(steps, fraction):
     """Looked up at instants: T_k acts during [k dt + eta, (k + 1) dt + eta)."""
     dt, timeline = 0.1, Timeline(0.1, Delay(steps, fraction))
     count = timeline.queue_length + 1
@@ -61,7 +58,7 @@ def test_what_acts_when_is_what_the_delay_says(steps: int, fraction: float) -> N
     # The newest was computed at -dt, the sample is now at 0.
     computed = dt * np.arange(-count, 0)
 
-    def at(t: float) -> float:
+    def at(t):
         (found,) = [
             torque[0]
             for torque, begin in zip(in_flight, computed + timeline.eta, strict=True)
@@ -88,7 +85,7 @@ def test_what_acts_when_is_what_the_delay_says(steps: int, fraction: float) -> N
     assert timeline.holds(-1, 1) == pytest.approx(timeline.eta + dt * np.array([-1, 0, 1]))
 
 
-def test_older_torques_than_the_delay_needs_change_nothing() -> None:
+def test_older_torques_than_the_delay_needs_change_nothing():
     timeline, rng = Timeline(0.1, Delay(2, 0.4)), np.random.default_rng(0)
     many = rng.normal(0, 1, (9, 6))
     assert np.array_equal(timeline.queue(many), many[-3:])
@@ -101,7 +98,7 @@ def test_older_torques_than_the_delay_needs_change_nothing() -> None:
 # The plant as it is known.
 
 
-def test_motors_let_through_what_is_within_their_limit() -> None:
+def test_motors_let_through_what_is_within_their_limit():
     motors = TorqueLimit(0.5)
     asked = np.array([-1.0, -0.5, 0.0, 0.2, 0.5, 3.0])
     assert np.array_equal(motors.let_through(asked), [-0.5, -0.5, 0.0, 0.2, 0.5, 0.5])
@@ -110,7 +107,7 @@ def test_motors_let_through_what_is_within_their_limit() -> None:
     assert not TorqueLimit().reached(1e300 * asked)
 
 
-def test_strong_torques_are_integrated_in_finer_steps() -> None:
+def test_strong_torques_are_integrated_in_finer_steps():
     for size, steps in ((0.5, 2), (0.51, 2 * VIGOROUS)):
         torques = np.zeros((3, 6))
         torques[1, 4] = -size
@@ -124,7 +121,7 @@ def test_strong_torques_are_integrated_in_finer_steps() -> None:
 # What is measured.
 
 
-def test_a_measurement_marks_what_is_lost() -> None:
+def test_a_measurement_marks_what_is_lost():
     values = np.array([1.0, np.nan, 3.0, np.inf])
     measurement = Measurement.of(values)
     assert np.array_equal(measurement.valid, [True, False, True, False])
@@ -135,7 +132,7 @@ def test_a_measurement_marks_what_is_lost() -> None:
 
 
 @pytest.mark.parametrize("estimate", ["[]", "[torque_bias,payload,damping]"])
-def test_who_takes_values_for_those_of_now_refuses_old_ones(estimate: str) -> None:
+def test_who_takes_values_for_those_of_now_refuses_old_ones(estimate):
     law = law_of(f"controller.estimate={estimate}", "delay.steps=0")
     old = Measurement.of(HOME[:12], age=0.1)
     memory = law.initial_memory(np.zeros((0, 6)))
@@ -143,7 +140,7 @@ def test_who_takes_values_for_those_of_now_refuses_old_ones(estimate: str) -> No
         law.step(memory, old, lambda times: np.tile(HOME, (len(times), 1)), WEIGHTS)
 
 
-def test_a_loss_is_told_by_the_mask_alone() -> None:
+def test_a_loss_is_told_by_the_mask_alone():
     """A number in its place is not looked at."""
     law = law_of("controller.estimate=[]", "delay.steps=0")
     valid = np.ones(12, bool)
@@ -151,7 +148,7 @@ def test_a_loss_is_told_by_the_mask_alone() -> None:
     lost = Measurement(HOME[:12] + 1e-3 * np.eye(12)[4], valid)
     memory = law.initial_memory(np.zeros((0, 6)))
 
-    def home(times: Array) -> Array:
+    def home(times):
         return np.tile(HOME, (len(times), 1))
 
     memory = law.step(memory, Measurement.of(HOME[:12]), home, WEIGHTS)
@@ -171,7 +168,7 @@ def test_a_loss_is_told_by_the_mask_alone() -> None:
         ("measurements_frozen", {6: 0.5}),  # moves on, but its pose does not
     ],
 )
-def test_each_fault_of_a_state_by_hand(fault: str | None, change: dict[int, float]) -> None:
+def test_each_fault_of_a_state_by_hand(fault, change):
     sensing = StateSensing(np.zeros(12), np.ones(6))
     last = HOME[:12]
     values = last.copy()
@@ -192,47 +189,45 @@ class Twice:
     std: Array
 
     @property
-    def size(self) -> int:
+    def size(self):
         return 24
 
     @property
-    def noise_std(self) -> Array:
+    def noise_std(self):
         return np.tile(np.sqrt(2) * self.std / self.unit, 2)
 
-    def seen(self, state: Array) -> Array:
+    def seen(self, state):
         return np.tile(state / self.unit, 2)
 
-    def through(self, state: Array, changes: Array) -> Array:
+    def through(self, state, changes):
         scaled = (changes.T / self.unit).T
         return np.concatenate([scaled, scaled])
 
-    def fault(
-        self, measurement: Measurement, last: Array, period: float, mechanism: Mechanism
-    ) -> str | None:
+    def fault(self, measurement, last, period, mechanism):
         return None if measurement.complete else "measurements_missing"
 
-    def stood(self, measurement: Measurement, last: Array, still: Array) -> Array:
+    def stood(self, measurement, last, still):
         return still
 
-    def now(self, measurement: Measurement) -> tuple[Sensing, Measurement]:
+    def now(self, measurement):
         return self, measurement
 
-    def start(self, measurement: Measurement, near: Array | None = None) -> FirstState:
+    def start(self, measurement, near=None):
         state = self.unit * measurement.values.reshape(2, 12).mean(axis=0)
         return FirstState(state, np.diag(self.std**2))
 
 
-def test_two_sensors_with_the_noise_of_two_are_one() -> None:
+def test_two_sensors_with_the_noise_of_two_are_one():
     """Another kind of sensing, other units, other size: the same estimates, the same torques."""
     law, reference, rng = law_of("delay.steps=2"), sine(0.5), np.random.default_rng(3)
     std = 1e-4 * np.repeat([0.3, 0.03, 0.3, 0.03], 3)
     single = replace(law, sensing=StateSensing(std, np.ones(6)))
-    double: Sensing = Twice(10.0 ** rng.integers(-2, 3, 12), std)
+    double = Twice(10.0 ** rng.integers(-2, 3, 12), std)
     noise = [std * rng.standard_normal(12) for _ in range(12)]
     away = [std * rng.standard_normal(12) for _ in range(12)]
     queue, truth = nominal_queue(law, reference), np.array([0.01] * 6 + [0.3, 1e-3])
 
-    def both(k: int, x: Array) -> Array:
+    def both(k, x):
         if k == 7:
             return np.full(24, np.nan)
         two = [x + noise[k] + away[k], x + noise[k] - away[k]]
@@ -256,13 +251,13 @@ def test_two_sensors_with_the_noise_of_two_are_one() -> None:
 # Feedforward, model, cost.
 
 
-def nodes_of(feedforward: Feedforward, timeline: Timeline) -> Array:
+def nodes_of(feedforward, timeline):
     """The reference (n, 18) at the nodes, of a motion that is no symmetric one."""
     reference = sine(0.7)
     return np.array([reference(1.0 + t) for t in feedforward.nodes(timeline, 2)])
 
 
-def test_nodes_are_those_of_the_holds_and_their_neighbours() -> None:
+def test_nodes_are_those_of_the_holds_and_their_neighbours():
     timeline = Timeline(0.1, Delay(3, 0.5))
     nodes = NoFeedforward().nodes(timeline, 2).reshape(-1, 2)
     begins = timeline.eta + 0.1 * np.array([-3, -2, -1, 0, 1])
@@ -270,12 +265,12 @@ def test_nodes_are_those_of_the_holds_and_their_neighbours() -> None:
     assert np.ptp(nodes, axis=1) == pytest.approx(0.1 / np.sqrt(3))
 
 
-def test_each_feedforward_holds_what_it_says() -> None:
+def test_each_feedforward_holds_what_it_says():
     timeline = Timeline(0.1, Delay(3, 0.4))
     nodes = nodes_of(NoFeedforward(), timeline)
     still = nodes * np.repeat([1.0, 0.0, 0.0], 6)
 
-    def by_hand(rows: Array) -> tuple[Array, Array]:
+    def by_hand(rows):
         torques = [HEAVY.inverse_dynamics(*np.split(row, 3), ZERO) for row in rows]
         return means_and_changes(np.reshape(torques, (-1, 2, 6)))
 
@@ -297,7 +292,7 @@ def test_each_feedforward_holds_what_it_says() -> None:
     assert InverseDynamicsFeedforward().offset(moving.changes, B, timeline).all()
 
 
-def test_a_model_is_refused_where_the_plate_cannot_be() -> None:
+def test_a_model_is_refused_where_the_plate_cannot_be():
     far = HOME[:12] + 0.3 * np.eye(12)[5]
     for kind in (PaperModel(), MultibodyModel()):
         with pytest.raises(UnreachablePoseError):
@@ -305,7 +300,7 @@ def test_a_model_is_refused_where_the_plate_cannot_be() -> None:
         kind.at(HOME[:12], np.zeros(6), ZERO, PLANT)
 
 
-def test_the_papers_model_is_made_of_its_torque_map() -> None:
+def test_the_papers_model_is_made_of_its_torque_map():
     x = HOME[:12] + 1e-2
     for form in ("virtual_work", "printed"):
         expected = double_integrators(torque_map(PAPER, x[:6], form))
@@ -313,7 +308,7 @@ def test_the_papers_model_is_made_of_its_torque_map() -> None:
         assert np.array_equal(found.A, expected.A) and np.array_equal(found.B, expected.B)
 
 
-def test_the_cost_has_an_integral_or_not() -> None:
+def test_the_cost_has_an_integral_or_not():
     both = QuadraticCost(np.arange(1.0, 7), np.arange(7.0, 13), np.full(6, 2.0))
     Q, R = both.matrices(np.array([3.0, 5.0]))
     assert np.array_equal(Q, np.diag(3 * np.arange(1.0, 13)))
@@ -332,7 +327,7 @@ def test_the_cost_has_an_integral_or_not() -> None:
 # Memory.
 
 
-def arrays(value: Any, name: str = "memory") -> dict[str, tuple[int, ...]]:
+def arrays(value, name="memory"):
     """Shapes of all that a memory is made of, by name; numbers have none."""
     if isinstance(value, np.ndarray):
         return {name: value.shape}
@@ -346,11 +341,11 @@ def arrays(value: Any, name: str = "memory") -> dict[str, tuple[int, ...]]:
 
 @pytest.mark.parametrize("settings", [(), ("delay.fraction=0.4",), ("controller.integral=false",)])
 @pytest.mark.parametrize("controller", ["lqr", "delay_lqi", "predictor_lqi"])
-def test_shapes_never_change_whatever_happens(controller: str, settings: tuple[str, ...]) -> None:
+def test_shapes_never_change_whatever_happens(controller, settings):
     law = law_of("delay.steps=2", *settings, controller=controller)
     reference = sine(0.3)
 
-    def seen(k: int, x: Array) -> Array:
+    def seen(k, x):
         return {0: np.full(12, np.nan), 3: x + 0.01, 4: x + 100.0}.get(k, x)
 
     loop = Loop(law, reference, queue=nominal_queue(law, reference))
@@ -363,11 +358,11 @@ def test_shapes_never_change_whatever_happens(controller: str, settings: tuple[s
     assert not names & {"seconds", "time", "clock"}
 
 
-def test_the_same_sample_leaves_the_same_memory() -> None:
+def test_the_same_sample_leaves_the_same_memory():
     """Nothing in it depends on when it was computed, or on what a part saw before."""
     law = law_of("delay.steps=2")
 
-    def once() -> list[Array]:
+    def once():
         loop = Loop(law, sine(0.3)).run(3)
         memory, estimate = loop.memory, loop.memory.belief.estimate
         return [memory.torque, memory.gain, memory.in_flight, estimate.mean, estimate.covariance]
@@ -375,7 +370,7 @@ def test_the_same_sample_leaves_the_same_memory() -> None:
     assert all(np.array_equal(a, b) for a, b in zip(once(), once(), strict=True))
 
 
-def test_a_preview_of_other_instants_is_a_mistake() -> None:
+def test_a_preview_of_other_instants_is_a_mistake():
     law = law_of("delay.steps=2")
     memory, times = law.initial_memory(np.zeros((2, 6))), law.preview_times
     for wrong in (times[:-1], times + 0.01):
@@ -393,17 +388,10 @@ class Blend:
 
     share: float
 
-    def start(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Belief:
+    def start(self, timeline, sensing, plant):
         return Belief.nothing(timeline, sensing.size, plant.dynamics.parameters)
 
-    def observe(
-        self,
-        belief: Belief,
-        measurement: Measurement,
-        in_flight: Array,
-        sensing: Sensing,
-        plant: NominalPlant,
-    ) -> Belief:
+    def observe(self, belief, measurement, in_flight, sensing, plant):
         if not belief.has_state:
             return belief.at(measurement.values) if measurement.complete else belief
         schedule, _ = belief.timeline.last_period(in_flight)
@@ -412,12 +400,12 @@ class Blend:
         return belief.at(x + self.share * beside)
 
 
-def test_a_fourth_observer_needs_no_change_of_the_package() -> None:
+def test_a_fourth_observer_needs_no_change_of_the_package():
     """It smooths noise, goes on where values are lost, and holds the plate on the reference."""
     law, reference, rng = law_of("delay.steps=2"), sine(0.5), np.random.default_rng(0)
     noise = 1e-4 * rng.standard_normal((40, 12))
 
-    def seen(k: int, x: Array) -> Array:
+    def seen(k, x):
         lost = k in (0, 9) or (k == 20) & (np.arange(12) < 3)
         return np.where(lost, np.nan, x + noise[k])
 
@@ -431,7 +419,7 @@ def test_a_fourth_observer_needs_no_change_of_the_package() -> None:
     assert errors[Blend(0.2)] < 0.5 * errors[NoObserver()]
 
 
-def test_a_fourth_observer_in_a_diagram() -> None:
+def test_a_fourth_observer_in_a_diagram():
     settings = ["start=on_reference", "duration=1.0", "delay.steps=2"]
     law = control_law(prepare(load_scenario("paper", settings=settings)))[0]
     assert isinstance(law.observer, ParameterObserver)
@@ -461,15 +449,13 @@ class Told(NoObserver):
 
     other: Timeline
 
-    def observe(self, belief: Belief, *rest: Any) -> Belief:
+    def observe(self, belief, *rest):
         return super().observe(replace(belief, timeline=self.other), *rest)
 
 
 @pytest.mark.parametrize("assumed", [0, 1, 4])
 @pytest.mark.parametrize("prediction", ["linear", "nonlinear"])
-def test_the_law_believes_in_the_delay_that_its_observer_believes_in(
-    prediction: str, assumed: int
-) -> None:
+def test_the_law_believes_in_the_delay_that_its_observer_believes_in(prediction, assumed):
     """With torques kept for the longest delay, it is the law that knew it from the start."""
     known = law_of("delay.steps=2", "controller.estimate=[]", f"controller.prediction={prediction}")
     reference = sine(0.5)
@@ -488,7 +474,7 @@ def test_the_law_believes_in_the_delay_that_its_observer_believes_in(
 
 
 @pytest.mark.parametrize(("prediction", "kept"), [("linear", False), ("nonlinear", True)])
-def test_a_gain_for_another_delay_is_used_only_where_it_fits(prediction: str, kept: bool) -> None:
+def test_a_gain_for_another_delay_is_used_only_where_it_fits(prediction, kept):
     """The Riccati equation fails at the very sample at which another delay is believed in."""
     known = law_of("delay.steps=2", "controller.estimate=[]", f"controller.prediction={prediction}")
     timeline = replace(known.timeline, delay=Delay(3))
@@ -496,7 +482,7 @@ def test_a_gain_for_another_delay_is_used_only_where_it_fits(prediction: str, ke
     law = replace(before, observer=Told(known.timeline))
     away = HOME[:12] + 1e-3
 
-    def home(times: Array) -> Array:
+    def home(times):
         return np.tile(HOME, (len(times), 1))
 
     memory = before.step(
@@ -509,7 +495,7 @@ def test_a_gain_for_another_delay_is_used_only_where_it_fits(prediction: str, ke
     assert np.isfinite(good.gain).all() and np.abs(good.torque).max() > 1e-6
 
 
-def test_a_delay_longer_than_what_is_kept_is_refused() -> None:
+def test_a_delay_longer_than_what_is_kept_is_refused():
     known = law_of("delay.steps=2", "controller.estimate=[]")
     law = replace(known, observer=Told(replace(known.timeline, delay=Delay(3))))
     with pytest.raises(ValueError, match="2 torques are kept in flight; expected at least the 3"):
@@ -519,19 +505,17 @@ def test_a_delay_longer_than_what_is_kept_is_refused() -> None:
 class Cautious(LeafSystem):
     """A source of weights: the errors count less the larger they are."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self._measurement = self.DeclareVectorInputPort("measurement", 12)
         self.DeclareVectorOutputPort("weights", 2, self._weigh)
 
-    def _weigh(self, context: Context, output: BasicVector) -> None:
+    def _weigh(self, context, output):
         error = np.abs(self._measurement.Eval(context) - HOME[:12]).max()
         output.SetFromVector([1 / (1 + 1e3 * error), 1.0])
 
 
-def test_a_source_of_weights_needs_no_change_of_the_package(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_source_of_weights_needs_no_change_of_the_package(monkeypatch):
     stepped_in_python(monkeypatch)  # compared to the last bit with the law itself
     law = law_of("delay.steps=2")
     builder = DiagramBuilder()

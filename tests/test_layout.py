@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +21,6 @@ from stewart_drake.studies.layout_search import (
     Found,
     Layout,
     LayoutStudy,
-    Problem,
     judge,
     problem_of,
     search,
@@ -43,7 +40,6 @@ from stewart_drake.studies.layout_space import (
 from stewart_drake.studies.reach import margins_along
 from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.workspace import size_motors
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.screen import too_long
 
@@ -54,7 +50,7 @@ OWN = Arrangement((5, 0, 1, 2, 3, 4), (-1, 1) * 3, 60.0)
 QUICK = ("plant.kind=exact", "duration=1.5")
 
 
-def problem(**options: Any) -> Problem:
+def problem(**options):
     chosen = {"goal": "condition", "limits": {}, "vary": {}, "keep": ()} | options
     return problem_of(load_scenario("paper", None, QUICK), **chosen)
 
@@ -63,7 +59,7 @@ def problem(**options: Any) -> Problem:
 
 
 @pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
-def test_measures_are_what_the_workspace_study_says(name: str) -> None:
+def test_measures_are_what_the_workspace_study_says(name):
     experiment = prepare(load_scenario(name))
     time = check_instants(experiment.scenario.duration)[::10]
     mechanism, reference = experiment.mechanism, experiment.reference
@@ -81,13 +77,13 @@ def test_measures_are_what_the_workspace_study_says(name: str) -> None:
     assert peak_torque(experiment.nominal, motion) == pytest.approx(torque, rel=1e-12)
 
 
-def _still(pose: Array) -> Any:
+def _still(pose):
     from pydrake.trajectories import PiecewisePolynomial
 
     return PiecewisePolynomial.ZeroOrderHold([0.0, 1.0], np.column_stack([pose, pose]))
 
 
-def test_joint_angles_are_those_of_the_link_frames() -> None:
+def test_joint_angles_are_those_of_the_link_frames():
     experiment = assemble(load_scenario("paper"))
     motion = motion_of(PAPER.home, experiment.reference, np.linspace(0, 6, 25))
     found, home = geometry(PAPER, motion), placed(PAPER, PAPER.home)
@@ -104,7 +100,7 @@ def test_joint_angles_are_those_of_the_link_frames() -> None:
     assert found["crank_joint_deg"] == pytest.approx(np.rad2deg(max(leans)), rel=1e-9)
 
 
-def test_a_wish_tells_which_limits_are_missed_and_by_which_share() -> None:
+def test_a_wish_tells_which_limits_are_missed_and_by_which_share():
     wish = wish_of("reach", {"clearance": 0.01, "condition": 4.0}, {"clearance": 1.0})
     missed = wish.missed({"clearance": 0.004, "condition": 5.0, "reach": 0.1})
     assert missed == pytest.approx({"clearance": 0.6, "condition": 0.25})
@@ -115,7 +111,7 @@ def test_a_wish_tells_which_limits_are_missed_and_by_which_share() -> None:
 # ------------------------------------------------------------------ the space
 
 
-def test_the_machine_it_begins_from_is_in_the_space() -> None:
+def test_the_machine_it_begins_from_is_in_the_space():
     space = space_around(SPEC, {}, ())
     machine = build_mechanism(space.machine(own_values(SPEC), OWN, "paper"))
     assert machine == PAPER
@@ -126,7 +122,7 @@ def test_the_machine_it_begins_from_is_in_the_space() -> None:
 
 @given(order=st.sampled_from([(5, 0, 1, 2, 3, 4), (0, 1, 2, 3, 4, 5)]), signs=st.booleans())
 @settings(max_examples=4, deadline=None, derandomize=True)
-def test_at_the_centre_the_legs_of_a_pair_are_mirror_images(order: Any, signs: bool) -> None:
+def test_at_the_centre_the_legs_of_a_pair_are_mirror_images(order, signs):
     space = space_around(SPEC, {}, ())
     branches = (1, -1) * 3 if signs else (-1, 1) * 3
     arrangement = next(
@@ -140,7 +136,7 @@ def test_at_the_centre_the_legs_of_a_pair_are_mirror_images(order: Any, signs: b
     np.testing.assert_allclose(legs.p_PQ[0] * [1, -1, 1], legs.p_PQ[1], atol=1e-12)
 
 
-def test_links_of_the_same_section_keep_a_uniform_bar_s_inertia() -> None:
+def test_links_of_the_same_section_keep_a_uniform_bar_s_inertia():
     """That of a thin bar, m l^2 / 12, grows with the cube of its length."""
     moments = bar_inertia(0.08, 0.404).tolist()
     spec = dataclasses.replace(SPEC, rod=dataclasses.replace(SPEC.rod, inertia=moments))
@@ -171,12 +167,12 @@ def test_links_of_the_same_section_keep_a_uniform_bar_s_inertia() -> None:
         ({}, PARAMETERS, "--keep: got every number"),
     ],
 )
-def test_a_space_that_is_none_is_one_line(vary: Any, keep: Any, word: str) -> None:
+def test_a_space_that_is_none_is_one_line(vary, keep, word):
     with pytest.raises(ConfigError, match=word):
         space_around(SPEC, vary, keep)
 
 
-def test_usual_bounds_are_numbers_that_a_file_may_hold() -> None:
+def test_usual_bounds_are_numbers_that_a_file_may_hold():
     assert SPEC.pattern is not None
     turned = dataclasses.replace(
         SPEC, pattern=dataclasses.replace(SPEC.pattern, rotation_deg=330.0)
@@ -184,7 +180,7 @@ def test_usual_bounds_are_numbers_that_a_file_may_hold() -> None:
     assert space_around(turned, {}, ()).bounds["rotation_deg"] == (270.0, 360.0)
 
 
-def test_a_machine_told_leg_by_leg_has_no_numbers_to_vary() -> None:
+def test_a_machine_told_leg_by_leg_has_no_numbers_to_vary():
     with pytest.raises(ConfigError, match="leg by leg; expected one with a pattern"):
         space_around(dataclasses.replace(SPEC, pattern=None), {}, ())
 
@@ -192,7 +188,7 @@ def test_a_machine_told_leg_by_leg_has_no_numbers_to_vary() -> None:
 # ------------------------------------------------------------------ the search
 
 
-def test_a_search_keeps_limits_and_betters_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_keeps_limits_and_betters_the_goal(monkeypatch):
     monkeypatch.setattr("stewart_drake.studies.layout_search.POPULATION", 3)
     asked = problem(limits={"reach": 0.005, "clearance": -1.0}, vary={"crank": (0.1, 0.12)})
     found = json.loads(search(asked, OWN, 3, 0, 4))
@@ -207,7 +203,7 @@ def test_a_search_keeps_limits_and_betters_the_goal(monkeypatch: pytest.MonkeyPa
     assert json.loads(search(asked, OWN, 4, 0, 4))["values"] != found["values"]
 
 
-def test_reach_counts_before_limits_and_limits_before_the_goal() -> None:
+def test_reach_counts_before_limits_and_limits_before_the_goal():
     asked = problem(goal="torque", limits={"reach": 0.005, "clearance": -1.0})
     own = own_values(SPEC)
     short, shorter = own.copy(), own.copy()
@@ -222,7 +218,7 @@ def test_reach_counts_before_limits_and_limits_before_the_goal() -> None:
     assert asked.cost(asked.trial(crank_as_long, OWN)) > tight.cost(missed)
 
 
-def test_a_judgement_is_of_all_instants_and_a_run() -> None:
+def test_a_judgement_is_of_all_instants_and_a_run():
     asked = problem(limits={"clearance": -1.0})
     found = json.loads(judge(asked, "paper"))
     along = margins_along(PAPER, assemble(asked.scenario).reference, check_instants(1.5))
@@ -232,14 +228,14 @@ def test_a_judgement_is_of_all_instants_and_a_run() -> None:
     assert set(found["measures"]) == {*MEASURES, "parallel"}
 
 
-def test_a_motion_out_of_reach_is_judged_without_a_run() -> None:
+def test_a_motion_out_of_reach_is_judged_without_a_run():
     far = load_scenario("paper", None, (*QUICK, "reference.offset=[0, 0, 0, 0, 0, 0.9]"))
     found = json.loads(judge(problem_of(far, "condition", {}, {}, ()), "paper"))
     assert found["outcome"]["status"] == "refused" and found["measures"]["reach"] < 0
     assert list(found["measures"]) == ["reach"]
 
 
-def test_a_layout_that_loses_its_goal_between_the_instants_looked_at_is_told() -> None:
+def test_a_layout_that_loses_its_goal_between_the_instants_looked_at_is_told():
     own = own_values(SPEC)
     lost = Layout("layout_1", PAPER, OWN.order, own, {"reach": -0.01}, {"reach": 1.02}, None,
                   Outcome("refused", "out of reach", time=0.0))  # fmt: skip
@@ -251,7 +247,7 @@ def test_a_layout_that_loses_its_goal_between_the_instants_looked_at_is_told() -
     )
 
 
-def test_errata_another_layout_is_conditioned_better() -> None:
+def test_errata_another_layout_is_conditioned_better():
     """Published lengths and separations; numbers of the search that docs/errata.md tells of."""
     asked = problem_of(
         load_scenario("paper"), "condition", {"reach": 0.005, "clearance": -1.0}, {}, ()
@@ -278,11 +274,11 @@ SMALL += ["--keep", "branches", "--keep", "plate_order", "--generations", "1", "
 
 
 @pytest.fixture
-def in_process(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def in_process(monkeypatch):
     """Jobs run here, with few trials, and are counted."""
-    done: list[int] = []
+    done = []
 
-    def here(workers: Any, calls: Any) -> Any:
+    def here(workers, calls):
         done.append(len(calls))
         return (call() for call in calls)
 
@@ -292,9 +288,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.slow
-def test_the_command_writes_machines_that_run_and_goes_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], in_process: list[int]
-) -> None:
+def test_the_command_writes_machines_that_run_and_goes_on(tmp_path, capsys, in_process):
     command = [*SMALL, "--limit", "clearance=-1", "--seed", "2", "--out", str(tmp_path)]
     assert main(command) == 0
     said = capsys.readouterr().out
@@ -325,7 +319,7 @@ def test_the_command_writes_machines_that_run_and_goes_on(
 
 
 @pytest.mark.usefixtures("in_process")
-def test_a_search_from_python_is_that_of_the_command(tmp_path: Path, in_process: list[int]) -> None:
+def test_a_search_from_python_is_that_of_the_command(tmp_path, in_process):
     keep = [name for name in PARAMETERS if name not in ("crank", "rod")] + ["branches"]
     found = sd.layout(
         load_scenario("paper", None, QUICK),
@@ -343,9 +337,7 @@ def test_a_search_from_python_is_that_of_the_command(tmp_path: Path, in_process:
     assert "layout_1" in (tmp_path / "page" / "report.html").read_text()
 
 
-def test_limits_that_nothing_keeps_are_told_and_no_machine_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_limits_that_nothing_keeps_are_told_and_no_machine_is_written(tmp_path, capsys):
     assert main([*SMALL, "--limit", "clearance=1", "--out", str(tmp_path)]) == 0
     told = " ".join(capsys.readouterr().out.split())
     assert told.startswith("no: of ") and "the nearest misses" in told and "clearance by" in told

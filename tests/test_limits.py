@@ -8,7 +8,7 @@ import pytest
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
 import stewart_drake as sd
-from stewart_drake.law.delay_model import DelayedModel, chain, delayed_model
+from stewart_drake.law.delay_model import chain, delayed_model
 from stewart_drake.law.error_model import (
     ContinuousModel,
     double_integrators,
@@ -30,15 +30,14 @@ from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.delay_limits import error_floor, simulated_growth
-from stewart_drake.studies.delay_loop import LoopMargins, loop_margins
-from stewart_drake.studies.verdict import Basis, basis
-from stewart_drake.types import Array
+from stewart_drake.studies.delay_loop import loop_margins
+from stewart_drake.studies.verdict import basis
 from tests.mechanisms import PAPER
 
 HEAVY = sd.StewartDynamics(PAPER, gravity=True)
 
 
-def found(*settings: str) -> Basis:
+def found(*settings):
     return basis(sd.load_scenario("paper", settings=("plant.kind=exact", *settings)))
 
 
@@ -46,7 +45,7 @@ def found(*settings: str) -> Basis:
 
 
 @pytest.mark.parametrize("time", [0.0, 0.7, 1.6, 2.5, 4.4])
-def test_poles_are_those_of_central_differences(time: float) -> None:
+def test_poles_are_those_of_central_differences(time):
     pose = evaluate(found().experiment.reference, time)[:6]
     torque = HEAVY.equilibrium_torque(pose)
     A = np.zeros((12, 12))
@@ -62,7 +61,7 @@ def test_poles_are_those_of_central_differences(time: float) -> None:
 
 
 @pytest.mark.parametrize(("time", "eta"), [(0.0, 0.8), (0.7, 0.3), (1.6, 0.2)])
-def test_a_prediction_error_grows_by_e_to_the_pole_times_the_delay(time: float, eta: float) -> None:
+def test_a_prediction_error_grows_by_e_to_the_pole_times_the_delay(time, eta):
     """Two runs of the exact plant in Drake's Simulator, 1e-7 apart along the fastest mode."""
     pose = evaluate(found().experiment.reference, time)[:6]
     torque = HEAVY.equilibrium_torque(pose)
@@ -89,7 +88,7 @@ def test_a_prediction_error_grows_by_e_to_the_pole_times_the_delay(time: float, 
     assert simulated == pytest.approx(growth, rel=0.05)
 
 
-def test_amplification_and_largest_delay_undo_each_other() -> None:
+def test_amplification_and_largest_delay_undo_each_other():
     for pole in (0.5, 5.0, 36.0):
         for tolerable in (2.0, 10.0, 1e3):
             delay = largest_delay(pole, tolerable)
@@ -103,7 +102,7 @@ def test_amplification_and_largest_delay_undo_each_other() -> None:
 
 
 @pytest.mark.parametrize(("eta", "frequency"), [(0.8, 1.0), (0.4, 2.0), (1.5, 0.5)])
-def test_floor_of_a_sine_is_the_closed_form(eta: float, frequency: float) -> None:
+def test_floor_of_a_sine_is_the_closed_form(eta, frequency):
     """50 (1 - cos(w eta)) / w: 15.16 % s for the paper's delay."""
     expected = 50 * (1 - math.cos(frequency * eta)) / frequency
     assert error_floor(found(f"reference.frequency={frequency}"), eta) == pytest.approx(
@@ -116,7 +115,7 @@ def test_floor_of_a_sine_is_the_closed_form(eta: float, frequency: float) -> Non
 # ------------------------------------------------------------------ closed loop
 
 
-def loop(steps: int, fraction: float = 0.0) -> tuple[DelayedModel, Array]:
+def loop(steps, fraction=0.0):
     """Two coupled masses, one unstable, with their LQI gain."""
     A = np.block(
         [[np.zeros((2, 2)), np.eye(2)], [np.array([[1.0, 0.3], [-0.2, -0.5]]), -0.1 * np.eye(2)]]
@@ -128,15 +127,13 @@ def loop(steps: int, fraction: float = 0.0) -> tuple[DelayedModel, Array]:
 
 
 @pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (3, 0.0), (0, 0.4), (2, 0.7)])
-def test_closed_loop_is_that_of_the_chain(steps: int, fraction: float) -> None:
+def test_closed_loop_is_that_of_the_chain(steps, fraction):
     model, K = loop(steps, fraction)
     augmented = chain(model)
     assert closed_loop(model, K) == pytest.approx(augmented.A - augmented.B @ K, abs=1e-14)
 
 
-def run(
-    model: DelayedModel, K: Array, disturbance: Array, gain: float = 1.0
-) -> tuple[Array, Array]:
+def run(model, K, disturbance, gain=1.0):
     """The loop torque by torque: commanded (k, m) and the state at the end."""
     n, m = model.B_new.shape
     e, sent = np.zeros(n), np.zeros((len(disturbance) + 50, m))
@@ -155,9 +152,7 @@ def run(
 
 
 @pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (3, 0.0), (2, 0.7)])
-def test_sensitivity_is_what_a_simulated_disturbance_of_a_motor_shows(
-    steps: int, fraction: float
-) -> None:
+def test_sensitivity_is_what_a_simulated_disturbance_of_a_motor_shows(steps, fraction):
     """In steady state the torque acting is S times the disturbance, the commanded one -T times."""
     model, K = loop(steps, fraction)
     omega, direction = 3.0, np.array([1.0, -0.5])
@@ -170,7 +165,7 @@ def test_sensitivity_is_what_a_simulated_disturbance_of_a_motor_shows(
 
 
 @pytest.mark.parametrize("steps", [0, 2, 5])
-def test_margins_of_one_motor_agree_with_python_control(steps: int) -> None:
+def test_margins_of_one_motor_agree_with_python_control(steps):
     """A double integrator: eigenvalues against its transfer function's crossings."""
     continuous = ContinuousModel(
         np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.eye(1, 2)
@@ -194,7 +189,7 @@ def test_margins_of_one_motor_agree_with_python_control(steps: int) -> None:
     assert 1 / T.value <= up * 1.001
 
 
-def test_first_instability_of_a_scalar_loop() -> None:
+def test_first_instability_of_a_scalar_loop():
     """e' = a e - g k e leaves the circle at g k = 1 + a."""
     a, k = 0.9, 0.5
     limit = first_instability(lambda by: np.array([[a - (1 + by) * k]]), 1e-3, 100.0)
@@ -203,7 +198,7 @@ def test_first_instability_of_a_scalar_loop() -> None:
     assert first_instability(lambda by: np.array([[1.5 - by]]), 1e-3, 10.0) == 0
 
 
-def test_a_wrong_gain_of_the_motors_is_what_the_recurrence_shows() -> None:
+def test_a_wrong_gain_of_the_motors_is_what_the_recurrence_shows():
     model, K = loop(3)
     limit = first_instability(lambda by: closed_loop(model, K, 1 + by), 1e-3, 10.0)
     quiet = np.zeros((3000, 2))
@@ -212,7 +207,7 @@ def test_a_wrong_gain_of_the_motors_is_what_the_recurrence_shows() -> None:
     assert inside < 1e-3 < outside
 
 
-def test_a_longer_delay_is_the_delayed_model_with_that_delay() -> None:
+def test_a_longer_delay_is_the_delayed_model_with_that_delay():
     """Delay that the gain does not know of adds places to the loop, no more."""
     model, K = loop(2)
     later, _ = loop(4, 0.5)
@@ -223,12 +218,12 @@ def test_a_longer_delay_is_the_delayed_model_with_that_delay() -> None:
     assert end > 1e3
 
 
-def margins(*settings: str, steps: int = 8) -> LoopMargins:
+def margins(*settings, steps=8):
     case = found(f"delay.steps={steps}", *settings)
     return next(m for m in loop_margins(case, ()) if m.steps == steps)
 
 
-def test_margins_of_the_papers_loop() -> None:
+def test_margins_of_the_papers_loop():
     """Those of docs/theory.md, section 13: 1.6 and 1.9 ms, and with tolerance 1 38 and 40 ms."""
     tight, loose = margins(), margins("controller.w_R=1111.1111")
     assert 1e3 * tight.later == pytest.approx(1.6, abs=0.05)
@@ -245,7 +240,7 @@ def test_margins_of_the_papers_loop() -> None:
         assert np.deg2rad(m.motor.phase) >= 2 * np.arcsin(0.5 / m.S.value) * 0.999
 
 
-def test_the_faithful_controller_is_unstable_on_the_true_plant() -> None:
+def test_the_faithful_controller_is_unstable_on_the_true_plant():
     """Its model has twice the true accelerations, through eight torques in flight."""
     scenario = sd.load_scenario("paper", "delay_lqi", ("plant.kind=exact",))
     (m,) = loop_margins(basis(scenario), ())
@@ -264,9 +259,7 @@ def test_the_faithful_controller_is_unstable_on_the_true_plant() -> None:
         ("delay_lqi", 1.0, 1.356),
     ],
 )
-def test_weights_that_hardly_act_keep_the_faithful_controllers_stable(
-    controller: str, weight: float, radius: float
-) -> None:
+def test_weights_that_hardly_act_keep_the_faithful_controllers_stable(controller, weight, radius):
     """At mu = 8, by an eigenvalue problem of its own; unstable for every mu is w_Q = w_R."""
     integral = controller == "delay_lqi"
     models = [
@@ -285,11 +278,11 @@ def test_weights_that_hardly_act_keep_the_faithful_controllers_stable(
     assert m.radius == pytest.approx(found, rel=1e-6)
 
 
-def test_zero_delay_cannot_be_shorter() -> None:
+def test_zero_delay_cannot_be_shorter():
     assert margins(steps=0).earlier == math.inf
 
 
-def test_linear_model_of_the_plant_is_the_loops() -> None:
+def test_linear_model_of_the_plant_is_the_loops():
     """The loop is closed around the plant at the reference's first pose, not around its model."""
     case = found()
     pose = case.experiment.reference.value(0.0)[:, 0]

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from scipy.integrate import solve_ivp
 
 import stewart_drake as sd
@@ -17,7 +17,6 @@ from stewart_drake.loop.varying_delay import VaryingDelay
 from stewart_drake.scenario.config import DelayConfig
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import delay_at, takes_effect, torque_delays
-from stewart_drake.types import Array
 
 PERIOD = 0.1
 LONG = ("plant.kind=exact", "start=on_reference", "queue=reference")
@@ -26,19 +25,19 @@ LONG = ("plant.kind=exact", "start=on_reference", "queue=reference")
 class Numbers(LeafSystem):
     """Puts out the number of the sample, and 1000 before t = 0."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.DeclareVectorOutputPort("number", 6, self._output, {self.time_ticket()})
 
-    def _output(self, context: Context, output: BasicVector) -> None:
+    def _output(self, context, output):
         output.SetFromVector(np.full(6, round(context.get_time() / PERIOD)))
 
 
-def scenario(*more: str) -> sd.Scenario:
+def scenario(*more):
     return sd.load_scenario("paper", settings=(*LONG, *more))
 
 
-def bare(delays: Array, before: Delay) -> tuple[Simulator, LeafSystem]:
+def bare(delays, before):
     """A link alone; the torque of sample k is k, also where it was sent before t = 0."""
     builder = DiagramBuilder()
     source = builder.AddSystem(Numbers())
@@ -48,7 +47,7 @@ def bare(delays: Array, before: Delay) -> tuple[Simulator, LeafSystem]:
     return Simulator(builder.Build()), link
 
 
-def newest(arrivals: dict[int, float], t: float) -> float:
+def newest(arrivals, t):
     """What has arrived by t and was sent last; 0 for nothing."""
     return max((k for k, arrival in arrivals.items() if arrival <= t), default=0)
 
@@ -58,7 +57,7 @@ def newest(arrivals: dict[int, float], t: float) -> float:
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**31), kind=st.sampled_from(["walk", "white", "short", "grid"]))
-def test_what_acts_is_the_newest_torque_that_has_arrived(seed: int, kind: str) -> None:
+def test_what_acts_is_the_newest_torque_that_has_arrived(seed, kind):
     """Overtaking, arrivals at samples and no delay at all among them."""
     rng = np.random.default_rng(seed)
     n = 25
@@ -90,7 +89,7 @@ def test_what_acts_is_the_newest_torque_that_has_arrived(seed: int, kind: str) -
 
 
 @pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (0, 0.4), (3, 0.0), (8, 0.5)])
-def test_a_constant_delay_is_the_delay_chain(steps: int, fraction: float) -> None:
+def test_a_constant_delay_is_the_delay_chain(steps, fraction):
     before = Delay(steps, fraction)
     simulator, link = bare(np.full(40, before.eta(PERIOD)), before)
     builder = DiagramBuilder()
@@ -108,14 +107,14 @@ def test_a_constant_delay_is_the_delay_chain(steps: int, fraction: float) -> Non
         assert np.array_equal(link.GetOutputPort("torque").Eval(of_link), expected)
 
 
-def test_a_torque_that_was_overtaken_never_acts() -> None:
+def test_a_torque_that_was_overtaken_never_acts():
     # Sent at 0, 1, 2, 3 s: the second comes after the third, the fourth together with the third.
     assert takes_effect(np.array([0.5, 4.0, 3.5, 3.5])).tolist() == [True, False, False, True]
     assert takes_effect(np.array([0.5, np.inf, 3.5])).tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize("wrong", [np.array([0.1, -0.1]), np.array([np.nan]), np.empty(0)])
-def test_what_is_no_delay_is_refused(wrong: Array) -> None:
+def test_what_is_no_delay_is_refused(wrong):
     with pytest.raises(ValueError, match="delays: got"):
         VaryingDelay(PERIOD, wrong, Delay(0), np.empty((0, 6)))
     with pytest.raises(ValueError, match="queue: got shape"):
@@ -125,7 +124,7 @@ def test_what_is_no_delay_is_refused(wrong: Array) -> None:
 # The delay as a function of the sending time.
 
 
-def test_drift_swing_and_jump_add_up() -> None:
+def test_drift_swing_and_jump_add_up():
     delay = DelayConfig(
         steps=3, drift=0.02, swing=0.05, swing_frequency=2.0, jump=-0.1, jump_time=4.0
     )
@@ -142,7 +141,7 @@ def test_drift_swing_and_jump_add_up() -> None:
     assert delay_at(DelayConfig(steps=1, jump=-5.0), 0.1, np.array([1.0])) == 0.0
 
 
-def test_jitter_is_white_seeded_and_never_before_its_time() -> None:
+def test_jitter_is_white_seeded_and_never_before_its_time():
     many = ("duration=1000", "delay.jitter_std=0.01")
     jitter = torque_delays(scenario(*many)) - 0.8
     n = len(jitter)
@@ -161,7 +160,7 @@ def test_jitter_is_white_seeded_and_never_before_its_time() -> None:
 # On the plants.
 
 
-def test_a_delay_that_does_not_change_takes_the_plain_chain() -> None:
+def test_a_delay_that_does_not_change_takes_the_plain_chain():
     assert type(build_closed_loop(scenario()).GetSubsystemByName("delay_chain")) is DelayChain
     loop = build_closed_loop(scenario("delay.seed=3", "delay.jump_time=2"))
     assert type(loop.GetSubsystemByName("delay_chain")) is DelayChain
@@ -175,7 +174,7 @@ def test_a_delay_that_does_not_change_takes_the_plain_chain() -> None:
         ("delay.jump=-0.23", "delay.jump_time=0.5", "delay.steps=4"),
     ],
 )
-def test_the_exact_plant_stops_at_every_arrival(course: tuple[str, ...]) -> None:
+def test_the_exact_plant_stops_at_every_arrival(course):
     """Against scipy from arrival to arrival, with the torques that the loop sent, to 1e-9."""
     sc = scenario("duration=1.65", "plant.accuracy=1e-11", *course)
     loop = build_closed_loop(sc)
@@ -198,7 +197,7 @@ def test_the_exact_plant_stops_at_every_arrival(course: tuple[str, ...]) -> None
     for end in sorted({a for a in arrivals.values() if 0 < a < 1.65} | {1.65}):
         torque = sent[int(newest(arrivals, (t + end) / 2))]
 
-        def change(_: float, x: Array, torque: Array = torque) -> Array:
+        def change(_, x, torque=torque):
             return np.concatenate([x[6:], dynamics.accelerations(x[:6], x[6:], torque)])
 
         x = solve_ivp(change, (t, end), x, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
@@ -206,7 +205,7 @@ def test_the_exact_plant_stops_at_every_arrival(course: tuple[str, ...]) -> None
     assert loop.GetOutputPort("state").Eval(context) == pytest.approx(x, abs=1e-9)
 
 
-def test_the_multibody_plant_feels_torques_at_its_nearest_step() -> None:
+def test_the_multibody_plant_feels_torques_at_its_nearest_step():
     settings = ("plant.kind=multibody", "plant.time_step=0.005", "duration=1.3")
     sc = scenario(*settings, "delay.jitter_std=0.02", "log_period=0.005", "delay.steps=2")
     signals = sd.simulate(sc, judge_stability=False).signals
@@ -221,7 +220,7 @@ def test_the_multibody_plant_feels_torques_at_its_nearest_step() -> None:
     assert np.allclose(signals.delay_true.values[::20], arrivals - 0.1 * np.arange(14), atol=1e-12)
 
 
-def test_the_record_shows_the_delay() -> None:
+def test_the_record_shows_the_delay():
     signals = sd.simulate(scenario("duration=1", "delay.drift=0.01"), judge_stability=False).signals
     sent = np.floor(signals.time.values / 0.1 + 1e-9) * 0.1
     assert signals.delay_true.values == pytest.approx(0.8 + 0.01 * sent, abs=1e-12)

@@ -13,20 +13,17 @@ from stewart_drake.law.startup import BLOCK, choose_substeps
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate, through_states
-from stewart_drake.types import Array
 
 MOST_HOLDS = 100
 
 
 @pytest.fixture
-def work(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+def work(monkeypatch):
     """Integration steps since the test began."""
     done = {"steps": 0}
     predict = StewartDynamics.predict
 
-    def predicted(
-        self: StewartDynamics, x: Array, T: Array, h: Array, substeps: int = 1, *more: Array
-    ) -> Array:
+    def predicted(self, x, T, h, substeps=1, *more):
         done["steps"] += substeps * len(T)
         return predict(self, x, T, h, substeps, *more)
 
@@ -36,9 +33,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
 
 @pytest.mark.parametrize("period", [0.1, 0.003, 0.0007, 1e-4])
 @pytest.mark.parametrize("duration", [0.3, 0.31])
-def test_a_plan_of_many_periods_is_followed_period_by_period(
-    period: float, duration: float
-) -> None:
+def test_a_plan_of_many_periods_is_followed_period_by_period(period, duration):
     """Onto the reference, by the torques that its own inverse dynamics gives for each period."""
     experiment = prepare(
         load_scenario("paper", None, ("plant.kind=exact", f"controller.period={period}"))
@@ -59,9 +54,7 @@ def test_a_plan_of_many_periods_is_followed_period_by_period(
     assert np.abs(end[:6] - wanted[:6]).max() < (2e-5 if period == 0.1 else 1e-6)
 
 
-def test_the_shortest_plan_within_a_limit_is_found_in_a_few_steps(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_shortest_plan_within_a_limit_is_found_in_a_few_steps(monkeypatch):
     period, limit, made, plan = 1e-3, 0.5, [], Model.plan
     monkeypatch.setattr(Model, "plan", lambda *given: (made.append(given[-1]), plan(*given))[1])
     experiment = prepare(
@@ -76,7 +69,7 @@ def test_the_shortest_plan_within_a_limit_is_found_in_a_few_steps(
     assert len(made) < 30
 
 
-def test_a_way_planned_in_flight_is_what_drake_makes_of_its_pieces() -> None:
+def test_a_way_planned_in_flight_is_what_drake_makes_of_its_pieces():
     """Of two plans one after the other: before, within, between and after their pieces."""
     experiment = prepare(load_scenario("paper"))
     reference, start = experiment.reference, np.zeros(12)
@@ -95,9 +88,7 @@ def test_a_way_planned_in_flight_is_what_drake_makes_of_its_pieces() -> None:
         assert motion(np.array([at - 0.3]))[0] == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
-def test_a_long_delay_is_compared_no_further_than_the_prediction_is_of_use(
-    work: dict[str, int],
-) -> None:
+def test_a_long_delay_is_compared_no_further_than_the_prediction_is_of_use(work):
     """Torques held for 0.1 s lead away from the reference long before 100 s are over."""
     experiment = prepare(load_scenario("paper"))
     began = time.perf_counter()

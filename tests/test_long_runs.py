@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.multibody.plant import MultibodyPlant
 
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.simulation import make_simulator, simulate
@@ -27,7 +26,7 @@ STEADY = ("reference.frequency=0.5", "delay.steps=3", *ON_REFERENCE)
 MB = 1e6
 
 
-def memory() -> float:
+def memory():
     """What this process holds in bytes, after tidying up."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text().split()[1])
@@ -39,7 +38,7 @@ needs_proc = pytest.mark.skipif(
 )
 
 
-def growth_per_run(runs: int, warm_up: int) -> float:
+def growth_per_run(runs, warm_up):
     """Bytes by which each of so many short runs makes the process larger: the slope of a line."""
     settings = ("duration=0.2", "delay.steps=2", *ON_REFERENCE)
     scenarios = [load_scenario("paper", None, (f"plant.kind={k}", *settings)) for k in PLANTS]
@@ -86,7 +85,7 @@ def test_a_thousand_runs_leave_nothing_behind():
     assert growth_per_run(runs=1000, warm_up=100) < 0.02 * MB
 
 
-def follow(kind: str, duration: float, *settings: str) -> list[tuple[float, float, float, float]]:
+def follow(kind, duration, *settings):
     """Time, memory, loop gap in m and share of error every tenth of the way, nothing recorded."""
     sc = load_scenario(
         "paper", None, (f"plant.kind={kind}", f"duration={duration}", *STEADY, *settings)
@@ -104,7 +103,7 @@ def follow(kind: str, duration: float, *settings: str) -> list[tuple[float, floa
         reference = loop.GetOutputPort("reference").Eval(context)
         error = np.max(np.abs(state[POSE] - reference[POSE]) / loop.experiment.scale)
         if kind == "multibody":
-            tree: MultibodyPlant = plant.tree
+            tree = plant.tree
             gap = joint_gap(tree, tree.GetMyContextFromRoot(context))
         else:
             gap = rod_error(state[POSE])
@@ -112,7 +111,7 @@ def follow(kind: str, duration: float, *settings: str) -> list[tuple[float, floa
     return rows
 
 
-def joint_gap(tree: MultibodyPlant, context: object) -> float:
+def joint_gap(tree, context):
     """m, the largest distance between a rod's end and its joint on the plate."""
     plate = tree.GetBodyByName("plate")
     gaps = []
@@ -124,7 +123,7 @@ def joint_gap(tree: MultibodyPlant, context: object) -> float:
     return float(max(gaps))
 
 
-def rod_error(pose: np.ndarray) -> float:
+def rod_error(pose):
     """m, by how much the rods between crank tips and plate joints miss their length."""
     legs = leg_geometry(PAPER, pose)
     tips = PAPER.p_WS + PAPER.crank_lengths[:, None] * legs.crank
@@ -133,7 +132,7 @@ def rod_error(pose: np.ndarray) -> float:
     return float(np.abs(lengths - PAPER.rod_lengths).max())
 
 
-def check_steady(rows: list[tuple[float, float, float, float]], gap: float, error: float) -> None:
+def check_steady(rows, gap, error):
     """Memory, gap and error of the second half are those of the first."""
     _, sizes, gaps, errors = np.array(rows).T
     assert sizes[-1] - sizes[4] < 5 * MB

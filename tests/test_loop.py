@@ -3,12 +3,10 @@
 import functools
 import json
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from pydrake.systems.framework import Context
 from scipy.integrate import quad_vec
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -16,16 +14,13 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop import metrics
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.experiment import prepare
-from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
-from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.scenario.trajectories import evaluate, make_reference
 from stewart_drake.studies import delay_limits
 from stewart_drake.studies.delay_limits import DelayOptions, study_delay
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
 GRID = 0.02
@@ -33,19 +28,19 @@ ON_REFERENCE = ("start=on_reference", "queue=reference")
 AMPLITUDE = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
 
 
-def scenario(*settings: str, controller: str | None = None, plant: str = "exact") -> Scenario:
+def scenario(*settings, controller=None, plant="exact"):
     return load_scenario("paper", controller, [f"plant.kind={plant}", *settings])
 
 
 @functools.cache
-def result(*settings: str, controller: str | None = None, plant: str = "exact") -> SimulationResult:
+def result(*settings, controller=None, plant="exact"):
     return simulate(scenario(*settings, controller=controller, plant=plant), judge_stability=False)
 
 
 # What is there.
 
 
-def test_log_is_on_the_metrics_grid_with_named_coordinates() -> None:
+def test_log_is_on_the_metrics_grid_with_named_coordinates():
     run = result("duration=0.93", *ON_REFERENCE)
     expected = [*(GRID * np.arange(47)), 0.93]
     assert run.status == "completed"
@@ -68,9 +63,7 @@ def test_log_is_on_the_metrics_grid_with_named_coordinates() -> None:
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
 @pytest.mark.parametrize("controller", ["predictor_lqi", "delay_lqi", "lqr"])
 @pytest.mark.parametrize(("steps", "fraction"), [(2, 0.0), (1, 0.2), (0, 0.0), (0, 0.6)])
-def test_applied_torque_is_the_commanded_one_a_delay_ago(
-    steps: int, fraction: float, controller: str, plant: str
-) -> None:
+def test_applied_torque_is_the_commanded_one_a_delay_ago(steps, fraction, controller, plant):
     """At every logged instant, bit by bit; before that, what was in flight at the start."""
     run = result(
         "duration=0.6",
@@ -91,7 +84,7 @@ def test_applied_torque_is_the_commanded_one_a_delay_ago(
 
 
 @pytest.mark.parametrize("tiny", [1e-10, 1e-15, 1e-16])
-def test_a_delay_that_is_next_to_whole_is_whole(tiny: float) -> None:
+def test_a_delay_that_is_next_to_whole_is_whole(tiny):
     """A release so near to the next event would come before it, or never."""
     settings = ("duration=2.0", *ON_REFERENCE)
     run = simulate(scenario(f"delay.fraction={tiny}", *settings), judge_stability=False)
@@ -106,7 +99,7 @@ def test_a_delay_that_is_next_to_whole_is_whole(tiny: float) -> None:
     assert sc.delay.fraction == 1e-9
 
 
-def test_torque_is_limited_before_the_chain() -> None:
+def test_torque_is_limited_before_the_chain():
     run = result("duration=1.2", "actuator.torque_limit=0.5", "delay.steps=2")
     assert run.summary["peak_torque_applied"] <= 0.5
     assert np.abs(run.signals.torque_applied.values).max() <= 0.5
@@ -120,7 +113,7 @@ def test_torque_is_limited_before_the_chain() -> None:
 
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
 @pytest.mark.parametrize("start", ["rest", "on_reference"])
-def test_runs_start_at_rest_or_on_the_reference(start: str, plant: str) -> None:
+def test_runs_start_at_rest_or_on_the_reference(start, plant):
     settings = ("duration=0.2", f"start={start}", "delay.steps=3", "controller.catch_up=0")
     run = result(*settings, plant=plant)
     reference = evaluate(make_reference(run.scenario.reference, 1.0), 0.0)
@@ -132,7 +125,7 @@ def test_runs_start_at_rest_or_on_the_reference(start: str, plant: str) -> None:
 
 
 @pytest.mark.parametrize(("steps", "fraction"), [(3, 0.0), (2, 0.4)])
-def test_torques_in_flight_at_the_start(steps: int, fraction: float) -> None:
+def test_torques_in_flight_at_the_start(steps, fraction):
     """None, those that hold still, or the reference's averaged over the period that they act in."""
     settings = (
         "duration=0.4",
@@ -147,10 +140,10 @@ def test_torques_in_flight_at_the_start(steps: int, fraction: float) -> None:
     eta = (steps + fraction) * 0.1
     waiting = slice(0, round(eta / GRID))
 
-    def nominal(t: float) -> Array:
+    def nominal(t):
         return dynamics.inverse_dynamics(*np.split(evaluate(motion, t), 3))
 
-    def mean(start: float, end: float) -> Array:
+    def mean(start, end):
         return quad_vec(nominal, start, end)[0] / (end - start)
 
     ends = eta - 0.1 * np.arange(steps + (fraction > 0))[::-1]
@@ -169,7 +162,7 @@ def test_torques_in_flight_at_the_start(steps: int, fraction: float) -> None:
 
 
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
-def test_torques_in_flight_hold_the_plate_from_the_first_instant(plant: str) -> None:
+def test_torques_in_flight_hold_the_plate_from_the_first_instant(plant):
     """Under gravity one step of 1 ms without them would leave it falling at 10 mm/s."""
     run = result(
         "duration=0.3",
@@ -186,7 +179,7 @@ def test_torques_in_flight_hold_the_plate_from_the_first_instant(plant: str) -> 
 # Metrics.
 
 
-def test_accumulated_error_of_a_signal_made_by_hand() -> None:
+def test_accumulated_error_of_a_signal_made_by_hand():
     """Triangles of two percent of peak to peak over two seconds, and one constant coordinate."""
     time = np.linspace(0, 2, 101)
     triangle = 1 - np.abs(time - 1)
@@ -199,7 +192,7 @@ def test_accumulated_error_of_a_signal_made_by_hand() -> None:
     assert metrics.accumulated_error(time, one, scale) == pytest.approx(2 * 100 / 6, rel=1e-12)
 
 
-def test_cost_and_variation_in_closed_form() -> None:
+def test_cost_and_variation_in_closed_form():
     n, period = 51, 0.1
     error, torque = np.full((n, 6), 2.0), np.outer((-1.0) ** np.arange(n), np.arange(1, 7))
     z = 2.0 * period * np.arange(n)
@@ -213,7 +206,7 @@ def test_cost_and_variation_in_closed_form() -> None:
 
 
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
-def test_delay_floor_is_what_a_plate_that_cannot_move_collects(plant: str) -> None:
+def test_delay_floor_is_what_a_plate_that_cannot_move_collects(plant):
     """100/2 (1 - cos 0.8) = 15.165 % s for the paper's motion, by trapezoids of 20 ms 15.164."""
     floor = 50 * (1 - np.cos(0.8))
     run = result("duration=0.9", plant=plant)
@@ -237,9 +230,7 @@ def test_delay_floor_is_what_a_plate_that_cannot_move_collects(plant: str) -> No
         (ON_REFERENCE, False),
     ],
 )
-def test_the_floor_is_that_of_a_plate_which_waits(
-    settings: tuple[str, ...], waits: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_floor_is_that_of_a_plate_which_waits(settings, waits, monkeypatch):
     """In the summary of a run and in the analysis of the delay alike; where it falls, none."""
     monkeypatch.setattr(delay_limits, "loop_margins", lambda _: [])  # which take seconds
     sc = scenario("duration=0.3", *settings)
@@ -248,7 +239,7 @@ def test_the_floor_is_that_of_a_plate_which_waits(
     assert study_delay(sc, DelayOptions(simulations=False)).floor_applies is waits
 
 
-def test_summary_is_what_the_signals_say() -> None:
+def test_summary_is_what_the_signals_say():
     run = result("duration=1.5", *ON_REFERENCE, "delay.steps=2")
     s, time = run.signals, run.signals.time.values
     error = s.error.values
@@ -284,10 +275,10 @@ def test_summary_is_what_the_signals_say() -> None:
 
 
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
-def test_the_same_seed_gives_the_same_bytes(plant: str, tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_bytes(plant, tmp_path):
     noise = "sensor.noise_std=[" + ", ".join(["1e-4"] * 12) + "]"
 
-    def saved(seed: int, folder: str) -> tuple[bytes, xr.Dataset]:
+    def saved(seed, folder):
         run = simulate(
             scenario("duration=0.5", *ON_REFERENCE, noise, f"sensor.seed={seed}", plant=plant),
             judge_stability=False,
@@ -307,10 +298,10 @@ def test_the_same_seed_gives_the_same_bytes(plant: str, tmp_path: Path) -> None:
     assert np.array_equal(read.pose.values, one[1].pose.values)
 
 
-def test_ctrl_c_keeps_what_there_is() -> None:
-    seen: list[float] = []
+def test_ctrl_c_keeps_what_there_is():
+    seen = []
 
-    def interrupt(time: float, error: float) -> None:
+    def interrupt(time, error):
         seen.append(time)
         assert error >= 0
         if time > 0.31:
@@ -326,11 +317,11 @@ def test_ctrl_c_keeps_what_there_is() -> None:
 
 
 @pytest.mark.parametrize("error", [RuntimeError, ValueError])
-def test_what_progress_raises_reaches_the_caller(error: type[Exception]) -> None:
+def test_what_progress_raises_reaches_the_caller(error):
     """It is the caller's own, not a solver that has failed."""
     mine = error("mine")
 
-    def progress(time: float, error: float) -> None:
+    def progress(time, error):
         if time > 0.05:
             raise mine
 
@@ -344,9 +335,7 @@ def test_what_progress_raises_reaches_the_caller(error: type[Exception]) -> None
 
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
 @pytest.mark.parametrize("controller", ["lqr", "lqi"])
-def test_leaving_the_workspace_ends_the_run_with_time_leg_and_margin(
-    controller: str, plant: str
-) -> None:
+def test_leaving_the_workspace_ends_the_run_with_time_leg_and_margin(controller, plant):
     """And that leg is at its dead centre: rod and crank lie in one plane with the motor axis."""
     settings = ("duration=3.0", "delay.steps=8")
     run = result(*settings, controller=controller, plant=plant)
@@ -374,7 +363,7 @@ def test_leaving_the_workspace_ends_the_run_with_time_leg_and_margin(
     assert abs(stopped.margin) < 1e-3
 
 
-def transmissions(loop, context: Context, pose: Array) -> Array:  # type: ignore[no-untyped-def]
+def transmissions(loop, context, pose):
     """Rod along the crank tip's tangent (6,): from the simulated cranks, or from the pose."""
     plant = loop.GetSubsystemByName("plant")
     if not plant.HasOutputPort("crank_angles"):
@@ -391,7 +380,7 @@ def transmissions(loop, context: Context, pose: Array) -> Array:  # type: ignore
 # What holds together.
 
 
-def test_a_run_with_a_delay_that_is_no_whole_number_of_periods() -> None:
+def test_a_run_with_a_delay_that_is_no_whole_number_of_periods():
     """Held torques are known within a hold too: a fraction costs nothing in accuracy."""
     for fraction in (0.0, 0.2, 0.6):
         run = result("duration=3.0", f"delay.fraction={fraction}", "delay.steps=8", *ON_REFERENCE)
@@ -400,7 +389,7 @@ def test_a_run_with_a_delay_that_is_no_whole_number_of_periods() -> None:
         assert run.summary["counts"]["riccati_failures"] == 0
 
 
-def test_only_a_leg_is_short_by_millimetres() -> None:
+def test_only_a_leg_is_short_by_millimetres():
     """A parallel singularity has no unit."""
     turned = "reference.offset=[-1.2112, 0.7651, 0.8994, -0.0246, -0.0499, 0.326]"
     with pytest.raises(ConfigError, match="parallel singularity") as caught:

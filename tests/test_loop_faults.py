@@ -6,7 +6,6 @@ motors that are too weak for a while.
 
 import json
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +15,8 @@ import stewart_drake.loop.diagram as diagram_module
 import stewart_drake.loop.kinds as kinds_module
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.loop.metrics import accumulated_error
-from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.types import Array
 from tests.backends import stepped_in_python
@@ -33,23 +30,21 @@ PLACES = ((0,), (12,), (10, 11, 12, 13, 14), (1, 5, 9, 13, 17))
 """The first sample, one later, five in a row, and every fourth."""
 
 
-def scenario(*settings: str, controller: str | None = None, plant: str = "exact") -> Scenario:
+def scenario(*settings, controller=None, plant="exact"):
     """The paper's experiment with a delay of 0.3 s, from its reference on."""
     mine = (f"plant.kind={plant}", "delay.steps=3", "duration=4", "start=on_reference")
     return load_scenario("paper", controller, (*mine, "queue=reference", *settings))
 
 
-def run_with(
-    monkeypatch: pytest.MonkeyPatch, spoil: Spoil, sc: Scenario | None = None
-) -> SimulationResult:
+def run_with(monkeypatch, spoil, sc=None):
     """A run whose sensor sends what `spoil` makes of the truth."""
 
     class Faulty(Sensor):
-        def __init__(self, *arguments: Any) -> None:
+        def __init__(self, *arguments):
             super().__init__(*arguments)
             self._sent: dict[int, Array] = {}
 
-        def _measure(self, context: Any, output: Any) -> None:
+        def _measure(self, context, output):
             super()._measure(context, output)
             k = round(context.get_time() / self._period)
             if k not in self._sent:  # the window of densities asks again
@@ -60,7 +55,7 @@ def run_with(
     return simulate(scenario() if sc is None else sc, judge_stability=False)
 
 
-def check_outcome(run: SimulationResult) -> None:
+def check_outcome(run):
     """It ran to its end, or says when and why not; its record is whole and its torques are real."""
     assert run.status in STATUSES
     assert (run.failure is None) == (run.status == "completed")
@@ -69,7 +64,7 @@ def check_outcome(run: SimulationResult) -> None:
     json.dumps(run.summary["counts"])
 
 
-def share_of_swing(run: SimulationResult, last: float) -> float:
+def share_of_swing(run, last):
     """Mean error over the last so many s, as a share of the reference's peak to peak."""
     scale = np.ptp(run.signals.reference.values, axis=0)
     late = run.signals.sel(time=slice(run.scenario.duration - last, None))
@@ -82,7 +77,7 @@ def share_of_swing(run: SimulationResult, last: float) -> float:
 def test_measurements_that_are_no_numbers(places, value, monkeypatch):
     """The model stands in for them."""
 
-    def spoil(k: int, measured: Array, _: Any) -> Array:
+    def spoil(k, measured, _):
         if k in places:
             measured[k % 12] = value
         return measured
@@ -108,7 +103,7 @@ def test_gains_that_cannot_be_found(failing, controller, monkeypatch):
     stepped_in_python(monkeypatch)
     solve, calls = cost_module.reduced_gain, {"started": -1}
 
-    def sometimes(*arguments: Any) -> Array:
+    def sometimes(*arguments):
         if calls["started"] >= 0:
             calls["started"] += 1
             if calls["started"] - 1 in failing:
@@ -118,7 +113,7 @@ def test_gains_that_cannot_be_found(failing, controller, monkeypatch):
     monkeypatch.setattr(cost_module, "reduced_gain", sometimes)
     build = diagram_module.DelayLqiController
 
-    def started(*arguments: Any) -> Any:
+    def started(*arguments):
         calls["started"] = 0  # the law tries itself out before
         return build(*arguments)
 
@@ -151,7 +146,7 @@ def test_motors_at_their_limit_for_a_second(monkeypatch):
 def test_everything_at_once_is_counted(monkeypatch):
     sc = scenario("actuator.torque_limit=0.01", "duration=3")
 
-    def spoil(k: int, measured: Array, sent: dict[int, Array]) -> Array:
+    def spoil(k, measured, sent):
         if k in (4, 9, 10):
             return np.full(12, np.nan)
         return sent[k - 1].copy() if k == 20 else measured

@@ -36,16 +36,14 @@ NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-
 BIAS = "plant.torque_bias=[1e-3,-1e-3,2e-3,0,0,0]"
 
 
-def together(
-    *settings: str, name: str = "paper", key: bytes | None = None, **own: object
-) -> Together:
+def together(*settings, name="paper", key=None, **own):
     scenario = load_scenario(name, settings=settings)
-    return Together(scenario, Settings(**own), key)  # type: ignore[arg-type]
+    return Together(scenario, Settings(**own), key)
 
 
-def begun(*settings: str, samples: int = 0, **own: object) -> Together:
+def begun(*settings, samples=0, **own):
     """With a run that began at 2 s, on the exact plant."""
-    found = together(EXACT, *settings, **own)  # type: ignore[arg-type]
+    found = together(EXACT, *settings, **own)
     period = found.driver.period
     found.greet(3 * period, -(-2 * SECOND // period) * period)
     found.drive(samples)
@@ -69,9 +67,7 @@ def begun(*settings: str, samples: int = 0, **own: object) -> Together:
         ("gravity", (EXACT, "sensor.faults=[{kind: missing, from: 0.1, to: 0.14}]"), 50),
     ],
 )
-def test_a_run_over_the_socket_is_the_simulated_one(
-    name: str, settings: tuple[str, ...], samples: int
-) -> None:
+def test_a_run_over_the_socket_is_the_simulated_one(name, settings, samples):
     """The same seeds, delays, losses: the states of Drake's loop at every sample."""
     scenario = load_scenario(name, settings=settings)
     scenario = replace(scenario, duration=samples * scenario.controller.period)
@@ -92,7 +88,7 @@ def test_a_run_over_the_socket_is_the_simulated_one(
     np.testing.assert_allclose(run.driver.torques, said, atol=1e-4 * np.abs(said).max())
 
 
-def test_counts_are_those_of_the_simulation() -> None:
+def test_counts_are_those_of_the_simulation():
     """Of torques that were played and periods that were dry."""
     settings = (EXACT, "link={kind: network, loss: 0.6, burst: 6}", "controller.packet_torques=2")
     scenario = load_scenario("paper", settings=("duration=3.1", *settings))
@@ -106,34 +102,34 @@ def test_counts_are_those_of_the_simulation() -> None:
     assert (machine["played"], machine["dry"]) == (played, dry)
 
 
-def test_encoders_are_told_as_codes() -> None:
+def test_encoders_are_told_as_codes():
     run = begun(
         "sensor={kind: encoders, bits: 12, samples: 3, offset: [0.01,0,0,0,0,0]}", samples=5
     )
     told = [m for m in run.driver.got if m.codes is not None]
-    assert told and all(m.codes.shape == (3, 6) and m.bits == 12 for m in told)  # type: ignore[union-attr]
+    assert told and all(m.codes.shape == (3, 6) and m.bits == 12 for m in told)
     run = begun(
         "sensor={kind: encoders, faults: [{kind: missing, leg: 2, from: 0.3, to: 0.4}]}", samples=5
     )
     lost = [m for m in run.driver.got if m.codes is not None and MISSING in m.codes]
     assert [m.sampled for m in lost] == [run.driver.begin + 3 * run.driver.period]
-    assert np.flatnonzero(lost[0].codes[0] == MISSING).tolist() == [1]  # type: ignore[index]
+    assert np.flatnonzero(lost[0].codes[0] == MISSING).tolist() == [1]
 
 
 # ---------------------------------------------------------------- safety
 
 
-def torque_of(run: Together) -> np.ndarray:
+def torque_of(run):
     return run.machine._motors.torque
 
 
 @pytest.mark.parametrize("safe", ["zero", "hold"])
 @pytest.mark.parametrize("settings", [(), (NETWORK,)])
-def test_silence_ends_in_the_safe_torque_in_time(safe: str, settings: tuple[str, ...]) -> None:
+def test_silence_ends_in_the_safe_torque_in_time(safe, settings):
     """At `watchdog` after the last datagram, whatever is in the buffer."""
     run = begun(*settings, samples=20, safe=safe, watchdog=0.35)
     run.at(run.machine.time() + round(0.33 * SECOND) * bool(settings))  # what is under way is heard
-    heard = run.machine.session.heard  # type: ignore[union-attr]
+    heard = run.machine.session.heard
     run.at(heard + round(0.35 * SECOND))
     before = torque_of(run)
     assert np.any(before) and not run.machine._safe
@@ -151,12 +147,12 @@ def test_silence_ends_in_the_safe_torque_in_time(safe: str, settings: tuple[str,
     assert (MachineFlags.SAFE_HOLDS in last.flags) == (safe == "hold")
 
 
-def messages(run: Together) -> list[MachineMessage]:
+def messages(run):
     run.driver.receive(run.machine.time())
     return run.driver.got
 
 
-def test_a_controller_that_was_suspended_goes_on_in_its_session() -> None:
+def test_a_controller_that_was_suspended_goes_on_in_its_session():
     run = begun(samples=20, watchdog=0.3)
     time = run.driver.begin + 30 * run.driver.period
     run.at(time)
@@ -169,7 +165,7 @@ def test_a_controller_that_was_suspended_goes_on_in_its_session() -> None:
     assert any(np.all(m.acted == 0.1, axis=1).any() for m in messages(run))
 
 
-def test_stop_is_the_safe_torque_and_the_end_of_the_session() -> None:
+def test_stop_is_the_safe_torque_and_the_end_of_the_session():
     run = begun(samples=20)
     time, driver = run.machine.time(), run.driver
     assert torque_of(run).any()
@@ -182,7 +178,7 @@ def test_stop_is_the_safe_torque_and_the_end_of_the_session() -> None:
     assert run.machine.summary()["sessions"] == 1
 
 
-def test_limits_are_kept_to_here() -> None:
+def test_limits_are_kept_to_here():
     run = begun("actuator.torque_limit=0.25", "link.kind=network", "link.loss=0", samples=1)
     driver, period = run.driver, run.driver.period
     time = driver.begin + period
@@ -193,7 +189,7 @@ def test_limits_are_kept_to_here() -> None:
     assert messages(run)[-1].torque_limit == 0.25
 
 
-def test_a_plate_that_leaves_stops_and_a_new_session_begins_at_rest() -> None:
+def test_a_plate_that_leaves_stops_and_a_new_session_begins_at_rest():
     run = begun("queue=equilibrium", "plant.gravity=true", samples=25)
     machine = run.machine
     assert machine.failure is not None
@@ -213,7 +209,7 @@ def test_a_plate_that_leaves_stops_and_a_new_session_begins_at_rest() -> None:
     assert machine.counts["runs"] == 2
 
 
-def test_a_run_does_not_begin_for_nobody() -> None:
+def test_a_run_does_not_begin_for_nobody():
     run = together(EXACT, watchdog=0.5)
     period = run.driver.period
     run.greet(3 * period, 60 * period)
@@ -223,7 +219,7 @@ def test_a_run_does_not_begin_for_nobody() -> None:
     np.testing.assert_array_equal(run.machine._body.state, run.driver.experiment.start)
 
 
-def test_a_beginning_in_the_past_or_off_the_grid_is_the_next_one() -> None:
+def test_a_beginning_in_the_past_or_off_the_grid_is_the_next_one():
     run = together(EXACT)
     driver, period = run.driver, run.driver.period
     run.at(0)
@@ -242,7 +238,7 @@ def test_a_beginning_in_the_past_or_off_the_grid_is_the_next_one() -> None:
 # ---------------------------------------------------------------- who drives
 
 
-def test_another_controller_has_to_wait() -> None:
+def test_another_controller_has_to_wait():
     run = begun(samples=10)
     time, other = run.machine.time(), Driver(run.scenario, run.ear.address)
     other.say(time)
@@ -258,12 +254,12 @@ def test_another_controller_has_to_wait() -> None:
     other.begin = NEVER
     other.say(time)
     run.at(time + 2 * SECOND + 1)
-    assert run.machine.session.number == other.session.number  # type: ignore[union-attr]
+    assert run.machine.session.number == other.session.number
     assert run.machine.counts["sessions"] == 2
 
 
 @pytest.mark.parametrize("restart", ["rest", "motion"])
-def test_a_new_session_begins_where_it_is_said(restart: str) -> None:
+def test_a_new_session_begins_where_it_is_said(restart):
     run = begun(samples=15, restart=restart)
     period, machine = run.driver.period, run.machine
     moving = np.array(machine._body.state)
@@ -280,7 +276,7 @@ def test_a_new_session_begins_where_it_is_said(restart: str) -> None:
     run.driver.begin = now + 3 * period
     run.driver.say(now)
     run.at(now + 2)
-    assert old.number != machine.session.number  # type: ignore[union-attr]
+    assert old.number != machine.session.number
     if restart == "rest":
         np.testing.assert_array_equal(machine._body.state, run.driver.experiment.start)
         assert run.said[-1].endswith("at rest")
@@ -296,18 +292,18 @@ def test_a_new_session_begins_where_it_is_said(restart: str) -> None:
         assert any(np.all(m.acted == 0.05, axis=1).any() for m in messages(run))
 
 
-def test_what_was_recorded_of_an_earlier_session_is_foreign() -> None:
+def test_what_was_recorded_of_an_earlier_session_is_foreign():
     """With a key and without: every datagram of a session, once it is over and another drives."""
     run = together(EXACT, key=KEY)
     period = run.driver.period
-    recorded: list[bytes] = []
+    recorded = []
     say = run.driver.endpoint.send
 
-    def send(message: ControllerMessage, to: tuple[str, int]) -> bool:
+    def send(message, to):
         recorded.append(encode(message, KEY))
         return say(message, to)
 
-    run.driver.endpoint.send = send  # type: ignore[method-assign, assignment]
+    run.driver.endpoint.send = send
     run.greet(3 * period, 20 * period)
     run.drive(12)
     run.driver.say(run.machine.time(), ControllerFlags.STOP)
@@ -334,7 +330,7 @@ def test_what_was_recorded_of_an_earlier_session_is_foreign() -> None:
 # ---------------------------------------------------------------- what nobody should act upon
 
 
-def attack(rng: random.Random, run: Together, attacker: Endpoint, recorded: list[bytes]) -> None:
+def attack(rng, run, attacker, recorded):
     """A datagram that must not do anything."""
     driver, time = run.driver, run.machine.time()
     if recorded and rng.random() < 0.3:
@@ -365,9 +361,7 @@ def attack(rng: random.Random, run: Together, attacker: Endpoint, recorded: list
     mouth._socket.sendto(data[:1600], run.ear.address)
 
 
-def attacked(
-    seed: int, samples: int, most: int
-) -> tuple[Counter[Refusal], int, Together, list[np.ndarray]]:
+def attacked(seed, samples, most):
     """A run among such datagrams: what was refused, how many there were, the states."""
     rng = random.Random(seed)
     run = together(EXACT, NETWORK, key=KEY)
@@ -394,7 +388,7 @@ def attacked(
     return Counter(run.ear.refused), number, run, states
 
 
-def check_attack(seed: int, samples: int = 25, most: int = 30) -> Counter[Refusal]:
+def check_attack(seed, samples=25, most=30):
     """Nothing differs from the run without them, but what is counted."""
     peace, nothing, calm, expected = attacked(seed, samples, 0)
     assert nothing == 0 and not peace
@@ -409,7 +403,7 @@ def check_attack(seed: int, samples: int = 25, most: int = 30) -> Counter[Refusa
     return refused
 
 
-def test_nothing_that_is_refused_is_acted_upon() -> None:
+def test_nothing_that_is_refused_is_acted_upon():
     refused = check_attack(20261122)
     assert set(refused) == {
         *(Refusal.MALFORMED, Refusal.VERSION, Refusal.KEY, Refusal.FOREIGN, Refusal.REPLAYED),
@@ -417,7 +411,7 @@ def test_nothing_that_is_refused_is_acted_upon() -> None:
 
 
 @pytest.mark.soak
-def test_nothing_that_is_refused_is_acted_upon_for_five_minutes() -> None:
+def test_nothing_that_is_refused_is_acted_upon_for_five_minutes():
     import time
 
     end, total, seed = time.monotonic() + 300, Counter[Refusal](), random.randrange(10**9)
@@ -427,7 +421,7 @@ def test_nothing_that_is_refused_is_acted_upon_for_five_minutes() -> None:
     print(dict(total))
 
 
-def test_a_flooded_socket_is_survived() -> None:
+def test_a_flooded_socket_is_survived():
     """More than its buffer takes: what is lost is lost, and the rest goes on."""
     run = begun(samples=10)
     attacker = Endpoint(MachineMessage)
@@ -436,7 +430,7 @@ def test_a_flooded_socket_is_survived() -> None:
     time = run.machine.time()
     run.at(time + 1)
     run.driver.say(time)
-    while run.machine.session.heard < time:  # type: ignore[union-attr]
+    while run.machine.session.heard < time:
         before = run.ear.refused[Refusal.MALFORMED]
         run.machine.poll(time + 1)
         run.machine.advance(time + 1)
@@ -448,7 +442,7 @@ def test_a_flooded_socket_is_survived() -> None:
 # ---------------------------------------------------------------- motors, settings
 
 
-def test_the_newest_plan_of_a_period_acts_and_a_dry_buffer_holds_or_not() -> None:
+def test_the_newest_plan_of_a_period_acts_and_a_dry_buffer_holds_or_not():
     for holds in (True, False):
         motors = Motors(1.0, 10, holds)
         motors.begin(Plan(0, 0, 0, 100, np.full((2, 6), 0.5)))
@@ -467,7 +461,7 @@ def test_the_newest_plan_of_a_period_acts_and_a_dry_buffer_holds_or_not() -> Non
         assert motors.take(Plan(7, 0, 0, 120, np.zeros((1 << 16, 6))), 155) == Refusal.MALFORMED
 
 
-def test_over_a_wire_what_was_overtaken_never_acts() -> None:
+def test_over_a_wire_what_was_overtaken_never_acts():
     delays = {0: 50, 1: 20, 2: 30}
     motors = Motors(1.0, 10, delay_of=delays.__getitem__)
     motors.begin(Plan(0, 0, 0, 0, np.array([[0.1] * 6, [0.2] * 6])))
@@ -494,7 +488,7 @@ def test_over_a_wire_what_was_overtaken_never_acts() -> None:
         ),
     ],
 )
-def test_what_the_protocol_cannot_say_is_refused(settings: tuple[str, ...], message: str) -> None:
+def test_what_the_protocol_cannot_say_is_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         check_scenario(load_scenario("paper", settings=settings))
 
@@ -502,12 +496,12 @@ def test_what_the_protocol_cannot_say_is_refused(settings: tuple[str, ...], mess
 @pytest.mark.parametrize(
     ("name", "value"), [("rate", 0.0), ("rate", float("nan")), ("watchdog", -1)]
 )
-def test_settings_have_a_range(name: str, value: float) -> None:
+def test_settings_have_a_range(name, value):
     with pytest.raises(ConfigError, match=f"{name}: got"):
-        Settings(**{name: value})  # type: ignore[arg-type]
+        Settings(**{name: value})
 
 
-def test_half_the_rate_takes_twice_the_time() -> None:
+def test_half_the_rate_takes_twice_the_time():
     run = together(EXACT, rate=0.5)
     start = run.clock.time
     run.clock.time = start + 2 * SECOND

@@ -10,9 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +25,7 @@ SETTINGS = ("plant.kind=exact", "duration=4.0")
 COMMAND = [sys.executable, "-m", "stewart_drake"]
 
 
-def free_port() -> int:
+def free_port():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
         found.bind(("127.0.0.1", 0))
         return int(found.getsockname()[1])
@@ -36,7 +34,7 @@ def free_port() -> int:
 class Process:
     """A process whose lines are read one by one."""
 
-    def __init__(self, command: list[str]) -> None:
+    def __init__(self, command):
         surroundings = os.environ | {"PYTHONUNBUFFERED": "1"}
         self.popen = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=surroundings
@@ -44,11 +42,11 @@ class Process:
         self.lines: list[str] = []
 
     @property
-    def said(self) -> str:
+    def said(self):
         """All of it, in one line."""
         return " ".join(" ".join(self.lines).split())
 
-    def until(self, pattern: str) -> str:
+    def until(self, pattern):
         """The line that has it, which must come before the process ends."""
         assert self.popen.stdout is not None
         for line in self.popen.stdout:
@@ -57,7 +55,7 @@ class Process:
                 return line
         raise AssertionError(f"no {pattern!r} in {self.lines}")
 
-    def end(self, number: signal.Signals | None = None) -> int:
+    def end(self, number=None):
         """Its exit status, after a signal."""
         if number is not None:
             self.popen.send_signal(number)
@@ -67,7 +65,7 @@ class Process:
 
 
 @contextmanager
-def process(command: list[str]) -> Iterator[Process]:
+def process(command):
     made = Process(command)
     try:
         yield made
@@ -78,7 +76,7 @@ def process(command: list[str]) -> Iterator[Process]:
 
 
 @contextmanager
-def machine(*options: str, settings: tuple[str, ...] = SETTINGS) -> Iterator[tuple[Process, int]]:
+def machine(*options, settings=SETTINGS):
     """`stewart-drake machine`, once it listens, and its port."""
     said = [word for setting in settings for word in ("--set", setting)]
     with process([*COMMAND, "machine", "paper", "--port", "0", *said, *options]) as made:
@@ -87,7 +85,7 @@ def machine(*options: str, settings: tuple[str, ...] = SETTINGS) -> Iterator[tup
         yield made, int(first.split("127.0.0.1:")[1].split(":")[0])
 
 
-def exported(made: Path, settings: tuple[str, ...]) -> Path:
+def exported(made, settings):
     """What export-c writes, with the examples over UDP under the sanitizers."""
     if build.compiler() is None or shutil.which("make") is None:
         pytest.skip("there is no C compiler, or no make")
@@ -103,35 +101,33 @@ def exported(made: Path, settings: tuple[str, ...]) -> Path:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     return exported(tmp_path_factory.mktemp("board"), SETTINGS)
 
 
 @pytest.fixture(scope="module")
-def soon(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def soon(tmp_path_factory):
     """The same for torques that act 0.2 s after their measurement."""
     return exported(tmp_path_factory.mktemp("soon"), (*SETTINGS, "delay.steps=2"))
 
 
-def c_controller(folder: Path, port: int, *options: str) -> list[str]:
+def c_controller(folder, port, *options):
     return [str(folder / "stewart_udp"), "127.0.0.1", str(port), *options]
 
 
-def states_of(log: Path) -> np.ndarray:
+def states_of(log):
     """(k, 12) that the C controller measured."""
     return np.loadtxt(log, delimiter=",")[:, 1:13]
 
 
-def simulated(samples: int, settings: tuple[str, ...] = SETTINGS) -> np.ndarray:
+def simulated(samples, settings=SETTINGS):
     """(k, 12) states."""
     result = simulate(load_scenario("paper", settings=settings), judge_stability=False)
     kept = result.signals.sel(time=0.1 * np.arange(samples), method="nearest")
     return np.hstack([kept.pose.values, kept.rates.values])
 
 
-def over(
-    folder: Path, settings: tuple[str, ...], log: Path, rate: float = 1.0
-) -> tuple[np.ndarray, str]:
+def over(folder, settings, log, rate=1.0):
     """States (k, 12) of the machine of a scenario that C drives, and what the machine said."""
     with machine("--watchdog", "3", "--rate", f"{rate}", settings=settings) as (running, port):
         with process(c_controller(folder, port, f"log={log}")) as driving:
@@ -143,7 +139,7 @@ def over(
 # ---------------------------------------------------------------- the three pairs with C
 
 
-def test_the_controller_in_c_drives_the_machine_in_python(folder: Path, tmp_path: Path) -> None:
+def test_the_controller_in_c_drives_the_machine_in_python(folder, tmp_path):
     log = tmp_path / "log"
     with machine() as (running, port):
         with process(c_controller(folder, port, f"log={log}")) as driving:
@@ -158,12 +154,12 @@ def test_the_controller_in_c_drives_the_machine_in_python(folder: Path, tmp_path
 
 
 @pytest.mark.slow
-def test_a_lost_datagram_of_the_controller_in_c_costs_nothing(folder: Path, tmp_path: Path) -> None:
+def test_a_lost_datagram_of_the_controller_in_c_costs_nothing(folder, tmp_path):
     """Where a buffer waits, those that follow say its torque again: the run without a loss."""
     lossy = "link={kind: network, low: 0.0, high: 0.02, loss: 0.3, playout: 0.8}"
     settings = (*SETTINGS, lossy, "controller.packet_repeats=0")
     states, said = over(folder, settings, tmp_path / "log")
-    lost = int(re.search(r"(\d+) lost by", said)[1])  # type: ignore[index]
+    lost = int(re.search(r"(\d+) lost by", said)[1])
     assert lost >= 5 and "32 played, 0 periods dry" in said
     np.testing.assert_allclose(states, simulated(40), atol=1e-6)
 
@@ -172,7 +168,7 @@ SLOW = 0.4
 """Of the machine's clock, where a measurement is soon too late for a busy computer."""
 
 
-def in_a_row(number: int, loss: float, seed: int) -> tuple[str, ...]:
+def in_a_row(number, loss, seed):
     """A link that loses so many datagrams in a row; a torque acts 0.2 s after its measurement."""
     lossy = f"low: 0.0, high: 0.02, loss: {loss}, burst: {number}, playout: 0.1"
     return (*SETTINGS, f"link={{kind: network, {lossy}, seed: {seed}}}")
@@ -183,9 +179,7 @@ MOTION = np.tile([0.26, 0.26, 0.26, 0.02, 0.02, 0.08], 2)
 
 
 @pytest.mark.slow
-def test_what_the_controller_in_c_plans_ahead_acts_in_the_place_of_what_is_lost(
-    soon: Path, tmp_path: Path
-) -> None:
+def test_what_the_controller_in_c_plans_ahead_acts_in_the_place_of_what_is_lost(soon, tmp_path):
     """Too late to be said again, where 3 or 7 in a row are lost: as the law in Python under the
     same losses. Without plans the plate leaves its workspace."""
     settings = in_a_row(3, loss=0.3, seed=2)
@@ -196,12 +190,12 @@ def test_what_the_controller_in_c_plans_ahead_acts_in_the_place_of_what_is_lost(
 
 
 @pytest.mark.slow
-def test_the_controller_in_c_hears_what_has_acted(soon: Path, tmp_path: Path) -> None:
+def test_the_controller_in_c_hears_what_has_acted(soon, tmp_path):
     """Ten in a row are lost, so that the last torque is held: without being told, the filter would
     take that for a torque bias, which takes the plate four amplitudes away."""
     settings = in_a_row(10, loss=0.2, seed=12)
     states, said = over(soon, settings, tmp_path / "log", SLOW)
-    dry = int(re.search(r"(\d+) periods dry", said)[1])  # type: ignore[index]
+    dry = int(re.search(r"(\d+) periods dry", said)[1])
     undisturbed = simulated(40, (*SETTINGS, "delay.steps=2"))
     assert dry >= 2
     most = np.abs(simulated(40, settings) - undisturbed) / MOTION
@@ -209,7 +203,7 @@ def test_the_controller_in_c_hears_what_has_acted(soon: Path, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_the_controller_in_python_drives_the_machine_in_c(folder: Path) -> None:
+def test_the_controller_in_python_drives_the_machine_in_c(folder):
     port = free_port()
     with process([str(folder / "stewart_machine"), str(port)]) as running:
         running.until("a simulated machine at port")
@@ -222,7 +216,7 @@ def test_the_controller_in_python_drives_the_machine_in_c(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_both_ends_in_c(folder: Path, tmp_path: Path) -> None:
+def test_both_ends_in_c(folder, tmp_path):
     log, port, key = tmp_path / "log", free_port(), tmp_path / "key"
     key.write_bytes(b"a key of some length\n")
     with process([str(folder / "stewart_machine"), str(port), "60", str(key)]) as running:
@@ -243,7 +237,7 @@ def test_both_ends_in_c(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_it_with_one_summary() -> None:
+def test_ctrl_c_ends_it_with_one_summary():
     with machine() as (running, _):
         assert running.end(signal.SIGINT) == 130
     begun = [line.split()[0] for line in running.lines if not line.startswith(" ")]
@@ -258,7 +252,7 @@ def test_ctrl_c_ends_it_with_one_summary() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("side", ["controller", "machine"])
-def test_either_side_of_a_network_may_stand_still_for_a_second(side: str) -> None:
+def test_either_side_of_a_network_may_stand_still_for_a_second(side):
     """Told in one line by whoever stood still; the machine is at its safe torque within the time
     that it promises, and the controller leads the plate back, or says why not."""
     way = "low: 0.1, high: 0.12"
@@ -288,7 +282,7 @@ def test_either_side_of_a_network_may_stand_still_for_a_second(side: str) -> Non
     assert re.search(told, driving.said), driving.lines
 
 
-def kills(folder: Path, number: int, rng: random.Random) -> None:
+def kills(folder, number, rng):
     """Kill the controller at random times; the next one takes over from rest."""
     with machine("--watchdog", "0.4") as (running, port):
         for k in range(number):
@@ -309,21 +303,17 @@ def kills(folder: Path, number: int, rng: random.Random) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_controller_ends_in_the_safe_torque_and_the_next_one_takes_over(
-    folder: Path,
-) -> None:
+def test_a_killed_controller_ends_in_the_safe_torque_and_the_next_one_takes_over(folder):
     kills(folder, 2, random.Random(3))
 
 
 @pytest.mark.soak
-def test_killed_twenty_times(folder: Path) -> None:
+def test_killed_twenty_times(folder):
     kills(folder, 20, random.Random())
 
 
 @pytest.mark.slow
-def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_successor(
-    folder: Path,
-) -> None:
+def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_successor(folder):
     port = free_port()
     command = [str(folder / "stewart_machine"), str(port)]
     with process(command) as running, process(c_controller(folder, port)) as driving:
@@ -342,9 +332,7 @@ def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_s
 
 
 @pytest.mark.slow
-def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_over(
-    folder: Path,
-) -> None:
+def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_over(folder):
     port = free_port()
     with process([str(folder / "stewart_machine"), str(port)]) as running:
         running.until("a simulated machine at port")
@@ -361,7 +349,7 @@ def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_
     assert sum("a session begins" in line for line in running.lines) == 2
 
 
-def test_wrong_commands_are_one_line(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_wrong_commands_are_one_line(capfd, tmp_path):
     from stewart_drake.cli import main
 
     busy = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

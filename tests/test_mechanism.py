@@ -4,7 +4,6 @@ import copy
 import dataclasses
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import data_root
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Body, Mechanism
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
 Loader = Callable[[dict[str, Any]], Mechanism]
@@ -31,10 +29,10 @@ LEG = {
 
 
 @pytest.fixture
-def load(tmp_path: Path) -> Loader:
+def load(tmp_path):
     """Writes a mechanism file and loads it."""
 
-    def write_and_load(contents: dict[str, Any]) -> Mechanism:
+    def write_and_load(contents):
         yaml = YAML()
         yaml.representer.ignore_aliases = lambda *_: True
         with (tmp_path / "mine.yaml").open("w") as stream:
@@ -44,7 +42,7 @@ def load(tmp_path: Path) -> Loader:
     return write_and_load
 
 
-def paper_with(edits: dict[str, Any]) -> dict[str, Any]:
+def paper_with(edits):
     """The paper's file with fields, dots between their sections, replaced or taken out."""
     contents = YAML(typ="safe").load(FILE.read_text())
     for name, value in edits.items():
@@ -59,7 +57,7 @@ def paper_with(edits: dict[str, Any]) -> dict[str, Any]:
     return contents
 
 
-def third_leg(**changes: Any) -> dict[str, Any]:
+def third_leg(**changes):
     """Edits that put six explicit legs in place of the pattern, the third of them changed."""
     legs = [copy.deepcopy(LEG) for _ in range(6)]
     legs[2].update(changes)
@@ -119,9 +117,7 @@ INVALID = [
 
 
 @pytest.mark.parametrize(("edits", "got", "allowed"), INVALID, ids=[got for _, got, _ in INVALID])
-def test_invalid_fields_are_refused_in_one_line(
-    edits: dict[str, Any], got: str, allowed: str, load: Loader
-) -> None:
+def test_invalid_fields_are_refused_in_one_line(edits, got, allowed, load):
     with pytest.raises(ConfigError) as caught:
         load(paper_with(edits))
     message = str(caught.value)
@@ -155,15 +151,13 @@ def test_invalid_fields_are_refused_in_one_line(
         ),
     ],
 )
-def test_unknown_and_missing_keys_are_named(
-    edits: dict[str, Any], problem: str, load: Loader
-) -> None:
+def test_unknown_and_missing_keys_are_named(edits, problem, load):
     with pytest.raises(ConfigError) as caught:
         load(paper_with(edits))
     assert str(caught.value).endswith(f"mine.yaml: {problem}")
 
 
-def test_all_impossible_bodies_are_told_at_once(load: Loader) -> None:
+def test_all_impossible_bodies_are_told_at_once(load):
     edits = {"base.inertia": [1.0, 1.0, 3.0], "crank.mass": 0, "rod.inertia": [0, 1e-3, 1e-3]}
     with pytest.raises(ConfigError) as caught:
         load(paper_with(edits))
@@ -176,7 +170,7 @@ def test_all_impossible_bodies_are_told_at_once(load: Loader) -> None:
 # ------------------------------------------------------------------ moments that nobody measured
 
 
-def rod_by_quadrature(length: float, diameter: float, mass: float) -> Array:
+def rod_by_quadrature(length, diameter, mass):
     """Moments of a uniform cylinder along x by Gauss-Legendre over its volume; exact for them."""
     nodes, weights = np.polynomial.legendre.leggauss(8)
     x, along = length / 2 * nodes, weights / 2
@@ -185,10 +179,10 @@ def rod_by_quadrature(length: float, diameter: float, mass: float) -> Array:
     return np.array([rr, xx + rr / 2, xx + rr / 2])
 
 
-def test_moments_left_out_are_those_of_uniform_bars_and_discs(load: Loader) -> None:
+def test_moments_left_out_are_those_of_uniform_bars_and_discs(load):
     cranks = [0.10, 0.11, 0.12, 0.13, 0.14, 0.15]
     bodies = ("base", "plate", "crank", "rod")
-    edits: dict[str, Any] = {f"{body}.inertia": ABSENT for body in bodies}
+    edits = {f"{body}.inertia": ABSENT for body in bodies}
     found = load(paper_with({**edits, "crank.length": cranks}))
     for link, length in ((found.crank, 0.125), (found.rod, 0.404)):
         expected = rod_by_quadrature(length, length / 20, link.mass)
@@ -206,7 +200,7 @@ def test_moments_left_out_are_those_of_uniform_bars_and_discs(load: Loader) -> N
     np.testing.assert_array_equal(massless.base.inertia, 0)
 
 
-def test_moments_of_what_is_not_uniform_have_to_be_given(load: Loader) -> None:
+def test_moments_of_what_is_not_uniform_have_to_be_given(load):
     with pytest.raises(ConfigError, match=r"rod\.inertia: is missing.* center of 0\.3"):
         load(paper_with({"rod.inertia": ABSENT, "rod.center": 0.3}))
 
@@ -217,7 +211,7 @@ LENGTHS = ["crank.length", "rod.length", "pattern.base_radius", "pattern.plate_r
 LENGTHS += ["pattern.shaft_height"]
 
 
-def enlarged(name: str, factor: float, masses: float, inertias: float) -> dict[str, Any]:
+def enlarged(name, factor, masses, inertias):
     """A shipped mechanism's file with all lengths, masses and inertias multiplied."""
     contents = YAML(typ="safe").load((FILE.parent / f"{name}.yaml").read_text())
     for field in [*LENGTHS, "pattern.plate_height"]:
@@ -233,7 +227,7 @@ def enlarged(name: str, factor: float, masses: float, inertias: float) -> dict[s
 
 @pytest.mark.parametrize("masses", [1, 1000], ids=["kg", "g"])
 @pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
-def test_a_file_in_millimetres_is_asked_for_metres(name: str, masses: float, load: Loader) -> None:
+def test_a_file_in_millimetres_is_asked_for_metres(name, masses, load):
     with pytest.raises(
         ConfigError, match=r"expected .*metres.*\(are these millimetres\?\)"
     ) as caught:
@@ -243,7 +237,7 @@ def test_a_file_in_millimetres_is_asked_for_metres(name: str, masses: float, loa
 
 @pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
 @pytest.mark.parametrize("factor", [1e-3, 0.01, 0.1, 1, 5])
-def test_machines_of_any_size_in_metres_are_taken(name: str, factor: float, load: Loader) -> None:
+def test_machines_of_any_size_in_metres_are_taken(name, factor, load):
     """From a tenth of a millimetre to ten metres, masses grown by as little as the square."""
     masses = factor**2 if factor > 1 else factor**3
     load(enlarged(name, factor, masses, masses * factor**2))
@@ -253,7 +247,7 @@ def test_machines_of_any_size_in_metres_are_taken(name: str, factor: float, load
 
 
 @pytest.mark.parametrize("z", [0.6, 0.05, -3.0, 380.0])
-def test_a_reachable_height_is_named(z: float, load: Loader) -> None:
+def test_a_reachable_height_is_named(z, load):
     """The range that is named is in reach, its outside is not, and the proposal loads."""
     home = [0.1, -0.05, 0.2, 0.01, 0.0]
     with pytest.raises(ConfigError, match="within reach") as caught:
@@ -269,7 +263,7 @@ def test_a_reachable_height_is_named(z: float, load: Loader) -> None:
         assert abs(PAPER.reach_margins(np.array([*home, edge])).min()) < 2e-4
 
 
-def test_that_no_height_is_reachable_is_said(load: Loader) -> None:
+def test_that_no_height_is_reachable_is_said(load):
     for sideways in (0.4, 50.0):
         with pytest.raises(ConfigError, match="within reach, of which there is none at this x, y"):
             load(paper_with({"home": [0, 0, 0, sideways, 0, 0.38]}))
@@ -292,14 +286,14 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("changes", "problem"), REFUSED, ids=[problem for _, problem in REFUSED])
-def test_constructor_refuses_what_no_mechanism_has(changes: dict[str, Any], problem: str) -> None:
+def test_constructor_refuses_what_no_mechanism_has(changes, problem):
     with pytest.raises(ConfigError) as caught:
         dataclasses.replace(PAPER, **changes)
     assert str(caught.value).startswith(problem)
     assert "\n" not in str(caught.value)
 
 
-def test_arrays_are_copies_and_read_only() -> None:
+def test_arrays_are_copies_and_read_only():
     shafts, moments = PAPER.p_WS.copy(), np.array([30e-4, 30e-4, 60e-4])
     mechanism = dataclasses.replace(PAPER, p_WS=shafts, plate=Body(4.0, moments))
     shafts += 1
@@ -319,7 +313,7 @@ def test_arrays_are_copies_and_read_only() -> None:
 # ------------------------------------------------------------------ what files describe
 
 
-def test_paper_geometry_is_the_tabulated_one() -> None:
+def test_paper_geometry_is_the_tabulated_one():
     """Pairs 15 and 5 degrees apart on circles of 0.22 and 0.12 m, installed at 70 degrees."""
     base_deg = 24 + np.array([-7.5, 7.5, 112.5, 127.5, 232.5, 247.5])
     t = 24 + 60 + np.array([-2.5, 2.5, 117.5, 122.5, 237.5, 242.5])
@@ -350,13 +344,13 @@ def test_paper_geometry_is_the_tabulated_one() -> None:
         ("rod", 0.08, [0.01, 16, 16]),
     ],
 )
-def test_paper_bodies_are_those_of_table_1(body: str, mass: float, inertia: list[float]) -> None:
+def test_paper_bodies_are_those_of_table_1(body, mass, inertia):
     assert getattr(PAPER, body).mass == mass
     np.testing.assert_allclose(getattr(PAPER, body).inertia, np.multiply(inertia, 1e-4), rtol=1e-15)
     assert PAPER.crank.center == PAPER.rod.center == 0.5
 
 
-def test_explicit_legs_give_the_geometry_of_the_pattern(load: Loader) -> None:
+def test_explicit_legs_give_the_geometry_of_the_pattern(load):
     """Directions may have any length; the crank's may lean a rounding error off the right angle."""
     legs = [
         {
@@ -377,7 +371,7 @@ def test_explicit_legs_give_the_geometry_of_the_pattern(load: Loader) -> None:
     np.testing.assert_allclose(explicit.crank_angles(pose), PAPER.crank_angles(pose), atol=1e-12)
 
 
-def test_directions_may_be_written_with_three_decimals(load: Loader) -> None:
+def test_directions_may_be_written_with_three_decimals(load):
     legs = [
         {
             "shaft": PAPER.p_WS[i].tolist(),
@@ -394,7 +388,7 @@ def test_directions_may_be_written_with_three_decimals(load: Loader) -> None:
     np.testing.assert_allclose(right, np.broadcast_to(np.eye(3), (6, 3, 3)), atol=1e-14)
 
 
-def test_lengths_may_differ_from_leg_to_leg(load: Loader) -> None:
+def test_lengths_may_differ_from_leg_to_leg(load):
     cranks = [0.10, 0.11, 0.12, 0.13, 0.14, 0.15]
     rods = [0.40, 0.41, 0.42, 0.43, 0.44, 0.45]
     mechanism = load(paper_with({"crank.length": cranks, "rod.length": rods}))
@@ -404,7 +398,7 @@ def test_lengths_may_differ_from_leg_to_leg(load: Loader) -> None:
     np.testing.assert_array_equal(alike.crank_lengths, PAPER.crank_lengths)
 
 
-def test_optional_fields_have_defaults(load: Loader) -> None:
+def test_optional_fields_have_defaults(load):
     massless = {"mass": 0, "inertia": [0, 0, 0]}
     mechanism = load(paper_with({"motor": ABSENT, "base": massless}))
     assert mechanism.effort_limit is None

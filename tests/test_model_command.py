@@ -2,9 +2,6 @@
 
 import contextlib
 import json
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +15,6 @@ from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.resources import data_root, shipped
 from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.reporting.viewer import SLIDERS, STOP, PoseViewer, place, slider_range
 from stewart_drake.studies.new_machine import check_mechanism
@@ -35,9 +31,7 @@ HOME_VALUES = PAPER.home * ([180 / np.pi] * 3 + [1e3] * 3)
 
 
 @pytest.mark.parametrize("name", shipped("mechanism"))
-def test_check_tells_what_the_dynamics_say(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_tells_what_the_dynamics_say(name, tmp_path, capsys):
     assert main(["model", "check", name, "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("yes: ") and not too_long(said)
@@ -60,9 +54,7 @@ def test_check_tells_what_the_dynamics_say(
     assert len(summary["travel"]) == 6
 
 
-def test_check_marks_moments_that_nobody_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_marks_moments_that_nobody_measured(tmp_path, capsys):
     path = tmp_path / "mine.yaml"
     text = (data_root() / "models" / "paper.yaml").read_text()
     path.write_text(text.replace(", inertia: [30.0e-4, 30.0e-4, 60.0e-4]", ""))
@@ -76,7 +68,7 @@ def test_check_marks_moments_that_nobody_measured(
     assert "estimated" not in capsys.readouterr().out
 
 
-def test_check_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_prints_json_and_nothing_else(capsys):
     assert main(["model", "check", "desktop", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["name"] == "desktop"
 
@@ -84,9 +76,7 @@ def test_check_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.parametrize(
     ("machine", "why"), [(parallel_rods(), "parallel singularity"), (stretched(), "end of its")]
 )
-def test_check_of_a_singular_machine_is_a_verdict(
-    machine: Mechanism, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_of_a_singular_machine_is_a_verdict(machine, why, tmp_path, capsys):
     path = write_mechanism(machine, tmp_path / "machine.yaml")
     assert main(["model", "check", str(path), "--out", str(tmp_path / "out")]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -95,7 +85,7 @@ def test_check_of_a_singular_machine_is_a_verdict(
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["torque"] == []
 
 
-def test_motors_that_cannot_hold_the_plate_are_told() -> None:
+def test_motors_that_cannot_hold_the_plate_are_told():
     weak = load_mechanism("motion_base")
     object.__setattr__(weak, "effort_limit", 500.0)
     assert "cannot hold the plate, 928 N m" in check_mechanism(weak).verdict
@@ -104,15 +94,12 @@ def test_motors_that_cannot_hold_the_plate_are_told() -> None:
 # ------------------------------------------------------------------ the drawing
 
 
-def test_the_drawing_shows_cranks_and_rods_where_they_are() -> None:
+def test_the_drawing_shows_cranks_and_rods_where_they_are():
     mechanism = load_mechanism("motion_base")
     home = assemble(mechanism, mechanism.home)
     top, front = mechanism_figure(mechanism).axes
     for ax, axes in ((top, [0, 1]), (front, [0, 2])):
-        drawn = {
-            tuple(np.round(np.ravel(line.get_xydata()), 6))  # type: ignore[arg-type]
-            for line in ax.lines
-        }
+        drawn = {tuple(np.round(np.ravel(line.get_xydata()), 6)) for line in ax.lines}
         for shaft, tip in zip(mechanism.p_WS, home.p_WT, strict=True):
             crank = 1e3 * np.concatenate([shaft[axes], tip[axes]])
             assert tuple(np.round(crank, 6)) in drawn
@@ -122,19 +109,19 @@ def test_the_drawing_shows_cranks_and_rods_where_they_are() -> None:
 
 
 @pytest.fixture(scope="module")
-def viewer() -> Iterator[PoseViewer]:
+def viewer():
     with contextlib.closing(PoseViewer(PAPER, Meshcat())) as shown:
         yield shown
 
 
-def test_the_viewer_starts_at_home_with_a_slider_per_coordinate(viewer: PoseViewer) -> None:
+def test_the_viewer_starts_at_home_with_a_slider_per_coordinate(viewer):
     np.testing.assert_allclose(viewer.values(), HOME_VALUES)
     assert set(viewer.meshcat.GetSliderNames()) == set(SLIDERS)
     low, high = slider_range(PAPER)
     assert np.all(low < HOME_VALUES) and np.all(high > HOME_VALUES)
 
 
-def test_sliders_place_the_machine(viewer: PoseViewer) -> None:
+def test_sliders_place_the_machine(viewer):
     values = HOME_VALUES + [5, -4, 10, 15, -20, 30]
     placement = viewer.step(values)
     pose = np.concatenate([np.deg2rad(values[:3]), values[3:] / 1e3])
@@ -146,7 +133,7 @@ def test_sliders_place_the_machine(viewer: PoseViewer) -> None:
     np.testing.assert_allclose(X_WP.translation(), pose[3:], atol=1e-12)
 
 
-def test_out_of_reach_is_shown_and_the_machine_stays_where_it_was(viewer: PoseViewer) -> None:
+def test_out_of_reach_is_shown_and_the_machine_stays_where_it_was(viewer):
     viewer.step(HOME_VALUES)
     placement = viewer.step(HOME_VALUES + [0, 0, 0, 0, 0, 150])
     margins = PAPER.reach_margins(placement.pose)
@@ -165,39 +152,39 @@ def test_out_of_reach_is_shown_and_the_machine_stays_where_it_was(viewer: PoseVi
 
 @given(values=st.lists(st.floats(-1e4, 1e4), min_size=6, max_size=6))
 @settings(deadline=None, max_examples=60)
-def test_no_slider_value_crashes(viewer: PoseViewer, values: list[float]) -> None:
+def test_no_slider_value_crashes(viewer, values):
     placement = viewer.step(values)
     assert (placement.failure is None) == (diagnose(PAPER, 0.0, placement.pose) is None)
     assert len(str(placement)) > 10
 
 
 @pytest.mark.parametrize("machine", [parallel_rods(), stretched()])
-def test_a_singular_machine_can_be_viewed(machine: Mechanism) -> None:
+def test_a_singular_machine_can_be_viewed(machine):
     with contextlib.closing(PoseViewer(machine, Meshcat())) as viewer:
         assert place(machine, viewer.values()).failure is not None
         assert viewer.values().shape == (6,)
 
 
-def test_the_viewer_follows_the_sliders_until_it_is_stopped(viewer: PoseViewer) -> None:
+def test_the_viewer_follows_the_sliders_until_it_is_stopped(viewer):
     class Clicked:
         """A Meshcat whose sliders move and whose button is pressed at the fourth look."""
 
-        def __init__(self, meshcat: Meshcat) -> None:
+        def __init__(self, meshcat):
             self.looks, self._meshcat = 0, meshcat
 
-        def __getattr__(self, name: str) -> Any:
+        def __getattr__(self, name):
             return getattr(self._meshcat, name)
 
-        def GetButtonClicks(self, name: str) -> int:
+        def GetButtonClicks(self, name):
             assert name == STOP
             self.looks += 1
             if self.looks == 2:
                 self._meshcat.SetSliderValue("z [mm]", 400.0)
             return int(self.looks == 4)
 
-    said: list[str] = []
+    said = []
     real = viewer.meshcat
-    viewer.meshcat = Clicked(real)  # type: ignore[assignment]
+    viewer.meshcat = Clicked(real)
     try:
         viewer.run(said.append)
     finally:
@@ -206,9 +193,7 @@ def test_the_viewer_follows_the_sliders_until_it_is_stopped(viewer: PoseViewer) 
     assert viewer.values()[5] == 400.0
 
 
-def test_view_writes_a_page_that_needs_no_server(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_view_writes_a_page_that_needs_no_server(tmp_path, capsys):
     assert main(["model", "view", "desktop", "--out", str(tmp_path)]) == 0
     assert (tmp_path / "view.html").stat().st_size > 500_000
     assert "view.html" in capsys.readouterr().out

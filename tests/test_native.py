@@ -7,9 +7,7 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -23,9 +21,7 @@ from stewart_drake.dynamics import generate, native_functions
 from stewart_drake.dynamics.native_functions import NativeFunctions, functions_of
 from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.dynamics.workspace import margin, standing
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, PAYLOAD
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.virtual_machine import VirtualMachine
 
@@ -36,7 +32,7 @@ QUICK = ("accelerations", "energy", "measures", "measures_of_tree", "change", "m
 """Functions that the virtual machine builds in a tenth of a second each."""
 
 
-def arguments(rng: np.random.Generator, mechanism: Mechanism) -> dict[str, Array | float]:
+def arguments(rng, mechanism):
     """Random ones within reach, by their names in the layout."""
     pose = random_pose(rng, mechanism)
     rates, accelerations, torque, angles = rng.normal(0, 1, (4, 6))
@@ -54,32 +50,30 @@ def arguments(rng: np.random.Generator, mechanism: Mechanism) -> dict[str, Array
     }
 
 
-def parameters(rng: np.random.Generator) -> Array:
+def parameters(rng):
     """Of the plant, any: but of a payload that leaves the plate its mass, so that it can move."""
     found = rng.normal(0, 0.1, NUM_PLANT_PARAMETERS)
     found[PAYLOAD] = abs(found[PAYLOAD])
     return found
 
 
-def difference(found: object, expected: object) -> float:
+def difference(found, expected):
     """Largest, of all results, relative to the largest number of each."""
     pairs = zip(_listed(found), _listed(expected), strict=True)
     return max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs)
 
 
-def _listed(results: object) -> list[Array]:
+def _listed(results):
     return [np.asarray(r) for r in results] if isinstance(results, list) else [np.asarray(results)]
 
 
 @functools.cache
-def machine(seed: int) -> VirtualMachine:
+def machine(seed):
     """Of a random mechanism; what is built of it stays."""
     return VirtualMachine(random_mechanism(np.random.default_rng(seed)))
 
 
-def assert_equal(
-    seed: int, names: tuple[str, ...] = tuple(SIGNATURES), made: ctypes.CDLL | None = None
-) -> None:
+def assert_equal(seed, names=tuple(SIGNATURES), made=None):
     """Core and virtual machine agree on a random machine; `made`: another library than the core."""
     rng, other = np.random.default_rng(seed), machine(seed)
     mechanism = other.mechanism
@@ -93,7 +87,7 @@ def assert_equal(
             assert difference(found, expected) < CLOSE, (seed, name)
 
 
-def test_native_equals_the_virtual_machine() -> None:
+def test_native_equals_the_virtual_machine():
     """Random machines; `make soak` has a thousand."""
     for seed in range(20):
         assert_equal(seed, QUICK)
@@ -103,13 +97,13 @@ def test_native_equals_the_virtual_machine() -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("part", range(20))
-def test_native_equals_the_virtual_machine_on_a_thousand_machines(part: int) -> None:
+def test_native_equals_the_virtual_machine_on_a_thousand_machines(part):
     for seed in range(1000 + 50 * part, 1000 + 50 * (part + 1)):
         assert_equal(seed)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 130])
-def test_predictions_are_those_of_the_virtual_machine(steps: int) -> None:
+def test_predictions_are_those_of_the_virtual_machine(steps):
     """Steps shorter than the motion's time constants, so that rounding does not grow."""
     rng = np.random.default_rng(steps)
     torque = PAPER_HOLD + rng.normal(0, 0.01, (steps, 6))
@@ -126,7 +120,7 @@ def test_predictions_are_those_of_the_virtual_machine(steps: int) -> None:
 PAPER_HOLD = sd.StewartDynamics(PAPER).equilibrium_torque(PAPER.home)
 
 
-def test_far_out_of_reach_and_without_numbers_they_agree_too() -> None:
+def test_far_out_of_reach_and_without_numbers_they_agree_too():
     """Where squares are held above zero, and where NaN must stay NaN."""
     rng = np.random.default_rng(5)
     one, other = NativeFunctions(PAPER), VirtualMachine(PAPER)
@@ -146,7 +140,7 @@ def test_far_out_of_reach_and_without_numbers_they_agree_too() -> None:
             assert np.isnan(found).any()
 
 
-def test_the_margin_is_the_least_of_the_measures() -> None:
+def test_the_margin_is_the_least_of_the_measures():
     functions = functions_of(PAPER)
     measures = functions.measures(PAPER.home)[0]
     least = np.zeros(8)
@@ -159,7 +153,7 @@ def test_the_margin_is_the_least_of_the_measures() -> None:
     assert margin(PAPER, PAPER.home) == standing(PAPER, PAPER.home).margin > 0.1
 
 
-def test_threads_have_buffers_of_their_own() -> None:
+def test_threads_have_buffers_of_their_own():
     """Eight threads on one function, released from Python's lock while they compute."""
     functions, meeting = NativeFunctions(PAPER), threading.Barrier(8)
     expected = {}
@@ -167,7 +161,7 @@ def test_threads_have_buffers_of_their_own() -> None:
         torque = np.full((200, 6), 0.01 * n)
         expected[n] = functions.many_steps(200)(_START, torque, NO_PARAMETERS, 9.81, 1e-4)[0]
 
-    def repeated(n: int) -> bool:
+    def repeated(n):
         meeting.wait(10)
         torque = np.full((200, 6), 0.01 * n)
         call = functions.many_steps(200)
@@ -185,7 +179,7 @@ _START = np.concatenate([PAPER.home, np.zeros(6)])
 # The source, and what is made of it.
 
 
-def made_of(equations: str, folder: Path) -> ctypes.CDLL:
+def made_of(equations, folder):
     """The dynamics compiled with other equations, quickly."""
     shutil.copytree(build.FOLDER, folder, ignore=shutil.ignore_patterns("*.so", "*.py"))
     (folder / "equations.h").write_text(equations)
@@ -196,7 +190,7 @@ def made_of(equations: str, folder: Path) -> ctypes.CDLL:
     return ctypes.CDLL(str(target))
 
 
-def test_the_c_is_what_the_equations_are(tmp_path: Path) -> None:
+def test_the_c_is_what_the_equations_are(tmp_path):
     """Word for word; or, as another CasADi writes it, in what it computes."""
     text = generate.equations_in_c()
     if text != build.EQUATIONS.read_text():
@@ -205,7 +199,7 @@ def test_the_c_is_what_the_equations_are(tmp_path: Path) -> None:
             assert_equal(seed)
 
 
-def test_it_is_compiled_without_a_warning(tmp_path: Path) -> None:
+def test_it_is_compiled_without_a_warning(tmp_path):
     strict = ["-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror"]
     command = [*(build.compiler() or ()), *build.FLAGS, "-O1", *strict]
     target = str(tmp_path / "lib.so")
@@ -213,7 +207,7 @@ def test_it_is_compiled_without_a_warning(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def unloaded() -> Iterator[None]:
+def unloaded():
     """No library is loaded yet, before the test and after it."""
     library.core_library.cache_clear()
     yield
@@ -221,8 +215,8 @@ def unloaded() -> Iterator[None]:
 
 
 def test_a_library_that_does_not_fit_is_refused_in_one_line(
-    unloaded, monkeypatch, tmp_path: Path, capsys
-) -> None:
+    unloaded, monkeypatch, tmp_path, capsys
+):
     damaged = tmp_path / "lib.so"
     damaged.write_bytes(b"no library")
     for change, problem in (
@@ -239,7 +233,7 @@ def test_a_library_that_does_not_fit_is_refused_in_one_line(
         assert f"the compiled core {problem}" in error and "core.build" in error
 
 
-def test_the_build_knows_whether_its_generated_text_is_current(monkeypatch, tmp_path: Path) -> None:
+def test_the_build_knows_whether_its_generated_text_is_current(monkeypatch, tmp_path):
     assert build.is_generated(), "make generate"
     with monkeypatch.context() as patched:
         patched.setattr(build, "equations_hash", lambda: "another")
@@ -252,15 +246,13 @@ def test_the_build_knows_whether_its_generated_text_is_current(monkeypatch, tmp_
         assert build.is_generated()
 
 
-def test_a_compiler_that_fails_is_named(monkeypatch, tmp_path: Path) -> None:
+def test_a_compiler_that_fails_is_named(monkeypatch, tmp_path):
     monkeypatch.setenv("CC", "false")
     assert build.compile_library(tmp_path / "lib.so") == "false: it failed"
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_a_compiler_zig_is_taken_and_without_both_one_line_says_so(
-    monkeypatch, tmp_path: Path
-) -> None:
+def test_without_a_compiler_zig_is_taken_and_without_both_one_line_says_so(monkeypatch, tmp_path):
     monkeypatch.setenv("CC", "/nowhere/cc")
     monkeypatch.setattr(build.importlib.util, "find_spec", lambda name: object())
     assert build.compiler()[:4] == [sys.executable, "-m", "ziglang", "cc"]
@@ -269,7 +261,7 @@ def test_without_a_compiler_zig_is_taken_and_without_both_one_line_says_so(
 
 
 @pytest.mark.slow
-def test_a_run_imports_no_casadi() -> None:
+def test_a_run_imports_no_casadi():
     code = """if True:
         import sys, stewart_drake as sd
         scenario = sd.load_scenario("paper", settings=["duration=0.1"])

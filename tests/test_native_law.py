@@ -12,7 +12,7 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law import core_law
 from stewart_drake.law.core_law import CompiledLaw, CoreLqi, serving, uncovered
-from stewart_drake.law.delay_model import DelayedModel, delayed_model
+from stewart_drake.law.delay_model import delayed_model
 from stewart_drake.law.doubling import Doubling
 from stewart_drake.law.error_model import linear_model
 from stewart_drake.law.measurement import Measurement
@@ -40,7 +40,7 @@ DIRTY = (
 # The Riccati equation.
 
 
-def problem(seed: int) -> tuple[DelayedModel, Array, Array]:
+def problem(seed):
     """A random machine at home, moving, with any delay and weights."""
     rng = np.random.default_rng(seed)
     mechanism = random_mechanism(rng)
@@ -59,7 +59,7 @@ def problem(seed: int) -> tuple[DelayedModel, Array, Array]:
     return model, Q, np.eye(6) * 10 ** rng.uniform(-1, 1) / peak**2
 
 
-def exact_gain(A: Array, B: Array, Q: Array, R: Array, P: Array) -> Array:
+def exact_gain(A, B, Q, R, P):
     """In extended precision, by value iteration from a solution that is nearly right."""
     a, b, q, r, p = (np.asarray(x, np.longdouble) for x in (A, B, Q, R, P))
     for _ in range(5000):
@@ -72,12 +72,12 @@ def exact_gain(A: Array, B: Array, Q: Array, R: Array, P: Array) -> Array:
     return riccati_gain(p, a, b, r).astype(np.float64)
 
 
-def assert_exact(seed: int) -> None:
+def assert_exact(seed):
     """1e-12 of the largest entry from the exact gain, and from Drake's as far as that is exact."""
     model, Q, R = problem(seed)
-    given: list[Array] = []
+    given = []
 
-    def by_drake(*matrices: Array) -> tuple[Array, Array]:
+    def by_drake(*matrices):
         given[:] = matrices
         return lqr(*matrices)
 
@@ -93,20 +93,20 @@ def assert_exact(seed: int) -> None:
 
 
 @pytest.mark.parametrize("part", range(3))
-def test_gains_are_exact(part: int) -> None:
+def test_gains_are_exact(part):
     for seed in range(10 * part, 10 * part + 10):
         assert_exact(seed)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("part", range(20))
-def test_gains_of_a_thousand_machines_are_exact(part: int) -> None:
+def test_gains_of_a_thousand_machines_are_exact(part):
     for seed in range(50 * part, 50 * part + 50):
         assert_exact(seed)
 
 
 @pytest.mark.parametrize("order", [6, 12, 18, 24])
-def test_the_cost_of_a_run_is_what_the_solution_says(order: int) -> None:
+def test_the_cost_of_a_run_is_what_the_solution_says(order):
     """Brute force: x'Px is what the loop costs from x on."""
     rng = np.random.default_rng(order)
     A = rng.normal(0, 1.2 / np.sqrt(order), (order, order))
@@ -122,7 +122,7 @@ def test_the_cost_of_a_run_is_what_the_solution_says(order: int) -> None:
     assert cost == pytest.approx(first @ P @ first, rel=1e-11)
 
 
-def test_what_has_no_solution_is_a_failure() -> None:
+def test_what_has_no_solution_is_a_failure():
     one, nothing = np.eye(12), np.zeros((12, 6))
     B = np.vstack([np.eye(6), np.zeros((6, 6))])
     doubling = Doubling(12)
@@ -142,7 +142,7 @@ def test_what_has_no_solution_is_a_failure() -> None:
 # Step by step.
 
 
-def spoiled(k: int, y: Array) -> Array:
+def spoiled(k, y):
     """Lost, frozen, impossible and outlying measurements, and a plate that was moved by hand."""
     y = y.copy()
     if k in (12, 13):
@@ -161,7 +161,7 @@ def spoiled(k: int, y: Array) -> Array:
 
 
 STUCK = np.concatenate([PAPER.home + 1e-4, np.full(6, 1e-3)])
-CASES: dict[str, tuple[str, tuple[str, ...], Spoil | None]] = {
+CASES = {
     "paper": ("paper", (), None),
     "gravity": ("gravity", (NOISE,), None),
     "a fraction of a period": ("desktop", ("delay.fraction=0.3",), None),
@@ -192,7 +192,7 @@ HAPPENED = {
 
 # Parts of the memory, and to what they are equal: at the first samples, without noise, the filter
 # divides by next to nothing.
-RECORDED: tuple[tuple[Callable[[Any], Array], float, float], ...] = (
+RECORDED = (
     (lambda m: m.error, 1e-8, 1e-11),
     (lambda m: m.integral, 1e-8, 1e-11),
     (lambda m: m.gain, 1e-6, 0.0),
@@ -209,7 +209,7 @@ RECORDED: tuple[tuple[Callable[[Any], Array], float, float], ...] = (
 class Pair:
     """Both laws in one loop with the plant as it is: what the one in Python says acts."""
 
-    def __init__(self, name: str, settings: tuple[str, ...]) -> None:
+    def __init__(self, name, settings):
         self.scenario = load_scenario(name, settings=("plant.kind=exact", *settings))
         experiment = prepare(self.scenario)
         self.law, self.planned, _ = control_law(experiment)
@@ -225,7 +225,7 @@ class Pair:
         self.late = round(sc.sensor.delay / sc.controller.period)
         self.weights = np.array([sc.controller.w_Q, sc.controller.w_R])
 
-    def step(self, k: int, noise: Array, spoil: Spoil | None, lose: Spoil | None = None) -> float:
+    def step(self, k, noise, spoil, lose=None):
         """By how much the torques differ; `lose` spoils the reference."""
         law, period = self.law, self.law.timeline.period
         age = min(self.late, k)
@@ -246,7 +246,7 @@ class Pair:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_step_by_step_the_torques_are_those_of_python(case: str) -> None:
+def test_step_by_step_the_torques_are_those_of_python(case):
     """1e-9 of the peak torque; and all that is recorded."""
     name, settings, spoil = CASES[case]
     pair, rng = Pair(name, settings), np.random.default_rng(7)
@@ -268,7 +268,7 @@ def test_step_by_step_the_torques_are_those_of_python(case: str) -> None:
         assert getattr(pair.one.counts, count) > 0
 
 
-def lost(k: int, reference: Array) -> Array:
+def lost(k, reference):
     """One number, one row, all accelerations, the last rows, everything, and that several times."""
     reference, rng = reference.copy(), np.random.default_rng(k)
     if k in (4, 5, 9, 15):
@@ -284,10 +284,10 @@ def lost(k: int, reference: Array) -> Array:
     return reference
 
 
-def lost_in_a_row(first: int, number: int) -> Spoil:
+def lost_in_a_row(first, number):
     """Whole previews, and later one without its last row."""
 
-    def lose(k: int, reference: Array) -> Array:
+    def lose(k, reference):
         reference = reference.copy()
         if first <= k < first + number:
             reference[:] = np.nan
@@ -300,7 +300,7 @@ def lost_in_a_row(first: int, number: int) -> Spoil:
 
 @pytest.mark.parametrize("case", ["paper", "a fraction of a period", "no delay", "gravity"])
 @pytest.mark.parametrize(("first", "number"), [(0, 1), (0, 3), (1, 5), (2, 5), (0, 10), (8, 10)])
-def test_after_a_gap_the_way_back_is_that_of_python(case: str, first: int, number: int) -> None:
+def test_after_a_gap_the_way_back_is_that_of_python(case, first, number):
     """From rest; the same torques, counts and memory."""
     name, settings, _ = CASES[case]
     pair, gaps, peak = Pair(name, settings), [], 0.0
@@ -319,7 +319,7 @@ def test_after_a_gap_the_way_back_is_that_of_python(case: str, first: int, numbe
 
 @pytest.mark.parametrize("case", ["paper", "a fraction of a period", "no delay", "gravity"])
 @pytest.mark.parametrize("start", ["measured", "unmeasured"])
-def test_a_reference_that_is_missing_is_continued_as_in_python(case: str, start: str) -> None:
+def test_a_reference_that_is_missing_is_continued_as_in_python(case, start):
     """The same torques, counts and memory; with weights that are no numbers, too."""
     name, settings, _ = CASES[case]
     pair = Pair(name, (*settings, "start=on_reference", "queue=reference"))
@@ -337,7 +337,7 @@ def test_a_reference_that_is_missing_is_continued_as_in_python(case: str, start:
     assert pair.one.counts.references_missing == 12
 
 
-def test_what_was_sent_in_its_place_is_in_flight() -> None:
+def test_what_was_sent_in_its_place_is_in_flight():
     pair = Pair("paper", ())
     for k in range(3):
         pair.step(k, np.zeros(12), None)
@@ -365,7 +365,7 @@ COVERED = (
 )
 
 
-def law_of(*settings: str, controller: str | None = None) -> PredictiveLqi:
+def law_of(*settings, controller=None):
     return compose_law(prepare(load_scenario("paper", controller, settings=settings)))
 
 
@@ -377,11 +377,11 @@ def law_of(*settings: str, controller: str | None = None) -> PredictiveLqi:
         *((settings, None) for settings in COVERED),
     ],
 )
-def test_what_the_law_in_c_has_not_is_named(settings: tuple[str, ...], field: str | None) -> None:
+def test_what_the_law_in_c_has_not_is_named(settings, field):
     assert uncovered(law_of(*settings)) == field
 
 
-def test_a_part_of_ones_own_is_stepped_in_python() -> None:
+def test_a_part_of_ones_own_is_stepped_in_python():
     class Mine(PredictiveLqi):
         pass
 
@@ -395,7 +395,7 @@ def test_a_part_of_ones_own_is_stepped_in_python() -> None:
     assert serving(mine) == (mine, "python (controller.replan)")
 
 
-def test_a_law_of_the_paper_is_stepped_in_python() -> None:
+def test_a_law_of_the_paper_is_stepped_in_python():
     assert serving(law_of("controller.prediction=linear")).backend == (
         "python (controller.prediction)"
     )
@@ -407,13 +407,13 @@ SPARE, UNTOUCHED = 500, 12345.678
 class Painted:
     """numpy for `law.core_law`: new arrays are painted, and kept."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.kept: list[Array] = []
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         return getattr(np, name)
 
-    def empty(self, shape: Any) -> Array:
+    def empty(self, shape):
         """Return an array that shows what was written."""
         self.kept.append(np.full(shape, UNTOUCHED))
         return self.kept[-1]
@@ -433,9 +433,7 @@ class Painted:
         ),
     ],
 )
-def test_a_step_takes_no_more_scratch_than_stated(
-    settings: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_takes_no_more_scratch_than_stated(settings, monkeypatch):
     """Nothing behind the stated number of numbers is written; most of them are."""
     stated = CompiledLaw(law_of(*settings)).scratch
     monkeypatch.setattr(CompiledLaw, "scratch", stated + SPARE)
@@ -447,7 +445,7 @@ def test_a_step_takes_no_more_scratch_than_stated(
     assert max(np.count_nonzero(array != UNTOUCHED) for array in used) > stated / 5
 
 
-def test_shapes_that_do_not_fit_are_refused() -> None:
+def test_shapes_that_do_not_fit_are_refused():
     law = law_of()
     native = CoreLqi(law)
     with pytest.raises(ValueError, match=r"queue: got shape \(2, 6\); expected \(8, 6\)"):

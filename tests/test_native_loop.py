@@ -5,18 +5,17 @@ import functools
 import math
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import LeafSystem
 
 import stewart_drake as sd
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.law.catch_up import plan_catch_up
 from stewart_drake.loop import bulk
-from stewart_drake.loop.bulk import Ending, SampledLaw, ending_of, run_in_bulk
+from stewart_drake.loop.bulk import SampledLaw, ending_of, run_in_bulk
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.native_loop import InPython, instants_of, run_loop, uncovered
@@ -26,12 +25,10 @@ from stewart_drake.loop.sensor import Sensor, white_noise, white_noises
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.mechanism.geometry import Body
-from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.ranges import Ranges
-from stewart_drake.studies.uncertainty import MACHINE, Scales, draw, drawn, scales_of
-from stewart_drake.types import Array
+from stewart_drake.studies.uncertainty import MACHINE, draw, drawn, scales_of
 from tests.mechanisms import PAPER
 
 NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
@@ -42,7 +39,7 @@ DIRTY = (
 )
 
 
-def scenario(name: str = "paper", *settings: str, controller: str | None = None) -> Scenario:
+def scenario(name="paper", *settings, controller=None):
     """On the exact plant, as tight as it can be."""
     tight = ["plant.kind=exact", "plant.accuracy=1e-12"]
     return sd.load_scenario(name, controller, [*tight, *settings])
@@ -97,11 +94,11 @@ IN_PYTHON = {
 """What the core has not."""
 
 
-def drake(one: Scenario, truth: sd.Mechanism | None = None) -> Ending:
+def drake(one, truth=None):
     return ending_of(simulate(one, true_mechanism=truth, judge_stability=False))
 
 
-def assert_same(found: Ending, expected: Ending) -> None:
+def assert_same(found, expected):
     assert found.status == expected.status
     for name, value in expected.figures._asdict().items():
         assert getattr(found.figures, name) == pytest.approx(value, rel=1e-6, nan_ok=True), name
@@ -117,19 +114,19 @@ def assert_same(found: Ending, expected: Ending) -> None:
 
 
 @pytest.mark.parametrize("name", LOOPS)
-def test_the_loop_is_drakes(name: str) -> None:
+def test_the_loop_is_drakes(name):
     found = run_in_bulk(LOOPS[name])
     assert found.loop == IN_PYTHON.get(name, "native")
     assert_same(found, drake(LOOPS[name]))
 
 
 @functools.cache
-def scales() -> Scales:
+def scales():
     one = LOOPS["from rest"]
     return scales_of(prepare(one), run_in_bulk(one).figures.peak_torque)
 
 
-def assert_drawn(indices: range, duration: float) -> None:
+def assert_drawn(indices, duration):
     """Machines as of `analyze robustness`, from rest, in Drake and in C."""
     one = scenario("paper", f"duration={duration}")
     for index in indices:
@@ -140,17 +137,17 @@ def assert_drawn(indices: range, duration: float) -> None:
         assert_same(found, drake(variant, truth))
 
 
-def test_drawn_machines_end_as_in_drake() -> None:
+def test_drawn_machines_end_as_in_drake():
     assert_drawn(range(4), 3.0)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("part", range(5))
-def test_many_drawn_machines_end_as_in_drake(part: int) -> None:
+def test_many_drawn_machines_end_as_in_drake(part):
     assert_drawn(range(4 + 20 * part, 24 + 20 * part), 10.0)
 
 
-def test_states_torques_and_measurements_are_drakes() -> None:
+def test_states_torques_and_measurements_are_drakes():
     one = LOOPS["late"]
     preparation = preparation_of(one)
     prepared = preparation.prepared(preparation.experiment(one))
@@ -169,15 +166,15 @@ def test_states_torques_and_measurements_are_drakes() -> None:
     assert np.abs(course.measured - measured).max() < 1e-9
 
 
-def test_noise_is_drakes_to_the_last_bit() -> None:
+def test_noise_is_drakes_to_the_last_bit():
     """What a measurement has beyond the state, which is known exactly where a plate stays."""
     one = LOOPS["dirty"]
     preparation = preparation_of(one)
     experiment = preparation.experiment(one)
     sensor = Sensor(np.array(one.sensor.noise_std), one.sensor.seed, one.controller.period)
-    seen: list[Array] = []
+    seen = []
 
-    def law(sample: int, measurement: Array) -> Array:
+    def law(sample, measurement):
         seen.append(measurement)
         return np.zeros(6)
 
@@ -196,24 +193,24 @@ def test_noise_is_drakes_to_the_last_bit() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2**31 - 1])
-def test_noise_of_many_samples_is_that_of_each(seed: int) -> None:
+def test_noise_of_many_samples_is_that_of_each(seed):
     assert np.array_equal(white_noises(seed, 9), [white_noise(seed, k) for k in range(9)])
 
 
 class Clock(LeafSystem):
     """Keeps the times of its samples."""
 
-    def __init__(self, period: float) -> None:
+    def __init__(self, period):
         super().__init__()
         self.times: list[float] = []
         update_every(self, period, self._keep)
 
-    def _keep(self, context: Context, state: Any) -> None:
+    def _keep(self, context, state):
         self.times.append(context.get_time())
 
 
 @pytest.mark.parametrize(("duration", "period"), [(10.0, 0.1), (1.01, 0.03), (2.0, 1 / 30)])
-def test_samples_are_taken_when_drake_takes_them(duration: float, period: float) -> None:
+def test_samples_are_taken_when_drake_takes_them(duration, period):
     clock = Clock(period)
     simulator = Simulator(clock)
     simulator.Initialize()
@@ -224,12 +221,12 @@ def test_samples_are_taken_when_drake_takes_them(duration: float, period: float)
     assert np.all(when.looks <= when.nominal) and np.all(np.diff(when.looks) > 0)
 
 
-def test_what_a_law_raises_comes_through() -> None:
+def test_what_a_law_raises_comes_through():
     preparation = preparation_of(LOOPS["from rest"])
     experiment = preparation.experiment(LOOPS["from rest"])
     taken = []
 
-    def law(sample: int, measurement: Array) -> Array:
+    def law(sample, measurement):
         taken.append(sample)
         if sample == 3:
             raise KeyboardInterrupt("stop")
@@ -250,7 +247,7 @@ def test_what_a_law_raises_comes_through() -> None:
         ("sensor.loss", ["sensor.loss=0.1"]),
     ],
 )
-def test_what_it_has_not_runs_in_drake_and_says_so(field: str, settings: list[str]) -> None:
+def test_what_it_has_not_runs_in_drake_and_says_so(field, settings):
     usual = ["duration=0.2", "start=on_reference", "queue=reference", "plant.accuracy=1e-8"]
     one = scenario("paper", *usual, *settings)
     assert uncovered(one) == field
@@ -260,8 +257,8 @@ def test_what_it_has_not_runs_in_drake_and_says_so(field: str, settings: list[st
     assert np.array_equal(found.samples, expected.samples, equal_nan=True)
 
 
-def test_where_no_step_is_short_enough_drake_tries(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: Any) -> None:
+def test_where_no_step_is_short_enough_drake_tries(monkeypatch):
+    def fails(*_):
         raise IntegrationError("no step is short enough")
 
     one = scenario("paper", "duration=0.2", "plant.accuracy=1e-8")
@@ -273,7 +270,7 @@ def test_where_no_step_is_short_enough_drake_tries(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("limit", ["null", "none", "0.3", "0.9", "5.0"])
-def test_a_prepared_run_is_that_of_the_scenario_alone(limit: str) -> None:
+def test_a_prepared_run_is_that_of_the_scenario_alone(limit):
     """Law, previews and start, with what is drawn, as they are without anything in common."""
     first = preparation_of(scenario("paper", "duration=2"))
     one = scenario("paper", "duration=2", f"actuator.torque_limit={limit}", *DIRTY)
@@ -289,7 +286,7 @@ def test_a_prepared_run_is_that_of_the_scenario_alone(limit: str) -> None:
     assert prepared.experiment.torque_limit == alone.torque_limit
 
 
-def test_a_late_truth_that_is_not_believed_has_the_same_preparation() -> None:
+def test_a_late_truth_that_is_not_believed_has_the_same_preparation():
     believed = "controller.delay_steps=8"
     first = preparation_of(scenario("paper", "duration=2"))
     assert preparation_of(scenario("paper", "duration=2", believed, "delay.fraction=0.1")) is first
@@ -298,7 +295,7 @@ def test_a_late_truth_that_is_not_believed_has_the_same_preparation() -> None:
     assert preparation_of(scenario("paper", "duration=2", "controller.catch_up=1")) is not first
 
 
-def test_the_machine_of_the_scenarios_plant_is_run(tmp_path: Path) -> None:
+def test_the_machine_of_the_scenarios_plant_is_run(tmp_path):
     """Twice as heavy as the controller knows it; and a file that changes is read again."""
     path, plate = tmp_path / "true.yaml", PAPER.plate
     heavy = Body(2 * plate.mass, 2 * plate.inertia)
@@ -312,7 +309,7 @@ def test_the_machine_of_the_scenarios_plant_is_run(tmp_path: Path) -> None:
     assert_same(run_in_bulk(one), run_in_bulk(scenario("paper", "duration=1", *FOLLOWS)))
 
 
-def test_another_mechanism_file_is_another_preparation(tmp_path: Path) -> None:
+def test_another_mechanism_file_is_another_preparation(tmp_path):
     path = tmp_path / "mine.yaml"
     text = (Path(__file__).parents[1] / "models" / "paper.yaml").read_text()
     path.write_text(text)
@@ -324,7 +321,7 @@ def test_another_mechanism_file_is_another_preparation(tmp_path: Path) -> None:
     assert preparation_of(one) is not first
 
 
-def test_a_motion_that_cannot_be_is_refused_each_time() -> None:
+def test_a_motion_that_cannot_be_is_refused_each_time():
     one = scenario("paper", "reference.amplitude=[0,0,0,0,0,0.3]", "duration=2")
     for _ in range(2):
         with pytest.raises(sd.ConfigError, match="reference: leg"):
@@ -334,10 +331,10 @@ def test_a_motion_that_cannot_be_is_refused_each_time() -> None:
 
 # A reference that is missing.
 
-START: dict[str, tuple[str, ...]] = {"rest": (), "reference": FOLLOWS}
+START = {"rest": (), "reference": FOLLOWS}
 
 
-def error_without(start: str, missing: dict[int, Any]) -> tuple[float, int]:
+def error_without(start, missing):
     """E_ac with NaN in parts of the previews, by sample, and how often that was counted."""
     experiment = scenario("paper", *START[start])
     prepared = preparation_of(experiment).prepared(
@@ -351,15 +348,13 @@ def error_without(start: str, missing: dict[int, Any]) -> tuple[float, int]:
     return ending.figures.accumulated_error, ending.counts["references_missing"]
 
 
-def samples(number: int) -> list[int]:
+def samples(number):
     return sorted({0, 1, 2, *np.linspace(3, 100, number).astype(int).tolist()})
 
 
 @pytest.mark.parametrize("number", [5, pytest.param(40, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("start", START)
-def test_a_number_that_is_missing_in_the_reference_costs_next_to_nothing(
-    start: str, number: int
-) -> None:
+def test_a_number_that_is_missing_in_the_reference_costs_next_to_nothing(start, number):
     """From rest within 1 % of the run without it, on the reference at most 0.05 % s."""
     rng, (before, nothing) = np.random.default_rng(number), error_without(start, {})
     assert nothing == 0
@@ -372,7 +367,7 @@ def test_a_number_that_is_missing_in_the_reference_costs_next_to_nothing(
 
 
 @pytest.mark.parametrize("number", [5, pytest.param(40, marks=pytest.mark.slow)])
-def test_a_preview_that_is_missing_is_continued_from_the_last(number: int) -> None:
+def test_a_preview_that_is_missing_is_continued_from_the_last(number):
     """At the first sample, where nothing is known, the last torque in flight is held."""
     for sample in samples(number):
         error, counted = error_without("reference", {sample: slice(None)})
@@ -383,7 +378,7 @@ def test_a_preview_that_is_missing_is_continued_from_the_last(number: int) -> No
         assert abs(error - before) < 0.01 * before
 
 
-def error_of_a_later_start(samples_late: int) -> float:
+def error_of_a_later_start(samples_late):
     """E_ac of `paper` from rest, held there for so many samples before the first torque."""
     preparation = preparation_of(scenario("paper"))
     prepared = preparation.prepared(preparation.experiment(scenario("paper")))
@@ -403,14 +398,14 @@ def error_of_a_later_start(samples_late: int) -> float:
 @pytest.mark.parametrize(
     ("number", "share"), [(1, 0.01), (2, 0.13), (3, 0.05), (5, 0.08), (10, 0.03), (20, 0.01)]
 )
-def test_without_the_first_previews_the_run_begins_later(number: int, share: float) -> None:
+def test_without_the_first_previews_the_run_begins_later(number, share):
     """E_ac is that of a planned later start, or larger by a share of that at the most."""
     error, counted = error_without("rest", dict.fromkeys(range(number), slice(None)))
     assert counted == number
     assert error < (1 + share) * error_of_a_later_start(number)
 
 
-def test_without_the_first_accelerations_the_run_begins_a_sample_later() -> None:
+def test_without_the_first_accelerations_the_run_begins_a_sample_later():
     without, _ = error_without("rest", {0: (slice(None), slice(12, 18))})
     whole, _ = error_without("rest", {0: slice(None)})
     assert without == whole
@@ -420,7 +415,7 @@ def test_without_the_first_accelerations_the_run_begins_a_sample_later() -> None
 @pytest.mark.parametrize(
     "first", [1, 2, 3, *(pytest.param(k, marks=pytest.mark.slow) for k in range(4, 80))]
 )
-def test_a_longer_gap_does_not_lose_the_plate(first: int, number: int) -> None:
+def test_a_longer_gap_does_not_lose_the_plate(first, number):
     """From rest, where the whole run has 21 % s, and on the reference."""
     gap = dict.fromkeys(range(first, first + number), slice(None))
     error, counted = error_without("rest", gap)

@@ -2,9 +2,6 @@
 
 import dataclasses
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,15 +12,14 @@ from hypothesis.extra.numpy import arrays
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.tuner.network import Network, load_network, save_network
-from stewart_drake.types import Array
 
 ARRAYS = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds")
 
 
-def small_network(hidden: int = 10, **changes: Any) -> Network:
+def small_network(hidden=10, **changes):
     """An untrained one, always the same, whose weights move a lot."""
     rng = np.random.default_rng(7)
-    fields: dict[str, Any] = {
+    fields = {
         "input_mean": rng.uniform(0.5, 1.5, 18),
         "input_scale": rng.uniform(0.5, 2.0, 18),
         "W1": rng.normal(0, 1, (hidden, 18)),
@@ -37,7 +33,7 @@ def small_network(hidden: int = 10, **changes: Any) -> Network:
     return Network(**(fields | changes))
 
 
-def torch_twin(torch: Any, network: Network) -> Callable[[Array], Array]:
+def torch_twin(torch, network):
     """The same network built from torch's own layers, in double precision."""
     layers = torch.nn.Sequential(
         torch.nn.Linear(18, network.hidden), torch.nn.Sigmoid(), torch.nn.Linear(network.hidden, 2)
@@ -50,7 +46,7 @@ def torch_twin(torch: Any, network: Network) -> Callable[[Array], Array]:
             layer.weight.copy_(torch.tensor(np.array(weight)))
             layer.bias.copy_(torch.tensor(np.array(bias)))
 
-    def run(densities: Array) -> Array:
+    def run(densities):
         with torch.no_grad():
             inputs = torch.tensor((densities - network.input_mean) / network.input_scale)
             outputs = layers(inputs)
@@ -63,7 +59,7 @@ def torch_twin(torch: Any, network: Network) -> Callable[[Array], Array]:
 # ------------------------------------------------------------------ the output
 
 
-def test_a_network_small_enough_for_pencil_and_paper() -> None:
+def test_a_network_small_enough_for_pencil_and_paper():
     """One neuron sees rho_1 only: sigmoid(ln 3 (rho - 2) / 0.5) is 3/4 at 2.5 and 1/2 at 2."""
     W1 = np.zeros((1, 18))
     W1[0, 0] = np.log(3)
@@ -86,7 +82,7 @@ def test_a_network_small_enough_for_pencil_and_paper() -> None:
 
 @pytest.mark.parametrize("output", ["weights", "log_weights"])
 @pytest.mark.parametrize("hidden", [1, 10, 23])
-def test_torch_gives_the_same_weights(hidden: int, output: str) -> None:
+def test_torch_gives_the_same_weights(hidden, output):
     torch = pytest.importorskip("torch")
     network = small_network(hidden, output=output)
     rho = np.random.default_rng(0).uniform(0, 31, (200, 18))
@@ -95,14 +91,14 @@ def test_torch_gives_the_same_weights(hidden: int, output: str) -> None:
     )
 
 
-def test_the_output_is_finite_for_any_density_and_not_for_a_missing_one() -> None:
+def test_the_output_is_finite_for_any_density_and_not_for_a_missing_one():
     network = small_network(W1=1e4 * small_network().W1)
     assert np.all(np.isfinite(network(np.full(18, 1e6))))
     assert np.all(np.isnan(network(np.full(18, np.nan))))
     assert np.all(np.isinf(small_network(b2=[800.0, 800.0])(np.ones(18))))
 
 
-def test_a_network_does_not_change_once_made() -> None:
+def test_a_network_does_not_change_once_made():
     W1 = np.ones((10, 18))
     network = small_network(W1=W1)
     W1[:] = 2
@@ -110,13 +106,13 @@ def test_a_network_does_not_change_once_made() -> None:
     with pytest.raises(ValueError, match="read-only"):
         network.W1[0, 0] = 2
     with pytest.raises(dataclasses.FrozenInstanceError):
-        network.W1 = W1  # type: ignore[misc]
+        network.W1 = W1
 
 
 # ------------------------------------------------------------------ the file
 
 
-def written(tmp_path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
+def written(tmp_path, change):
     """The file of a network, changed."""
     path = tmp_path / "network.json"
     save_network(small_network(), path)
@@ -132,9 +128,7 @@ def written(tmp_path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
     output=st.sampled_from(["weights", "log_weights"]),
     density=st.sampled_from(["magnitude", "signed"]),
 )
-def test_a_file_comes_back_to_the_last_bit(
-    hidden: int, data: st.DataObject, output: str, density: str, tmp_path_factory: Any
-) -> None:
+def test_a_file_comes_back_to_the_last_bit(hidden, data, output, density, tmp_path_factory):
     finite = st.floats(allow_nan=False, allow_infinity=False)
     W1 = data.draw(arrays(np.float64, (hidden, 18), elements=finite))
     W2 = data.draw(arrays(np.float64, (2, hidden), elements=finite))
@@ -153,7 +147,7 @@ def test_a_file_comes_back_to_the_last_bit(
     assert [p.name for p in path.parent.iterdir()] == ["one.json"]
 
 
-def test_a_missing_file_or_name_and_a_directory_are_refused(tmp_path: Path) -> None:
+def test_a_missing_file_or_name_and_a_directory_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="no file"):
         load_network(tmp_path / "none.json")
     with pytest.raises(ConfigError, match="got 'no_such_network'"):
@@ -172,13 +166,13 @@ def test_a_missing_file_or_name_and_a_directory_are_refused(tmp_path: Path) -> N
         {"density": "plain"},
     ],
 )
-def test_a_wrong_network_cannot_be_made(changes: dict[str, Any]) -> None:
+def test_a_wrong_network_cannot_be_made(changes):
     with pytest.raises(ConfigError, match=f"{next(iter(changes))}: got"):
         small_network(**changes)
 
 
 @pytest.mark.parametrize("card", [{"a": np.nan}, {"a": np.float64}, {"a": {1, 2}}])
-def test_a_card_that_is_no_json_leaves_the_old_file(tmp_path: Path, card: dict[str, Any]) -> None:
+def test_a_card_that_is_no_json_leaves_the_old_file(tmp_path, card):
     path = tmp_path / "w.json"
     save_network(small_network(), path)
     before = path.read_bytes()
@@ -187,7 +181,7 @@ def test_a_card_that_is_no_json_leaves_the_old_file(tmp_path: Path, card: dict[s
     assert path.read_bytes() == before
 
 
-def test_shipped_networks_load() -> None:
+def test_shipped_networks_load():
     for name in shipped("weights"):
         network = load_network(name)
         assert network.card, f"{name} does not say where it comes from"

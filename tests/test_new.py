@@ -1,8 +1,6 @@
 """new: a machine, a scenario and a first look from a few measurements."""
 
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from stewart_drake.cli import main, model
 from stewart_drake.mechanism.kinematics import leg_geometry
 from tests.screen import too_long
 
-MEASURED: dict[str, Any] = {
+MEASURED = {
     "base-radius": 0.2,
     "shaft-distance": 0.13,
     "plate-radius": 0.11,
@@ -25,18 +23,18 @@ MEASURED: dict[str, Any] = {
 }
 
 
-def flags(**other: Any) -> list[str]:
+def flags(**other):
     given = MEASURED | {name.replace("_", "-"): value for name, value in other.items()}
     return [f"--{name}={value}" for name, value in given.items() if value is not None]
 
 
-def made(folder: Path, **other: Any) -> sd.Mechanism:
+def made(folder, **other):
     assert main(["new", str(folder), *flags(**other), "--quiet"]) == 0
     return sd.load_mechanism(folder / "machine.yaml")
 
 
 @pytest.mark.parametrize("cranks", ["apart", "together"])
-def test_the_machine_is_as_it_was_measured(cranks: str, tmp_path: Path) -> None:
+def test_the_machine_is_as_it_was_measured(cranks, tmp_path):
     machine = made(tmp_path / "mine", cranks=cranks, upright=80, shaft_height=0.03)
     assert machine.name == "mine"
     shafts, joints = machine.p_WS, machine.p_PQ
@@ -52,10 +50,10 @@ def test_the_machine_is_as_it_was_measured(cranks: str, tmp_path: Path) -> None:
     assert np.all(beside > apart + 0.05 if cranks == "apart" else beside < apart - 0.05)
 
 
-def test_no_other_height_gives_the_rods_a_better_push(tmp_path: Path) -> None:
+def test_no_other_height_gives_the_rods_a_better_push(tmp_path):
     machine = made(tmp_path)
 
-    def push(z: float) -> float:
+    def push(z):
         pose = np.array([0, 0, 0, 0, 0, z])
         return float(np.abs(leg_geometry(machine, pose).transmission).min())
 
@@ -63,7 +61,7 @@ def test_no_other_height_gives_the_rods_a_better_push(tmp_path: Path) -> None:
     assert push(machine.home[5]) >= max(others) - 1e-4
 
 
-def test_what_it_proposes_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_it_proposes_runs(tmp_path, capsys):
     assert main(["new", str(tmp_path), *flags(torque_limit=2.0, delay=0.05)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("yes: ") and not too_long(said)
@@ -77,9 +75,7 @@ def test_what_it_proposes_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert summary["peak_torque"] == pytest.approx(result.summary["peak_torque"], rel=0.05)
 
 
-def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(tmp_path, capsys):
     for other, words in (
         ({"rod": 260}, "--rod: got 260 m; expected metres, 0.26 for 260 mm"),
         ({"rod": 0.06}, "reach the plate"),
@@ -106,12 +102,10 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(
     assert (tmp_path / "machine.yaml").read_bytes() == before
 
 
-def test_what_is_missing_is_asked_for_and_millimetres_are_noticed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_missing_is_asked_for_and_millimetres_are_noticed(tmp_path, monkeypatch):
     answers, agreed = iter([270.0, 260.0, 2.5]), list[str]()
 
-    def agree(text: str, **_: Any) -> bool:
+    def agree(text, **_):
         agreed.append(text)
         return len(agreed) > 1  # no: it is asked for again
 

@@ -20,8 +20,8 @@ class Done(NamedTuple):
     shown: list[str]
 
 
-def run(name: str) -> Done:
-    names: dict[str, Any] = {"__name__": "__main__"}
+def run(name):
+    names = {"__name__": "__main__"}
     shown = []
     for cell in json.loads((FOLDER / name).read_text(encoding="utf-8"))["cells"]:
         if cell["cell_type"] != "code":

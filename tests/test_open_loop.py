@@ -1,7 +1,6 @@
 """The exact plant without Drake: DOP853 against scipy, energy, order, events, where it ends."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.scenario.signals import POSE, RATES
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism
 
 HEAVY = StewartDynamics(PAPER, parameters=[*[0.01] * 6, 0.5, 0.02])
@@ -26,7 +24,7 @@ PUSH = HOLD + 0.02 * np.abs(HOLD) * [1.0, 0.6, -0.4, 0.8, -0.2, 0.5]
 SWING = Drive(HOLD, 0.05 * HOLD, 9.0, np.arange(6.0))
 
 
-def of_scipy(dynamics: StewartDynamics, drives: list[Drive], times: Array, rtol: float) -> Array:
+def of_scipy(dynamics, drives, times, rtol):
     """States (n, 12) at the times, each drive a problem of its own."""
     states, x = np.full((len(times), 12), np.nan), AT_HOME
     for i, drive in enumerate(drives):
@@ -43,7 +41,7 @@ def of_scipy(dynamics: StewartDynamics, drives: list[Drive], times: Array, rtol:
     return states
 
 
-def test_states_are_those_of_scipy_at_any_time() -> None:
+def test_states_are_those_of_scipy_at_any_time():
     """Gravity, payload, damping, bias; a sine, and torques that change between the looks."""
     times = np.sort(np.random.default_rng(1).uniform(0, 0.4, 57))
     drives = [Drive(PUSH), SWING._replace(start=0.1234), Drive(HOLD, start=0.3)]
@@ -56,7 +54,7 @@ def test_states_are_those_of_scipy_at_any_time() -> None:
     assert np.array_equal(found.final, found.states[-1])
 
 
-def test_any_machine_is_followed() -> None:
+def test_any_machine_is_followed():
     rng = np.random.default_rng(2)
     for _ in range(3):
         mechanism = random_mechanism(rng)
@@ -71,7 +69,7 @@ def test_any_machine_is_followed() -> None:
         assert np.abs(found.final - expected).max() < 1e-11 * max(1.0, np.abs(expected).max())
 
 
-def test_energy_is_kept() -> None:
+def test_energy_is_kept():
     """A fall from home and back up, without torque or friction, in steps of its own choice."""
     free = StewartDynamics(PAPER, gravity=1.0)
     start = AT_HOME + 0.2 * np.eye(12)[11]
@@ -83,7 +81,7 @@ def test_energy_is_kept() -> None:
 
 
 @pytest.mark.parametrize(("looks", "order"), [(1, 8), (50, 7)])
-def test_order(looks: int, order: int) -> None:
+def test_order(looks, order):
     """Error of equal steps at their end, and of their polynomials at many instants."""
     errors, numbers, times = [], np.array([12, 16, 24]), np.linspace(0.4, 0.1, looks)[::-1]
     expected = of_scipy(HEAVY, [SWING], times, 1e-13)
@@ -96,7 +94,7 @@ def test_order(looks: int, order: int) -> None:
     assert errors[-1] > 1e-12  # the slope is not that of rounding
 
 
-def test_errors_are_of_the_size_of_the_accuracy() -> None:
+def test_errors_are_of_the_size_of_the_accuracy():
     times = np.linspace(0, 0.4, 9)
     expected = of_scipy(HEAVY, [SWING], times, 1e-13)
     steps = []
@@ -107,12 +105,12 @@ def test_errors_are_of_the_size_of_the_accuracy() -> None:
     assert steps[0] < steps[1] < steps[2] < 12 * steps[0]
 
 
-def falling() -> tuple[StewartDynamics, list[Drive]]:
+def falling():
     """With hardly any torque the platform falls out of its workspace."""
     return StewartDynamics(PAPER), [Drive(PUSH - HOLD)]
 
 
-def test_the_edge_is_found_where_a_tight_solution_crosses_it() -> None:
+def test_the_edge_is_found_where_a_tight_solution_crosses_it():
     dynamics, drives = falling()
     found = integrate(dynamics, AT_HOME, drives, np.linspace(0, 2, 101), 1e-11)
     solution = solve_ivp(
@@ -128,7 +126,7 @@ def test_the_edge_is_found_where_a_tight_solution_crosses_it() -> None:
     assert np.abs(found.states - solution(found.times).T).max() < 1e-9
 
 
-def test_the_edge_is_where_drake_stops() -> None:
+def test_the_edge_is_where_drake_stops():
     from pydrake.systems.analysis import Simulator
     from pydrake.systems.framework import DiagramBuilder
 
@@ -144,7 +142,7 @@ def test_the_edge_is_where_drake_stops() -> None:
     assert simulator.get_context().get_time() == pytest.approx(found.end, abs=1e-8)
 
 
-def test_a_look_outside_ends_a_run_within_a_step() -> None:
+def test_a_look_outside_ends_a_run_within_a_step():
     """One long step across the edge and back: only who looks in between sees it."""
     dynamics, drives = falling()
     end = integrate(dynamics, AT_HOME, drives, [2.0], 1e-12).end
@@ -153,7 +151,7 @@ def test_a_look_outside_ends_a_run_within_a_step() -> None:
     assert seen.end == pytest.approx(end, abs=1e-5)
 
 
-def test_several_looks_at_one_instant_and_at_the_start() -> None:
+def test_several_looks_at_one_instant_and_at_the_start():
     found = integrate(HEAVY, AT_HOME, [SWING], [0.0, 0.0, 0.1, 0.1], 1e-9)
     assert np.array_equal(found.states[0], AT_HOME) and np.array_equal(found.states[1], AT_HOME)
     assert np.array_equal(found.states[2], found.states[3])
@@ -162,12 +160,12 @@ def test_several_looks_at_one_instant_and_at_the_start() -> None:
     assert np.array_equal(alone.times, [0.0]) and np.array_equal(alone.states, [AT_HOME])
 
 
-def test_torques_beyond_all_bounds_end_in_an_error() -> None:
+def test_torques_beyond_all_bounds_end_in_an_error():
     with pytest.raises(IntegrationError, match="no step is short enough at t = 0 s"):
         integrate(HEAVY, AT_HOME, [Drive(np.full(6, 1e300))], [0.1])
 
 
-def test_where_there_is_no_number_steps_are_cut_to_a_fifth() -> None:
+def test_where_there_is_no_number_steps_are_cut_to_a_fifth():
     """As scipy does: ln(0.1 / 16 eps) / ln 5 steps of eleven evaluations at the most."""
     plant = NativePlant(HEAVY, AT_HOME, np.array([0.1]), 1e-9, math.inf)
     ended = plant.call("open_loop", *in_c([Drive(np.full(6, np.nan))]))
@@ -192,7 +190,7 @@ def test_where_there_is_no_number_steps_are_cut_to_a_fifth() -> None:
         ({"drives": [Drive(constant=[1.0])]}, "drives: constant: got shape"),
     ],
 )
-def test_what_cannot_be_is_refused(changes: dict[str, Any], message: str) -> None:
-    given: dict[str, Any] = {"start": AT_HOME, "drives": [Drive()], "times": [0.1]} | changes
+def test_what_cannot_be_is_refused(changes, message):
+    given = {"start": AT_HOME, "drives": [Drive()], "times": [0.1]} | changes
     with pytest.raises(ValueError, match=message):
         integrate(HEAVY, **given)

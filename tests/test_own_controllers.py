@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from pydrake.systems.framework import LeafSystem
@@ -54,7 +53,7 @@ except KeyError as error:
 """
 
 
-def run(workers: int, *arguments: str, folder: Path) -> str:
+def run(workers, *arguments, folder):
     """What another Python prints, on so many cores."""
     surroundings = os.environ | {"LOKY_MAX_CPU_COUNT": str(workers), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, *arguments]
@@ -81,7 +80,7 @@ def test_own_controllers_are_compared(place, workers, tmp_path):
 # ---------------------------------------------------------------- jobs that cannot be sent
 
 
-def system_of_a_script() -> type:
+def system_of_a_script():
     """A class that cloudpickle sends by its contents."""
     names = {"__name__": "__main__", "LeafSystem": LeafSystem}
     exec("class Mine(LeafSystem):\n    pass", names)
@@ -91,20 +90,20 @@ def system_of_a_script() -> type:
 
 
 class Unreadable:
-    def __reduce__(self) -> tuple[object, ...]:
+    def __reduce__(self):
         return refused, ("by whoever reads it",)
 
 
 class Unwritable:
-    def __reduce__(self) -> tuple[object, ...]:
+    def __reduce__(self):
         raise OSError("not for others")
 
 
-def refused(what: str) -> None:
+def refused(what):
     raise RuntimeError(what)
 
 
-def told(number: int, thing: object = None) -> bytes:
+def told(number, thing=None):
     return f"{number} {type(thing).__name__} {os.getpid()}".encode()
 
 
@@ -123,11 +122,11 @@ def test_what_no_process_can_read_runs_in_this_one(workers, tmp_path):
 class Odd(Exception):
     """One that pickle writes and cannot read."""
 
-    def __init__(self, first: int, second: int) -> None:
+    def __init__(self, first, second):
         super().__init__(f"{first} and {second}")
 
 
-def fails(number: int, how: str) -> bytes:
+def fails(number, how):
     if how == "odd":
         raise Odd(1, 2)
     if how == "exit":

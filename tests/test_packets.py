@@ -2,14 +2,13 @@
 
 import dataclasses
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
@@ -47,12 +46,12 @@ IDEAL = (*NETWORK, "link.loss=0", "controller.packet_repeats=0")
 class Plans(LeafSystem):
     """Packet k, whose row c is 100 k + c in all six."""
 
-    def __init__(self, rows: int) -> None:
+    def __init__(self, rows):
         super().__init__()
         self._rows = rows
         self.DeclareVectorOutputPort("plan", 6 * rows, self._output, {self.time_ticket()})
 
-    def _output(self, context: Context, output: BasicVector) -> None:
+    def _output(self, context, output):
         k = round(context.get_time() / PERIOD)
         output.SetFromVector(np.repeat(100.0 * k + np.arange(self._rows), 6))
 
@@ -60,19 +59,19 @@ class Plans(LeafSystem):
 class Ramp(LeafSystem):
     """Its time, twice."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.DeclareVectorOutputPort("y", 2, self._output, {self.time_ticket()})
 
-    def _output(self, context: Context, output: BasicVector) -> None:
+    def _output(self, context, output):
         output.SetFromVector([context.get_time()] * 2)
 
 
-def scenario(*more: str, controller: str | None = None) -> sd.Scenario:
+def scenario(*more, controller=None):
     return sd.load_scenario("paper", controller, settings=(*LONG, *more))
 
 
-def run(*more: str) -> sd.SimulationResult:
+def run(*more):
     return sd.simulate(scenario(*more), judge_stability=False)
 
 
@@ -81,7 +80,7 @@ def run(*more: str) -> sd.SimulationResult:
 
 @settings(max_examples=80, deadline=None)
 @given(seed=st.integers(0, 2**31), dry=st.sampled_from(["hold", "zero"]))
-def test_the_buffer_plays_the_newest_packet_that_is_there(seed: int, dry: Any) -> None:
+def test_the_buffer_plays_the_newest_packet_that_is_there(seed, dry):
     rng = np.random.default_rng(seed)
     n, rows = 30, int(rng.integers(1, 6))
     repeats = int(rng.integers(0, rows))
@@ -138,7 +137,7 @@ def test_the_buffer_plays_the_newest_packet_that_is_there(seed: int, dry: Any) -
 
 
 @pytest.mark.parametrize("burst", [1, 3])
-def test_so_many_are_lost_and_in_bursts(burst: int) -> None:
+def test_so_many_are_lost_and_in_bursts(burst):
     n, loss = 200_000, 0.2
     lost = losses(n, loss, burst, np.random.default_rng(1))
     # A burst makes neighbours alike: as if there were so many fewer packets.
@@ -151,7 +150,7 @@ def test_so_many_are_lost_and_in_bursts(burst: int) -> None:
     assert lengths.mean() == pytest.approx(loss / ((1 - loss) * begins), rel=0.03)
 
 
-def test_times_are_those_of_the_distribution() -> None:
+def test_times_are_those_of_the_distribution():
     uniform = packet_times(PacketsConfig(low=0.5, high=0.9, loss=0.0), 20_000, 3)
     assert 0.5 <= uniform.min() < 0.501 and 0.899 < uniform.max() <= 0.9
     assert abs(uniform.mean() - 0.7) < 4 * 0.4 / np.sqrt(12 * 20_000)
@@ -164,7 +163,7 @@ def test_times_are_those_of_the_distribution() -> None:
     assert in_time(dataclasses.replace(log, loss=0.3), 0.65) == pytest.approx(0.5, abs=1e-6)
 
 
-def test_the_usual_bound_is_the_least_that_makes_late_rarer_than_lost() -> None:
+def test_the_usual_bound_is_the_least_that_makes_late_rarer_than_lost():
     config = PacketsConfig(low=0.5, high=0.9, loss=0.05)
     rng = np.random.default_rng(0)
     for repeats in (0, 1, 2):
@@ -184,7 +183,7 @@ def test_the_usual_bound_is_the_least_that_makes_late_rarer_than_lost() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**31))
-def test_the_newest_measurement_is_handed_on_once(seed: int) -> None:
+def test_the_newest_measurement_is_handed_on_once(seed):
     rng = np.random.default_rng(seed)
     n = 25
     times = rng.choice([PERIOD * rng.integers(0, 5, n), rng.uniform(0, 0.5, n), np.zeros(n)])
@@ -210,7 +209,7 @@ def test_the_newest_measurement_is_handed_on_once(seed: int) -> None:
             assert np.isnan(y).all() and age == 0
 
 
-def test_a_sensor_that_is_late_is_borne_like_a_longer_delay() -> None:
+def test_a_sensor_that_is_late_is_borne_like_a_longer_delay():
     """On a plant without faults 0.6 and 0.2 s leave what 0.8 and 0 do, or less: 0.03 % s."""
     late = run("delay.steps=6", "sensor.delay=0.2")
     assert late.status == "completed" and late.accumulated_error < 0.03
@@ -224,13 +223,13 @@ def test_a_sensor_that_is_late_is_borne_like_a_longer_delay() -> None:
     assert np.abs(estimate - state)[5:].max() < 1e-3 * late_by
 
 
-def test_a_delay_of_the_sensor_that_is_no_whole_period_waits_for_the_sample() -> None:
+def test_a_delay_of_the_sensor_that_is_no_whole_period_waits_for_the_sample():
     first = run("delay.steps=6", "sensor.delay=0.2", "duration=1").signals
     second = run("delay.steps=6", "sensor.delay=0.11", "duration=1").signals
     assert np.array_equal(first.pose.values, second.pose.values)
 
 
-def test_lost_measurements_are_counted_and_borne() -> None:
+def test_lost_measurements_are_counted_and_borne():
     result = run("sensor.loss=0.5", "sensor.seed=1", "duration=5")
     missing = result.summary["counts"]["measurements_missing"]
     assert result.status == "completed" and 10 < missing < 41
@@ -245,9 +244,7 @@ def test_lost_measurements_are_counted_and_borne() -> None:
 )
 @pytest.mark.parametrize("torques", [1, 4])
 @pytest.mark.parametrize("controller", ["predictor_lqi", "delay_lqi"])
-def test_a_network_without_losses_is_a_wire(
-    time: float, delay: tuple[str, ...], torques: int, controller: str
-) -> None:
+def test_a_network_without_losses_is_a_wire(time, delay, torques, controller):
     """Every packet takes as long as the bound: nothing differs from a wire of that delay."""
     network = (
         *IDEAL,
@@ -267,7 +264,7 @@ def test_a_network_without_losses_is_a_wire(
     assert found.packets.values[-1].tolist()[:3] == [11, 0, 0]
 
 
-def test_plans_say_what_the_law_will_say() -> None:
+def test_plans_say_what_the_law_will_say():
     """Where everything arrives, the next sample's plan is this one's, but for what was learnt."""
     loop = build_closed_loop(scenario(*IDEAL, "link.playout=0.9", "duration=4"))
     simulator, controller = make_simulator(loop), loop.GetSubsystemByName("controller")
@@ -280,7 +277,7 @@ def test_plans_say_what_the_law_will_say() -> None:
         assert np.abs(before[1:] - after[:-1]).max() < 1e-3 * np.abs(after).max()
 
 
-def test_the_law_knows_what_has_acted() -> None:
+def test_the_law_knows_what_has_acted():
     """Over a bad network, with reports: what the filter takes to have acted has acted."""
     bad = (*NETWORK, "link.loss=0.1", "link.playout=0.8", "duration=4")
     loop = build_closed_loop(scenario(*bad, "controller.packet_torques=3"))
@@ -307,7 +304,7 @@ def test_the_law_knows_what_has_acted() -> None:
     assert not np.array_equal(applied[steps:], decided[: len(applied) - steps])
 
 
-def test_the_most_probable_content_is_believed() -> None:
+def test_the_most_probable_content_is_believed():
     """One packet a period, r = 1, by hand: packet k has T_{k-1}, T_k and a plan for k + 1."""
     # mu = 3: the rows are due 0.2, 0.3 and 0.4 s after they are sent.
     channel = Packets(2, 1, in_time=(0.3, 0.6, 0.9), arrived_by=(0.0, 0.1, 0.3, 0.6, 0.9, 0.9))
@@ -346,7 +343,7 @@ def test_the_most_probable_content_is_believed() -> None:
     assert believed[-5:, 0].tolist() == [7, 7, 12, 13, 14]
 
 
-def test_packets_that_come_later_than_reports_tell_of_are_borne() -> None:
+def test_packets_that_come_later_than_reports_tell_of_are_borne():
     """Of a packet that was not there when it was last told of, nobody knows whether it is."""
     channel = Packets(1, 0, (0.5,), (0.0, 0.2, 0.4, 1.0, 1.0, 1.0), told=2)
     sent = channel.start()
@@ -368,7 +365,7 @@ def test_packets_that_come_later_than_reports_tell_of_are_borne() -> None:
     assert slow.status == "completed"
 
 
-def test_a_channel_refuses_chances_of_other_rows() -> None:
+def test_a_channel_refuses_chances_of_other_rows():
     with pytest.raises(ValueError, match="in_time: got 1 values; expected 3"):
         Packets(2, 1, in_time=(1.0,), arrived_by=(0.0,))
     assert isinstance(
@@ -376,7 +373,7 @@ def test_a_channel_refuses_chances_of_other_rows() -> None:
     )
 
 
-def test_measurements_that_come_back_over_a_network_are_borne() -> None:
+def test_measurements_that_come_back_over_a_network_are_borne():
     back = "link.return={low: 0.0, high: 0.3, loss: 0.1}"
     result = run("link.kind=network", "link.loss=0.05", back, "link.low=0.3", "link.high=0.5")
     assert result.status == "completed"
@@ -384,13 +381,13 @@ def test_measurements_that_come_back_over_a_network_are_borne() -> None:
     assert result.accumulated_error < 5
 
 
-def test_the_multibody_plant_is_held_over_a_network() -> None:
+def test_the_multibody_plant_is_held_over_a_network():
     settings = ("plant.kind=multibody", *NETWORK, "link.loss=0.05", "duration=3")
     result = sd.simulate(scenario(*settings), judge_stability=False)
     assert result.status == "completed" and result.accumulated_error < 1
 
 
-def test_the_bound_is_a_whole_number_of_a_multibody_plants_steps() -> None:
+def test_the_bound_is_a_whole_number_of_a_multibody_plants_steps():
     multibody = (*NETWORK, "plant.kind=multibody")
     assert scenario(*multibody, "link.playout=0.653").true_delay.fraction == pytest.approx(0.53)
     message = r"link\.playout: got 0\.6535; expected a whole number of plant\.time_step"
@@ -400,7 +397,7 @@ def test_the_bound_is_a_whole_number_of_a_multibody_plants_steps() -> None:
         scenario("link.kind=network", "plant.kind=multibody", "link.distribution=lognormal")
 
 
-def test_a_network_on_which_nothing_ever_comes_is_refused_at_once() -> None:
+def test_a_network_on_which_nothing_ever_comes_is_refused_at_once():
     for times in ("link.low=0", "link.high=1e4"), ("link.playout=101",):
         with pytest.raises(ConfigError, match="torques wait for more than 1000 periods"):
             scenario("link.kind=network", *times)
@@ -409,7 +406,7 @@ def test_a_network_on_which_nothing_ever_comes_is_refused_at_once() -> None:
         compose_law(prepare(scenario(*NETWORK, slow)))
 
 
-def test_without_reports_the_law_goes_on_what_is_probable() -> None:
+def test_without_reports_the_law_goes_on_what_is_probable():
     """The same packets: it still tracks, and takes for acted what was not."""
     network = (*NETWORK, "link.loss=0.2", "link.seed=2", "duration=3")
     deaf = run(*network, "link.playout=0.9", "link.acknowledged=false")
@@ -419,7 +416,7 @@ def test_without_reports_the_law_goes_on_what_is_probable() -> None:
     assert not np.array_equal(deaf.signals.pose.values, told.signals.pose.values)
 
 
-def test_a_network_has_the_delay_of_bound_and_repetitions() -> None:
+def test_a_network_has_the_delay_of_bound_and_repetitions():
     sc = scenario(*NETWORK, "link.playout=0.65", "controller.packet_repeats=2")
     assert sc.true_delay.eta(0.1) == pytest.approx(0.85, abs=1e-12)
     assert sc.true_delay.steps == 8 and sc.true_delay.fraction == pytest.approx(0.5)
@@ -432,24 +429,24 @@ def test_a_network_has_the_delay_of_bound_and_repetitions() -> None:
 
 
 @pytest.fixture
-def known_outcomes(monkeypatch: Any) -> list[sd.Scenario]:
+def known_outcomes(monkeypatch):
     """Runs whose outcome is known: best at 0.43 s, and nothing completes above 20 % lost.
 
     The list is of the runs that were asked for.
     """
-    asked: list[sd.Scenario] = []
+    asked = []
 
-    def jobs(wanted: Any, *_: Any, **more: Any) -> None:
+    def jobs(wanted, *_, **more):
         more["progress"](len(wanted), len(wanted))
 
-    def outcome(run: sd.Scenario) -> Outcome:
+    def outcome(run):
         asked.append(run)
         assert isinstance(run.link, NetworkConfig) and run.link.playout is not None
         if run.link.loss > 0.2:
             return Outcome("left_workspace", "left", time=1.0)
         return Outcome("completed", error=1 + abs(run.link.playout - 0.43) + 0.01 * run.link.seed)
 
-    def done(wanted: Any, _: Any) -> dict[str, Any]:
+    def done(wanted, _):
         return {key: arguments[0] for key, arguments in wanted.items()}
 
     monkeypatch.setattr(link_bound, "run_jobs", jobs)
@@ -461,9 +458,7 @@ def known_outcomes(monkeypatch: Any) -> list[sd.Scenario]:
 QUICK = ("link.kind=network", "link.low=0.2", "link.high=0.45")
 
 
-def test_the_study_finds_the_best_bound_and_the_loss_that_is_borne(
-    known_outcomes: list[sd.Scenario],
-) -> None:
+def test_the_study_finds_the_best_bound_and_the_loss_that_is_borne(known_outcomes):
     """Half periods beside the best whole one are tried: 0.45 s is better than 0.4 s."""
     told = []
     study = study_link(scenario(*QUICK), LinkOptions(runs=3), lambda *counts: told.append(counts))
@@ -484,13 +479,10 @@ def test_the_study_finds_the_best_bound_and_the_loss_that_is_borne(
     assert page.count("<svg") + page.count("image/svg") >= 1
 
 
-def test_the_worst_run_has_an_interval_from_runs_that_chose_nothing(
-    known_outcomes: list[sd.Scenario],
-) -> None:
+def test_the_worst_run_has_an_interval_from_runs_that_chose_nothing(known_outcomes):
     study = study_link(scenario(*QUICK), LinkOptions(runs=3))
     chose, checked = (
-        {run.link.seed for run in runs}  # type: ignore[union-attr]
-        for runs in (known_outcomes[:18], known_outcomes[18:])
+        {run.link.seed for run in runs} for runs in (known_outcomes[:18], known_outcomes[18:])
     )
     assert (chose, checked) == ({0, 1, 2}, {3, 4, 5})
     assert {run.sensor.seed for run in known_outcomes[18:]} == {3, 4, 5}
@@ -505,9 +497,7 @@ def test_the_worst_run_has_an_interval_from_runs_that_chose_nothing(
     assert study.summary["losses"][0]["no_worse"] == pytest.approx(0.05 ** (1 / 3))
 
 
-def test_half_periods_that_a_plant_cannot_have_are_left_out(
-    known_outcomes: list[sd.Scenario],
-) -> None:
+def test_half_periods_that_a_plant_cannot_have_are_left_out(known_outcomes):
     coarse = ("plant.kind=multibody", "plant.time_step=0.02")
     study = study_link(scenario(*QUICK, *coarse), LinkOptions(runs=1))
     assert [cell.bound for cell in study.bounds] == pytest.approx([0.3, 0.4, 0.5, 0.6])
@@ -515,14 +505,14 @@ def test_half_periods_that_a_plant_cannot_have_are_left_out(
     assert "Not tried: 0.35 s and 0.45 s" in document(study).plain()
 
 
-def test_a_network_runs_with_a_bound_of_half_a_period() -> None:
+def test_a_network_runs_with_a_bound_of_half_a_period():
     result = run(*NETWORK, "link.playout=0.85", "duration=3")
     assert result.status == "completed" and result.summary["link"]["playout"] == 0.85
     assert result.summary["delay"]["true_s"] == pytest.approx(0.95)
 
 
 @pytest.mark.parametrize("completes", [1.0, 0.97, 0.8])
-def test_statements_on_the_worst_run_are_wrong_in_five_percent_at_most(completes: float) -> None:
+def test_statements_on_the_worst_run_are_wrong_in_five_percent_at_most(completes):
     """Of 20,000 studies: a run's error is uniform, runs beyond `completes` are lost."""
     rng, studies = np.random.default_rng(4), 20_000
     for n in (5, 29):
@@ -538,19 +528,19 @@ def test_statements_on_the_worst_run_are_wrong_in_five_percent_at_most(completes
             assert wrong / studies > 0.045
 
 
-def test_the_study_asks_for_a_network_and_for_runs() -> None:
+def test_the_study_asks_for_a_network_and_for_runs():
     with pytest.raises(ConfigError, match="got 'wire'; expected 'network'"):
         study_link(scenario(), LinkOptions())
     with pytest.raises(ConfigError, match="runs: got 0; expected greater than or equal to 1"):
         LinkOptions(runs=0)
 
 
-def test_the_overlay_lays_fields_over_a_scenario() -> None:
+def test_the_overlay_lays_fields_over_a_scenario():
     dirty = scenario("overlay=dirty", "sensor.seed=4")
     assert dirty.plant.payload_mass == pytest.approx(0.1 * 4.0)
     assert np.abs(dirty.plant.torque_bias).tolist() == [3e-4] * 6
     clean = scenario("sensor.seed=4")
-    amplitude = np.array(clean.reference.amplitude)  # type: ignore[union-attr]
+    amplitude = np.array(clean.reference.amplitude)
     assert dirty.sensor.noise_std == pytest.approx(1e-3 * np.tile(amplitude, 2))
     for dusty, plain in ((dirty.plant, clean.plant), (dirty.sensor, clean.sensor)):
         changed = {

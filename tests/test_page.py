@@ -29,7 +29,7 @@ class Outline(HTMLParser):
 
     VOID = {"meta", "img", "br", "link"}
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.open: list[str] = []
         self.tags: list[tuple[str, dict[str, str | None]]] = []
@@ -37,29 +37,29 @@ class Outline(HTMLParser):
         self.feed(text)
         assert not self.open
 
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attributes):
         self.tags.append((tag, dict(attributes)))
         if tag not in self.VOID:
             self.open.append(tag)
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         self.words.append(data.strip())
 
-    def all(self, tag: str) -> list[dict[str, str | None]]:
+    def all(self, tag):
         return [attributes for name, attributes in self.tags if name == tag]
 
 
-def picture() -> Picture:
+def picture():
     with figure_style():
         figure = Figure(figsize=(3, 2))
         figure.subplots().plot([0, 1], [1, 0])
     return Picture(figure, "a line that goes down")
 
 
-def embedded(text: str) -> list[ElementTree.Element]:
+def embedded(text):
     """The figures in a page, as a browser finds them in its attributes."""
     head = "data:image/svg+xml,"
     sources = [str(image["src"]) for image in Outline(text).all("img")]
@@ -70,7 +70,7 @@ def embedded(text: str) -> list[ElementTree.Element]:
 MADE = Provenance("stewart-drake analyze hautus 'a b'", {"drake": "1.51"}, 12.3)
 
 
-def document(**changes: object) -> Document:
+def document(**changes):
     table = Table(
         ("model", "margin", "note"),
         [("<b>a</b> & b", "1.2e-3", "x" * 50), ("c", "-", "fine"), ("d", "> 5", "")],
@@ -82,14 +82,14 @@ def document(**changes: object) -> Document:
         Section("Three", "Hidden.", folded=True),
     ]
     parts = {"title": "A <title>", "verdict": "All is well.", "tone": "good", "facts": {"mu": "8"}}
-    return Document(**{**parts, "sections": sections, **changes})  # type: ignore[arg-type]
+    return Document(**{**parts, "sections": sections, **changes})
 
 
-def page(**changes: object) -> str:
+def page(**changes):
     return html(document(**changes), MADE)
 
 
-def test_a_page_holds_everything_and_fetches_nothing() -> None:
+def test_a_page_holds_everything_and_fetches_nothing():
     text = page()
     outline = Outline(text)
     sources = [image["src"] or "" for image in outline.all("img")]
@@ -110,7 +110,7 @@ def test_a_page_holds_everything_and_fetches_nothing() -> None:
     assert len(outline.all("details")) == 1
 
 
-def test_names_from_files_are_text_and_not_markup() -> None:
+def test_names_from_files_are_text_and_not_markup():
     text = page(verdict="<script>alert(1)</script>")
     assert "<script" not in text
     assert "<b>a</b>" not in text
@@ -162,7 +162,7 @@ def test_every_kind_of_block_is_on_a_page():
 def test_a_figure_is_drawn_when_a_page_needs_it_and_is_sent_drawn():
     drawn = []
 
-    def draw() -> Figure:
+    def draw():
         drawn.append(picture().drawn)
         return drawn[-1]
 
@@ -177,7 +177,7 @@ def test_a_figure_is_drawn_when_a_page_needs_it_and_is_sent_drawn():
     assert len(drawn) == 1
 
 
-def test_command_lines_are_quoted_for_a_shell() -> None:
+def test_command_lines_are_quoted_for_a_shell():
     line = command_line(
         "analyze",
         "delay",

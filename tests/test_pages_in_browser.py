@@ -1,14 +1,12 @@
 """Pages in a real browser: figures enlarged and legible, tables whole, on any screen."""
 
-from pathlib import Path
-
 import pytest
 from matplotlib.figure import Figure
 
 from stewart_drake.reporting.document import Document, Picture, Section, Table
 from stewart_drake.reporting.page import Provenance, write_page
 from stewart_drake.reporting.style import CONTROLLER_LINES, figure_style
-from tests.browser import Browser, needs_chromium
+from tests.browser import needs_chromium
 
 pytestmark = needs_chromium
 NARROW = 400
@@ -16,7 +14,7 @@ MADE = Provenance("stewart-drake analyze hautus paper --out out/hautus")
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small(tmp_path_factory):
     """A figure with a line of every controller, a wide table and one with long words."""
     with figure_style():
         figure = Figure(figsize=(10, 6))
@@ -34,11 +32,11 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_page(Document("A page", "Fine.", sections), MADE, path)
 
 
-def box(tab: Browser, selector: str) -> dict[str, float]:
+def box(tab, selector):
     return tab.evaluate(f"document.querySelector('{selector}').getBoundingClientRect().toJSON()")
 
 
-def press(tab: Browser, key: str, code: int, text: str = "") -> None:
+def press(tab, key, code, text=""):
     for kind in ("keyDown", "keyUp"):
         tab.call(
             "Input.dispatchKeyEvent",
@@ -50,7 +48,7 @@ def press(tab: Browser, key: str, code: int, text: str = "") -> None:
         )
 
 
-def enlarged(tab: Browser) -> bool:
+def enlarged(tab):
     return tab.evaluate("document.querySelector('.figure:popover-open') !== null")
 
 

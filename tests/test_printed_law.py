@@ -23,7 +23,7 @@ PERIOD, STEPS, PARTS = 0.1, 8, 5
 B = torque_map(PAPER, PAPER.home)
 
 
-def sampled_as_printed(model: DelayedModel) -> DelayedModel:
+def sampled_as_printed(model):
     """With (35): z is sampled like any other state of (24), from its differential equation."""
     A = np.zeros((24, 24))
     A[:6, 6:12] = A[12:18, :6] = np.eye(6)
@@ -34,14 +34,7 @@ def sampled_as_printed(model: DelayedModel) -> DelayedModel:
 
 
 @functools.cache
-def error(
-    ratio: float,
-    *,
-    integral: bool,
-    rest: bool = False,
-    printed_z: bool = False,
-    share: float = 1.0,
-) -> float:
+def error(ratio, *, integral, rest=False, printed_z=False, share=1.0):
     """E_ac in % s of (46) over 10 s with w_Q/w_R = ratio, with the torques for it in flight.
 
     The integral counts by `share` of what the error does.
@@ -80,7 +73,7 @@ def error(
     return accumulated_error(time, np.vstack(errors), 2 * AMPLITUDE)
 
 
-def test_motors_that_are_off_cost_308() -> None:
+def test_motors_that_are_off_cost_308():
     """Entry 12: 50 times the integral of |sin t| over 10 s, three half waves and a rest."""
     time = np.linspace(0, 10, 501)
     resting = np.outer(np.sin(time), AMPLITUDE)
@@ -89,7 +82,7 @@ def test_motors_that_are_off_cost_308() -> None:
     assert accumulated_error(time, resting, 2 * AMPLITUDE) == pytest.approx(by_hand, rel=1e-3)
 
 
-def test_no_weights_make_the_printed_law_follow_a_sine() -> None:
+def test_no_weights_make_the_printed_law_follow_a_sine():
     """Entry 12: E_ac falls with the gain towards what the missing acceleration leaves."""
     ratios = 10.0 ** np.arange(7)
     for integral, least in ((False, 119), (True, 99)):
@@ -101,7 +94,7 @@ def test_no_weights_make_the_printed_law_follow_a_sine() -> None:
         assert min(from_rest) == pytest.approx({119: 147, 99: 144}[least], abs=0.6)
 
 
-def test_at_high_gain_the_plate_goes_where_the_tangent_leads() -> None:
+def test_at_high_gain_the_plate_goes_where_the_tangent_leads():
     """Entry 12: x(t + eta) = x_d(t) + eta dx_d/dt, 1.28 of the amplitude and 0.314 of it off."""
     eta = PERIOD * STEPS
     assert math.hypot(1, eta) == pytest.approx(1.28, abs=0.005)
@@ -111,7 +104,7 @@ def test_at_high_gain_the_plate_goes_where_the_tangent_leads() -> None:
     assert 500 * 2 / math.pi * missed == pytest.approx(error(1e6, integral=False), rel=0.2)
 
 
-def test_the_recurrence_of_the_integral_does_no_harm() -> None:
+def test_the_recurrence_of_the_integral_does_no_harm():
     """Entry 23: trapezoids against the integral itself, in the model and in the controller."""
     trapezoid, printed = error(3.0, integral=True), error(3.0, integral=True, printed_z=True)
     assert trapezoid == pytest.approx(191.7, abs=0.05)

@@ -8,7 +8,6 @@ import re
 import struct
 import subprocess
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,7 +41,6 @@ from stewart_drake.live.protocol import (
     Head,
     MachineFlags,
     MachineMessage,
-    Message,
     Refusal,
     RefusedError,
     decode,
@@ -105,7 +103,7 @@ ENCODERS = MachineMessage(
     zeros=np.array([0, 0.5, 0, 0, 0, -0.5]),
 )
 OFFER = replace(ENCODERS, codes=None, bits=0, zeros=None, identity=IDENTITY)
-VECTORS: list[tuple[Message, bytes | None]] = [
+VECTORS = [
     (PLAN, None),
     (PLAN, KEY),
     (STATE, None),
@@ -115,26 +113,26 @@ VECTORS: list[tuple[Message, bytes | None]] = [
 ]
 
 
-def documented() -> list[bytes]:
+def documented():
     """The vectors of docs/protocol.md."""
     return blocks_of("Test vectors")
 
 
-def blocks_of(section: str) -> list[bytes]:
+def blocks_of(section):
     """The datagrams of a section of docs/protocol.md."""
     text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split(f"## {section}\n")[1]
     text = text.split("\n## ")[0]
     return [bytes.fromhex(block) for block in re.findall(r"```text\n(.*?)```", text, re.DOTALL)]
 
 
-def in_c() -> list[bytes]:
+def in_c():
     """Those of protocol_test.c."""
     text = (TEMPLATES / "protocol_test.c").read_text("utf-8")
     found = re.findall(r"_bytes\[\] =\n(.*?);", text, re.DOTALL)
     return [bytes.fromhex("".join(re.findall('"([0-9a-f]+)"', block))) for block in found]
 
 
-def cause(data: bytes, key: bytes | None = None) -> Refusal | None:
+def cause(data, key=None):
     try:
         decode(data, key)
     except RefusedError as refused:
@@ -143,7 +141,7 @@ def cause(data: bytes, key: bytes | None = None) -> Refusal | None:
 
 
 @pytest.mark.parametrize("number", range(len(VECTORS)))
-def test_the_documented_bytes_are_written_and_read(number: int) -> None:
+def test_the_documented_bytes_are_written_and_read(number):
     message, key = VECTORS[number]
     assert len(documented()) == len(in_c()) == len(VECTORS)
     data = documented()[number]
@@ -152,7 +150,7 @@ def test_the_documented_bytes_are_written_and_read(number: int) -> None:
     assert decode(data, key) == message
 
 
-def test_the_documented_exchange_is_what_a_machine_answers() -> None:
+def test_the_documented_exchange_is_what_a_machine_answers():
     """`python -m tests.exchange` prints the blocks."""
     said = exchange.exchange()
     assert [encode(message) for message in said] == blocks_of("A worked exchange")
@@ -163,7 +161,7 @@ def test_the_documented_exchange_is_what_a_machine_answers() -> None:
     assert len(encode(offer)) <= len(encode(request))
 
 
-def test_each_field_lies_where_the_tables_say() -> None:
+def test_each_field_lies_where_the_tables_say():
     """Every row of the tables of docs/protocol.md whose place is a number, read by itself."""
     text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split("## A session")[0]
     head, machine, controller = re.split(r"## (?:Machine|Controller) to ", text)
@@ -199,12 +197,12 @@ def test_each_field_lies_where_the_tables_say() -> None:
     assert seen == 2 * 11 + 20 + 5
 
 
-def test_the_tag_is_the_first_half_of_an_hmac() -> None:
+def test_the_tag_is_the_first_half_of_an_hmac():
     data = encode(PLAN, KEY)
     assert data[-TAG:] == hmac.new(KEY, data[:-TAG], hashlib.sha256).digest()[:16]
 
 
-def test_crank_angles_follow_from_codes() -> None:
+def test_crank_angles_follow_from_codes():
     values = ENCODERS.values
     assert values is not None
     turn = 2 * np.pi
@@ -222,7 +220,7 @@ HEADS = st.builds(
 )
 
 
-def rows(most: int) -> st.SearchStrategy[np.ndarray]:
+def rows(most):
     row = st.lists(FINITE, min_size=6, max_size=6)
     return st.lists(row, max_size=most).map(lambda found: np.array(found).reshape(-1, 6))
 
@@ -237,7 +235,7 @@ REASONS = st.builds(Reason, st.sampled_from(Fault), st.integers(0, 6), U64)
 
 
 @st.composite
-def plans(draw: st.DrawFn) -> ControllerMessage:
+def plans(draw):
     if draw(st.booleans()):
         flags = ControllerFlags(draw(st.integers(0, 3)))
         times = draw(U64), draw(U64), draw(U64)
@@ -249,9 +247,9 @@ def plans(draw: st.DrawFn) -> ControllerMessage:
 
 
 @st.composite
-def reports(draw: st.DrawFn) -> MachineMessage:
+def reports(draw):
     kind = draw(st.integers(0, 3))
-    said: dict[str, object] = {
+    said = {
         "reason": draw(REASONS),
         "before": draw(REASONS)._replace(leg=0),
     }
@@ -276,20 +274,20 @@ def reports(draw: st.DrawFn) -> MachineMessage:
         draw(U64),
         draw(rows(MOST_HISTORY if kind < 3 else 0)),
         *(draw(U32), draw(U32), draw(U32)),
-        **said,  # type: ignore[arg-type]
+        **said,
     )
 
 
 @settings(max_examples=150, deadline=None)
 @given(st.one_of(plans(), reports()), st.one_of(st.none(), st.binary(min_size=16, max_size=99)))
-def test_what_is_written_is_read(message: Message, key: bytes | None) -> None:
+def test_what_is_written_is_read(message, key):
     data = encode(message, key)
     assert len(data) <= LONGEST
     assert decode(data, key) == message
     assert encode(decode(data, key), key) == data
 
 
-def test_messages_that_do_not_fit_are_not_written() -> None:
+def test_messages_that_do_not_fit_are_not_written():
     for torques in (np.zeros((MOST_ROWS + 1, 6)), np.zeros((2, 5)), np.zeros(6)):
         with pytest.raises(ValueError, match="expected up to"):
             encode(ControllerMessage(HEAD, begin=0, torques=torques))
@@ -298,11 +296,11 @@ def test_messages_that_do_not_fit_are_not_written() -> None:
 # ---------------------------------------------------------------- what is refused
 
 
-def changed(data: bytes, place: int, value: bytes) -> bytes:
+def changed(data, place, value):
     return data[:place] + value + data[place + len(value) :]
 
 
-def test_every_shorter_datagram_is_malformed() -> None:
+def test_every_shorter_datagram_is_malformed():
     for message, key in VECTORS:
         data = encode(message, key)
         assert all(cause(data[:n], key) == Refusal.MALFORMED for n in range(len(data)))
@@ -310,10 +308,10 @@ def test_every_shorter_datagram_is_malformed() -> None:
         assert cause(data + bytes(LONGEST), key) == Refusal.MALFORMED
 
 
-def test_the_first_thing_that_is_wrong_is_the_cause() -> None:
+def test_the_first_thing_that_is_wrong_is_the_cause():
     plan, report, nan = encode(PLAN), encode(STATE), struct.pack("<d", math.nan)
     request, offer = encode(REQUEST), encode(OFFER)
-    wrong: list[tuple[bytes, bytes | None, Refusal]] = [
+    wrong = [
         (changed(plan, 0, b"XTWC"), None, Refusal.MALFORMED),
         (changed(plan, 4, b"\1"), None, Refusal.VERSION),
         (changed(encode(PLAN, KEY), 4, b"\1"), None, Refusal.VERSION),
@@ -354,7 +352,7 @@ def test_the_first_thing_that_is_wrong_is_the_cause() -> None:
     assert cause(changed(report, 160, nan)) is None  # a value that is lost
 
 
-def test_a_window_takes_each_number_once() -> None:
+def test_a_window_takes_each_number_once():
     """Against a set of all that were seen, over numbers that overtake one another and repeat."""
     rng = random.Random(20261122)
     window, seen, newest = Window(), set[int](), 0
@@ -376,11 +374,11 @@ def test_a_window_takes_each_number_once() -> None:
     assert causes == {None, Refusal.LATE, Refusal.REPLAYED}
 
 
-def test_a_session_is_of_two_numbers_and_an_address() -> None:
+def test_a_session_is_of_two_numbers_and_an_address():
     here, other = ("127.0.0.1", 5), ("127.0.0.1", 6)
     session = Session(9, here, nonce=4)
 
-    def refusal(number: int, nonce: int, sequence: int, address: tuple[str, int]) -> Refusal | None:
+    def refusal(number, nonce, sequence, address):
         return session.refusal(Head(number, nonce, sequence, 0, 100, 0, 0), address, 1000)
 
     assert refusal(8, 4, 1, here) == refusal(9, 5, 1, here) == refusal(9, 4, 1, other)
@@ -394,12 +392,12 @@ def test_a_session_is_of_two_numbers_and_an_address() -> None:
 
 
 @pytest.mark.parametrize("rate", [1.0, 0.5])
-def test_the_other_clock_is_found_within_half_the_difference_of_the_ways(rate: float) -> None:
+def test_the_other_clock_is_found_within_half_the_difference_of_the_ways(rate):
     """There 0.3 s and up to 20 ms more, back 0.31 s and up to 20 ms: off by at most the spread."""
     rng = np.random.default_rng(5)
     clock, worst = OtherClock(rate), 0.0
 
-    def there(own: int) -> int:  # the other clock: another zero, another rate
+    def there(own):  # the other clock: another zero, another rate
         return round(rate * (own + 123 * SECOND))
 
     for k in range(200):
@@ -418,7 +416,7 @@ def test_the_other_clock_is_found_within_half_the_difference_of_the_ways(rate: f
 # ---------------------------------------------------------------- sockets
 
 
-def test_without_a_key_only_loopback(tmp_path: Path) -> None:
+def test_without_a_key_only_loopback(tmp_path):
     for host in ("0.0.0.0", "192.0.2.1"):
         with pytest.raises(ConfigError, match="without a key; expected a loopback address"):
             Endpoint(ControllerMessage, host)
@@ -441,7 +439,7 @@ def test_without_a_key_only_loopback(tmp_path: Path) -> None:
     endpoint.close()
 
 
-def test_an_endpoint_counts_what_it_refuses() -> None:
+def test_an_endpoint_counts_what_it_refuses():
     ear, mouth = Endpoint(ControllerMessage, key=KEY), Endpoint(MachineMessage, key=KEY)
     good = encode(PLAN, KEY)
     for data in (
@@ -468,7 +466,7 @@ def test_an_endpoint_counts_what_it_refuses() -> None:
 
 
 @pytest.fixture(scope="module")
-def codec(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def codec(tmp_path_factory):
     """protocol_test.c, compiled with the sanitizers."""
     compiler = build.compiler()
     if compiler is None:
@@ -481,7 +479,7 @@ def codec(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def through_c(codec: Path, datagrams: list[bytes], key: bytes) -> Iterator[tuple[int, bytes]]:
+def through_c(codec, datagrams, key):
     """Of each why C refuses it, as a number, and what it writes of it."""
     lines = "".join(data.hex() + "\n" for data in datagrams)
     done = subprocess.run(
@@ -492,7 +490,7 @@ def through_c(codec: Path, datagrams: list[bytes], key: bytes) -> Iterator[tuple
         yield int(number), bytes.fromhex(text)
 
 
-def test_c_writes_and_reads_the_documented_bytes(codec: Path) -> None:
+def test_c_writes_and_reads_the_documented_bytes(codec):
     """Its messages are those of the table above, written in C."""
     done = subprocess.run([codec], capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout == "protocol: as documented\n"
@@ -501,7 +499,7 @@ def test_c_writes_and_reads_the_documented_bytes(codec: Path) -> None:
 IN_C = {None: 0, Refusal.MALFORMED: 1, Refusal.VERSION: 2, Refusal.KEY: 3}
 
 
-def damaged(rng: random.Random, data: bytes) -> bytes:
+def damaged(rng, data):
     """What a bad link, or somebody, makes of a datagram."""
     kind = rng.randrange(6)
     if kind == 0:
@@ -517,7 +515,7 @@ def damaged(rng: random.Random, data: bytes) -> bytes:
     return changed(data, place, rng.randbytes(min(number, len(data) - place)))
 
 
-def any_message(rng: random.Random) -> Message:
+def any_message(rng):
     """Of either side, with numbers of all sizes."""
     head = Head(*(rng.randrange(1, 2**n) for n in (64, 64, 32, 32, 64, 64, 64)))
     some = np.array([rng.uniform(-1, 1) * 10.0 ** rng.randrange(-300, 300) for _ in range(6)])
@@ -545,7 +543,7 @@ def any_message(rng: random.Random) -> Message:
     return MachineMessage(head, flags, *times, *fixed, codes=codes, bits=9, zeros=some)
 
 
-def compare_codecs(codec: Path, rng: random.Random, number: int) -> set[Refusal | None]:
+def compare_codecs(codec, rng, number):
     """Damaged and sound datagrams through both; the causes that were seen."""
     key = KEY if rng.random() < 0.5 else b""
     datagrams = []
@@ -565,14 +563,14 @@ def compare_codecs(codec: Path, rng: random.Random, number: int) -> set[Refusal 
     return seen
 
 
-def test_both_codecs_take_and_refuse_the_same(codec: Path) -> None:
+def test_both_codecs_take_and_refuse_the_same(codec):
     rng = random.Random(202611)
     seen = set.union(*(compare_codecs(codec, rng, 300) for _ in range(6)))
     assert seen == set(IN_C)
 
 
 @pytest.mark.soak
-def test_both_codecs_take_and_refuse_the_same_for_five_minutes(codec: Path) -> None:
+def test_both_codecs_take_and_refuse_the_same_for_five_minutes(codec):
     rng, end, number = random.Random(), time.monotonic() + 300, 0
     while time.monotonic() < end:
         compare_codecs(codec, rng, 1000)

@@ -36,11 +36,11 @@ ON_REFERENCE = ("start=on_reference", "queue=reference")
 NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-3,1e-3,1e-3,1e-4,1e-4,1e-4]"
 
 
-def scenario(*settings: str, plant: str = "exact", start: tuple[str, ...] = ON_REFERENCE):
+def scenario(*settings, plant="exact", start=ON_REFERENCE):
     return sd.load_scenario("paper", settings=(f"plant.kind={plant}", *start, *settings))
 
 
-def run(*settings: str, plant: str = "exact") -> sd.SimulationResult:
+def run(*settings, plant="exact"):
     return sd.simulate(scenario(*settings, plant=plant), judge_stability=False)
 
 
@@ -49,7 +49,7 @@ def run(*settings: str, plant: str = "exact") -> sd.SimulationResult:
 
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
 @pytest.mark.parametrize("period", [0.01, 0.005, 0.03])
-def test_no_torque_is_lost(period: float, plant: str) -> None:
+def test_no_torque_is_lost(period, plant):
     """The law's own torques, taken at its samples, are those of the log."""
     sc = scenario(f"controller.period={period}", "duration=0.3", "delay.steps=3", plant=plant)
     result = sd.simulate(sc, judge_stability=False)
@@ -66,22 +66,22 @@ def test_no_torque_is_lost(period: float, plant: str) -> None:
     np.testing.assert_array_equal(logged.torque_applied.values[3:], torques[:-3])
 
 
-def test_the_usual_instants_are_the_grid_and_every_sample() -> None:
+def test_the_usual_instants_are_the_grid_and_every_sample():
     found = run("controller.period=0.03", "duration=0.1").signals.time.values
     np.testing.assert_allclose(found, [0, 0.02, 0.03, 0.04, 0.06, 0.08, 0.09, 0.1], atol=1e-12)
 
 
 @pytest.mark.parametrize(("period", "number"), [(0.005, 61), (0.1, 4), (0.25, 3), (10.0, 2)])
-def test_a_log_has_the_period_that_is_asked_for(period: float, number: int) -> None:
+def test_a_log_has_the_period_that_is_asked_for(period, number):
     found = run(f"log_period={period}", "duration=0.3").signals.time.values
     expected = np.append(period * np.arange(number - 1), 0.3)
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-def test_what_is_measured_of_a_run_does_not_depend_on_its_log() -> None:
+def test_what_is_measured_of_a_run_does_not_depend_on_its_log():
     """The multibody plant steps as it does anyway: its numbers are the same to the last digit."""
 
-    def numbers(result: sd.SimulationResult) -> dict[str, object]:
+    def numbers(result):
         left_out = ("wall_s", "controller_step_ms", "scenario")
         return {
             key: value for key, value in jsonable(result.summary).items() if key not in left_out
@@ -102,14 +102,14 @@ def test_what_is_measured_of_a_run_does_not_depend_on_its_log() -> None:
     assert finer == pytest.approx(exact.accumulated_error, rel=1e-6)
 
 
-def test_a_data_set_needs_the_samples_whatever_the_log() -> None:
+def test_a_data_set_needs_the_samples_whatever_the_log():
     sc = sd.load_scenario("paper", settings=("plant.kind=exact", "delay.steps=1", *ON_REFERENCE))
     both = [dataclasses.replace(sc, log_period=period) for period in (None, 0.05)]
     rows = [run_condition(one, ((1.0, 1.0),)) for one in both]
     assert rows[0] == rows[1]
 
 
-def test_the_last_instant_is_the_end_once() -> None:
+def test_the_last_instant_is_the_end_once():
     found = list(instants(0.3, 0.1, None))
     assert [one.time for one in found] == pytest.approx(0.02 * np.arange(16), abs=1e-12)
     assert found[-1] == (0.3, True, True, True)
@@ -119,7 +119,7 @@ def test_the_last_instant_is_the_end_once() -> None:
 # What the controller got, and what it made of it.
 
 
-def test_measurement_and_estimate_are_the_controllers() -> None:
+def test_measurement_and_estimate_are_the_controllers():
     result = run(NOISE, "duration=0.5", "delay.steps=2", "controller.period=0.02")
     signals, sc = result.signals, result.scenario
     sensor = Sensor(np.array(sc.sensor.noise_std), sc.sensor.seed, 0.02)
@@ -133,7 +133,7 @@ def test_measurement_and_estimate_are_the_controllers() -> None:
     assert list(signals.state.values[[0, 3, 6, 11]]) == ["phi", "x", "phi_dot", "z_dot"]
 
 
-def test_measurements_are_held_between_samples_and_kept_where_they_are_missing() -> None:
+def test_measurements_are_held_between_samples_and_kept_where_they_are_missing():
     """With a bad reading, the log shows it as it came, and the model's state beside it."""
     loop = build_closed_loop(scenario("duration=0.5"))
     port = loop.GetOutputPort("measurement")
@@ -148,7 +148,7 @@ def test_measurements_are_held_between_samples_and_kept_where_they_are_missing()
 # What the file says.
 
 
-def test_the_file_says_what_is_in_it(tmp_path) -> None:
+def test_the_file_says_what_is_in_it(tmp_path):
     result = run("duration=0.3", "controller.w_R=3")
     result.save(tmp_path)
     plain = xr.load_dataset(tmp_path / "signals.nc")
@@ -173,7 +173,7 @@ def test_the_file_says_what_is_in_it(tmp_path) -> None:
     assert plain.attrs["scenario"] == scenario_yaml(result.scenario)
 
 
-def test_labels_of_the_file_are_those_of_the_first_release() -> None:
+def test_labels_of_the_file_are_those_of_the_first_release():
     signals = run("duration=0.1").signals
     for name, dimension in DIMENSIONS.items():
         assert list(signals[name].values) == list(dimension.labels)
@@ -189,7 +189,7 @@ NEW = (
 )
 
 
-def test_a_new_signal_is_a_line_of_the_table_and_where_it_comes_from(tmp_path, monkeypatch) -> None:
+def test_a_new_signal_is_a_line_of_the_table_and_where_it_comes_from(tmp_path, monkeypatch):
     """It is a port of controller and loop, in the record, the file and the CSV with its unit."""
     before = run("duration=0.3").signals
     for signal in NEW:
@@ -215,12 +215,12 @@ def test_a_new_signal_is_a_line_of_the_table_and_where_it_comes_from(tmp_path, m
     assert first.split(",")[-1] == f"{squares[0].sum():.12g}"
 
 
-def test_every_signal_of_the_controller_has_a_value_and_no_other() -> None:
+def test_every_signal_of_the_controller_has_a_value_and_no_other():
     assert set(HELD) == {signal.name for signal in ports_of("controller").values()}
     assert all(signal.size == (len(signal.labels) or 1) for signal in SIGNALS.values())
 
 
-def test_the_ports_are_those_of_the_table() -> None:
+def test_the_ports_are_those_of_the_table():
     loop = build_closed_loop(scenario())
     ports = {loop.get_output_port(n).get_name() for n in range(loop.num_output_ports())}
     assert ports == set(exported_ports())
@@ -237,7 +237,7 @@ def test_the_ports_are_those_of_the_table() -> None:
     "settings",
     [("duration=0.3",), ("duration=2", "start=rest", "queue=zero", "plant.gravity=true")],
 )
-def test_the_summary_has_the_keys_and_kinds_that_its_type_tells(settings: tuple[str, ...]) -> None:
+def test_the_summary_has_the_keys_and_kinds_that_its_type_tells(settings):
     """Of a run that completes, and of one that leaves the workspace."""
     summary = sd.simulate(scenario(*settings)).summary
     assert (summary["status"] == "completed") == (len(settings) == 1)
@@ -259,7 +259,7 @@ def test_the_summary_has_the_keys_and_kinds_that_its_type_tells(settings: tuple[
                 assert all(type(value) is inner for value in part[name]), name
 
 
-def test_a_table_grows_without_being_copied() -> None:
+def test_a_table_grows_without_being_copied():
     """A row of 100 numbers takes 800 bytes and little more, also at the peak."""
     tracemalloc.start()
     table = Table(100)

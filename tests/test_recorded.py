@@ -16,7 +16,7 @@ FEW = 10
 """Samples; alone, without a plant, the law makes more of any rounding with each further one."""
 
 
-def test_every_scenario_is_recorded_with_every_controller_on_both_plants() -> None:
+def test_every_scenario_is_recorded_with_every_controller_on_both_plants():
     assert set(RECORDED) == set(runs.ROWS)
 
 
@@ -27,7 +27,7 @@ QUICK = [row for row in runs.ROWS if row.startswith("paper/") and row.endswith("
 @pytest.mark.parametrize(
     "row", [pytest.param(r, marks=() if r in QUICK else pytest.mark.slow) for r in runs.ROWS]
 )
-def test_torques_are_what_they_were(row: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torques_are_what_they_were(row, monkeypatch):
     """The law's first answers and the loop with its plant, to 1e-9 of the peak torque.
 
     With other releases or another processor the law's first answers, to 1e-7.
@@ -46,7 +46,7 @@ def test_torques_are_what_they_were(row: str, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("scenario", shipped("scenario"))
-def test_in_c_the_loop_does_the_same(scenario: str) -> None:
+def test_in_c_the_loop_does_the_same(scenario):
     """1e-9 of the peak torque, with the law that asks most of the dynamics; found are 4e-13."""
     if not runs.same_rounding():
         pytest.skip("recorded with other releases or another processor")

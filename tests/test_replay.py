@@ -23,12 +23,12 @@ PAPER = sd.load_mechanism("paper")
 
 
 @pytest.fixture(scope="module")
-def run() -> sd.SimulationResult:
+def run():
     settings = ("plant.kind=exact", "duration=0.4", "start=on_reference", "queue=reference")
     return sd.simulate(sd.load_scenario("paper", settings=settings), judge_stability=False)
 
 
-def data_of(html: str) -> dict:
+def data_of(html):
     """What the page's own script works with."""
     return json.loads(re.search(r"const run = (\{.*\});", html)[1])
 

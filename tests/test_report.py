@@ -7,7 +7,6 @@ import re
 import time
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import joblib
 import pytest
@@ -40,7 +39,7 @@ pytestmark = pytest.mark.slow  # one report of all there is, which most of them 
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory) -> Path:
+def report(tmp_path_factory):
     """The folder of a report on two seconds of the paper's scenario."""
     folder = tmp_path_factory.mktemp("report")
     (folder / "summary.json").write_text("of an earlier run")
@@ -51,24 +50,24 @@ def report(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def html(report) -> str:
+def html(report):
     return (report / "report.html").read_text()
 
 
 @pytest.fixture(scope="module")
-def summary(report) -> dict:
+def summary(report):
     return json.loads((report / "summary.json").read_text())
 
 
-def text_of(html: str) -> str:
+def text_of(html):
     """What a reader sees, roughly: without tags, styles and the replay inside."""
 
     class Reader(HTMLParser):
-        def __init__(self) -> None:
+        def __init__(self):
             super().__init__()
             self.parts: list[str] = []
 
-        def handle_data(self, data: str) -> None:
+        def handle_data(self, data):
             self.parts.append(data)
 
     reader = Reader()

@@ -14,7 +14,7 @@ from stewart_drake.cli import main
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
 
 
-def started(code: str, folder: Path) -> subprocess.Popen:
+def started(code, folder):
     return subprocess.Popen(
         [sys.executable, "-c", code, str(folder)],
         stdout=subprocess.DEVNULL,
@@ -43,7 +43,7 @@ def test_ctrl_c_ends_it_with_nothing_written(tmp_path):
 
 def test_ctrl_c_while_drake_is_loaded_is_one_as_well(monkeypatch):
     """A C++ module whose loading is interrupted says so by an ImportError."""
-    stop: BaseException | None = KeyboardInterrupt()
+    stop = KeyboardInterrupt()
 
     def loading(kind):
         raise ImportError("initialization failed") from stop

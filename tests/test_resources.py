@@ -9,7 +9,7 @@ from stewart_drake.files.errors import ConfigError
 
 
 @pytest.mark.parametrize("kind", ["mechanism", "scenario", "controller", "weights"])
-def test_every_shipped_name_resolves_to_a_file(kind: resources.Kind) -> None:
+def test_every_shipped_name_resolves_to_a_file(kind):
     for name in resources.shipped(kind):
         path = resources.resolve(kind, name)
         assert path.is_absolute()
@@ -17,9 +17,7 @@ def test_every_shipped_name_resolves_to_a_file(kind: resources.Kind) -> None:
         assert path.stem == name
 
 
-def test_a_wheel_carries_the_data_inside_the_package(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wheel_carries_the_data_inside_the_package(tmp_path, monkeypatch):
     package = tmp_path / "site-packages" / "stewart_drake"
     wanted = package / "_data" / "models" / "mine.yaml"
     wanted.parent.mkdir(parents=True)
@@ -32,9 +30,7 @@ def test_a_wheel_carries_the_data_inside_the_package(
     assert resources.resolve("mechanism", "mine") == wanted
 
 
-def test_a_path_starts_from_the_given_folder_or_the_working_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_path_starts_from_the_given_folder_or_the_working_directory(tmp_path, monkeypatch):
     file = tmp_path / "sub" / "mine.yaml"
     file.parent.mkdir()
     file.touch()
@@ -46,9 +42,7 @@ def test_a_path_starts_from_the_given_folder_or_the_working_directory(
     assert resources.resolve("scenario", Path("sub/mine.yaml")) == file
 
 
-def test_a_word_never_means_a_file_in_the_working_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_word_never_means_a_file_in_the_working_directory(tmp_path, monkeypatch):
     (tmp_path / "paper").write_text("not this one")
     monkeypatch.chdir(tmp_path)
     assert resources.resolve("scenario", "paper").parent != tmp_path
@@ -67,7 +61,7 @@ def test_a_word_never_means_a_file_in_the_working_directory(
         ("long" * 5000 + "/x", ["no file"]),
     ],
 )
-def test_what_is_missing_is_named_in_one_line(name: str, parts: list[str]) -> None:
+def test_what_is_missing_is_named_in_one_line(name, parts):
     with pytest.raises(ConfigError) as caught:
         resources.resolve("scenario", name)
     message = str(caught.value)

@@ -4,8 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
 import joblib
 import pytest
@@ -27,17 +25,17 @@ pytestmark = pytest.mark.usefixtures("blank_figures")
 EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.3", "--set", "delay.steps=1")
 
 
-def broken(folder: Path) -> Callable[..., None]:
+def broken(folder):
     """Stands for whatever draws; the results must be there before it is called."""
 
-    def draw(*_: object, **__: object) -> None:
+    def draw(*_, **__):
         assert (folder / "summary.json").exists()
         raise ZeroDivisionError("no ink\nleft")
 
     return draw
 
 
-def names(folder: Path) -> set[str]:
+def names(folder):
     return {path.name for path in folder.iterdir()}
 
 
@@ -54,7 +52,7 @@ def names(folder: Path) -> set[str]:
 )
 def test_a_failure_while_drawing_costs_the_figures_only(
     arguments, module, name, kept, tmp_path, monkeypatch, capsys
-) -> None:
+):
     monkeypatch.setattr(joblib, "cpu_count", lambda: 1)  # so that no process has to start
     judge_few_delays(monkeypatch)
     monkeypatch.setattr(module, name, broken(tmp_path))
@@ -66,7 +64,7 @@ def test_a_failure_while_drawing_costs_the_figures_only(
     assert json.loads((tmp_path / "summary.json").read_text())
 
 
-def test_a_report_that_cannot_be_drawn_leaves_its_numbers(tmp_path, monkeypatch, capsys) -> None:
+def test_a_report_that_cannot_be_drawn_leaves_its_numbers(tmp_path, monkeypatch, capsys):
     found = type("Found", (), {"run": None, "analyses": {}, "comparison": {}})()
     monkeypatch.setattr("stewart_drake.reporting.report.collect", lambda *_: found)
     monkeypatch.setattr(report_document, "report_summary", lambda _: {"all": 1})
@@ -77,7 +75,7 @@ def test_a_report_that_cannot_be_drawn_leaves_its_numbers(tmp_path, monkeypatch,
 
 
 @pytest.mark.slow
-def test_figures_of_an_earlier_run_do_not_stay_beside_new_results(tmp_path, monkeypatch) -> None:
+def test_figures_of_an_earlier_run_do_not_stay_beside_new_results(tmp_path, monkeypatch):
     arguments = ["simulate", *EXACT, "--quiet", "--out", str(tmp_path)]
     assert main(arguments) == 0
     drawn = {name for name in names(tmp_path) if name.endswith((".png", ".svg"))}
@@ -88,7 +86,7 @@ def test_figures_of_an_earlier_run_do_not_stay_beside_new_results(tmp_path, monk
 
 
 @pytest.mark.slow
-def test_nothing_of_an_earlier_comparison_stays_beside_new_results(tmp_path, monkeypatch) -> None:
+def test_nothing_of_an_earlier_comparison_stays_beside_new_results(tmp_path, monkeypatch):
     assert {*figures.TORQUE_CONTROLLERS, ADAPTIVE, *SERVOS} <= set(LABELS)
     for name in LABELS:
         for old in (f"{name}.nc", f"torques_{name}.png", f"delay_{name}.svg", "weights.png"):
@@ -100,7 +98,7 @@ def test_nothing_of_an_earlier_comparison_stays_beside_new_results(tmp_path, mon
 
 
 @pytest.mark.slow
-def test_a_closed_stream_costs_its_text_only(tmp_path) -> None:
+def test_a_closed_stream_costs_its_text_only(tmp_path):
     """Run `simulate` from a shell that also asks for a backend that does not exist."""
     arguments = " ".join(("simulate", *EXACT, "--out", str(tmp_path)))
     line = f'"$0" -m stewart_drake {arguments} <&- >&- 2>&-'

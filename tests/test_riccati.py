@@ -1,7 +1,5 @@
 """The delayed LQI gain against theory: residual, cost, closed forms, extended precision."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,7 +13,6 @@ from stewart_drake.law.error_model import double_integrators, linear_model
 from stewart_drake.law.riccati import RiccatiError, augmented_gain, full_gain, lqr, reduced_gain
 from stewart_drake.law.stability import is_stable
 from stewart_drake.mechanism.assembly import torque_map
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 
@@ -31,14 +28,14 @@ UNIT = (np.eye(12), np.eye(6))
 """The paper's weights (41): Q on pose error and integral, R on the torques."""
 
 
-def delayed(name: str, steps: int, fraction: float, integral: bool = True) -> DelayedModel:
+def delayed(name, steps, fraction, integral=True):
     return delayed_model(PLATFORMS[name], 0.1, steps, fraction, integral=integral)
 
 
 # The oracle: the whole chain's Riccati equation in extended precision (19 digits).
 
 
-def solve_extended(A: Extended, b: Extended) -> Extended:
+def solve_extended(A, b):
     """A^-1 b: the double-precision inverse, refined."""
     inverse = np.linalg.inv(A.astype(np.float64)).astype(np.longdouble)
     x = inverse @ b
@@ -47,12 +44,12 @@ def solve_extended(A: Extended, b: Extended) -> Extended:
     return x
 
 
-def riccati_gain(P: Extended, A: Extended, B: Extended, R: Extended) -> Extended:
+def riccati_gain(P, A, B, R):
     PB = P @ B
     return solve_extended(R + B.T @ PB, PB.T @ A)
 
 
-def undelayed_solution(model: DelayedModel, Q: Array, R: Array) -> Extended:
+def undelayed_solution(model, Q, R):
     """P of the chain without its mu steps, by value iteration down to extended precision."""
     short = chain(DelayedModel(model.A, model.B_old, model.B_new, model.C, 0, model.fraction))
     A, B, C, R_ = (np.asarray(x, np.longdouble) for x in (short.A, short.B, short.C, R))
@@ -67,7 +64,7 @@ def undelayed_solution(model: DelayedModel, Q: Array, R: Array) -> Extended:
     raise AssertionError("value iteration does not converge")
 
 
-def true_solution(model: DelayedModel, Q: Array, R: Array) -> tuple[Extended, Extended]:
+def true_solution(model, Q, R):
     """K and P of the whole chain, P put together from costs, and that it solves the equation.
 
     Until the torque of now acts, the chain runs by itself: its cost over mu steps, and the cost
@@ -92,7 +89,7 @@ def true_solution(model: DelayedModel, Q: Array, R: Array) -> tuple[Extended, Ex
     return K, P
 
 
-def spectral_radius(matrix: Array) -> float:
+def spectral_radius(matrix):
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
@@ -101,7 +98,7 @@ def spectral_radius(matrix: Array) -> float:
 
 @pytest.mark.parametrize("fraction", FRACTIONS)
 @pytest.mark.parametrize("steps", STEPS)
-def test_the_papers_gain_solves_its_riccati_equation(steps: int, fraction: float) -> None:
+def test_the_papers_gain_solves_its_riccati_equation(steps, fraction):
     model, (Q, R) = delayed("paper", steps, fraction), UNIT
     K, P = full_gain(model, Q, R)
     augmented = chain(model)
@@ -116,9 +113,7 @@ def test_the_papers_gain_solves_its_riccati_equation(steps: int, fraction: float
 
 @pytest.mark.parametrize("fraction", FRACTIONS)
 @pytest.mark.parametrize("steps", STEPS)
-def test_under_gravity_the_reduced_gain_is_right_and_the_full_solve_gives_up(
-    steps: int, fraction: float
-) -> None:
+def test_under_gravity_the_reduced_gain_is_right_and_the_full_solve_gives_up(steps, fraction):
     """Open-loop poles of 5 /s make P of the chain grow like e^(2 p eta), 1e13 over 3 s.
 
     Up to mu = 8 both gains agree to 1e-8. At mu = 10 the full solve still has seven digits. At
@@ -141,9 +136,7 @@ def test_under_gravity_the_reduced_gain_is_right_and_the_full_solve_gives_up(
 
 @pytest.mark.parametrize("name", PLATFORMS)
 @pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (8, 0.0), (5, 0.5)])
-def test_simulated_cost_is_the_quadratic_form_of_the_solution(
-    name: str, steps: int, fraction: float
-) -> None:
+def test_simulated_cost_is_the_quadratic_form_of_the_solution(name, steps, fraction):
     model, (Q, R) = delayed(name, steps, fraction), UNIT
     _, P = full_gain(model, Q, R)
     K = augmented_gain(model, Q, R)
@@ -165,9 +158,7 @@ def test_simulated_cost_is_the_quadratic_form_of_the_solution(
     r=st.floats(0.01, 100),
     steps=st.integers(0, 6),
 )
-def test_gain_of_one_delayed_state_is_in_closed_form(
-    a: float, b: float, q: float, r: float, steps: int
-) -> None:
+def test_gain_of_one_delayed_state_is_in_closed_form(a, b, q, r, steps):
     """b^2 p^2 + (r - a^2 r - q b^2) p - q r = 0, k = a b p / (r + b^2 p)."""
     half = (r - a**2 * r - q * b**2) / 2
     p = (-half + np.sqrt(half**2 + b**2 * q * r)) / b**2
@@ -188,9 +179,7 @@ def test_gain_of_one_delayed_state_is_in_closed_form(
     ratio=st.floats(-2, 2).map(lambda x: 10**x),
     scale=st.floats(-4, 4).map(lambda x: 10**x),
 )
-def test_gain_depends_on_the_ratio_of_the_weights_only(
-    name: str, integral: bool, fraction: float, ratio: float, scale: float
-) -> None:
+def test_gain_depends_on_the_ratio_of_the_weights_only(name, integral, fraction, ratio, scale):
     model = delayed(name, 3, fraction, integral)
     Q, R = np.eye(len(model.C)), np.eye(6)
     once = augmented_gain(model, ratio * Q, R)
@@ -207,7 +196,7 @@ ONE_INPUT = np.array([[1.0], [1]])
 TURNING = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 0.5]])
 """A mode on the unit circle that goes round in four steps, and a stable one."""
 
-BAD: dict[str, tuple[str, tuple[Array, Array, Array, Array]]] = {
+BAD = {
     "A not square": ("A", (np.ones((2, 3)), B, Q, R)),
     "A a vector": ("A", (np.ones(2), B, Q, R)),
     "A a number": ("A", (np.array(1.0), B, Q, R)),
@@ -249,7 +238,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_gives_an_error_of_its_kind_that_names_the_matrix(case: str) -> None:
+def test_bad_input_gives_an_error_of_its_kind_that_names_the_matrix(case):
     name, arguments = BAD[case]
     assert not issubclass(RiccatiError, ValueError)
     with pytest.raises(ValueError if case in SHAPES else RiccatiError) as caught:
@@ -274,23 +263,19 @@ def test_bad_input_gives_an_error_of_its_kind_that_names_the_matrix(case: str) -
     ids=["extreme", "R 0", "R < 0", "Q < 0", "Q indefinite", "NaN", "roll unseen"],
 )
 @pytest.mark.parametrize("name", PLATFORMS)
-def test_every_gain_of_the_platform_refuses_bad_weights(
-    name: str, Q: Array, R: Array, solve: Callable[..., object]
-) -> None:
+def test_every_gain_of_the_platform_refuses_bad_weights(name, Q, R, solve):
     with pytest.raises(RiccatiError):
         solve(delayed(name, 2, 0.0), Q, R)
 
 
 @pytest.mark.parametrize("solve", [full_gain, reduced_gain, augmented_gain])
 @pytest.mark.parametrize(("Q", "R"), [(np.eye(12), np.eye(5)), (np.eye(11), np.eye(6))])
-def test_every_gain_of_the_platform_refuses_wrong_shapes(
-    Q: Array, R: Array, solve: Callable[..., object]
-) -> None:
+def test_every_gain_of_the_platform_refuses_wrong_shapes(Q, R, solve):
     with pytest.raises(ValueError, match=r"shape|dimension"):
         solve(delayed("paper", 2, 0.0), Q, R)
 
 
-def test_a_motor_that_cannot_move_the_plate_is_found_out() -> None:
+def test_a_motor_that_cannot_move_the_plate_is_found_out():
     """The torque map next to a parallel singularity: one direction is out of reach."""
     U, s, Vt = np.linalg.svd(torque_map(PAPER, PAPER.home))
     for least in (0.0, 1e-14, 1e-12, 1e-10):
@@ -309,9 +294,7 @@ def test_a_motor_that_cannot_move_the_plate_is_found_out() -> None:
     name=st.sampled_from(sorted(PLATFORMS)),
     integral=st.booleans(),
 )
-def test_whatever_the_weights_a_gain_that_comes_out_stabilises(
-    data: st.DataObject, w_Q: float, w_R: float, name: str, integral: bool
-) -> None:
+def test_whatever_the_weights_a_gain_that_comes_out_stabilises(data, w_Q, w_R, name, integral):
     model = delayed(name, data.draw(st.integers(0, 3)), 0.0, integral)
     try:
         K = augmented_gain(model, w_Q * np.eye(len(model.C)), w_R * np.eye(6))
@@ -321,16 +304,14 @@ def test_whatever_the_weights_a_gain_that_comes_out_stabilises(
     assert spectral_radius(augmented.A - augmented.B @ K) < 1 + 1e-9
 
 
-def test_a_solver_that_answers_nonsense_or_ends_the_process_is_caught(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def ends(*_: Array) -> Array:
+def test_a_solver_that_answers_nonsense_or_ends_the_process_is_caught(monkeypatch):
+    def ends(*_):
         raise SystemExit("condition failed")
 
-    def gives_up(*_: Array) -> Array:
+    def gives_up(*_):
         raise RuntimeError("no solution")
 
-    answers: dict[str, Callable[..., Array]] = {
+    answers = {
         "condition failed": ends,
         "no solution": gives_up,
         "NaN": lambda *_: np.full((2, 2), np.nan),
@@ -349,9 +330,7 @@ def test_a_solver_that_answers_nonsense_or_ends_the_process_is_caught(
     shear=st.sampled_from([0.0, 1.0, 1e3]),
 )
 @settings(deadline=None)
-def test_contraction_is_decided_as_by_the_eigenvalues(
-    seed: int, size: int, radius: float, shear: float
-) -> None:
+def test_contraction_is_decided_as_by_the_eigenvalues(seed, size, radius, shear):
     """Also where the first powers grow because the eigenvectors are nearly parallel."""
     generator = np.random.default_rng(seed)
     eigenvalues = radius * generator.uniform(-1, 1, size)

@@ -6,7 +6,6 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism import kinematics
 from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.reporting.robustness import document
-from stewart_drake.scenario.config import Scenario, StateSensorConfig
+from stewart_drake.scenario.config import StateSensorConfig
 from stewart_drake.studies import statistics, uncertainty
 from stewart_drake.studies.ranges import Ranges, read_ranges
 from stewart_drake.studies.robustness import RobustnessOptions, study_robustness
@@ -34,10 +33,8 @@ from stewart_drake.studies.statistics import auc_interval, explain
 from stewart_drake.studies.uncertainty import (
     MACHINE,
     About,
-    Draw,
     Quantity,
     Scales,
-    Truth,
     draw,
     draw_from,
     drawn,
@@ -57,7 +54,7 @@ NOTHING = dict.fromkeys(
 )
 
 
-def short(**changes: Any) -> Scenario:
+def short(**changes):
     """The paper's experiment on the exact plant, its first 0.2 s, where nothing has gone wrong."""
     scenario = sd.load_scenario(
         "paper", None, ["plant.kind=exact", "start=on_reference", "queue=reference"]
@@ -65,11 +62,11 @@ def short(**changes: Any) -> Scenario:
     return replace(scenario, **{"duration": 0.2, **changes})
 
 
-def changed(scenario: Scenario, one: Draw) -> Scenario:
+def changed(scenario, one):
     return drawn(MACHINE, scenario, PAPER, one).as_scenario()
 
 
-def machine(payload: float, one: Draw) -> sd.Mechanism:
+def machine(payload, one):
     """The paper's machine, of a scenario with a payload in kg, as it was drawn."""
     scenario = short()
     scenario.plant.payload_mass = payload
@@ -81,7 +78,7 @@ def machine(payload: float, one: Draw) -> sd.Mechanism:
 
 @settings(deadline=None)
 @given(st.integers(1, 2000), st.data(), st.floats(0.5, 0.999))
-def test_wilson_ends_solve_their_equation(n: int, data: st.DataObject, confidence: float) -> None:
+def test_wilson_ends_solve_their_equation(n, data, confidence):
     s = data.draw(st.integers(0, n))
     found = statistics.wilson_interval(s, n, confidence)
     z = scipy.stats.norm.ppf((1 + confidence) / 2)
@@ -91,7 +88,7 @@ def test_wilson_ends_solve_their_equation(n: int, data: st.DataObject, confidenc
 
 
 @pytest.mark.parametrize("p", [0.02, 0.3, 0.5, 0.9, 0.99])
-def test_wilson_covers_as_often_as_promised(p: float) -> None:
+def test_wilson_covers_as_often_as_promised(p):
     """Summed over all outcomes of 100 trials, no sampling; Wald's interval has 0.63 at 0.99."""
     n = 100
     chance = scipy.stats.binom.pmf(np.arange(n + 1), n, p)
@@ -102,7 +99,7 @@ def test_wilson_covers_as_often_as_promised(p: float) -> None:
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(-5, 5), st.floats(-1e3, 1e3)), min_size=4, max_size=60))
-def test_rank_correlation_is_pearsons_of_the_ranks(pairs: list[tuple[int, float]]) -> None:
+def test_rank_correlation_is_pearsons_of_the_ranks(pairs):
     x, y = np.array(pairs, dtype=float).T
     found = statistics.rank_correlation(x, y)
     if len(set(x)) == 1 or len(set(y)) == 1:
@@ -118,7 +115,7 @@ def test_rank_correlation_is_pearsons_of_the_ranks(pairs: list[tuple[int, float]
     assert found.rho == pytest.approx(statistics.rank_correlation(np.exp(x), y).rho)
 
 
-def test_the_interval_of_the_rank_correlation_covers_the_truth() -> None:
+def test_the_interval_of_the_rank_correlation_covers_the_truth():
     """Pairs from a normal distribution of correlation r have rho = 6/pi asin(r/2)."""
     rng, r = np.random.default_rng(1), 0.6
     truth, hits, trials = 6 / math.pi * math.asin(r / 2), 0, 2000
@@ -129,14 +126,14 @@ def test_the_interval_of_the_rank_correlation_covers_the_truth() -> None:
     assert 0.935 < hits / trials < 0.965
 
 
-def test_too_few_pairs_have_no_correlation() -> None:
+def test_too_few_pairs_have_no_correlation():
     assert math.isnan(statistics.rank_correlation([1, 2, 3], [1, 2, 3]).rho)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("q", [0.5, 0.9])
 @pytest.mark.parametrize("n", [20, 200])
-def test_quantiles_are_covered(n: int, q: float) -> None:
+def test_quantiles_are_covered(n, q):
     """Of uniform numbers, whose q-quantile is q; infinite ones are the worst there are."""
     rng, hits, trials = np.random.default_rng(2), 0, 1500
     for _ in range(trials):
@@ -148,7 +145,7 @@ def test_quantiles_are_covered(n: int, q: float) -> None:
     assert hits / trials > 0.94
 
 
-def test_small_samples_leave_quantiles_open() -> None:
+def test_small_samples_leave_quantiles_open():
     found = statistics.quantile_interval([1.0, 2.0, 3.0], 0.9)
     assert (found.value, found.high) == (3.0, np.inf)
     assert statistics.quantile_interval([1.0, np.inf], 0.99).value == np.inf
@@ -157,13 +154,13 @@ def test_small_samples_leave_quantiles_open() -> None:
             statistics.quantile_interval(bad, 0.5)
 
 
-def test_holm_by_hand() -> None:
+def test_holm_by_hand():
     found = statistics.holm([0.01, 0.04, np.nan, 0.03, 0.005])
     assert found == pytest.approx([0.03, 0.06, np.nan, 0.06, 0.02], nan_ok=True)
     assert statistics.holm([0.6, 0.7]) == pytest.approx([1, 1])
 
 
-def test_chance_alone_is_rarely_taken_for_an_influence() -> None:
+def test_chance_alone_is_rarely_taken_for_an_influence():
     """Ten unrelated quantities at once: at most 5 % of studies see anything, without Holm 40 %."""
     rng, trials, seen, naive = np.random.default_rng(3), 400, 0, 0
     for _ in range(trials):
@@ -178,7 +175,7 @@ def test_chance_alone_is_rarely_taken_for_an_influence() -> None:
 # ---------------------------------------------------------------- draws
 
 
-def test_a_draw_depends_on_seed_and_index_alone() -> None:
+def test_a_draw_depends_on_seed_and_index_alone():
     scenario, ranges = short(), Ranges()
     forward = [draw(ranges, SCALES, scenario, 3, i) for i in range(5)]
     backward = [draw(ranges, SCALES, scenario, 3, i) for i in reversed(range(5))]
@@ -188,8 +185,8 @@ def test_a_draw_depends_on_seed_and_index_alone() -> None:
 
 
 @pytest.mark.parametrize("name", [*NOTHING, "torque_limit", "delay_steps"])
-def test_a_range_of_its_own_leaves_the_other_draws_alone(name: str) -> None:
-    changed: dict[str, Any] = {name: {"torque_limit": None, "delay_steps": 3}.get(name, 0.0)}
+def test_a_range_of_its_own_leaves_the_other_draws_alone(name):
+    changed = {name: {"torque_limit": None, "delay_steps": 3}.get(name, 0.0)}
     if name == "delay_steps":
         name = "delay"
     for i in range(5):
@@ -198,10 +195,10 @@ def test_a_range_of_its_own_leaves_the_other_draws_alone(name: str) -> None:
         assert one | {name: other[name]} == other
 
 
-def test_a_new_quantity_is_one_entry_and_leaves_the_other_draws_alone() -> None:
+def test_a_new_quantity_is_one_entry_and_leaves_the_other_draws_alone():
     """Here for how long nothing is measured, told in ms, in half of the runs."""
 
-    def lose(truth: Truth, time: float) -> None:
+    def lose(truth, time):
         truth.fields["sensor"]["faults"] = [{"kind": "missing", "from": 0.1, "to": 0.1 + time}]
 
     loss = Quantity(lambda rng, about: rng.uniform(0, 0.1), lose, "ms", 1e3, sometimes=True)
@@ -220,7 +217,7 @@ def test_a_new_quantity_is_one_entry_and_leaves_the_other_draws_alone() -> None:
     assert truth.machine() is PAPER and scenario.sensor.faults == []
 
 
-def test_draws_fill_their_ranges() -> None:
+def test_draws_fill_their_ranges():
     scenario, r, n = short(), Ranges(delay_steps=2), 2000
     draws = [draw(r, SCALES, scenario, 0, i) for i in range(n)]
     values = factor_values(draws)
@@ -246,7 +243,7 @@ def test_draws_fill_their_ranges() -> None:
     assert directions.T @ directions / n == pytest.approx(np.eye(6) / 6, abs=0.02)
 
 
-def test_friction_and_the_payloads_place_are_drawn_where_they_are_asked_for() -> None:
+def test_friction_and_the_payloads_place_are_drawn_where_they_are_asked_for():
     """And leave all other draws, and what is told of them, as they are."""
     scenario, asked = short(), Ranges(coulomb=0.1, payload_position=0.3)
     scenario.plant.coulomb_friction, scenario.plant.payload_position = 1e-3, [0.0, 0.0, 0.05]
@@ -264,7 +261,7 @@ def test_friction_and_the_payloads_place_are_drawn_where_they_are_asked_for() ->
     assert plant.payload_position == [x, y, 0.05 + z]
 
 
-def test_a_delay_is_never_negative() -> None:
+def test_a_delay_is_never_negative():
     scenario = short()
     scenario.delay.steps = 1
     ranges = Ranges(delay_steps=5)
@@ -278,12 +275,12 @@ def test_a_delay_is_never_negative() -> None:
     assert max(totals) > 5
 
 
-def test_the_scenario_changes_as_drawn_and_the_belief_stays() -> None:
+def test_the_scenario_changes_as_drawn_and_the_belief_stays():
     scenario = short()
     scenario.plant.payload_mass, scenario.plant.torque_bias = 0.5, [0.1] * 6
     scenario.sensor.noise_std = [1e-3] * 12
     scenario.sensor.faults = [{"kind": "frozen", "from": 1.0, "to": 1.5}]
-    one: Draw = {
+    one = {
         **{"payload": 0.25, "torque_bias": (0.01,) * 6, "noise": 0.01, "damping": 0.02},
         **{"delay": -0.03, "seed": 7, "torque_limit": 2.0},
     }
@@ -300,16 +297,16 @@ def test_the_scenario_changes_as_drawn_and_the_belief_stays() -> None:
     other.check()
 
 
-def test_what_the_link_does_is_drawn_too() -> None:
+def test_what_the_link_does_is_drawn_too():
     wire = short()
     wire.sensor.loss = 0.5
-    one: Draw = {"jitter": 0.003, "loss": 0.2, "link_seed": 9}
+    one = {"jitter": 0.003, "loss": 0.2, "link_seed": 9}
     other = changed(wire, one)
     assert (other.delay.jitter_std, other.delay.seed) == (0.003, 9)
     assert other.sensor.loss == pytest.approx(1 - 0.5 * 0.8) and other.sensor.seed == 9
     network = sd.load_scenario("paper", None, ["link.kind=network", "link.loss=0.1"])
     lossy = changed(network, {**one, "jitter": 0.0}).link
-    assert (lossy.loss, lossy.seed) == (pytest.approx(1 - 0.9 * 0.8), 9)  # type: ignore[union-attr]
+    assert (lossy.loss, lossy.seed) == (pytest.approx(1 - 0.9 * 0.8), 9)
     same = changed(wire, {"jitter": 0.0, "loss": 0.0, "link_seed": 9})
     assert (same.delay.seed, same.sensor.seed) == (0, 0)
     scales = SCALES._replace(period=0.02)
@@ -320,9 +317,7 @@ def test_what_the_link_does_is_drawn_too() -> None:
 
 
 @pytest.mark.slow
-def test_other_controllers_run_the_same_machines(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_other_controllers_run_the_same_machines(tmp_path, capsys):
     out = tmp_path / "out"
     words = ["analyze", "robustness", "paper", "--controller", "predictor_lqi", "--runs", "2"]
     words += ["--set", "duration=0.2", "--vary", "delay=1", "--out", str(out)]
@@ -341,7 +336,7 @@ def test_other_controllers_run_the_same_machines(
     assert alone["beside"] == {}
 
 
-def test_a_scenarios_own_limit_is_kept() -> None:
+def test_a_scenarios_own_limit_is_kept():
     scenario = short()
     scenario.actuator.torque_limit = 1.0
     scales = SCALES._replace(torque_limit=1.0)
@@ -351,7 +346,7 @@ def test_a_scenarios_own_limit_is_kept() -> None:
     assert none["torque_limit"] == 1.0
 
 
-def test_where_nothing_is_commanded_no_limit_is_drawn() -> None:
+def test_where_nothing_is_commanded_no_limit_is_drawn():
     """At rest without gravity, multiples of the undisturbed run's torque would forbid any."""
     scenario, idle = short(), SCALES._replace(commanded=0.0)
     one = draw(Ranges(), idle, scenario, 0, 0)
@@ -360,7 +355,7 @@ def test_where_nothing_is_commanded_no_limit_is_drawn() -> None:
     assert draw(Ranges(), SCALES, scenario, 0, 0) | {"torque_limit": None} == one
 
 
-def test_multibody_delays_are_whole_steps() -> None:
+def test_multibody_delays_are_whole_steps():
     scenario = short()
     scenario.plant.kind = "multibody"
     for i in range(20):
@@ -368,7 +363,7 @@ def test_multibody_delays_are_whole_steps() -> None:
         changed(scenario, one).check()
 
 
-def test_ranges_from_settings() -> None:
+def test_ranges_from_settings():
     ranges = read_ranges(["payload=0.2", "torque_limit=null", "delay_steps=1"])
     assert ranges == Ranges(payload=0.2, torque_limit=None, delay_steps=1)
     for bad, said in (
@@ -386,9 +381,9 @@ def test_ranges_from_settings() -> None:
 # ---------------------------------------------------------------- another machine than believed
 
 
-def test_the_true_machine_is_off_by_what_was_drawn() -> None:
+def test_the_true_machine_is_off_by_what_was_drawn():
     rng = np.random.default_rng(0)
-    one: Draw = {
+    one = {
         "lengths": tuple(1e-4 * rng.standard_normal(12)),
         "anchors": tuple(1e-4 * rng.standard_normal(36)),
         "payload": -0.3,
@@ -402,7 +397,7 @@ def test_the_true_machine_is_off_by_what_was_drawn() -> None:
     assert machine(0.1, {"payload": -0.1, "lengths": (0.0,) * 12}) is PAPER
 
 
-def test_lacking_mass_is_a_negative_payload() -> None:
+def test_lacking_mass_is_a_negative_payload():
     rng = np.random.default_rng(0)
     light = sd.StewartDynamics(machine(0.0, {"payload": -0.3}))
     nominal, theta = sd.StewartDynamics(PAPER), np.zeros(8)
@@ -414,7 +409,7 @@ def test_lacking_mass_is_a_negative_payload() -> None:
 
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
-def test_the_loop_simulates_the_true_machine(kind: str) -> None:
+def test_the_loop_simulates_the_true_machine(kind):
     """For 0.4 s only the torques in flight act, which move a plate ten times as heavy less."""
     scenario = short(start="rest", queue="reference", duration=0.4)
     scenario.plant.kind = kind
@@ -433,7 +428,7 @@ def test_the_loop_simulates_the_true_machine(kind: str) -> None:
     assert experiment.truth == heavy
 
 
-def test_the_true_machine_decides_where_the_workspace_ends() -> None:
+def test_the_true_machine_decides_where_the_workspace_ends():
     """Rods so short that the machine can only just be assembled cannot follow the reference."""
     scenario = sd.load_scenario("paper", None, ["plant.kind=exact"])
     lack = float(kinematics.reach_margins(PAPER, PAPER.home).min())
@@ -450,8 +445,8 @@ def test_the_true_machine_decides_where_the_workspace_ends() -> None:
     assert "out of reach" in found["reason"]
 
 
-def test_what_cannot_be_prepared_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: Any, **__: Any) -> None:
+def test_what_cannot_be_prepared_is_an_outcome(monkeypatch):
+    def refuse(*_, **__):
         raise ConfigError("controller.catch_up: got 1 s")
 
     for name in ("preparation_of", "assemble"):  # what the two loops begin with
@@ -470,7 +465,7 @@ def test_what_cannot_be_prepared_is_an_outcome(monkeypatch: pytest.MonkeyPatch) 
         ({"delay": 100.0}, "delay.steps: got 1008"),
     ],
 )
-def test_a_draw_beyond_all_scenarios_is_an_outcome(one: Draw, field: str) -> None:
+def test_a_draw_beyond_all_scenarios_is_an_outcome(one, field):
     found = json.loads(run_draw(short(), one))["outcome"]
     assert found["status"] == "refused"
     assert field in found["reason"]
@@ -483,33 +478,29 @@ def test_a_draw_beyond_all_scenarios_is_an_outcome(one: Draw, field: str) -> Non
     ("changes", "loop"),
     [({}, "native"), ({"sensor": StateSensorConfig(delay=0.1)}, "drake, sensor.delay")],
 )
-def test_the_summary_counts_runs_by_what_ran_them(
-    tmp_path: Path, changes: dict[str, Any], loop: str
-) -> None:
+def test_the_summary_counts_runs_by_what_ran_them(tmp_path, changes, loop):
     study = study_robustness(short(**changes), tmp_path, RobustnessOptions(runs=2, workers=1))
     assert study.summary["loops"] == {loop: 2}
     assert document(study).facts["loop"] == f"{loop}: 2"
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {p.name: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name[0] != "."}
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RobustnessStudy]:
+def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("robustness") / "whole"
     return folder, study_robustness(short(), folder, RobustnessOptions(runs=4, workers=1))
 
 
-def told(outcomes: list[Outcome]) -> list[str]:
+def told(outcomes):
     """To the last digit; as text, since NaN is not equal to itself."""
     return [repr(outcome) for outcome in outcomes]
 
 
 @pytest.mark.slow
-def test_a_resumed_study_equals_an_uninterrupted_one(
-    tmp_path: Path, whole: tuple[Path, RobustnessStudy]
-) -> None:
+def test_a_resumed_study_equals_an_uninterrupted_one(tmp_path, whole):
     folder, study = whole
     first = study_robustness(short(), tmp_path, RobustnessOptions(runs=2, workers=1))
     assert told(first.outcomes) == told(study.outcomes[:2])
@@ -521,7 +512,7 @@ def test_a_resumed_study_equals_an_uninterrupted_one(
         study_robustness(short(), tmp_path, RobustnessOptions(runs=4, seed=1))
 
 
-def test_nothing_drawn_changes_nothing(tmp_path: Path) -> None:
+def test_nothing_drawn_changes_nothing(tmp_path):
     ranges = Ranges(**NOTHING, torque_limit=None)
     study = study_robustness(short(), tmp_path, RobustnessOptions(ranges=ranges, runs=2, workers=1))
     assert told(study.outcomes) == told([study.undisturbed] * 2)
@@ -533,7 +524,7 @@ def test_nothing_drawn_changes_nothing(tmp_path: Path) -> None:
     html(document(study), Provenance("command"))
 
 
-def test_scales_of_the_paper() -> None:
+def test_scales_of_the_paper():
     scales = scales_of(prepare(short(duration=10.0)), 0.7)
     assert scales.motion == pytest.approx(MOTION)
     assert (scales.plate_mass, scales.crank, scales.commanded) == (4.0, 0.11, 0.7)
@@ -544,7 +535,7 @@ def test_scales_of_the_paper() -> None:
 
 
 @functools.cache
-def made_up(n: int = 400, limit: float | None = None) -> RobustnessStudy:
+def made_up(n=400, limit=None):
     """E_ac grows with the noise, the delay and nothing else; late delays fail."""
     scenario = short()
     draws = [draw(Ranges(), SCALES, scenario, 1, i) for i in range(n)]
@@ -563,7 +554,7 @@ def made_up(n: int = 400, limit: float | None = None) -> RobustnessStudy:
     )
 
 
-def test_influences_are_found() -> None:
+def test_influences_are_found():
     study = made_up()
     found = {one.factor: one for one in study.influences()}
     assert study.influences()[0].factor == "noise"
@@ -579,7 +570,7 @@ def test_influences_are_found() -> None:
     assert "of those that completed: noise of the sensor, delay error." in told
 
 
-def with_failures(failing: Any, n: int = 300) -> RobustnessStudy:
+def with_failures(failing, n=300):
     """A made-up study in which those draws fail that `failing` says; E_ac follows the noise."""
     study = made_up(n)
     rng = np.random.default_rng(7)
@@ -592,16 +583,16 @@ def with_failures(failing: Any, n: int = 300) -> RobustnessStudy:
     return study._replace(outcomes=outcomes)
 
 
-def told_of(study: RobustnessStudy) -> str:
+def told_of(study):
     return " ".join(document(study).plain().split())
 
 
-def median_of(study: RobustnessStudy, name: str) -> float:
+def median_of(study, name):
     return float(np.median(factor_values(study.draws)[name]))
 
 
 @pytest.mark.slow
-def test_one_cause_of_failing_is_found_and_counted() -> None:
+def test_one_cause_of_failing_is_found_and_counted():
     bias = factor_values(made_up(300).draws)["torque_bias"]
     high = float(np.quantile(bias, 0.6))
     study = with_failures(
@@ -633,12 +624,12 @@ def test_one_cause_of_failing_is_found_and_counted() -> None:
 
 
 @pytest.mark.parametrize("opposite", [False, True])
-def test_two_causes_that_only_work_together_are_found_as_a_pair(opposite: bool) -> None:
+def test_two_causes_that_only_work_together_are_found_as_a_pair(opposite):
     """Late and heavy; or as well early and light, so that no quantity alone tells anything."""
     plain = made_up(600)
     late, heavy = median_of(plain, "delay"), median_of(plain, "payload")
 
-    def failing(one: Draw, luck: float) -> bool:
+    def failing(one, luck):
         a, b = 1e3 * one["delay"] > late, one["payload"] > heavy
         return bool(luck < 0.5 and (a == b if opposite else a and b))
 
@@ -657,7 +648,7 @@ def test_two_causes_that_only_work_together_are_found_as_a_pair(opposite: bool) 
 
 
 @pytest.mark.slow
-def test_failures_by_chance_are_explained_by_nothing() -> None:
+def test_failures_by_chance_are_explained_by_nothing():
     """But for the one in twenty that chance is allowed, for single quantities and for pairs."""
     rng, values = np.random.default_rng(5), factor_values(made_up(300).draws)
     by_chance = [explain(values, rng.uniform(size=300) < 0.27) for _ in range(40)]
@@ -672,7 +663,7 @@ def test_failures_by_chance_are_explained_by_nothing() -> None:
     assert "What matters for completing" not in told
 
 
-def test_the_auc_interval_covers_the_truth() -> None:
+def test_the_auc_interval_covers_the_truth():
     """Of two shifted normal samples AUC is Phi(d / sqrt 2), missed by 5 % of the intervals."""
     rng, shift = np.random.default_rng(4), 1.0
     truth = scipy.stats.norm.cdf(shift / np.sqrt(2))
@@ -687,7 +678,7 @@ def test_the_auc_interval_covers_the_truth() -> None:
 
 
 @pytest.mark.slow
-def test_all_failing_or_none_needs_no_explanation() -> None:
+def test_all_failing_or_none_needs_no_explanation():
     for fails in (True, False):
         study = with_failures(lambda one, luck, fails=fails: fails, 20)
         assert study.explanation.singles == []
@@ -695,7 +686,7 @@ def test_all_failing_or_none_needs_no_explanation() -> None:
         html(document(study), Provenance("command"))
 
 
-def test_failures_are_counted_and_never_dropped() -> None:
+def test_failures_are_counted_and_never_dropped():
     study = made_up()
     failures = sum(one["delay"] > 8e-4 for one in study.draws)
     assert 0 < failures < 400
@@ -715,7 +706,7 @@ def test_failures_are_counted_and_never_dropped() -> None:
 
 
 @pytest.mark.slow
-def test_tables_and_pages_of_extreme_studies() -> None:
+def test_tables_and_pages_of_extreme_studies():
     for study in (
         made_up(1),
         made_up(400),
@@ -732,7 +723,7 @@ def test_tables_and_pages_of_extreme_studies() -> None:
 
 
 @pytest.mark.slow
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(tmp_path, capsys):
     out = tmp_path / "out"
     words = ["analyze", "robustness", "paper", "--runs", "3", "--seed", "5", "--out", str(out)]
     words += ["--set", "duration=0.2", "--vary", "delay=0", "--vary", "noise=0.002"]
@@ -755,9 +746,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "belongs to other settings" in capsys.readouterr().err
 
 
-def test_nothing_is_drawn_where_the_undisturbed_run_fails(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_is_drawn_where_the_undisturbed_run_fails(tmp_path, capsys):
     """All runs were drawn, for a page of dashes."""
     words = ["analyze", "robustness", "paper", "--set", "duration=1", "--out", str(tmp_path)]
     assert main([*words, "--runs", "50", "--set", "plant.gravity=true"]) == 2
@@ -768,7 +757,7 @@ def test_nothing_is_drawn_where_the_undisturbed_run_fails(
     assert files == {"manifest.json", "undisturbed.json", ".lock"}
 
 
-def test_another_controller_that_fails_undisturbed_is_named(tmp_path: Path) -> None:
+def test_another_controller_that_fails_undisturbed_is_named(tmp_path):
     lost = replace(short(), plant=replace(short().plant, gravity=True), duration=1.0)
     with pytest.raises(ConfigError, match="robustness with heavy: the undisturbed run fails"):
         study_robustness(
@@ -777,8 +766,8 @@ def test_another_controller_that_fails_undisturbed_is_named(tmp_path: Path) -> N
     assert not list(tmp_path.glob("*/run0*.json"))
 
 
-def test_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    def interrupted(*_: Any, **__: Any) -> None:
+def test_ctrl_c(tmp_path, monkeypatch, capsys):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(uncertainty, "run_jobs", interrupted)

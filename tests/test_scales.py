@@ -5,7 +5,6 @@ the equations of motion stay what they were. Any number with a unit in the law w
 """
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,12 +18,10 @@ from stewart_drake.law.startup import machine_torque
 from stewart_drake.loop import experiment as experiment_module
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import control_law
-from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.geometry import Body, Link, Mechanism
+from stewart_drake.mechanism.geometry import Body, Link
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 from tests.test_riccati import STEPS, UNIT, delayed
@@ -34,11 +31,11 @@ SIZES = [(0.1, 1e-3), (0.01, 1e-6), (10.0, 1e3), (1.0, 100.0)]
 ON = ("start=on_reference", "queue=reference")
 
 
-def scaled(s: float, m: float) -> Mechanism:
-    def body(b: Body) -> Body:
+def scaled(s, m):
+    def body(b):
         return Body(m * b.mass, m * s**2 * b.inertia)
 
-    def link(b: Link) -> Link:
+    def link(b):
         return Link(m * b.mass, m * s**2 * b.inertia, b.center)
 
     return dataclasses.replace(
@@ -56,9 +53,7 @@ def scaled(s: float, m: float) -> Mechanism:
     )
 
 
-def run(
-    monkeypatch: pytest.MonkeyPatch, s: float, m: float, *settings: str
-) -> tuple[SimulationResult, Array]:
+def run(monkeypatch, s, m, *settings):
     """On the exact plant; and the torques in units of m s^2."""
     sc = load_scenario("paper", None, ("plant.kind=exact", *settings))
     for field in {"amplitude", "offset"} & set(vars(sc.reference)):  # a hold has one of them
@@ -71,7 +66,7 @@ def run(
     monkeypatch.setattr(experiment_module, "load_mechanism", lambda _: mechanism)
     if sc.plant.gravity:  # goes with lengths too, as times stay
 
-        def dynamics(machine: Mechanism, gravity: float, *more: Array) -> StewartDynamics:
+        def dynamics(machine, gravity, *more):
             return StewartDynamics(machine, 9.81 * s * gravity, *more)
 
         monkeypatch.setattr(experiment_module, "StewartDynamics", dynamics)
@@ -94,16 +89,14 @@ CASES = {
     ),
     "yaw alone": (*ON, "reference.amplitude=[0, 0, 0.2, 0, 0, 0]", "duration=3"),
 }
-AS_IT_IS: dict[str, tuple[SimulationResult, Array]] = {}
+AS_IT_IS = {}
 """Runs of the machine that is not scaled, by case, and their torques."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize(("s", "m"), SIZES)
-def test_a_scaled_machine_moves_alike(
-    case: str, s: float, m: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scaled_machine_moves_alike(case, s, m, monkeypatch):
     """To six digits of the torques: the integrator's own tolerance is all that is not in scale."""
     if case not in AS_IT_IS:
         AS_IT_IS[case] = run(monkeypatch, 1.0, 1.0, *CASES[case])
@@ -119,7 +112,7 @@ def test_a_scaled_machine_moves_alike(
 
 
 @pytest.mark.parametrize(("s", "m"), SIZES)
-def test_the_machines_torque_is_in_proportion(s: float, m: float) -> None:
+def test_the_machines_torque_is_in_proportion(s, m):
     """And it is what inverse dynamics asks for: 2 cranks per s^2 along the axis that takes most."""
     expected = machine_torque(StewartDynamics(PAPER, False))
     found = machine_torque(StewartDynamics(scaled(s, m), True))
@@ -130,7 +123,7 @@ def test_the_machines_torque_is_in_proportion(s: float, m: float) -> None:
     assert expected == pytest.approx(np.abs(torques).max(), rel=1e-9)
 
 
-def test_a_file_may_describe_a_machine_of_a_few_millimetres(tmp_path: Path) -> None:
+def test_a_file_may_describe_a_machine_of_a_few_millimetres(tmp_path):
     s, m = 0.01, 1e-6
     yaml = YAML(typ="safe")
     data = yaml.load((data_root() / "models" / "paper.yaml").read_text())
@@ -164,7 +157,7 @@ def test_a_file_may_describe_a_machine_of_a_few_millimetres(tmp_path: Path) -> N
 @pytest.mark.parametrize("fraction", [0.0, 0.5])
 @pytest.mark.parametrize("steps", STEPS[:4])
 @pytest.mark.parametrize("name", ["paper", "gravity"])
-def test_units_change_no_gain(name: str, steps: int, fraction: float) -> None:
+def test_units_change_no_gain(name, steps, fraction):
     """Metres or millimetres, N m or mN m: the gain in one unit follows from that in the other."""
     model, (Q, R) = delayed(name, steps, fraction), UNIT
     K, P = full_gain(model, Q, R)
@@ -183,7 +176,7 @@ def test_units_change_no_gain(name: str, steps: int, fraction: float) -> None:
     assert relative(cost * np.outer(chain, chain), P) < 1e-8
 
 
-def test_the_gain_of_scaled_states_is_drakes_own() -> None:
+def test_the_gain_of_scaled_states_is_drakes_own():
     """Where the units are sensible already, nothing but rounding comes of the scaling."""
     for name in ("paper", "gravity"):
         model, (Q, R) = delayed(name, 0, 0.0), UNIT
@@ -193,7 +186,7 @@ def test_the_gain_of_scaled_states_is_drakes_own() -> None:
         assert relative(cost, P) < 1e-9
 
 
-def test_what_the_law_believes_of_the_paper_is_in_its_order_of_magnitude() -> None:
+def test_what_the_law_believes_of_the_paper_is_in_its_order_of_magnitude():
     """The torque of the reference is 0.013 N m, of the catch-up 0.66."""
     law, _, _ = control_law(prepare(load_scenario("paper")))
     machine = machine_torque(law.plant.dynamics)

@@ -22,20 +22,20 @@ PLATE = "/drake/visualizer/paper/plate"
 
 
 @pytest.fixture
-def meshcat() -> Meshcat:
+def meshcat():
     return Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
 
 
-def transform(meshcat: Meshcat, path: str) -> np.ndarray:
+def transform(meshcat, path):
     """What a browser is told of a path, 4 x 4."""
     return np.reshape(msgpack.unpackb(meshcat._GetPackedTransform(path))["matrix"], (4, 4)).T
 
 
-def value(meshcat: Meshcat, path: str, name: str):
+def value(meshcat, path, name):
     return msgpack.unpackb(meshcat._GetPackedProperty(path, name))["value"]
 
 
-def crank(leg: int) -> str:
+def crank(leg):
     return "/" + "/".join(crank_paths("paper")[LEGS.index(leg)][0]) + "/<object>"
 
 
@@ -43,7 +43,7 @@ def crank(leg: int) -> str:
 def test_a_live_run_shows_the_plate_the_ring_and_the_torques(kind, meshcat):
     looks = []
 
-    def look(now: float, error: float) -> None:
+    def look(now, error):
         looks.append(
             (transform(meshcat, PLATE), transform(meshcat, "/reference"))
             + tuple(value(meshcat, crank(leg), "color") for leg in LEGS)
@@ -121,7 +121,7 @@ def test_colours_are_of_the_usual_torque():
         assert got == expected
 
 
-def listening(port: int) -> bool:
+def listening(port):
     try:
         socket.create_connection(("localhost", port), 1).close()
     except OSError:

@@ -7,27 +7,25 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from pydrake.geometry import Box, SceneGraph
+from pydrake.geometry import Box
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder
 
 from stewart_drake.files.resources import data_root, shipped
 from stewart_drake.loop.multibody import add_mechanism, set_pose
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
 MODELS = data_root() / "models"
 LEGS = range(1, 7)
 
 
-def parse(mechanism: Mechanism) -> tuple[MultibodyPlant, Context]:
+def parse(mechanism):
     """The document alone, at the positions it gives."""
     plant = MultibodyPlant(time_step=1e-3)
     Parser(plant).AddModelsFromString(to_sdformat(mechanism), "sdf")
@@ -35,7 +33,7 @@ def parse(mechanism: Mechanism) -> tuple[MultibodyPlant, Context]:
     return plant, plant.CreateDefaultContext()
 
 
-def any_machine(seed: int) -> Mechanism:
+def any_machine(seed):
     """The paper's mechanism for seed 0, else a random one that uses either crank branch."""
     rng = np.random.default_rng(seed)
     if seed == 0:
@@ -43,7 +41,7 @@ def any_machine(seed: int) -> Mechanism:
     return dataclasses.replace(random_mechanism(rng), branches=rng.choice([-1, 1], 6))
 
 
-def with_vertical(link: str) -> Mechanism:
+def with_vertical(link):
     """All cranks, or all rods, vertical at home: a pitch of 90 degrees. Crank angles are zero."""
     azimuth = np.arange(6) * np.pi / 3
     out = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(6)])
@@ -68,7 +66,7 @@ def with_vertical(link: str) -> Mechanism:
     )
 
 
-def gaps(mechanism: Mechanism, plant: MultibodyPlant, context: Context) -> tuple[float, float]:
+def gaps(mechanism, plant, context):
     """Largest distance and relative velocity between a rod's end and its plate joint."""
     distance, velocity = [], []
     for leg in LEGS:
@@ -89,7 +87,7 @@ def gaps(mechanism: Mechanism, plant: MultibodyPlant, context: Context) -> tuple
 
 
 @pytest.mark.parametrize("name", shipped("mechanism"))
-def test_the_generated_file_is_what_the_writer_writes(name: str) -> None:
+def test_the_generated_file_is_what_the_writer_writes(name):
     """Up to the last digit, in which platforms may differ."""
     number = re.compile(r"-?\d+(\.\d+)?(e[+-]\d+)?")
     generated = (MODELS / f"{name}.sdf").read_text()
@@ -100,7 +98,7 @@ def test_the_generated_file_is_what_the_writer_writes(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", shipped("mechanism"))
-def test_package_url_resolves(name: str) -> None:
+def test_package_url_resolves(name):
     plant = MultibodyPlant(time_step=1e-3)
     parser = Parser(plant)
     parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
@@ -108,7 +106,7 @@ def test_package_url_resolves(name: str) -> None:
     assert plant.HasModelInstanceNamed(name)
 
 
-def test_the_plate_is_drawn_at_its_joints() -> None:
+def test_the_plate_is_drawn_at_its_joints():
     """Also where its centre of mass, the frame's origin, is elsewhere."""
     mechanism = load_mechanism("motion_base")
     deck = mechanism.p_PQ[0, 2]
@@ -121,15 +119,13 @@ def test_the_plate_is_drawn_at_its_joints() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_parser_has_nothing_to_warn_of(seed: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_parser_has_nothing_to_warn_of(seed, caplog):
     with caplog.at_level(logging.WARNING, logger="drake"):
         parse(any_machine(seed))
     assert caplog.messages == []
 
 
-def test_parser_only_warns_of_the_inertia_that_the_paper_prints(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_parser_only_warns_of_the_inertia_that_the_paper_prints(caplog):
     """Hence the mechanism's own check; and the warnings that the test above looks for do arrive."""
     printed = to_sdformat(PAPER).replace("5.9e-05", "6e-05")
     plant = MultibodyPlant(time_step=1e-3)
@@ -139,13 +135,13 @@ def test_parser_only_warns_of_the_inertia_that_the_paper_prints(
 
 
 @pytest.mark.parametrize("name", ["base", "plate", "crank_1", "model", "static", "my-robot_2"])
-def test_names_do_not_collide_with_those_inside(name: str) -> None:
+def test_names_do_not_collide_with_those_inside(name):
     plant, _ = parse(dataclasses.replace(PAPER, name=name))
     assert plant.HasModelInstanceNamed(name)
     assert plant.num_actuated_dofs() == 6
 
 
-def test_two_machines_fit_into_one_plant() -> None:
+def test_two_machines_fit_into_one_plant():
     plant = MultibodyPlant(time_step=1e-3)
     for name in ("left", "right"):
         document = to_sdformat(dataclasses.replace(PAPER, name=name))
@@ -158,7 +154,7 @@ def test_two_machines_fit_into_one_plant() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_bodies_have_the_mechanism_s_mass_inertia_and_centre(seed: int) -> None:
+def test_bodies_have_the_mechanism_s_mass_inertia_and_centre(seed):
     mechanism = any_machine(seed)
     plant, context = parse(mechanism)
     expected = {"base": (mechanism.base, 0.0), "plate": (mechanism.plate, 0.0)}
@@ -179,12 +175,12 @@ def test_bodies_have_the_mechanism_s_mass_inertia_and_centre(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_joints_turn_about_the_mechanism_s_axes(seed: int) -> None:
+def test_joints_turn_about_the_mechanism_s_axes(seed):
     """Second axis of the universal joint: perpendicular to the motor axis and to the rod."""
     mechanism = any_machine(seed)
     plant, context = parse(mechanism)
 
-    def origin(frame: str) -> Array:
+    def origin(frame):
         return plant.GetFrameByName(frame).CalcPoseInWorld(context).translation()
 
     for i, leg in enumerate(LEGS):
@@ -201,7 +197,7 @@ def test_joints_turn_about_the_mechanism_s_axes(seed: int) -> None:
 
 
 @pytest.mark.parametrize("limit", [None, 2.5])
-def test_motors_are_the_only_actuators_in_the_order_of_the_legs(limit: float | None) -> None:
+def test_motors_are_the_only_actuators_in_the_order_of_the_legs(limit):
     plant, _ = parse(dataclasses.replace(PAPER, effort_limit=limit))
     actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
     assert [actuator.joint().name() for actuator in actuators] == [f"motor_{leg}" for leg in LEGS]
@@ -214,10 +210,10 @@ def test_motors_are_the_only_actuators_in_the_order_of_the_legs(limit: float | N
     [*map(any_machine, range(4)), with_vertical("crank"), with_vertical("rod")],
     ids=["paper", "random 1", "random 2", "random 3", "vertical cranks", "vertical rods"],
 )
-def test_frames_stand_where_the_mechanism_has_its_joints(mechanism: Mechanism) -> None:
+def test_frames_stand_where_the_mechanism_has_its_joints(mechanism):
     plant, context = parse(mechanism)
 
-    def pose(frame: str) -> tuple[Array, Array]:
+    def pose(frame):
         X_WF = plant.GetFrameByName(frame).CalcPoseInWorld(context)
         return X_WF.translation(), X_WF.rotation().matrix()
 
@@ -239,7 +235,7 @@ def test_frames_stand_where_the_mechanism_has_its_joints(mechanism: Mechanism) -
 
 
 @pytest.mark.parametrize("link", ["crank", "rod"])
-def test_links_that_should_be_vertical_are(link: str) -> None:
+def test_links_that_should_be_vertical_are(link):
     plant, context = parse(with_vertical(link))
     for leg in LEGS:
         X_WL = plant.GetBodyByName(f"{link}_{leg}").EvalPoseInWorld(context)
@@ -249,7 +245,7 @@ def test_links_that_should_be_vertical_are(link: str) -> None:
 # ------------------------------------------------------------------ the loops
 
 
-def test_each_loop_is_closed_by_one_constraint() -> None:
+def test_each_loop_is_closed_by_one_constraint():
     plant, _ = parse(PAPER)
     assert plant.num_constraints() == 6
     assert len(plant.GetConstraintIds()) == 6
@@ -258,7 +254,7 @@ def test_each_loop_is_closed_by_one_constraint() -> None:
 
 
 @pytest.mark.parametrize("seed", range(25))
-def test_loops_close_at_any_pose_and_rates(seed: int) -> None:
+def test_loops_close_at_any_pose_and_rates(seed):
     mechanism = any_machine(seed)
     rng = np.random.default_rng(seed)
     plant = MultibodyPlant(time_step=1e-3)
@@ -289,7 +285,7 @@ def test_loops_close_at_any_pose_and_rates(seed: int) -> None:
 # ------------------------------------------------------------------ collisions
 
 
-def scene(documents: list[str]) -> tuple[DiagramBuilder, MultibodyPlant, SceneGraph]:
+def scene(documents):
     """The documents in a plant of somebody else's, not finalized yet."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
@@ -299,7 +295,7 @@ def scene(documents: list[str]) -> tuple[DiagramBuilder, MultibodyPlant, SceneGr
 
 
 @pytest.mark.parametrize("name", shipped("mechanism"))
-def test_a_box_dropped_on_the_plate_of_a_held_machine_stays_on_it(name: str) -> None:
+def test_a_box_dropped_on_the_plate_of_a_held_machine_stays_on_it(name):
     """Shafts locked, under gravity, for 2 s; the box ends half its height above the disc.
 
     Two flat faces touch in one point only, on which the box may still rock a little.
@@ -345,7 +341,7 @@ def test_a_box_dropped_on_the_plate_of_a_held_machine_stays_on_it(name: str) -> 
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_machine_collides_with_everything_but_itself(seed: int) -> None:
+def test_a_machine_collides_with_everything_but_itself(seed):
     machine = any_machine(seed)
     _, plant, scene_graph = scene([to_sdformat(machine)])
     plant.Finalize()
@@ -367,7 +363,7 @@ def test_a_machine_collides_with_everything_but_itself(seed: int) -> None:
     assert candidates == expected
 
 
-def test_what_collides_is_what_is_seen() -> None:
+def test_what_collides_is_what_is_seen():
     root = ElementTree.fromstring(to_sdformat(PAPER))
     for link in root.iter("link"):
         shapes = link.findall("collision")
@@ -383,7 +379,7 @@ def test_what_collides_is_what_is_seen() -> None:
     assert "collision" not in bare and "visual" in bare
 
 
-def test_shapes_change_no_run_of_the_machine_alone() -> None:
+def test_shapes_change_no_run_of_the_machine_alone():
     """To the last bit, through a motion in which cranks and rods of the pairs cross."""
     torque = 1e-3 * np.array([1, -1, 1, -1, 1, -1])
     states = []

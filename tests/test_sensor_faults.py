@@ -1,7 +1,6 @@
 """Sensors that lie: noticed, counted by cause, replaced by the model; and no false alarms."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,16 +8,12 @@ import pytest
 import stewart_drake.loop.kinds as kinds_module
 from stewart_drake.core.library import core
 from stewart_drake.files.yamlio import parse_yaml
-from stewart_drake.law.filter_settings import FilterSettings
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.sensing import StateSensing
-from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_to_dict, scenario_yaml
-from stewart_drake.types import Array
 from tests.test_control_law import HOME, Loop, law_of, nominal_queue, sine, step
 
 PATIENCE = core().lib.STEWART_PATIENCE
@@ -34,18 +29,18 @@ NOISE = f"sensor.noise_std={[1e-3 * a for a in AMPLITUDES * 2]}"
 """A thousandth of the motion, and that per s."""
 
 
-def on_reference(*settings: str, controller: str | None = None) -> Scenario:
+def on_reference(*settings, controller=None):
     """The paper's experiment on the exact plant, from its reference on."""
     mine = ("plant.kind=exact", "start=on_reference", "queue=reference")
     return load_scenario("paper", controller, (*mine, *settings))
 
 
-def fault(kind: str, start: float = 4.0, end: float = 5.0, **more: Any) -> str:
+def fault(kind, start=4.0, end=5.0, **more):
     inside = "".join(f", {name}: {value}" for name, value in more.items())
     return f"sensor.faults=[{{kind: {kind}, from: {start}, to: {end}{inside}}}]"
 
 
-def bad(run: SimulationResult) -> dict[str, int]:
+def bad(run):
     """The measurements that were not used, by cause."""
     counts = run.summary["counts"]
     found = {name: counts[name] for name in COUNT.values() if counts[name]}
@@ -59,7 +54,7 @@ def bad(run: SimulationResult) -> dict[str, int]:
     ids=["filter", "alone"],
 )
 @pytest.mark.parametrize("kind", COUNT)
-def test_a_second_of_it_is_survived(kind: str, estimate: str, bound: float) -> None:
+def test_a_second_of_it_is_survived(kind, estimate, bound):
     """E_ac 0.0271 with the filter (0.0260 undisturbed), 0.0254 without it (0.0254)."""
     run = simulate(
         on_reference(f"controller.estimate={estimate}", fault(kind)), judge_stability=False
@@ -70,7 +65,7 @@ def test_a_second_of_it_is_survived(kind: str, estimate: str, bound: float) -> N
 
 
 @pytest.mark.parametrize("size", [0.01, 0.1, 1.0, 1e3])
-def test_spikes_of_all_sizes_are_told_from_motion(size: float) -> None:
+def test_spikes_of_all_sizes_are_told_from_motion(size):
     """Also within reach, and ten in a row: they do not bear each other out."""
     run = simulate(on_reference(fault("spike", size=size)), judge_stability=False)
     assert run.status == "completed"
@@ -78,7 +73,7 @@ def test_spikes_of_all_sizes_are_told_from_motion(size: float) -> None:
     assert run.accumulated_error < 0.03
 
 
-def test_the_same_under_noise() -> None:
+def test_the_same_under_noise():
     well = simulate(on_reference(NOISE), judge_stability=False)
     assert not bad(well)
     for kind, count in COUNT.items():
@@ -90,7 +85,7 @@ def test_the_same_under_noise() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("controller", CONTROLLERS[:4])
-def test_the_papers_controllers_count_them_too(controller: str) -> None:
+def test_the_papers_controllers_count_them_too(controller):
     """Without a delay, where they keep the plate."""
     slow = ("delay.steps=0", "reference.amplitude=[0.02, 0.02, 0.02, 0.002, 0.002, 0.008]")
     for kind in COUNT:
@@ -103,7 +98,7 @@ def test_the_papers_controllers_count_them_too(controller: str) -> None:
         assert bad(run) == {COUNT[kind]: 5}
 
 
-def test_a_sensor_that_froze_at_rest_is_found_by_the_filter() -> None:
+def test_a_sensor_that_froze_at_rest_is_found_by_the_filter():
     """Then its pose and rates agree with each other, but not with the torques that act."""
     sc = on_reference("start=rest", "queue=zero", fault("frozen", 0.0, 1.4))
     run = simulate(sc, judge_stability=False)
@@ -113,11 +108,11 @@ def test_a_sensor_that_froze_at_rest_is_found_by_the_filter() -> None:
     assert run.accumulated_error < 21.2
 
 
-def test_one_stuck_value_is_enough() -> None:
+def test_one_stuck_value_is_enough():
     law, reference = law_of("delay.steps=2", "controller.estimate=[]"), sine(0.5)
-    first: list[Array] = []
+    first = []
 
-    def stuck(k: int, x: Array) -> Array:
+    def stuck(k, x):
         first.append(x)
         return np.where(np.arange(12) == 1, first[min(k, 3)], x)  # the pitch, from sample 3 on
 
@@ -126,11 +121,9 @@ def test_one_stuck_value_is_enough() -> None:
 
 
 @pytest.mark.parametrize("estimate", ["[torque_bias,payload,damping]", "[]"])
-def test_a_sample_of_zeros_is_rejected_and_counted(
-    estimate: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sample_of_zeros_is_rejected_and_counted(estimate, monkeypatch):
     class Zero(Sensor):
-        def _measure(self, context: Any, output: Any) -> None:
+        def _measure(self, context, output):
             super()._measure(context, output)
             if round(context.get_time() / 0.1) == 20:
                 output.SetFromVector(np.zeros(12))
@@ -144,12 +137,12 @@ def test_a_sample_of_zeros_is_rejected_and_counted(
     assert run.accumulated_error < 0.025
 
 
-def test_a_sensor_that_comes_back_is_believed_again() -> None:
+def test_a_sensor_that_comes_back_is_believed_again():
     """At once, and with it the plate: the outage was longer than the filter's patience."""
     law, reference = law_of("delay.steps=2"), sine(0.5)
-    sent: list[Array] = []
+    sent = []
 
-    def frozen(k: int, x: Array) -> Array:
+    def frozen(k, x):
         sent.append(sent[-1] if 5 <= k < 5 + 4 * PATIENCE else x)
         return sent[-1]
 
@@ -164,7 +157,7 @@ def test_a_sensor_that_comes_back_is_believed_again() -> None:
     assert np.abs(loop.memory.belief.state - sent[-1]).max() < 1e-6
 
 
-def test_a_plate_that_was_put_elsewhere_is_believed_in_the_end() -> None:
+def test_a_plate_that_was_put_elsewhere_is_believed_in_the_end():
     """By hand, 1 mm away: outliers that follow from one another are no broken sensor."""
     law, reference = law_of("delay.steps=2"), sine(0.3)
     loop = Loop(law, reference, queue=nominal_queue(law, reference)).run(8)
@@ -179,7 +172,7 @@ def test_a_plate_that_was_put_elsewhere_is_believed_in_the_end() -> None:
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("name", SHIPPED)
-def test_no_shipped_scenario_has_a_bad_measurement(name: str, controller: str) -> None:
+def test_no_shipped_scenario_has_a_bad_measurement(name, controller):
     """Also where the controller loses the plate, and where one that is not aware of the delay
     wonders for 0.8 s why the plate does not move."""
     settings = ("plant.kind=exact", "duration=3")
@@ -187,13 +180,13 @@ def test_no_shipped_scenario_has_a_bad_measurement(name: str, controller: str) -
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_nor_on_the_multibody_plant(name: str) -> None:
+def test_nor_on_the_multibody_plant(name):
     assert not bad(simulate(load_scenario(name, None, ("duration=1.5",)), judge_stability=False))
 
 
 @pytest.mark.parametrize("estimate", ["[torque_bias,payload,damping]", "[]"])
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
-def test_a_plate_at_rest_is_not_frozen(plant: str, estimate: str) -> None:
+def test_a_plate_at_rest_is_not_frozen(plant, estimate):
     """Exactly the same pose and rates, sample for sample."""
     settings = ("reference.kind=hold", "duration=2", f"plant.kind={plant}")
     run = simulate(
@@ -205,7 +198,7 @@ def test_a_plate_at_rest_is_not_frozen(plant: str, estimate: str) -> None:
 
 
 @pytest.mark.parametrize("std", [1e-3, 1e-9, 1e-15, 1e-17])
-def test_noise_at_rest_is_not_frozen_unless_it_repeats(std: float) -> None:
+def test_noise_at_rest_is_not_frozen_unless_it_repeats(std):
     """Noise that is lost in the last digit of a pose repeats, and is no noise."""
     law = law_of("controller.estimate=[]", "delay.steps=0")
     sensing = dataclasses.replace(law.sensing, noise_std=std * np.eye(12)[5])
@@ -223,7 +216,7 @@ def test_noise_at_rest_is_not_frozen_unless_it_repeats(std: float) -> None:
 # The sensor, and what scenarios say of it.
 
 
-def test_the_sensors_faults_by_hand() -> None:
+def test_the_sensors_faults_by_hand():
     motion = np.arange(1.0, 7.0)
     faults = [
         {"kind": "frozen", "from": 0.2, "to": 0.4},
@@ -249,11 +242,11 @@ def test_the_sensors_faults_by_hand() -> None:
     assert Sensor(np.zeros(12), 0, 0.1).CreateDefaultContext().num_total_states() == 0
 
 
-def test_faults_in_a_scenario_come_back_as_they_were_written() -> None:
+def test_faults_in_a_scenario_come_back_as_they_were_written():
     given = [{"kind": "frozen", "from": 4.0, "to": 5.0}, {"kind": "spike", "from": 1.0, "to": 2.0}]
     sc = load_scenario("paper")
     assert sc.sensor.faults == []
-    sc.sensor.faults = given  # type: ignore[assignment]
+    sc.sensor.faults = given
     sc.check()
     assert scenario_to_dict(sc)["sensor"]["faults"] == given
     assert parse_yaml(scenario_yaml(sc), "text")["sensor"]["faults"] == given
@@ -264,10 +257,10 @@ def test_faults_in_a_scenario_come_back_as_they_were_written() -> None:
 
 
 @pytest.mark.parametrize("wrong", ["errors", "torques", "noise", "parameters"])
-def test_a_wrong_shape_is_an_exception(wrong: str) -> None:
+def test_a_wrong_shape_is_an_exception(wrong):
     """It was a counted Riccati failure, or an outlier."""
     law = law_of("delay.steps=2")
-    parts: dict[str, Any] = {
+    parts = {
         "errors": {"cost": dataclasses.replace(law.cost, errors=np.ones(5))},
         "torques": {"cost": dataclasses.replace(law.cost, torques=np.ones(5))},
         "noise": {"sensing": StateSensing(np.zeros(11), np.ones(6))},
@@ -278,7 +271,7 @@ def test_a_wrong_shape_is_an_exception(wrong: str) -> None:
         dataclasses.replace(law, **parts[wrong]).warm_up()
 
 
-def seven(observer: Any) -> FilterSettings:
+def seven(observer):
     """Without the last parameter of the equations of motion."""
     known = observer.settings.parameters
     columns = {f.name: getattr(known, f.name) for f in dataclasses.fields(known)}
@@ -286,7 +279,7 @@ def seven(observer: Any) -> FilterSettings:
     return dataclasses.replace(observer.settings, parameters=dataclasses.replace(known, **fewer))
 
 
-def test_the_causes_are_counted_apart() -> None:
+def test_the_causes_are_counted_apart():
     assert Counts().plus("unreachable", None, "measurements_frozen") == Counts(
         unreachable=1, measurements_frozen=1
     )
@@ -299,7 +292,7 @@ def test_the_causes_are_counted_apart() -> None:
     ]
 
 
-def test_a_share_of_the_samples_is_struck() -> None:
+def test_a_share_of_the_samples_is_struck():
     faults = [{"kind": "missing", "from": 0.0, "to": 1e5, "share": 0.2}]
     sensor = Sensor(np.zeros(12), 3, 0.1, faults)
     context = sensor.CreateDefaultContext()

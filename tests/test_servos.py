@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from stewart_drake.law.servos import (
     still,
     turned,
 )
-from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
+from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.servo_design import compose_servo_law, servo_loop
@@ -37,7 +36,6 @@ from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.scenario.timing import look_time, servo_ticks
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import CONTROLLERS, SERVOS, shown
-from stewart_drake.types import Array
 
 ON = ("start=on_reference", "queue=reference")
 UNKNOWN = (
@@ -52,16 +50,16 @@ LOOP = ServoLoop(0.005, 60.0, 0.7, 1e-3, TorqueLimit())
 NOTHING = np.zeros(6)
 
 
-def scenario(*more: str, controller: str = "servo_preview", kind: str = "exact") -> sd.Scenario:
+def scenario(*more, controller="servo_preview", kind="exact"):
     given = ("actuator.kind=servo", f"plant.kind={kind}", *more)
     return sd.load_scenario("paper", controller, given)
 
 
-def run(*more: str, controller: str = "servo_preview", kind: str = "exact") -> Any:
+def run(*more, controller="servo_preview", kind="exact"):
     return sd.simulate(scenario(*more, controller=controller, kind=kind))
 
 
-def crank_rates(pose: Array, rates: Array) -> Array:
+def crank_rates(pose, rates):
     """By differences of the crank angles."""
     h, angles = 1e-6, DYNAMICS.mechanism.crank_angles
     return (angles(pose + h * rates) - angles(pose - h * rates)) / (2 * h)
@@ -71,7 +69,7 @@ def crank_rates(pose: Array, rates: Array) -> Array:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_energy_of_the_cranks_is_that_of_the_pose(seed: int) -> None:
+def test_the_energy_of_the_cranks_is_that_of_the_pose(seed):
     rng = np.random.default_rng(seed)
     pose = HOME + 0.02 * rng.standard_normal(6)
     rates = rng.standard_normal(6)
@@ -80,7 +78,7 @@ def test_the_energy_of_the_cranks_is_that_of_the_pose(seed: int) -> None:
     assert energy == pytest.approx(DYNAMICS.energy(pose, rates), rel=1e-7)
 
 
-def test_a_motor_alone_moves_its_crank_as_the_mean_inertia_says() -> None:
+def test_a_motor_alone_moves_its_crank_as_the_mean_inertia_says():
     """Crank i under 1 N m of its own motor, from the plate's acceleration and differences."""
     own = [
         crank_rates(HOME, DYNAMICS.accelerations(HOME, NOTHING, unit))[i]
@@ -90,7 +88,7 @@ def test_a_motor_alone_moves_its_crank_as_the_mean_inertia_says() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_rotors_add_their_energy_and_nothing_else(seed: int) -> None:
+def test_rotors_add_their_energy_and_nothing_else(seed):
     rng = np.random.default_rng(seed)
     pose, rates = HOME + 0.02 * rng.standard_normal(6), rng.standard_normal(6)
     heavier = sd.StewartDynamics(with_rotors(DYNAMICS.mechanism, 2e-3), gravity=True)
@@ -100,7 +98,7 @@ def test_rotors_add_their_energy_and_nothing_else(seed: int) -> None:
     assert np.allclose(heavier.equilibrium_torque(pose), lighter.equilibrium_torque(pose))
 
 
-def test_both_plants_have_the_rotors() -> None:
+def test_both_plants_have_the_rotors():
     """Falling from rest without any torque to speak of, heavier cranks fall more slowly."""
     soft = ("plant.gravity=true", "actuator.bandwidth=0.01", "duration=0.1", *HOLD)
     fallen = {}
@@ -117,9 +115,7 @@ def test_both_plants_have_the_rotors() -> None:
 
 
 @pytest.mark.parametrize(("damping", "share"), [(0.7, 1.0), (0.3, 1.0), (0.7, 0.5)])
-def test_a_single_motor_answers_a_step_as_a_second_order_system(
-    damping: float, share: float
-) -> None:
+def test_a_single_motor_answers_a_step_as_a_second_order_system(damping, share):
     """Frequency w sqrt(J / m), damping d sqrt(J / m); what is held for h is late by h / 2."""
     loop = replace(LOOP, damping=damping, period=1e-5)
     mass, h = share * loop.inertia, loop.period
@@ -139,14 +135,12 @@ def test_a_single_motor_answers_a_step_as_a_second_order_system(
 
 
 @pytest.mark.parametrize(("damping", "least"), [(0.7, 1.0), (0.7, 0.1), (2.0, 0.04), (0.1, 3.0)])
-def test_the_highest_bandwidth_is_where_the_sampled_loop_becomes_unstable(
-    damping: float, least: float
-) -> None:
+def test_the_highest_bandwidth_is_where_the_sampled_loop_becomes_unstable(damping, least):
     loop = replace(LOOP, damping=damping)
     highest = loop.highest_bandwidth(loop.inertia * np.array([5.0, least]))
     h = loop.period
 
-    def radius(w: float, exact: bool) -> float:
+    def radius(w, exact):
         p, q = w**2 / least, 2 * damping * w / least
         change = np.array([-p, -q])
         second = np.array([0.0, 1.0]) + h * change
@@ -159,7 +153,7 @@ def test_the_highest_bandwidth_is_where_the_sampled_loop_becomes_unstable(
     assert max(below) < 1 < max(above)
 
 
-def test_the_speed_limit_makes_the_setpoint_late_and_never_faster() -> None:
+def test_the_speed_limit_makes_the_setpoint_late_and_never_faster():
     loop = replace(LOOP, speed_limit=2.0)
     followed, last = [], NOTHING
     for k in range(200):
@@ -174,7 +168,7 @@ def test_the_speed_limit_makes_the_setpoint_late_and_never_faster() -> None:
     assert np.array_equal(replace(loop, speed_limit=np.inf).limited(wanted, last), wanted)
 
 
-def test_whole_turns_do_not_count() -> None:
+def test_whole_turns_do_not_count():
     setpoint = np.concatenate([np.full(6, 3.1), NOTHING])
     crank = np.concatenate([np.full(6, -3.1), NOTHING])
     short = LOOP.inertia * LOOP.bandwidth**2 * (6.2 - 2 * np.pi)
@@ -182,7 +176,7 @@ def test_whole_turns_do_not_count() -> None:
 
 
 @given(st.floats(-20, 20), st.floats(-20, 20))
-def test_turned_is_the_same_angle_close_by(angle: float, near: float) -> None:
+def test_turned_is_the_same_angle_close_by(angle, near):
     found = turned(np.array([angle]), np.array([near]))[0]
     assert abs(found - near) <= np.pi + 1e-9
     assert np.exp(1j * found) == pytest.approx(np.exp(1j * angle))
@@ -193,7 +187,7 @@ def test_turned_is_the_same_angle_close_by(angle: float, near: float) -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 2**31))
-def test_the_setpoint_is_smooth_whenever_commands_arrive(seed: int) -> None:
+def test_the_setpoint_is_smooth_whenever_commands_arrive(seed):
     """Angles, rates and torques go on where they were, early and late arrivals among them."""
     rng = np.random.default_rng(seed)
     segment, now, coast = still(rng.standard_normal(18), 0.0), 0.0, 0.1
@@ -214,7 +208,7 @@ def test_the_setpoint_is_smooth_whenever_commands_arrive(seed: int) -> None:
         segment = after
 
 
-def test_without_a_further_command_the_cranks_coast_for_a_period_and_stop() -> None:
+def test_without_a_further_command_the_cranks_coast_for_a_period_and_stop():
     stop = np.concatenate([np.ones(6), np.full(6, 2.0), np.full(6, 3.0)])
     segment = Segment(0.0, 0.1, np.zeros(18), stop)
     assert np.allclose(segment.at(0.15, 0.1)[POSE], 1.1)
@@ -227,7 +221,7 @@ def test_without_a_further_command_the_cranks_coast_for_a_period_and_stop() -> N
     steps=st.integers(1, 400),
     time_step=st.sampled_from([1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3]),
 )
-def test_servos_tick_on_steps_and_samples(steps: int, time_step: float) -> None:
+def test_servos_tick_on_steps_and_samples(steps, time_step):
     period = steps * time_step
     ticks = servo_ticks(period, time_step)
     assert steps % ticks == 0
@@ -237,20 +231,20 @@ def test_servos_tick_on_steps_and_samples(steps: int, time_step: float) -> None:
     assert servo_ticks(period, None) == max(1, int(np.ceil(1000 * period - 1e-9)))
 
 
-def loop_at(*more: str, until: float, **which: str) -> tuple[ClosedLoop, Any, Any]:
+def loop_at(*more, until, **which):
     """A loop that has run until then, its context, and what the servos remember."""
     loop = build_closed_loop(scenario(*more, **which))
     simulator = make_simulator(loop)
     simulator.Initialize()
     simulator.AdvanceTo(look_time(until))
     context = simulator.get_context()
-    servos: Any = loop.GetSubsystemByName("servos")
+    servos = loop.GetSubsystemByName("servos")
     return loop, context, servos.remembered(servos.GetMyContextFromRoot(context))
 
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
 @pytest.mark.parametrize("delay", [(0, 0.0), (3, 0.0), (2, 0.5)])
-def test_the_setpoint_is_the_reference_at_every_sample(delay: tuple[int, float], kind: str) -> None:
+def test_the_setpoint_is_the_reference_at_every_sample(delay, kind):
     """The period after its arrival a command is reached: no sooner, no later, on both plants."""
     steps, fraction = delay
     more = (f"delay.steps={steps}", f"delay.fraction={fraction}", *ON)
@@ -268,7 +262,7 @@ def test_the_setpoint_is_the_reference_at_every_sample(delay: tuple[int, float],
     assert np.abs(servos.setpoint[POSE] - angles).max() < 0.1**4 / 384 * 5
 
 
-def test_with_jitter_the_setpoint_still_moves_smoothly() -> None:
+def test_with_jitter_the_setpoint_still_moves_smoothly():
     more = ("delay.jitter_std=0.03", "delay.seed=4", *ON, "duration=3")
     loop = build_closed_loop(scenario(*more))
     simulator, servos = make_simulator(loop), loop.GetSubsystemByName("servos")
@@ -277,7 +271,7 @@ def test_with_jitter_the_setpoint_still_moves_smoothly() -> None:
     for k in range(1, 2001):
         simulator.AdvanceTo(look_time(k * 1e-3))
         context = servos.GetMyContextFromRoot(simulator.get_context())
-        seen.append(servos.remembered(context).setpoint)  # type: ignore[attr-defined]
+        seen.append(servos.remembered(context).setpoint)
     setpoints = np.array(seen)
     jumps = np.diff(setpoints[:, POSE], axis=0) - 1e-3 * setpoints[1:, RATES]
     assert np.abs(jumps).max() < 2e-5  # h^2 / 2 times the acceleration
@@ -287,7 +281,7 @@ def test_with_jitter_the_setpoint_still_moves_smoothly() -> None:
 
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
-def test_a_constant_bias_leaves_itself_over_the_stiffness(kind: str) -> None:
+def test_a_constant_bias_leaves_itself_over_the_stiffness(kind):
     """The torque of each servo then is the bias with another sign: J w^2 e = -b, motor by motor."""
     bias = np.array([3e-3, -1e-3, 2e-3, 0.0, -2e-3, 1e-3])
     more = (f"plant.torque_bias={bias.tolist()}", "duration=3", "start=on_reference", *HOLD)
@@ -300,7 +294,7 @@ def test_a_constant_bias_leaves_itself_over_the_stiffness(kind: str) -> None:
 
 
 @pytest.mark.parametrize("mode", range(6))
-def test_each_mode_follows_as_a_second_order_system(mode: int) -> None:
+def test_each_mode_follows_as_a_second_order_system(mode):
     """Plate over setpoint (w^2 + 2 d w s) / (s^2 m/J + 2 d w s + w^2), for small motions."""
     inertias, shapes = np.linalg.eigh(np.linalg.inv(crank_mobility(DYNAMICS, HOME)))
     to_cranks = np.column_stack([crank_rates(HOME, unit) for unit in np.eye(6)])
@@ -324,7 +318,7 @@ def test_each_mode_follows_as_a_second_order_system(mode: int) -> None:
     assert real + 1j * imaginary == pytest.approx(follows, abs=0.003 + 0.03 * abs(follows - 1))
 
 
-def test_the_torque_limit_clips_and_is_counted() -> None:
+def test_the_torque_limit_clips_and_is_counted():
     free, limited = run("duration=2"), run("duration=2", "actuator.torque_limit=0.1")
     assert np.abs(free.signals.torque_applied.values).max() > 0.2
     assert np.abs(limited.signals.torque_applied.values).max() <= 0.1
@@ -334,7 +328,7 @@ def test_the_torque_limit_clips_and_is_counted() -> None:
 
 
 @pytest.mark.slow
-def test_a_speed_limit_that_the_motion_exceeds_makes_it_late() -> None:
+def test_a_speed_limit_that_the_motion_exceeds_makes_it_late():
     slow = run(*ON, "duration=3", "actuator.speed_limit=0.3")
     assert slow.status == "completed"
     assert slow.accumulated_error > 10 * run(*ON, "duration=3").accumulated_error
@@ -343,7 +337,7 @@ def test_a_speed_limit_that_the_motion_exceeds_makes_it_late() -> None:
 # Reports, and what is made of them.
 
 
-def test_a_report_is_read_as_it_was_written() -> None:
+def test_a_report_is_read_as_it_was_written():
     rng, layout = np.random.default_rng(3), ReportLayout(parts=4, periods=3)
     torques = rng.standard_normal((3 * 4 * 5, 6))
     torques[25, 2] = 7.0  # in the second period
@@ -362,7 +356,7 @@ def test_a_report_is_read_as_it_was_written() -> None:
 
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
-def test_the_machine_reports_what_has_acted(kind: str) -> None:
+def test_the_machine_reports_what_has_acted(kind):
     loop = build_closed_loop(scenario("delay.steps=2", kind=kind))
     simulator, servos = make_simulator(loop), loop.GetSubsystemByName("servos")
     simulator.Initialize()
@@ -372,7 +366,7 @@ def test_the_machine_reports_what_has_acted(kind: str) -> None:
         acted.append(loop.GetOutputPort("torque_applied").Eval(context))
         simulator.AdvanceTo(look_time((k + 1) * 1e-3) if k < 399 else 0.4 * (1 - 9e-15))
     own = servos.GetMyContextFromRoot(context)
-    layout = servos.reports  # type: ignore[attr-defined]
+    layout = servos.reports
     said = layout.read(servos.GetOutputPort("report").Eval(own), 2)
     means = np.array(acted[200:]).reshape(len(said.torques), -1, 6).mean(axis=1)
     assert np.abs(means).max() == 0 or np.allclose(said.torques, means, rtol=1e-12, atol=1e-15)
@@ -381,7 +375,7 @@ def test_the_machine_reports_what_has_acted(kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
-def test_the_parameters_are_found_from_the_reports(kind: str) -> None:
+def test_the_parameters_are_found_from_the_reports(kind):
     result = run(*ON, *UNKNOWN, "duration=4", controller="servo_feedforward", kind=kind)
     found = result.signals.parameters.values[-1]
     true = np.array([3e-4, -3e-4, 3e-4, -3e-4, 3e-4, -3e-4, 0.4, 3e-4])
@@ -391,7 +385,7 @@ def test_the_parameters_are_found_from_the_reports(kind: str) -> None:
 
 
 @pytest.mark.slow
-def test_lost_and_late_measurements_cost_little() -> None:
+def test_lost_and_late_measurements_cost_little():
     sensor = ("sensor.loss=0.3", "sensor.delay=0.25", "sensor.seed=5")
     more = (*ON, *UNKNOWN, "duration=6")
     result = run(*more, *sensor, controller="servo_feedforward")
@@ -402,7 +396,7 @@ def test_lost_and_late_measurements_cost_little() -> None:
     assert result.accumulated_error < 4 * clean.accumulated_error < 0.05
 
 
-def test_more_lost_reports_than_there_are_periods_in_one_are_borne() -> None:
+def test_more_lost_reports_than_there_are_periods_in_one_are_borne():
     """What acted is not known then: the observer begins anew with what it had found."""
     lossy = scenario(
         *ON, "sensor.loss=0.85", "sensor.seed=4", "duration=4", controller="servo_feedforward"
@@ -412,17 +406,17 @@ def test_more_lost_reports_than_there_are_periods_in_one_are_borne() -> None:
     assert sd.simulate(lossy).status == "completed"
 
 
-def law_and_memory(**fields: Any) -> tuple[Any, Any]:
+def law_and_memory(**fields):
     law = compose_servo_law(prepare(scenario(controller="servo_feedforward")))
     command = law.command(np.concatenate([HOME, np.zeros(12)]), law.plant.dynamics.parameters)
     return law, replace(law.initial_memory(command), **fields)
 
 
-def at_home(times: Array) -> Array:
+def at_home(times):
     return np.tile(np.concatenate([HOME, np.zeros(12)]), (len(times), 1))
 
 
-def test_where_too_many_reports_are_lost_the_observer_begins_anew() -> None:
+def test_where_too_many_reports_are_lost_the_observer_begins_anew():
     law, memory = law_and_memory()
     state = np.concatenate([HOME, np.zeros(6)])
     quiet, nothing = np.zeros(law.reports.size), np.full(law.reports.size, np.nan)
@@ -438,13 +432,13 @@ def test_where_too_many_reports_are_lost_the_observer_begins_anew() -> None:
     assert np.allclose(memory.belief.state, state) and memory.behind == 0
 
 
-def test_a_command_is_finite_whatever_the_reference_is() -> None:
+def test_a_command_is_finite_whatever_the_reference_is():
     law, memory = law_and_memory()
     state = Measurement.of(np.concatenate([HOME, np.zeros(6)]))
     report = np.full(law.reports.size, np.nan)
     for wrong, cause in ((np.nan, "nonfinite_torque"), (5.0, "unreachable")):
 
-        def motion(times: Array, wrong: float = wrong) -> Array:
+        def motion(times, wrong=wrong):
             x = at_home(times)
             x[:, -1 if np.isnan(wrong) else 5] = wrong
             return x
@@ -455,9 +449,9 @@ def test_a_command_is_finite_whatever_the_reference_is() -> None:
         assert not after.command[RATES].any()
 
 
-def test_servos_do_not_follow_what_is_no_number() -> None:
+def test_servos_do_not_follow_what_is_no_number():
     loop, context, before = loop_at(*ON, until=0.35)
-    servos: Any = loop.GetSubsystemByName("servos")
+    servos = loop.GetSubsystemByName("servos")
     own = servos.GetMyContextFromRoot(context)
     inputs = {name: servos.GetInputPort(name).Eval(own) for name in ("command", "arrived", "state")}
     alone = servos.CreateDefaultContext()
@@ -491,21 +485,19 @@ def test_servos_do_not_follow_what_is_no_number() -> None:
     ],
 )
 @pytest.mark.slow
-def test_what_servos_reach_across_the_paper_s_delay(
-    controller: str, more: tuple[str, ...], most: float
-) -> None:
+def test_what_servos_reach_across_the_paper_s_delay(controller, more, most):
     """E_ac in % s; torques across the delay reach 0.03, 1.1, 21, nothing at all under gravity."""
     result = run(*more, controller=controller)
     assert result.status == "completed" and result.summary["warnings"] == []
     assert result.accumulated_error <= most
 
 
-def test_the_engine_agrees_with_the_exact_plant() -> None:
+def test_the_engine_agrees_with_the_exact_plant():
     exact, engine = run(*ON, "duration=3"), run(*ON, "duration=3", kind="multibody")
     assert engine.accumulated_error == pytest.approx(exact.accumulated_error, rel=0.1)
 
 
-def test_another_machine_than_the_one_that_is_known() -> None:
+def test_another_machine_than_the_one_that_is_known():
     """Cranks are where they should be; the plate is where a machine with these cranks has it."""
     known = DYNAMICS.mechanism
     longer = replace(known, rod_lengths=known.rod_lengths * 1.002)
@@ -519,7 +511,7 @@ def test_another_machine_than_the_one_that_is_known() -> None:
 # Scenarios.
 
 
-def test_compare_gives_every_controller_the_motors_that_it_is_for() -> None:
+def test_compare_gives_every_controller_the_motors_that_it_is_for():
     limit = ("actuator.kind=servo", "actuator.bandwidth=5", "actuator.torque_limit=0.5")
     rows = shown("paper", limit)
     assert tuple(rows) == (*CONTROLLERS, *SERVOS)
@@ -530,7 +522,7 @@ def test_compare_gives_every_controller_the_motors_that_it_is_for() -> None:
     assert tuple(shown("paper")) == CONTROLLERS
 
 
-def test_a_row_may_have_servos_of_its_own() -> None:
+def test_a_row_may_have_servos_of_its_own():
     row = "{stiff: {controller: servo_preview, actuator: {bandwidth: 20}, catch_up: 1.0}}"
     rows = load_comparison("paper", CONTROLLERS, [f"compare={row}", "actuator.torque_limit=2"])
     assert rows["stiff"].actuator == ServoActuatorConfig(bandwidth=20, torque_limit=2)
@@ -555,12 +547,12 @@ def test_a_row_may_have_servos_of_its_own() -> None:
         ),
     ],
 )
-def test_what_does_not_go_with_servos_is_refused(more: tuple[str, ...], said: str) -> None:
+def test_what_does_not_go_with_servos_is_refused(more, said):
     with pytest.raises(ConfigError, match=said):
         scenario(*more)
 
 
-def test_loops_that_would_be_unstable_are_refused() -> None:
+def test_loops_that_would_be_unstable_are_refused():
     with pytest.raises(ConfigError, match=r"actuator.bandwidth: got 40 Hz; expected less than 3\d"):
         build_closed_loop(scenario("actuator.bandwidth=40"))
     loop = servo_loop(prepare(scenario("actuator.bandwidth=30")))
@@ -568,11 +560,11 @@ def test_loops_that_would_be_unstable_are_refused() -> None:
     assert loop.inertia == pytest.approx(mean_inertia(DYNAMICS))
 
 
-def test_systems_for_torques_are_refused_and_laws_may_be_changed() -> None:
+def test_systems_for_torques_are_refused_and_laws_may_be_changed():
     system = SimpleNamespace()
     for role in ("controller", "link"):
         experiment = prepare(scenario())
-        own = experiment.own._replace(systems={role: system})  # type: ignore[dict-item]
+        own = experiment.own._replace(systems={role: system})
         with pytest.raises(ConfigError, match=f"got 'servo' with a {role} of your own"):
             sd.build_closed_loop(experiment._replace(own=own))
     with pytest.raises(ConfigError, match="expected 'torque', for a law that closes"):
@@ -590,7 +582,7 @@ def test_systems_for_torques_are_refused_and_laws_may_be_changed() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
-def test_encoders_do_where_the_state_is_not_measured(kind: str) -> None:
+def test_encoders_do_where_the_state_is_not_measured(kind):
     """A payload that nobody told is found through the delay, from crank angles alone."""
     encoders = ("sensor.kind=encoders", "sensor.bits=14", "sensor.samples=20")
     given = (*ON, *encoders, "plant.payload_mass=0.4", "duration=3")

@@ -4,10 +4,8 @@ import dataclasses
 import json
 import re
 import typing
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.calibration import DELAY, Calibration, save_calibration
-from stewart_drake.scenario.config import ESTIMATED, PriorConfig, Scenario
+from stewart_drake.scenario.config import ESTIMATED, PriorConfig
 from stewart_drake.scenario.dependencies import NEEDS
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import shown
@@ -27,7 +25,7 @@ DOCS = Path(__file__).parents[1] / "docs" / "reference" / "scenario.md"
 
 SIX = [0.01, 0.0, 0.0, 0.0, 0.0, 0.0]
 
-SCENARIOS: dict[str, tuple[str, str | None, tuple[str, ...]]] = {
+SCENARIOS = {
     "paper": ("paper", None, ("duration=0.6", "delay.steps=2")),
     "paper's plant": ("table2", "delay_lqi", ("overlay=paper_plant", "duration=0.9")),
     "gravity, hold": (
@@ -89,7 +87,7 @@ SCENARIOS: dict[str, tuple[str, str | None, tuple[str, ...]]] = {
 }
 """Name, controller and settings of each."""
 
-OTHER: dict[str, Any] = {
+OTHER = {
     "mechanism": "FILE",
     "duration": 0.3,
     "log_period": 0.05,
@@ -167,10 +165,10 @@ OTHER: dict[str, Any] = {
 """Another legal value of each field that is no word of a list, yes or no."""
 
 
-def fields_of(scenario: Scenario) -> Iterator[str]:
+def fields_of(scenario):
     """Every field of the scenario's sections, as --set has them; `kind` is each section's own."""
 
-    def walk(owner: Any, above: str) -> Iterator[str]:
+    def walk(owner, above):
         for field in dataclasses.fields(owner):
             name = f"{above}{spelling(type(owner), field.name)}"
             value = getattr(owner, field.name)
@@ -182,7 +180,7 @@ def fields_of(scenario: Scenario) -> Iterator[str]:
     return walk(scenario, "")
 
 
-def other_values(owner_hint: Any, name: str, value: Any) -> list[Any]:
+def other_values(owner_hint, name, value):
     """Other legal values of a field."""
     if name in OTHER:
         return [OTHER[name]]
@@ -195,23 +193,23 @@ def other_values(owner_hint: Any, name: str, value: Any) -> list[Any]:
     return [word for word in words if word != value]
 
 
-def hint_of(scenario: Scenario, name: str) -> Any:
-    owner: Any = scenario
+def hint_of(scenario, name):
+    owner = scenario
     for part in name.split(".")[:-1]:
         owner = getattr(owner, part)
     hints = {spelling(type(owner), n): h for n, h in typing.get_type_hints(type(owner)).items()}
     return hints[name.split(".")[-1]]
 
 
-def value_of(scenario: Scenario, name: str) -> Any:
-    owner: Any = scenario
+def value_of(scenario, name):
+    owner = scenario
     for part in name.split("."):
         names = {spelling(type(owner), f.name): f.name for f in dataclasses.fields(owner)}
         owner = getattr(owner, names[part])
     return owner
 
 
-def setting_of(name: str, value: Any) -> str:
+def setting_of(name, value):
     section, *parts = name.split(".")
     if len(parts) == 2:
         return f"{section}.{parts[0]}={json.dumps({parts[1]: value})}"
@@ -219,11 +217,11 @@ def setting_of(name: str, value: Any) -> str:
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Scenario], str]:
+def files(tmp_path_factory):
     """What makes a file for a field: another machine, a known one, another motion."""
     folder = tmp_path_factory.mktemp("files")
 
-    def make(name: str, scenario: Scenario) -> str:
+    def make(name, scenario):
         machine = load_mechanism(scenario.mechanism)
         path = folder / f"{machine.name}-{name}"
         if name.endswith("mechanism"):
@@ -251,7 +249,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Scenario],
     return make
 
 
-NO_EFFECT: dict[str, Callable[[Scenario], bool]] = {
+NO_EFFECT = {
     "compare": lambda sc: True,
     "plant.time_step": lambda sc: sc.plant.kind != "multibody",
     "plant.accuracy": lambda sc: sc.plant.kind != "exact" or sc.actuator.kind == "servo",
@@ -275,11 +273,11 @@ NO_EFFECT: dict[str, Callable[[Scenario], bool]] = {
 """Fields that are accepted without an effect, as the docs list them, and when."""
 
 
-def _cranks(scenario: Scenario) -> bool:
+def _cranks(scenario):
     return scenario.controller.command == "cranks"
 
 
-def outcome(name: str, value: Any, chosen: tuple[Any, ...], before: Any) -> str:
+def outcome(name, value, chosen, before):
     """`effective`, `refused` or `none`."""
     scenario, controller, settings = chosen
     try:
@@ -318,7 +316,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("beside", REFUSED)
-def test_a_setting_without_an_effect_is_refused_in_one_line(beside: str) -> None:
+def test_a_setting_without_an_effect_is_refused_in_one_line(beside):
     assert load_scenario("paper", None, (beside,))
     for setting in REFUSED[beside]:
         with pytest.raises(
@@ -329,12 +327,12 @@ def test_a_setting_without_an_effect_is_refused_in_one_line(beside: str) -> None
         assert name in str(said.value) and beside.split("=")[0] in str(said.value)
 
 
-def test_every_row_of_the_table_names_fields_that_exist() -> None:
+def test_every_row_of_the_table_names_fields_that_exist():
     known = {name for chosen in SCENARIOS.values() for name in fields_of(load_scenario(*chosen))}
     assert {name for row in NEEDS for name in (*row.fields, row.other)} <= known
 
 
-def test_a_field_of_the_file_may_be_made_useless_by_what_is_laid_over_it(tmp_path: Path) -> None:
+def test_a_field_of_the_file_may_be_made_useless_by_what_is_laid_over_it(tmp_path):
     mine, asked = tmp_path / "mine.yaml", "controller: {prior: {payload: 0.1}, w_Q: 3.0}\n"
     mine.write_text(asked)
     assert load_scenario(mine).controller.prior.payload == 0.1
@@ -349,7 +347,7 @@ def test_a_field_of_the_file_may_be_made_useless_by_what_is_laid_over_it(tmp_pat
     assert load_scenario(mine, "predictor_lqi").controller.prior.payload  # which uses it
 
 
-def test_a_controller_file_is_to_fit_by_itself(tmp_path: Path) -> None:
+def test_a_controller_file_is_to_fit_by_itself(tmp_path):
     own = tmp_path / "own.yaml"
     own.write_text("estimate: []\nprior: {payload: 0.1}\n")
     with pytest.raises(ConfigError, match=r"own\.yaml: controller\.prior\.payload: got 0\.1"):
@@ -358,7 +356,7 @@ def test_a_controller_file_is_to_fit_by_itself(tmp_path: Path) -> None:
     assert load_scenario("table2", own).controller.catch_up is None  # it begins on the reference
 
 
-def test_a_comparison_refuses_what_no_row_uses(tmp_path: Path) -> None:
+def test_a_comparison_refuses_what_no_row_uses(tmp_path):
     rows = shown("paper", ("controller.prior={payload: 0.1}",))
     assert rows["predictor_lqi"].controller.prior.payload == 0.1
     assert rows["delay_lqi"].controller.prior.payload is None
@@ -376,7 +374,7 @@ def test_a_comparison_refuses_what_no_row_uses(tmp_path: Path) -> None:
         shown(mine)
 
 
-def test_what_is_accepted_without_an_effect_stands_in_the_docs() -> None:
+def test_what_is_accepted_without_an_effect_stands_in_the_docs():
     rows = [line for line in DOCS.read_text().splitlines() if line.startswith("| `")]
     told = {word for row in rows for word in re.findall(r"`([\w.]+)", row.split("|")[1])}
     assert "delay" in told and {name for name in NO_EFFECT if name[:6] != "delay."} <= told
@@ -384,7 +382,7 @@ def test_what_is_accepted_without_an_effect_stands_in_the_docs() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("called", SCENARIOS)
-def test_every_field_has_an_effect_or_is_refused_or_documented(called: str, files) -> None:
+def test_every_field_has_an_effect_or_is_refused_or_documented(called, files):
     chosen = SCENARIOS[called]
     scenario = load_scenario(*chosen)
     before, wrong = simulate(scenario, judge_stability=False).signals, {}

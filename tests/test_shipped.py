@@ -23,7 +23,7 @@ DIVERGES = {("gravity", "multibody")}
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
 @pytest.mark.parametrize("name", shipped("scenario"))
-def test_every_scenario_runs_on_both_plants(name: str, kind: str) -> None:
+def test_every_scenario_runs_on_both_plants(name, kind):
     duration = 0.4 if (name, kind) in DIVERGES else SHORT
     result = simulate(load_scenario(name, None, (f"plant.kind={kind}", f"duration={duration}")))
     assert result.status == "completed"
@@ -33,16 +33,14 @@ def test_every_scenario_runs_on_both_plants(name: str, kind: str) -> None:
 @pytest.mark.soak
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
 @pytest.mark.parametrize("name", OWN)
-def test_own_scenarios_complete_in_full(name: str, kind: str) -> None:
+def test_own_scenarios_complete_in_full(name, kind):
     result = simulate(load_scenario(name, None, (f"plant.kind={kind}",)))
     assert result.status == "completed"
     assert result.accumulated_error < (1e-3 if kind == "exact" else 0.2)
 
 
 @pytest.mark.parametrize("controller", [None, "adaptive_lqi"])
-def test_paper_clear_completes_the_papers_scenario_at_full_amplitude(
-    controller: str | None,
-) -> None:
+def test_paper_clear_completes_the_papers_scenario_at_full_amplitude(controller):
     settings = ("mechanism=paper_clear", "plant.kind=exact")
     result = simulate(load_scenario("paper", controller, settings))
     assert result.status == "completed"
@@ -50,7 +48,7 @@ def test_paper_clear_completes_the_papers_scenario_at_full_amplitude(
 
 
 @pytest.mark.parametrize("name", OWN)
-def test_own_scenarios_are_tracked_within_the_motors_limit(name: str) -> None:
+def test_own_scenarios_are_tracked_within_the_motors_limit(name):
     """With the controller predictor_lqi, which says nothing that a scenario's default does not."""
     middle = load_scenario(name, "predictor_lqi", ("plant.kind=exact", "duration=3.0"))
     result = simulate(middle)
@@ -63,7 +61,7 @@ def test_own_scenarios_are_tracked_within_the_motors_limit(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", shipped("scenario"))
-def test_every_scenario_s_delay_can_be_beaten(name: str) -> None:
+def test_every_scenario_s_delay_can_be_beaten(name):
     verdict = delay_verdict(prepare(load_scenario(name)))
     assert verdict.beatable != "no"
     if name in OWN:
@@ -71,7 +69,7 @@ def test_every_scenario_s_delay_can_be_beaten(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", shipped("mechanism"))
-def test_cranks_of_a_pair_of_the_own_mechanisms_cannot_touch(name: str) -> None:
+def test_cranks_of_a_pair_of_the_own_mechanisms_cannot_touch(name):
     """Of the paper's lengths they can, see docs/errata.md; ours have them further apart."""
     mechanism = load_mechanism(name)
     distance = np.linalg.norm(mechanism.p_WS[:, None] - mechanism.p_WS[None], axis=2)
@@ -80,7 +78,7 @@ def test_cranks_of_a_pair_of_the_own_mechanisms_cannot_touch(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", shipped("mechanism"))
-def test_links_have_the_inertia_of_the_rods_that_they_are(name: str) -> None:
+def test_links_have_the_inertia_of_the_rods_that_they_are(name):
     """m l^2 / 12 across, within the shape's factor of two; far less along."""
     mechanism = load_mechanism(name)
     across = mechanism.rod.mass * mechanism.rod_lengths[0] ** 2 / 12
@@ -88,7 +86,7 @@ def test_links_have_the_inertia_of_the_rods_that_they_are(name: str) -> None:
     assert mechanism.rod.inertia[0] < 0.05 * across
 
 
-def test_every_reference_file_is_used_and_read() -> None:
+def test_every_reference_file_is_used_and_read():
     folder = data_root() / "diagrams" / "references"
     used = set()
     for name in shipped("scenario"):
@@ -103,7 +101,7 @@ def test_every_reference_file_is_used_and_read() -> None:
     np.testing.assert_array_equal(poses[-1], poses[0])
 
 
-def test_own_scenarios_differ_from_the_defaults_where_they_say() -> None:
+def test_own_scenarios_differ_from_the_defaults_where_they_say():
     default = dataclasses.asdict(load_scenario("paper").controller)
     for name in OWN:
         own = dataclasses.asdict(load_scenario(name).controller)

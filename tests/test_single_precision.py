@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +11,9 @@ from cffi import FFI
 import stewart_drake as sd
 from stewart_drake.core import build, library
 from stewart_drake.core.layout import geometry_of
-from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.delay_observer import DelayBelief, DelayObserver
 from stewart_drake.law.encoder_sensing import EncoderSensing
-from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.parameter_filter import ParameterFilter, gate
-from stewart_drake.law.sensing import Sensing
 from tests.backends import stepped_in_python
 
 HOST = ("dop853", "packed", "packed_law", "plant")
@@ -27,7 +23,7 @@ HOST = ("dop853", "packed", "packed_law", "plant")
 class Single:
     """The core in single precision, and numbers for it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         made = folder / "single.so"
         sources = [str(c) for c in build.FOLDER.glob("*.c") if c.stem not in HOST]
         compiler = build.compiler() or pytest.skip("needs a C compiler")
@@ -37,12 +33,12 @@ class Single:
         self.ffi.cdef(library.declarations().replace("typedef double real", "typedef float real"))
         self.lib: Any = self.ffi.dlopen(os.fspath(made))
 
-    def at(self, values: Any) -> Any:
+    def at(self, values):
         """Pointer to numbers that stay."""
         self._kept.append(np.array(values, np.float32, order="C"))
         return self.ffi.from_buffer("float[]", self._kept[-1])
 
-    def machine(self, dynamics: StewartDynamics) -> Any:
+    def machine(self, dynamics):
         """`stewart_machine` with eight parameters."""
         machine = self.ffi.new("stewart_machine *")
         machine.geometry = list(geometry_of(dynamics.mechanism))
@@ -51,14 +47,14 @@ class Single:
         self._kept.append(machine)
         return machine
 
-    def state_sensing(self, sensing: Sensing) -> Any:
+    def state_sensing(self, sensing):
         """`stewart_sensing` of the state."""
         sensor = self.ffi.new("stewart_state_sensor *")
         sensor.noise_std = list(sensing.noise_std)
         self._kept.append(sensor)
         return self.lib.stewart_state_sensing(sensor)
 
-    def delay(self, observer: DelayObserver, sensing: Sensing, plant: NominalPlant) -> Any:
+    def delay(self, observer, sensing, plant):
         """`stewart_delay` of an observer of eight parameters and the state."""
         known, told, it = observer.settings, observer.delay, self.ffi.new("stewart_delay *")
         theta, seen = known.parameters, self.ffi.new("stewart_sensing *")
@@ -75,7 +71,7 @@ class Single:
         self._kept.append(seen)
         return it
 
-    def filter(self, one: ParameterFilter) -> Any:
+    def filter(self, one):
         """`stewart_filter` of a filter of eight parameters."""
         new, dynamics, known = self.ffi.new, one.dynamics, one.settings.parameters
         machine, sensing = self.machine(dynamics), one.sensing
@@ -103,7 +99,7 @@ class Single:
 
 
 @pytest.fixture(scope="module")
-def single(tmp_path_factory: pytest.TempPathFactory) -> Single:
+def single(tmp_path_factory):
     """Compiled once."""
     return Single(tmp_path_factory.mktemp("single"))
 
@@ -118,14 +114,12 @@ def single(tmp_path_factory: pytest.TempPathFactory) -> Single:
         ("sensor.kind=encoders", "sensor.bits=16", "sensor.samples=20"),
     ],
 )
-def test_a_filter_is_right_to_a_share_of_its_deviation(
-    sensor: tuple[str, ...], single: Single, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_filter_is_right_to_a_share_of_its_deviation(sensor, single, monkeypatch):
     """Every estimate to 3 % of its standard deviation, which is that of double to 0.1 %."""
-    calls: list[tuple[Any, ...]] = []
+    calls = []
     advance = ParameterFilter.advance
 
-    def recorded(one: ParameterFilter, *given: Any) -> Any:
+    def recorded(one, *given):
         calls.append((one, *given, advance(one, *given)))
         return calls[-1][-1]
 
@@ -171,14 +165,12 @@ def test_a_filter_is_right_to_a_share_of_its_deviation(
         ),
     ],
 )
-def test_the_delay_is_found_to_microseconds_of_that_in_double(
-    settings: tuple[str, ...], single: Single, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_delay_is_found_to_microseconds_of_that_in_double(settings, single, monkeypatch):
     """At every sample, through the search, a jump, and drift."""
-    calls: list[tuple[Any, ...]] = []
+    calls = []
     observe = DelayObserver.observe
 
-    def recorded(one: DelayObserver, *given: Any) -> Any:
+    def recorded(one, *given):
         calls.append((one, *given, observe(one, *given)))
         return calls[-1][-1]
 

@@ -2,19 +2,15 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
-    Diagram,
     DiagramBuilder,
     LeafSystem,
     State,
-    System,
 )
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
@@ -25,7 +21,7 @@ from stewart_drake.law.motion import Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.delay_chain import DelayChain
-from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
+from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import control_law
@@ -36,7 +32,6 @@ from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate, make_reference
-from stewart_drake.types import Array
 from tests.backends import stepped_in_python
 from tests.mechanisms import PAPER
 
@@ -45,14 +40,14 @@ MOTION = make_reference(load_scenario("paper").reference, 10.0)
 AT_REST = np.concatenate([PAPER.home, np.zeros(6)])
 
 
-def ports(system: System) -> tuple[dict[str, int], dict[str, int]]:
+def ports(system):
     """Sizes of the input and output ports by name."""
     inputs = map(system.get_input_port, range(system.num_input_ports()))
     outputs = map(system.get_output_port, range(system.num_output_ports()))
     return {p.get_name(): p.size() for p in inputs}, {p.get_name(): p.size() for p in outputs}
 
 
-def queue(steps: int, fraction: float) -> Array:
+def queue(steps, fraction):
     """Distinct torques in flight, the oldest first."""
     length = steps + (fraction > 0)
     return -np.arange(length, 0, -1.0)[:, None] * np.ones(6)
@@ -61,7 +56,7 @@ def queue(steps: int, fraction: float) -> Array:
 # Reference.
 
 
-def test_reference_shows_the_true_motion_now_and_the_planned_one_ahead() -> None:
+def test_reference_shows_the_true_motion_now_and_the_planned_one_ahead():
     faster = load_scenario("paper", settings=["reference.frequency=2"])
     planned = make_reference(faster.reference, 1.0)
     ahead = np.array([0.0, 0.25, -0.5])
@@ -81,14 +76,14 @@ def test_reference_shows_the_true_motion_now_and_the_planned_one_ahead() -> None
 # Sensor.
 
 
-def measure(sensor: Sensor, state: Array, time: float) -> Array:
+def measure(sensor, state, time):
     context = sensor.CreateDefaultContext()
     context.SetTime(time)
     sensor.get_input_port().FixValue(context, state)
     return sensor.get_output_port().Eval(context)
 
 
-def test_sensor_without_noise_passes_the_state_through() -> None:
+def test_sensor_without_noise_passes_the_state_through():
     sensor, state = Sensor(np.zeros(12), 0, 0.1), np.random.default_rng(0).normal(0, 1, 12)
     assert ports(sensor) == ({"state": 12}, {"measurement": 12})
     assert sensor.CreateDefaultContext().num_total_states() == 0
@@ -99,7 +94,7 @@ def test_sensor_without_noise_passes_the_state_through() -> None:
     assert measure(partly, state, 0.7)[3] != state[3]
 
 
-def test_sensor_noise_is_a_function_of_seed_and_sample() -> None:
+def test_sensor_noise_is_a_function_of_seed_and_sample():
     std = np.linspace(1, 2, 12)
     one, again, other = (Sensor(std, seed, 0.1) for seed in (5, 5, 6))
     for k in (7, 0, 3):  # in any order
@@ -110,7 +105,7 @@ def test_sensor_noise_is_a_function_of_seed_and_sample() -> None:
         assert not np.any(y == measure(one, AT_REST, 0.1 * (k + 1)))
 
 
-def test_sensor_noise_is_white_and_as_large_as_asked_for() -> None:
+def test_sensor_noise_is_white_and_as_large_as_asked_for():
     n, std = 20_000, np.linspace(1e-4, 2.0, 12)
     sensor = Sensor(std, 1, 0.1)
     normal = np.array([sensor.noise(k) for k in range(n)]) / std
@@ -128,16 +123,16 @@ def test_sensor_noise_is_white_and_as_large_as_asked_for() -> None:
 class Counter(LeafSystem):
     """Torque of sample k: `torque(k)`, at t = k dt."""
 
-    def __init__(self, period: float, torque: Callable[[int], Array]) -> None:
+    def __init__(self, period, torque):
         super().__init__()
         self._period, self._torque = period, torque
         self.DeclareVectorOutputPort("torque", 6, self._output, {self.time_ticket()})
 
-    def _output(self, context: Context, output: BasicVector) -> None:
+    def _output(self, context, output):
         output.SetFromVector(self._torque(round(context.get_time() / self._period)))
 
 
-def test_delay_chain_topology_and_initial_state() -> None:
+def test_delay_chain_topology_and_initial_state():
     for steps, fraction in DELAYS:
         chain = DelayChain(0.1, steps, fraction, queue(steps, fraction))
         assert ports(chain) == ({"commanded": 6}, {"torque": 6})
@@ -155,7 +150,7 @@ def test_delay_chain_topology_and_initial_state() -> None:
 Update = Callable[[Context, State], None]
 
 
-def carry_out(update: Update, context: Context) -> None:
+def carry_out(update, context):
     """What a simulator does with an unrestricted update."""
     after = context.Clone()
     update(context, after.get_mutable_state())
@@ -163,7 +158,7 @@ def carry_out(update: Update, context: Context) -> None:
 
 
 @pytest.mark.parametrize(("steps", "fraction"), DELAYS)
-def test_delay_chain_forced_updates_shift_the_queue(steps: int, fraction: float) -> None:
+def test_delay_chain_forced_updates_shift_the_queue(steps, fraction):
     chain = DelayChain(0.1, steps, fraction, queue(steps, fraction))
     context = chain.CreateDefaultContext()
     order = [*queue(steps, fraction), *(np.full(6, 10.0 + k) for k in range(12))]
@@ -178,9 +173,7 @@ def test_delay_chain_forced_updates_shift_the_queue(steps: int, fraction: float)
 
 @pytest.mark.parametrize("period", [0.1, 0.01, 1 / 30])
 @pytest.mark.parametrize(("steps", "fraction"), DELAYS)
-def test_torque_leaves_the_bare_chain_in_its_own_interval(
-    steps: int, fraction: float, period: float
-) -> None:
+def test_torque_leaves_the_bare_chain_in_its_own_interval(steps, fraction, period):
     """Looked at next to every instant at which it may change, and by a logger in between."""
     builder = DiagramBuilder()
     source = builder.AddSystem(Counter(period, lambda k: np.full(6, float(k))))
@@ -207,7 +200,7 @@ def test_torque_leaves_the_bare_chain_in_its_own_interval(
     assert np.array_equal(log.data()[0, clear], np.floor(phase[clear]))
 
 
-def chained(plant: System, period: float, steps: int, fraction: float, torque) -> Diagram:  # type: ignore[no-untyped-def]
+def chained(plant, period, steps, fraction, torque):
     """Counter, delay chain with nothing in flight, plant."""
     builder = DiagramBuilder()
     source = builder.AddSystem(Counter(period, torque))
@@ -220,7 +213,7 @@ def chained(plant: System, period: float, steps: int, fraction: float, torque) -
     return builder.Build()
 
 
-def state_at(simulator: Simulator, time: float) -> Array:
+def state_at(simulator, time):
     """State of the plant at a nominal time, before a discrete plant steps out of it."""
     if time > 0:
         simulator.AdvanceTo(look_time(time))
@@ -230,9 +223,7 @@ def state_at(simulator: Simulator, time: float) -> Array:
 
 
 @pytest.mark.parametrize(("steps", "fraction"), DELAYS)
-def test_an_impulse_reaches_the_exact_plant_in_its_own_interval(
-    steps: int, fraction: float
-) -> None:
+def test_an_impulse_reaches_the_exact_plant_in_its_own_interval(steps, fraction):
     """At rest until the release, then on the way that the dynamics alone predict."""
     period, k0, push = 0.1, 2, 0.05 * np.array([1.0, -1, 0.5, 1, -0.5, 2])
     dynamics = StewartDynamics(PAPER, gravity=False)
@@ -256,7 +247,7 @@ def test_an_impulse_reaches_the_exact_plant_in_its_own_interval(
 
 
 @pytest.mark.parametrize(("steps", "fraction"), DELAYS)
-def test_torques_reach_the_multibody_plant_in_their_own_steps(steps: int, fraction: float) -> None:
+def test_torques_reach_the_multibody_plant_in_their_own_steps(steps, fraction):
     """The step that starts at the release is the first to feel a torque; none is late or early.
 
     Torques that all differ push along one direction, so that the change of the rates over each
@@ -292,12 +283,12 @@ def test_torques_reach_the_multibody_plant_in_their_own_steps(steps: int, fracti
 
 
 @functools.cache
-def law() -> PredictiveLqi:
+def law():
     settings = ["start=on_reference", "duration=1.0", "delay.steps=2"]
     return control_law(prepare(load_scenario("paper", settings=settings)))[0]
 
 
-def test_controller_topology_and_initial_state() -> None:
+def test_controller_topology_and_initial_state():
     in_flight = 1e-3 * np.arange(12.0).reshape(2, 6)
     controller = DelayLqiController(law(), in_flight)
     inputs, outputs = ports(controller)
@@ -326,7 +317,7 @@ def test_controller_topology_and_initial_state() -> None:
     memory = controller.memory(context)
     assert np.array_equal(memory.in_flight[1:], in_flight)
 
-    def shown(name: str) -> Array:
+    def shown(name):
         return controller.GetOutputPort(name).Eval(context)
 
     assert not shown("integral").any()
@@ -337,7 +328,7 @@ def test_controller_topology_and_initial_state() -> None:
     assert np.array_equal(shown("torque_commanded"), in_flight[-1])
 
 
-def fixed(controller: DelayLqiController, context: Context) -> dict[str, Array]:
+def fixed(controller, context):
     """Constant inputs, off the reference."""
     preview = np.array([evaluate(MOTION, max(0.0, t)) for t in law().preview_times])
     values = {
@@ -351,15 +342,13 @@ def fixed(controller: DelayLqiController, context: Context) -> dict[str, Array]:
 
 
 @pytest.mark.parametrize("in_python", [False, True])
-def test_controller_output_and_forced_update_are_steps_of_the_law(
-    in_python: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_controller_output_and_forced_update_are_steps_of_the_law(in_python, monkeypatch):
     if in_python:
         stepped_in_python(monkeypatch)
     controller = DelayLqiController(law(), np.zeros((2, 6)))
     context = controller.CreateDefaultContext()
     inputs = fixed(controller, context)
-    steps: Any = law() if in_python else serving(law()).law
+    steps = law() if in_python else serving(law()).law
     expected = steps.initial_memory(np.zeros((2, 6)))
     for _ in range(3):
         preview = Preview(law().preview_times, inputs["preview"].reshape(-1, 18))
@@ -380,20 +369,18 @@ def test_controller_output_and_forced_update_are_steps_of_the_law(
             assert np.array_equal(controller.GetOutputPort(name).Eval(context), value)
 
 
-def short_loop(plant: str, *settings: str) -> ClosedLoop:
+def short_loop(plant, *settings):
     usual = ["duration=1.0", f"plant.kind={plant}", "start=on_reference", "queue=reference"]
     return build_closed_loop(load_scenario("paper", settings=[*usual, *settings]))
 
 
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
-def test_the_law_is_evaluated_once_per_sample(
-    fraction: float, plant: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_law_is_evaluated_once_per_sample(fraction, plant, monkeypatch):
     stepped_in_python(monkeypatch)
     step, calls = PredictiveLqi.step, []
 
-    def counted(self, memory, *inputs):  # type: ignore[no-untyped-def]
+    def counted(self, memory, *inputs):
         calls.append(memory)
         return step(self, memory, *inputs)
 
@@ -408,12 +395,12 @@ def test_the_law_is_evaluated_once_per_sample(
 
 
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
-def test_two_contexts_of_one_diagram_do_not_know_of_each_other(plant: str) -> None:
+def test_two_contexts_of_one_diagram_do_not_know_of_each_other(plant):
     """Nothing lives on the systems: interrupting a run by another leaves no trace."""
     noise = "sensor.noise_std=[" + ", ".join(["1e-4"] * 12) + "]"
     loop = short_loop(plant, "delay.steps=2", "delay.fraction=0.3", noise)
 
-    def outcome(simulator: Simulator) -> list[Array]:
+    def outcome(simulator):
         context = simulator.get_context()
         names = ("state", "torque_commanded", "torque_applied", "integral", "parameters")
         return [loop.GetOutputPort(name).Eval(context).copy() for name in names]
@@ -429,7 +416,7 @@ def test_two_contexts_of_one_diagram_do_not_know_of_each_other(plant: str) -> No
         assert np.array_equal(expected, found)
 
 
-def test_weights_may_change_from_sample_to_sample() -> None:
+def test_weights_may_change_from_sample_to_sample():
     """The controller takes the weights that stand at its port."""
     builder = DiagramBuilder()
     controller = builder.AddSystem(DelayLqiController(law(), np.zeros((2, 6))))

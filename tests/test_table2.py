@@ -1,7 +1,6 @@
 """The paper's Table II under the conditions in which it comes out, and rows of `compare`."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,11 +20,11 @@ from tests.mechanisms import PAPER
 
 
 @pytest.fixture(scope="module")
-def rows() -> dict[str, sd.Scenario]:
+def rows():
     return load_comparison("table2", CONTROLLERS)
 
 
-def test_rows_are_the_controllers_and_what_the_scenario_adds(rows: dict[str, sd.Scenario]) -> None:
+def test_rows_are_the_controllers_and_what_the_scenario_adds(rows):
     assert list(rows) == [*CONTROLLERS, "delay_lqi_sum", "delay_lqi_200"]
     for name in ("lqr", "lqi", "delay_lqr", "delay_lqi", "delay_lqi_sum"):
         assert rows[name].controller.model == "multibody", name
@@ -45,13 +44,13 @@ def test_rows_are_the_controllers_and_what_the_scenario_adds(rows: dict[str, sd.
         ("{lqr: {torque_map: printed, model: multibody}}", "compare.lqr: controller.torque_map"),
     ],
 )
-def test_a_row_that_does_not_fit_is_refused_in_one_line(compare: str, message: str) -> None:
+def test_a_row_that_does_not_fit_is_refused_in_one_line(compare, message):
     with pytest.raises(sd.ConfigError, match=rf"^[^\n]*{message}[^\n]*$"):
         load_comparison("paper", CONTROLLERS, [f"compare={compare}"])
 
 
-def test_the_integral_weight_scales_its_block_alone() -> None:
-    def blocks(weight: float) -> np.ndarray:
+def test_the_integral_weight_scales_its_block_alone():
+    def blocks(weight):
         settings = [f"controller.integral_weight={weight}"]
         law = compose_law(prepare(sd.load_scenario("paper", settings=settings)))
         return np.diag(law.cost.matrices(np.ones(2))[0])
@@ -69,42 +68,36 @@ def test_the_integral_weight_scales_its_block_alone() -> None:
         ("delay_lqi_200", 82, 2),
     ],
 )
-def test_table_two_comes_out(
-    rows: dict[str, sd.Scenario], row: str, error: float, within: float
-) -> None:
+def test_table_two_comes_out(rows, row, error, within):
     result = sd.simulate(rows[row], judge_stability=False)
     assert result.status == "completed"
     assert result.accumulated_error == pytest.approx(error, abs=within)
 
 
 @pytest.mark.parametrize("row", ["lqr", "lqi"])
-def test_who_does_not_know_of_the_delay_loses_the_plate(
-    rows: dict[str, sd.Scenario], row: str
-) -> None:
+def test_who_does_not_know_of_the_delay_loses_the_plate(rows, row):
     assert sd.simulate(rows[row], judge_stability=False).status == "left_workspace"
 
 
-def test_a_multibody_plant_gives_the_same(rows: dict[str, sd.Scenario]) -> None:
+def test_a_multibody_plant_gives_the_same(rows):
     scenario = replace(rows["delay_lqi_200"], plant=PlantConfig(kind="multibody"))
     result = sd.simulate(scenario, judge_stability=False)
     assert result.accumulated_error == pytest.approx(82, abs=1)
 
 
 @pytest.fixture(scope="module")
-def short() -> dict[str, sd.SimulationResult]:
+def short():
     return sd.compare("table2", ["duration=0.3"])
 
 
-def of_the_paper(results: dict[str, sd.SimulationResult]) -> tuple[Table, list[str]]:
+def of_the_paper(results):
     """The table that has the paper's numbers, and the paragraphs below it."""
     table, *told = table_two_blocks(results)
     assert isinstance(table, Table)
     return table, [block.text for block in told if isinstance(block, Paragraph)]
 
 
-def test_the_table_has_paper_printed_and_reproduced_beside_each_other(
-    rows: dict[str, sd.Scenario],
-) -> None:
+def test_the_table_has_paper_printed_and_reproduced_beside_each_other(rows):
     names = ("lqr", "delay_lqr", "delay_lqi", "delay_lqi_200")
     results = {name: sd.simulate(rows[name], judge_stability=False) for name in names}
     table, told = of_the_paper(results)
@@ -118,9 +111,7 @@ def test_the_table_has_paper_printed_and_reproduced_beside_each_other(
     assert "= 1.28 of the motion" in told[1] and "room for 1.07 of (46)" in told[1]
 
 
-def test_it_is_shown_once_and_every_row_is_in_the_summary(
-    short: dict[str, sd.SimulationResult],
-) -> None:
+def test_it_is_shown_once_and_every_row_is_in_the_summary(short):
     assert list(short) == [*CONTROLLERS, "delay_lqi_sum", "delay_lqi_200"]
     text = short.table()
     assert text.count("Table II") == 1 and max(map(len, text.splitlines())) <= 80
@@ -135,7 +126,7 @@ def test_it_is_shown_once_and_every_row_is_in_the_summary(
     ]
 
 
-def test_other_comparisons_have_no_such_table(short: dict[str, sd.SimulationResult]) -> None:
+def test_other_comparisons_have_no_such_table(short):
     assert not table_two_blocks({name: short[name] for name in CONTROLLERS})
     settings = ["duration=0.3", "delay.steps=2"]
     other = sd.simulate(
@@ -144,7 +135,7 @@ def test_other_comparisons_have_no_such_table(short: dict[str, sd.SimulationResu
     assert not table_two_blocks({"delay_lqi_sum": other})
 
 
-def test_more_room_alone_is_not_enough(tmp_path: Path) -> None:
+def test_more_room_alone_is_not_enough(tmp_path):
     """Theory 33: cranks of 0.18 m have room for 1.7 of (46), and the printed law needs 1.28."""
     path = tmp_path / "longer.yaml"
     path.write_text(mechanism_yaml(replace(PAPER, crank_lengths=np.full(6, 0.18))))
@@ -157,7 +148,7 @@ def test_more_room_alone_is_not_enough(tmp_path: Path) -> None:
         assert sd.simulate(rows[row], judge_stability=False).status == "left_workspace", row
 
 
-def test_the_papers_model_makes_a_loop_that_grows_whatever_the_weights() -> None:
+def test_the_papers_model_makes_a_loop_that_grows_whatever_the_weights():
     """Theory 33: on the exact plant, along 0.3 of (46)."""
     for controller in ("delay_lqr", "delay_lqi"):
         for ratio in 10.0 ** np.arange(-7, 1):
@@ -166,7 +157,7 @@ def test_the_papers_model_makes_a_loop_that_grows_whatever_the_weights() -> None
             assert controller_margin(prepare(scenario)).radius > 1.004, (controller, ratio)
 
 
-def test_nobody_is_lost_before_the_first_torque_and_for_some_time_after() -> None:
+def test_nobody_is_lost_before_the_first_torque_and_for_some_time_after():
     """Theory 33: 0.8 s is when the first torque acts, and it takes time to move a plate."""
     for weight in (1.0, 1e8):
         settings = ("start=rest", f"controller.w_Q={weight}", "controller.model=multibody")

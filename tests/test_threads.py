@@ -2,22 +2,19 @@
 
 import itertools
 import threading
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-import xarray as xr
 from threadpoolctl import OpenBLASController, threadpool_info, threadpool_limits
 
 import stewart_drake as sd
 from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.loop import simulation
-from stewart_drake.loop.experiment import Experiment
 
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 
 
-def variants(duration: float) -> Iterable[tuple[str, ...]]:
+def variants(duration):
     """Both plants, delays of whole periods and parts, with and without noise, four gains."""
     delays = (("delay.steps=2",), ("delay.steps=1", "delay.fraction=0.5"))
     noises = ((), ("sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,0,0,0,0,0,0]",))
@@ -28,11 +25,11 @@ def variants(duration: float) -> Iterable[tuple[str, ...]]:
         yield (*plant, *delay, *noise, *own, *ON_REFERENCE)
 
 
-def run(settings: tuple[str, ...]) -> xr.Dataset:
+def run(settings):
     return sd.simulate(sd.load_scenario("paper", settings=settings), judge_stability=False).signals
 
 
-def differing(settings: list[tuple[str, ...]], threads: int) -> list[tuple[str, ...]]:
+def differing(settings, threads):
     """Of the runs, those whose signals are not the same in threads as alone."""
     functions_of.cache_clear()  # so that the threads also make them at the same time
     with ThreadPoolExecutor(threads) as pool:
@@ -42,27 +39,27 @@ def differing(settings: list[tuple[str, ...]], threads: int) -> list[tuple[str, 
     return [one for one, a, b in pairs if not a.identical(b)]
 
 
-def test_runs_in_threads_are_those_alone() -> None:
+def test_runs_in_threads_are_those_alone():
     assert differing(list(itertools.islice(variants(0.4), 6)), threads=3) == []
 
 
 @pytest.mark.soak
-def test_forty_runs_in_eight_threads_are_those_alone() -> None:
+def test_forty_runs_in_eight_threads_are_those_alone():
     settings = list(variants(1.0))
     assert len(settings) == 40
     assert differing(settings, threads=8) == []
 
 
-def blas_threads() -> set[int]:
+def blas_threads():
     return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
 
-def test_linear_algebra_stays_on_one_thread_until_the_last_run_ends(monkeypatch) -> None:
+def test_linear_algebra_stays_on_one_thread_until_the_last_run_ends(monkeypatch):
     """Of two runs that overlap, neither the first to begin nor the first to end decides alone."""
     begun, both = threading.Event(), threading.Event()
     seen = []
 
-    def run(experiment: Experiment, *_: object) -> None:
+    def run(experiment, *_):
         seen.append(blas_threads())
         if experiment.scenario.duration == 1.0:
             begun.set()
@@ -85,6 +82,6 @@ def test_linear_algebra_stays_on_one_thread_until_the_last_run_ends(monkeypatch)
         assert blas_threads() == {2}
 
 
-def set_blas_threads(number: int) -> None:
+def set_blas_threads(number):
     threadpool_limits(number, user_api="blas")
     OpenBLASController.clear_controlling_thread()

@@ -3,8 +3,6 @@
 import dataclasses
 import functools
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,13 +13,10 @@ from stewart_drake.files.yamlio import load_yaml
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.experiment import assemble
 from stewart_drake.loop.platforms import MultibodyStewart
-from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import make_simulator, simulate
-from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_yaml
 from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.uncertainty import draw, scales_of
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 
 PLANTS = ["exact", "multibody"]
@@ -30,11 +25,11 @@ WEAK = 0.3
 GRID = 0.02
 
 
-def scenario(*settings: str, plant: str = "exact") -> Scenario:
+def scenario(*settings, plant="exact"):
     return load_scenario("paper", None, [f"plant.kind={plant}", *settings])
 
 
-def paper_with(folder: Path, effort: float | None, masses: float = 1.0) -> str:
+def paper_with(folder, effort, masses=1.0):
     """The paper's machine with other motors, all masses and inertias so many times as large."""
     data = load_yaml(resolve("mechanism", "paper"))
     data["motor"]["effort_limit"] = effort
@@ -47,7 +42,7 @@ def paper_with(folder: Path, effort: float | None, masses: float = 1.0) -> str:
 
 
 @pytest.fixture(scope="module")
-def weak(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SimulationResult]:
+def weak(tmp_path_factory):
     """The paper's experiment with motors of 0.3 N m on both plants."""
     motors = paper_with(tmp_path_factory.mktemp("weak"), WEAK)
     return {
@@ -55,14 +50,14 @@ def weak(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SimulationResult
     }
 
 
-def saturated(run: SimulationResult) -> int:
+def saturated(run):
     return int(run.summary["counts"]["saturated_steps"])
 
 
 # Both plants.
 
 
-def test_weak_motors_are_as_weak_on_both_plants(weak: dict[str, SimulationResult]) -> None:
+def test_weak_motors_are_as_weak_on_both_plants(weak):
     exact, multibody = (weak[plant] for plant in PLANTS)
     assert exact.status == multibody.status == "completed"
     assert saturated(exact) == saturated(multibody) > 0
@@ -79,9 +74,7 @@ def test_weak_motors_are_as_weak_on_both_plants(weak: dict[str, SimulationResult
 
 
 @pytest.mark.parametrize("plant", PLANTS)
-def test_applied_is_what_the_limit_lets_through_a_delay_later(
-    weak: dict[str, SimulationResult], plant: str
-) -> None:
+def test_applied_is_what_the_limit_lets_through_a_delay_later(weak, plant):
     signals = weak[plant].signals
     asked, applied = signals.torque_commanded.values, signals.torque_applied.values
     behind = round(0.8 / GRID)
@@ -90,7 +83,7 @@ def test_applied_is_what_the_limit_lets_through_a_delay_later(
 
 
 @pytest.mark.parametrize("plant", PLANTS)
-def test_a_heavy_machine_is_not_held_back_without_a_word(tmp_path: Path, plant: str) -> None:
+def test_a_heavy_machine_is_not_held_back_without_a_word(tmp_path, plant):
     """A thousand times the masses take a thousand times the torque, which the motors lack."""
     motors = paper_with(tmp_path, 10.0, masses=1000.0)
     run = simulate(scenario(motors, "duration=2.5", plant=plant), judge_stability=False)
@@ -106,10 +99,10 @@ def test_a_heavy_machine_is_not_held_back_without_a_word(tmp_path: Path, plant: 
     assert free.accumulated_error == pytest.approx(light.accumulated_error, rel=1e-3)
 
 
-def test_the_engine_itself_does_not_clip() -> None:
+def test_the_engine_itself_does_not_clip():
     """The loop has one place for that; SDFormat keeps the limit for whoever else reads it."""
 
-    def moved(effort: float | None) -> Array:
+    def moved(effort):
         plant = MultibodyStewart(dataclasses.replace(PAPER, effort_limit=effort), gravity=False)
         context = plant.CreateDefaultContext()
         plant.set_state(context, np.concatenate([PAPER.home, np.zeros(6)]))
@@ -122,7 +115,7 @@ def test_the_engine_itself_does_not_clip() -> None:
 
 
 @pytest.mark.parametrize("plant", PLANTS)
-def test_bias_acts_beyond_the_limit_and_after_it(plant: str) -> None:
+def test_bias_acts_beyond_the_limit_and_after_it(plant):
     """At the shafts: what the record calls applied, and the bias, on both plants alike."""
     bias = np.array([0.02, -0.02, 0.01, 0.0, 0.0, -0.01])
     loop = build_closed_loop(
@@ -149,7 +142,7 @@ def test_bias_acts_beyond_the_limit_and_after_it(plant: str) -> None:
 # Where it comes from, and what else it does.
 
 
-def test_limits_come_from_the_scenario_else_from_the_machine() -> None:
+def test_limits_come_from_the_scenario_else_from_the_machine():
     limits = {"null": 10.0, "none": np.inf, "0.5": 0.5, "20": 20.0}
     for text, expected in limits.items():
         experiment = assemble(scenario(f"actuator.torque_limit={text}"))
@@ -161,7 +154,7 @@ def test_limits_come_from_the_scenario_else_from_the_machine() -> None:
     assert assemble(scenario("actuator.torque_limit=3"), stronger).torque_limit == 3.0
 
 
-def test_none_is_written_and_read_back(tmp_path: Path) -> None:
+def test_none_is_written_and_read_back(tmp_path):
     sc = scenario("actuator.torque_limit=none")
     path = tmp_path / "again.yaml"
     path.write_text(scenario_yaml(sc), encoding="utf-8")
@@ -169,14 +162,14 @@ def test_none_is_written_and_read_back(tmp_path: Path) -> None:
     assert load_scenario(path, None, ["actuator.torque_limit=2"]).actuator.torque_limit == 2.0
 
 
-def test_a_limit_of_the_machine_alone_plans_nothing() -> None:
+def test_a_limit_of_the_machine_alone_plans_nothing():
     """The way onto the reference takes 0.3 s; only a number that was asked for makes it shorter,
     and only that one bounds what the estimator may believe in."""
 
     @functools.cache
-    def built(*settings: str) -> tuple[float, Any]:
+    def built(*settings):
         loop = build_closed_loop(scenario(*settings))
-        law: Any = loop.GetSubsystemByName("controller")._law
+        law = loop.GetSubsystemByName("controller")._law
         return loop.catch_up, law.observer.settings.parameters
 
     catch_up, prior = built()
@@ -187,7 +180,7 @@ def test_a_limit_of_the_machine_alone_plans_nothing() -> None:
     assert narrower.upper[0] == 5.0 < prior.upper[0]
 
 
-def test_the_papers_experiment_does_not_feel_its_motors_limit() -> None:
+def test_the_papers_experiment_does_not_feel_its_motors_limit():
     usual, free = (
         simulate(scenario(*s), judge_stability=False) for s in ((), ("actuator.torque_limit=none",))
     )
@@ -198,7 +191,7 @@ def test_the_papers_experiment_does_not_feel_its_motors_limit() -> None:
 
 
 @pytest.mark.parametrize("queue", ["equilibrium", "reference"])
-def test_torques_in_flight_at_the_start_keep_it_too(tmp_path: Path, queue: str) -> None:
+def test_torques_in_flight_at_the_start_keep_it_too(tmp_path, queue):
     """Motors too weak to hold the plate, which falls: nothing stronger ever acts."""
     motors = paper_with(tmp_path, 0.9)
     held = StewartDynamics(PAPER).equilibrium_torque(PAPER.home)
@@ -211,12 +204,12 @@ def test_torques_in_flight_at_the_start_keep_it_too(tmp_path: Path, queue: str) 
     )
     assert np.abs(run.signals.torque_applied.values).max() == 0.9
     loop = build_closed_loop(run.scenario)
-    controller: Any = loop.GetSubsystemByName("controller")
+    controller = loop.GetSubsystemByName("controller")
     memory = controller.memory(controller.GetMyContextFromRoot(loop.CreateDefaultContext()))
     assert np.abs(memory.in_flight).max() == 0.9
 
 
-def test_drawn_limits_are_never_above_the_motors(tmp_path: Path) -> None:
+def test_drawn_limits_are_never_above_the_motors(tmp_path):
     """0.66 N m are commanded, so that limits of up to 1.97 would be drawn."""
     sc = scenario(paper_with(tmp_path, 0.8))
     scales = scales_of(assemble(sc), 0.6559)

@@ -8,13 +8,12 @@ from pydrake.math import RollPitchYaw
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.mechanism.assembly import torque_map
-from stewart_drake.mechanism.geometry import Link, Mechanism
+from stewart_drake.mechanism.geometry import Link
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, leg_geometry
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 
 
-def with_legs_scaled(mechanism: Mechanism, factor: float) -> Mechanism:
+def with_legs_scaled(mechanism, factor):
     """The same mechanism, mass and inertia of cranks and rods multiplied by `factor`."""
     crank, rod = (
         Link(factor * link.mass, factor * link.inertia, link.center)
@@ -23,19 +22,19 @@ def with_legs_scaled(mechanism: Mechanism, factor: float) -> Mechanism:
     return dataclasses.replace(mechanism, crank=crank, rod=rod)
 
 
-def acceleration_per_torque(mechanism: Mechanism, pose: Array) -> Array:
+def acceleration_per_torque(mechanism, pose):
     """(6, 6) of the exact dynamics at rest without gravity, column by column."""
     dynamics = StewartDynamics(mechanism, gravity=False)
     columns = [dynamics.accelerations(pose, np.zeros(6), torque) for torque in np.eye(6)]
     return np.column_stack(columns)
 
 
-def relative(a: Array, b: Array) -> float:
+def relative(a, b):
     return float(np.linalg.norm(a - b) / np.linalg.norm(b))
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_exact_dynamics_approach_the_map_as_the_legs_lose_their_mass(seed: int) -> None:
+def test_exact_dynamics_approach_the_map_as_the_legs_lose_their_mass(seed):
     """The difference is proportional to the legs' mass: ten times lighter, ten times closer."""
     rng = np.random.default_rng(seed)
     mechanism = random_mechanism(rng)
@@ -50,7 +49,7 @@ def test_exact_dynamics_approach_the_map_as_the_legs_lose_their_mass(seed: int) 
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_motor_power_is_what_the_plate_receives(seed: int) -> None:
+def test_motor_power_is_what_the_plate_receives(seed):
     """Massless legs store nothing: T' alpha_dot = w' I w_dot + m v' v_dot, from rest."""
     rng = np.random.default_rng(seed)
     mechanism = random_mechanism(rng)
@@ -72,7 +71,7 @@ def test_motor_power_is_what_the_plate_receives(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_printed_form_is_the_formula_of_the_paper(seed: int) -> None:
+def test_printed_form_is_the_formula_of_the_paper(seed):
     """(11)-(19) as they stand, with e_N the crank's tangent; geometry built from Drake's frames."""
     rng = np.random.default_rng(seed)
     mechanism = random_mechanism(rng)
@@ -95,7 +94,7 @@ def test_printed_form_is_the_formula_of_the_paper(seed: int) -> None:
     np.testing.assert_allclose(printed, tau_tot, rtol=1e-10, atol=1e-12)
 
 
-def test_forms_differ_by_the_squared_force_factor_where_the_plate_is_level() -> None:
+def test_forms_differ_by_the_squared_force_factor_where_the_plate_is_level():
     """e_l . e_N stands in the numerator of (15) as printed, in the denominator by virtual work."""
     pose = PAPER.home + [0, 0, 0, 0.02, -0.01, 0.06]
     factor = leg_geometry(PAPER, pose).transmission
@@ -105,7 +104,7 @@ def test_forms_differ_by_the_squared_force_factor_where_the_plate_is_level() -> 
     )
 
 
-def test_map_over_predicts_angular_accelerations_about_twofold() -> None:
+def test_map_over_predicts_angular_accelerations_about_twofold():
     """Seen from the plate, the legs have about the rotational inertia of the plate itself."""
     tau_tot = torque_map(PAPER, PAPER.home)
     exact = acceleration_per_torque(PAPER, PAPER.home)
@@ -115,11 +114,11 @@ def test_map_over_predicts_angular_accelerations_about_twofold() -> None:
     assert np.all((linear > 1.0) & (linear < 1.5))
 
 
-def test_poses_out_of_reach_are_refused() -> None:
+def test_poses_out_of_reach_are_refused():
     with pytest.raises(UnreachablePoseError):
         torque_map(PAPER, PAPER.home + [0, 0, 0, 0, 0, 0.3])
 
 
-def test_plain_lists_are_accepted() -> None:
+def test_plain_lists_are_accepted():
     pose = [0.1, -0.1, 0.05, 0.01, 0.02, 0.4]
     np.testing.assert_array_equal(torque_map(PAPER, pose), torque_map(PAPER, np.array(pose)))

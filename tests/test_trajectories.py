@@ -1,8 +1,6 @@
 """References: exact derivatives, smooth joints, defined for all time, honest about bad files."""
 
 import math
-from collections.abc import Callable
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -10,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic.dataclasses import dataclass
-from pydrake.trajectories import PiecewisePolynomial, Trajectory
+from pydrake.trajectories import PiecewisePolynomial
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.field_types import STRICT
@@ -28,7 +26,6 @@ from stewart_drake.scenario.trajectories import (
     peak_to_peak,
     spread_instants,
 )
-from stewart_drake.types import Array
 
 HOME = [0.0, 0.0, 0.0, 0.0, 0.0, 0.38]
 HEADER = "time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]"
@@ -38,13 +35,13 @@ WAYPOINTS = WaypointsConfig(
 )
 
 
-def sample_csv(path: Path, times: Array, motion: Callable[[float], Array]) -> CsvConfig:
+def sample_csv(path, times, motion):
     rows = [",".join(repr(float(v)) for v in [t, *motion(t)]) for t in times]
     path.write_text("\n".join([HEADER, *rows, ""]))
     return CsvConfig(file=str(path))
 
 
-def assert_derivatives_agree(trajectory: Trajectory, t: float) -> None:
+def assert_derivatives_agree(trajectory, t):
     """Central differences of the pose give the rates, those of the rates the accelerations."""
     h = 1e-5
     before, at, after = (evaluate(trajectory, s) for s in (t - h, t, t + h))
@@ -55,7 +52,7 @@ def assert_derivatives_agree(trajectory: Trajectory, t: float) -> None:
         )
 
 
-def assert_smooth(trajectory: Trajectory, knots: list[float], atol: float = 1e-4) -> None:
+def assert_smooth(trajectory, knots, atol=1e-4):
     """Pose, rates and accelerations have no jump at the knots."""
     for t in knots:
         np.testing.assert_allclose(
@@ -74,9 +71,9 @@ class RampConfig:
     rate: float = 0.01
 
 
-def test_a_kind_of_reference_is_a_class_and_how_to_make_its_motion() -> None:
+def test_a_kind_of_reference_is_a_class_and_how_to_make_its_motion():
     @make_reference.register
-    def _ramp(config: RampConfig, duration: float) -> Trajectory:
+    def _ramp(config, duration):
         poses = np.column_stack([[0.0] * 6, [0.0] * 5 + [config.rate]])
         return PiecewisePolynomial.FirstOrderHold([0.0, 1.0], poses)
 
@@ -86,7 +83,7 @@ def test_a_kind_of_reference_is_a_class_and_how_to_make_its_motion() -> None:
         make_reference("sine", 1.0)
 
 
-def test_the_sine_is_the_papers_equation_46() -> None:
+def test_the_sine_is_the_papers_equation_46():
     trajectory = make_reference(SineConfig(), 10.0)
     amplitude = np.array([0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08])
     for t in (0.0, 0.7, math.pi / 2, 123.4):
@@ -105,10 +102,8 @@ def test_the_sine_is_the_papers_equation_46() -> None:
     t=st.floats(0.1, 20),
 )
 @settings(deadline=None)
-def test_the_derivatives_of_a_sine_are_exact(
-    frequency: float, unit: str, amplitude: list[float], t: float
-) -> None:
-    config = SineConfig(amplitude=amplitude, frequency=frequency, frequency_unit=unit)  # type: ignore[arg-type]
+def test_the_derivatives_of_a_sine_are_exact(frequency, unit, amplitude, t):
+    config = SineConfig(amplitude=amplitude, frequency=frequency, frequency_unit=unit)
     trajectory = make_reference(config, 10.0)
     assert_derivatives_agree(trajectory, t)
     omega = config.angular_frequency
@@ -119,7 +114,7 @@ def test_the_derivatives_of_a_sine_are_exact(
     )
 
 
-def test_a_hold_stands_still_for_ever() -> None:
+def test_a_hold_stands_still_for_ever():
     trajectory = make_reference(HoldConfig(offset=HOME), 10.0)
     for t in (0.0, 3.0, 1e6):
         np.testing.assert_array_equal(evaluate(trajectory, t), HOME + [0.0] * 12)
@@ -128,7 +123,7 @@ def test_a_hold_stands_still_for_ever() -> None:
 # Waypoints
 
 
-def test_waypoints_are_met_and_held_before_and_after() -> None:
+def test_waypoints_are_met_and_held_before_and_after():
     assert WAYPOINTS.times is not None and WAYPOINTS.poses is not None
     trajectory = make_reference(WAYPOINTS, 10.0)
     for t, pose in zip(WAYPOINTS.times, WAYPOINTS.poses, strict=True):
@@ -143,9 +138,7 @@ def test_waypoints_are_met_and_held_before_and_after() -> None:
     start=st.floats(0, 1),
 )
 @settings(deadline=None)
-def test_waypoints_are_joined_with_continuous_acceleration(
-    gaps: list[float], values: list[float], start: float
-) -> None:
+def test_waypoints_are_joined_with_continuous_acceleration(gaps, values, start):
     times = [float(t) for t in start + np.cumsum([0.0, *gaps])]
     poses = [[v, -v, v, v / 10, 0.0, 0.38] for v in values[: len(times)]]
     config = WaypointsConfig(times=times, poses=poses)
@@ -155,7 +148,7 @@ def test_waypoints_are_joined_with_continuous_acceleration(
         assert_derivatives_agree(trajectory, middle)
 
 
-def test_two_waypoints_are_the_minimum_jerk_motion() -> None:
+def test_two_waypoints_are_the_minimum_jerk_motion():
     config = WaypointsConfig(times=[0.0, 2.0], poses=[[0.0] * 6, [0.4] * 6])
     trajectory = make_reference(config, 2.0)
     for s in np.linspace(0, 1, 11):
@@ -163,7 +156,7 @@ def test_two_waypoints_are_the_minimum_jerk_motion() -> None:
         np.testing.assert_allclose(evaluate(trajectory, 2 * s)[POSE], expected, atol=1e-15)
 
 
-def test_the_plate_dwells_between_two_equal_waypoints() -> None:
+def test_the_plate_dwells_between_two_equal_waypoints():
     there = [0.1, 0.0, 0.0, 0.0, 0.0, 0.4]
     config = WaypointsConfig(times=[0.0, 1.0, 2.0, 3.0], poses=[HOME, there, there, HOME])
     trajectory = make_reference(config, 3.0)
@@ -171,7 +164,7 @@ def test_the_plate_dwells_between_two_equal_waypoints() -> None:
         np.testing.assert_allclose(evaluate(trajectory, t), there + [0.0] * 12, atol=1e-13)
 
 
-def test_waypoints_from_a_file_are_the_same(tmp_path: Path) -> None:
+def test_waypoints_from_a_file_are_the_same(tmp_path):
     path = tmp_path / "poses.yaml"
     path.write_text(f"times: {WAYPOINTS.times}\nposes: {WAYPOINTS.poses}\n")
     inline = make_reference(WAYPOINTS, 10.0)
@@ -190,9 +183,7 @@ def test_waypoints_from_a_file_are_the_same(tmp_path: Path) -> None:
         ([0, 1], [HOME, [0, 0, 0, 2e3, 0, 0]], ["poses[1][3]: got 2000.0", "1000"]),
     ],
 )
-def test_bad_waypoints_are_refused(
-    times: list[float], poses: list[list[float]], parts: list[str], tmp_path: Path
-) -> None:
+def test_bad_waypoints_are_refused(times, poses, parts, tmp_path):
     path = tmp_path / "poses.yaml"
     path.write_text(f"times: {times}\nposes: {poses}\n")
     for config, where in [
@@ -210,11 +201,11 @@ def test_bad_waypoints_are_refused(
 # CSV
 
 
-def sine_pose(t: float) -> Array:
+def sine_pose(t):
     return evaluate(make_reference(SineConfig(), 10.0), t)[POSE]
 
 
-def test_a_sampled_sine_is_the_sine(tmp_path: Path) -> None:
+def test_a_sampled_sine_is_the_sine(tmp_path):
     """Also at t = 0, where it moves already."""
     config = sample_csv(tmp_path / "a.csv", np.linspace(0, 10, 1001), sine_pose)
     sampled = make_reference(config, 10.0)
@@ -226,8 +217,8 @@ def test_a_sampled_sine_is_the_sine(tmp_path: Path) -> None:
         assert error[ACCELERATIONS].max() < 1e-4
 
 
-def test_a_csv_motion_is_smooth_at_its_samples_and_held_after(tmp_path: Path) -> None:
-    def bump(t: float) -> Array:  # comes to rest at t = 2
+def test_a_csv_motion_is_smooth_at_its_samples_and_held_after(tmp_path):
+    def bump(t):  # comes to rest at t = 2
         return np.array(HOME) + 0.05 * (1 - math.cos(math.pi * t))
 
     times = np.concatenate([np.linspace(0, 1, 21), np.linspace(1.1, 2, 10)])
@@ -239,7 +230,7 @@ def test_a_csv_motion_is_smooth_at_its_samples_and_held_after(tmp_path: Path) ->
         np.testing.assert_allclose(evaluate(trajectory, t), [*bump(2.0)] + [0.0] * 12, atol=1e-12)
 
 
-def test_units_and_the_order_of_columns_are_read_from_the_header(tmp_path: Path) -> None:
+def test_units_and_the_order_of_columns_are_read_from_the_header(tmp_path):
     path = tmp_path / "a.csv"
     rows = [f"{380 + t},{t},0,10,20,30,{t}" for t in range(5)]
     header = "\ufeff Z [mm], Time[s],roll[deg],pitch[deg],yaw[deg],x[mm],y[m]"
@@ -255,7 +246,7 @@ GOOD_ROWS = [f"{t / 10},0,0,0,0,0,0.38" for t in range(6)]
 MOVING = "\n".join([HEADER, *(f"{t / 10},0,0,0,{t / 100},0,0.38" for t in range(6))])
 
 
-def changed(row: int, text: str) -> str:
+def changed(row, text):
     rows = list(GOOD_ROWS)
     rows[row] = text
     return "\n".join([HEADER, *rows])
@@ -305,7 +296,7 @@ BAD_CSV = {
 
 
 @pytest.mark.parametrize("case", BAD_CSV)
-def test_a_bad_csv_file_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
+def test_a_bad_csv_file_is_refused_in_one_line(case, tmp_path):
     text, parts = BAD_CSV[case]
     path = tmp_path / "a.csv"
     path.write_text(text)
@@ -321,8 +312,8 @@ def test_a_bad_csv_file_is_refused_in_one_line(case: str, tmp_path: Path) -> Non
 @given(noise=st.floats(0, 2.5e-4), seed=st.integers(0, 2**32 - 1), jitter=st.floats(0, 0.3))
 @settings(deadline=None, max_examples=50)
 def test_a_measured_motion_with_noise_and_uneven_steps_is_accepted(
-    noise: float, seed: int, jitter: float, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+    noise, seed, jitter, tmp_path_factory
+):
     """Ten samples per period; angles and two positions are still but for the noise.
 
     On an even grid noise shows by at most 1 + 4/3 + 1/3 times itself, two thirds of the bound.
@@ -331,7 +322,7 @@ def test_a_measured_motion_with_noise_and_uneven_steps_is_accepted(
     times = np.arange(60) / 10 + jitter * rng.uniform(-0.05, 0.05, 60)
     times[0] = 0.0
 
-    def motion(t: float) -> Array:
+    def motion(t):
         pose = np.array(HOME) + rng.uniform(-noise, noise, 6)
         return pose + [0, 0, 0, 0, 0, 0.08 * math.sin(2 * math.pi * t)]
 
@@ -343,20 +334,20 @@ def test_a_measured_motion_with_noise_and_uneven_steps_is_accepted(
 # Peak to peak
 
 
-def test_the_peak_to_peak_of_a_sine_is_twice_its_amplitude_however_short_the_run() -> None:
+def test_the_peak_to_peak_of_a_sine_is_twice_its_amplitude_however_short_the_run():
     config = SineConfig(amplitude=[0.1, -0.2, 0.0, 0.01, 0.0, 0.02], frequency=1e-3)
     span = peak_to_peak(config, make_reference(config, 0.1), 0.1)
     np.testing.assert_allclose(span, [0.2, 0.4, 0, 0.02, 0, 0.04])
 
 
-def test_the_peak_to_peak_of_a_constant_is_zero() -> None:
+def test_the_peak_to_peak_of_a_constant_is_zero():
     config = HoldConfig()
     np.testing.assert_array_equal(peak_to_peak(config, make_reference(config, 5.0), 5.0), [0] * 6)
     still = WaypointsConfig(times=[0, 1, 3], poses=[[0.3] * 6] * 3)
     np.testing.assert_array_equal(peak_to_peak(still, make_reference(still, 5.0), 5.0), [0] * 6)
 
 
-def test_the_peak_to_peak_of_samples_is_their_range_within_the_run(tmp_path: Path) -> None:
+def test_the_peak_to_peak_of_samples_is_their_range_within_the_run(tmp_path):
     config = sample_csv(tmp_path / "a.csv", np.linspace(0, 10, 501), sine_pose)
     whole = peak_to_peak(config, make_reference(config, 10.0), 10.0)
     np.testing.assert_allclose(
@@ -375,8 +366,8 @@ def test_the_peak_to_peak_of_samples_is_their_range_within_the_run(tmp_path: Pat
     periods=st.sampled_from([0.25, 0.5, 1.0, 1.5, 2.0, 7.0, 100.0]),
 )
 def test_spread_instants_see_all_phases_of_a_motion_in_step_with_the_parts(
-    duration: float, number: int, periods: float
-) -> None:
+    duration, number, periods
+):
     times = spread_instants(duration, number)
     part = duration / number
     assert times[0] == 0 and times[-1] < duration
@@ -395,9 +386,7 @@ def test_spread_instants_see_all_phases_of_a_motion_in_step_with_the_parts(
     start=st.lists(st.floats(-0.3, 0.3), min_size=12, max_size=12),
 )
 @settings(deadline=None)
-def test_a_catch_up_leaves_the_start_and_joins_the_reference_smoothly(
-    t_start: float, duration: float, start: list[float]
-) -> None:
+def test_a_catch_up_leaves_the_start_and_joins_the_reference_smoothly(t_start, duration, start):
     pose, rates = np.array(start[:6]), np.array(start[6:])
     reference = make_reference(SineConfig(), 10.0)
     blend = catch_up(pose, rates, reference, t_start, duration)
@@ -411,14 +400,14 @@ def test_a_catch_up_leaves_the_start_and_joins_the_reference_smoothly(
     assert_derivatives_agree(blend, t_start + duration / 2)
 
 
-def test_a_catch_up_from_the_first_microsecond_is_one_from_zero() -> None:
+def test_a_catch_up_from_the_first_microsecond_is_one_from_zero():
     reference = make_reference(SineConfig(), 10.0)
     at_zero, late = (catch_up(HOME, [0.1] * 6, reference, t, 0.5) for t in (0.0, 1e-300))
     for t in (0.0, 0.2, 0.6):
         np.testing.assert_array_equal(evaluate(late, t), evaluate(at_zero, t))
 
 
-def test_a_catch_up_onto_itself_is_the_reference() -> None:
+def test_a_catch_up_onto_itself_is_the_reference():
     """A start on a straight line that the reference follows anyway needs no blend."""
     line = PiecewisePolynomial.FirstOrderHold([0.0, 10.0], np.array([[0.0, 1.0]] * 6))
     blend = catch_up([0.0] * 6, [0.1] * 6, line, 1.0, 0.5)
@@ -437,8 +426,6 @@ def test_a_catch_up_onto_itself_is_the_reference() -> None:
         ([0.0] * 6, math.inf, 1.0),
     ],
 )
-def test_a_catch_up_refuses_what_has_no_blend(
-    pose: list[float], t_start: float, duration: float
-) -> None:
+def test_a_catch_up_refuses_what_has_no_blend(pose, t_start, duration):
     with pytest.raises(ValueError, match="expected"):
         catch_up(pose, [0.0] * 6, make_reference(SineConfig(), 1.0), t_start, duration)

@@ -1,7 +1,6 @@
 """A plant that is not what the controller knows: friction, an eccentric payload, other lengths."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,12 +28,12 @@ ROUGH = (
 )
 
 
-def run(*settings: str, controller: str = "delay_lqi", **more: object) -> sd.SimulationResult:
+def run(*settings, controller="delay_lqi", **more):
     scenario = sd.load_scenario("paper", controller, (*ON_REFERENCE, *settings))
     return sd.simulate(scenario, judge_stability=False, **more)
 
 
-def test_both_plants_go_the_same_way() -> None:
+def test_both_plants_go_the_same_way():
     """Multibody is of first order in its step; without friction and payload it goes elsewhere."""
     exact = run("plant.kind=exact", "duration=1.5", *ROUGH).signals.pose
     errors = [
@@ -48,7 +47,7 @@ def test_both_plants_go_the_same_way() -> None:
 
 
 @pytest.mark.parametrize("stiffness", [0.5, 1.5, 1.9, 2.1, 2.5])
-def test_friction_in_steps_of_the_engine_is_a_factor_per_step(stiffness: float) -> None:
+def test_friction_in_steps_of_the_engine_is_a_factor_per_step(stiffness):
     """Slow cranks in the direction of the least inertia: rates go by 1 - h c / s H^-1."""
     h, speed = 1e-3, 0.02
     dynamics = sd.StewartDynamics(PAPER, gravity=False)
@@ -67,8 +66,8 @@ def test_friction_in_steps_of_the_engine_is_a_factor_per_step(stiffness: float) 
     np.testing.assert_allclose(modes[:, -1] @ rates, (1 - stiffness) ** 4 * 1e-2 * speed, rtol=0.03)
 
 
-def test_a_step_in_which_friction_makes_cranks_tremble_is_told() -> None:
-    def said(*settings: str) -> list[str]:
+def test_a_step_in_which_friction_makes_cranks_tremble_is_told():
+    def said(*settings):
         return cautions_before(prepare(sd.load_scenario("paper", settings=settings)), None)
 
     heavy = "plant.coulomb_friction=0.06"
@@ -81,7 +80,7 @@ def test_a_step_in_which_friction_makes_cranks_tremble_is_told() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("controller", ["predictor_lqi", "adaptive_lqi"])
-def test_friction_is_found_where_it_is_asked_for(controller: str) -> None:
+def test_friction_is_found_where_it_is_asked_for(controller):
     """Without it is taken for bias and damping, which it is not, and the run is lost or bad."""
     settings = ("plant.kind=exact", "duration=6", "plant.coulomb_friction=1e-3", *ON_REFERENCE)
     asked = "controller.estimate=[torque_bias,payload,damping,coulomb]"
@@ -99,10 +98,10 @@ def test_friction_is_found_where_it_is_asked_for(controller: str) -> None:
     assert not without < 5 * found  # or lost
 
 
-def test_the_law_sees_a_crank_turn_back() -> None:
+def test_the_law_sees_a_crank_turn_back():
     """While its rate passes coulomb_speed; the paper's cranks accelerate by about 1 rad/s^2."""
 
-    def substeps(*settings: str) -> int:
+    def substeps(*settings):
         return compose_law(prepare(sd.load_scenario("paper", settings=settings))).plant.substeps
 
     plain = substeps("plant.coulomb_friction=1e-3")  # which nobody told
@@ -117,7 +116,7 @@ def test_the_law_sees_a_crank_turn_back() -> None:
 
 
 @pytest.fixture
-def machine(tmp_path: Path) -> Path:
+def machine(tmp_path):
     """The paper's with rods 0.3 mm longer."""
     data = YAML(typ="safe").load((data_root() / "models" / "paper.yaml").read_text())
     data["rod"]["length"] = float(PAPER.rod_lengths[0]) + 3e-4
@@ -127,7 +126,7 @@ def machine(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
-def test_the_plant_is_the_machine_that_the_scenario_says(machine: Path, kind: str) -> None:
+def test_the_plant_is_the_machine_that_the_scenario_says(machine, kind):
     """As with `true_mechanism`; the controller knows the other one."""
     settings = (f"plant.kind={kind}", "duration=0.5")
     found = run(*settings, f"plant.mechanism={machine}")
@@ -141,12 +140,12 @@ def test_the_plant_is_the_machine_that_the_scenario_says(machine: Path, kind: st
     assert experiment.truth.rod_lengths == pytest.approx(truth.rod_lengths, rel=1e-12)
 
 
-def test_a_truth_that_is_given_comes_first(machine: Path) -> None:
+def test_a_truth_that_is_given_comes_first(machine):
     scenario = sd.load_scenario("paper", settings=[f"plant.mechanism={machine}"])
     assert prepare(scenario, PAPER).truth is PAPER
 
 
-def test_its_limit_is_that_of_its_motors(machine: Path) -> None:
+def test_its_limit_is_that_of_its_motors(machine):
     data = YAML(typ="safe").load(machine.read_text())
     data["motor"]["effort_limit"] = 0.25
     YAML(typ="safe").dump(data, machine)
@@ -154,7 +153,7 @@ def test_its_limit_is_that_of_its_motors(machine: Path) -> None:
     assert found.torque_limit == 0.25
 
 
-def test_a_machine_that_does_not_reach_the_start_is_refused(machine: Path) -> None:
+def test_a_machine_that_does_not_reach_the_start_is_refused(machine):
     data = YAML(typ="safe").load(machine.read_text())
     data["rod"]["length"], data["home"][5] = 0.8, 0.8
     YAML(typ="safe").dump(data, machine)
@@ -167,12 +166,12 @@ def test_a_machine_that_does_not_reach_the_start_is_refused(machine: Path) -> No
     ("name", "message"),
     [("nothing", r"^plant\.mechanism: got 'nothing'"), ("/no/file.yaml", r"^plant\.mechanism: no")],
 )
-def test_a_machine_that_is_not_there_names_the_field(name: str, message: str) -> None:
+def test_a_machine_that_is_not_there_names_the_field(name, message):
     with pytest.raises(ConfigError, match=message):
         prepare(sd.load_scenario("paper", settings=[f"plant.mechanism={name}"]))
 
 
-def test_a_payload_is_found_alone_and_recorded_at_its_place() -> None:
+def test_a_payload_is_found_alone_and_recorded_at_its_place():
     """What is not estimated is recorded as it is known, without a standard deviation."""
     settings = ("plant.kind=exact", "duration=3", "plant.payload_mass=0.02", *ON_REFERENCE)
     last = run(*settings, "controller.estimate=[payload]").signals.isel(time=-1)

@@ -1,24 +1,19 @@
 """The tuner in the loop: window and network as systems, who knows what when, what goes wrong."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from pydrake.systems.framework import BasicVector, Context
 
 import stewart_drake as sd
-from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
+from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.loop.tuner import AnnTuner, DensityWindow
 from stewart_drake.scenario.timing import look_time
-from stewart_drake.tuner.network import NUM_INPUTS, Network, densities, save_network
+from stewart_drake.tuner.network import NUM_INPUTS, densities, save_network
 from stewart_drake.tuner.source import MAX_FACTOR, tune
-from stewart_drake.types import Array
 from tests.test_network import small_network, torch_twin
 from tests.test_systems import carry_out, ports
 
@@ -34,7 +29,7 @@ OVERFLOWING = {"b2": [800.0, 0.0]}
     rho=arrays(np.float64, NUM_INPUTS, elements=st.floats()),
     last=arrays(np.float64, 2, elements=st.floats(1e-3, 1e3)),
 )
-def test_weights_stay_finite_positive_and_within_the_rate(rho: Array, last: Array) -> None:
+def test_weights_stay_finite_positive_and_within_the_rate(rho, last):
     weights, fell_back = tune(small_network(), rho, last, FIXED)
     assert fell_back is not bool(np.all(np.isfinite(small_network()(rho))))
     assert np.all(weights > 0)
@@ -42,7 +37,7 @@ def test_weights_stay_finite_positive_and_within_the_rate(rho: Array, last: Arra
     assert np.all((last / factor <= weights) & (weights <= last * factor))
 
 
-def test_where_the_rate_allows_it_the_weights_are_the_clipped_output() -> None:
+def test_where_the_rate_allows_it_the_weights_are_the_clipped_output():
     rng, network = np.random.default_rng(0), small_network()
     clipped = 0
     for rho in rng.uniform(0, 3, (200, NUM_INPUTS)):
@@ -55,7 +50,7 @@ def test_where_the_rate_allows_it_the_weights_are_the_clipped_output() -> None:
 
 
 @pytest.mark.parametrize("output", ["not finite in", "infinite out"])
-def test_a_failing_network_leads_back_to_the_fixed_weights_at_the_same_rate(output: str) -> None:
+def test_a_failing_network_leads_back_to_the_fixed_weights_at_the_same_rate(output):
     network = small_network(**(OVERFLOWING if output == "infinite out" else {}))
     rho = np.full(NUM_INPUTS, np.nan if output == "not finite in" else 1.0)
     weights = np.array([4.0, 2.0])
@@ -68,7 +63,7 @@ def test_a_failing_network_leads_back_to_the_fixed_weights_at_the_same_rate(outp
 # ------------------------------------------------------------------ the systems
 
 
-def sample_in(system: DensityWindow, context: Context, sample: Array) -> Array:
+def sample_in(system, context, sample):
     """Let the window take one sample in; the densities afterwards."""
     reference = np.arange(18.0)
     for name, value in (
@@ -81,7 +76,7 @@ def sample_in(system: DensityWindow, context: Context, sample: Array) -> Array:
     return np.array(system.GetOutputPort("density").Eval(context))
 
 
-def test_window_topology_and_initial_state() -> None:
+def test_window_topology_and_initial_state():
     system = DensityWindow(0.1)
     assert ports(system) == (
         {"measurement": 12, "reference": 18, "torque": 6},
@@ -94,7 +89,7 @@ def test_window_topology_and_initial_state() -> None:
 
 
 @pytest.mark.parametrize("kind", ["magnitude", "signed"])
-def test_window_gives_the_densities_of_the_samples_so_far(kind: Any) -> None:
+def test_window_gives_the_densities_of_the_samples_so_far(kind):
     samples = np.random.default_rng(1).normal(1, 1, (70, NUM_INPUTS))
     samples[[0, 20]] = np.nan  # nothing known at all, first and later
     samples[33, :12] = np.nan
@@ -109,7 +104,7 @@ def test_window_gives_the_densities_of_the_samples_so_far(kind: Any) -> None:
             np.testing.assert_allclose(found, expected[k], rtol=1e-9)
 
 
-def test_tuner_topology_state_and_output() -> None:
+def test_tuner_topology_state_and_output():
     system = AnnTuner(small_network(), FIXED, 0.1)
     assert ports(system) == ({"density": 18}, {"weights": 2})
     context = system.CreateDefaultContext()
@@ -122,7 +117,7 @@ def test_tuner_topology_state_and_output() -> None:
 # ------------------------------------------------------------------ the loop
 
 
-def scenario(tmp_path: Path, network: Network | None, *settings: str) -> sd.Scenario:
+def scenario(tmp_path, network, *settings):
     """The paper's scenario on the exact plant, with this network or with fixed weights."""
     tuner = []
     if network is not None:
@@ -131,20 +126,20 @@ def scenario(tmp_path: Path, network: Network | None, *settings: str) -> sd.Scen
     return sd.load_scenario("paper", settings=["plant.kind=exact", *tuner, *settings])
 
 
-def at_samples(result: sd.SimulationResult) -> Any:
+def at_samples(result):
     """The signals at the controller's samples, 0.1 s apart."""
     return result.signals.isel(time=slice(None, None, 5))
 
 
 @pytest.fixture(scope="module")
-def tuned(tmp_path_factory: pytest.TempPathFactory) -> sd.SimulationResult:
+def tuned(tmp_path_factory):
     """The paper's whole experiment with a network."""
     return sd.simulate(
         scenario(tmp_path_factory.mktemp("tuned"), small_network()), judge_stability=False
     )
 
 
-def test_the_papers_experiment_completes_with_a_network(tuned: sd.SimulationResult) -> None:
+def test_the_papers_experiment_completes_with_a_network(tuned):
     assert tuned.status == "completed"
     assert tuned.accumulated_error < 25
     weights = tuned.signals.weights.values
@@ -156,13 +151,13 @@ def test_the_papers_experiment_completes_with_a_network(tuned: sd.SimulationResu
     assert np.all((rho >= 0) & (rho <= 31))
 
 
-def test_weights_rest_on_the_samples_before(tuned: sd.SimulationResult) -> None:
+def test_weights_rest_on_the_samples_before(tuned):
     """w_k = tune(rho_{k-1}, w_{k-1}), w_0 = fixed; neither earlier nor later data."""
     s, network = at_samples(tuned), small_network()
     weights, rho = s.weights.values, s.density.values
     np.testing.assert_array_equal(weights[0], [1.0, 1.0])
 
-    def replay(age: int) -> Array:
+    def replay(age):
         """Had the tuner seen densities so many samples old."""
         samples = range(2, len(weights))
         return np.array(
@@ -174,7 +169,7 @@ def test_weights_rest_on_the_samples_before(tuned: sd.SimulationResult) -> None:
         assert np.abs(weights[2:] / replay(wrong) - 1).max() > 0.1
 
 
-def test_the_network_in_the_loop_is_the_torch_network(tuned: sd.SimulationResult) -> None:
+def test_the_network_in_the_loop_is_the_torch_network(tuned):
     torch = pytest.importorskip("torch")
     s, network = at_samples(tuned), small_network()
     weights = s.weights.values
@@ -187,7 +182,7 @@ def test_the_network_in_the_loop_is_the_torch_network(tuned: sd.SimulationResult
 
 
 @pytest.mark.parametrize("kind", ["magnitude", "signed"])
-def test_recorded_densities_are_those_of_the_recorded_signals(tmp_path: Path, kind: Any) -> None:
+def test_recorded_densities_are_those_of_the_recorded_signals(tmp_path, kind):
     """On the multibody plant, where the state is the same just before and after an instant."""
     settings = ("plant.kind=multibody", "duration=4.0")
     result = sd.simulate(
@@ -204,10 +199,10 @@ def test_recorded_densities_are_those_of_the_recorded_signals(tmp_path: Path, ki
     assert list(s.tuner_input.values[[0, 6, 12]]) == ["error_phi", "rate_error_phi", "torque_1"]
 
 
-def test_the_window_holds_what_the_density_is_taken_of(tmp_path: Path) -> None:
+def test_the_window_holds_what_the_density_is_taken_of(tmp_path):
     """Recorded density and `densities` of the very samples, to 1e-12."""
     loop = build_closed_loop(scenario(tmp_path, None, "duration=4.0"))
-    window: Any = loop.GetSubsystemByName("density")
+    window = loop.GetSubsystemByName("density")
     simulator = make_simulator(loop)
     context = simulator.get_context()
     simulator.Initialize()
@@ -226,11 +221,11 @@ def test_the_window_holds_what_the_density_is_taken_of(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, densities(samples), rtol=1e-12)
 
 
-def subsystems(loop: ClosedLoop) -> set[str]:
+def subsystems(loop):
     return {system.get_name() for system in loop.GetSystems()}
 
 
-def test_fixed_weights_stay_and_a_network_takes_their_place(tmp_path: Path) -> None:
+def test_fixed_weights_stay_and_a_network_takes_their_place(tmp_path):
     fixed = scenario(tmp_path, None, "duration=1.0", "controller.w_R=3")
     result = sd.simulate(fixed, judge_stability=False)
     np.testing.assert_array_equal(result.signals.weights.values, np.tile([1.0, 3.0], (51, 1)))
@@ -248,7 +243,7 @@ def test_fixed_weights_stay_and_a_network_takes_their_place(tmp_path: Path) -> N
     assert tuner.HasAnyDirectFeedthrough()
 
 
-def test_a_network_that_fails_is_a_controller_with_fixed_weights(tmp_path: Path) -> None:
+def test_a_network_that_fails_is_a_controller_with_fixed_weights(tmp_path):
     settings = ("duration=2.0", "controller.w_R=1000")  # outside the network's bounds
     failing = sd.simulate(
         scenario(tmp_path, small_network(**OVERFLOWING), *settings), judge_stability=False
@@ -260,12 +255,10 @@ def test_a_network_that_fails_is_a_controller_with_fixed_weights(tmp_path: Path)
     assert failing.accumulated_error == fixed.accumulated_error
 
 
-def test_missed_measurements_do_not_reach_the_weights(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missed_measurements_do_not_reach_the_weights(tmp_path, monkeypatch):
     missed, measure = (0, 7, 8), Sensor._measure
 
-    def lose(self: Sensor, context: Context, output: BasicVector) -> None:
+    def lose(self, context, output):
         measure(self, context, output)
         if round(context.get_time() / 0.1) in missed:
             output.SetFromVector(np.full(12, np.nan))

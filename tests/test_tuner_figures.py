@@ -1,7 +1,6 @@
 """Figures of the tuner: that they show the real network, the real loop, the weights as set."""
 
 import dataclasses
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,7 +16,7 @@ from stewart_drake.tuner.network import save_network
 from tests.test_network import small_network
 
 
-def tuned_scenario(folder: Path, *settings: str) -> sd.Scenario:
+def tuned_scenario(folder, *settings):
     path = folder / "network.json"
     save_network(small_network(), path)
     tuner = ("tuner.kind=ann", f"tuner.weights={path}")
@@ -25,7 +24,7 @@ def tuned_scenario(folder: Path, *settings: str) -> sd.Scenario:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> sd.SimulationResult:
+def run(tmp_path_factory):
     return sd.simulate(
         tuned_scenario(tmp_path_factory.mktemp("run"), "duration=2.0"), judge_stability=False
     )
@@ -34,9 +33,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> sd.SimulationResult:
 # ------------------------------------------------------------------ the network
 
 
-def test_a_shipped_network_is_listed_with_what_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_shipped_network_is_listed_with_what_it_is(tmp_path, monkeypatch):
     monkeypatch.setattr(resources, "data_root", lambda: tmp_path)
     (tmp_path / "models" / "weights").mkdir(parents=True)
     save_network(small_network(7, density="signed"), tmp_path / "models" / "weights" / "mine.json")
@@ -48,7 +45,7 @@ def test_a_shipped_network_is_listed_with_what_it_is(
 # ------------------------------------------------------------------ the weights
 
 
-def test_weights_and_their_ratio_are_those_of_the_run(run: sd.SimulationResult) -> None:
+def test_weights_and_their_ratio_are_those_of_the_run(run):
     figure = weights_figure({"one": run, "two": run})
     above, other, below, _ = figure.axes
     weights = run.signals.weights.values
@@ -60,10 +57,8 @@ def test_weights_and_their_ratio_are_those_of_the_run(run: sd.SimulationResult) 
     assert above.get_ylim() == other.get_ylim()
 
 
-def test_weights_are_shown_where_a_network_set_them(
-    run: sd.SimulationResult, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    kept: dict[str, object] = {}
+def test_weights_are_shown_where_a_network_set_them(run, monkeypatch):
+    kept = {}
     monkeypatch.setattr(figures, "write_figures", lambda made, _: kept.update(made) or [])
     before = dict(plt.rcParams)
     run_figures(run, "unused")

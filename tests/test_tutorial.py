@@ -43,7 +43,7 @@ def do(tmp_path, monkeypatch, capsys):
     # Commands before it print these analyses.
     monkeypatch.setattr(report, "_analyse", lambda name, scenario: BLANK)
 
-    def done(part: str) -> dict[str, str]:
+    def done(part):
         told = {}
         for language, name, text in FENCE.findall(part):
             if name:
@@ -67,7 +67,7 @@ def do(tmp_path, monkeypatch, capsys):
     return done
 
 
-def summary(name: str) -> dict:
+def summary(name):
     return json.loads(Path(f"out/{name}/summary.json").read_text())
 
 

@@ -5,8 +5,6 @@ import socket
 import subprocess
 import threading
 import time
-from pathlib import Path
-from typing import Final
 
 import pytest
 
@@ -29,8 +27,8 @@ from tests.test_machine_process import (
 from tests.test_protocol import PLAN, changed
 
 __all__ = ["folder"]
-SANITIZED: Final = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-TRIED: Final = """
+SANITIZED = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+TRIED = """
 #include <arpa/inet.h>
 #include <stdio.h>
 #include <string.h>
@@ -66,7 +64,7 @@ int main(int argc, char **argv)
 
 
 @pytest.fixture(scope="module")
-def tried(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tried(tmp_path_factory):
     """udp.c under the sanitizers, with and without a source of random bytes."""
     compiler = build.compiler()
     if compiler is None:
@@ -83,13 +81,13 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def said(*command: object) -> str:
+def said(*command):
     done = subprocess.run([str(word) for word in command], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 
 
-def test_a_key_file_beyond_what_python_takes_is_refused(tried: Path, tmp_path: Path) -> None:
+def test_a_key_file_beyond_what_python_takes_is_refused(tried, tmp_path):
     file = tmp_path / "key"
     for size, taken in (
         (0, 0),
@@ -103,20 +101,20 @@ def test_a_key_file_beyond_what_python_takes_is_refused(tried: Path, tmp_path: P
         assert said(tried / "tried", file) == str(taken)
 
 
-def test_without_random_bytes_there_is_no_session(tried: Path) -> None:
+def test_without_random_bytes_there_is_no_session(tried):
     assert said(tried / "tried") == ""
     done = subprocess.run([tried / "without"], capture_output=True, text=True)
     assert done.returncode == 1 and done.stderr.startswith("/nowhere: no random bytes")
 
 
-def test_a_datagram_without_a_byte_hides_none(tried: Path) -> None:
+def test_a_datagram_without_a_byte_hides_none(tried):
     assert said(tried / "tried", "gets") == "0 3"
 
 
 # ---------------------------------------------------------------- what both sides say
 
 
-def test_a_controller_in_c_of_another_machine_is_refused_by_both(folder: Path) -> None:
+def test_a_controller_in_c_of_another_machine_is_refused_by_both(folder):
     settings = (*SETTINGS, "mechanism=paper_clear")
     with machine(settings=settings) as (running, port):
         with process(c_controller(folder, port)) as driving:
@@ -129,7 +127,7 @@ def test_a_controller_in_c_of_another_machine_is_refused_by_both(folder: Path) -
 
 
 @pytest.mark.slow
-def test_a_machine_in_c_refuses_a_controller_of_another_mechanism(folder: Path) -> None:
+def test_a_machine_in_c_refuses_a_controller_of_another_mechanism(folder):
     port = free_port()
     live = [*COMMAND, "live", "paper", "--no-browser", "--set", "mechanism=paper_clear"]
     with process([str(folder / "stewart_machine"), str(port)]) as running:
@@ -149,7 +147,7 @@ def test_a_machine_in_c_refuses_a_controller_of_another_mechanism(folder: Path) 
 
 
 @pytest.mark.slow
-def test_a_machine_in_c_is_not_locked_by_replayed_requests(folder: Path, tmp_path: Path) -> None:
+def test_a_machine_in_c_is_not_locked_by_replayed_requests(folder, tmp_path):
     """Twenty a second, without the key: 10 of 10 runs connect."""
     port, key = free_port(), tmp_path / "key"
     key.write_bytes(b"a key of some length")
@@ -158,7 +156,7 @@ def test_a_machine_in_c_is_not_locked_by_replayed_requests(folder: Path, tmp_pat
     recorded, over = encode(asked, key.read_bytes()), threading.Event()
     attacker = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
-    def attack() -> None:
+    def attack():
         while not over.wait(0.05):
             attacker.sendto(recorded, ("127.0.0.1", port))
 
@@ -179,7 +177,7 @@ def test_a_machine_in_c_is_not_locked_by_replayed_requests(folder: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_machine_in_c_says_why_it_stopped(folder: Path) -> None:
+def test_a_machine_in_c_says_why_it_stopped(folder):
     """Silence and its end, in its datagrams; a controller of version 1 is told the version."""
     port = free_port()
     with process([str(folder / "stewart_machine"), str(port)]) as running:

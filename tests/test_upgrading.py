@@ -35,7 +35,7 @@ tuner: {kind: fixed, weights: null}
 
 @pytest.fixture
 def old(tmp_path):
-    def load(text: str) -> Scenario:
+    def load(text):
         path = tmp_path / "old.yaml"
         path.write_text(text)
         return load_scenario(path)

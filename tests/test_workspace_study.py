@@ -19,9 +19,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.experiment import assemble, check_instants, prepare, reference_failure
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
-from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import HoldConfig, SineConfig
 from stewart_drake.scenario.trajectories import make_reference
@@ -40,7 +38,6 @@ from stewart_drake.studies.workspace_map import (
     travel,
     wrenches,
 )
-from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.screen import too_long
 from tests.singular import parallel_rods, stretched, write_mechanism
@@ -51,7 +48,7 @@ seeds = st.integers(0, 2**32 - 1)
 seeded = settings(max_examples=30, deadline=None, derandomize=True)
 
 
-def heave(amplitude: float, frequency: float = 1.0, pose: Array = PAPER.home) -> Scenario:
+def heave(amplitude, frequency=1.0, pose=PAPER.home):
     """The paper's scenario, but up and down only."""
     sine = SineConfig(
         amplitude=[0.0] * 5 + [amplitude], offset=list(map(float, pose)), frequency=frequency
@@ -64,7 +61,7 @@ def heave(amplitude: float, frequency: float = 1.0, pose: Array = PAPER.home) ->
 
 @given(seed=seeds)
 @seeded
-def test_condition_and_play_are_those_of_the_jacobian_in_twists(seed: int) -> None:
+def test_condition_and_play_are_those_of_the_jacobian_in_twists(seed):
     """A = J diag(E^-1 / rho, 1), and J is checked against finite differences elsewhere."""
     rng = np.random.default_rng(seed)
     mechanism = random_mechanism(rng)
@@ -81,15 +78,13 @@ def test_condition_and_play_are_those_of_the_jacobian_in_twists(seed: int) -> No
 
 @given(seed=seeds, turn=st.floats(-3, 3), size=st.floats(0.1, 10))
 @seeded
-def test_condition_depends_neither_on_size_nor_on_the_frame(
-    seed: int, turn: float, size: float
-) -> None:
+def test_condition_depends_neither_on_size_nor_on_the_frame(seed, turn, size):
     rng = np.random.default_rng(seed)
     mechanism = random_mechanism(rng)
     R = rotation(np.array([0.0, 0.0, turn]))
     scale = np.repeat([1.0, size], 3)
 
-    def moved(pose: Array) -> Array:
+    def moved(pose):
         """Yaw comes last in R = Rz Ry Rx, so that turning the world adds to it."""
         return scale * np.concatenate([pose[:3] + [0, 0, turn], R @ pose[3:]])
 
@@ -110,13 +105,13 @@ def test_condition_depends_neither_on_size_nor_on_the_frame(
     np.testing.assert_allclose(two.play, size * one.play, rtol=1e-7)
 
 
-def test_wrenches_are_what_shortens_rods_on_locked_cranks() -> None:
+def test_wrenches_are_what_shortens_rods_on_locked_cranks():
     """Virtual work: d |p_TQ| = W' [rho omega; v] dt, by central differences of the twist."""
     pose = PAPER.home + [0.1, -0.2, 0.15, 0.01, -0.02, 0.03]
     legs, rho = leg_geometry(PAPER, pose), characteristic_length(PAPER)
     tips = PAPER.p_WS + PAPER.crank_lengths[:, None] * legs.crank
 
-    def lengths(twist: Array) -> Array:
+    def lengths(twist):
         p_PQ_W = legs.p_PQ_W + np.cross(twist[:3] / rho, legs.p_PQ_W)
         return np.linalg.norm(pose[3:] + twist[3:] + p_PQ_W - tips, axis=1)
 
@@ -125,7 +120,7 @@ def test_wrenches_are_what_shortens_rods_on_locked_cranks() -> None:
     np.testing.assert_allclose(wrenches(PAPER, legs), rows, atol=1e-9)
 
 
-def test_parallel_rods_do_not_hold_the_plate() -> None:
+def test_parallel_rods_do_not_hold_the_plate():
     """Six parallel forces span three directions: no yaw, no shift."""
     mechanism = parallel_rods()
     W = wrenches(mechanism, leg_geometry(mechanism, mechanism.home))
@@ -134,7 +129,7 @@ def test_parallel_rods_do_not_hold_the_plate() -> None:
     assert abs(found.parallel) < 1e-12 and found.margin < 0 and np.isnan(found.condition)
 
 
-def test_the_condition_grows_like_the_root_of_the_distance_to_a_dead_centre() -> None:
+def test_the_condition_grows_like_the_root_of_the_distance_to_a_dead_centre():
     mechanism = stretched()
     distances = np.array([1e-3, 1e-4])
     values = [measure(mechanism, mechanism.home - [0, 0, 0, x, 0, 0]) for x in distances]
@@ -148,18 +143,18 @@ def test_the_condition_grows_like_the_root_of_the_distance_to_a_dead_centre() ->
 
 @given(end=st.floats(1e-3, 2.0) | st.integers(1, 200).map(lambda k: np.nextafter(k * 0.005, 0)))
 @settings(deadline=None)
-def test_the_last_inside_is_found(end: float) -> None:
+def test_the_last_inside_is_found(end):
     found = last_inside(lambda s: s <= end, 1.0)
     np.testing.assert_allclose(found, min(end, 1.0), atol=1e-8)
     assert found <= end
 
 
-def test_the_last_inside_is_before_the_first_gap() -> None:
+def test_the_last_inside_is_before_the_first_gap():
     np.testing.assert_allclose(last_inside(lambda s: not 0.3 < s < 0.4, 1.0), 0.3, atol=1e-8)
 
 
 @pytest.mark.parametrize("name", shipped("mechanism"))
-def test_travel_ends_on_the_border(name: str) -> None:
+def test_travel_ends_on_the_border(name):
     mechanism = load_mechanism(name)
     for k, t in enumerate(travel(mechanism)):
         assert t.low < 0 < t.high
@@ -174,14 +169,14 @@ def test_travel_ends_on_the_border(name: str) -> None:
                 np.testing.assert_allclose(abs(now.parallel), SINGULARITY_LIMIT, rtol=1e-3)
 
 
-def test_a_machine_with_a_mirror_plane_travels_alike_to_both_sides() -> None:
+def test_a_machine_with_a_mirror_plane_travels_alike_to_both_sides():
     """The desktop one, with rotation 0, is its own mirror image in the x-z plane."""
     for t in travel(load_mechanism("desktop")):
         if t.coordinate in ("phi", "psi", "y"):
             np.testing.assert_allclose(-t.low, t.high, rtol=1e-6)
 
 
-def test_sections_meet_the_travel_on_their_axes() -> None:
+def test_sections_meet_the_travel_on_their_axes():
     mechanism = load_mechanism("desktop")
     spans = travel(mechanism)
     for section in sections(mechanism, points=31):
@@ -201,7 +196,7 @@ def test_sections_meet_the_travel_on_their_axes() -> None:
 # ------------------------------------------------------------------ along a reference
 
 
-def test_the_exit_of_a_heave_is_where_the_travel_says() -> None:
+def test_the_exit_of_a_heave_is_where_the_travel_says():
     """A sin(t) = travel; and at worst the leg is short by what its margin says at the peak."""
     up = travel(PAPER)[5]
     study = study_workspace(heave(0.2))
@@ -219,14 +214,14 @@ def test_the_exit_of_a_heave_is_where_the_travel_says() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("later", "fits"), [(-1e-3, True), (1e-3, False)])
-def test_a_motion_is_checked_up_to_its_end_and_not_beyond(later: float, fits: bool) -> None:
+def test_a_motion_is_checked_up_to_its_end_and_not_beyond(later, fits):
     leaves = math.asin(travel(PAPER)[5].high / 0.2)
     scenario = dataclasses.replace(heave(0.2), duration=leaves + later)
     assert (study_workspace(scenario).exit is None) is fits
     assert (reference_failure(assemble(scenario)) is None) is fits
 
 
-def test_the_largest_heave_is_the_shorter_travel() -> None:
+def test_the_largest_heave_is_the_shorter_travel():
     """Hence the scaled scenario is accepted, and one a permille larger is not."""
     t = travel(PAPER)[5]
     study = study_workspace(heave(0.05))
@@ -238,7 +233,7 @@ def test_the_largest_heave_is_the_shorter_travel() -> None:
 
 
 @pytest.mark.parametrize("name", shipped("scenario"))
-def test_every_shipped_reference_fits_and_so_does_its_largest_scaling(name: str) -> None:
+def test_every_shipped_reference_fits_and_so_does_its_largest_scaling(name):
     experiment = assemble(load_scenario(name))
     time = check_instants(experiment.scenario.duration)
     assert first_exit(experiment.mechanism, experiment.reference, time) is None
@@ -252,7 +247,7 @@ def test_every_shipped_reference_fits_and_so_does_its_largest_scaling(name: str)
 
 
 @pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
-def test_the_table_in_the_theory_is_what_comes_out(name: str) -> None:
+def test_the_table_in_the_theory_is_what_comes_out(name):
     text = (Path(__file__).parents[1] / "docs" / "theory.md").read_text(encoding="utf-8")
     section = text[text.index("largest amplitude factor") :]
     row = re.findall(rf"^\| `{name}`.*\|$", section, re.MULTILINE)[0]
@@ -272,7 +267,7 @@ def test_the_table_in_the_theory_is_what_comes_out(name: str) -> None:
     np.testing.assert_allclose(numbers, found, rtol=5e-3)
 
 
-def test_factors_at_the_ends_of_what_can_be() -> None:
+def test_factors_at_the_ends_of_what_can_be():
     time = check_instants(2.0)
     still = make_reference(HoldConfig(offset=list(PAPER.home)), 2.0)
     assert math.isnan(largest_factor(PAPER, still, time).value)
@@ -288,7 +283,7 @@ def test_factors_at_the_ends_of_what_can_be() -> None:
 # ------------------------------------------------------------------ motors
 
 
-def test_motors_at_rest_hold_the_equilibrium() -> None:
+def test_motors_at_rest_hold_the_equilibrium():
     dynamics = StewartDynamics(PAPER, gravity=True)
     still = make_reference(HoldConfig(offset=list(PAPER.home)), 1.0)
     sizing = size_motors(dynamics, still, check_instants(0.1))
@@ -301,7 +296,7 @@ def test_motors_at_rest_hold_the_equilibrium() -> None:
     assert math.isnan(sizing.summary(None)[0]["use_of_limit"])
 
 
-def test_the_motors_work_is_the_machine_s_energy() -> None:
+def test_the_motors_work_is_the_machine_s_energy():
     """Sum of powers over time = kinetic plus potential energy gained; no friction."""
     experiment = assemble(load_scenario("motion_base"))
     time = np.linspace(0.0, 4.7, 2001)
@@ -322,16 +317,14 @@ def test_the_motors_work_is_the_machine_s_energy() -> None:
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick(monkeypatch):
     monkeypatch.setattr("stewart_drake.studies.workspace_map.POINTS", 15)
     monkeypatch.setattr("stewart_drake.studies.workspace_map._ROUGH", 15)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-def test_the_command_writes_a_table_a_page_and_a_summary(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_a_table_a_page_and_a_summary(tmp_path, capsys):
     assert main(["analyze", "workspace", "desktop", "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("yes: the reference stays in the workspace")
@@ -353,9 +346,7 @@ def test_the_command_writes_a_table_a_page_and_a_summary(
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_reference_that_leaves_is_analysed_not_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_reference_that_leaves_is_analysed_not_refused(tmp_path, capsys):
     amplitude = "reference.amplitude=[0.3, 0.3, 0.3, 0.02, 0.02, 0.1]"
     arguments = ["analyze", "workspace", "--set", amplitude, "--out", str(tmp_path)]
     assert main(arguments) == 0
@@ -373,9 +364,7 @@ def test_a_reference_that_leaves_is_analysed_not_refused(
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("machine", [parallel_rods(), stretched()], ids=["parallel", "dead centre"])
-def test_a_singular_home_pose_gets_a_verdict(
-    machine: Mechanism, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_singular_home_pose_gets_a_verdict(machine, tmp_path, capsys):
     path = write_mechanism(machine, tmp_path / "singular.yaml")
     hold = ["--set", "reference.kind=hold", "--set", f"reference.offset={machine.home.tolist()}"]
     chosen = ["--set", f"mechanism={path}", *hold]
