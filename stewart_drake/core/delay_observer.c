@@ -161,17 +161,16 @@ void stewart_delayed_assume(const stewart_law *law, real *memory, const real *st
 
 static void start(const stewart_law *law, real *memory)
 {
-    const stewart_sensing sensing = stewart_state_sensing(law->sensing);
+    const stewart_sensing sensing = stewart_sensing_of(law);
     stewart_delayed_start(law, &sensing, memory);
 }
 
 static int observe(const stewart_law *law, real *memory, int number, const real *torques,
                    const real *values, stewart_scratch scratch)
 {
-    const stewart_sensing sensing = stewart_state_sensing(law->sensing);
+    const stewart_sensing sensing = stewart_sensing_of(law);
     const real *last = stewart_delayed_last(law, memory);
-    const int fault =
-        stewart_state_fault(law->sensing, law->machine.geometry, law->period, values, last);
+    const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
     return stewart_delayed_observe(law, &sensing, fault, memory, number, torques, values, scratch);
 }
 

@@ -44,13 +44,12 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
     real *durations = since + U * GAP_TORQUES, *pieces = durations + GAP_TORQUES, *periods = pieces + 1;
     real *known = stewart_take(&scratch, size), *last = stewart_take(&scratch, m);
     real longer[X];
-    const stewart_sensing sensing = stewart_state_sensing(law->sensing);
+    const stewart_sensing sensing = stewart_sensing_of(law);
     stewart_filter filter = stewart_filter_of(law, &sensing, NULL);
     stewart_copy(size, memory, known);
     stewart_copy(m, memory + size, last);
     const stewart_posterior before = stewart_posterior_at(known, n, m);
-    const int fault =
-        stewart_state_fault(law->sensing, law->machine.geometry, law->period, values, last);
+    const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
     const int status = stewart_state_filter_observe(law, memory, number, torques, values, scratch);
     const int had_anchor = *periods > 0, parts = (int)*pieces;
     stewart_interval period = stewart_last_interval(law, number, torques, &scratch);
@@ -89,7 +88,7 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
 
 static int gap_scratch(const stewart_law *law)
 {
-    const stewart_sensing sensing = stewart_state_sensing(law->sensing);
+    const stewart_sensing sensing = stewart_sensing_of(law);
     const stewart_filter filter = stewart_filter_of(law, &sensing, NULL);
     return stewart_state_filter_scratch(law) + stewart_estimate_numbers(law) + law->measured +
            (U + 1) * 2 + stewart_filter_scratch(&filter, GAP_TORQUES);

@@ -17,6 +17,7 @@
 #include "design.h"
 #include "observer.h"
 #include "packets.h"
+#include "sensing.h"
 
 /* A field of the memory: its place, and its size as a matrix. */
 typedef struct {
@@ -105,6 +106,7 @@ struct stewart_law {
     stewart_layout layout;
     const stewart_observer *observer;
     const void *sensing, *estimation; /* assumptions of the observer */
+    const stewart_sensing *described; /* a sensor given by its functions, in the place of `sensing`; or NULL */
     const stewart_channel *channel;   /* NULL: every torque arrives, after the delay */
     const stewart_packets *packets;   /* assumptions of the channel */
     const stewart_planner *planner;   /* NULL: what the caller asks for is followed */
@@ -155,6 +157,9 @@ void stewart_note_acted(const stewart_law *law, real *memory, int ago, int numbe
 
 /* A `stewart_preview_function`: `about` points to all rows that are asked for. */
 void stewart_given_rows(void *about, int number, const real *times, real *rows);
+
+/* The sensor of an observer of the measured state. */
+stewart_sensing stewart_sensing_of(const stewart_law *law);
 
 /* The torque as the motors let it through; whether that is another one. */
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited);

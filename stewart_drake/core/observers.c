@@ -88,17 +88,22 @@ static int state_observe(const stewart_law *law, real *memory, int number, const
                          const real *values, stewart_scratch scratch)
 {
     real *state = memory, *last = memory + X;
-    int fault = stewart_state_fault(law->sensing, law->machine.geometry, law->period, values, last);
+    real *root = stewart_take(&scratch, X * X);
+    const stewart_sensing sensing = stewart_sensing_of(law);
+    int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
+    const int had_state = stewart_all_finite(X, state);
     stewart_keep_last(law, values, last);
-    if (!fault)
-        stewart_copy(X, values, state);
-    else if (stewart_all_finite(X, state))
-        stewart_move_on(law, number, torques, state, scratch);
+    if (fault || !sensing.start(&sensing, values, had_state ? state : NULL, state, root, scratch)) {
+        if (had_state)
+            stewart_move_on(law, number, torques, state, scratch);
+    }
     return fault << STEWART_CAUSES_AT;
 }
 
+static int state_scratch(const stewart_law *law) { return X * X + stewart_moving_scratch(law); }
+
 const stewart_observer stewart_state_observer = {
-    stewart_plain_memory,  stewart_moving_scratch,   stewart_plain_start,
+    stewart_plain_memory,  state_scratch,            stewart_plain_start,
     state_observe,         stewart_plain_tell,       stewart_plain_assume,
     stewart_plain_restart, stewart_known_parameters, stewart_known_last_period,
     1,
@@ -222,17 +227,16 @@ int stewart_filtered_scratch(const stewart_law *law, const stewart_sensing *sens
 int stewart_state_filter_observe(const stewart_law *law, real *memory, int number,
                                  const real *torques, const real *values, stewart_scratch scratch)
 {
-    const stewart_sensing sensing = stewart_state_sensing(law->sensing);
+    const stewart_sensing sensing = stewart_sensing_of(law);
     const real *last = memory + stewart_estimate_numbers(law);
-    const int fault =
-        stewart_state_fault(law->sensing, law->machine.geometry, law->period, values, last);
+    const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
     return stewart_filtered_observe(law, &sensing, NULL, fault, memory, number, torques, values,
                                     scratch);
 }
 
 int stewart_state_filter_scratch(const stewart_law *law)
 {
-    const stewart_sensing sensing = stewart_state_sensing(law->sensing);
+    const stewart_sensing sensing = stewart_sensing_of(law);
     return stewart_filtered_scratch(law, &sensing, NULL);
 }
 

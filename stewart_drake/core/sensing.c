@@ -20,9 +20,15 @@ static int start_of_state(const stewart_sensing *sensing, const real *values, co
     return 1;
 }
 
+static int fault_of_state(const stewart_sensing *sensing, const real *geometry, real period,
+                          const real *values, const real *last)
+{
+    return stewart_state_fault(sensing->kind, geometry, period, values, last);
+}
+
 stewart_sensing stewart_state_sensing(const stewart_state_sensor *sensor)
 {
-    return (stewart_sensing){X, sensor->noise_std, sensor, NULL, NULL, start_of_state};
+    return (stewart_sensing){X, sensor->noise_std, sensor, NULL, NULL, start_of_state, fault_of_state};
 }
 
 int stewart_state_fault(const stewart_state_sensor *sensor, const real *geometry, real period,

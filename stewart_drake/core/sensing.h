@@ -15,7 +15,10 @@ enum { STEWART_MISSING = 1, STEWART_FROZEN = 2, STEWART_REJECTED = 4 };
 
    `start` writes the state (12), and a root (12, 12) of its covariance, from values (m) without a
    fault; `near` (12) is where the plate is thought to be, or NULL at the beginning. Returns 0 where
-   they fix no state. */
+   they fix no state.
+
+   `fault` returns what is wrong with values (m), bits of the causes above, for a machine and the values
+   `last` (m) of `period` s ago. */
 typedef struct stewart_sensing {
     int size;              /* m */
     const real *noise_std; /* (m) */
@@ -24,6 +27,8 @@ typedef struct stewart_sensing {
     void (*jacobian)(const struct stewart_sensing *sensing, const real *state, real *J);
     int (*start)(const struct stewart_sensing *sensing, const real *values, const real *near,
                  real *state, real *root, stewart_scratch scratch);
+    int (*fault)(const struct stewart_sensing *sensing, const real *geometry, real period,
+                 const real *values, const real *last);
 } stewart_sensing;
 
 /* Pose and rates. */

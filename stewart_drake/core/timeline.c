@@ -6,6 +6,11 @@
 
 int stewart_queue_length(const stewart_law *law) { return law->steps + (law->fraction > 0); }
 
+stewart_sensing stewart_sensing_of(const stewart_law *law)
+{
+    return law->described ? *law->described : stewart_state_sensing(law->sensing);
+}
+
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited)
 {
     const real most = machine->torque_limit;
