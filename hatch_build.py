@@ -9,7 +9,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from packaging.tags import sys_tags
 
-GENERATOR = ["casadi==3.8.2", "numpy>=2", "pydantic>=2", "ruamel.yaml>=0.18", "typing-extensions"]
+GENERATOR = ["casadi==3.8.2", "cffi>=1.16", "numpy>=2", "pydantic>=2", "ruamel.yaml>=0.18"]
 COMPILER = ["ziglang==0.17.1"]
 
 

@@ -27,7 +27,6 @@ from stewart_drake.mechanism.kinematics import (
     leg_geometry,
     legs_along,
     reach_margins,
-    reach_margins_along,
 )
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.clearance import clearance_along, study_clearance
@@ -89,7 +88,7 @@ def test_legs_along_a_motion_are_those_of_each_pose(seed):
             np.testing.assert_allclose(
                 getattr(many, field.name)[k], getattr(one, field.name), rtol=1e-12, atol=1e-12
             )
-        margins = reach_margins_along(mechanism, poses)[k]
+        margins = reach_margins(mechanism, poses)[k]
         np.testing.assert_allclose(margins, reach_margins(mechanism, pose), atol=1e-15)
 
 

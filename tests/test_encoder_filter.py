@@ -19,7 +19,7 @@ from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.parameter_filter import Period
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.mechanism.kinematics import crank_angles_along
+from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.calibration import OFFSETS
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import PARAMETERS, POSE, RATES
@@ -132,9 +132,9 @@ def reading(sensing, said, shown, last, still):
 def test_angles_along_a_path_are_those_of_each_pose():
     poses = PAPER.home + 0.3 * MOTION * RNG.uniform(-1, 1, (50, 6))
     expected = np.array([PAPER.crank_angles(pose) for pose in poses])
-    assert np.array_equal(crank_angles_along(PAPER, poses), expected)
+    assert np.array_equal(legs_along(PAPER, poses).crank_angles, expected)
     away = PAPER.home + [0, 0, 0, 0, 0, 1.0]
-    assert np.all(np.isnan(crank_angles_along(PAPER, away[None])))
+    assert np.all(np.isnan(legs_along(PAPER, away[None]).crank_angles))
 
 
 def test_the_jacobian_is_that_of_what_is_seen():
@@ -168,7 +168,7 @@ def test_a_pose_is_as_uncertain_as_its_angles():
 def test_a_start_bears_spikes_and_a_leg_that_is_silent():
     many = sensing(100)
     poses = START[POSE] + np.linspace(-DT, 0, 101)[1:, None] * START[RATES]
-    read = crank_angles_along(PAPER, poses)
+    read = legs_along(PAPER, poses).crank_angles
     read[[10, 95, 99], [0, 3, 5]] += 1.0
     read[:, 4] = np.nan
     first = many.start(Measurement.of(read.ravel()), START)
@@ -300,7 +300,7 @@ def follow(encoders, wrong):
         back = 3 * (PAPER.home - state[POSE]) - 2 * state[RATES] + MOTION * rng.uniform(-1, 1, 6)
         torque = DYNAMICS.inverse_dynamics(state[POSE], state[RATES], back)
         states = DYNAMICS.predict(state, np.tile(torque, (N, 1)), DT / N, 4)
-        state, read = states[-1], crank_angles_along(PAPER, states[:, POSE])
+        state, read = states[-1], legs_along(PAPER, states[:, POSE]).crank_angles
         if encoders.quantum > 0:
             read = encoders.quantum * np.round(read / encoders.quantum)
         said = Measurement.of((read + off).ravel())

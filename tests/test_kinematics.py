@@ -10,11 +10,11 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.optimize import minimize_scalar
 
-from stewart_drake.core.layout import geometry_of
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.mechanism.assembly import joint_state
 from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.mechanism.kinematics import (
     ForwardKinematicsError,
     SingularPoseError,

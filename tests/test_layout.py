@@ -14,7 +14,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.experiment import assemble, check_instants, prepare
 from stewart_drake.mechanism.assembly import assemble as placed
 from stewart_drake.mechanism.files import build_mechanism, load_mechanism, mechanism_spec
-from stewart_drake.mechanism.inertias import bar_inertia
+from stewart_drake.mechanism.geometry import bar_inertia
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.layout_search import (

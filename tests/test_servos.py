@@ -28,7 +28,7 @@ from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.servo_design import compose_servo_law, servo_loop
 from stewart_drake.loop.simulation import make_simulator
-from stewart_drake.mechanism.inertias import with_rotors
+from stewart_drake.mechanism.geometry import with_rotors
 from stewart_drake.scenario.config import ServoActuatorConfig, TorqueActuatorConfig
 from stewart_drake.scenario.link import measurement_times
 from stewart_drake.scenario.loading import load_comparison

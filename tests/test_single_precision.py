@@ -10,10 +10,10 @@ from cffi import FFI
 
 import stewart_drake as sd
 from stewart_drake.core import build, library
-from stewart_drake.core.layout import geometry_of
 from stewart_drake.law.delay_observer import DelayBelief, DelayObserver
 from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.parameter_filter import ParameterFilter, gate
+from stewart_drake.mechanism.geometry import geometry_of
 from tests.backends import stepped_in_python
 
 HOST = ("dop853", "packed", "packed_law", "plant")

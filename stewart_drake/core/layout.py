@@ -2,9 +2,6 @@
 
 from typing import Final, NamedTuple
 
-import numpy as np
-
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
     NUM_LEGS,
@@ -12,7 +9,6 @@ from stewart_drake.scenario.signals import (
     NUM_STATE,
     NUM_TORQUES,
 )
-from stewart_drake.types import Array
 
 STANDARD_GRAVITY: Final = 9.81
 """m/s^2, along -z of W; Drake's default."""
@@ -74,28 +70,3 @@ SIGNATURES: Final = {
     "margin": _signature("pose sign least", ()),
 }
 """What packed.c holds, and `predict`; the geometry stands between arguments and results."""
-
-
-def plate_radius(mechanism: Mechanism) -> float:
-    """Mean distance of the plate's joints from its COM, m."""
-    return float(np.linalg.norm(mechanism.p_PQ, axis=1).mean())
-
-
-def geometry_of(mechanism: Mechanism) -> Array:
-    """The numbers of a machine, (GEOMETRY,), in the order of `dynamics.numbers`."""
-    m = mechanism
-    legs = np.column_stack(
-        [
-            m.crank_lengths,
-            m.rod_lengths,
-            m.branches,
-            m.R_WS.transpose(0, 2, 1).reshape(NUM_LEGS, 9),
-            m.p_PQ,
-            m.p_WS,
-        ]
-    )
-    crank = [m.crank.mass, m.crank.center, m.crank.inertia[2]]
-    rod = [m.rod.mass, m.rod.center, *m.rod.inertia]
-    return np.array(
-        [*legs.T.ravel(), m.plate.mass, *m.plate.inertia, *crank, *rod, plate_radius(m)]
-    )

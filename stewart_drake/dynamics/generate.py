@@ -1,7 +1,7 @@
 """`python -m stewart_drake.dynamics.generate` writes core/equations.h and models/*.sdf.
 
 The expressions are those of `dynamics.equations`, for any machine: its geometry
-(`core.layout.geometry_of`) is an argument. A function of one leg is a loop of six, which a
+(`mechanism.geometry.geometry_of`) is an argument. A function of one leg is a loop of six, which a
 compiler can do for several legs at a time. core/dynamics.c calls these functions.
 """
 

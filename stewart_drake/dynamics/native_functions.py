@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stewart_drake.core.layout import SHAPES, SIGNATURES, geometry_of
+from stewart_drake.core.layout import SHAPES, SIGNATURES
 from stewart_drake.core.library import core_library
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, NUM_STATE, NUM_TORQUES
 from stewart_drake.types import Array
 

@@ -1,15 +1,15 @@
 """A mechanism's numbers as the equations take them: floats, or symbols in their place.
 
 With floats an expression is that of one machine. With symbols it is that of every machine, whose
-geometry (`core.layout.geometry_of`) is one more argument.
+geometry (`mechanism.geometry.geometry_of`) is one more argument.
 """
 
 from typing import NamedTuple
 
 import casadi as ca
 
-from stewart_drake.core.layout import COMMON_NUMBERS, LEG_NUMBERS, plate_radius
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.core.layout import COMMON_NUMBERS, LEG_NUMBERS
+from stewart_drake.mechanism.geometry import Mechanism, plate_radius
 
 Number = float | ca.SX
 Numbers = ca.DM | ca.SX

@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.core.layout import LEG_NUMBERS, geometry_of, plate_radius
+from stewart_drake.core.layout import LEG_NUMBERS
 from stewart_drake.identification.model import LEG_PLACES, NUM_DYNAMIC, NUM_GEOMETRY, Numbers
 from stewart_drake.identification.tolerances import Tolerances
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.geometry import Mechanism, geometry_of, plate_radius
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.core.layout import geometry_of
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.timeline import TorqueSchedule
+from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     NUM_REFERENCE,

@@ -6,11 +6,10 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from stewart_drake.core.layout import geometry_of
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.frozen_map import FrozenDynamics
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.scenario.signals import PLANT_PARAMETERS
 from stewart_drake.types import Array
 

@@ -13,7 +13,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from stewart_drake.core.layout import geometry_of
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import home_sign
@@ -47,6 +46,7 @@ from stewart_drake.law.predictors import ArrivalPredictor, NonlinearPredictor
 from stewart_drake.law.sensing import Sensing, StateSensing, state_sensor
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
     NUM_LEGS,

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stewart_drake.core.layout import geometry_of
 from stewart_drake.dynamics.frozen_map import FrozenDynamics
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.catch_up import DEFAULT_CATCH_UP
@@ -36,6 +35,7 @@ from stewart_drake.law.predictors import Ahead, Predictor
 from stewart_drake.law.return_path import ReturnPath
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.signals import (
     NUM_COORDINATES,

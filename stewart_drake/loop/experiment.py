@@ -17,8 +17,7 @@ from stewart_drake.law.startup import (
 )
 from stewart_drake.loop.own import NOTHING, Own, own_motion, take
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.geometry import Mechanism, fingerprint
-from stewart_drake.mechanism.inertias import with_rotors
+from stewart_drake.mechanism.geometry import Mechanism, fingerprint, with_rotors
 from stewart_drake.scenario.calibration import DELAY, OFFSETS, Calibration, load_calibration
 from stewart_drake.scenario.config import (
     Scenario,

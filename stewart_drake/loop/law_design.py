@@ -12,7 +12,6 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.core.layout import plate_radius
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import validate
@@ -63,6 +62,7 @@ from stewart_drake.loop.experiment import (
 from stewart_drake.loop.kinds import LINKS, REPORTS, SENSORS
 from stewart_drake.loop.own import Own, own_motion
 from stewart_drake.loop.reference import Reference
+from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.scenario.calibration import OFFSETS
 from stewart_drake.scenario.config import (
     ControllerConfig,

@@ -17,7 +17,7 @@ from pydrake.systems.framework import (
 from stewart_drake.core.link import Link
 from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import crank_angles_along
+from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.fault_config import SPIKE
 from stewart_drake.scenario.link import TOGETHER
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, NUM_STATE, POSE
@@ -316,7 +316,7 @@ class Encoders(LeafSystem):
         if last == number:
             return number, window
         state = np.asarray(self._state.Eval(context))
-        angles = crank_angles_along(self._mechanism, state[None, POSE])[0] + self._offset
+        angles = legs_along(self._mechanism, state[POSE]).crank_angles + self._offset
         if self._quantum > 0:
             q, p = self._quantum, self._phases
             angles = q * (np.round(angles / q + p) - p)

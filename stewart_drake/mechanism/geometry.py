@@ -13,13 +13,14 @@ Frames, in Drake's monogram notation, leg by leg (leading axis of length six):
 
 import hashlib
 import re
-from dataclasses import KW_ONLY, dataclass, fields
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stewart_drake.core.library import core
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism import kinematics
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS
@@ -27,14 +28,20 @@ from stewart_drake.types import Array
 
 RESERVED_NAMES: Final = ("world", "WorldModelInstance", "DefaultModelInstance")
 """Names that SDFormat and Drake keep for themselves."""
+THINNESS: Final = 20.0
+"""Length over diameter of an estimated crank or rod."""
+_BRANCHES: Final = slice(2 * NUM_LEGS, 3 * NUM_LEGS)
+"""Place of the crank branches in `geometry_of`."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body: mass in kg, principal moments of inertia (3,) about its COM in kg m^2.
+    """A rigid body.
 
-    `estimated`: nobody measured the moments, they are those of a uniform body
-    (`mechanism.inertias`); the mathematics does not care.
+    Attributes:
+        mass: kg.
+        inertia: principal moments (3,) about its COM, kg m^2.
+        estimated: whether the moments are those of a uniform body, not measured ones.
     """
 
     mass: float
@@ -43,31 +50,23 @@ class Body:
     estimated: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "inertia", _read_only(self.inertia))
+        object.__setattr__(self, "inertia", _fixed("inertia", self.inertia, (3,)))
 
-    def problems(self, field: str, *, massless: bool = False) -> list[str]:
-        """Why no rigid body has this mass and inertia: at most one line, opened by `field`."""
-        found, moments = self.inertia, _listed(self.inertia)
-        nothing = massless and self.mass == 0
+    def problem(self, field: str, *, massless: bool = False) -> str | None:
+        """Return why no rigid body has this mass and inertia, opened by `field`, or None."""
+        moments, nothing = self.inertia, massless and self.mass == 0
+        got = f"{field}.inertia: got {_listed(moments)} kg m^2"
+        if not (0 < self.mass < np.inf or nothing):
+            return f"{field}.mass: got {self.mass:g} kg; expected a positive mass"
+        if np.any(moments <= 0) and not nothing:
+            return f"{got}; expected positive moments"
         # A moment larger than the sum of the other two needs negative mass somewhere.
-        if found.shape != (3,):
-            problem = f".inertia: got shape {found.shape}; expected (3,)"
-        elif not np.all(np.isfinite([self.mass, *found])):
-            problem = (
-                f": got mass {self.mass:g} kg, inertia {moments} kg m^2; expected finite numbers"
+        if (excess := 2 * moments.max() - moments.sum()) > 1e-9 * moments.max():
+            return (
+                f"{got}, which violates the triangle inequality by {excess:.3g}; expected the "
+                "largest moment to be at most the sum of the other two"
             )
-        elif not self.mass > 0 and not nothing:
-            problem = f".mass: got {self.mass:g} kg; expected a positive mass"
-        elif np.any(found <= 0) and not nothing:
-            problem = f".inertia: got {moments} kg m^2; expected positive moments"
-        elif (excess := 2 * found.max() - found.sum()) > 1e-9 * found.max():
-            problem = (
-                f".inertia: got {moments} kg m^2, which violates the triangle inequality by "
-                f"{excess:.3g}; expected the largest moment to be at most the sum of the other two"
-            )
-        else:
-            return []
-        return [field + problem]
+        return None
 
 
 @dataclass(frozen=True)
@@ -80,19 +79,17 @@ class Link(Body):
 
     center: float = 0.5
 
-    def problems(self, field: str, *, massless: bool = False) -> list[str]:
-        """As for any body; and a centre of mass beyond the ends."""
-        found = super().problems(field, massless=massless)
+    def problem(self, field: str, *, massless: bool = False) -> str | None:
         if not 0 <= self.center <= 1:
-            found.append(
-                f"{field}.center: got {self.center:g}; expected a fraction of the length "
-                "between 0 and 1"
+            return (
+                f"{field}.center: got {self.center:g}; expected a fraction of the length between "
+                "0 and 1"
             )
-        return found
+        return super().problem(field, massless=massless)
 
 
-@dataclass(frozen=True, eq=False)
-class Mechanism:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Mechanism(kinematics.Legs):
     """A rotary Stewart platform (6-RSS), SI units.
 
     Attributes:
@@ -102,7 +99,7 @@ class Mechanism:
         R_WS: motor frames (6, 3, 3); columns x, y and the motor axis z.
         p_PQ: plate joints (6, 3) in the plate frame, m.
         crank_lengths, rod_lengths: (6,) m.
-        branches: (6,) of -1 or +1, which of the two crank solutions a leg uses.
+        branches: (6,) of -1 or +1, the crank solution that a leg uses.
         base, plate, crank, rod: masses and inertias; the six cranks are alike, so are the rods.
         effort_limit: of each motor in N m, written to SDFormat and the default of a scenario's
             `actuator.torque_limit`; or None.
@@ -114,12 +111,6 @@ class Mechanism:
 
     name: str
     home: Array
-    p_WS: Array
-    R_WS: Array
-    p_PQ: Array
-    crank_lengths: Array
-    rod_lengths: Array
-    branches: Array
     base: Body
     plate: Body
     crank: Link
@@ -129,19 +120,10 @@ class Mechanism:
     def __post_init__(self) -> None:
         for field, shape in (
             ("home", (6,)),
-            ("p_WS", (NUM_LEGS, 3)),
-            ("R_WS", (NUM_LEGS, 3, 3)),
-            ("p_PQ", (NUM_LEGS, 3)),
-            ("crank_lengths", (NUM_LEGS,)),
-            ("rod_lengths", (NUM_LEGS,)),
-            ("branches", (NUM_LEGS,)),
+            *(("p_WS", (NUM_LEGS, 3)), ("R_WS", (NUM_LEGS, 3, 3)), ("p_PQ", (NUM_LEGS, 3))),
+            *((name, (NUM_LEGS,)) for name in ("crank_lengths", "rod_lengths", "branches")),
         ):
-            value = _read_only(getattr(self, field))
-            if value.shape != shape:
-                raise ConfigError(f"{field}: got shape {value.shape}; expected {shape}")
-            if not np.all(np.isfinite(value)):
-                raise ConfigError(f"{field}: got {_listed(value)}; expected finite numbers")
-            object.__setattr__(self, field, value)
+            object.__setattr__(self, field, _fixed(field, getattr(self, field), shape))
         self._check()
 
     def __repr__(self) -> str:
@@ -153,14 +135,9 @@ class Mechanism:
 
     @cached_property
     def _key(self) -> tuple[object, ...]:
-        values: list[object] = []
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, Body):
-                values += [value.mass, value.inertia.tobytes(), getattr(value, "center", None)]
-            else:
-                values.append(value.tobytes() if isinstance(value, np.ndarray) else value)
-        return tuple(values)
+        bodies = (x for b in (self.base, self.crank) for x in (b.mass, *b.inertia))
+        numbers = np.array([*self.home, *bodies, *geometry_of(self)])
+        return self.name, self.effort_limit, numbers.tobytes()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Mechanism) and self._key == other._key
@@ -169,93 +146,102 @@ class Mechanism:
         return hash(self._key)
 
     def _check(self) -> None:
-        if not re.fullmatch("[A-Za-z][A-Za-z0-9_-]*", self.name) or self.name in RESERVED_NAMES:
-            raise ConfigError(
-                f"name: got {self.name!r}; expected a letter, then letters, digits, _ or -, and "
-                f"none of {', '.join(RESERVED_NAMES)}"
-            )
-        for field, lengths in (("crank", self.crank_lengths), ("rod", self.rod_lengths)):
-            if np.any(lengths <= 0):
-                raise ConfigError(
-                    f"{field}.length: got {_listed(lengths)} m; expected positive lengths"
-                )
-        for leg, (u, rod) in enumerate(zip(self.crank_lengths, self.rod_lengths, strict=True)):
-            if rod <= u:
-                raise ConfigError(
-                    f"rod.length: got {rod:g} m for leg {LEGS[leg]}, whose crank is {u:g} m; "
-                    "expected a rod longer than its crank"
-                )
-        if not np.all(np.abs(self.branches) == 1):
-            raise ConfigError(f"branches: got {_listed(self.branches)}; expected -1 or 1 six times")
+        u, rods = self.crank_lengths, self.rod_lengths
         skew = np.abs(self.R_WS @ self.R_WS.transpose(0, 2, 1) - np.eye(3)).max()
-        if skew > 1e-9 or np.any(np.linalg.det(self.R_WS) < 0):
-            raise ConfigError(
-                f"motor frames: off a rotation by {skew:.1e}; expected right-handed frames"
-            )
-        if abs(self.home[1]) >= np.pi / 2:
-            raise ConfigError(
-                f"home: got a pitch of {self.home[1]:g} rad; expected less than pi/2 in magnitude"
-            )
-        self._check_bodies()
-        if self.effort_limit is not None and not self.effort_limit > 0:
-            raise ConfigError(
-                f"motor.effort_limit: got {self.effort_limit:g} N m; expected a positive torque "
-                "or null"
-            )
-        try:
-            self.crank_angles(self.home)
-        except kinematics.UnreachablePoseError as error:
+        leg = int(np.argmax(rods <= u))
+        bodies = (
+            self.base.problem("base", massless=True),
+            *(getattr(self, name).problem(name) for name in ("plate", "crank", "rod")),
+        )
+        problems = "; ".join(filter(None, bodies))
+        for is_met, problem in (
+            (
+                re.fullmatch("[A-Za-z][A-Za-z0-9_-]*", self.name)
+                and self.name not in RESERVED_NAMES,
+                f"name: got {self.name!r}; expected a letter, then letters, digits, _ or -, and "
+                f"none of {', '.join(RESERVED_NAMES)}",
+            ),
+            (np.all(u > 0), f"crank.length: got {_listed(u)} m; expected positive lengths"),
+            (
+                np.all(rods > u),
+                f"rod.length: got {rods[leg]:g} m for leg {LEGS[leg]}, whose crank is {u[leg]:g} "
+                "m; expected a rod longer than its crank",
+            ),
+            (
+                np.all(np.abs(self.branches) == 1),
+                f"branches: got {_listed(self.branches)}; expected -1 or 1 six times",
+            ),
+            (
+                skew <= 1e-9 and np.all(np.linalg.det(self.R_WS) > 0),
+                f"motor frames: off a rotation by {skew:.1e}; expected right-handed frames",
+            ),
+            (
+                abs(self.home[1]) < np.pi / 2,
+                f"home: got a pitch of {self.home[1]:g} rad; expected less than pi/2 in magnitude",
+            ),
+            (not problems, problems),
+            (
+                self.effort_limit is None or self.effort_limit > 0,
+                f"motor.effort_limit: got {self.effort_limit} N m; expected a positive torque or "
+                "null",
+            ),
+        ):
+            if not is_met:
+                raise ConfigError(problem)
+        margins = kinematics.reach_margins(self, self.home)
+        if not np.all(margins >= 0):
+            heights = kinematics.reachable_heights(self, self.home)
+            where = "at this x, y and orientation"
+            if heights is None:
+                accepted = f"of which there is none {where}"
+            else:
+                low, high = heights
+                middle = (low + high) / 2
+                accepted = f"{where} z between {low:.4g} and {high:.4g} m, such as {middle:.4g}"
             raise kinematics.UnreachablePoseError(
-                error.margins,
+                margins,
                 prefix=f"home: got {_listed(self.home)}, out of reach",
-                suffix=f"; expected a home pose within reach, {self._reachable_z()}",
-            ) from None
-
-    def _check_bodies(self) -> None:
-        # All four are looked at, so that a file is mended in one go.
-        problems = [
-            *self.base.problems("base", massless=True),
-            *self.plate.problems("plate"),
-            *self.crank.problems("crank"),
-            *self.rod.problems("rod"),
-        ]
-        if problems:
-            raise ConfigError("; ".join(problems))
-
-    def _reachable_z(self) -> str:
-        """What z would do for home, in words."""
-        where = "at this x, y and orientation"
-        found = kinematics.reachable_heights(self, self.home)
-        if found is None:
-            return f"of which there is none {where}"
-        low, high = found
-        return f"{where} z between {low:.4g} and {high:.4g} m, such as {(low + high) / 2:.4g}"
+                suffix=f"; expected a home pose within reach, {accepted}",
+            )
 
     def crank_angles(self, pose: ArrayLike) -> Array:
-        """Inverse kinematics, equations (1)-(5): crank angles (6,) in rad at a pose (6,).
-
-        This and the methods below take what numpy makes six numbers of; else a ValueError.
+        """Return the crank angles (6,) in rad at a pose (6,), equations (1)-(5).
 
         Raises:
             UnreachablePoseError: naming the legs and by how much each falls short.
         """
-        return kinematics.crank_angles(self, _six("pose", pose))
+        return kinematics.leg_geometry(self, _six("pose", pose)).crank_angles
 
     def reach_margins(self, pose: ArrayLike) -> Array:
-        """Distance (6,) in m that each leg has left to reach its plate joint; < 0 out of reach."""
+        """Return the distance (6,) in m that each leg has left; negative out of reach."""
         return kinematics.reach_margins(self, _six("pose", pose))
 
     def forward_kinematics(self, crank_angles: ArrayLike, guess: ArrayLike | None = None) -> Array:
-        """Pose (6,) of the assembly nearest to `guess` (default: home) with these crank angles.
+        """Return the pose (6,) of the assembly near `guess` (default: home), see core/kinematics.h.
 
         Raises:
-            ForwardKinematicsError: Newton did not converge, or found another crank branch.
+            ForwardKinematicsError: no such pose on the mechanism's crank branches.
         """
         guess = self.home if guess is None else _six("guess", guess)
-        return kinematics.forward_kinematics(self, _six("crank_angles", crank_angles), guess)
+        angles, numbers = _six("crank_angles", crank_angles), geometry_of(self)
+        pose = _pose_of(numbers, angles, guess)
+        if pose is not None:
+            return pose
+        for leg in LEGS:
+            other = numbers.copy()
+            other[_BRANCHES][leg - 1] *= -1
+            if _pose_of(other, angles, guess) is not None:
+                raise kinematics.ForwardKinematicsError(
+                    "forward kinematics found a pose that needs the other crank branch on leg "
+                    f"{leg}; expected crank angles of the mechanism's own branches"
+                )
+        raise kinematics.ForwardKinematicsError(
+            "forward kinematics did not converge: no pose near the guess has these crank angles; "
+            "give a guess closer to the assembly"
+        )
 
     def jacobian(self, pose: ArrayLike) -> Array:
-        """d crank_angles / d pose (6, 6), in closed form.
+        """Return d crank_angles / d pose (6, 6), in closed form.
 
         Raises:
             UnreachablePoseError: the pose is out of reach.
@@ -264,8 +250,35 @@ class Mechanism:
         return kinematics.jacobian(self, _six("pose", pose))
 
 
+def _pose_of(numbers: Array, angles: Array, guess: Array) -> Array | None:
+    c, pose = core(), guess.copy()
+    given = (c.at(numbers), c.at(angles), c.at(pose), c.scratch(48))
+    return pose if c.lib.stewart_forward_kinematics(*given) else None
+
+
+def plate_radius(mechanism: kinematics.Legs) -> float:
+    """Return the mean distance of the plate's joints from its COM, m."""
+    return float(np.linalg.norm(mechanism.p_PQ, axis=1).mean())
+
+
+def geometry_of(mechanism: Mechanism) -> Array:
+    """Return the numbers of a machine as the core takes them, see `core.layout`.
+
+    Leg by leg within each number: lengths of crank and rod, branch, R_WS by columns, p_PQ, p_WS.
+    Then mass and inertia of the plate; mass, centre and inertia about the motor axis of the crank;
+    mass, centre and inertia of the rod; the plate's mean radius.
+    """
+    m = mechanism
+    R_WS = m.R_WS.transpose(0, 2, 1).reshape(NUM_LEGS, 9)
+    legs = np.column_stack([m.crank_lengths, m.rod_lengths, m.branches, R_WS, m.p_PQ, m.p_WS])
+    crank = [m.crank.mass, m.crank.center, m.crank.inertia[2]]
+    rod = [m.rod.mass, m.rod.center, *m.rod.inertia]
+    plate = [m.plate.mass, *m.plate.inertia]
+    return np.array([*legs.T.ravel(), *plate, *crank, *rod, plate_radius(m)])
+
+
 def fingerprint(mechanism: Mechanism) -> str:
-    """Of the numbers that a machine moves by: what was found of one is not used for another.
+    """Return a hash of the numbers that determine the motion, so that data of others are refused.
 
     Lengths count to a nanometre, masses and inertias to nine digits: writing a machine to a file
     and reading it again changes nothing. Name, home, base and motors do not count.
@@ -279,22 +292,62 @@ def fingerprint(mechanism: Mechanism) -> str:
     return hashlib.sha256(" ".join(words).encode()).hexdigest()[:16]
 
 
+def bar_inertia(mass: float, length: float) -> Array:
+    """Return the principal moments (3,) in kg m^2, along and twice across, of a uniform round bar.
+
+    With length L, diameter d and constant density m / (pi d^2/4 L),
+
+        about its axis     I_x = integral of r^2 dm           = m d^2/8
+        across it          I_y = I_z = integral of x^2 dm + half of I_x = m (L^2/12 + d^2/16).
+
+    The diameter is unknown; with L/d = THINNESS the second term is 0.2 % of the first. The limit
+    d = 0, a slender rod, has no inertia about its own axis, which no rigid body can have.
+    """
+    diameter = length / THINNESS
+    across = length**2 / 12 + diameter**2 / 16
+    return mass * np.array([diameter**2 / 8, across, across])
+
+
+def disc_inertia(mass: float, radius: float) -> Array:
+    """Return the principal moments (3,) in kg m^2 of a thin uniform disc, the last about its axis.
+
+    I_z = integral of r^2 dm = m R^2/2 about its axis, and since I_z = I_x + I_y for any flat body,
+    m R^2/4 across it.
+    """
+    return mass * radius**2 * np.array([0.25, 0.25, 0.5])
+
+
+def with_rotors(mechanism: Mechanism, inertia: float) -> Mechanism:
+    """Return the machine with rotors of inertia N^2 I in kg m^2 at the shafts.
+
+    A rotor of moment I that turns N times as fast as its crank has the energy I (N a')^2 / 2, as if
+    the crank had N^2 I more about the motor axis. The axis is fixed, so the crank's other moments
+    have no effect. Each gets half of it, as for a thin disc: no body has a moment that is larger
+    than the sum of the other two.
+    """
+    if inertia == 0:
+        return mechanism
+    crank, disc = mechanism.crank, inertia * np.array([0.5, 0.5, 1.0])
+    return replace(mechanism, crank=replace(crank, inertia=crank.inertia + disc))
+
+
 def _six(name: str, values: ArrayLike) -> Array:
-    """Six numbers; fewer would be broadcast, or end in a message about arrays."""
+    """Return six numbers; fewer would be broadcast."""
     numbers = np.asarray(values, dtype=np.float64)
     if numbers.shape != (6,):
-        what = (
-            "six crank angles in rad"
-            if name == "crank_angles"
-            else ("[roll, pitch, yaw, x, y, z] in rad and m")
-        )
+        angles = name == "crank_angles"
+        what = "crank angles in rad" if angles else "[roll, pitch, yaw, x, y, z] in rad and m"
         raise ValueError(f"{name}: got shape {numbers.shape}; expected (6,), {what}")
     return numbers
 
 
-def _read_only(values: ArrayLike) -> Array:
-    """A copy of its own that nobody can write to."""
+def _fixed(field: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return a read-only copy of finite numbers of this shape."""
     copy = np.array(values, dtype=np.float64)
+    if copy.shape != shape:
+        raise ConfigError(f"{field}: got shape {copy.shape}; expected {shape}")
+    if not np.all(np.isfinite(copy)):
+        raise ConfigError(f"{field}: got {_listed(copy)}; expected finite numbers")
     copy.setflags(write=False)
     return copy
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from stewart_drake.loop.clearance import ClearanceScene, Pair
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import reach_margins_along
+from stewart_drake.mechanism.kinematics import reach_margins
 from stewart_drake.scenario.signals import NUM_COORDINATES
 from stewart_drake.studies.workspace_map import Section, Travel, last_inside
 from stewart_drake.types import Array
@@ -158,7 +158,7 @@ def clearance_along(
 ) -> ClearanceAlong:
     """At the poses (n, 6), those out of reach left out."""
     distances = np.full((len(time), len(scene.pairs)), np.nan)
-    for k in np.flatnonzero((reach_margins_along(mechanism, poses) > 0).all(axis=1)):
+    for k in np.flatnonzero((reach_margins(mechanism, poses) > 0).all(axis=1)):
         distances[k] = scene.distances(poses[k])
     seen = np.flatnonzero(np.isfinite(distances[:, 0]))
     rows = seen[distances[seen].argmin(axis=0)] if len(seen) else []

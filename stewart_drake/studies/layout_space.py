@@ -26,14 +26,13 @@ from stewart_drake.mechanism.files import (
     LinkSpec,
     MechanismSpec,
     PatternSpec,
-    SixLegs,
     pattern_legs,
 )
 from stewart_drake.mechanism.kinematics import (
     LegGeometry,
     Legs,
     legs_along,
-    reach_margins_along,
+    reach_margins,
     rotation,
 )
 from stewart_drake.scenario.signals import ACCELERATIONS, ANGLES, POSE, RATES
@@ -89,7 +88,7 @@ def motion_of(home: Array, reference: Trajectory, time: Array) -> Motion:
 
 def least_reach(legs: Legs, motion: Motion) -> float:
     """m, negative where a pose is out of reach."""
-    return float(reach_margins_along(legs, motion.poses).min())
+    return float(reach_margins(legs, motion.poses).min())
 
 
 def geometry(mechanism: Legs, motion: Motion) -> dict[str, float]:
@@ -121,7 +120,7 @@ def geometry(mechanism: Legs, motion: Motion) -> dict[str, float]:
 
 def _turns(legs: LegGeometry, poses: Array) -> Array:
     """Angles (n, 6) in rad between a rod as the plate sees it and as it saw it at home."""
-    R_WP = np.moveaxis(rotation(poses[:, ANGLES].T), -1, 0)
+    R_WP = rotation(poses[:, ANGLES])
     seen = legs.rod @ R_WP
     return np.arccos(np.clip(np.einsum("nli,li->nl", seen, seen[0]), -1.0, 1.0))
 
@@ -257,7 +256,7 @@ class Space:
             for name, (low, high) in self.bounds.items()
         ]
 
-    def legs(self, values: Sequence[float] | Array, arrangement: Arrangement) -> SixLegs:
+    def legs(self, values: Sequence[float] | Array, arrangement: Arrangement) -> Legs:
         """Return the legs, which kinematics needs."""
         named = dict(zip(PARAMETERS, map(float, values), strict=True))
         crank, rod = named.pop("crank"), named.pop("rod")

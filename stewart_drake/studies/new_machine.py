@@ -27,9 +27,9 @@ from stewart_drake.files.fileio import write_whole
 from stewart_drake.law.startup import reference_torque
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.experiment import prepare
-from stewart_drake.mechanism.files import PatternSpec, SixLegs, load_mechanism, pattern_legs
+from stewart_drake.mechanism.files import PatternSpec, load_mechanism, pattern_legs
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import leg_geometry, reachable_heights
+from stewart_drake.mechanism.kinematics import Legs, leg_geometry, reachable_heights
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES
@@ -198,7 +198,7 @@ def best_height(pattern: PatternSpec, m: Measurements) -> float:
     return float(heights[int(np.argmax(push))])
 
 
-def _gap(legs: SixLegs) -> float:
+def _gap(legs: Legs) -> float:
     """Largest horizontal distance of a shaft from its joint, m."""
     return float(np.linalg.norm((legs.p_PQ - legs.p_WS)[:, :2], axis=1).max())
 
