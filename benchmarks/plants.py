@@ -34,7 +34,7 @@ from stewart_drake.dynamics.native_plant import NativePlant
 from stewart_drake.dynamics.open_loop import Drive, in_c
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.platforms import MultibodyStewart
-from stewart_drake.reporting.style import figure_style, write_figure
+from stewart_drake.reporting.style import figure_style, write_figures
 from stewart_drake.scenario.signals import POSE, RATES
 
 ROUNDS, BUDGET = 25, 2.0
@@ -255,7 +255,7 @@ def main() -> None:
     more = f", mujoco {mujoco.__version__}"
     write(__file__, "Error against computing time", parts, more)
     with figure_style():
-        write_figure(figure(curves), RESULTS, "plants")
+        write_figures({"plants": figure(curves)}, RESULTS)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import typer
 from stewart_drake.cli.common import AsJson, Delivery, Out, Quiet, Settings
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.tolerances import TOLERANCE_UNITS, read_tolerances
-from stewart_drake.reporting.terminal import working
+from stewart_drake.reporting.terminal import count_bar
 from stewart_drake.studies.options import refuse
 
 if TYPE_CHECKING:
@@ -105,14 +105,14 @@ def identify(
         chosen["command"] = command_line(
             "identify", settings=settings or [], options={"plan": plan, **typed}
         )
-        with working("plan", quiet):
+        with count_bar("plan", quiet, "computing"):
             found = functions.plan_identification(loaded, poses=pose_std is not None, **chosen)
         delivery.discard(MOTION, functions.SCENARIO)
     else:
         words = [*map(str, logs or []), *(["--no-gravity"] if gravity is False else [])]
         options = {"mechanism": mechanism, **typed}
         chosen["command"] = command_line("identify", *words, options=options)
-        with working("identify", quiet):
+        with count_bar("identify", quiet, "computing"):
             found = functions.identify(
                 logs or [], mechanism or "", delay=delay, gravity=gravity is not False, **chosen
             )

@@ -18,7 +18,7 @@ from stewart_drake.live.rows import RowFile
 from stewart_drake.loop.controller import held_by
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.recording import Record, Table
-from stewart_drake.reporting.csv_file import columns_of
+from stewart_drake.reporting.csv_file import headings
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, TUNER_INPUTS, ports_of
 from stewart_drake.types import Array
@@ -71,7 +71,7 @@ class LiveRecord(Record):
         for signal in self._recorded:
             dimension = signal.quantity.dimension
             labels = () if dimension is None else self._dimensions[dimension].labels
-            header += columns_of(signal, labels)
+            header += headings(signal.name, labels, signal.quantity.units)
         self._file = RowFile(path, [*header, "step[s]", "late[s]"], say)
 
     def acted(self, torques: dict[int, Array]) -> None:

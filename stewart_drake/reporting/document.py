@@ -1,28 +1,28 @@
-"""Documents of results: made once, shown as a page (`reporting.page`) and at a terminal.
+"""Documents of results, shown as a page (`reporting.page`) and on a terminal.
 
-A document is a verdict and sections, a section an ordered list of blocks. A page shows all of it; a
-terminal of 80 columns shows the verdict and, of sections that are not folded, the blocks that are
-`brief`.
+A document is a verdict and sections; a section is an ordered list of blocks. A page shows all of
+it. A terminal of 80 columns shows the verdict and the `brief` blocks of sections that are not
+folded.
 
-Its words are a template, templates/NAME.md.j2, of parts with empty lines between them. Jinja fills
-in each part by itself, so that no value can change the structure; a part that comes out empty is
-left out, and numbers get three significant digits.
+The text of a document is a template, templates/NAME.md.j2: parts with empty lines between them.
+Jinja renders each part separately, so that no value can change the structure. A part that is empty
+after rendering is left out. Numbers get three significant digits.
 
     ! Title                  begins the document; paragraphs are its verdict, values its facts
     # Heading                begins a section, #- a folded one
     text                     is a paragraph of a page
     > text                   is a paragraph of a page and of a terminal
     = name :: value          is a value with its name
-    @name caption            is what the context has by this name: blocks, or what draws a figure;
-                             a paragraph where that is True
+    @name caption            is the context's entry of this name: blocks, or a function that draws
+                             a figure; a paragraph if it is True
       | head :: cell         below it is a column of a table of all `it` in the named items
-      | head :: brief :: cell    with the head at a terminal, where - leaves the column out
+      | head :: brief :: cell    with the head on a terminal, where - leaves the column out
       | @other               has the columns of another table
     text
       + cell :: cell         below it are head and rows of a table
       = name :: value        below it is a value of the named item, `it`
 
-A terminal shows a table or a paragraph of `@>name`. No line of a head is broken at a ~, a blank.
+A terminal shows a table or a paragraph of `@>name`. A line is not broken at ~, a blank.
 """
 
 import math
@@ -43,12 +43,14 @@ Tone = Literal["good", "fair", "bad", "plain"]
 
 WIDTH: Final = 80
 _NO_BREAK: Final = "\N{NO-BREAK SPACE}"
+_JOINED: Final = "\ue000"
+"""Placeholder for a no-break space, at which rich would break a line."""
 _TOGETHER: Final = (
     r"(?<=\d) (?=(?:%|mm|ms|s|N|mN|kg|deg)(?!\w))|(?<=N) (?=m\b)|(?<=\d %) (?=s\b)|(?<=beatable:) "
 )
 """Spaces at which no line is broken: before a unit and in it."""
 _SHORT: Final = 36
-"""Characters of a cell that stays on one line of a page."""
+"""Characters of a cell that stays on one line."""
 
 
 def wrap(text: str, first: str = "", rest: str = "  ") -> str:
@@ -77,12 +79,12 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def capital(text: str) -> str:
-    """Return a text with a capital letter."""
+    """Return a text with a capital first letter."""
     return text[:1].upper() + text[1:]
 
 
 def sentence(text: str) -> str:
-    """Return a text with a capital letter and a full stop."""
+    """Return a text with a capital first letter and a full stop."""
     return capital(text).removesuffix(".") + "."
 
 
@@ -116,7 +118,7 @@ class Caution:
 
 @dataclass(frozen=True)
 class Values:
-    """Names and what they are, with units."""
+    """Names and values with units."""
 
     entries: Mapping[str, str]
     brief: bool = True
@@ -128,17 +130,16 @@ class Values:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; its cells are shown as they are, columns of numbers to the right.
+    """A table of texts; columns of numbers are aligned to the right.
 
     Attributes:
-        columns: the head, with units.
-        rows: as many cells each as there are columns; a terminal breaks them at "\\n".
-        caption: a sentence above it.
-        brief: whether a terminal shows it, or the heads that it has there, None for a column that
-            is left out; "\\n" breaks a head.
+        columns: heads, with units.
+        rows: cells; a terminal breaks them at "\\n".
+        caption: a sentence above the table.
+        brief: whether a terminal shows it, or the heads on a terminal, None for a column left out.
 
     Raises:
-        ValueError: a row of another length.
+        ValueError: a row of another length than the head.
     """
 
     columns: Sequence[str]
@@ -151,71 +152,55 @@ class Table:
         for count, row in enumerate(self.rows, start=1):
             if len(row) != len(self.columns):
                 raise ValueError(
-                    f"row {count} has {len(row)} cells; expected {len(self.columns)}, one per "
-                    "column"
+                    f"row {count} has {len(row)} cells; expected one per column, {len(self.columns)}"
                 )
 
     @cached_property
     def short(self) -> list[bool]:
-        """Per column, whether no cell need be broken over lines."""
+        """Whether all cells of a column fit on one line of a page, per column."""
         return [all(len(row[k]) <= _SHORT for row in self.rows) for k in range(len(self.columns))]
 
     @cached_property
     def numeric(self) -> list[bool]:
-        """Per column, whether its cells are numbers (or dashes) and are aligned to the right."""
-        return [
-            bool(self.rows) and all(_is_number(row[k]) for row in self.rows)
-            for k in range(len(self.columns))
-        ]
+        """Whether all cells of a column are numbers or dashes, per column."""
+        columns = range(len(self.columns))
+        return [bool(self.rows) and all(_is_number(row[k]) for row in self.rows) for k in columns]
 
     def plain(self) -> str:
-        """Return the table for a terminal; what is too wide is wrapped."""
+        """Return the table for a terminal, heads and long cells wrapped."""
         from rich.console import Console
         from rich.table import Table as Grid
         from rich.text import Text
 
-        console = Console(width=WIDTH, file=StringIO(), color_system=None)
-        brief = self.columns if isinstance(self.brief, bool) else self.brief
-        kept = [k for k, head in enumerate(brief) if head is not None]
-        heads = [brief[k] or "" for k in kept]
-        cells = [
-            min(
-                _SHORT,
-                max((len(part) for row in self.rows for part in row[k].split("\n")), default=1),
-            )
-            for k in kept
-        ]
-        for gap, most in ((2, WIDTH), (2, 16), (2, 13), (2, 10), (2, 1), (1, 10), (1, 1)):
-            shown = [
-                head
-                if "\n" in head
-                else textwrap.fill(head, max(width, most), break_long_words=False)
-                for head, width in zip(heads, cells, strict=True)
-            ]
-            widths = [
-                max(width, *map(len, head.split("\n")))
-                for head, width in zip(shown, cells, strict=True)
-            ]
-            if sum(widths) + gap * (len(kept) - 1) <= WIDTH:
-                break
+        heads = self.columns if isinstance(self.brief, bool) else self.brief
+        kept = {
+            k: head.replace(_NO_BREAK, _JOINED) for k, head in enumerate(heads) if head is not None
+        }
+        least = {
+            k: min(_SHORT, max(map(len, re.split("[ \n]", head) + _lines(self.rows, k))))
+            for k, head in kept.items()
+        }
+        gap = 2 if sum(least.values()) + 2 * len(least) <= WIDTH + 2 else 1
         grid = Grid(box=None, padding=(0, gap, 0, 0), pad_edge=False)
-        for k, head in zip(kept, shown, strict=True):
-            grid.add_column(Text(head), justify="right" if self.numeric[k] else "left")
+        for k, head in kept.items():
+            justify: Literal["right", "left"] = "right" if self.numeric[k] else "left"
+            grid.add_column(Text(head), justify=justify, min_width=least[k])
         for row in self.rows:
             grid.add_row(*(Text(row[k]) for k in kept))
+        console = Console(width=WIDTH, file=StringIO(), color_system=None)
         with console.capture() as capture:
             console.print(grid)
-        lines = [line.rstrip() for line in capture.get().splitlines()]
+        lines = [line.rstrip() for line in capture.get().replace(_JOINED, " ").splitlines()]
         return "\n".join([*([wrap(self.caption)] if self.caption else []), *lines])
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure and the sentence under it, for a page.
+    """A figure of a page and its caption.
 
     Attributes:
-        figure: drawn inside `style.figure_style`, or what draws it when the page is made.
-        caption: what it shows.
+        figure: drawn inside `style.figure_style`, or a function that draws it for a page.
+        caption: the sentence below it.
     """
 
     figure: "Figure | Callable[[], Figure]"
@@ -225,16 +210,15 @@ class Picture:
 
     @cached_property
     def drawn(self) -> "Figure":
-        """The figure."""
         return self.figure() if callable(self.figure) else self.figure
 
-    def __reduce__(self) -> tuple[Any, ...]:  # what draws it may hold what no process can send
+    def __reduce__(self) -> tuple[Any, ...]:  # the function may hold what cannot be pickled
         return Picture, (self.drawn, self.caption)
 
 
 @dataclass(frozen=True)
 class Listing:
-    """Lines shown as they are on a page."""
+    """Lines of a page, unchanged."""
 
     text: str
     brief: ClassVar = False
@@ -243,10 +227,7 @@ class Listing:
 
 @dataclass(frozen=True)
 class Frame:
-    """A whole HTML page inside a page, on screen only.
-
-    It runs its scripts, but cannot reach anything outside.
-    """
+    """An HTML page inside a page, on screen only; its scripts reach nothing outside."""
 
     html: str
     brief: ClassVar = False
@@ -258,12 +239,12 @@ _Kind = TypeVar("_Kind")
 
 
 class Section:
-    """A heading and what stands below it.
+    """A heading and blocks.
 
     Args:
         heading: a short title, or empty.
-        parts: blocks; a bare text is a paragraph that only pages show.
-        folded: start closed, for what only some readers want; not at a terminal.
+        parts: blocks; a text is a paragraph that only pages show.
+        folded: closed at first on a page, left out on a terminal.
     """
 
     def __init__(self, heading: str, *parts: Block | str, folded: bool = False) -> None:
@@ -271,20 +252,20 @@ class Section:
         self.blocks = [Paragraph(part) if isinstance(part, str) else part for part in parts]
 
     def all(self, kind: type[_Kind]) -> list[_Kind]:
-        """The blocks of a kind."""
+        """Return the blocks of a kind."""
         return [block for block in self.blocks if isinstance(block, kind)]
 
 
 @dataclass(frozen=True)
 class Document:
-    """A verdict and its sections.
+    """A verdict and sections.
 
     Attributes:
-        title: what was looked at.
-        verdict: the answer in a sentence or two, or empty.
-        sections: in order; a page lists their headings where there are several.
+        title: subject.
+        verdict: the conclusion in a sentence or two, or empty.
+        sections: in order; a page lists the headings of more than two.
         tone: of the verdict.
-        facts: a few names and values below the verdict of a page, with units.
+        facts: names and values below the verdict of a page, with units.
     """
 
     title: str
@@ -297,19 +278,23 @@ class Document:
         """Return the document for a terminal, in at most 80 columns."""
         text = wrap(self.verdict) if self.verdict else ""
         for section in self.sections:
-            told = [
+            shown = [
                 block.plain()
                 for block in section.blocks
                 if block.brief and not isinstance(block, Picture | Listing | Frame)
             ]
-            if told and not section.folded:
-                text += "\n".join([f"\n\n{section.heading}" if section.heading else "", *told])
+            if shown and not section.folded:
+                text += "\n".join([f"\n\n{section.heading}" if section.heading else "", *shown])
         return text.strip("\n")
 
 
 def _is_number(cell: str) -> bool:
     text = cell.strip()
     return text in ("", "-", "–", "∞", "NaN") or text.lstrip("+-−<>≤≥±* ")[:1].isdigit()
+
+
+def _lines(rows: Sequence[Sequence[str]], k: int) -> list[str]:
+    return [line for row in rows for line in row[k].split("\n")]
 
 
 def from_template(name: str, tone: Tone = "plain", /, **context: Any) -> Document:
@@ -332,7 +317,7 @@ def sections(name: str, /, **context: Any) -> list[Section]:
 
 
 class _Part(NamedTuple):
-    """A part of a template; `rows` are the pieces between :: of lines that begin with `kind`."""
+    """A part of a template; `rows` are the pieces between :: of its lines that begin with `kind`."""
 
     mark: str
     name: str
@@ -349,8 +334,8 @@ def _blocks(part: _Part, context: Mapping[str, Any]) -> Iterator[Block]:
     if part.kind == "|":
         yield _table(part, text, value, context)
     elif part.kind == "=":
-        told = ([one.render(context, it=value).strip() for one in row] for row in part.rows)
-        if entries := {name: text for name, text in told if text}:
+        pairs = ([one.render(context, it=value).strip() for one in row] for row in part.rows)
+        if entries := {name: text for name, text in pairs if text}:
             yield Values(entries)
     elif part.kind == "+":
         head, *rows = [[one.render(context).strip() for one in row] for row in part.rows]
@@ -379,7 +364,7 @@ def _table(part: _Part, caption: str, items: Any, context: Mapping[str, Any]) ->
 
 @cache
 def _template(name: str) -> "list[tuple[Template, bool, list[_Part]]]":
-    """Return headings, whether they are folded, and the parts below them."""
+    """Return the headings of a template, whether they are folded, and their parts."""
     environment = _environment()
     assert environment.loader is not None
     found: list[tuple[Template, bool, list[_Part]]] = []

@@ -1,7 +1,6 @@
-"""How every figure looks: one line per controller, also told apart in grey print, light or dark."""
+"""Style of all figures: for light and dark pages, grey print and colour-blind readers."""
 
 import itertools
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,13 +10,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import (
-    FormatStrFormatter,
-    FuncFormatter,
-    LogLocator,
-    MaxNLocator,
-    NullFormatter,
-)
+from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from stewart_drake.files.fileio import replacing
 
@@ -33,7 +26,7 @@ class Line(NamedTuple):
     markersize: float = 4.0
 
 
-# Okabe and Ito's colours, which colour-blind readers tell apart.
+# Colours of Okabe and Ito, which colour-blind readers can distinguish.
 CONTROLLER_LINES: Final = {
     "lqr": Line("#E69F00", ":", 2.0),
     "lqi": Line("#009E73", "-.", 1.6),
@@ -46,24 +39,21 @@ _DASHES: Final = ("-", (0, (5, 1.6)), (0, (1.2, 1.2)), (0, (6, 1.4, 1.2, 1.4)), 
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 REFERENCE: Final = Line("#BBBBBB", "-", 4.0)
 RUN: Final = Line("#0072B2", "-", 1.5)
-"""A single run."""
 COMMANDED: Final = Line("#D55E00", "--", 1.0)
 TRUTH: Final = Line("#D55E00", "--", 1.2)
 LIMIT: Final = Line("#8A2B0B", "-", 0.9)
-"""A limit that something must stay on one side of."""
 MARK: Final = Line("#666666", ":", 1.1)
-"""A place on the horizontal axis."""
 WIDTH: Final = 10.0
-"""Inches of the figures of a page."""
+"""Width of a figure, inches."""
 UNITS: Final = ("deg",) * 3 + ("mm",) * 3
 FACTORS: Final = np.array([180 / np.pi] * 3 + [1e3] * 3)
-"""In which coordinates are shown, and what takes them there from rad and m."""
+"""Units in which coordinates are shown, and factors from rad and m."""
 BAND_ALPHA: Final = 0.2
 """Opacity of an uncertainty band, in the colour of its line."""
 
 DATA_INK: Final = "#111111"
 DATA_PAPER: Final = "#FDFDFD"
-"""On and between fields whose colour is a value, which a dark page does not change."""
+"""Text and background of fields with a colour scale, which stay as they are on a dark page."""
 DARK: Final = {
     "#ffffff": "#16191d",  # the page's paper
     "#000000": "#e6e9ed",  # and ink
@@ -84,13 +74,8 @@ DARK: Final = {
     "#9b4f80": "#d68fbd",
     "#946800": "#d9a940",
 }
-"""What our lines and letters become on a dark page. Any other colour is data and stays."""
+"""Colours on a dark page of lines and letters; all other colours are data and stay."""
 
-FORMATS: Final = ("png", "svg")
-_RAISED: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_PATH: Final = re.compile(rb' d="[^"]*"')
-_DIGITS: Final = re.compile(rb"(\.\d\d)\d+")
-"""Beyond the second, which are cut off."""
 _RC: Final[dict[Any, Any]] = {
     "axes.facecolor": "none",  # the figure's is behind it, or the page
     "axes.grid": True,
@@ -117,10 +102,10 @@ _RC: Final[dict[Any, Any]] = {
 
 
 def line(k: int, *, marked: bool = True, width: float = 1.5) -> Line:
-    """Return the look of curve k of any number, told apart in grey print by dash and marker.
+    """Return the style of curve k, distinct by dash or marker in grey print.
 
-    `marked` curves have few points, each with a marker; of others only the sixth and later ones
-    have markers, ten along the curve.
+    A `marked` curve has few points, each with a marker. Of the others, the sixth and later ones
+    have ten markers along the curve.
     """
     rest, dash = divmod(k, len(_DASHES))
     look = Line(_COLORS[k % len(_COLORS)], _DASHES[dash], width)
@@ -135,14 +120,14 @@ LEG_LINES: Final = tuple(line(k, marked=False, width=1.4) for k in range(6))
 
 
 def controller_lines(names: Iterable[str]) -> dict[str, Line]:
-    """Return a line per controller: the shipped ones have their own, others get the next ones."""
+    """Return a line per controller; those that are not shipped get the next free styles."""
     others = (line(k, marked=False, width=1.3) for k in itertools.count(len(_DASHES)))
     return {name: CONTROLLER_LINES.get(name) or next(others) for name in names}
 
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """Matplotlib's settings for our figures, whatever the user's own are."""
+    """Use the package's settings of Matplotlib, not the user's."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_RC)
@@ -150,7 +135,7 @@ def figure_style() -> Iterator[None]:
 
 
 class _RoundTicks(LogLocator):
-    """1, 2, 5 and so on; of less than half a decade, where these are few, evenly spaced."""
+    """Ticks at 1, 2 and 5; evenly spaced on an axis of less than half a decade."""
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
         narrow = max(vmin, vmax) < 3 * min(vmin, vmax)
@@ -158,61 +143,36 @@ class _RoundTicks(LogLocator):
 
 
 def plain_log_ticks(axis: Axis) -> None:
-    """Ticks such as 20 and 50 on a logarithmic axis, not powers of ten with a factor."""
+    """Label a logarithmic axis with plain numbers such as 20 and 50."""
     axis.set_major_locator(_RoundTicks(subs=(1, 2, 5)))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
 
 
 def powers_of_ten(axis: Axis) -> None:
-    """Ticks such as 10⁻³ on a logarithmic axis, as text: formulas take ten times as long."""
-    axis.set_major_formatter(FuncFormatter(_power_of_ten))
+    """Label a logarithmic axis with 10⁻³ and so on, as text: formulas take ten times as long."""
+    raised = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+    axis.set_major_formatter(lambda value, _: "10" + f"{round(np.log10(value))}".translate(raised))
     axis.set_minor_formatter(NullFormatter())
 
 
-def _power_of_ten(value: float, _: int) -> str:
-    return "10" + f"{round(np.log10(value))}".translate(_RAISED)
-
-
 def write_figures(figures: Mapping[str, Figure], directory: str | Path) -> list[Path]:
-    """Write every figure by its name as `write_figure` does; the paths written.
-
-    Raises:
-        OSError: the directory cannot be written to.
-    """
-    with figure_style():
-        return [
-            path
-            for name, figure in figures.items()
-            for path in write_figure(figure, Path(directory), name)
-        ]
-
-
-def write_figure(figure: Figure, directory: Path, name: str) -> list[Path]:
-    """Write NAME.png and NAME.svg, each whole or not; the same figure gives the same bytes.
-
-    Raises:
-        OSError: the directory cannot be written to.
-    """
+    """Write each figure as NAME.png and NAME.svg; the same figure gives the same bytes."""
     paths = []
-    for suffix in FORMATS:
-        path = directory / f"{name}.{suffix}"
-        metadata = {"Date": None} if suffix == "svg" else None
-        with replacing(path) as partial:
-            figure.savefig(partial, format=suffix, metadata=metadata)
-        paths.append(path)
+    with figure_style():
+        for name, figure in figures.items():
+            for suffix in ("png", "svg"):
+                paths.append(Path(directory) / f"{name}.{suffix}")
+                metadata = {"Date": None} if suffix == "svg" else None
+                with replacing(paths[-1]) as partial:
+                    figure.savefig(partial, format=suffix, metadata=metadata)
     return paths
 
 
-def rounded(svg: bytes) -> bytes:
-    """A figure with its paths to a hundredth of a point, which nobody sees: a fifth is saved."""
-    return _PATH.sub(lambda path: _DIGITS.sub(rb"\1", path[0]), svg)
+def for_dark_too(svg: str) -> str:
+    """Return an SVG of Matplotlib with the colours of `DARK` for readers who prefer dark.
 
-
-def for_dark_too(svg: bytes) -> bytes:
-    """A figure as matplotlib writes it, with the colours of DARK where its reader prefers dark.
-
-    Matplotlib puts colours into style attributes, lower case, and leaves out a black fill.
+    Matplotlib writes colours into style attributes, in lower case, and leaves out a black fill.
     """
     rules = "".join(
         f'[style*="{what}: {light}"]{{{what}:{dark}!important}}'
@@ -220,6 +180,6 @@ def for_dark_too(svg: bytes) -> bytes:
         for what in ("fill", "stroke")
     )
     style = f"@media(prefers-color-scheme:dark){{svg{{fill:{DARK['#000000']}}}{rules}}}"
-    before, end, after = svg.partition(b"<defs>")
+    before, end, after = svg.partition("<defs>")
     assert end, "a figure without definitions"
-    return b"".join((before, b"<style>", style.encode(), b"</style>", end, after))
+    return f"{before}<style>{style}</style>{end}{after}"

@@ -1,6 +1,7 @@
-"""What the command shows on a terminal: coloured text, lists, and how far it has got.
+"""Terminal output: coloured text, the list of shipped files, and progress.
 
-On a terminal that is a bar per running simulation, in a log a line every ten seconds."""
+Progress is a bar per run on a terminal, and a line every ten seconds in a log or pipe.
+"""
 
 import os
 import re
@@ -29,22 +30,22 @@ _COLORS: Final = {
     r"|\b(left workspace|solver failed)( at [\d.]+ s(, leg \d)?)?",
 }
 EVERY: Final = 10.0
-"""s between two lines of progress where there is no terminal."""
+"""Time between two lines of progress without a terminal, s."""
 
 
 def echo(text: str, *, error: bool = False) -> None:
-    """Print a line; good and bad words are coloured on a terminal, unless NO_COLOR is set."""
+    """Print a text, with verdicts coloured on a terminal unless NO_COLOR is set."""
     for color, words in _COLORS.items():
         text = re.sub(words, partial(_styled, color), text)
     try:
         typer.echo(text, err=error, color=False if os.environ.get("NO_COLOR") else None)
-    except BrokenPipeError:  # nobody reads on: what is still to be saved is not lost for that
+    except BrokenPipeError:  # the reader has left; the files are still to be written
         stream = sys.stderr if error else sys.stdout
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _styled(color: str, match: re.Match[str]) -> str:
-    return typer.style(match[0], fg=color)
+def _styled(color: str, found: re.Match[str]) -> str:
+    return typer.style(found[0], fg=color)
 
 
 def shipped_table(kind: "Kind") -> str:
@@ -55,7 +56,7 @@ def shipped_table(kind: "Kind") -> str:
 
 
 def _description(path: Path) -> str:
-    if path.suffix == ".json":  # which has no comments
+    if path.suffix == ".json":  # a network, without comments
         from stewart_drake.tuner.network import NUM_INPUTS, NUM_OUTPUTS, load_network
 
         network = load_network(path)
@@ -73,12 +74,12 @@ def _description(path: Path) -> str:
 def progress_bars(
     names: Iterable[str], duration: float, quiet: bool
 ) -> Iterator[dict[str, Callable[[float, float], None]]]:
-    """A bar per name on a terminal's stderr, else a line now and then, until the context ends.
+    """Show the progress of simulations on stderr.
 
     Args:
         names: of the runs.
         duration: of each, s.
-        quiet: whether to draw nothing.
+        quiet: whether to print nothing.
 
     Yields:
         By name, a function of simulated time in s and current error in % of peak to peak.
@@ -88,13 +89,13 @@ def progress_bars(
     def advance(name: str, time: float, error: float) -> None:
         times[name] = time
         text = f"{time:6.2f} of {duration:g} s, error {error:7.3f} %"
-        bars.update(tasks[name], completed=time, state=_with_rest(text, bars, tasks[name]))
+        _update(bars, tasks[name], time, text)
 
     def state() -> str:
         runs = ", ".join(f"{name} {times[name]:.1f}" for name in names if name in times)
         return f"{runs} of {duration:g} s" if runs else f"{', '.join(names)}: preparing"
 
-    with _bars(quiet) as bars, _said_now_and_then(state, quiet):
+    with _bars(quiet, state) as bars:
         tasks = {name: bars.add_task(name, total=duration, state="preparing") for name in names}
         yield {name: partial(advance, name) for name in names}
 
@@ -103,49 +104,49 @@ def progress_bars(
 def count_bar(
     name: str, quiet: bool, first: str = "preparing"
 ) -> Iterator[Callable[[int, int], None]]:
-    """One bar on a terminal's stderr, else a line now and then, until the context ends.
+    """Show on stderr how many of several pieces are done.
 
     Args:
-        name: of what is counted.
-        quiet: whether to draw nothing.
-        first: what is said until it is known how many there are.
+        name: of the pieces.
+        quiet: whether to print nothing.
+        first: state until the number of pieces is known.
 
     Yields:
         A function of the number done and the number of all.
     """
-    with _bars(quiet) as bars:
+
+    def show(done: int, total: int) -> None:
+        if bars.tasks[0].total != total:
+            # The pace is measured from here: an earlier start may have done some of them.
+            bars.reset(task, total=total, completed=done)
+            bars.advance(task, 0)
+        _update(bars, task, done, f"{done} of {total}")
+
+    with _bars(quiet, lambda: f"{name}: {bars.tasks[0].fields['state']}") as bars:
         task = bars.add_task(name, total=None, state=first)
+        yield show
 
-        def show(done: int, total: int) -> None:
-            if bars.tasks[0].total != total:
-                # What an earlier start has done says nothing of the pace, nor does the time before.
-                bars.reset(task, total=total, completed=done)
-                bars.advance(task, 0)  # from here on
-            bars.update(task, completed=done)
-            bars.update(task, state=_with_rest(f"{done} of {total}", bars, task))
 
-        with _said_now_and_then(lambda: f"{name}: {bars.tasks[0].fields['state']}", quiet):
-            yield show
+def _update(bars: "Progress", task: "TaskID", completed: float, text: str) -> None:
+    """Advance a bar and show its text with the estimated time left."""
+    bars.update(task, completed=completed)
+    left = next(one.time_remaining for one in bars.tasks if one.id == task)
+    text += "" if left is None else f", about {_duration(left)} left"
+    bars.update(task, state=text)
 
 
 @contextmanager
-def working(name: str, quiet: bool) -> Iterator[None]:
-    """A line now and then while something is done of which nothing is counted.
-
-    Args:
-        name: of what is done.
-        quiet: whether to say nothing.
-    """
-    with count_bar(name, quiet, "computing"):
-        yield
-
-
-def _bars(quiet: bool) -> "Progress":
-    """Bars with what the field `state` says; none where there is no terminal."""
+def _bars(quiet: bool, state: Callable[[], str]) -> "Iterator[Progress]":
+    """Show bars on a terminal's stderr, and the line `state()` every `EVERY` s elsewhere."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
-    return Progress(
+    try:  # stderr may be closed
+        terminal = sys.stderr is not None and sys.stderr.isatty()
+        terminal &= os.environ.get("TERM") not in ("dumb", "unknown")
+    except ValueError:
+        terminal = False
+    bars = Progress(
         TextColumn("{task.description:<13}"),
         BarColumn(None),
         TextColumn("{task.fields[state]}"),
@@ -154,47 +155,24 @@ def _bars(quiet: bool) -> "Progress":
         transient=True,
         redirect_stdout=False,
         redirect_stderr=False,
-        speed_estimate_period=1e9,  # workers end in bursts: the mean pace of all is better
-        disable=quiet or not _is_terminal(),
+        speed_estimate_period=1e9,  # workers end in bursts: take the mean pace of all
+        disable=quiet or not terminal,
     )
-
-
-def _with_rest(text: str, bars: "Progress", task: "TaskID") -> str:
-    """The text, and as far as that is known how long the rest of the task will take."""
-    left = next(one.time_remaining for one in bars.tasks if one.id == task)
-    return text if left is None else f"{text}, about {_duration(left)} left"
-
-
-@contextmanager
-def _said_now_and_then(state: Callable[[], str], quiet: bool) -> Iterator[None]:
-    """A line of plain text on stderr every `EVERY` s, for logs and pipes; none on a terminal."""
-    if quiet or sys.stderr is None or _is_terminal():
-        yield
-        return
     stop, start = threading.Event(), time.monotonic()
 
-    def say() -> None:
+    def print_lines() -> None:
         while not stop.wait(EVERY):
-            with suppress(OSError, ValueError):  # whoever reads it is gone
+            with suppress(OSError, ValueError):  # the reader may have left
                 line = f"{state()}, after {_duration(time.monotonic() - start)}"
                 print(line, file=sys.stderr, flush=True)
 
-    thread = threading.Thread(target=say, daemon=True)
-    thread.start()
+    if not (quiet or terminal or sys.stderr is None):
+        threading.Thread(target=print_lines, daemon=True).start()
     try:
-        yield
+        with bars:
+            yield bars
     finally:
         stop.set()
-        thread.join()
-
-
-def _is_terminal() -> bool:
-    """Whether stderr is one that can draw; it may also be closed."""
-    try:
-        drawing = os.environ.get("TERM") not in ("dumb", "unknown")
-        return drawing and sys.stderr is not None and sys.stderr.isatty()
-    except ValueError:
-        return False
 
 
 def _duration(seconds: float) -> str:
