@@ -30,8 +30,9 @@ from stewart_drake.files.jsonio import jsonable
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_understood
-from stewart_drake.studies.robustness import RobustnessOptions, study_robustness
+from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.studies.statistics import SIGNIFICANT
+from stewart_drake.studies.study_options import RobustnessOptions
 
 SEEDS = range(7300, 7320)
 """Seeds of no other benchmark, test or setting of the law."""

@@ -52,7 +52,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COULOMB_SPEED
 from stewart_drake.studies import uncertainty
-from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.study_options import Ranges
 
 MACHINES = size("MACHINES", 50)
 FRESH = int(os.environ.get("FRESH", "1000"))

@@ -22,7 +22,7 @@ from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.uncertainty import MACHINE, Draw, draw, drawn, run_draw, scales_of
 
 TIMED: Final = 5

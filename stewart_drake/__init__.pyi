@@ -6,7 +6,7 @@ import typing
 import stewart_drake.reporting.results
 import stewart_drake.scenario.config
 import stewart_drake.studies.new_machine
-import stewart_drake.studies.ranges
+import stewart_drake.studies.study_options
 from stewart_drake import law as law
 from stewart_drake import systems as systems
 from stewart_drake.dynamics.stewart import StewartDynamics as StewartDynamics
@@ -225,7 +225,7 @@ def analyze_robustness(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
     runs: int = 200,
     *,
-    ranges: stewart_drake.studies.ranges.Ranges | None = None,
+    ranges: stewart_drake.studies.study_options.Ranges | None = None,
     seed: int = 0,
     limit: float | None = None,
     also: collections.abc.Mapping[str, stewart_drake.scenario.config.Scenario] | None = None,

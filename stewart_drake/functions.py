@@ -27,7 +27,6 @@ from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario, load_scenario, scenario_yaml
 from stewart_drake.studies.jobs import Progress
-from stewart_drake.studies.measurements import Measurements
 from stewart_drake.studies.new_machine import (
     MechanismCheck,
     NewMachine,
@@ -35,6 +34,7 @@ from stewart_drake.studies.new_machine import (
     new_machine,
 )
 from stewart_drake.studies.options import takes
+from stewart_drake.studies.study_options import Measurements
 from stewart_drake.tuning.options import DataOptions, TrainingOptions, WorthOptions
 
 MECHANISM: Final = "mechanism.yaml"

@@ -33,8 +33,8 @@ def leave_blank(patch: pytest.MonkeyPatch) -> None:
 
 def judge_few_delays(patch: pytest.MonkeyPatch) -> None:
     """Analyse the loop for three delays and for its own, in the place of thirty."""
-    from stewart_drake.studies.delay_loop import loop_margins
+    from stewart_drake.studies.delay import loop_margins
 
     patch.setattr("stewart_drake.studies.hautus.LONGEST", 2)
     few = partial(loop_margins, delays=())
-    patch.setattr("stewart_drake.studies.delay_limits.loop_margins", few)
+    patch.setattr("stewart_drake.studies.delay.loop_margins", few)

@@ -14,8 +14,8 @@ from stewart_drake.dynamics.workspace import standing
 from stewart_drake.files.resources import resolve
 from stewart_drake.loop.experiment import prepare
 from stewart_drake.scenario.reference_config import HoldConfig, SineConfig, WaypointsConfig
-from stewart_drake.studies import delay_limits, delay_map, hautus
-from stewart_drake.studies.delay_map import Cell, map_delays, scaled_motion
+from stewart_drake.studies import delay, hautus, runs
+from stewart_drake.studies.delay import Cell, delay_map, map_delays, scaled_motion
 from stewart_drake.studies.runs import run_scenario
 from stewart_drake.studies.verdict import delay_verdict
 from tests.mechanisms import PAPER
@@ -36,7 +36,7 @@ def _short(monkeypatch):
         Cell(0, 1.25, "out_of_reach", math.nan, 1),
         Cell(8, 1.25, "solver_failed", math.nan, 1),
     ]
-    monkeypatch.setattr(delay_limits, "delay_map", lambda *_: (cells, False))
+    monkeypatch.setattr(delay, "delay_map", lambda *_: (cells, False))
 
 
 def analyze(kind, out, *arguments):
@@ -195,11 +195,11 @@ def test_json_and_quiet(capsys):
 
 def test_cells_are_simulations(monkeypatch):
     """On a short run: one that completes, one that leaves, one that is out of reach."""
-    monkeypatch.setattr(delay_map, "FACTORS", (0.5, 1.25))
-    monkeypatch.setattr(delay_map, "map_delays", lambda _: [0, 8])
+    monkeypatch.setattr(delay, "FACTORS", (0.5, 1.25))
+    monkeypatch.setattr(delay, "map_delays", lambda _: [0, 8])
     scenario = sd.load_scenario("paper", settings=("duration=1.1", "controller.estimate=[]"))
     seen = []
-    cells, interrupted = delay_map.delay_map(scenario, lambda done, all_: seen.append((done, all_)))
+    cells, interrupted = delay_map(scenario, lambda done, all_: seen.append((done, all_)))
     assert not interrupted
     assert [(cell.steps, cell.factor) for cell in cells] == [
         (0, 0.5),
@@ -231,9 +231,9 @@ def test_ctrl_c_keeps_the_cells_that_are_there(monkeypatch):
         (Path(folder) / f"{key}.json").write_bytes(function(*jobs[key]))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(delay_map, "run_jobs", interrupted_jobs)
+    monkeypatch.setattr(runs, "run_jobs", interrupted_jobs)
     scenario = sd.load_scenario("paper", settings=("duration=0.2", "controller.estimate=[]"))
-    cells, interrupted = delay_map.delay_map(scenario)
+    cells, interrupted = delay_map(scenario)
     assert interrupted
     assert cells[0].status == "completed"
     assert {cell.status for cell in cells[1:]} == {"not_run"}

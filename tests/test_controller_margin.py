@@ -27,7 +27,7 @@ from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import CONTROLLERS
-from stewart_drake.studies.delay_loop import loop_margins
+from stewart_drake.studies.delay import loop_margins
 from stewart_drake.studies.verdict import basis
 from tests.mechanisms import PAPER
 
@@ -255,7 +255,7 @@ def test_a_run_tells_the_margin_of_its_loop():
 
 def test_the_first_line_is_about_the_loop(capsys, monkeypatch):
     # Simulations over delay and amplitude have tests of their own.
-    monkeypatch.setattr("stewart_drake.studies.delay_limits.delay_map", lambda *_: ([], False))
+    monkeypatch.setattr("stewart_drake.studies.delay.delay_map", lambda *_: ([], False))
     assert main(["analyze", "delay", "paper", "--controller", "lqi", "--set", "duration=2"]) == 0
     first, *others = capsys.readouterr().out.splitlines()
     assert first.startswith("This loop is unstable: linearised along the reference")

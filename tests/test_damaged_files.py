@@ -17,8 +17,9 @@ import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.families import paper_grid
-from stewart_drake.studies.robustness import RobustnessOptions, study_robustness
+from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.studies.runs import read_outcome
+from stewart_drake.studies.study_options import RobustnessOptions
 from stewart_drake.tuning.data import assemble, read_condition
 from tests.faults import put, written
 from tests.test_robustness import contents, short

@@ -12,7 +12,7 @@ from stewart_drake.files.schema import field_names, plain, sections
 from stewart_drake.files.yamlio import parse_yaml, validate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_yaml, setting_choices
-from stewart_drake.studies.ranges import RANGE_UNITS, Ranges
+from stewart_drake.studies.study_options import RANGE_UNITS, Ranges
 from tests import test_docs
 
 main(["--version"])  # which also puts the examples where they belong

@@ -15,9 +15,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.studies import jobs as module
 from stewart_drake.studies.jobs import (
     MANIFEST,
-    finished,
     run_jobs,
-    settings_hash,
 )
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -100,7 +98,6 @@ def test_a_second_start_does_only_what_is_missing(tmp_path):
     run_jobs(calls, noted, folder, settings=SETTINGS, workers=1, progress=lambda *n: seen.append(n))
     assert trace.read_text().split() == ["1", "3", "0", "2"]
     assert seen == [(2, 4), (3, 4), (4, 4)]
-    assert finished(calls, folder) == {key: folder / f"{key}.json" for key in calls}
 
 
 def test_bad_keys_and_numbers_of_workers_are_refused(tmp_path):
@@ -123,11 +120,6 @@ def test_workers_are_processes_with_one_thread(tmp_path):
 
 
 # ---------------------------------------------------------------- settings and locks
-
-
-def test_the_hash_is_of_values_not_of_their_order():
-    assert settings_hash({"a": 1, "b": [1.0, None]}) == settings_hash({"b": [1.0, None], "a": 1})
-    assert settings_hash({"a": 1}) != settings_hash({"a": 2})
 
 
 def test_a_folder_of_other_settings_is_refused(tmp_path):
@@ -282,7 +274,7 @@ def test_errors_of_a_cluster_are_one_line(tmp_path, cluster):
 
 def test_a_cluster_with_threads_or_without_workers_is_refused(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
-    from stewart_drake.studies import cluster as backend
+    from stewart_drake.studies import jobs as backend
 
     monkeypatch.setattr(backend, "_CONNECT_TIMEOUT", 1.0)
     for number, threads, said in ((1, 2, "has 2 threads"), (0, 1, "has no workers")):
@@ -302,7 +294,7 @@ def test_a_cluster_with_threads_or_without_workers_is_refused(tmp_path, monkeypa
 
 def test_an_address_without_a_scheduler_is_refused(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    from stewart_drake.studies import cluster as backend
+    from stewart_drake.studies import jobs as backend
 
     monkeypatch.setattr(backend, "_CONNECT_TIMEOUT", 0.2)
     before = set(threading.enumerate())

@@ -29,8 +29,7 @@ from stewart_drake.law.stability import (
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.trajectories import evaluate
-from stewart_drake.studies.delay_limits import error_floor, simulated_growth
-from stewart_drake.studies.delay_loop import loop_margins
+from stewart_drake.studies.delay import error_floor, loop_margins, simulated_growth
 from stewart_drake.studies.verdict import basis
 from tests.mechanisms import PAPER
 

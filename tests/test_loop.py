@@ -19,8 +19,9 @@ from stewart_drake.mechanism.kinematics import leg_geometry, rotation
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.scenario.trajectories import evaluate, make_reference
-from stewart_drake.studies import delay_limits
-from stewart_drake.studies.delay_limits import DelayOptions, study_delay
+from stewart_drake.studies import delay
+from stewart_drake.studies.delay import study_delay
+from stewart_drake.studies.study_options import DelayOptions
 from tests.mechanisms import PAPER
 
 GRID = 0.02
@@ -232,7 +233,7 @@ def test_delay_floor_is_what_a_plate_that_cannot_move_collects(plant):
 )
 def test_the_floor_is_that_of_a_plate_which_waits(settings, waits, monkeypatch):
     """In the summary of a run and in the analysis of the delay alike; where it falls, none."""
-    monkeypatch.setattr(delay_limits, "loop_margins", lambda _: [])  # which take seconds
+    monkeypatch.setattr(delay, "loop_margins", lambda _: [])  # which take seconds
     sc = scenario("duration=0.3", *settings)
     floor = simulate(sc, judge_stability=False).summary["delay_floor"]
     assert (floor > 1) is waits and (floor == 0) is not waits

@@ -27,7 +27,7 @@ from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.mechanism.geometry import Body
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate
-from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.uncertainty import MACHINE, draw, drawn, scales_of
 from tests.mechanisms import PAPER
 

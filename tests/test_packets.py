@@ -33,9 +33,10 @@ from stewart_drake.scenario.packets import (
     usual_bound,
 )
 from stewart_drake.scenario.timing import look_time
-from stewart_drake.studies import link_bound
-from stewart_drake.studies.link import LinkOptions, study_link
+from stewart_drake.studies import link as link_study
+from stewart_drake.studies.link import study_link
 from stewart_drake.studies.runs import Outcome
+from stewart_drake.studies.study_options import LinkOptions
 
 PERIOD = 0.1
 LONG = ("plant.kind=exact", "start=on_reference", "queue=reference")
@@ -436,9 +437,6 @@ def known_outcomes(monkeypatch):
     """
     asked = []
 
-    def jobs(wanted, *_, **more):
-        more["progress"](len(wanted), len(wanted))
-
     def outcome(run):
         asked.append(run)
         assert isinstance(run.link, NetworkConfig) and run.link.playout is not None
@@ -446,12 +444,12 @@ def known_outcomes(monkeypatch):
             return Outcome("left_workspace", "left", time=1.0)
         return Outcome("completed", error=1 + abs(run.link.playout - 0.43) + 0.01 * run.link.seed)
 
-    def done(wanted, _):
-        return {key: arguments[0] for key, arguments in wanted.items()}
+    def runs(wanted, progress):
+        if progress is not None:
+            progress(len(wanted), len(wanted))
+        return {key: outcome(run) for key, run in wanted.items()}, False
 
-    monkeypatch.setattr(link_bound, "run_jobs", jobs)
-    monkeypatch.setattr(link_bound, "finished", done)
-    monkeypatch.setattr(link_bound, "read_outcome", outcome)
+    monkeypatch.setattr(link_study, "run_scenarios", runs)
     return asked
 
 
@@ -469,7 +467,7 @@ def test_the_study_finds_the_best_bound_and_the_loss_that_is_borne(known_outcome
     assert study.best is not None and study.best.bound == pytest.approx(0.45)
     assert study.best.expected == pytest.approx(1.03)
     assert study.survivable == 0.2 and study.left_out == ()
-    assert [cell.runs for cell in study.losses] == [3] * len(link_bound.LOSSES)
+    assert [cell.runs for cell in study.losses] == [3] * len(link_study.LOSSES)
     assert told == [(12, 39), (18, 39), (39, 39)]
     told_of_it = document(study)
     table = told_of_it.plain()
@@ -517,7 +515,7 @@ def test_statements_on_the_worst_run_are_wrong_in_five_percent_at_most(completes
     rng, studies = np.random.default_rng(4), 20_000
     for n in (5, 29):
         stated = np.array(
-            [link_bound.Cell(0.5, 0.1, 0.0, 0.0, n, (1.0,) * k).no_worse for k in range(n + 1)]
+            [link_study.Cell(0.5, 0.1, 0.0, 0.0, n, (1.0,) * k).no_worse for k in range(n + 1)]
         )
         errors = rng.random((studies, n))
         completed = (errors < completes).sum(axis=1)

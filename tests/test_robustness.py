@@ -25,11 +25,11 @@ from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.reporting.robustness import document
 from stewart_drake.scenario.config import StateSensorConfig
 from stewart_drake.studies import statistics, uncertainty
-from stewart_drake.studies.ranges import Ranges, read_ranges
-from stewart_drake.studies.robustness import RobustnessOptions, study_robustness
+from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.studies.robustness_result import RobustnessStudy, factor_values, table
 from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.statistics import auc_interval, explain
+from stewart_drake.studies.study_options import Ranges, RobustnessOptions, read_ranges
 from stewart_drake.studies.uncertainty import (
     MACHINE,
     About,

@@ -15,7 +15,7 @@ from stewart_drake.loop.experiment import assemble
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.scenario.loading import load_scenario, scenario_yaml
-from stewart_drake.studies.ranges import Ranges
+from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.uncertainty import draw, scales_of
 from tests.mechanisms import PAPER
 

@@ -14,7 +14,7 @@ import xarray as xr
 
 from stewart_drake.cli import main
 from stewart_drake.reporting import report
-from stewart_drake.studies import delay_limits
+from stewart_drake.studies import delay
 from tests import test_docs
 from tests.shorter import judge_few_delays, leave_blank
 from tests.test_report import BLANK
@@ -35,7 +35,7 @@ def do(tmp_path, monkeypatch, capsys):
     """Does what a part of it says, in an empty folder; returns what each command printed."""
     monkeypatch.chdir(tmp_path)
     # Its simulations over delay and amplitude have tests of their own, and take a while.
-    monkeypatch.setattr(delay_limits, "delay_map", lambda *_: ([], False))
+    monkeypatch.setattr(delay, "delay_map", lambda *_: ([], False))
     judge_few_delays(monkeypatch)
     # The report's pieces in this process, which has loaded everything: tests/test_report_stopped.py
     # has processes.

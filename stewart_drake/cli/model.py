@@ -19,7 +19,7 @@ from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.reporting.terminal import echo
-from stewart_drake.studies.measurements import LARGEST, Measurements
+from stewart_drake.studies.study_options import LARGEST, Measurements
 
 if TYPE_CHECKING:
     from stewart_drake.studies.new_machine import NewMachine

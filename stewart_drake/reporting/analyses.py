@@ -22,7 +22,6 @@ class Analysis(NamedTuple):
     """One analysis of a scenario.
 
     Attributes:
-        study: module in `studies` with the function `study_NAME` and the class `NAMEOptions`.
         help: of the command.
         examples: of the command, without the program's name.
         counts: what its progress counts; nothing where it takes no `progress`.
@@ -34,7 +33,6 @@ class Analysis(NamedTuple):
         second: argument of the Python function that may be given by position.
     """
 
-    study: str
     help: str
     examples: tuple[str, ...]
     counts: str = ""
@@ -47,12 +45,10 @@ class Analysis(NamedTuple):
 
 ANALYSES: Final = {
     "hautus": Analysis(
-        "hautus",
         "Check controllability and observability, by mode.",
         ("analyze hautus paper --out out/hautus",),
     ),
     "delay": Analysis(
-        "delay_limits",
         "Find the delay that the loop tolerates.",
         ("analyze delay gravity --out out/delay",),
         counts="simulations",
@@ -60,7 +56,6 @@ ANALYSES: Final = {
         second="simulations",
     ),
     "link": Analysis(
-        "link",
         "Find the best play-out bound of a network.\n\n"
         "Needs --set link.kind=network or a scenario with a network.",
         ("analyze link paper --set link.kind=network --out out/link",),
@@ -69,14 +64,12 @@ ANALYSES: Final = {
         second="runs",
     ),
     "workspace": Analysis(
-        "workspace",
         "Check whether the motion fits the machine.\n\n"
         "Also for a motion that does not fit. Shows the reach margin of each leg, the largest "
         "feasible\namplitude, and torque, speed and power of each motor.",
         ("analyze workspace paper --out out/workspace",),
     ),
     "robustness": Analysis(
-        "robustness",
         "Run a Monte Carlo study of uncertain machines.\n\n"
         "With --out the same command continues an interrupted study.",
         ("analyze robustness paper --out out/robustness",),
@@ -87,7 +80,6 @@ ANALYSES: Final = {
         second="runs",
     ),
     "layout": Analysis(
-        "layout",
         "Search the layout and lengths of a machine for a motion.\n\n"
         "Writes the best few as machine files, and a page that compares them. With --out the same\n"
         "command continues an interrupted search.",
@@ -101,7 +93,8 @@ ANALYSES: Final = {
         second="directory",
     ),
 }
-"""By name. The function `document` of the module NAME describes the result."""
+"""By name: `studies.NAME.study_NAME` makes the result, `studies.study_options.NameOptions` has its
+options, `reporting.NAME.document` describes it."""
 
 
 def words_of(name: str) -> tuple[str, ...]:
@@ -111,11 +104,10 @@ def words_of(name: str) -> tuple[str, ...]:
 
 def options_of(name: str) -> "type[Options]":
     """Return the class of an analysis' options."""
+    from stewart_drake.studies import study_options
     from stewart_drake.studies.options import Options
 
-    if not ANALYSES[name].counts:
-        return Options
-    options: type[Options] = getattr(_module(name), f"{name.capitalize()}Options")
+    options: type[Options] = getattr(study_options, f"{name.capitalize()}Options", Options)
     return options
 
 
@@ -148,7 +140,7 @@ def analyze(
     given: dict[str, Any] = {"directory": directory} if row.keeps else {}
     if row.counts:
         given |= {"options": options or options_of(name)(), "progress": progress}
-    study = getattr(_module(name), f"study_{name}")
+    study = getattr(import_module(f"stewart_drake.studies.{name}"), f"study_{name}")
     document = import_module(f"stewart_drake.reporting.{name}").document
     found = analysis_result(lambda: study(scenario, **given), document, command)
     facts = {"link": text} if (text := link_text(scenario)) else {}
@@ -157,7 +149,3 @@ def analyze(
         summary=found.summary | {"link": plain(scenario.assumed_link)},
         document=replace(found.document, facts={**facts, **found.document.facts}),
     )
-
-
-def _module(name: str) -> Any:
-    return import_module(f"stewart_drake.studies.{ANALYSES[name].study}")

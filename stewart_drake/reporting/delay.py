@@ -14,8 +14,7 @@ from stewart_drake.reporting.document import Document, Table, Tone, from_templat
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import DATA_INK, DATA_PAPER, line
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.studies.delay_limits import DelayStudy
-from stewart_drake.studies.delay_map import Cell
+from stewart_drake.studies.delay import Cell, DelayStudy
 from stewart_drake.studies.verdict import HARDLY, NO, loop_verdict, milliseconds
 
 _TONES: Final[dict[str, Tone]] = {"yes": "good", "hardly": "fair", "no": "bad"}

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from stewart_drake.reporting.document import Document, from_template
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import Line, line
-from stewart_drake.studies.link_bound import Cell, LinkStudy
+from stewart_drake.studies.link import Cell, LinkStudy
 from stewart_drake.studies.statistics import CONFIDENCE
 
 _ASSURED: Final = 0.9

@@ -5,8 +5,8 @@ or a full disk lose only the jobs in flight. The next start in the same folder d
 Only this process writes, so workers need no common file system.
 """
 
+import asyncio
 import fcntl
-import hashlib
 import json
 import logging
 import os
@@ -17,8 +17,9 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -26,40 +27,32 @@ from typing import Any, Final, NamedTuple
 
 import cloudpickle
 import joblib
-from pydantic import ConfigDict
-from pydantic.dataclasses import dataclass
 from typing_extensions import TypeVar
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials, write_whole
 from stewart_drake.files.jsonio import jsonable, load_json
-from stewart_drake.files.yamlio import brief, validate
-from stewart_drake.studies.cluster import on_cluster
+from stewart_drake.files.yamlio import brief
 
 MANIFEST: Final = "manifest.json"
-"""File of the settings that all jobs of a folder share, and of their hash."""
+"""File of the settings that all jobs of a folder share."""
 
 Job = tuple[Any, ...]
 """Arguments of one call, pickled."""
 Progress = Callable[[int, int], None]
 """Called with the number of finished jobs and of all jobs."""
-
 T = TypeVar("T", default=Path)
+_Call = Callable[[], tuple[str, bytes]]
 
 _LOCK: Final = ".lock"
 _MAX_MANIFEST: Final = 10_000_000
 _KEY: Final = re.compile(r"[A-Za-z0-9_+-][A-Za-z0-9_.+-]{0,199}")
 _WATCH: Final = 0.5
 """Time between two checks of a worker for the process that started it, s."""
+_CONNECT_TIMEOUT: Final = 10.0
+"""Longest wait for the scheduler, and for its first worker, s."""
+_RESUME: Final = "finished jobs are kept and the same command continues from there"
 _log: Final = logging.getLogger("stewart_drake")
-
-
-@dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
-class Manifest:
-    """The file MANIFEST."""
-
-    hash: str
-    settings: dict[str, Any]
 
 
 def run_jobs(
@@ -80,10 +73,8 @@ def run_jobs(
 
     Args:
         jobs: by key; a key is a file name without its suffix, of letters, digits and `_.+-`.
-        function: of a module, so that workers can import it. Equal arguments must give equal bytes
-            if a resumed folder shall equal an uninterrupted one. A job that cannot be sent to
-            another process, such as one with a script's own class of a Drake system, runs in this
-            one.
+        function: of a module, so that workers can import it. A job that cannot be sent to another
+            process, such as one with a script's own class of a Drake system, runs in this one.
         folder: of the files KEY + suffix; made if it is missing.
         settings: of all jobs, plain data; a folder of other settings is refused.
         suffix: of the files.
@@ -107,38 +98,37 @@ def run_jobs(
     """
     for key in jobs:
         if not _KEY.fullmatch(key):
-            raise ValueError(f"{key!r} is no file name; expected letters, digits and _.+-")
+            raise ValueError(f"{key!r} is not a file name; expected letters, digits and _.+-")
     if workers is not None and workers < 1:
         raise ConfigError(f"--workers: got {workers}; expected 1 or more processes")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = {key: folder / f"{key}{suffix}" for key in jobs}
+    report = progress or (lambda *_: None)
     with _locked(folder):
         remove_partials(folder)
         _check_manifest(folder, settings, suffix)
-        found = _kept(paths, read)
+        found = _finished(paths, read)
         calls = [partial(_named, k, function, job) for k, job in jobs.items() if k not in found]
-        made = (
-            _on_this_machine(workers, calls) if scheduler is None else on_cluster(scheduler, calls)
-        )
-        tell = progress or (lambda *_: None)
-        tell(len(found), len(jobs))
+        made = _on_this_machine(workers, calls) if scheduler is None else _on_dask(scheduler, calls)
+        report(len(found), len(jobs))
         with closing(made):
             for key, data in made:
                 write_whole(paths[key], data)
                 found[key] = read(paths[key])
-                tell(len(found), len(jobs))
+                report(len(found), len(jobs))
     return {key: found[key] for key in jobs}
 
 
-def finished(jobs: Mapping[str, Job], folder: str | Path, suffix: str = ".json") -> dict[str, Path]:
-    """Return the existing files, in the order of `jobs`."""
-    paths = {key: Path(folder) / f"{key}{suffix}" for key in jobs}
-    return {key: path for key, path in paths.items() if path.exists()}
+def part_of(progress: Progress | None, before: int, total: int) -> Progress | None:
+    """Return the progress of jobs that are part of `total`, after `before` others."""
+    if progress is None:
+        return None
+    return lambda done, _: progress(before + done, total)
 
 
-def _kept(paths: Mapping[str, Path], read: Callable[[Path], T]) -> dict[str, T]:
-    """Return the sound files of an earlier start; warn of damaged ones."""
+def _finished(paths: Mapping[str, Path], read: Callable[[Path], T]) -> dict[str, T]:
+    """Read the files of an earlier start; warn of damaged ones."""
     found, damaged = {}, []
     for key, path in paths.items():
         try:
@@ -150,11 +140,6 @@ def _kept(paths: Mapping[str, Path], read: Callable[[Path], T]) -> dict[str, T]:
         more = f" (and {len(damaged) - 1} more)" if len(damaged) > 1 else ""
         _log.warning("%s; this run is done again%s", damaged[0], more)
     return found
-
-
-def settings_hash(settings: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of the settings as JSON with sorted keys."""
-    return hashlib.sha256(_canonical(settings).encode()).hexdigest()
 
 
 def _named(key: str, function: Callable[..., bytes], job: Job) -> tuple[str, bytes]:
@@ -170,7 +155,7 @@ def _named(key: str, function: Callable[..., bytes], job: Job) -> tuple[str, byt
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes out; the lock ends with this process, however that ends."""
+    """Lock a folder for this process; the lock ends with the process, also after kill -9."""
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     with open(os.open(folder / _LOCK, flags, 0o666), "rb", buffering=0) as file:
         try:
@@ -184,40 +169,25 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _check_manifest(folder: Path, settings: Mapping[str, Any], suffix: str) -> None:
-    path, mine = folder / MANIFEST, json.loads(_canonical(settings))
+    """Write the manifest of a new folder, or compare that of an earlier start."""
+    path, mine = folder / MANIFEST, jsonable(settings)
     if not path.exists():
         if any(not p.name.startswith(".") for p in folder.glob(f"*{suffix}")):
             raise ConfigError(
                 f"{folder}: has {suffix} files but no {MANIFEST}; expected an empty folder, or one "
                 "that an earlier start has made"
             )
-        text = json.dumps({"hash": settings_hash(settings), "settings": mine}, indent=2)
-        write_whole(path, text + "\n")
+        write_whole(path, json.dumps({"settings": mine}, indent=2, allow_nan=False) + "\n")
         return
     expected = "the manifest of the runs in its folder (choose another folder, or delete this one)"
-    manifest = read_manifest(folder, expected)
-    if manifest.hash != settings_hash(settings):
+    theirs = load_json(path, _MAX_MANIFEST, expected).get("settings")
+    if not isinstance(theirs, dict):
+        raise ConfigError(f"{path}: has no settings; expected {expected}")
+    if theirs != mine:
         raise ConfigError(
-            f"{folder}: belongs to other settings ({_difference(manifest.settings, mine)}); "
+            f"{folder}: belongs to other settings ({_difference(theirs, mine)}); "
             "expected the same settings as before, or another folder"
         )
-
-
-def read_manifest(folder: Path, expected: str) -> Manifest:
-    """Return the settings that the runs in a folder depend on.
-
-    Raises:
-        ConfigError: there is none, or it is damaged; one line with what is `expected`.
-    """
-    path = folder / MANIFEST
-    manifest = validate(Manifest, load_json(path, _MAX_MANIFEST, expected), str(path))
-    if manifest.hash != settings_hash(manifest.settings):
-        raise ConfigError(f"{path}: is damaged, its hash differs; expected {expected}")
-    return manifest
-
-
-def _canonical(settings: Mapping[str, Any]) -> str:
-    return json.dumps(jsonable(settings), sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 def _difference(theirs: Any, mine: Any, name: str = "") -> str:
@@ -229,16 +199,19 @@ def _difference(theirs: Any, mine: Any, name: str = "") -> str:
     return f"{name or 'settings'}: {brief(theirs)} there, {brief(mine)} now"
 
 
-class _Unsent(NamedTuple):
-    """A job that a worker could not read."""
+# ---------------------------------------------------------------- this machine
+
+
+class _Unreadable(NamedTuple):
+    """Job that a worker could not read."""
 
     number: int
     reason: str
 
 
 # cloudpickle sends a class of a script or notebook by its contents. One that derives from a class
-# of pydrake cannot be made again from them; in an executor's own reading that ends the worker.
-def _pack(call: Callable[[], Any]) -> bytes | str:
+# of pydrake cannot be made again from them; if an executor reads it, that ends the worker.
+def _pack(call: _Call) -> bytes | str:
     """Return a call as bytes, or the reason why it cannot be sent."""
     try:
         packed: bytes = cloudpickle.dumps(call)
@@ -247,30 +220,28 @@ def _pack(call: Callable[[], Any]) -> bytes | str:
     return packed
 
 
-def _call_packed(number: int, packed: bytes | str) -> tuple[str, bytes] | _Unsent:
-    """Call in a worker what was packed."""
+def _call_packed(number: int, packed: bytes | str) -> tuple[str, bytes] | _Unreadable:
+    """Call in a worker the result of `_pack`."""
     if isinstance(packed, str):
-        return _Unsent(number, packed)
+        return _Unreadable(number, packed)
     try:
-        call: Callable[[], tuple[str, bytes]] = pickle.loads(packed)
+        call: _Call = pickle.loads(packed)
     except Exception as error:
-        return _Unsent(number, f"{type(error).__name__}: {error}")
+        return _Unreadable(number, f"{type(error).__name__}: {error}")
     try:
         return call()
     except Exception as error:
         try:
             pickle.loads(cloudpickle.dumps(error))
         except Exception:
-            told = RuntimeError(f"{type(error).__name__}: {error}")
-            told.__notes__ = getattr(error, "__notes__", [])
-            raise told from None
+            plain = RuntimeError(f"{type(error).__name__}: {error}")
+            plain.__notes__ = getattr(error, "__notes__", [])
+            raise plain from None
         raise
 
 
-def _on_this_machine(
-    workers: int | None, calls: Sequence[Callable[[], tuple[str, bytes]]]
-) -> Generator[tuple[str, bytes]]:
-    """Yield what calls return, as they finish; closing the iterator ends the workers."""
+def _on_this_machine(workers: int | None, calls: Sequence[_Call]) -> Generator[tuple[str, bytes]]:
+    """Yield the results of calls as they finish; closing the iterator ends the workers."""
     number = min(workers or joblib.cpu_count(), max(1, len(calls)))
     if number == 1:
         yield from (call() for call in calls)
@@ -282,35 +253,35 @@ def _on_this_machine(
     with backend, warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=UserWarning, module="joblib")
         parallel = joblib.Parallel(n_jobs=number, batch_size=1, return_as="generator_unordered")
-        with _left_alone():
+        with _signals_blocked():
             outcomes = parallel(
                 joblib.delayed(_call_packed)(i, _pack(call)) for i, call in enumerate(calls)
             )
         try:
             with closing(outcomes):
                 for outcome in outcomes:
-                    if isinstance(outcome, _Unsent):
+                    if isinstance(outcome, _Unreadable):
                         _log.debug("a job runs here: no process could read it (%s)", outcome.reason)
                         outcome = calls[outcome.number]()
                     yield outcome
         except BrokenProcessPool as error:
-            how = re.search(r"exit codes of the workers are \{(.*)\}", str(error))
+            codes = re.search(r"exit codes of the workers are \{(.*)\}", str(error))
             raise ChildProcessError(
-                f"a worker process was killed{f' ({how[1]})' if how else ''}, perhaps for want of "
-                "memory; what had finished is kept and the same command goes on from there"
+                f"a worker process was killed{f' ({codes[1]})' if codes else ''}, perhaps for want "
+                f"of memory; {_RESUME}"
             ) from None
 
 
 @contextmanager
-def _left_alone() -> Iterator[None]:
+def _signals_blocked() -> Iterator[None]:
     """Start processes that Ctrl-C does not reach, and resource trackers that print nothing.
 
     A process inherits the signal mask of the thread that starts it, and a thread likewise; Ctrl-C
     would break the imports of a worker in the middle. The tracker comes first, because some Pythons
     unblock the signal when they start it. It clears what a killed worker leaves, with warnings.
     """
-    warned = os.environ.get("PYTHONWARNINGS")
-    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [warned, "ignore:resource_tracker"]))
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [before, "ignore:resource_tracker"]))
     resource_tracker.ensure_running()
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -318,12 +289,12 @@ def _left_alone() -> Iterator[None]:
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         del os.environ["PYTHONWARNINGS"]
-        if warned is not None:
-            os.environ["PYTHONWARNINGS"] = warned
+        if before is not None:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 def _end_with(parent: int) -> None:
-    """Let a worker process end with the one that started it, even after kill -9."""
+    """End a worker process with the one that started it, also after kill -9."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -331,3 +302,74 @@ def _end_with(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+# ---------------------------------------------------------------- a Dask cluster
+
+
+# joblib's backend for Dask waits for ever if workers die over a call, so futures are used here.
+def _on_dask(scheduler: str, calls: Sequence[_Call]) -> Generator[tuple[str, bytes]]:
+    """Yield the results of calls as they finish; closing the iterator cancels the others.
+
+    Raises:
+        ConfigError: no scheduler at this address; no workers, or workers that cannot be used.
+        ChildProcessError: workers died over one call, or the scheduler went away.
+    """
+    try:
+        import distributed
+    except ImportError:
+        raise ConfigError(
+            "--scheduler: needs the package distributed; install it with pip install distributed"
+        ) from None
+    dask: Any = distributed  # without types
+    try:
+        _greet(dask, scheduler)
+        client = dask.Client(scheduler, timeout=_CONNECT_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:  # the last if TLS is not configured
+        reason = " ".join(str(error).split())
+        raise ConfigError(
+            f"--scheduler: got {scheduler!r}; expected the address of a running Dask scheduler, "
+            f"such as tcp://127.0.0.1:8786 ({reason})"
+        ) from None
+    with client:
+        with suppress(TimeoutError):
+            client.wait_for_workers(1, timeout=_CONNECT_TIMEOUT)
+        threads = max(client.nthreads().values(), default=0)
+        if threads == 0:
+            raise ConfigError(f"--scheduler: {scheduler} has no workers; start at least one first")
+        if threads > 1:  # the compiled equations of motion have one set of buffers per process
+            raise ConfigError(
+                f"--scheduler: a worker of {scheduler} has {threads} threads; expected workers "
+                "with one thread each (dask worker --nthreads 1)"
+            )
+        futures = [client.submit(call, pure=False) for call in calls]
+        try:
+            for future in dask.as_completed(futures, loop=client.loop):
+                yield future.result()
+        except dask.KilledWorker:
+            raise ChildProcessError(
+                f"Dask gave up a job whose workers died one after the other; {_RESUME}"
+            ) from None
+        except dask.CancelledError:
+            raise ChildProcessError(f"the scheduler {scheduler} went away; {_RESUME}") from None
+        except ModuleNotFoundError as error:
+            raise ConfigError(
+                f"--scheduler: the workers of {scheduler} lack a module ({error}); install the "
+                "same stewart-drake there"
+            ) from None
+
+
+def _greet(dask: Any, scheduler: str) -> None:
+    """Connect once without a client: one that finds no scheduler leaves an event loop running.
+
+    Raises:
+        OSError, ValueError: no scheduler, or not an address.
+    """
+    options = dask.Security().get_connection_args("client")
+
+    async def greet() -> None:
+        await (await dask.comm.connect(scheduler, timeout=_CONNECT_TIMEOUT, **options)).close()
+
+    # The calling thread may have an event loop already, as in a notebook.
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(asyncio.run, greet()).result()

@@ -3,78 +3,16 @@
 Drake is imported by the search, not by its options.
 """
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.studies.options import JobOptions, option
+from stewart_drake.studies.study_options import LayoutOptions
 
 if TYPE_CHECKING:
     from stewart_drake.scenario.config import Scenario
     from stewart_drake.studies.jobs import Progress
     from stewart_drake.studies.layout_search import LayoutStudy
-
-
-def _number(option: str, form: str, text: str, value: str) -> float:
-    try:
-        return float(value)
-    except ValueError:
-        raise ConfigError(f"--{option}: got {text!r}; expected {form}") from None
-
-
-def _read_limits(texts: list[str], _: object) -> dict[str, float]:
-    found = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        found[name.strip()] = _number("limit", "NAME=VALUE", text, value)
-    return found
-
-
-def _read_bounds(texts: list[str], _: object) -> dict[str, tuple[float, float]]:
-    found = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        low, colon, high = value.partition(":")
-        ends = (low, high if colon else low)
-        first, last = (_number("vary", "NAME=LOW:HIGH or NAME=VALUE", text, end) for end in ends)
-        found[name.strip()] = (first, last)
-    return found
-
-
-class LayoutOptions(JobOptions):
-    """Options of `study_layout`."""
-
-    goal: str = option(
-        "condition",
-        "Goal of the search: condition, torque, reach, clearance, "
-        "transmission, plate_joint_deg or crank_joint_deg.",
-        "NAME",
-    )
-    limits: Mapping[str, float] | None = option(
-        None,
-        "Least (reach, clearance, transmission) or largest value, SI units.",
-        "NAME=VALUE",
-        name="limit",
-        read=_read_limits,
-    )
-    vary: Mapping[str, tuple[float, float]] | None = option(
-        None,
-        "Bounds of a number of the pattern, or of crank or rod; one value fixes it.",
-        "NAME=LOW:HIGH",
-        read=_read_bounds,
-    )
-    keep: Sequence[str] = option(
-        (),
-        "Number to keep, or branches or plate_order.",
-        "NAME",
-        read=lambda texts, _: texts,
-    )
-    best: int = option(3, "Number of machines to write.", "N", ge=1)
-    starts: int = option(1, "Number of searches per arrangement of legs.", "N", ge=1)
-    generations: int = option(100, "Largest number of generations of a search.", "N", ge=1)
-    seed: int = option(0, "Random seed.", ge=0)
 
 
 def study_layout(

@@ -1,29 +1,144 @@
-"""Analysis of a network: the best play-out bound, and the losses that it survives.
+"""Search for the best play-out bound of a network, and for the losses that it survives.
 
-Drake is imported by the analysis, not by its options.
+With a longer bound fewer packets are late, but every torque acts later: bound + repetitions after
+its measurement, also if its packet was quicker. The scenario is simulated over bounds, first in
+whole periods, then in half periods near the best, and at the best of them over losses, with several
+seeds each. The seeds of the losses are new, because the first seeds chose the best bound and are
+too good there.
 """
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.scenario.config import Scenario
-from stewart_drake.studies.options import Options, option
+from stewart_drake.scenario.config import NetworkConfig, Scenario
+from stewart_drake.scenario.packets import (
+    in_time,
+    times_under_way,
+    torque_missing,
+    usual_bound,
+)
+from stewart_drake.studies.jobs import Progress, part_of
+from stewart_drake.studies.runs import run_scenarios
+from stewart_drake.studies.statistics import least_share
+from stewart_drake.studies.study_options import LinkOptions
 
-if TYPE_CHECKING:
-    from stewart_drake.studies.jobs import Progress
-    from stewart_drake.studies.link_bound import LinkStudy
+LOSSES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4)
+"""Shares of lost packets that are tried, in addition to the scenario's own."""
+_FEW: Final = 0.4
+_NEARLY_ALL: Final = 0.999
+"""Shares of the packets that arrive within the shortest and the longest bound tried."""
+_MOST_BOUNDS: Final = 12
 
 
-class LinkOptions(Options):
-    """Options of `study_link`."""
+class Cell(NamedTuple):
+    """Simulations with one bound and loss.
 
-    runs: int = option(5, "Number of seeds for each bound and loss.", "N", ge=1)
+    Attributes:
+        bound: s.
+        loss: share of lost packets.
+        late: probability that a packet which is not lost arrives after the bound.
+        missing: probability that no packet brings a torque in time, plans not counted.
+        runs: number of simulations.
+        errors: E_ac in % s of the completed ones.
+    """
+
+    bound: float
+    loss: float
+    late: float
+    missing: float
+    runs: int
+    errors: tuple[float, ...]
+
+    @property
+    def completed(self) -> float:
+        """Share of the runs; NaN for none."""
+        return len(self.errors) / self.runs if self.runs else math.nan
+
+    @property
+    def no_worse(self) -> float:
+        """Least share of all runs that complete, with 95 % confidence; NaN without simulations.
+
+        If all simulations completed, this share also has at most the largest of their errors.
+        """
+        return least_share(len(self.errors), self.runs) if self.runs else math.nan
+
+    @property
+    def expected(self) -> float:
+        """Mean E_ac in % s of the completed runs, infinite if one was lost."""
+        return float(np.mean(self.errors)) if self.errors and self.completed == 1 else math.inf
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        more = {name: getattr(self, name) for name in ("completed", "expected", "no_worse")}
+        return self._asdict() | more
+
+
+@dataclass(frozen=True)
+class LinkStudy:
+    """Result of the study.
+
+    Attributes:
+        scenario: with the network.
+        runs: seeds per bound and loss.
+        bounds: over the bound, the shortest first, at the scenario's loss.
+        losses: over the loss, at the best bound, with new seeds.
+        usual: bound of a scenario with `playout: null`, s.
+        left_out: bounds in s that the multibody plant of the scenario cannot have.
+        interrupted: whether Ctrl-C ended it early.
+    """
+
+    scenario: Scenario
+    runs: int
+    bounds: Sequence[Cell]
+    losses: Sequence[Cell]
+    usual: float
+    left_out: tuple[float, ...]
+    interrupted: bool
+
+    @property
+    def best(self) -> Cell | None:
+        """Cell of the least mean E_ac among those with the most completed runs, or None."""
+        return best_of(self.bounds)
+
+    @property
+    def checked(self) -> Cell | None:
+        """The best bound at the scenario's loss with new seeds, or None."""
+        link = self.scenario.link
+        assert link.kind == "network"
+        return next((cell for cell in self.losses if cell.loss == link.loss), None)
+
+    @property
+    def survivable(self) -> float:
+        """Largest loss up to which every run completed; NaN for none."""
+        survived = math.nan
+        for cell in self.losses:
+            if cell.completed != 1:
+                break
+            survived = cell.loss
+        return survived
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        return {
+            "best_bound": None if self.best is None else self.best.bound,
+            "usual_bound": self.usual,
+            "survivable_loss": self.survivable,
+            "runs": self.runs,
+            "bounds": [cell.summary for cell in self.bounds],
+            "losses": [cell.summary for cell in self.losses],
+            "left_out": self.left_out,
+            "interrupted": self.interrupted,
+        }
 
 
 def study_link(
-    scenario: Scenario, options: LinkOptions, progress: "Progress | None" = None
-) -> "LinkStudy":
+    scenario: Scenario, options: LinkOptions, progress: Progress | None = None
+) -> LinkStudy:
     """Simulate a scenario on the exact plant over bounds, then over losses.
 
     Args:
@@ -34,44 +149,25 @@ def study_link(
     Raises:
         ConfigError: the scenario has no network.
     """
-    from stewart_drake.scenario.packets import usual_bound
-    from stewart_drake.studies.link_bound import (
-        LOSSES,
-        Cell,
-        LinkStudy,
-        best_of,
-        bounds_for,
-        possible,
-        simulated,
-    )
-
     link = scenario.assumed_link
     if link.kind != "network":
         raise ConfigError(f"link.kind: got {link.kind!r}; expected 'network'")
-    runs = options.runs
-    period, repeats = scenario.controller.period, scenario.controller.packet_repeats
+    runs, period = options.runs, scenario.controller.period
     base = replace(scenario, link=link, plant=scenario.plant.without_engine)
     losses = sorted({*LOSSES, link.loss})
     done = 0
 
     def run(
-        base: Scenario, cells: list[tuple[float, float]], following: int
+        base: Scenario, wanted: list[tuple[float, float]], following: int
     ) -> tuple[list[Cell], bool]:
-        """Simulate cells, before some number of `following` ones."""
+        """Simulate bounds and losses, before a number of `following` ones."""
         nonlocal done
-        if not cells:
-            return [], False
-        before, total = done, done + runs * (len(cells) + following)
-        done += runs * len(cells)
-
-        def tell(now: int, _: int) -> None:
-            if progress is not None:
-                progress(before + now, total)
-
-        return simulated(base, cells, runs, tell)
+        before = done
+        done += runs * len(wanted)
+        return _simulated(base, wanted, runs, part_of(progress, before, done + runs * following))
 
     wanted, left_out, found = bounds_for(link, period), set[float](), list[Cell]()
-    for step in (1.0, 0.5, 0.0):  # periods between the best bound and those that are tried next
+    for step in (1.0, 0.5, 0.0):  # periods between the best bound and the next ones to try
         following = len(losses) + (2 if step else 0)
         cells, stopped = run(base, [(bound, link.loss) for bound in wanted], following)
         found = sorted([*found, *cells])
@@ -80,13 +176,61 @@ def study_link(
             break
         near = {round(best.bound + sign * step * period, 12) for sign in (-1, 1)}
         near = {b for b in near if b > 0 and min(abs(b - cell.bound) for cell in found) > 1e-9}
-        left_out |= {bound for bound in near if not possible(scenario, link, bound)}
+        left_out |= {bound for bound in near if not _possible(scenario, link, bound)}
         wanted = sorted(near - left_out)
-    kept: list[Cell] = []
+    checked: list[Cell] = []
     if best is not None and not stopped:
         sensor = replace(base.sensor, seed=base.sensor.seed + runs)
         fresh = replace(base, link=replace(link, seed=link.seed + runs), sensor=sensor)
-        kept, stopped = run(fresh, [(best.bound, loss) for loss in losses], 0)
-    usual = usual_bound(link, repeats, period)
-    there = tuple(sorted(left_out))
-    return LinkStudy(scenario, runs, tuple(found), tuple(kept), usual, there, stopped)
+        checked, stopped = run(fresh, [(best.bound, loss) for loss in losses], 0)
+    usual = usual_bound(link, scenario.controller.packet_repeats, period)
+    return LinkStudy(scenario, runs, found, checked, usual, tuple(sorted(left_out)), stopped)
+
+
+def bounds_for(link: NetworkConfig, period: float) -> list[float]:
+    """Return bounds in whole periods, s, from few packets in time to nearly all."""
+    times = times_under_way(link)
+    first, last = (math.ceil(times.ppf(share) / period - 1e-9) for share in (_FEW, _NEARLY_ALL))
+    steps = np.unique(np.linspace(first, last + 1, min(last + 2 - first, _MOST_BOUNDS)).round())
+    return [float(period * step) for step in steps]
+
+
+def best_of(cells: Iterable[Cell]) -> Cell | None:
+    done = [cell for cell in cells if cell.errors]
+    return min(done, key=lambda c: (-c.completed, np.mean(c.errors)), default=None)
+
+
+def _possible(scenario: Scenario, link: NetworkConfig, bound: float) -> bool:
+    """Return whether the scenario's own plant can have a bound in s."""
+    other = replace(scenario, link=replace(link, playout=bound))
+    return scenario.plant.kind != "multibody" or not other.step_problem(scenario.plant.time_step)
+
+
+def _simulated(
+    base: Scenario, wanted: list[tuple[float, float]], runs: int, progress: Progress | None
+) -> tuple[list[Cell], bool]:
+    """Return a cell for each bound and loss, and whether Ctrl-C ended it early."""
+    link, c = base.link, base.controller
+    assert link.kind == "network"
+    keys = {
+        (bound, loss): [f"bound{bound:g}-loss{loss:g}-seed{seed}" for seed in range(runs)]
+        for bound, loss in wanted
+    }
+    variants = {
+        key: replace(
+            base,
+            link=replace(link, playout=bound, loss=loss, seed=link.seed + seed),
+            sensor=replace(base.sensor, seed=base.sensor.seed + seed),
+        )
+        for (bound, loss), some in keys.items()
+        for seed, key in enumerate(some)
+    }
+    results, stopped = run_scenarios(variants, progress) if variants else ({}, False)
+    cells = []
+    for (bound, loss), some in keys.items():
+        finished = [results[key] for key in some if key in results]
+        errors = tuple(one.error for one in finished if one.status == "completed")
+        late = 1 - float(in_time(link, bound))
+        missing = torque_missing(replace(link, loss=loss), bound, c.packet_repeats, c.period)
+        cells.append(Cell(bound, loss, late, missing, len(finished), errors))
+    return cells, stopped

@@ -33,7 +33,7 @@ from stewart_drake.mechanism.kinematics import Legs, leg_geometry, reachable_hei
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES
-from stewart_drake.studies.measurements import Measurements
+from stewart_drake.studies.study_options import Measurements
 from stewart_drake.studies.workspace_map import (
     Measures,
     Travel,

@@ -4,54 +4,16 @@ Drake is imported by the study, not by its options.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials, write_whole
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.studies.options import JobOptions, option
-from stewart_drake.studies.ranges import RANGE_UNITS, Ranges, read_ranges
+from stewart_drake.studies.study_options import Ranges, RobustnessOptions
 
 if TYPE_CHECKING:
     from stewart_drake.studies.jobs import Progress
     from stewart_drake.studies.robustness_result import RobustnessStudy
-
-
-def _read_also(names: list[str], load: Callable[[str], Scenario]) -> dict[str, Scenario]:
-    others = {Path(name).stem: name for name in names}
-    if len(others) < len(names):
-        raise ConfigError(
-            f"--also: got two of one name, {', '.join(names)}; expected each but once"
-        )
-    return {key: load(name) for key, name in others.items()}
-
-
-class RobustnessOptions(JobOptions):
-    """Options of `study_robustness`."""
-
-    ranges: Ranges | None = option(
-        None,
-        "Size of a variation, 0: none. "
-        + "; ".join(f"{name}: {unit}" for name, unit in RANGE_UNITS.items())
-        + ". torque_limit takes null too: as the scenario has it.",
-        "NAME=VALUE",
-        name="vary",
-        read=lambda texts, _: read_ranges(texts),
-    )
-    runs: int = option(200, "Number of machines.", "N", ge=1)
-    seed: int = option(0, "Random seed.", ge=0)
-    limit: float | None = option(
-        None, "E_ac above which a run counts as failed, % s.", "E_AC", gt=0
-    )
-    also: Mapping[str, Scenario] | None = option(
-        None,
-        "Run the same machines with this controller too, such as adaptive_lqi, "
-        "which finds the delay.",
-        "CONTROLLER",
-        read=_read_also,
-    )
 
 
 def study_robustness(

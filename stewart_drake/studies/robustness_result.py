@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from stewart_drake.files.versions import versions
 from stewart_drake.loop.experiment import Experiment
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.runs import Outcome, loops_of
 from stewart_drake.studies.statistics import (
     Correlation,
@@ -26,6 +25,7 @@ from stewart_drake.studies.statistics import (
     rank_correlation,
     wilson_interval,
 )
+from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.uncertainty import MACHINE, Draw, Scales
 from stewart_drake.types import Array
 

@@ -1,14 +1,11 @@
-"""One run of a study: how it ended, and the small file that keeps this.
-
-Files are read back as strictly as a scenario. One says that a run completed only if all that a
-completed run has is there; whatever breaks a rule is a ConfigError, never a success.
-"""
+"""One run of a study: how it ended, and the small JSON file that keeps this."""
 
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import ConfigDict, Field, WrapValidator
@@ -19,6 +16,7 @@ from stewart_drake.files.jsonio import jsonable, load_json, sealed_json
 from stewart_drake.files.yamlio import brief, validate
 from stewart_drake.loop.bulk import Ending, run_in_bulk
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.studies.jobs import Progress, run_jobs
 
 _MAX_BYTES: Final = 1_000_000
 _EXPECTED: Final = "the file of one run of a study"
@@ -31,23 +29,23 @@ def _or_nan(value: Any, check: Any) -> float:
 
 
 _Number = Annotated[float, Field(ge=0), WrapValidator(_or_nan)]
-"""Not negative; null, and what is not finite, is NaN."""
+"""Number that is not negative; null, infinity and NaN become NaN."""
 
 
 @dataclass(config=_STRICT)
 class Outcome:
-    """How a run ended.
+    """End of a run.
 
     Attributes:
-        status: as of a simulation; `not_assembled` where drawn parts do not fit together, `refused`
-            where the scenario cannot be prepared with what was drawn.
-        reason: why it failed, or nothing.
+        status: as of a simulation; `not_assembled` if drawn parts do not fit together, `refused`
+            if the scenario with the drawn values cannot be prepared.
+        reason: why it failed, or empty.
         leg: that reached its end, or None.
         time: s, when it failed, else NaN.
         error: E_ac in % s, NaN for a run that did not complete.
-        peak_torque: N m, as commanded, NaN where nothing ran.
-        tuner_fallbacks: samples at which a tuner passed its network over.
-        loop: what ran it, see `loop.bulk.Ending`; nothing where nothing ran.
+        peak_torque: N m, as commanded, NaN without a run.
+        tuner_fallbacks: number of samples at which a tuner ignored its network.
+        loop: what ran it, see `loop.bulk.Ending`; empty without a run.
     """
 
     status: Literal["completed", "left_workspace", "solver_failed", "not_assembled", "refused"]
@@ -67,7 +65,7 @@ class _File:
 
 
 def outcome_of(ending: Ending) -> Outcome:
-    """How a run ended."""
+    """Return how a run ended."""
     stopped = ending.stopped
     ended: dict[str, Any] = {}
     if stopped is not None:
@@ -83,27 +81,42 @@ def outcome_of(ending: Ending) -> Outcome:
 
 
 def loops_of(outcomes: Iterable[Outcome]) -> dict[str, int]:
-    """Number of runs by what ran them, the most frequent first."""
+    """Return the number of runs by what ran them, the most frequent first."""
     return dict(Counter(one.loop for one in outcomes if one.loop).most_common())
 
 
 def run_file(outcome: Outcome, draw: dict[str, Any] | None = None) -> bytes:
-    """The file of a run, JSON: what was drawn for it, and how it ended."""
-    data = {"draw": draw or {}, "outcome": dataclasses.asdict(outcome)}
-    return sealed_json(data)
+    """Return the file of a run, JSON: its drawn values and how it ended."""
+    return sealed_json({"draw": draw or {}, "outcome": dataclasses.asdict(outcome)})
 
 
 def run_scenario(scenario: Scenario) -> bytes:
-    """Run a scenario as it stands: the file of the run.
-
-    Raises:
-        As `run_in_bulk`.
-    """
+    """Run a scenario; return the file of the run."""
     return run_file(outcome_of(run_in_bulk(scenario)))
 
 
+def run_scenarios(
+    scenarios: Mapping[str, Scenario], progress: Progress | None = None
+) -> tuple[dict[str, Outcome], bool]:
+    """Run scenarios on all cores.
+
+    Returns:
+        Outcomes of the runs that finished, and whether Ctrl-C ended the runs early.
+    """
+    interrupted = False
+    with TemporaryDirectory() as folder:
+        try:
+            jobs = {key: (scenario,) for key, scenario in scenarios.items()}
+            run_jobs(jobs, run_scenario, folder, settings={}, progress=progress)
+        except KeyboardInterrupt:
+            interrupted = True
+        paths = {key: Path(folder) / f"{key}.json" for key in scenarios}
+        found = {key: read_outcome(path) for key, path in paths.items() if path.exists()}
+    return found, interrupted
+
+
 def read_outcome(path: Path) -> Outcome:
-    """How a run ended, from its file.
+    """Read how a run ended; a completed run must have everything that a completed run has.
 
     Raises:
         ConfigError: the file is damaged; one line, with the field.

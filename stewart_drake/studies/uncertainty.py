@@ -34,8 +34,8 @@ from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
 from stewart_drake.scenario.trajectories import spread_instants
 from stewart_drake.studies.jobs import run_jobs
-from stewart_drake.studies.ranges import Ranges
 from stewart_drake.studies.runs import Outcome, outcome_of, run_file
+from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.workspace import rms, size_motors
 
 Draw = dict[str, Any]

@@ -1,0 +1,494 @@
+"""Limits of a delay: open loop, closed loop, and simulations over delay and amplitude."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import singledispatch
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.law.delay_model import DelayedModel
+from stewart_drake.law.error_model import double_integrators, linear_model
+from stewart_drake.law.riccati import RiccatiError, law_gain
+from stewart_drake.law.stability import (
+    LinearLoop,
+    Peak,
+    amplification,
+    fastest_pole,
+    frequency_grid,
+    largest_delay,
+    loop_gain,
+    peaks,
+    sensitivity,
+    spectral_radius,
+    worst_margins,
+)
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.loop.experiment import (
+    assemble,
+    believed_delay,
+    reference_failure,
+    true_dynamics,
+    waits_at_rest,
+)
+from stewart_drake.loop.law_design import quadratic_cost
+from stewart_drake.loop.metrics import delay_floor
+from stewart_drake.mechanism.assembly import torque_map
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig, WaypointsConfig
+from stewart_drake.scenario.reference_files import waypoints
+from stewart_drake.scenario.signals import POSE
+from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.studies.jobs import Progress
+from stewart_drake.studies.runs import run_scenarios
+from stewart_drake.studies.study_options import DelayOptions
+from stewart_drake.studies.verdict import Basis, Verdict, basis, pole_in_motion
+from stewart_drake.types import Array
+
+INSTANTS: Final = 62
+"""Number of poles along the reference, in 61 steps: a round number may be in step with it."""
+TOLERABLE: Final = (2.0, 10.0, 100.0, 1000.0)
+"""Growths of prediction errors for which the largest delay is given."""
+DELAYS: Final = (0, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 25, 30)
+"""Delays in periods for which the loop is judged; the scenario's is added."""
+FACTORS: Final = (0.5, 0.75, 1.0, 1.25)
+"""Factors on the reference's amplitude that are simulated."""
+_CHECKS: Final = 5
+"""Number of poses at which growth is simulated."""
+_LARGEST_GROWTH: Final = 1e5
+"""Growth above which rounding errors would show in a simulation."""
+_PERTURBATION: Final = 1e-5
+"""Final size of a perturbation, as a share of the usual motion."""
+_STEP: Final = 1e-3
+"""Step of the Runge-Kutta method, s."""
+_POINTS: Final = 800
+"""Number of frequencies of a motor's loop for python-control, without some low ones."""
+_BEYOND: Final = 1.1
+"""End of the grid in Nyquist frequencies, for a crossing exactly at Nyquist's."""
+
+
+class PolePoint(NamedTuple):
+    """Fastest unstable poles at one instant of the reference, 1/s; 0 without one.
+
+    `moving` is linearised about the moving reference, `held` with the plate held still at that
+    pose; `time` in s.
+    """
+
+    time: float
+    moving: float
+    held: float
+
+
+class Growth(NamedTuple):
+    """Simulated perturbation of the plate held still, along its fastest mode, for some seconds.
+
+    `expected` is e^(p seconds); `time` in s is that of the pose.
+    """
+
+    time: float
+    seconds: float
+    expected: float
+    simulated: float
+
+
+class MotorMargins(NamedTuple):
+    """Worst margins of the six loops that are cut at one motor: factors > 1, < 1, and degrees."""
+
+    gain_up: float
+    gain_down: float
+    phase: float
+
+
+@dataclass(frozen=True)
+class LoopMargins:
+    """Margins of the loop of one delay.
+
+    Attributes:
+        steps: mu.
+        radius: spectral radius of the closed loop.
+        S, T: peaks of sensitivity and complementary sensitivity at the motors.
+        gain_up, gain_down: factors on the torques of all motors.
+        motor: classical margins of one motor at a time; None if the loop is unstable.
+        later, earlier: errors of the believed delay, s.
+    """
+
+    steps: int
+    radius: float
+    S: Peak
+    T: Peak
+    gain_up: float
+    gain_down: float
+    motor: MotorMargins | None
+    later: float
+    earlier: float
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        return {
+            "mu": self.steps,
+            "spectral_radius": self.radius,
+            "sensitivity_peak": self.S.value,
+            "sensitivity_frequency": self.S.frequency,
+            "complementary_peak": self.T.value,
+            "complementary_frequency": self.T.frequency,
+            "gain_margin": [self.gain_down, self.gain_up],
+            "motor_gain_margin": self.motor and [self.motor.gain_down, self.motor.gain_up],
+            "motor_phase_margin_deg": self.motor and self.motor.phase,
+            "delay_margin_later": self.later,
+            "delay_margin_earlier": self.earlier,
+        }
+
+
+class Cell(NamedTuple):
+    """Simulation with one delay and amplitude.
+
+    Attributes:
+        steps: whole periods of delay.
+        factor: on the reference's amplitude.
+        status: as of a simulation, or `out_of_reach` if the reference leaves the workspace, or
+            `not_run` after Ctrl-C.
+        error: E_ac in % s, NaN for a run that did not complete.
+        time: s, when it ended early or the reference leaves the workspace; else NaN.
+    """
+
+    steps: int
+    factor: float
+    status: str
+    error: float
+    time: float
+
+
+@dataclass(frozen=True)
+class DelayStudy:
+    """Result of the analysis of the delay.
+
+    Attributes:
+        basis: of the analysis.
+        controller: the scenario's loop along the reference, as far as that can be followed; None if
+            it cannot be followed at all.
+        eta: total delay, s.
+        poles: along the reference, as far as it can be followed.
+        growths: simulated checks of e^(p eta); none if nothing grows.
+        floors: E_ac in % s of a plate that waits at rest, by whole periods of delay.
+        loops: the closed loop by delay; empty with a reason in `loop_problem`.
+        loop_problem: why the closed loop was not judged, or empty.
+        cells: simulations by delay and amplitude.
+        interrupted: whether Ctrl-C ended the simulations early.
+    """
+
+    basis: Basis
+    controller: ControllerMargin | None
+    eta: float
+    poles: list[PolePoint]
+    growths: list[Growth]
+    floors: dict[int, float]
+    loops: list[LoopMargins]
+    loop_problem: str
+    cells: list[Cell]
+    interrupted: bool
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Verdict on the delay alone; None if the reference cannot be followed at all."""
+        if not self.poles:
+            return None
+        worst = max(self.poles, key=lambda point: point.moving)
+        return Verdict(self.eta, worst.moving, worst.time)
+
+    @property
+    def loop(self) -> LoopMargins | None:
+        """Closed loop at the scenario's delay."""
+        own = self.basis.experiment.scenario.true_delay.steps
+        return next((loop for loop in self.loops if loop.steps == own), None)
+
+    @property
+    def floor_applies(self) -> bool:
+        """Whether the scenario waits at rest, an assumption of the floor."""
+        return waits_at_rest(self.basis.experiment.scenario)
+
+    @property
+    def limits(self) -> list[tuple[float, float, float]]:
+        """Tolerable growths, largest delays in s, and the time in s of the fastest pole."""
+        worst = self.verdict
+        if worst is None:
+            return []
+        return [(a, largest_delay(worst.pole, a), worst.time) for a in TOLERABLE]
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Content of `summary.json`."""
+        verdict = self.verdict
+        return {
+            "eta": self.eta,
+            "obstacles": self.basis.obstacles,
+            "controller_margin": None if self.controller is None else self.controller.summary,
+            "verdict": None if verdict is None else str(verdict),
+            "beatable": None if verdict is None else verdict.beatable,
+            "poses": [
+                {
+                    "t": point.time,
+                    "fastest_pole": point.moving,
+                    "amplification": amplification(point.moving, self.eta),
+                    "fastest_pole_held": point.held,
+                }
+                for point in self.poles
+            ],
+            "growth_checks": [growth._asdict() for growth in self.growths],
+            "largest_delay": [
+                {"amplification": a, "delay": delay, "t": t} for a, delay, t in self.limits
+            ],
+            "error_floor": self.floors[self.basis.experiment.scenario.true_delay.steps],
+            "error_floor_applies": self.floor_applies,
+            "loop": [loop.summary for loop in self.loops],
+            "loop_problem": self.loop_problem or None,
+            "map": [
+                {**cell._asdict(), "floor": self.floors[cell.steps] if self.floor_applies else 0.0}
+                for cell in self.cells
+            ],
+            "interrupted": self.interrupted,
+        }
+
+
+def study_delay(
+    scenario: Scenario, options: DelayOptions, progress: Progress | None = None
+) -> DelayStudy:
+    """Analyse a scenario's delay; `progress` is called for each finished simulation.
+
+    Raises:
+        ConfigError: one line. A motion or a home pose outside the workspace is reported in
+            `Basis.obstacles` instead.
+    """
+    with threadpool_limits(limits=1):
+        found = basis(scenario)
+        delay, period = scenario.true_delay, scenario.controller.period
+        poles = _poles(found)
+        loops, problem = _loops(found)
+        simulated = options.simulations and not problem
+        cells, interrupted = delay_map(scenario, progress) if simulated else ([], False)
+        floors = {
+            steps: error_floor(found, Delay(steps, delay.fraction).eta(period))
+            for steps in {delay.steps, *map_delays(delay.steps)}
+        }
+        return DelayStudy(
+            basis=found,
+            controller=controller_margin(found.experiment, found.followed_until) if poles else None,
+            eta=scenario.eta,
+            poles=poles,
+            growths=_growths(found, poles, scenario.eta),
+            floors=floors,
+            loops=loops,
+            loop_problem=problem,
+            cells=cells,
+            interrupted=interrupted,
+        )
+
+
+# ---------------------------------------------------------------- open loop
+
+
+def error_floor(found: Basis, eta: float) -> float:
+    """Return E_ac in % s of a plate at rest at the first pose after `eta` s without any torque."""
+    reference, duration = found.experiment.reference, found.experiment.scenario.duration
+    time: Array = np.linspace(0.0, min(eta, duration), 2001, dtype=np.float64)
+    poses = np.array([reference.value(t)[:, 0] for t in time])
+    return delay_floor(time, poses, found.experiment.scale, eta)
+
+
+def simulated_growth(
+    dynamics: StewartDynamics, pose: Array, seconds: float, size: float
+) -> tuple[float, float]:
+    """Return e^(p seconds), and the growth of a perturbation of a plate held still at a pose (6,).
+
+    It starts along the mode of the fastest pole p, so small that it ends at about `size` (rad, m).
+    The nonlinear equations are integrated with the torque that holds the plate.
+    """
+    torque = dynamics.equilibrium_torque(pose)
+    values, vectors = np.linalg.eig(dynamics.linearize(pose, torque=torque)[0])
+    at = int(values.real.argmax())
+    mode = vectors[:, at].real / np.abs(vectors[POSE, at].real).max()
+    expected = amplification(float(values[at].real), seconds)
+    start = np.concatenate([pose, np.zeros(6)]) + size / expected * mode
+    number = max(1, math.ceil(seconds / _STEP))
+    states = dynamics.predict(start, np.tile(torque, (number, 1)), seconds / number)
+    moved = np.linalg.norm(states[-1, POSE] - pose) / np.linalg.norm(start[POSE] - pose)
+    return expected, float(moved)
+
+
+def _poles(found: Basis) -> list[PolePoint]:
+    experiment, points = found.experiment, []
+    end = found.followed_until
+    for t in np.linspace(0.0, end, INSTANTS) if end > 0 else ():
+        pose = experiment.reference.value(t)[:, 0]
+        held = fastest_pole(experiment.nominal.linearize(pose)[0])
+        points.append(PolePoint(float(t), pole_in_motion(experiment, t), held))
+    return points
+
+
+def _growths(found: Basis, poles: list[PolePoint], eta: float) -> list[Growth]:
+    experiment, growths = found.experiment, []
+    for point in poles[:: max(1, len(poles) // _CHECKS)][:_CHECKS]:
+        if point.held == 0 or eta == 0:
+            continue
+        seconds = min(eta, largest_delay(point.held, _LARGEST_GROWTH))
+        pose = experiment.reference.value(point.time)[:, 0]
+        size = _PERTURBATION * float(found.motion.min())
+        pair = simulated_growth(experiment.nominal, pose, seconds, size)
+        growths.append(Growth(point.time, seconds, *pair))
+    return growths
+
+
+# ---------------------------------------------------------------- closed loop
+
+
+def _loops(found: Basis) -> tuple[list[LoopMargins], str]:
+    if found.experiment.scenario.link.kind == "network":
+        return [], "its torques come in packets, which analyze link is about"
+    pose = found.experiment.reference.value(0.0)[:, 0]
+    failure = diagnose(found.experiment.mechanism, 0.0, pose)
+    if failure is not None:
+        return [], f"at the reference's first pose: {failure.reason}"
+    try:
+        return loop_margins(found), ""
+    except (RiccatiError, np.linalg.LinAlgError) as error:
+        return [], f"no gain at the reference's first pose: {error}"
+
+
+def loop_margins(found: Basis, delays: Iterable[int] = DELAYS) -> list[LoopMargins]:
+    """Judge the loop over the delay, linearised at the reference's first pose, held still.
+
+    The law is designed as the scenario's controller (model, prediction, weights, believed delay)
+    and closed around the true plant. An estimator is assumed to have found payload and friction.
+
+    Raises:
+        RiccatiError: the Riccati equation has no solution.
+        numpy.linalg.LinAlgError: no torques hold the plate at that pose.
+    """
+    experiment, sc = found.experiment, found.experiment.scenario
+    c, pose = sc.controller, evaluate(experiment.reference, 0.0)[POSE]
+    plant = linear_model(*true_dynamics(experiment).linearize(pose))
+    known = true_dynamics(experiment) if c.estimate else experiment.nominal
+    predictor = design = linear_model(*known.linearize(pose))
+    if c.model == "paper":
+        design = double_integrators(torque_map(experiment.mechanism, pose, c.torque_map))
+    if c.prediction == "linear":
+        predictor = design
+    weights = quadratic_cost(experiment, found.torque).matrices(np.array([c.w_Q, c.w_R]))
+    judged = []
+    for steps in sorted({*delays, sc.delay.steps}):
+        believed = believed_delay(replace(sc, delay=replace(sc.delay, steps=steps)))
+        K = law_gain(design, predictor, c.period, believed, weights)
+        loop = LinearLoop(plant, K, c.period, Delay(steps, sc.delay.fraction), c.integral)
+        judged.append(_margins_of(loop))
+    return judged
+
+
+def _margins_of(loop: LinearLoop) -> LoopMargins:
+    radius, true = spectral_radius(loop.matrix()), loop.sampled()
+    S = T = Peak(math.nan, math.nan)
+    if radius < 1:
+        S, T = peaks(true, loop.K, loop.period)
+    margins = worst_margins([loop])
+    return LoopMargins(
+        steps=loop.delay.steps,
+        radius=radius,
+        S=S,
+        T=T,
+        gain_up=margins.gain_up,
+        gain_down=margins.gain_down,
+        motor=_motor_margins(true, loop.K, loop.period) if radius < 1 else None,
+        later=margins.longer,
+        earlier=margins.shorter,
+    )
+
+
+def _motor_margins(plant: DelayedModel, K: Array, period: float) -> MotorMargins:
+    """Return the worst margins of six single loops, from their frequency responses.
+
+    With the other five closed, the loop of motor i is L_i = 1 / S_ii - 1.
+    """
+    import control
+
+    nyquist = np.pi / period
+    evenly = np.linspace(0.0, _BEYOND * nyquist, _POINTS)[1:]
+    grid = np.union1d(frequency_grid(period, _POINTS // 8), evenly)
+    S = sensitivity(loop_gain(plant, K, np.exp(1j * grid * period)))
+    up, down, phase = math.inf, 0.0, math.inf
+    for motor in range(S.shape[1]):
+        response = control.frd(1 / S[:, motor, motor] - 1, grid, smooth=True)
+        gains, phases, *_ = control.stability_margins(response, returnall=True)
+        up = min([up, *gains[gains > 1]])
+        down = max([down, *gains[gains < 1]])
+        phase = min([phase, *np.abs(phases)])
+    return MotorMargins(float(up), float(down), float(phase))
+
+
+# ---------------------------------------------------------------- simulations
+
+
+def map_delays(steps: int) -> list[int]:
+    """Return the delays in periods that are simulated for a scenario's own."""
+    return sorted({0, steps // 2, steps, 3 * steps // 2, 2 * steps}) if steps > 1 else [0, 1, 2, 4]
+
+
+@singledispatch
+def _scaled(reference: ReferenceConfig, factor: float) -> ReferenceConfig | None:
+    return None
+
+
+@_scaled.register
+def _(reference: SineConfig, factor: float) -> SineConfig:
+    return replace(reference, amplitude=[factor * a for a in reference.amplitude])
+
+
+@_scaled.register
+def _(reference: WaypointsConfig, factor: float) -> WaypointsConfig:
+    times, poses = waypoints(reference)
+    way = poses[0] + factor * (poses - poses[0])
+    return replace(reference, file=None, times=times.tolist(), poses=way.tolist())
+
+
+def scaled_motion(reference: ReferenceConfig, factor: float) -> ReferenceConfig | None:
+    """Return the motion with its amplitude, or its way from the first waypoint, times `factor`.
+
+    None if it has no amplitude to scale: a constant pose, or a file of samples.
+    """
+    return reference if factor == 1 else _scaled(reference, factor)
+
+
+def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[list[Cell], bool]:
+    """Simulate a scenario on the exact plant over delays and amplitudes, on all cores.
+
+    Everything else stays the same, also the delay that the controller believes.
+
+    Returns:
+        Cells by delay, then factor, and whether Ctrl-C ended the simulations early.
+    """
+    cells: dict[str, Cell] = {}
+    variants: dict[str, Scenario] = {}
+    for steps in map_delays(scenario.delay.steps):
+        for factor in FACTORS:
+            motion = scaled_motion(scenario.reference, factor)
+            if motion is None:
+                continue
+            variant = replace(
+                scenario,
+                reference=motion,
+                plant=scenario.plant.without_engine,
+                delay=replace(scenario.delay, steps=steps),
+            )
+            key = f"mu{steps}-x{factor}"
+            failure = reference_failure(assemble(variant))
+            if failure is None:
+                variants[key] = variant
+                cells[key] = Cell(steps, factor, "not_run", math.nan, math.nan)
+            else:
+                cells[key] = Cell(steps, factor, "out_of_reach", math.nan, float(failure.time))
+    found, interrupted = run_scenarios(variants, progress)
+    for key, one in found.items():
+        cells[key] = cells[key]._replace(status=one.status, error=one.error, time=one.time)
+    return list(cells.values()), interrupted

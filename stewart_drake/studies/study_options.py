@@ -1,0 +1,249 @@
+"""Options of all studies, and measurements of a new machine; nothing heavy is imported here."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import field
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.yamlio import units_of, validate_pairs
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.studies.options import JobOptions, Options, option
+
+_TORQUE_SHARE: Final = "share of the reference's largest torque"
+_CRANK_SHARE: Final = "share of the mean crank length"
+
+
+def _share(unit: str, **bounds: float) -> Any:
+    return Field(ge=0, description=unit, **bounds)  # type: ignore[arg-type]
+
+
+@dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+class Ranges:
+    """Size of the variation of each quantity; 0 (null for `torque_limit`) switches it off.
+
+    Only the torque limit and the noise of the sensor are known to the controller. The unit of each
+    number is in `RANGE_UNITS`.
+
+    Attributes:
+        payload: mass at the plate's centre of mass, uniform in +-.
+        torque_bias: rms over the motors, uniform from 0; its direction in the space of the six
+            motors is random.
+        noise: standard deviation of the measured pose (rates: per second), uniform from 0.
+        torque_limit: least and largest limit of the motors, uniform. The limit of the undisturbed
+            run (the scenario's, or that of the mechanism's motors) is never exceeded.
+        damping: friction torque of a crank, uniform from 0.
+        delay: true minus believed delay, uniform in +-; over a wire.
+        delay_steps: the same in whole periods, uniform in +-; adds to `delay`.
+        lengths: error of crank and rod lengths, rms over the twelve, uniform from 0.
+        anchors: error of the coordinates of motor shafts and plate joints, rms over the 36,
+            uniform from 0.
+        coulomb: Coulomb friction of a crank, uniform from 0.
+        payload_position: error of the coordinates of the payload, rms over the three, uniform
+            from 0; without effect if there is no payload.
+        jitter: standard deviation of the delay from torque to torque, uniform from 0; over a wire.
+        loss: share of the measurements that are lost, uniform from 0; over a network of packets.
+    """
+
+    payload: Annotated[float, _share("+-share of the plate's mass", lt=1)] = 0.1
+    torque_bias: Annotated[float, _share(_TORQUE_SHARE)] = 0.02
+    noise: Annotated[float, _share("share of half the reference's peak to peak")] = 1e-3
+    torque_limit: Annotated[
+        Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=2, max_length=2)] | None,
+        Field(description="[least, most] in peak torques of the undisturbed run"),
+    ] = field(default_factory=lambda: [1.0, 3.0])
+    damping: Annotated[float, _share(f"{_TORQUE_SHARE}, at its largest crank speed")] = 0.02
+    delay: Annotated[float, _share("+-periods of the controller", le=100)] = 0.01
+    delay_steps: Annotated[int, _share("+-whole periods", le=100)] = 0
+    lengths: Annotated[float, _share(_CRANK_SHARE, lt=1)] = 2e-4
+    anchors: Annotated[float, _share(_CRANK_SHARE, lt=1)] = 2e-4
+    coulomb: Annotated[float, _share(_TORQUE_SHARE)] = 0.0
+    payload_position: Annotated[float, _share(_CRANK_SHARE)] = 0.0
+    jitter: Annotated[float, _share("periods of the controller", le=1)] = 0.0
+    loss: Annotated[float, _share("share of measurements, of packets over a network", lt=0.99)] = (
+        0.0
+    )
+
+
+RANGE_UNITS: Final = units_of(Ranges)
+"""Unit of each field of `Ranges`."""
+
+
+def read_ranges(settings: Iterable[str]) -> Ranges:
+    """Return the ranges of `name=value` settings, the value in YAML; others keep their default.
+
+    Raises:
+        ConfigError: in one line.
+    """
+    ranges = validate_pairs(Ranges, settings, "--vary", RANGE_UNITS)
+    limit = ranges.torque_limit
+    if limit is not None and limit[0] > limit[1]:
+        raise ConfigError(
+            f"--vary: torque_limit: got {limit!r}; expected the lesser one first"
+            f" (torque_limit: {RANGE_UNITS['torque_limit']})"
+        )
+    return ranges
+
+
+class DelayOptions(Options):
+    """Options of `study_delay`."""
+
+    simulations: Annotated[
+        bool, Field(description="Whether to simulate over delay and amplitude too, on all cores.")
+    ] = True
+
+
+class LinkOptions(Options):
+    """Options of `study_link`."""
+
+    runs: int = option(5, "Number of seeds for each bound and loss.", "N", ge=1)
+
+
+def _read_also(names: list[str], load: Callable[[str], Scenario]) -> dict[str, Scenario]:
+    others = {Path(name).stem: name for name in names}
+    if len(others) < len(names):
+        raise ConfigError(
+            f"--also: got two of one name, {', '.join(names)}; expected each but once"
+        )
+    return {key: load(name) for key, name in others.items()}
+
+
+class RobustnessOptions(JobOptions):
+    """Options of `study_robustness`."""
+
+    ranges: Ranges | None = option(
+        None,
+        "Size of a variation, 0: none. "
+        + "; ".join(f"{name}: {unit}" for name, unit in RANGE_UNITS.items())
+        + ". torque_limit takes null too: as the scenario has it.",
+        "NAME=VALUE",
+        name="vary",
+        read=lambda texts, _: read_ranges(texts),
+    )
+    runs: int = option(200, "Number of machines.", "N", ge=1)
+    seed: int = option(0, "Random seed.", ge=0)
+    limit: float | None = option(
+        None, "E_ac above which a run counts as failed, % s.", "E_AC", gt=0
+    )
+    also: Mapping[str, Scenario] | None = option(
+        None,
+        "Run the same machines with this controller too, such as adaptive_lqi, "
+        "which finds the delay.",
+        "CONTROLLER",
+        read=_read_also,
+    )
+
+
+def _numbers(option: str, form: str, text: str, values: Iterable[str]) -> list[float]:
+    try:
+        return [float(value) for value in values]
+    except ValueError:
+        raise ConfigError(f"--{option}: got {text!r}; expected {form}") from None
+
+
+def _read_limits(texts: list[str], _: object) -> dict[str, float]:
+    found = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        (found[name.strip()],) = _numbers("limit", "NAME=VALUE", text, [value])
+    return found
+
+
+def _read_bounds(texts: list[str], _: object) -> dict[str, tuple[float, float]]:
+    found = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        low, colon, high = value.partition(":")
+        ends = [low, high if colon else low]
+        first, last = _numbers("vary", "NAME=LOW:HIGH or NAME=VALUE", text, ends)
+        found[name.strip()] = (first, last)
+    return found
+
+
+class LayoutOptions(JobOptions):
+    """Options of `study_layout`."""
+
+    goal: str = option(
+        "condition",
+        "Goal of the search: condition, torque, reach, clearance, "
+        "transmission, plate_joint_deg or crank_joint_deg.",
+        "NAME",
+    )
+    limits: Mapping[str, float] | None = option(
+        None,
+        "Least (reach, clearance, transmission) or largest value, SI units.",
+        "NAME=VALUE",
+        name="limit",
+        read=_read_limits,
+    )
+    vary: Mapping[str, tuple[float, float]] | None = option(
+        None,
+        "Bounds of a number of the pattern, or of crank or rod; one value fixes it.",
+        "NAME=LOW:HIGH",
+        read=_read_bounds,
+    )
+    keep: Sequence[str] = option(
+        (), "Number to keep, or branches or plate_order.", "NAME", read=lambda texts, _: texts
+    )
+    best: int = option(3, "Number of machines to write.", "N", ge=1)
+    starts: int = option(1, "Number of searches per arrangement of legs.", "N", ge=1)
+    generations: int = option(100, "Largest number of generations of a search.", "N", ge=1)
+    seed: int = option(0, "Random seed.", ge=0)
+
+
+LARGEST: Final = 5.0
+"""Largest length in m; above, millimetres were probably meant."""
+_Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Mass = Annotated[float, Field(gt=0, lt=1e6)]
+
+
+class Measurements(Options):
+    """Measurements of a machine with a ruler and scales, lengths in m and masses in kg."""
+
+    base_radius: _Length = option(..., "Radius of the circle of the motor shafts, m.")
+    shaft_distance: _Length = option(..., "Distance of the two shafts of a pair, m.")
+    plate_radius: _Length = option(..., "Radius of the circle of the plate's joints, m.")
+    joint_distance: _Length = option(..., "Distance of two neighbouring joints of the plate, m.")
+    crank: _Length = option(..., "Crank, from shaft to rod, m.")
+    rod: _Length = option(..., "Rod, from joint to joint, m.")
+    plate_mass: _Mass = option(..., "Mass of the plate with its load, kg.")
+    crank_mass: _Mass = option(..., "Mass of a crank, kg.")
+    rod_mass: _Mass = option(..., "Mass of a rod, kg.")
+    shaft_height: float = option(0.0, "Height of the shafts, m.", ge=-LARGEST, le=LARGEST)
+    upright: float = option(
+        90.0, "Degrees from the horizon of the planes the cranks turn in.", ge=-180, le=180
+    )
+    cranks: Literal["apart", "together"] = option(
+        "apart", "Of a pair: they point apart, or together."
+    )
+    torque_limit: float | None = option(None, "Torque limit of each motor, N m.", gt=0, lt=1e6)
+    delay: float = option(0.1, "Time from computing a torque to its action, s.", ge=0, le=5)
+    gravity: bool = option(True, "Gravity acts; not on a counterbalanced plate.")
+
+    def __init__(self, **values: object) -> None:
+        super().__init__(**values)
+        for name, value in self.lengths().items():
+            if value > LARGEST:
+                raise ConfigError(
+                    f"{name}: got {value:g} m; expected metres, {value / 1000:g} for {value:g} mm"
+                )
+        if self.rod <= self.crank:
+            raise ConfigError(
+                f"rod: got {self.rod:g} m with cranks of {self.crank:g} m; expected a rod longer "
+                "than its crank"
+            )
+        for name, radius in (("shaft", self.base_radius), ("joint", self.plate_radius)):
+            distance = getattr(self, f"{name}_distance")
+            if distance >= math.sqrt(3) * radius:
+                raise ConfigError(
+                    f"{name}_distance: got {distance:g} m on a circle of radius {radius:g} m; "
+                    f"expected less than {math.sqrt(3) * radius:.4g}, where pairs meet"
+                )
+
+    def lengths(self) -> dict[str, float]:
+        """Return the lengths by name, m."""
+        return {name: getattr(self, name) for name in list(type(self).model_fields)[:6]}
