@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import contextmanager
 
@@ -23,6 +24,8 @@ from tests.live_driver import Driver, drive_in_real_time
 
 SETTINGS = ("plant.kind=exact", "duration=4.0")
 COMMAND = [sys.executable, "-m", "stewart_drake"]
+PATIENCE = 120.0
+"""s in which a process must say what is waited for, on a busy computer."""
 
 
 def free_port():
@@ -48,9 +51,7 @@ class Process:
 
     def until(self, pattern):
         """The line that has it, which must come before the process ends."""
-        assert self.popen.stdout is not None
-        for line in self.popen.stdout:
-            self.lines.append(line.rstrip("\n"))
+        for line in self._read():
             if re.search(pattern, line):
                 return line
         raise AssertionError(f"no {pattern!r} in {self.lines}")
@@ -59,9 +60,25 @@ class Process:
         """Its exit status, after a signal."""
         if number is not None:
             self.popen.send_signal(number)
-        said, _ = self.popen.communicate(timeout=30)
-        self.lines += said.splitlines()
-        return self.popen.returncode
+        for _ in self._read():
+            pass
+        return self.popen.wait()
+
+    def _read(self) -> Iterator[str]:
+        """Yield the lines as they come, for `PATIENCE` s; then the process is killed.
+
+        Reads through the file object: `communicate(timeout=...)` reads the descriptor, and loses
+        the lines that the file object has read ahead.
+        """
+        assert self.popen.stdout is not None
+        late = threading.Timer(PATIENCE, self.popen.kill)
+        late.start()
+        try:
+            for line in self.popen.stdout:
+                self.lines.append(line.rstrip("\n"))
+                yield line
+        finally:
+            late.cancel()
 
 
 @contextmanager
@@ -268,11 +285,12 @@ def test_either_side_of_a_network_may_stand_still_for_a_second(side):
         suspended.popen.send_signal(signal.SIGSTOP)
         time.sleep(1.0)
         suspended.popen.send_signal(signal.SIGCONT)
-        line = suspended.until("stood still for")
+        suspended.until(r"stood still for (0\.[5-9]|[12]\.)")
         survived = driving.end() == 0
         assert running.end(signal.SIGINT) == 130
-    assert 0.5 < float(line.split("stood still for ")[1].split()[0]) < 3.0
-    assert sum("stood still" in line for line in suspended.lines) == 1
+    # A busy computer may suspend it for some tenths of a second more.
+    stops = [float(s) for s in re.findall(r"stood still for ([\d.]+) s", suspended.said)]
+    assert sum(stop > 0.5 for stop in stops) == 1 and max(stops) < 3.0
     assert (
         "nothing was heard from the controller for 0.7 s: the safe torque (zero) acts"
         in running.said
