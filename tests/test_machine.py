@@ -165,6 +165,21 @@ def test_a_controller_that_was_suspended_goes_on_in_its_session():
     assert any(np.all(m.acted == 0.1, axis=1).any() for m in messages(run))
 
 
+def test_a_suspended_machine_was_safe_in_time_and_no_torque_acts_in_the_past():
+    run = begun(samples=20, watchdog=0.3)
+    driver, heard = run.driver, run.machine.session.heard
+    for k in range(20, 30):  # sent while the machine does not read
+        driver.step(driver.begin + k * driver.period)
+    run.clock.time = run.zero + driver.begin + 30 * driver.period
+    woken = run.machine.time()
+    run.machine.poll(woken)
+    run.machine.advance(woken)
+    times = [float(line.split(" s: ")[0]) for line in run.said[-3:]]
+    assert "stood still for" in run.said[-3] and "nothing was heard" in run.said[-2]
+    assert times[1] == pytest.approx((heard + run.machine.watchdog) / SECOND, abs=1e-3)
+    assert "torques act again" in run.said[-1] and times[2] >= woken / SECOND - 1e-3
+
+
 def test_stop_is_the_safe_torque_and_the_end_of_the_session():
     run = begun(samples=20)
     time, driver = run.machine.time(), run.driver

@@ -112,9 +112,11 @@ int stewart_link_take(const stewart_link *link, double *memory, double now, doub
     }
     if (last < now - link->together || last <= memory[STEWART_LINK_LAST] + link->together)
         return STEWART_LINK_LATE;
-    for (int i = 0; i < number; i++)
-        if (first + i * link->period > memory[STEWART_LINK_LAST] + link->together)
-            keep(link, memory, first + i * link->period, sequence, arrival, commands + link->size * i);
+    for (int i = 0; i < number; i++) {
+        const double at = first + i * link->period;
+        if (at > memory[STEWART_LINK_LAST] + link->together && at >= now - link->together)
+            keep(link, memory, at, sequence, arrival, commands + link->size * i);
+    }
     return STEWART_LINK_TAKES;
 }
 
