@@ -72,7 +72,7 @@ class RampConfig:
 
 
 def test_a_kind_of_reference_is_a_class_and_how_to_make_its_motion():
-    @make_reference.register
+    @make_reference.register(RampConfig)
     def _ramp(config, duration):
         poses = np.column_stack([[0.0] * 6, [0.0] * 5 + [config.rate]])
         return PiecewisePolynomial.FirstOrderHold([0.0, 1.0], poses)
@@ -257,14 +257,14 @@ BAD_CSV = {
     "no header": ("\n".join(GOOD_ROWS), ["row 1", "'0.0'", "a header time[s]"]),
     "three rows": ("\n".join([HEADER, *GOOD_ROWS[:3]]), ["got 3 samples", "at least 4"]),
     "semicolons": (HEADER.replace(",", ";"), ["row 1", "separated by ';'", "expected commas"]),
-    "decimal commas": (changed(1, "0,1,0,0,0,0,0,0,38"), ["row 3", "got 9 cells", "a point for"]),
+    "decimal commas": (changed(1, "0,1,0,0,0,0,0,0,38"), ["7 fields in line 3, saw 9", "points for the decimals"]),
     "no units": ("time,roll,pitch,yaw,x,y,z", ["row 1", "unknown column 'time'"]),
     "odd unit": (HEADER.replace("x[m]", "x[ft]"), ["row 1", "'x[ft]'", "x in m or mm"]),
     "missing column": (HEADER.replace(",z[m]", ""), ["row 1", "column z is missing"]),
     "column twice": (HEADER.replace("y[m]", "x[mm]"), ["row 1", "a second column 'x[mm]'"]),
     "extra column": (HEADER + ",w[m]", ["row 1", "unknown column 'w[m]'"]),
-    "short row": (changed(2, "0.2,0,0"), ["row 4", "got 3 cells", "7"]),
-    "text": (changed(2, "0.2,0,abc,0,0,0,0.38"), ["row 4", "pitch[rad]", "'abc'", "a number"]),
+    "short row": (changed(2, "0.2,0,0"), ["row 4", "yaw[rad]: got ''"]),
+    "text": (changed(2, "0.2,0,abc,0,0,0,0.38"), ["row 4", "pitch[rad]", "'abc'", "a finite number"]),
     "nan": (changed(3, "0.3,0,0,nan,0,0,0.38"), ["row 5", "yaw[rad]", "nan", "finite"]),
     "late start": (changed(0, "0.05,0,0,0,0,0,0.38"), ["row 2", "time[s]", "0.05", "subtract"]),
     "time twice": (changed(2, "0.1,0,0,0,0,0,0.38"), ["row 4", "time[s]", "0.1 after 0.1"]),
@@ -278,7 +278,7 @@ BAD_CSV = {
         changed(1, "0.1,0,0,0,0,0,-2e6").replace("z[m]", "z[mm]"),
         ["row 3", "z[mm]: got -2000000.0; expected a finite number below 1e+06 mm"],
     ),
-    "open quote": (changed(1, '"0.1,0,0,0,0,0,0.38'), ["row 7", "is not CSV"]),
+    "open quote": (changed(1, '"0.1,0,0,0,0,0,0.38'), ["is not CSV", "inside string"]),
     "moving end": (MOVING, ["last row", " x at 0.5 s", "duration"]),
     "glitch": (
         f"{MOVING}\n0.6,0,0,0,0.06,0,0.40\n0.7,0,0,0,0.07,0,0.38\n0.8,0,0,0,0.08,0,0.38",

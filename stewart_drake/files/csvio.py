@@ -1,15 +1,15 @@
 """Tables of numbers in CSV whose header names each column with its unit, `name[unit]`."""
 
-import csv
+import io
 import math
 import re
-from array import array
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+import pandas as pd
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import read_bytes
@@ -35,7 +35,7 @@ class Table:
         header: description of the expected header.
         labels: by name, the header's cell of each column that was read.
         scales: by name, the factor to SI units.
-        lines: line number of each row.
+        lines: (n,) line number of each row.
         columns: by name, the numbers (n,); NaN for an empty cell.
     """
 
@@ -43,7 +43,7 @@ class Table:
     header: str
     labels: dict[str, str]
     scales: dict[str, float]
-    lines: list[int]
+    lines: Array
     columns: dict[str, Array]
 
     def place(self, row: int, name: str | None = None) -> str:
@@ -57,7 +57,6 @@ class Table:
         Raises:
             ConfigError: a column is missing.
         """
-        names = list(names)
         for name in names:
             if name not in self.columns:
                 raise ConfigError(
@@ -89,58 +88,48 @@ def read_table(
     Raises:
         ConfigError: one line, opened by the path, with row and column where there are such.
     """
+    raw = read_bytes(path, _MAX_BYTES, expected)
     try:
-        text = read_bytes(path, _MAX_BYTES, expected).decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text; expected a CSV file") from None
-    rows = _rows(path, text)
-    _, first = next(rows, (0, list[str]()))
-    if not first:
-        raise ConfigError(f"{path}: is empty; expected a header {header}")
-    places, names, scales = _columns(path, first, header, units, prefix)
-    labels = {name: first[at].strip() for name, at in zip(names, places, strict=True)}
-    empty = {name: name in optional for name in names}
-    lines, numbers = list[int](), array("d")
-    for line, row in rows:
-        lines.append(line)
-        if len(row) != len(first):
-            hint = ", with a point for the decimals" if len(row) > len(first) else ""
-            raise ConfigError(
-                f"{path}: row {line}: got {len(row)} cells; expected {len(first)}, as above{hint}"
-            )
-        cells = [row[at] for at in places]
-        try:
-            values = [*map(float, cells)]
-        except ValueError:
-            values = [math.nan]
-        if not all(map(math.isfinite, values)):
-            where = f"{path}: row {line}, column"
-            values = [
-                _number(f"{where} {labels[name]}", cell, empty[name])
-                for name, cell in zip(names, cells, strict=True)
-            ]
-        numbers.extend(values)
-    table = np.frombuffer(numbers).reshape(-1, len(names)) * scales
-    columns = dict(zip(names, np.ascontiguousarray(table.T), strict=True))
-    return Table(path, header, labels, dict(zip(names, scales, strict=True)), lines, columns)
-
-
-def _rows(path: Path, text: list[str]) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows that are not blank, with their line numbers."""
-    reader = csv.reader(text, strict=True)
-    try:
-        for row in reader:
-            if any(map(str.strip, row)):
-                yield reader.line_num, row
-    except csv.Error as error:
+        cells = pd.read_csv(
+            io.BytesIO(raw),
+            header=None,
+            dtype=str,
+            keep_default_na=False,
+            skip_blank_lines=False,
+            encoding="utf-8-sig",
+        )
+    except pd.errors.EmptyDataError:
+        raise ConfigError(f"{path}: is empty; expected a header {header}") from None
+    except ValueError as error:
+        problem = " ".join(str(error).rpartition("error: ")[2].split())
         raise ConfigError(
-            f"{path}: row {reader.line_num}: is not CSV ({error}); expected cells between commas"
+            f"{path}: is not CSV ({problem}); expected UTF-8 text, as many cells in each row as in "
+            "row 1, with commas between them and points for the decimals"
         ) from None
+    cells = cells.fillna("").apply(lambda column: column.str.strip())
+    lines = 1 + np.flatnonzero((cells != "").any(axis=1))
+    first = cells.iloc[0].tolist()
+    columns: dict[str, Array] = {}
+    labels, scales = {}, {}
+    for at, name, scale in _columns(path, first, header, units, prefix):
+        labels[name], scales[name] = first[at], scale
+        texts = cells[at].iloc[lines[1:] - 1]
+        # Read by Python's float, whose last digit is right.
+        there = pd.to_numeric(texts, errors="coerce").notna()
+        values = texts.where(there, "nan").to_numpy(np.float64)
+        allowed = (texts == "").to_numpy() & (name in optional)
+        for row in np.flatnonzero(~(np.isfinite(values) | allowed))[:1]:
+            raise ConfigError(
+                f"{path}: row {lines[1:][row]}, column {first[at]}: got {texts.iloc[row]!r}; "
+                "expected a finite number"
+            )
+        columns[name] = values * scale
+    return Table(path, header, labels, scales, lines[1:], columns)
 
 
 def _columns(
     path: Path, first: list[str], header: str, units: Units, prefix: str | None
-) -> tuple[list[int], list[str], list[float]]:
+) -> list[tuple[int, str, float]]:
     """Return place, name and factor to SI units of the columns to read."""
     for separator in (";", "\t"):
         if separator in first[0]:
@@ -148,19 +137,20 @@ def _columns(
                 f"{path}: row 1: got cells separated by {separator!r}; expected commas, and points "
                 "for the decimals"
             )
-    if first[0].strip()[:1].isdigit():
+    if first[0][:1].isdigit():
         raise ConfigError(f"{path}: row 1: got {brief(first[0])}; expected a header {header}")
-    found = [_name_and_unit(cell) for cell in first]
-    all_names, known = {name for name, _ in found}, units.keys() - {"time"}
-    prefixed = {name for name in all_names if prefix and name.startswith(prefix)}
-    alone = prefixed and not all_names & known
-    names, scales, places = list[str](), list[float](), list[int]()
+    matches = [_LABEL.fullmatch(cell) for cell in first]
+    found = [(match[1].lower(), match[2]) if match else ("", "") for match in matches]
+    names, known = {name for name, _ in found}, units.keys() - {"time"}
+    prefixed = {name for name in names if prefix and name.startswith(prefix)}
+    only_prefixed = prefixed and not names & known
+    columns: dict[str, tuple[int, str, float]] = {}
     for at, (label, unit) in enumerate(found):
-        if alone and label not in prefixed and label != "time":
+        if only_prefixed and label not in prefixed and label != "time":
             continue
         name = label.removeprefix(prefix or "")
-        if name not in units or name in names:
-            problem = "a second" if name in names else "an unknown"
+        if name not in units or name in columns:
+            problem = "a second" if name in columns else "an unknown"
             raise ConfigError(
                 f"{path}: row 1: got {problem} column {brief(first[at])}; expected {header}"
             )
@@ -170,25 +160,5 @@ def _columns(
                 f"{path}: row 1: got column {brief(first[at])}; expected {name} in "
                 f"{' or '.join(units[name])}"
             )
-        places.append(at)
-        names.append(name)
-        scales.append(scale)
-    return places, names, scales
-
-
-def _name_and_unit(cell: str) -> tuple[str, str]:
-    """Return both parts of a header's cell, empty ones of any other text."""
-    match = _LABEL.fullmatch(cell)
-    return (match[1].lower(), match[2]) if match else ("", "")
-
-
-def _number(where: str, cell: str, may_be_empty: bool) -> float:
-    if may_be_empty and not cell.strip():
-        return math.nan
-    try:
-        value = float(cell)
-    except ValueError:
-        raise ConfigError(f"{where}: got {brief(cell)}; expected a number") from None
-    if not math.isfinite(value):
-        raise ConfigError(f"{where}: got {cell.strip()}; expected a finite number")
-    return value
+        columns[name] = (at, name, scale)
+    return list(columns.values())

@@ -11,21 +11,11 @@ class ConfigError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        # File names may hold line breaks; what a user sees stays one line.
-        super().__init__(" ".join(message.splitlines()))
+        super().__init__(" ".join(message.splitlines()))  # a file name may hold line breaks
 
 
 def resembling(name: str, names: Iterable[str]) -> list[str]:
-    """Return the names that resemble `name`, those that differ in case only first."""
-
-    def distance(other: str) -> int:  # Levenshtein, by rows
-        row = list(range(len(other) + 1))
-        for i, a in enumerate(name, start=1):
-            before, row = row, [i]
-            for j, b in enumerate(other, start=1):
-                row.append(min(before[j] + 1, row[-1] + 1, before[j - 1] + (a != b)))
-        return row[-1]
-
-    folded = name.casefold()
-    close = {other for other in names if difflib.get_close_matches(folded, [other.casefold()], n=1)}
-    return sorted(close, key=lambda other: (other.casefold() != folded, distance(other), other))
+    """Return the names that resemble `name`, the nearest first; case does not count."""
+    spelled = {other.casefold(): other for other in names}
+    close = difflib.get_close_matches(name.casefold(), spelled, n=max(1, len(spelled)))
+    return [spelled[one] for one in close]

@@ -12,7 +12,7 @@ from typing import Final
 from stewart_drake.files.errors import ConfigError
 
 _NAME: Final = 40
-"""Letters of a file's name that its temporary name shows; a name has at most 255 bytes."""
+"""Letters of a file's name in its temporary name; a name has at most 255 bytes."""
 
 
 def read_bytes(path: Path, most: int, expected: str) -> bytes:
@@ -21,33 +21,29 @@ def read_bytes(path: Path, most: int, expected: str) -> bytes:
     Args:
         path: of a regular file; a folder, a pipe or a device is refused.
         most: largest accepted number of bytes.
-        expected: in words, closing every message.
+        expected: description of the file, closing every message.
 
     Raises:
         ConfigError: one line, opened by the path.
     """
-    raw = None
     try:
-        if path.is_file() or not path.exists():
-            with path.open("rb") as file:
-                raw = file.read(most + 1)
+        if path.exists() and not path.is_file():
+            problem = f"{path}: is not a file"
+        elif path.stat().st_size <= most:
+            return path.read_bytes()
+        else:
+            limit = f"{most // 1_000_000} MB" if most >= 1_000_000 else f"{most // 1000} kB"
+            problem = f"{path}: is larger than {limit}"
     except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot be read ({error.strerror}); expected {expected}"
-        ) from None
+        problem = f"{path}: cannot be read ({error.strerror})"
     except ValueError:  # a zero byte, half a surrogate pair
-        raise ConfigError(f"{str(path)!r}: is no file name; expected {expected}") from None
-    if raw is None:
-        raise ConfigError(f"{path}: is not a file; expected {expected}")
-    if len(raw) > most:
-        limit = f"{most // 1_000_000} MB" if most >= 1_000_000 else f"{most // 1000} kB"
-        raise ConfigError(f"{path}: is larger than {limit}; expected {expected}")
-    return raw
+        problem = f"{str(path)!r}: is not a file name"
+    raise ConfigError(f"{problem}; expected {expected}") from None
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, and replace `path` by what was written to it.
+    """Yield a temporary path in the same folder, and replace `path` by what was written to it.
 
     After a crash or a loss of power `path` is the old file or the new one. On an error the old file
     stays and the temporary one is removed. A replaced file keeps its permissions.
@@ -59,7 +55,7 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         yield partial
         if path.is_file():
-            with contextlib.suppress(OSError):  # a file system that has no permissions
+            with contextlib.suppress(OSError):  # a file system without permissions
                 shutil.copymode(path, partial)
         with partial.open("rb") as file:
             os.fsync(file.fileno())

@@ -17,14 +17,13 @@ _SEAL: Final = re.compile(rb'\{"crc32": "([0-9a-f]{8})", ')
 
 
 def load_json(path: Path, most: int, expected: str, *, sealed: bool = False) -> dict[str, Any]:
-    """Read one JSON object from a file.
+    """Read one JSON object from a UTF-8 file.
 
     Args:
-        path: a UTF-8 file.
-        most: number of bytes above which it is refused.
-        expected: what the file is, in words, closing every message.
-        sealed: whether it must have the checksum that `sealed_json` writes, which is checked and
-            not returned.
+        path: of the file.
+        most: largest accepted number of bytes.
+        expected: description of the file, closing every message.
+        sealed: whether it must have the checksum that `sealed_json` writes. It is not returned.
 
     Raises:
         ConfigError: the file cannot be read or decoded, is not one object, or holds a key twice.
@@ -34,17 +33,14 @@ def load_json(path: Path, most: int, expected: str, *, sealed: bool = False) -> 
     if sealed:
         seal = _SEAL.match(raw)
         if seal is None:
-            raise ConfigError(
-                f"{path}: has no checksum, which files of 0.2 lack too; expected {expected}"
-            )
+            problem = "has no checksum, as files of 0.2"
+            raise ConfigError(f"{path}: {problem}; expected {expected}")
         raw = raw[seal.end() :]
         if zlib.crc32(raw) != int(seal[1], 16):
             raise ConfigError(f"{path}: is damaged, its checksum differs; expected {expected}")
         raw = b"{" + raw
     try:
-        data = json.loads(raw.decode("utf-8"), object_pairs_hook=_unique)
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text; expected {expected}") from None
+        data = json.loads(raw.decode(), object_pairs_hook=_unique)
     except (ValueError, RecursionError) as error:
         problem = "nested too deep" if isinstance(error, RecursionError) else str(error)
         raise ConfigError(
@@ -80,6 +76,6 @@ def jsonable(data: Any) -> Any:
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     data = dict(pairs)
     if len(data) < len(pairs):
-        twice = next(key for key, number in Counter(key for key, _ in pairs).items() if number > 1)
+        twice, _ = Counter(key for key, _ in pairs).most_common(1)[0]
         raise ValueError(f"key {brief(twice)} given more than once")
     return data

@@ -3,7 +3,6 @@
 Moments of inertia may be left out; `mechanism.geometry` estimates them.
 """
 
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +12,7 @@ from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.files.yamlio import one_message, read_yaml, validate, yaml_of, yaml_text
+from stewart_drake.files.yamlio import load_yaml, one_message, validate, yaml_text
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism, bar_inertia, disc_inertia
 from stewart_drake.mechanism.kinematics import Legs, UnreachablePoseError
 from stewart_drake.types import Array
@@ -168,8 +167,11 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism:
     Raises:
         ConfigError: one line naming the file, the field, its value and what is allowed.
     """
-    path = resolve("mechanism", name_or_path)
-    return _parsed(read_yaml(path), path)
+    path, spec = resolve("mechanism", name_or_path), mechanism_spec(name_or_path)
+    try:
+        return build_mechanism(spec)
+    except (UnreachablePoseError, ConfigError) as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def as_mechanism(given: Mechanism | str | Path) -> Mechanism:
@@ -184,17 +186,7 @@ def mechanism_spec(name_or_path: str | Path) -> MechanismSpec:
         ConfigError: as `load_mechanism` does for a file that is not well formed.
     """
     path = resolve("mechanism", name_or_path)
-    return validate(MechanismSpec, yaml_of(read_yaml(path), path), str(path))
-
-
-@lru_cache(maxsize=16)
-def _parsed(raw: bytes, path: Path) -> Mechanism:
-    """Return the mechanism of a file's content, parsed once while the file is unchanged."""
-    spec = validate(MechanismSpec, yaml_of(raw, path), str(path))
-    try:
-        return build_mechanism(spec)
-    except (UnreachablePoseError, ConfigError) as error:
-        raise ConfigError(f"{path}: {error}") from None
+    return validate(MechanismSpec, load_yaml(path), str(path))
 
 
 def mechanism_yaml(mechanism: Mechanism) -> str:
