@@ -8,8 +8,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from stewart_drake.core.plant import Ended
-from stewart_drake.dynamics.native_plant import NativePlant
+from stewart_drake.dynamics.native_plant import Ended, NativePlant
 from stewart_drake.dynamics.open_loop import Drive, IntegrationError, in_c, integrate
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin

@@ -16,7 +16,7 @@ from stewart_drake.law.parameter_filter import ParameterFilter, gate
 from stewart_drake.mechanism.geometry import geometry_of
 from tests.backends import stepped_in_python
 
-HOST = ("dop853", "packed", "packed_law", "plant")
+HOST = ("dop853", "plant")
 """Sources for the host alone, in double precision."""
 
 

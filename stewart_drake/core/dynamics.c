@@ -59,11 +59,17 @@ void stewart_inverse_dynamics(const stewart_plant *plant, const real *pose, cons
                  torque);
 }
 
-real stewart_energy(const stewart_plant *plant, const real *pose, const real *rates)
+void stewart_change(const stewart_plant *plant, const real *state, const real *torque, real *slope)
+{
+    memcpy(slope, state + 6, 6 * sizeof(real));
+    stewart_accelerations(plant, state, state + 6, torque, slope + 6);
+}
+
+void stewart_energy(const stewart_plant *plant, const real *pose, const real *rates, real *energy)
 {
     Motion m;
     motion(plant, pose, rates, &m);
-    return m.sums[SUMS - 1];
+    *energy = m.sums[SUMS - 1];
 }
 
 void stewart_terms(const stewart_plant *plant, const real *pose, const real *rates, real *M,
@@ -113,8 +119,7 @@ void stewart_move(const stewart_plant *plant, const real *torque, real h, real *
     real y[12], k[4][12];
     memcpy(y, x, sizeof y);
     for (int stage = 0; stage < 4; stage++) {
-        memcpy(k[stage], y + 6, 6 * sizeof(real));
-        stewart_accelerations(plant, y, y + 6, torque, k[stage] + 6);
+        stewart_change(plant, y, torque, k[stage]);
         if (stage < 3)
             for (int i = 0; i < 12; i++)
                 y[i] = x[i] + part[stage] * h * k[stage][i];

@@ -27,8 +27,11 @@ void stewart_accelerations(const stewart_plant *plant, const real *pose, const r
 void stewart_inverse_dynamics(const stewart_plant *plant, const real *pose, const real *rates,
                               const real *accelerations, real *torque);
 
-/* J. */
-real stewart_energy(const stewart_plant *plant, const real *pose, const real *rates);
+/* Slope (12) of a state (12): its rates and accelerations. */
+void stewart_change(const stewart_plant *plant, const real *state, const real *torque, real *slope);
+
+/* Kinetic and potential energy, J. */
+void stewart_energy(const stewart_plant *plant, const real *pose, const real *rates, real *energy);
 
 /* Mass matrix M (6, 6), bias h (6) and input matrix B' (6, 6) in coordinates of the pose. */
 void stewart_terms(const stewart_plant *plant, const real *pose, const real *rates, real *M,
@@ -44,7 +47,7 @@ void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, 
    the pitch's amount; `angles` of the cranks where they are known, else NULL. */
 void stewart_measures(const real *geometry, const real *pose, const real *angles, real *measures);
 
-/* A step of h seconds of the classical Runge-Kutta method, of a state in its place. */
+/* Advance a state (12) by one step of h seconds of the classical Runge-Kutta method. */
 void stewart_move(const stewart_plant *plant, const real *torque, real h, real *state);
 
 #endif

@@ -1,6 +1,6 @@
-"""What the functions in C take and give: one buffer, arguments, then geometry, then results."""
+"""Arguments and results of the functions in C, and the numbers of a machine."""
 
-from typing import Final, NamedTuple
+from typing import Any, Final
 
 from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
@@ -23,7 +23,7 @@ COMMON_NUMBERS: Final = 13
 """Plate's mass and inertia (3); crank's mass, centre and inertia about the motor axis; rod's mass,
 centre and inertia (3); the plate's mean radius."""
 MEASURES: Final = NUM_LEGS + 2
-"""Of the workspace."""
+"""Measures of the workspace."""
 GEOMETRY: Final = NUM_LEGS * LEG_NUMBERS + COMMON_NUMBERS
 
 SHAPES: Final = {
@@ -35,21 +35,12 @@ SHAPES: Final = {
     "parameters": (NUM_PLANT_PARAMETERS,),
     "gravity": (),
     "angles": (NUM_LEGS,),
-    "sign": (),
-    "least": (MEASURES,),
 }
 """Shape of each argument."""
 
 
-class Signature(NamedTuple):
-    """Arguments by their names in SHAPES, and the shapes of results, transposed as CasADi's are."""
-
-    arguments: tuple[str, ...]
-    results: tuple[tuple[int, ...], ...]
-
-
-def _signature(arguments: str, *results: tuple[int, ...]) -> Signature:
-    return Signature(tuple(arguments.split()), results)
+def _signature(arguments: str, *results: tuple[int, ...]) -> tuple[list[str], tuple[Any, ...]]:
+    return arguments.split(), results
 
 
 SIGNATURES: Final = {
@@ -59,14 +50,10 @@ SIGNATURES: Final = {
     "terms": _signature("pose rates parameters gravity", (6, 6), (6,), (6, 6)),
     "residual_derivatives": _signature(
         "pose rates accelerations torque parameters gravity",
-        (NUM_STATE, 6),
-        (NUM_PLANT_PARAMETERS, 6),
-        (6, 6),
-        (6, 6),
+        *((NUM_STATE, 6), (NUM_PLANT_PARAMETERS, 6), (6, 6), (6, 6)),
     ),
     "measures": _signature("pose", (MEASURES,)),
     "measures_of_tree": _signature("pose angles", (MEASURES,)),
     "change": _signature("state torque parameters gravity", (NUM_STATE,)),
-    "margin": _signature("pose sign least", ()),
 }
-"""What packed.c holds, and `predict`; the geometry stands between arguments and results."""
+"""Functions of dynamics.h: names of their arguments, and shapes of their results, transposed."""

@@ -1,12 +1,8 @@
-"""The compiled core: found, checked and loaded once in a process.
+"""The compiled core, loaded once in a process through cffi, which reads its headers."""
 
-`core_library` is the library for ctypes, whose functions take packed buffers. `core` is the same
-library for cffi, which reads the declarations in the headers themselves.
-"""
-
-import ctypes
 import re
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -20,33 +16,11 @@ PRIVATE: Final = (
     *("real.h", "equations.h", "dop853.h", "dop853_table.h"),
     *("filter_attempt.h", "observing.h", "delay_observing.h"),
 )
-"""Headers that Python does not call."""
-
-
-@lru_cache(maxsize=1)
-def core_library() -> ctypes.CDLL:
-    """Load the library.
-
-    Raises:
-        ConfigError: it is missing, older than its source, or cannot be loaded.
-    """
-    problem = "is missing"
-    if LIBRARY.exists():
-        try:
-            library = ctypes.CDLL(str(LIBRARY))
-            library.source.restype = ctypes.c_char_p
-            if library.source().decode() == source_hash():
-                return library
-            problem = "is older than its source"
-        except (OSError, AttributeError) as error:
-            problem = f"cannot be loaded ({error})"
-    raise ConfigError(
-        f"the compiled core {problem}; expected one that python -m stewart_drake.core.build made"
-    )
+"""Headers that Python does not use."""
 
 
 def declarations() -> str:
-    """Return what the headers declare, without directives but for whole numbers.
+    """Return the declarations of the headers, without directives but for whole numbers.
 
     A size that is a sum is an enumeration constant in a header, not a macro.
     """
@@ -78,43 +52,62 @@ def _is_directive(line: str) -> bool:
 class Core:
     """The library for cffi.
 
+    Args:
+        path: of the library.
+
     Attributes:
-        ffi: makes its structures.
-        lib: its functions.
+        ffi: creates structures.
+        lib: functions and constants.
     """
 
-    def __init__(self) -> None:
-        core_library()  # which says what is wrong with it
+    def __init__(self, path: Path = LIBRARY) -> None:
         self.ffi: Any = FFI()
         self.ffi.cdef(declarations())
-        self.lib: Any = self.ffi.dlopen(str(LIBRARY))
+        self.lib: Any = self.ffi.dlopen(str(path))
+        names = {np.float64: "double[]", np.intc: "int[]"}
+        self._kinds = {np.dtype(kind): self.ffi.typeof(name) for kind, name in names.items()}
         self._block = self.ffi.new_allocator(should_clear_after_alloc=False)
 
     def at(self, array: NDArray[Any] | None) -> Any:
-        """Return the numbers of a contiguous array of doubles or C ints, which it keeps alive.
+        """Return a pointer to a contiguous array of doubles or C ints, which it keeps alive.
 
-        A structure that points to them does not.
+        A structure that holds the pointer does not keep the array alive.
 
         Raises:
             ValueError: other numbers, or not contiguous.
         """
         if array is None:
             return self.ffi.NULL
-        kind = {np.dtype(np.float64): "double[]", np.dtype(np.intc): "int[]"}.get(array.dtype)
+        kind = self._kinds.get(array.dtype)
         if kind is None or not array.flags.c_contiguous:
             raise ValueError(f"array: got {array.dtype}; expected contiguous doubles or C ints")
         return self.ffi.from_buffer(kind, array)
 
+    def plant(self, geometry: Any, parameters: Any, gravity: Any) -> Any:
+        """Return a `stewart_plant` that points to numbers of these addresses."""
+        return self.ffi.new("stewart_plant *", (geometry, parameters, gravity))
+
     def scratch(self, numbers: int) -> Any:
-        """Return a `stewart_scratch` of so many numbers, for one call."""
+        """Return a `stewart_scratch` with `numbers` numbers, for one call."""
         return [self._block("real[]", numbers)]
 
 
 @lru_cache(maxsize=1)
 def core() -> Core:
-    """Load the library for cffi.
+    """Load the library.
 
     Raises:
-        ConfigError: see `core_library`.
+        ConfigError: it is missing, older than its source, or cannot be loaded.
     """
-    return Core()
+    problem = "is missing"
+    if LIBRARY.exists():
+        try:
+            loaded = Core(LIBRARY)
+            if loaded.ffi.string(loaded.lib.stewart_source()).decode() == source_hash():
+                return loaded
+            problem = "is older than its source"
+        except (OSError, AttributeError) as error:
+            problem = f"cannot be loaded ({error})"
+    raise ConfigError(
+        f"the compiled core {problem}; expected one that python -m stewart_drake.core.build made"
+    )

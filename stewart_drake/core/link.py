@@ -43,11 +43,6 @@ class Link:
         values = size, kept, history, wire, holds, period, together, limit
         self.data: Any = c.ffi.new("stewart_link *", values)
 
-    @property
-    def address(self) -> int:
-        """Place of `data`."""
-        return int(core().ffi.cast("intptr_t", self.data))
-
     def start(self) -> Array:
         """Return the memory of a link on which nothing is under way."""
         memory = np.empty(self._lib.stewart_link_memory(self.data))

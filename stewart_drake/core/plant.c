@@ -1,242 +1,196 @@
-/* The exact plant under torques that are known beforehand, and in a loop with a delay. It is
-   integrated by DOP853 from one change of the torque to the next, and seen at any time by the
-   polynomials of the steps. It ends where the plate leaves its workspace.
+/* See plant.h. */
 
-   A caller's numbers are not kept, and nothing is allocated: any thread may call. */
-
-#include <math.h>
 #include <string.h>
 
 #include "dop853.h"
-#include "link.h"
-#include "tuner.h"
+#include "plant.h"
 
-#define EXPORT __attribute__((visibility("default")))
-#define MOTORS 6
+#define X STEWART_STATES
+#define U STEWART_MOTORS
 
-/* Of packed.c. */
-void change(double *buffer);
-void margin(double *buffer);
+#ifndef SOURCE
+#define SOURCE ""
+#endif
 
-/* How a run, or a part of it, has ended. */
-enum { INSIDE, LEFT, TOO_SHORT_STEPS, CONTROLLER_FAILED };
+const char *stewart_source(void) { return SOURCE; }
 
-/* amplitude sin(frequency t + phase), added to a constant torque. */
-typedef struct {
-    double constant[MOTORS], amplitude[MOTORS], phase[MOTORS], frequency;
-} drive;
-
-/* The packed buffers of `change`, which begins with the state, and of `margin`, which begins with the
-   pose; and where in them torque and results are. */
-typedef struct {
-    double *change, *torque, *slope, *margin, *above;
-    const drive *sine; /* what the torque is at any time, or NULL where it is constant */
-} machine;
-
-/* Instants in s, ascending, and the states there as far as the run has come. */
-typedef struct {
-    const double *time;
-    double *state;
-    long number, seen;
-} looks;
-
-typedef struct {
-    double tolerance, longest, end; /* longest step, s; end of the run, s */
-    double time, state[STATES];     /* the start; then where the run has ended */
-    long steps, evaluations;
-} run;
-
-static void set_torque(machine *m, const drive *d, double time)
+double stewart_margin(const double *geometry, const double *pose, double sign, const double *least)
 {
-    for (int i = 0; i < MOTORS; i++)
-        m->torque[i] = d->constant[i] + d->amplitude[i] * sin(d->frequency * time + d->phase[i]);
+    double measures[STEWART_MEASURES], margin = HUGE_VAL;
+    stewart_measures(geometry, pose, NULL, measures);
+    measures[6] *= sign;
+    for (int i = 0; i < STEWART_MEASURES; i++) {
+        const double above = measures[i] - least[i];
+        if (above < margin || isnan(above))
+            margin = above;
+    }
+    return margin;
+}
+
+void stewart_steps(const stewart_plant *plant, long number, const double *state,
+                   const double *torques, const double *h, double *states)
+{
+    for (long k = 0; k < number; k++, state = states, states += X) {
+        stewart_copy(X, state, states);
+        stewart_move(plant, torques + U * k, h[k], states);
+    }
+}
+
+/* The plant of a run under its torque; `drive` gives a torque that changes with time, else NULL. */
+typedef struct {
+    stewart_run *run;
+    const stewart_drive *drive;
+    double torque[U];
+} driven;
+
+static void set_torque(driven *d, const stewart_drive *drive, double time)
+{
+    for (int i = 0; i < U; i++)
+        d->torque[i] = drive->constant[i] + drive->amplitude[i] * sin(drive->frequency * time + drive->phase[i]);
 }
 
 static void slope(void *system, double time, const double *x, double *rate)
 {
-    machine *m = system;
-    if (m->sine)
-        set_torque(m, m->sine, time);
-    memcpy(m->change, x, STATES * sizeof(double));
-    change(m->change);
-    memcpy(rate, m->slope, STATES * sizeof(double));
+    driven *d = system;
+    if (d->drive)
+        set_torque(d, d->drive, time);
+    stewart_change(d->run->plant, x, d->torque, rate);
 }
 
-static int inside(machine *m, const double *x)
+static int inside(const stewart_run *r, const double *x)
 {
-    memcpy(m->margin, x, MOTORS * sizeof(double));
-    margin(m->margin);
-    return *m->above > 0.;
+    return stewart_margin(r->plant->geometry, x, r->sign, r->least) > 0.;
 }
 
-/* It is inside at `from` and not at `to`: s->x is where it is no longer, to 1e-13 s. By halves, since
-   the margin is a least of several, with edges. */
-static int leave(dop853 *s, machine *m, double from, double to)
+/* Bisect for the instant between `from`, inside, and `to`, outside, to 1e-13 s; s->x is the state just
+   outside. The margin is a minimum of several measures and therefore not smooth. */
+static int leave(dop853 *s, const stewart_run *r, double from, double to)
 {
-    double x[STATES];
+    double x[X];
     while (to - from > 1e-13 * fmax(1., to)) {
         double middle = from + (to - from) / 2.;
         dop853_at(s, middle, x);
-        *(inside(m, x) ? &from : &to) = middle;
+        *(inside(r, x) ? &from : &to) = middle;
     }
     dop853_at(s, to, x);
     s->time = to;
-    memcpy(s->x, x, sizeof x);
-    return LEFT;
+    stewart_copy(X, x, s->x);
+    return STEWART_LEFT;
 }
 
-/* On to `end`, where the torque changes only as m->sine says. */
-static int advance(dop853 *s, machine *m, double end, looks *l)
+/* Advance to `end`, up to which the torque is smooth. */
+static int advance(dop853 *s, stewart_run *r, double end)
 {
-    for (; l->seen < l->number && l->time[l->seen] <= s->time; l->seen++)
-        memcpy(l->state + STATES * l->seen, s->x, sizeof s->x);
+    for (; r->seen < r->number && r->times[r->seen] <= s->time; r->seen++)
+        stewart_copy(X, s->x, r->states + X * r->seen);
     if (s->time < end)
         dop853_begin(s);
     while (s->time < end) {
         if (!dop853_step(s, end))
-            return TOO_SHORT_STEPS;
+            return STEWART_TOO_SHORT_STEPS;
         double from = s->before;
-        for (; l->seen < l->number && l->time[l->seen] <= s->time; l->seen++) {
-            double *x = l->state + STATES * l->seen, to = l->time[l->seen];
+        for (; r->seen < r->number && r->times[r->seen] <= s->time; r->seen++) {
+            double *x = r->states + X * r->seen, to = r->times[r->seen];
             dop853_at(s, to, x);
-            if (!inside(m, x))
-                return leave(s, m, from, to);
+            if (!inside(r, x))
+                return leave(s, r, from, to);
             from = to;
         }
-        if (!inside(m, s->x))
-            return leave(s, m, from, s->time);
+        if (!inside(r, s->x))
+            return leave(s, r, from, s->time);
     }
-    return INSIDE;
+    return STEWART_INSIDE;
 }
 
-static dop853 integrator(const run *r, machine *m)
+static dop853 integrator(driven *d)
 {
-    dop853 s = {.slope = slope, .system = m, .tolerance = r->tolerance, .longest = r->longest};
+    const stewart_run *r = d->run;
+    dop853 s = {.slope = slope, .system = d, .tolerance = r->tolerance, .longest = r->longest};
     s.time = r->time;
-    memcpy(s.x, r->state, sizeof s.x);
+    stewart_copy(X, r->state, s.x);
     return s;
 }
 
-static int ended(run *r, const dop853 *s, int how)
+static int ended(stewart_run *r, const dop853 *s, int how)
 {
     r->time = s->time, r->steps = s->steps, r->evaluations = s->evaluations;
-    memcpy(r->state, s->x, sizeof s->x);
+    stewart_copy(X, s->x, r->state);
     return how;
 }
 
-/* `number` drives, each from its own time on, the first at the start. */
-EXPORT int open_loop(run *r, machine *m, looks *l, const drive *drives, const double *from, long number)
+int stewart_open_loop(stewart_run *r, const stewart_drive *drives, long number)
 {
-    dop853 s = integrator(r, m);
-    for (long i = 0; i < number; i++) {
-        double until = i + 1 < number ? fmin(from[i + 1], r->end) : r->end;
+    driven d = {.run = r};
+    dop853 s = integrator(&d);
+    int how = STEWART_INSIDE;
+    for (long i = 0; i < number && how == STEWART_INSIDE; i++) {
+        const stewart_drive *drive = drives + i;
         int constant = 1;
-        for (int j = 0; j < MOTORS; j++)
-            constant &= drives[i].amplitude[j] == 0. || drives[i].frequency == 0.;
-        m->sine = constant ? NULL : &drives[i];
-        set_torque(m, &drives[i], s.time);
-        int how = advance(&s, m, until, l);
-        if (how != INSIDE)
-            return ended(r, &s, how);
+        for (int j = 0; j < U; j++)
+            constant &= drive->amplitude[j] == 0. || drive->frequency == 0.;
+        d.drive = constant ? NULL : drive;
+        set_torque(&d, drive, s.time);
+        how = advance(&s, r, i + 1 < number ? fmin(drive[1].from, r->end) : r->end);
     }
-    return ended(r, &s, INSIDE);
+    return ended(r, &s, how);
 }
 
-/* The torque (6) of a sample, of its number and the measurement (12); not 0 to give up. */
-typedef int (*controller)(void *about, long sample, const double *measurement, double *torque);
-
-/* What stands between a controller and the plant. */
-typedef struct {
-    long samples;             /* that are taken in the run */
-    const double *sampled;    /* when, s */
-    double period;            /* between them by the controller's clock, s */
-    const double *delays;     /* (samples) of the torques on their way, s */
-    const stewart_link *link; /* a wire */
-    double *memory;           /* of the link */
-    const double *noise;      /* (samples, 12), or NULL */
-    double bias[MOTORS];      /* added to what acts */
-    double *measured;         /* (samples, 12) result */
-    double *asked;            /* (samples, 6) result: torques, without limit */
-    long taken;               /* result: samples */
-} loop;
-
-static int sample(dop853 *s, loop *o, long k, controller law, void *about)
+static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller law, void *about)
 {
-    double *y = o->measured + STATES * k, *torque = o->asked + MOTORS * k, now = o->period * (double)k;
-    for (int i = 0; i < STATES; i++)
-        y[i] = o->noise ? s->x[i] + o->noise[STATES * k + i] : s->x[i];
+    double *y = o->measured + X * k, *torque = o->asked + U * k, now = o->period * (double)k;
+    for (int i = 0; i < X; i++)
+        y[i] = o->noise ? s->x[i] + o->noise[X * k + i] : s->x[i];
     if (law(about, k, y, torque))
-        return CONTROLLER_FAILED;
+        return STEWART_CONTROLLER_FAILED;
     stewart_link_take(o->link, o->memory, now, (double)(k + 1), 0., now + o->delays[k], 1, torque);
     o->taken = k + 1;
-    return INSIDE;
+    return STEWART_INSIDE;
 }
 
-static void apply(machine *m, const loop *o)
+/* Take samples and release torques until the run's end. A change of the torque that coincides with a
+   sample takes place at the sample's instant. */
+int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law, void *about)
 {
-    const double *torque = stewart_link_current(o->memory);
-    for (int i = 0; i < MOTORS; i++)
-        m->torque[i] = torque[i] + o->bias[i];
-}
-
-/* Sample, wait, release, until the run's end. A change of the torque that is together with a sample
-   takes place at its instant. */
-EXPORT int closed_loop(run *r, machine *m, looks *l, loop *o, controller law, void *about)
-{
-    dop853 s = integrator(r, m);
-    m->sine = NULL;
-    apply(m, o);
+    driven d = {.run = r};
+    dop853 s = integrator(&d);
     for (long k = 0;;) {
+        for (int i = 0; i < U; i++)
+            d.torque[i] = stewart_link_current(o->memory)[i] + o->bias[i];
         double sampled = k < o->samples ? o->sampled[k] : HUGE_VAL;
         double released = stewart_link_next(o->link, o->memory);
-        int samples = sampled <= released + o->link->together, how = INSIDE;
+        int samples = sampled <= released + o->link->together, how = STEWART_INSIDE;
         double next = samples ? sampled : released;
         if (next > r->end)
-            return ended(r, &s, advance(&s, m, r->end, l));
+            return ended(r, &s, advance(&s, r, r->end));
         if (next > s.time + o->link->together)
-            how = advance(&s, m, next, l);
-        if (how == INSIDE && samples)
+            how = advance(&s, r, next);
+        if (how == STEWART_INSIDE && samples)
             how = sample(&s, o, k++, law, about);
-        else if (how == INSIDE)
+        else if (how == STEWART_INSIDE)
             stewart_link_change(o->link, o->memory, fmax(released, s.time));
-        if (how != INSIDE)
+        if (how != STEWART_INSIDE)
             return ended(r, &s, how);
-        apply(m, o);
     }
 }
-
-/* law.c as a controller, without Python in between; with a tuner, or fixed weights where that is NULL. */
-typedef struct {
-    const stewart_law *law;
-    const stewart_tuner *tuner;
-    double *memory, *tuner_memory, *scratch;
-    double *previews;        /* of each sample one after the other, `rows` each */
-    const double *wanted;    /* (samples, 12) reference, for a tuner */
-    double *weights;         /* (samples, 2): given, or with a tuner the result */
-    double *kept;            /* (samples, columns) result: rows of the tuner's window */
-    long rows, columns;
-} law_in_c;
 
 static int step(void *about, long k, const double *measurement, double *torque)
 {
-    law_in_c *in = about;
+    stewart_law_in_loop *in = about;
     stewart_sample sample = {.measurement = measurement, .reference = stewart_given_rows};
     sample.about = in->previews + STEWART_REFERENCE * in->rows * k;
-    memcpy(sample.weights, in->weights + 2 * k, sizeof sample.weights);
+    stewart_copy(2, in->weights + 2 * k, sample.weights);
     if (!in->tuner) {
         stewart_step(in->law, in->memory, in->scratch, &sample, torque);
         return 0;
     }
     stewart_tuned_step(in->law, in->tuner, in->memory, in->tuner_memory, in->scratch, &sample,
-                       in->wanted + STATES * k, torque);
-    memcpy(in->weights + 2 * k, sample.weights, sizeof sample.weights);
+                       in->wanted + X * k, torque);
+    stewart_copy(2, sample.weights, in->weights + 2 * k);
     stewart_newest_row(in->tuner, in->tuner_memory, in->kept + in->columns * k);
     return 0;
 }
 
-/* `closed_loop` with the law in C; `controller` points to a `law_in_c` whose memories have been
-   started. */
-EXPORT int closed_loop_of_law(run *r, machine *m, looks *l, loop *o, law_in_c *controller)
+int stewart_closed_loop_of_law(stewart_run *run, stewart_loop *loop, stewart_law_in_loop *law)
 {
-    return closed_loop(r, m, l, o, step, controller);
+    return stewart_closed_loop(run, loop, step, law);
 }

@@ -1,6 +1,5 @@
 """The functions of a mechanism's dynamics, of the compiled core: a mechanism is data."""
 
-import ctypes
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -11,12 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stewart_drake.core.layout import SHAPES, SIGNATURES
-from stewart_drake.core.library import core_library
+from stewart_drake.core.library import core
+from stewart_drake.dynamics.functions import Call
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, NUM_STATE, NUM_TORQUES
 from stewart_drake.types import Array
-
-Shape = tuple[int, ...]
 
 
 class Buffers(NamedTuple):
@@ -61,41 +59,31 @@ class Buffered(ABC):
 
 
 class NativeFunction(Buffered):
-    """A function of core/packed.c: one buffer with arguments, geometry and results.
+    """A function of core/dynamics.h for one machine.
 
     Args:
-        name: its name there.
-        geometry: of the machine.
-        arguments, results: their shapes.
-        first: numbers that stand before the arguments.
+        name: in `core.layout.SIGNATURES`.
+        geometry: numbers of the machine.
     """
 
-    def __init__(
-        self,
-        name: str,
-        geometry: Array,
-        arguments: Sequence[Shape],
-        results: Sequence[Shape],
-        first: Sequence[float] = (),
-    ) -> None:
+    def __init__(self, name: str, geometry: Array) -> None:
         super().__init__()
-        self._call = getattr(core_library(), name)
-        self._call.restype = None
-        self._fixed = np.array(first, dtype=np.float64), geometry
-        self._shapes = arguments, results
+        self._name, self._geometry = name, geometry
+        self._core = core()
 
     def buffers(self) -> Buffers:
-        """One block of memory, and views of it."""
-        (first, geometry), (arguments, results) = self._fixed, self._shapes
-        shapes = [first.shape, *arguments, geometry.shape, *results]
-        ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-        block = np.zeros(ends[-1])
-        parts = np.split(block, ends[:-1])
-        views = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
-        after = 1 + len(arguments)
-        views[0][...], views[after][...] = first, geometry
-        evaluate = partial(self._call, ctypes.c_void_p(block.ctypes.data))
-        return Buffers(views[1:after], views[after + 1 :], evaluate, block)
+        """Return arrays of this thread, and a call of the function with their addresses."""
+        names, shapes = SIGNATURES[self._name]
+        given, results = {n: np.zeros(SHAPES[n]) for n in names}, [np.zeros(s) for s in shapes]
+        at = {name: self._core.at(array) for name, array in given.items()}
+        first = self._core.at(self._geometry)
+        if "gravity" in at:
+            first = self._core.plant(first, at.pop("parameters"), at.pop("gravity"))
+        if self._name == "measures":
+            at["angles"] = self._core.ffi.NULL
+        function = getattr(self._core.lib, f"stewart_{self._name.removesuffix('_of_tree')}")
+        evaluate = partial(function, first, *at.values(), *map(self._core.at, results))
+        return Buffers(list(given.values()), results, evaluate, first)
 
 
 class NativeFunctions:
@@ -109,24 +97,14 @@ class NativeFunctions:
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
-        self._geometry = geometry_of(mechanism)
-        self._many: dict[int, NativeFunction] = {}
-        named = {name: self._function(name) for name in SIGNATURES}
+        self._geometry, self._core = geometry_of(mechanism), core()
+        named = {name: NativeFunction(name, self._geometry) for name in SIGNATURES}
         self.accelerations = named["accelerations"]
         self.inverse_dynamics = named["inverse_dynamics"]
         self.energy, self.terms = named["energy"], named["terms"]
         self.residual_derivatives = named["residual_derivatives"]
         self.measures, self.measures_of_tree = named["measures"], named["measures_of_tree"]
-        self._change, self._margin = named["change"], named["margin"]
-
-    def _function(self, name: str) -> NativeFunction:
-        signature = SIGNATURES[name]
-        arguments = [SHAPES[argument] for argument in signature.arguments]
-        return NativeFunction(name, self._geometry, arguments, signature.results)
-
-    def own_buffers(self, name: str) -> Buffers:
-        """Fresh ones of a function of SIGNATURES, for C that calls it."""
-        return self._function(name).buffers()
+        self._change, self._first = named["change"], self._core.at(self._geometry)
 
     def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
         """d[pose; rates]/dt (12,): a plain call of `_change`, in half its time."""
@@ -141,20 +119,27 @@ class NativeFunctions:
 
         `sign`: the parallel measure's at home.
         """
-        places, results, evaluate, _ = self._margin.own_buffers()
-        places[0][...], places[1][...], places[2][...] = pose, sign, least
-        evaluate()
-        return float(results[0])
+        at = self._core.at
+        given = self._first, at(np.array(pose, np.float64)), sign, at(least)
+        return float(self._core.lib.stewart_margin(*given))
 
-    def many_steps(self, steps: int) -> NativeFunction:
+    def many_steps(self, steps: int) -> Call:
         """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12), one call."""
-        found = self._many.get(steps)
-        if found is None:
-            shapes = (NUM_STATE,), (steps, NUM_TORQUES), (NUM_PLANT_PARAMETERS,), (), (steps,)
-            results = [(steps, NUM_STATE)]
-            made = NativeFunction("predict", self._geometry, shapes, results, [steps])
-            found = self._many.setdefault(steps, made)
-        return found
+
+        c, first = self._core, self._first
+
+        def call(*arguments: ArrayLike) -> Sequence[Array]:
+            shapes = (NUM_STATE,), (steps, NUM_TORQUES), (NUM_PLANT_PARAMETERS,), (1,), (steps,)
+            given = [np.empty(shape) for shape in shapes]
+            for place, argument in zip(given, arguments, strict=True):
+                place[...] = argument
+            states = np.empty((steps, NUM_STATE))
+            state, torques, parameters, gravity, h, result = map(c.at, (*given, states))
+            plant = c.plant(first, parameters, gravity)
+            c.lib.stewart_steps(plant, steps, state, torques, h, result)
+            return [states]
+
+        return call
 
 
 @lru_cache(maxsize=64)

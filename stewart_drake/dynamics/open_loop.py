@@ -2,10 +2,9 @@
 
 DOP853, the Runge-Kutta method of order 8 of Dormand and Prince, goes from one change of the torques
 to the next and stops where the plate leaves its workspace (docs/theory.md, section 32). It runs in
-the compiled core, core/plant.c.
+the compiled core, core/plant.h.
 """
 
-import ctypes
 import math
 from collections.abc import Sequence
 from itertools import pairwise
@@ -14,8 +13,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stewart_drake.core.plant import DriveStruct, Ended
-from stewart_drake.dynamics.native_plant import NativePlant
+from stewart_drake.core.library import core
+from stewart_drake.dynamics.native_plant import Ended, NativePlant
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose, margin
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
@@ -138,12 +137,11 @@ def _check(
                 raise ValueError(f"drives: {name}: got shape {shape}; expected {(NUM_TORQUES,)}")
 
 
-def in_c(drives: Sequence[Drive]) -> tuple[Any, ...]:
-    """Drives as the arguments of `open_loop` of plant.c."""
-    structs = (DriveStruct * len(drives))()
-    for struct, drive in zip(structs, drives, strict=True):
-        for name in ("constant", "amplitude", "phase"):
-            getattr(struct, name)[:] = np.asarray(getattr(drive, name), dtype=np.float64)
-        struct.frequency = drive.frequency
-    starts = (ctypes.c_double * len(drives))(*(drive.start for drive in drives))
-    return structs, starts, ctypes.c_long(len(drives))
+def in_c(drives: Sequence[Drive]) -> tuple[Any, int]:
+    """Return drives as arguments of `stewart_open_loop`."""
+    rows = [
+        (*(list(np.asarray(one, np.float64)) for one in (d.constant, d.amplitude, d.phase)),)
+        + (d.frequency, d.start)
+        for d in drives
+    ]
+    return core().ffi.new("stewart_drive[]", rows), len(rows)

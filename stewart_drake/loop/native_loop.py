@@ -2,7 +2,6 @@
 delay chain, limit, bias and noise, seen and judged at the same instants (theory.md, section 32).
 """
 
-import ctypes
 import math
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple, Protocol
@@ -12,12 +11,11 @@ from numpy.typing import NDArray
 
 from stewart_drake.core.library import core
 from stewart_drake.core.link import Link
-from stewart_drake.core.plant import Controller, Ended, LawStruct, LoopStruct
-from stewart_drake.dynamics.native_plant import NativePlant
+from stewart_drake.dynamics.native_plant import Ended, NativePlant
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.compiled import Compiled
-from stewart_drake.law.core_law import CompiledLaw, CoreMemory, address_of
+from stewart_drake.law.core_law import CompiledLaw, CoreMemory
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.experiment import Experiment, torques_in_flight, true_dynamics
 from stewart_drake.loop.sensor import white_noises
@@ -91,7 +89,7 @@ class Course(NamedTuple):
 class Law(Protocol):
     """What gives a loop its torques."""
 
-    def run(self, plant: NativePlant, loop: LoopStruct) -> Ended:
+    def run(self, plant: NativePlant, loop: Any) -> Ended:
         """Take the plant to its end."""
 
 
@@ -105,21 +103,22 @@ class InPython:
     def __init__(self, torque: Callable[[int, Array], Array]) -> None:
         self._torque = torque
 
-    def run(self, plant: NativePlant, loop: LoopStruct) -> Ended:
+    def run(self, plant: NativePlant, loop: Any) -> Ended:
         """Raises whatever the law does."""
         raised: list[BaseException] = []
 
         def step(_: object, sample: int, measurement: Any, torque: Any) -> int:
             try:
-                asked = self._torque(sample, np.array(measurement[:NUM_STATE]))
-                for i in range(NUM_TORQUES):
-                    torque[i] = asked[i]
+                asked = self._torque(sample, np.array(list(measurement[0:NUM_STATE])))
+                torque[0:NUM_TORQUES] = list(asked)
             except BaseException as error:  # which cannot pass through C; it goes on below
                 raised.append(error)
                 return 1
             return 0
 
-        ended = plant.call("closed_loop", ctypes.byref(loop), Controller(step), None)
+        ffi = core().ffi
+        called = ffi.callback("stewart_controller", step)
+        ended = plant.call("closed_loop", loop, called, ffi.NULL)
         if raised:
             raise raised[0]
         return ended
@@ -166,22 +165,26 @@ class InC:
             self.rows = np.empty((len(previews), columns))
             self._scratch = np.empty(c.lib.stewart_tuned_step_scratch(self._compiled.data))
 
-    def run(self, plant: NativePlant, loop: LoopStruct) -> Ended:
+    def run(self, plant: NativePlant, loop: Any) -> Ended:
         """See `Law`."""
-        law = LawStruct(
-            law=address_of(self._compiled.data),
-            tuner=None if self._tuner is None else address_of(self._tuner.it),
-            memory=self._memory.ctypes.data,
-            tuner_memory=self._tuned.ctypes.data,
-            scratch=self._scratch.ctypes.data,
-            previews=self._previews.ctypes.data,
-            wanted=self._wanted.ctypes.data,
-            weights=self.weights.ctypes.data,
-            kept=self.rows.ctypes.data,
-            rows=self._previews.shape[1],
-            columns=self.rows.shape[1],
+        c = core()
+        law = c.ffi.new(
+            "stewart_law_in_loop *",
+            {
+                "law": self._compiled.data,
+                "tuner": c.ffi.NULL if self._tuner is None else self._tuner.it,
+                "memory": c.at(self._memory),
+                "tuner_memory": c.at(self._tuned),
+                "scratch": c.at(self._scratch),
+                "previews": c.at(self._previews),
+                "wanted": c.at(self._wanted),
+                "weights": c.at(self.weights),
+                "kept": c.at(self.rows),
+                "rows": self._previews.shape[1],
+                "columns": self.rows.shape[1],
+            },
         )
-        return plant.call("closed_loop_of_law", ctypes.byref(loop), ctypes.byref(law))
+        return plant.call("closed_loop_of_law", loop, law)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -251,17 +254,21 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
     drawn = None
     if noise.any():
         drawn = noise * white_noises(sensor.seed, number)
-    loop = LoopStruct(
-        samples=number,
-        sampled=when.samples.ctypes.data,
-        period=sc.controller.period,
-        delays=delays.ctypes.data,
-        link=link.address,
-        memory=memory.ctypes.data,
-        noise=None if drawn is None else drawn.ctypes.data,
-        bias=tuple(sc.plant.torque_bias),
-        measured=measured.ctypes.data,
-        asked=asked.ctypes.data,
+    c = core()
+    loop = c.ffi.new(
+        "stewart_loop *",
+        {
+            "samples": number,
+            "sampled": c.at(when.samples),
+            "period": sc.controller.period,
+            "delays": c.at(delays),
+            "link": link.data,
+            "memory": c.at(memory),
+            "noise": c.at(drawn),
+            "bias": list(sc.plant.torque_bias),
+            "measured": c.at(measured),
+            "asked": c.at(asked),
+        },
     )
     ended = law.run(plant, loop)
     if ended == Ended.TOO_SHORT_STEPS:

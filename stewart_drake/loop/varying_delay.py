@@ -28,8 +28,8 @@ class VaryingDelay(Wire):
     Output:     torque = applied.
 
     The order of arrival is not kept: a torque that was overtaken never acts
-    (`scenario.link.takes_effect`). All arrivals are known beforehand. Each is an event of its own, so
-    that an integrator stops there. As in `DelayChain` they come slightly early.
+    (`scenario.link.takes_effect`). All arrivals are known beforehand. Each is an event of its own,
+    so that an integrator stops there. As in `DelayChain` they come slightly early.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
