@@ -145,7 +145,7 @@ static int start_of_encoders(const stewart_sensing *sensing, const real *values,
 stewart_sensing stewart_encoder_sensing(const stewart_encoders *encoders)
 {
     return (stewart_sensing){LEGS * encoders->samples, encoders->noise_std, encoders,
-                             seen_of_encoders,        jacobian_of_encoders, start_of_encoders};
+                             seen_of_encoders,        jacobian_of_encoders, start_of_encoders, NULL};
 }
 
 int stewart_encoder_fault(const stewart_encoders *encoders, const real *values)
