@@ -29,7 +29,7 @@ from stewart_drake.files.fileio import replacing
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import load_understood
+from stewart_drake.scenario.loading import load_compatible
 from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.studies.statistics import SIGNIFICANT
 from stewart_drake.studies.study_options import RobustnessOptions
@@ -103,7 +103,7 @@ def scenario_of(row: Row, seed: int, folder: str) -> Scenario:
     plant = (*row.settings, *of_seed(row.drawn, seed))
     known = told(plant, folder) if row.known else ()
     settings = ("plant.kind=exact", *plant, *known)
-    return load_understood(row.scenario, row.controller, settings)
+    return load_compatible(row.scenario, row.controller, settings)
 
 
 def run(row: Row, seed: int) -> tuple[float | None, float | None]:

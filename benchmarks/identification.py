@@ -47,7 +47,7 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint
-from stewart_drake.scenario.calibration import KNOWABLE, Calibration, save_calibration
+from stewart_drake.scenario.calibration import CALIBRATED, Calibration, save_calibration
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COULOMB_SPEED
@@ -242,7 +242,7 @@ def next_runs(truth: Truth, found: Identification, true: Array) -> Array:
     return np.array(
         [
             runs_by(truth, found.mechanism, found.calibration),
-            runs_by(truth, unknowns.machine(true), lambda m: surely(m, true, KNOWABLE)),
+            runs_by(truth, unknowns.machine(true), lambda m: surely(m, true, CALIBRATED)),
             runs_by(truth, unknowns.mechanism, lambda m: surely(m, drawn, (NAMES[DELAY],))),
         ]
     )

@@ -17,7 +17,7 @@ from joblib import Parallel, delayed
 
 import stewart_drake as sd
 from stewart_drake.files.versions import versions
-from stewart_drake.scenario.loading import load_understood
+from stewart_drake.scenario.loading import load_compatible
 
 EXACT, GRAVITY = ("plant.kind=exact",), ("plant.gravity=true",)
 ON, REST = ("start=on_reference", "queue=reference"), ()
@@ -56,7 +56,7 @@ def run(
 ) -> tuple[float, float]:
     """E_ac in % s, infinite for a lost run, and the largest torque in N m."""
     servo = ("actuator.kind=servo",) if controller in SERVOS else ()
-    scenario = load_understood("paper", controller, (*EXACT, *servo, *settings))
+    scenario = load_compatible("paper", controller, (*EXACT, *servo, *settings))
     result = sd.simulate(
         scenario,
         true_mechanism=None if machine is None else as_built(machine),

@@ -10,10 +10,10 @@ from stewart_drake.law.channel import Packets, structure
 from stewart_drake.scenario.config import PacketsConfig
 from stewart_drake.scenario.packets import (
     BurstChain,
+    default_bound,
     losses,
     packet_times,
     torque_missing,
-    usual_bound,
 )
 
 PERIOD = 0.1
@@ -60,8 +60,8 @@ def test_single_losses_are_independent():
 
 def test_the_usual_bound_knows_bursts():
     """Both packets of a torque are often lost together, which no bound mends."""
-    assert usual_bound(network(1), 1, PERIOD) == pytest.approx(0.6)
-    assert usual_bound(network(12), 1, PERIOD) == pytest.approx(0.5)
+    assert default_bound(network(1), 1, PERIOD) == pytest.approx(0.6)
+    assert default_bound(network(12), 1, PERIOD) == pytest.approx(0.5)
 
 
 def test_the_first_packets_are_lost_as_often_as_later_ones():

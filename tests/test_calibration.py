@@ -16,7 +16,7 @@ from stewart_drake.loop.experiment import believed_delay, prepare
 from stewart_drake.loop.law_design import GENTLE, compose_law
 from stewart_drake.mechanism.geometry import Body, fingerprint
 from stewart_drake.scenario.calibration import (
-    KNOWABLE,
+    CALIBRATED,
     OFFSETS,
     Calibration,
     load_calibration,
@@ -37,7 +37,7 @@ ON_REFERENCE = ("plant.kind=exact", "start=on_reference", "queue=reference")
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.sets(st.sampled_from(KNOWABLE)), st.integers(0, 2**32 - 1))
+@given(st.sets(st.sampled_from(CALIBRATED)), st.integers(0, 2**32 - 1))
 def test_a_file_is_read_back_to_the_last_digit(tmp_path_factory, names, seed):
     rng, n, path = np.random.default_rng(seed), len(names), tmp_path_factory.mktemp("k") / "k.yaml"
     spread = rng.normal(0, 1, (n, max(0, n - 1)))  # of less than full rank

@@ -32,9 +32,9 @@ from stewart_drake.scenario.config import (
 from stewart_drake.scenario.dependencies import idle_fields, reset
 from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.loading import (
+    load_compatible,
     load_controller,
     load_scenario,
-    load_understood,
     scenario_to_dict,
 )
 from stewart_drake.scenario.reference_config import (
@@ -88,7 +88,7 @@ def test_the_gravity_scenario_is_short_delayed_and_starts_on_the_reference():
 def test_every_shipped_controller_fits_every_shipped_scenario(scenario, controller):
     servos = load_controller(controller).get("command") == "cranks"
     settings = ("actuator.kind=servo",) if servos else ()
-    plain = load_understood(scenario, settings=settings)
+    plain = load_compatible(scenario, settings=settings)
     laid_over = load_scenario(scenario, controller=controller, settings=settings)
     if servos:
         with pytest.raises(ConfigError, match=r"actuator.kind: got .torque. with .* .servo."):

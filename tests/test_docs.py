@@ -44,7 +44,7 @@ from stewart_drake.loop.metrics import accumulated_error
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
 from stewart_drake.scenario.config import ControllerConfig, Scenario
-from stewart_drake.scenario.loading import load_controller, load_understood, setting_choices
+from stewart_drake.scenario.loading import load_compatible, load_controller, setting_choices
 from stewart_drake.scenario.reference_files import read_waypoints
 from stewart_drake.scenario.renames import CONTROLLER
 from stewart_drake.scenario.signals import SIGNALS, exported_ports, ports_of
@@ -471,7 +471,7 @@ def test_commands_parse(block):
         if scenario is None or resources.is_path(scenario):
             continue
         overlay = (parameters.get("controller"), parameters.get("settings") or ())
-        load = load_understood if arguments[0] == "compare" else sd.load_scenario
+        load = load_compatible if arguments[0] == "compare" else sd.load_scenario
         load(scenario, *overlay)
 
 

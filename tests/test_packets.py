@@ -26,11 +26,11 @@ from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.scenario.config import NetworkConfig, PacketsConfig
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.packets import (
+    default_bound,
     in_time,
     losses,
     packet_times,
     torque_missing,
-    usual_bound,
 )
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.studies import link as link_study
@@ -168,7 +168,7 @@ def test_the_usual_bound_is_the_least_that_makes_late_rarer_than_lost():
     config = PacketsConfig(low=0.5, high=0.9, loss=0.05)
     rng = np.random.default_rng(0)
     for repeats in (0, 1, 2):
-        bound = usual_bound(config, repeats, PERIOD)
+        bound = default_bound(config, repeats, PERIOD)
         enough = max(1.5 * 0.05 ** (repeats + 1), 1e-3)
         assert torque_missing(config, bound, repeats, PERIOD) <= enough
         assert torque_missing(config, bound - PERIOD, repeats, PERIOD) > enough
@@ -423,7 +423,7 @@ def test_a_network_has_the_delay_of_bound_and_repetitions():
     assert sc.true_delay.steps == 8 and sc.true_delay.fraction == pytest.approx(0.5)
     usual = scenario(*NETWORK)
     assert isinstance(usual.link, NetworkConfig)
-    assert usual.eta == pytest.approx(usual_bound(usual.link, 1, 0.1) + 0.1)
+    assert usual.eta == pytest.approx(default_bound(usual.link, 1, 0.1) + 0.1)
 
 
 # The study of the bound.

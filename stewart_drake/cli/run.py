@@ -202,7 +202,7 @@ def compare(
     """Run the shipped controllers on a scenario, as a table."""
     from stewart_drake.loop.experiment import prepare
     from stewart_drake.reporting.run import comparison_document
-    from stewart_drake.scenario.loading import load_understood
+    from stewart_drake.scenario.loading import load_compatible
     from stewart_drake.studies import compare as study
     from stewart_drake.studies.verdict import delay_verdict
 
@@ -211,7 +211,7 @@ def compare(
 
         return comparison_figures(results, folder)
 
-    experiment = prepare(load_understood(scenario, settings=settings or ()))
+    experiment = prepare(load_compatible(scenario, settings=settings or ()))
     delivery = Delivery(out, quiet, as_json)
     names = tuple(study.shown(scenario, settings or ()))
     delivery.tell_link(experiment.scenario)

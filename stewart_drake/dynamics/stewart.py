@@ -17,6 +17,7 @@ from stewart_drake.mechanism.kinematics import UnreachablePoseError, angle_rate_
 from stewart_drake.scenario.signals import (
     ANGLES,
     COULOMB_SPEED,
+    DEFAULT_COULOMB_SPEED,
     NUM_COORDINATES,
     NUM_PARAMETERS,
     NUM_PLANT_PARAMETERS,
@@ -26,7 +27,6 @@ from stewart_drake.scenario.signals import (
     PLANT_PARAMETERS,
     POSE,
     RATES,
-    USUAL_COULOMB_SPEED,
 )
 from stewart_drake.types import Array
 
@@ -80,7 +80,7 @@ def plant_parameters(values: ArrayLike | None = None) -> Array:
         ConfigError: another shape, numbers that are not finite, a speed that is not positive.
     """
     whole = np.zeros(NUM_PLANT_PARAMETERS)
-    whole[COULOMB_SPEED] = USUAL_COULOMB_SPEED
+    whole[COULOMB_SPEED] = DEFAULT_COULOMB_SPEED
     if values is None:
         return whole
     if np.shape(values) == (NUM_PARAMETERS,):

@@ -20,13 +20,13 @@ from stewart_drake.scenario.signals import (
     COULOMB,
     COULOMB_SPEED,
     DAMPING,
+    DEFAULT_COULOMB_SPEED,
     LEGS,
     NUM_LEGS,
     PAYLOAD,
     PAYLOAD_POSITION,
     PLANT_PARAMETER_UNITS,
     PLANT_PARAMETERS,
-    USUAL_COULOMB_SPEED,
 )
 from stewart_drake.types import Array
 
@@ -123,7 +123,7 @@ def unknowns_of(
     mean[GEOMETRY], mean[DELAY] = legs.ravel(), delay
     std[GEOMETRY] = np.tile([t.lengths] * 2 + [t.joints] * 6, NUM_LEGS)
     std[OFFSETS], std[DELAY] = t.offsets, t.delay
-    mean[COULOMB_SPEED] = USUAL_COULOMB_SPEED
+    mean[COULOMB_SPEED] = DEFAULT_COULOMB_SPEED
     for place, given, usual in (
         (BIAS, t.bias, torque),
         (PAYLOAD, t.payload, m.plate.mass),

@@ -11,13 +11,13 @@ from stewart_drake.scenario.signals import (
     COULOMB,
     COULOMB_SPEED,
     DAMPING,
+    DEFAULT_COULOMB_SPEED,
     NUM_PLANT_PARAMETERS,
     PARAMETERS,
     PAYLOAD,
     PAYLOAD_POSITION,
     PLANT_PARAMETER_UNITS,
     PLANT_PARAMETERS,
-    USUAL_COULOMB_SPEED,
 )
 from stewart_drake.types import Array
 
@@ -162,7 +162,7 @@ def usual_parameters(
     for friction in (DAMPING, COULOMB):
         std[friction], upper[friction] = 0.1 * torque_scale, 100 * torque_scale
     at = COULOMB_SPEED
-    prior[at] = std[at] = USUAL_COULOMB_SPEED
+    prior[at] = std[at] = DEFAULT_COULOMB_SPEED
     lower[at], upper[at] = 1e-3, 10.0
     std[PAYLOAD_POSITION] = radius / 2
     lower[PAYLOAD_POSITION], upper[PAYLOAD_POSITION] = -2 * radius, 2 * radius

@@ -31,7 +31,7 @@ from stewart_drake.loop.experiment import Experiment, prepare
 from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.scenario.config import NetworkConfig, Scenario
 from stewart_drake.scenario.dependencies import differing
-from stewart_drake.scenario.packets import usual_bound
+from stewart_drake.scenario.packets import default_bound
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
@@ -133,7 +133,7 @@ def _whole_delay(scenario: Scenario, found: NetworkConfig) -> float:
         return scenario.eta
     if link.playout is not None:
         return link.playout + c.packet_repeats * c.period
-    return usual_bound(found, c.packet_repeats, c.period) + c.packet_repeats * c.period
+    return default_bound(found, c.packet_repeats, c.period) + c.packet_repeats * c.period
 
 
 def design(scenario: Scenario, machine: MachineMessage) -> Design:

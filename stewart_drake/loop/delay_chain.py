@@ -8,7 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from stewart_drake.core.link import FULL, Link
 from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.link import TOGETHER
+from stewart_drake.scenario.link import SIMULTANEOUS
 from stewart_drake.scenario.signals import CARRIED, Carried
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
@@ -52,7 +52,7 @@ class LinkSystem(LeafSystem):
         self._change(memory, number * self._period)
 
     def _change(self, memory: Array, time: float) -> None:
-        if self._link.next_change(memory) <= time + TOGETHER * self._period:
+        if self._link.next_change(memory) <= time + SIMULTANEOUS * self._period:
             self._link.change(memory, time)
 
     def _of(self, state: Context | State) -> Array:
@@ -79,7 +79,7 @@ class Wire(LinkSystem):
     def _lay(self, period: float, kept: int, delay: Delay, queue: Array, carries: Carried) -> None:
         """Declare all, with place for so many commands under way beyond the queue."""
         kept += delay.queue_length
-        link = Link(CARRIED[carries], kept, period, wire=True, together=TOGETHER * period)
+        link = Link(CARRIED[carries], kept, period, wire=True, together=SIMULTANEOUS * period)
         self._begin(link, period, 1, delay, queue)
         self._put_out(carries, slice(1, None))
         if carries == "command":

@@ -33,7 +33,7 @@ from stewart_drake.scenario.signals import (
     POSE,
     POSITION,
 )
-from stewart_drake.scenario.trajectories import evaluate, make_reference, moved, peak_to_peak
+from stewart_drake.scenario.trajectories import evaluate, make_reference, motion_range, peak_to_peak
 from stewart_drake.tuner.network import DEFAULT, Network, load_network
 from stewart_drake.types import Array
 
@@ -183,7 +183,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
         span = peak_to_peak(scenario.reference, reference, scenario.duration)
     else:
         reference = own_motion(own.reference, scenario.duration)
-        span = moved(reference, scenario.duration)
+        span = motion_range(reference, scenario.duration)
     start = evaluate(reference, 0.0)[:12]
     if scenario.start == "rest":
         start[6:] = 0.0

@@ -80,7 +80,7 @@ from stewart_drake.scenario.signals import (
     PAYLOAD,
     POSE,
 )
-from stewart_drake.scenario.trajectories import evaluate, moved
+from stewart_drake.scenario.trajectories import evaluate, motion_range
 from stewart_drake.types import Array
 
 GENTLE = 3.0
@@ -405,7 +405,7 @@ def design_law(
         mechanism=dynamics.mechanism,
         truth=dynamics.mechanism,
         reference=motion,
-        peak_to_peak=moved(motion, horizon),
+        peak_to_peak=motion_range(motion, horizon),
         nominal=dynamics,
         start=at,
         network=None,

@@ -21,7 +21,7 @@ from stewart_drake.loop.experiment import Experiment, torques_in_flight, true_dy
 from stewart_drake.loop.sensor import white_noises
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
-from stewart_drake.scenario.link import TOGETHER, torque_delays
+from stewart_drake.scenario.link import SIMULTANEOUS, torque_delays
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
 from stewart_drake.scenario.timing import event_time, instants, look_time
 from stewart_drake.types import Array
@@ -221,7 +221,7 @@ def _wire_of(experiment: Experiment, number: int) -> tuple[Link, Array, Array]:
         drawn = torque_delays(sc)
         delays = drawn[np.minimum(np.arange(number), len(drawn) - 1)]
     kept = len(queue) + int(delays.max(initial=0.0) / period) + 2
-    together, limit = TOGETHER * period, experiment.torque_limit
+    together, limit = SIMULTANEOUS * period, experiment.torque_limit
     link = Link(NUM_TORQUES, kept, period, wire=True, together=together, limit=limit)
     memory, first = link.start(), (delay.periods - len(queue)) * period
     if len(queue):

@@ -9,7 +9,7 @@ from stewart_drake.core.link import Link
 from stewart_drake.loop.delay_chain import LinkSystem
 from stewart_drake.loop.sampling import weak
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.link import TOGETHER
+from stewart_drake.scenario.link import SIMULTANEOUS
 from stewart_drake.scenario.signals import NUM_TORQUES, PACKETS
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
@@ -66,7 +66,7 @@ class PlayoutBuffer(LinkSystem):
         self._arrivals = period * np.arange(len(times)) + np.asarray(times, dtype=np.float64)
         # A packet is of use from when it is sent until its last row was due.
         kept = (delay.steps + rows + 2) * rows + delay.queue_length
-        holds, together = dry == "hold", TOGETHER * period
+        holds, together = dry == "hold", SIMULTANEOUS * period
         given = NUM_TORQUES, kept, period
         link = Link(*given, wire=False, holds=holds, history=history, together=together)
         self._begin(link, period, rows, delay, queue)
@@ -107,7 +107,7 @@ class PlayoutBuffer(LinkSystem):
         lost = ~np.isfinite(self._arrivals[:taken])
         # Packets whose first row's time has come: of this period and those before.
         due = max(0, min(begun - self._delay.steps + self._repeats, taken))
-        wanted = period * (np.arange(due) + self._delay.periods - self._repeats + TOGETHER)
+        wanted = period * (np.arange(due) + self._delay.periods - self._repeats + SIMULTANEOUS)
         arrived = self._arrivals[:due]
         late = np.isfinite(arrived) & (arrived > wanted)
         played, dry = (self._link.number(memory, name) for name in ("played", "dry"))
@@ -118,6 +118,6 @@ class PlayoutBuffer(LinkSystem):
         past = self._link.acted(memory)[:, 1:]
         packets = self._taken(memory) - 1 - np.arange(len(past))
         here = (packets >= 0) & (packets < len(self._arrivals))
-        now = context.get_time() + TOGETHER * self._period
+        now = context.get_time() + SIMULTANEOUS * self._period
         flags = here & (self._arrivals[np.where(here, packets, 0)] <= now)
         output.SetFromVector(np.concatenate([flags, past.ravel()]))

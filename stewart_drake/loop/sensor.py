@@ -19,7 +19,7 @@ from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.fault_config import SPIKE
-from stewart_drake.scenario.link import TOGETHER
+from stewart_drake.scenario.link import SIMULTANEOUS
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, NUM_STATE, POSE
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
@@ -194,7 +194,7 @@ class LateMeasurements(LeafSystem):
         super().__init__()
         self._times, self._period = np.asarray(times, dtype=np.float64), period
         longest = self._times.max(initial=0.0, where=np.isfinite(self._times))
-        kept, together = int(longest / period) + 2, TOGETHER * period
+        kept, together = int(longest / period) + 2, SIMULTANEOUS * period
         self._link = Link(size, kept, period, wire=True, together=together)
         self._memory = self.DeclareDiscreteState(self._link.start())
         self._measured = self.DeclareVectorInputPort("measured", size)
@@ -210,7 +210,7 @@ class LateMeasurements(LeafSystem):
             waits = self._times[k] if k < len(self._times) else np.inf
             now, y = k * self._period, np.asarray(self._measured.Eval(context))
             self._link.take(memory, now, k + 1, now + waits, y[None])
-            if self._link.next_change(memory) <= now + TOGETHER * self._period:
+            if self._link.next_change(memory) <= now + SIMULTANEOUS * self._period:
                 self._link.change(memory, now)
         return memory
 
@@ -221,7 +221,7 @@ class LateMeasurements(LeafSystem):
         """Return what arrived in the last period, or None."""
         arrived, begun = self._link.acted(memory)[0], self._link.number(memory, "taken") - 2
         there = self._link.number(memory, "acted") > 0
-        new = arrived[0] > (begun + TOGETHER) * self._period
+        new = arrived[0] > (begun + SIMULTANEOUS) * self._period
         return arrived[1:] if there and new else None
 
     def _measurement(self, context: Context, output: BasicVector) -> None:

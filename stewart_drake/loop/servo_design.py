@@ -28,7 +28,7 @@ from stewart_drake.loop.experiment import Experiment, planned_limit
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.sampling import SteppedLaw
-from stewart_drake.scenario.config import Scenario, understanding
+from stewart_drake.scenario.config import Scenario, compatible_actuator
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
@@ -115,7 +115,7 @@ def compose_servo_law(experiment: Experiment) -> ServoPreview:
 def _law_for_torques(experiment: Experiment) -> PredictiveLqi:
     sc = experiment.scenario
     controller = replace(sc.controller, command="torque")
-    actuator = understanding("torque", sc.actuator)
+    actuator = compatible_actuator("torque", sc.actuator)
     alike = replace(sc, controller=controller, actuator=actuator)
     return compose_law(experiment._replace(scenario=alike, own=NOTHING))
 

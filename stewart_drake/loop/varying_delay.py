@@ -8,7 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from stewart_drake.loop.delay_chain import Wire
 from stewart_drake.loop.sampling import weak
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.link import TOGETHER, releases
+from stewart_drake.scenario.link import SIMULTANEOUS, releases
 from stewart_drake.scenario.signals import PACKETS, Carried
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
@@ -62,7 +62,7 @@ class VaryingDelay(Wire):
         delays = np.asarray(delays, np.float64)
         if delays.ndim != 1 or not len(delays) or not np.all(delays >= 0):
             raise ValueError("delays: got an empty or negative one; expected (n,) of at least 0 s")
-        self._delays = np.where(delays > TOGETHER * period, delays, 0.0)
+        self._delays = np.where(delays > SIMULTANEOUS * period, delays, 0.0)
         longest = self._delays.max(initial=0.0, where=np.isfinite(delays))
         self._lay(period, int(longest / period) + 2, delay, queue, carries)
         ticket = self.discrete_state_ticket(self._memory)

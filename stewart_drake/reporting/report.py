@@ -44,7 +44,7 @@ from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.reporting.run import comparison_blocks, run_blocks
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link import link_text, number_sent
-from stewart_drake.scenario.loading import load_understood, scenario_yaml
+from stewart_drake.scenario.loading import load_compatible, scenario_yaml
 from stewart_drake.studies.compare import LABELS, is_papers, label, shown
 from stewart_drake.studies.jobs import Job, Progress, run_jobs
 from stewart_drake.tuner.network import DEFAULT
@@ -140,7 +140,7 @@ def collect(
         KeyboardInterrupt: Ctrl-C.
     """
     settings = tuple(settings)
-    scenario = load_understood(scenario_name, controller, settings)
+    scenario = load_compatible(scenario_name, controller, settings)
     failure = reference_failure(assemble(scenario))
     scenarios: dict[str, Scenario] = {}
     rows: set[str] = set()
@@ -152,7 +152,7 @@ def collect(
         if has_network(scenario):
             tuned = (*settings, "tuner.kind=ann")
             for name in TORQUE_CONTROLLERS:
-                scenarios[_TUNED + name] = load_understood(scenario_name, name, tuned)
+                scenarios[_TUNED + name] = load_compatible(scenario_name, name, tuned)
     done, analyses = _work(scenario, scenarios, progress)
     return Collected(
         scenario=scenario,

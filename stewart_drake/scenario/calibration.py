@@ -18,7 +18,7 @@ DELAY: Final = "delay"
 """Between computing a torque and feeling it, s."""
 OFFSETS: Final = tuple(f"offset_A{leg}" for leg in LEGS)
 """Of the motors' encoders: what they say less the crank's angle, rad."""
-KNOWABLE: Final = (*PLANT_PARAMETERS, DELAY, *OFFSETS)
+CALIBRATED: Final = (*PLANT_PARAMETERS, DELAY, *OFFSETS)
 ROUNDING: Final = 1e-9
 """Of a covariance, as a share, that makes it neither unsymmetric nor negative."""
 
@@ -29,7 +29,7 @@ class Calibration:
 
     Attributes:
         mechanism: fingerprint of the machine's numbers, `mechanism.geometry.fingerprint`.
-        names: (n,) out of KNOWABLE, each at the most once; SI units.
+        names: (n,) out of CALIBRATED, each at the most once; SI units.
         mean: (n,).
         covariance: (n, n); zero where something is known exactly.
 
@@ -45,9 +45,9 @@ class Calibration:
     def __post_init__(self) -> None:
         n, mean, P = len(self.names), np.array(self.mean), np.array(self.covariance)
         for name in self.names:
-            if name not in KNOWABLE:
+            if name not in CALIBRATED:
                 raise ConfigError(
-                    f"names: got {brief(name)}; expected some of {', '.join(KNOWABLE)}"
+                    f"names: got {brief(name)}; expected some of {', '.join(CALIBRATED)}"
                 )
         if len(set(self.names)) < n:
             raise ConfigError(f"names: got {', '.join(self.names)}; expected each once")

@@ -33,7 +33,7 @@ from stewart_drake.scenario.field_types import (
 )
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
 from stewart_drake.scenario.renames import CONTROLLER
-from stewart_drake.scenario.signals import USUAL_COULOMB_SPEED
+from stewart_drake.scenario.signals import DEFAULT_COULOMB_SPEED
 from stewart_drake.scenario.timing import (
     METRIC_PERIOD,
     log_problem,
@@ -74,7 +74,7 @@ class PlantConfig:
     joint_damping: Annotated[float, Field(ge=0, le=1e3)] = 0.0
     mechanism: Name | None = None
     coulomb_friction: Annotated[float, Field(ge=0, le=1e3)] = 0.0
-    coulomb_speed: Annotated[float, Field(ge=1e-6, le=1e3)] = USUAL_COULOMB_SPEED
+    coulomb_speed: Annotated[float, Field(ge=1e-6, le=1e3)] = DEFAULT_COULOMB_SPEED
     payload_position: Annotated[
         list[Annotated[float, Field(ge=-1e3, le=1e3)]], Field(min_length=3, max_length=3)
     ] = field(default_factory=lambda: [0.0] * 3)
@@ -301,7 +301,7 @@ AnyActuator = TorqueActuatorConfig | ServoActuatorConfig
 ActuatorConfig = Annotated[AnyActuator, ByKind()]
 
 
-def understanding(command: str, actuator: AnyActuator) -> AnyActuator:
+def compatible_actuator(command: str, actuator: AnyActuator) -> AnyActuator:
     """Motors of the kind that a controller's command is for: these, or others of their limit."""
     wanted = TorqueActuatorConfig if command == "torque" else ServoActuatorConfig
     return actuator if actuator.kind == wanted.kind else wanted(torque_limit=actuator.torque_limit)
@@ -378,7 +378,7 @@ class NetworkConfig(PacketsConfig):
     Attributes:
         kind: `network`.
         playout: the bound, s; null is the one that makes late packets as rare as lost ones
-            (`scenario.packets.usual_bound`). The controller adds its `packet_repeats` periods.
+            (`scenario.packets.default_bound`). The controller adds its `packet_repeats` periods.
         dry: what a dry buffer does, `hold` the last torque or put out `zero`.
         back: `return` in files, how measurements come back, with times of its own; null is at once
             and all of them.
@@ -570,10 +570,10 @@ class Scenario:
             link = dataclasses.replace(link, low=low, high=high)
         if link.playout is None:
             from stewart_drake.scenario.packets import (
-                usual_bound,
+                default_bound,
             )  # numpy, which --help goes without
 
-            bound = usual_bound(link, c.packet_repeats, c.period)
+            bound = default_bound(link, c.packet_repeats, c.period)
             link = dataclasses.replace(link, playout=bound)
         return link
 

@@ -18,7 +18,7 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.packets import BACK, SENSOR, packet_times
 from stewart_drake.types import Array
 
-TOGETHER: Final = 1e-9
+SIMULTANEOUS: Final = 1e-9
 """Of a period; what is so close to each other has no order."""
 
 
@@ -79,11 +79,11 @@ def releases(period: float, delays: Array, delay: Delay) -> tuple[NDArray[np.int
         delay: of those sent before t = 0.
     """
     length = delay.queue_length
-    waits = np.where(delays > TOGETHER * period, delays, 0.0)
+    waits = np.where(delays > SIMULTANEOUS * period, delays, 0.0)
     numbers = np.arange(-length, len(delays))
     earlier = (numbers[:length] + delay.periods) * period
     arrivals = np.concatenate([earlier, period * numbers[length:] + waits])
-    acts = takes_effect(arrivals, TOGETHER * period)
+    acts = takes_effect(arrivals, SIMULTANEOUS * period)
     return numbers[acts], arrivals[acts]
 
 

@@ -19,7 +19,7 @@ from stewart_drake.files.yamlio import brief, load_yaml, parse_yaml, validate, y
 from stewart_drake.scenario.config import (
     ControllerConfig,
     Scenario,
-    understanding,
+    compatible_actuator,
     with_actuator,
 )
 from stewart_drake.scenario.dependencies import Idle, idle_fields, reset
@@ -63,7 +63,7 @@ def as_scenario(given: Scenario | str | Path) -> Scenario:
     return given if isinstance(given, Scenario) else load_scenario(given)
 
 
-def load_understood(
+def load_compatible(
     name_or_path: str | Path,
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
@@ -74,7 +74,7 @@ def load_understood(
     machine without them, within the same torque limit. Fields without an effect are not refused.
     """
     scenario, where, *_ = read_scenario(name_or_path, controller, settings)
-    scenario.actuator = understanding(scenario.controller.command, scenario.actuator)
+    scenario.actuator = compatible_actuator(scenario.controller.command, scenario.actuator)
     scenario.check(where)
     return _without_idle(scenario)
 
@@ -179,7 +179,7 @@ def load_comparison(
     """Reads a scenario once for every controller, and for every further row of its `compare`.
 
     What `settings` say of the delay that is believed in does not change a controller that knows of
-    none. Each has motors that understand it, see `load_understood`.
+    none. Each has motors that understand it, see `load_compatible`.
 
     Args:
         name_or_path, settings: as of `load_scenario`.
@@ -205,7 +205,7 @@ def load_comparison(
         scenario = read_scenario(name_or_path, controller, others if blind else settings).scenario
         changed = dataclasses.asdict(scenario.controller) | change
         scenario.controller = validate(ControllerConfig, changed, where)
-        motors = understanding(scenario.controller.command, scenario.actuator)
+        motors = compatible_actuator(scenario.controller.command, scenario.actuator)
         scenario.actuator = with_actuator(plain(motors), actuator, where)
         scenario.check(where)
         idle = {one.field: one for one in idle_fields(scenario)}

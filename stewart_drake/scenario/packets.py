@@ -88,7 +88,7 @@ class BurstChain:
         longer = np.minimum(np.arange(self.burst + 1) + 1, self.burst)
         return self.begins * values[..., :1] + (1 - self.begins) * values[..., longer]
 
-    def none_in_time(self, late: Array) -> float:
+    def probability_none_in_time(self, late: Array) -> float:
         """Return the probability that of consecutive packets each is lost or late.
 
         The weights of the states are carried from packet to packet; at each the weight of "kept" is
@@ -136,10 +136,10 @@ def torque_missing(config: PacketTimes, bound: float, repeats: int, period: floa
     Sent one after the other they have B + r dt, ..., B + dt, B left (theory.md, section 25).
     """
     late = 1 - in_time(config, bound + period * np.arange(repeats + 1))
-    return BurstChain(config.loss, config.burst).none_in_time(late)
+    return BurstChain(config.loss, config.burst).probability_none_in_time(late)
 
 
-def usual_bound(config: PacketTimes, repeats: int, period: float) -> float:
+def default_bound(config: PacketTimes, repeats: int, period: float) -> float:
     """Return the least bound in s, in whole periods, at which being late is rarer than being lost.
 
     A longer one cannot bring back what is lost, and costs delay. A torque is missing with a
@@ -147,7 +147,7 @@ def usual_bound(config: PacketTimes, repeats: int, period: float) -> float:
     is the least B with q(B) <= RARE q(inf), or ALMOST_NONE. Bounds beyond MOST_PERIODS, which no
     delay may have, are not tried.
     """
-    all_lost = BurstChain(config.loss, config.burst).none_in_time(np.zeros(repeats + 1))
+    all_lost = BurstChain(config.loss, config.burst).probability_none_in_time(np.zeros(repeats + 1))
     enough = max(RARE * all_lost, ALMOST_NONE)
 
     def there(steps: int) -> bool:

@@ -58,7 +58,7 @@ NUM_PLANT_PARAMETERS: Final = len(PLANT_PARAMETERS)
 COULOMB: Final = 8
 COULOMB_SPEED: Final = 9
 PAYLOAD_POSITION: Final = slice(10, 13)
-USUAL_COULOMB_SPEED: Final = 0.02
+DEFAULT_COULOMB_SPEED: Final = 0.02
 """rad/s, where nothing else is said."""
 
 WEIGHTS: Final = ("w_Q", "w_R")

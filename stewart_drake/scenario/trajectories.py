@@ -144,7 +144,7 @@ def peak_to_peak(config: ReferenceConfig, trajectory: Trajectory, duration: floa
     return _told(_span(config, trajectory, duration), trajectory)
 
 
-def moved(trajectory: Trajectory, duration: float) -> Array:
+def motion_range(trajectory: Trajectory, duration: float) -> Array:
     """(6,) rad and m, the range of any motion within [0, duration], 0 where it is constant."""
     return _told(_range(trajectory, duration), trajectory)
 

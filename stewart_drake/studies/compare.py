@@ -25,7 +25,7 @@ from stewart_drake.loop.own import OwnReference
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario, ServoActuatorConfig
-from stewart_drake.scenario.loading import load_comparison, load_understood, read_scenario
+from stewart_drake.scenario.loading import load_comparison, load_compatible, read_scenario
 from stewart_drake.studies.jobs import run_jobs
 
 ADAPTIVE: Final = "adaptive_lqi"
@@ -91,7 +91,7 @@ def compare(
     settings, controllers = tuple(settings), dict(controllers or {})
     scenarios = shown(scenario_name, settings)
     _check_makers(controllers, reference, disturbance, taken={*LABELS, *scenarios})
-    scenarios |= {name: load_understood(scenario_name, settings=settings) for name in controllers}
+    scenarios |= {name: load_compatible(scenario_name, settings=settings) for name in controllers}
     given = {
         name: {
             "controller": controllers.get(name),

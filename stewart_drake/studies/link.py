@@ -17,10 +17,10 @@ import numpy as np
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.config import NetworkConfig, Scenario
 from stewart_drake.scenario.packets import (
+    default_bound,
     in_time,
     times_under_way,
     torque_missing,
-    usual_bound,
 )
 from stewart_drake.studies.jobs import Progress, part_of
 from stewart_drake.studies.runs import run_scenarios
@@ -126,7 +126,7 @@ class LinkStudy:
     def summary(self) -> dict[str, Any]:
         return {
             "best_bound": None if self.best is None else self.best.bound,
-            "usual_bound": self.usual,
+            "default_bound": self.usual,
             "survivable_loss": self.survivable,
             "runs": self.runs,
             "bounds": [cell.summary for cell in self.bounds],
@@ -183,7 +183,7 @@ def study_link(
         sensor = replace(base.sensor, seed=base.sensor.seed + runs)
         fresh = replace(base, link=replace(link, seed=link.seed + runs), sensor=sensor)
         checked, stopped = run(fresh, [(best.bound, loss) for loss in losses], 0)
-    usual = usual_bound(link, scenario.controller.packet_repeats, period)
+    usual = default_bound(link, scenario.controller.packet_repeats, period)
     return LinkStudy(scenario, runs, found, checked, usual, tuple(sorted(left_out)), stopped)
 
 

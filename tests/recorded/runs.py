@@ -26,7 +26,7 @@ from stewart_drake.files.resources import shipped
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.scenario.loading import load_understood
+from stewart_drake.scenario.loading import load_compatible
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES
 from stewart_drake.scenario.timing import event_time, look_time
 from stewart_drake.types import Array
@@ -49,7 +49,7 @@ def closed_loop(row: str) -> ClosedLoop:
     """The loop of a row."""
     scenario, controller, kind = row.split("/")
     settings = (f"plant.kind={kind}",)
-    return build_closed_loop(load_understood(scenario, controller, settings))
+    return build_closed_loop(load_compatible(scenario, controller, settings))
 
 
 def _run_servos(loop: ClosedLoop) -> tuple[Array, Array]:
