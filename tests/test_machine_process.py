@@ -64,7 +64,7 @@ class Process:
             pass
         return self.popen.wait()
 
-    def _read(self) -> Iterator[str]:
+    def _read(self):
         """Yield the lines as they come, for `PATIENCE` s; then the process is killed.
 
         Reads through the file object: `communicate(timeout=...)` reads the descriptor, and loses
