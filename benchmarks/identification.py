@@ -42,7 +42,7 @@ from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log, P
 from stewart_drake.identification.plan import fitted_multisine
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import DELAY, DYNAMIC, GEOMETRY, NAMES, OFFSETS
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml

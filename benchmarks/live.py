@@ -30,7 +30,7 @@ from _page import QUICK, RESULTS, size
 
 import stewart_drake as sd
 from stewart_drake.files.versions import versions
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
 

@@ -19,7 +19,7 @@ from _page import size, table, write
 
 import stewart_drake as sd
 from stewart_drake.loop.bulk import run_in_bulk
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.study_options import Ranges

@@ -19,7 +19,7 @@ from joblib import Parallel, delayed
 
 import stewart_drake as sd
 from stewart_drake.loop.controller_margin import controller_margin
-from stewart_drake.loop.experiment import check_instants, prepare
+from stewart_drake.loop.preparation import check_instants, prepare
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.studies.reach import largest_factor

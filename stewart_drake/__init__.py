@@ -15,7 +15,7 @@ _PUBLIC: Final = {
     "loop.exact": "ExactPlant set_accuracy",
     "loop.law_design": "DesignedLaw design_law",
     "loop.platforms": "AddStewartPlatform StewartPlatform",
-    "loop.state_space": "linear_models",
+    "loop.controller_margin": "linear_models",
     "mechanism.files": "load_mechanism",
     "mechanism.geometry": "Mechanism",
     "mechanism.kinematics": "ForwardKinematicsError UnreachablePoseError",

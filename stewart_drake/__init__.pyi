@@ -19,6 +19,7 @@ from stewart_drake.functions import identify as identify
 from stewart_drake.functions import model_sdf as model_sdf
 from stewart_drake.functions import plan_identification as plan_identification
 from stewart_drake.functions import view_model as view_model
+from stewart_drake.loop.controller_margin import linear_models as linear_models
 from stewart_drake.loop.diagram import ClosedLoop as ClosedLoop
 from stewart_drake.loop.diagram import build_closed_loop as build_closed_loop
 from stewart_drake.loop.exact import ExactPlant as ExactPlant
@@ -27,7 +28,6 @@ from stewart_drake.loop.law_design import DesignedLaw as DesignedLaw
 from stewart_drake.loop.law_design import design_law as design_law
 from stewart_drake.loop.platforms import AddStewartPlatform as AddStewartPlatform
 from stewart_drake.loop.platforms import StewartPlatform as StewartPlatform
-from stewart_drake.loop.state_space import linear_models as linear_models
 from stewart_drake.mechanism.files import load_mechanism as load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism as Mechanism
 from stewart_drake.mechanism.kinematics import ForwardKinematicsError as ForwardKinematicsError

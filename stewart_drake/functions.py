@@ -15,7 +15,7 @@ from stewart_drake.identification.logs import ANGLES, POSE, Precision, read_log
 from stewart_drake.identification.plan import MOTION, Plan, plan
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.live.options import LiveOptions, MachineOptions
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import as_mechanism, load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat

@@ -21,8 +21,8 @@ from stewart_drake.live.protocol import (
     Message,
     encode,
 )
-from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.peer import identity_of
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.loading import load_scenario
 from tests.live_driver import Clock
 

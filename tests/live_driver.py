@@ -20,9 +20,9 @@ from stewart_drake.live.protocol import (
     Head,
     MachineMessage,
 )
-from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.peer import identity_of
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.config import Scenario
 
 

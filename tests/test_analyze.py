@@ -12,7 +12,7 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.dynamics.workspace import standing
 from stewart_drake.files.resources import resolve
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.reference_config import HoldConfig, SineConfig, WaypointsConfig
 from stewart_drake.studies import delay, hautus, runs
 from stewart_drake.studies.delay import Cell, delay_map, map_delays, scaled_motion

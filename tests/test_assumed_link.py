@@ -6,9 +6,9 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.bulk import preparation_of
 from stewart_drake.loop.law_design import compose_law
-from stewart_drake.loop.preparation import preparation_of
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.config import NetworkConfig
 from stewart_drake.scenario.link import forward_times, link_text

@@ -12,13 +12,14 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.law.filter_settings import CHANCE, EXACT, usual_parameters
 from stewart_drake.law.observers import ParameterObserver
-from stewart_drake.loop.experiment import believed_delay, prepare
 from stewart_drake.loop.law_design import GENTLE, compose_law
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.geometry import Body, fingerprint
 from stewart_drake.scenario.calibration import (
     CALIBRATED,
     OFFSETS,
     Calibration,
+    believed_delay,
     load_calibration,
     save_calibration,
 )

@@ -13,7 +13,7 @@ from scipy.optimize import lsq_linear
 from stewart_drake.cli import main
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.clearance import ClearanceScene, Pair
-from stewart_drake.loop.experiment import assemble as made
+from stewart_drake.loop.preparation import assemble as made
 from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.clearance import (
     APART,

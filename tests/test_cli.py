@@ -15,7 +15,7 @@ import xarray as xr
 
 from stewart_drake.cli import main
 from stewart_drake.files.resources import KINDS, shipped
-from stewart_drake.loop.experiment import assemble, prepare
+from stewart_drake.loop.preparation import assemble, prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
@@ -55,7 +55,7 @@ def test_a_scenario_is_prepared_once(tmp_path, monkeypatch):
         prepared.append(scenario)
         return assemble(scenario, *more)
 
-    monkeypatch.setattr("stewart_drake.loop.experiment.assemble", counted)
+    monkeypatch.setattr("stewart_drake.loop.preparation.assemble", counted)
     assert main(["simulate", *SHORT, "--quiet", "--out", str(tmp_path)]) == 0
     assert len(prepared) == 1
     experiment = prepare(prepared[0])

@@ -6,7 +6,7 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.dynamics.workspace import standing
 from stewart_drake.files.resources import data_root
-from stewart_drake.loop import metrics
+from stewart_drake.loop import results as metrics
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.scenario.signals import LEGS

@@ -11,7 +11,7 @@ import xarray as xr
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_comparison, load_scenario
 from stewart_drake.studies.compare import (

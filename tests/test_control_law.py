@@ -28,8 +28,8 @@ from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.predictors import LinearPredictor, NonlinearPredictor
 from stewart_drake.law.riccati import RiccatiError, full_gain
 from stewart_drake.law.startup import weight_scales
-from stewart_drake.loop.experiment import assemble, motion_scale, prepare
 from stewart_drake.loop.law_design import control_law
+from stewart_drake.loop.preparation import assemble, prepare
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate, make_reference
@@ -620,7 +620,7 @@ def test_a_motion_of_one_radian_peak_to_peak_is_no_constant():
     for amplitude in (0.5, 0.5001):
         settings = [f"reference.amplitude=[0,0,{amplitude},0,0,0]", "plant.kind=exact"]
         experiment = assemble(load_scenario("paper", None, settings))
-        scales.append(motion_scale(experiment))
+        scales.append(experiment.motion_scale)
         assert scales[-1][2] == pytest.approx(amplitude)
         assert experiment.scale == pytest.approx([1, 1, 2 * amplitude, 1, 1, 1])
         weights, _, _ = weight_scales("bryson", experiment.nominal, experiment.peak_to_peak, 1.0)

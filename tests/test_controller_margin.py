@@ -20,9 +20,9 @@ from stewart_drake.loop.controller_margin import (
     controller_margin,
     true_model,
 )
-from stewart_drake.loop.experiment import prepare, torques_in_flight, true_dynamics
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.platforms import MultibodyStewart
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE
 from stewart_drake.scenario.trajectories import evaluate
@@ -57,12 +57,12 @@ def distances(sc, periods):
     """
     experiment = prepare(sc)
     law = control_law(experiment)[0]
-    truth, mu, share = true_dynamics(experiment), sc.delay.steps, sc.delay.fraction
+    truth, mu, share = experiment.true_dynamics(), sc.delay.steps, sc.delay.fraction
     held = np.array([share, 1 - share]) * sc.controller.period
     pair = []
     for sign in (1, -1):
         x = experiment.start + sign * SIZE * DIRECTION
-        memory = law.initial_memory(torques_in_flight(experiment, law.timeline.delay))
+        memory = law.initial_memory(experiment.torques_in_flight(law.timeline.delay))
         standing = np.zeros(NUM_TORQUES)
         if sc.queue == "equilibrium":
             standing = experiment.nominal.equilibrium_torque(experiment.start[POSE])
@@ -309,7 +309,7 @@ def test_the_fastest_pole_is_told_where_it_is(tmp_path):
     )  # fmt: skip
     experiment = prepare(sc)
     found = controller_margin(experiment)
-    truth = true_dynamics(experiment)
+    truth = experiment.true_dynamics()
     assert "does not reach" in found.problem and found.pole > 0
     again = fastest_pole(true_model(experiment, truth, found.pole_time).A)
     assert found.pole == pytest.approx(again, rel=1e-12)

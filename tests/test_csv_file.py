@@ -9,7 +9,7 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.reporting.csv_file import signals_csv, write_csv
 from stewart_drake.scenario.reference_files import read_csv
 

@@ -27,7 +27,7 @@ from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller_margin import controller_margin
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.reporting.figures import draw_run
 from stewart_drake.scenario.delay import Delay

@@ -40,7 +40,7 @@ from stewart_drake.law.error_model import double_integrators, linear_model
 from stewart_drake.law.riccati import reduced_gain
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.diagram import ClosedLoop
-from stewart_drake.loop.metrics import accumulated_error
+from stewart_drake.loop.results import accumulated_error
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
 from stewart_drake.scenario.config import ControllerConfig, Scenario

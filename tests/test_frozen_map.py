@@ -10,8 +10,8 @@ import stewart_drake as sd
 from stewart_drake.dynamics.frozen_map import Band, FrozenDynamics
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.core_law import uncovered
-from stewart_drake.loop.experiment import limits_of, prepare
 from stewart_drake.loop.law_design import compose_law
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.loading import load_comparison
@@ -103,7 +103,7 @@ def test_a_copy_is_of_the_same_kind(plant):
 
 def test_the_band_is_ten_peak_to_peaks_about_the_moving_reference():
     experiment = prepare(sd.load_scenario("table2", settings=[FULL]))
-    band = limits_of(experiment)
+    band = experiment.limits
     assert isinstance(band, Band)
     np.testing.assert_allclose(band.width, 20 * AMPLITUDE)
     there = experiment.reference.value(1.3)[:, 0]

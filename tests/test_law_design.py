@@ -8,7 +8,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.delay_chain import DelayChain
+from stewart_drake.loop.link import DelayChain
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.calibration import Calibration, save_calibration
 from stewart_drake.scenario.signals import POSE

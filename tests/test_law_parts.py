@@ -28,8 +28,8 @@ from stewart_drake.law.observers import NoObserver, ParameterObserver
 from stewart_drake.law.sensing import FirstState, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import DelayLqiController
-from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import control_law
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.delay import Delay

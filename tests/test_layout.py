@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.experiment import assemble, check_instants, prepare
+from stewart_drake.loop.preparation import assemble, check_instants, prepare
 from stewart_drake.mechanism.assembly import assemble as placed
 from stewart_drake.mechanism.files import build_mechanism, load_mechanism, mechanism_spec
 from stewart_drake.mechanism.geometry import bar_inertia

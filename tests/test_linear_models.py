@@ -8,9 +8,8 @@ import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.error_model import ContinuousModel
 from stewart_drake.law.stability import LinearLoop, loop_gain, sensitivity, spectral_radius
-from stewart_drake.loop.controller_margin import controller_margin, loop_at
-from stewart_drake.loop.experiment import prepare
-from stewart_drake.loop.state_space import state_spaces
+from stewart_drake.loop.controller_margin import controller_margin, loop_at, state_spaces
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.delay import Delay
 
 OMEGA = np.geomspace(0.05, 30, 40)

@@ -9,11 +9,9 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from scipy.integrate import solve_ivp
 
 import stewart_drake as sd
-from stewart_drake.loop.delay_chain import DelayChain
 from stewart_drake.loop.diagram import build_closed_loop
-from stewart_drake.loop.experiment import torques_in_flight
+from stewart_drake.loop.link import DelayChain, VaryingDelay
 from stewart_drake.loop.simulation import make_simulator
-from stewart_drake.loop.varying_delay import VaryingDelay
 from stewart_drake.scenario.config import DelayConfig
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import delay_at, takes_effect, torque_delays
@@ -185,7 +183,7 @@ def test_the_exact_plant_stops_at_every_arrival(course):
     sent, start = {}, loop.experiment.start
     delays = torque_delays(sc)
     eta, before = sc.eta, sc.true_delay.queue_length
-    first = torques_in_flight(loop.experiment, sc.true_delay)
+    first = loop.experiment.torques_in_flight(sc.true_delay)
     sent |= {k - before: first[k] for k in range(before)}
     for k in range(n):
         simulator.AdvanceTo(k * period + 1e-12)

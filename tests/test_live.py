@@ -38,9 +38,9 @@ from stewart_drake.live.page import Asked, PageViewer, _Board, read_wish
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerMessage, MachineFlags
 from stewart_drake.live.session import _queue_advice, check_armed, drive, plans, prepare_session
 from stewart_drake.live.steering import Steering, Way, Wish
-from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import identity_of
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.reporting.run import run_document
 from stewart_drake.reporting.style import FACTORS

@@ -21,9 +21,9 @@ from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.machine import Machine
 from stewart_drake.live.rows import RowFile
 from stewart_drake.live.session import drive, prepare_session
-from stewart_drake.loop import metrics
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop import results as metrics
 from stewart_drake.loop.law_design import control_law, first_queue
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.recording import Table
 from stewart_drake.reporting.csv_file import signals_csv
 from stewart_drake.scenario.signals import POSE

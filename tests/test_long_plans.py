@@ -10,7 +10,7 @@ from stewart_drake.law.catch_up import Model, plan_catch_up
 from stewart_drake.law.holds import mean_torques
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.startup import BLOCK, choose_substeps
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate, through_states
 

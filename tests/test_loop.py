@@ -11,9 +11,9 @@ from scipy.integrate import quad_vec
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop import metrics
+from stewart_drake.loop import results as metrics
 from stewart_drake.loop.diagram import build_closed_loop
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
 from stewart_drake.scenario.loading import load_scenario

@@ -14,7 +14,7 @@ import stewart_drake.law.cost as cost_module
 import stewart_drake.loop.diagram as diagram_module
 import stewart_drake.loop.kinds as kinds_module
 from stewart_drake.law.riccati import RiccatiError
-from stewart_drake.loop.metrics import accumulated_error
+from stewart_drake.loop.results import accumulated_error
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario

@@ -19,8 +19,8 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError, lqr, reduced_gain
-from stewart_drake.loop.experiment import prepare, torques_in_flight
 from stewart_drake.loop.law_design import compose_law, control_law
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
@@ -214,7 +214,7 @@ class Pair:
         experiment = prepare(self.scenario)
         self.law, self.planned, _ = control_law(experiment)
         self.native = CoreLqi(self.law)
-        queue = torques_in_flight(experiment, self.law.timeline.delay)
+        queue = experiment.torques_in_flight(self.law.timeline.delay)
         self.one: Any = self.law.initial_memory(queue)
         self.other: Any = self.native.initial_memory(queue)
         sc = self.scenario

@@ -15,11 +15,10 @@ import stewart_drake as sd
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.law.catch_up import plan_catch_up
 from stewart_drake.loop import bulk
-from stewart_drake.loop.bulk import SampledLaw, ending_of, run_in_bulk
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.bulk import SampledLaw, ending_of, preparation_of, run_in_bulk
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.native_loop import InPython, instants_of, run_loop, uncovered
-from stewart_drake.loop.preparation import preparation_of
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.loop.sensor import Sensor, white_noise, white_noises
 from stewart_drake.loop.simulation import simulate

@@ -11,8 +11,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.trajectories import FunctionHandleTrajectory, PiecewisePolynomial
 
 import stewart_drake as sd
-from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.own import take
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.trajectories import make_reference
 
 ROOT = Path(__file__).resolve().parents[1]

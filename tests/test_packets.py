@@ -16,10 +16,9 @@ from stewart_drake.law.channel import Packets, Report, Wire
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.diagram import build_closed_loop
-from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import compose_law
-from stewart_drake.loop.playout import PlayoutBuffer
-from stewart_drake.loop.sensor import LateMeasurements
+from stewart_drake.loop.link import LateMeasurements, PlayoutBuffer
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.reporting.link import document
 from stewart_drake.reporting.page import Provenance, html

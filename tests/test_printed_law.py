@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from stewart_drake.law.delay_model import DelayedModel, delayed_model
 from stewart_drake.law.error_model import double_integrators
 from stewart_drake.law.riccati import augmented_gain
-from stewart_drake.loop.metrics import accumulated_error
+from stewart_drake.loop.results import accumulated_error
 from stewart_drake.mechanism.assembly import torque_map
 from tests.mechanisms import PAPER
 

@@ -18,7 +18,7 @@ from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.loop import bulk
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism import kinematics
 from stewart_drake.reporting.page import Provenance, html

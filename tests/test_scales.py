@@ -15,9 +15,9 @@ from stewart_drake.files.resources import data_root
 from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.riccati import full_gain, lqr
 from stewart_drake.law.startup import machine_torque
-from stewart_drake.loop import experiment as experiment_module
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop import preparation as experiment_module
 from stewart_drake.loop.law_design import control_law
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Body, Link

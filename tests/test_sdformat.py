@@ -16,7 +16,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from stewart_drake.files.resources import data_root, shipped
-from stewart_drake.loop.multibody import add_mechanism, set_pose
+from stewart_drake.loop.platforms import add_mechanism, set_pose
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
 from tests.mechanisms import PAPER, random_mechanism, random_pose

@@ -24,9 +24,9 @@ from stewart_drake.law.servos import (
     turned,
 )
 from stewart_drake.loop.diagram import build_closed_loop
-from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import compose_law
-from stewart_drake.loop.servo_design import compose_servo_law, servo_loop
+from stewart_drake.loop.preparation import prepare
+from stewart_drake.loop.servos import compose_servo_law, servo_loop
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.mechanism.geometry import with_rotors
 from stewart_drake.scenario.config import ServoActuatorConfig, TorqueActuatorConfig

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stewart_drake.files.resources import data_root, shipped
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario

@@ -19,14 +19,13 @@ from stewart_drake.law.core_law import serving
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.controller import DelayLqiController
-from stewart_drake.loop.delay_chain import DelayChain
+from stewart_drake.loop.controller import DelayLqiController, Reference
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.exact import ExactPlant
-from stewart_drake.loop.experiment import prepare
 from stewart_drake.loop.law_design import control_law
+from stewart_drake.loop.link import DelayChain
 from stewart_drake.loop.platforms import MultibodyStewart
-from stewart_drake.loop.reference import Reference
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.scenario.loading import load_scenario

@@ -7,8 +7,8 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.loop.controller_margin import controller_margin
-from stewart_drake.loop.experiment import check_instants, prepare
 from stewart_drake.loop.law_design import compose_law
+from stewart_drake.loop.preparation import check_instants, prepare
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.reporting.document import Paragraph, Table
 from stewart_drake.reporting.run import table_two_blocks

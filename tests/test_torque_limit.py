@@ -11,8 +11,8 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import load_yaml
 from stewart_drake.loop.diagram import build_closed_loop
-from stewart_drake.loop.experiment import assemble
 from stewart_drake.loop.platforms import MultibodyStewart
+from stewart_drake.loop.preparation import assemble
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.scenario.loading import load_scenario, scenario_yaml
 from stewart_drake.studies.study_options import Ranges

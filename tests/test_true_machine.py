@@ -13,9 +13,9 @@ from stewart_drake.files.resources import data_root
 from stewart_drake.law.servos import crank_mobility
 from stewart_drake.loop.cautions import cautions_before
 from stewart_drake.loop.diagram import build_closed_loop
-from stewart_drake.loop.experiment import prepare, simulated_machine
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.platforms import MultibodyStewart
+from stewart_drake.loop.preparation import prepare, simulated_machine
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.scenario.signals import COULOMB, NUM_PARAMETERS, PAYLOAD
 from tests.mechanisms import PAPER

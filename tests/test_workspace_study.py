@@ -17,7 +17,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, margin, standing
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
-from stewart_drake.loop.experiment import assemble, check_instants, prepare, reference_failure
+from stewart_drake.loop.preparation import assemble, check_instants, prepare
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
 from stewart_drake.scenario.loading import load_scenario
@@ -218,7 +218,7 @@ def test_a_motion_is_checked_up_to_its_end_and_not_beyond(later, fits):
     leaves = math.asin(travel(PAPER)[5].high / 0.2)
     scenario = dataclasses.replace(heave(0.2), duration=leaves + later)
     assert (study_workspace(scenario).exit is None) is fits
-    assert (reference_failure(assemble(scenario)) is None) is fits
+    assert (assemble(scenario).reference_failure() is None) is fits
 
 
 def test_the_largest_heave_is_the_shorter_travel():

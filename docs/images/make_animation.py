@@ -28,7 +28,7 @@ from pydrake.systems.sensors import CameraInfo
 
 import stewart_drake as sd
 from docs.images.make_platform import LIGHTS, looking_at
-from stewart_drake.loop.multibody import add_mechanism, set_pose
+from stewart_drake.loop.platforms import add_mechanism, set_pose
 from stewart_drake.loop.scene import pointer, ring
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
-from stewart_drake.loop.multibody import add_mechanism, set_pose
+from stewart_drake.loop.platforms import add_mechanism, set_pose
 from stewart_drake.mechanism.files import load_mechanism
 
 OFFSET = np.array([0.14, -0.16, 0.12, 0.02, 0.01, 0.03])

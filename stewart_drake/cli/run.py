@@ -62,7 +62,7 @@ def simulate(
     """Run one scenario."""
     from stewart_drake.loop.cautions import cautions_before
     from stewart_drake.loop.controller_margin import controller_margin
-    from stewart_drake.loop.experiment import prepare
+    from stewart_drake.loop.preparation import prepare
     from stewart_drake.loop.simulation import simulate as run
     from stewart_drake.reporting.document import Caution
     from stewart_drake.reporting.run import run_document
@@ -200,7 +200,7 @@ def compare(
     as_json: AsJson = False,
 ) -> int:
     """Run the shipped controllers on a scenario, as a table."""
-    from stewart_drake.loop.experiment import prepare
+    from stewart_drake.loop.preparation import prepare
     from stewart_drake.reporting.run import comparison_document
     from stewart_drake.scenario.loading import load_compatible
     from stewart_drake.studies import compare as study
@@ -245,7 +245,7 @@ def report(
 
     It is run, compared under all shipped controllers, and analysed.
     """
-    from stewart_drake.loop.experiment import simulated_machine
+    from stewart_drake.loop.preparation import simulated_machine
     from stewart_drake.reporting import report as report_document
     from stewart_drake.reporting.page import Provenance, command_line
     from stewart_drake.reporting.report import collect

@@ -28,9 +28,9 @@ from stewart_drake.law.compiled import Compiled
 from stewart_drake.law.core_law import CompiledLaw
 from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.experiment import Experiment, prepare
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import FAULTS, identity_of
+from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.tuner import weights_source
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_yaml

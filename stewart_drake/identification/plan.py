@@ -30,7 +30,7 @@ from stewart_drake.identification.start import segment_length, segments_of
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import DELAY, NAMES, UNITS, Unknowns, unknowns_of
 from stewart_drake.law.holds import mean_torques
-from stewart_drake.loop.experiment import Experiment, motion_scale
+from stewart_drake.loop.preparation import Experiment
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.reference_config import CsvConfig
@@ -185,7 +185,7 @@ def plan(
     instants = np.linspace(0, sc.duration, 200)
     seen = np.array([experiment.reference.value(t)[:, 0] for t in instants])
     middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
-    peak = amplitude * motion_scale(experiment)
+    peak = amplitude * experiment.motion_scale
     times, poses, share = fitted_multisine(mechanism, middle, peak, duration)
     motion = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, poses.T)
     log, states = _foreseen(experiment, motion, times[-1], std)

@@ -27,8 +27,8 @@ from stewart_drake.live.protocol import (
     MachineFlags,
     MachineMessage,
 )
-from stewart_drake.loop.experiment import Experiment, prepare
 from stewart_drake.loop.law_design import control_law, first_queue
+from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.scenario.config import NetworkConfig, Scenario
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.packets import default_bound
@@ -140,7 +140,7 @@ def design(scenario: Scenario, machine: MachineMessage) -> Design:
     """The law for a scenario as it is seen.
 
     Raises:
-        ConfigError: as `loop.experiment.prepare` and `control_law`.
+        ConfigError: as `loop.preparation.prepare` and `control_law`.
     """
     experiment = prepare(scenario)
     law, planned, _ = control_law(experiment)

@@ -16,7 +16,7 @@ from stewart_drake.law.core_law import AnyMemory
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.live.rows import RowFile
 from stewart_drake.loop.controller import held_by
-from stewart_drake.loop.experiment import Experiment
+from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.recording import Record, Table
 from stewart_drake.reporting.csv_file import headings
 from stewart_drake.scenario.config import Scenario

@@ -39,7 +39,6 @@ from stewart_drake.live.protocol import (
 from stewart_drake.live.reports import ReportCheck
 from stewart_drake.live.steering import Steering, Wish
 from stewart_drake.loop.controller import reported
-from stewart_drake.loop.experiment import motion_scale
 from stewart_drake.loop.peer import Fault
 from stewart_drake.loop.recording import has_measured
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, PACKETS, POSE, RATES
@@ -237,7 +236,7 @@ class LiveLoop:
         self._measured, self._known = -1, self.memory
         c = design.experiment.scenario.controller
         self._period, self._weights = c.period, np.array([c.w_Q, c.w_R])
-        self._size = 2 * motion_scale(design.experiment)
+        self._size = 2 * design.experiment.motion_scale
         self._sends = isinstance(design.law.channel, Packets)
         # The next torque alone: what a plan goes on with may still change.
         self._horizon = float(replace(design.law, channel=Wire()).preview_times.max())

@@ -36,8 +36,8 @@ from stewart_drake.live.protocol import (
     MachineMessage,
     Refusal,
 )
-from stewart_drake.loop.experiment import Experiment, prepare, torques_in_flight
 from stewart_drake.loop.peer import FAULTS, Fault, Reason, code_bits, identity_of, in_words
+from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link import (
@@ -358,7 +358,7 @@ class Machine:
             self._say("nobody was heard when the run should have begun: still parked")
             return
         sc, delay = self._experiment.scenario, self._experiment.scenario.true_delay
-        queue = torques_in_flight(self._experiment, delay)
+        queue = self._experiment.torques_in_flight(delay)
         early = delay.fraction - 1 if delay.fraction > 0 else 0.0
         playout = self.begin + round(early * sc.controller.period * SECOND)
         self._running, self._origin, self._safe = True, time, False

@@ -20,8 +20,8 @@ from stewart_drake.live.loop import LiveLoop, Nobody, Viewer
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
 from stewart_drake.live.steering import Steering, Way
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
-from stewart_drake.loop.experiment import Experiment
 from stewart_drake.loop.peer import identity_of
+from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LiveSummary, SimulationResult
 from stewart_drake.scenario.config import DelayConfig, Scenario, WireConfig

@@ -5,38 +5,198 @@ it has not; both come to the same.
 """
 
 import dataclasses
-from typing import NamedTuple
+import json
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, NamedTuple
 
 import numpy as np
+from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import resolve
+from stewart_drake.files.schema import plain
 from stewart_drake.law import core_law
+from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.core_law import AnyMemory
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
-from stewart_drake.loop.experiment import Experiment, assemble
-from stewart_drake.loop.law_design import first_queue, followed_motion
-from stewart_drake.loop.metrics import Figures, accumulated_error, figures
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.loop.law_design import (
+    compose_law,
+    first_queue,
+    followed_motion,
+    sizing_of,
+    way_onto,
+)
 from stewart_drake.loop.native_loop import (
     Course,
     InC,
     InPython,
     Instants,
+    instants_of,
     run_loop,
     uncovered,
 )
-from stewart_drake.loop.preparation import MakeTuner, Preparation, Prepared, preparation_of
-from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.preparation import Experiment, assemble, network_of, prepare
+from stewart_drake.loop.results import Figures, SimulationResult, accumulated_error, figures
 from stewart_drake.loop.simulation import simulate
+from stewart_drake.loop.tuner import weights_source
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.signals import POSE, TUNER_INPUTS, WEIGHTS
+from stewart_drake.scenario.loading import scenario_to_dict
+from stewart_drake.scenario.signals import NUM_STATE, POSE, TUNER_INPUTS, WEIGHTS
+from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.tuner.compiled import compiled_tuner
-from stewart_drake.tuner.source import Decision
+from stewart_drake.tuner.source import Decision, WeightsSource
 from stewart_drake.types import Array
+
+MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
+"""What sets the weights of an experiment with such a law, None where they are fixed."""
+
+_DRAWN: Final = (
+    ("plant", "payload_mass"),
+    ("plant", "torque_bias"),
+    ("plant", "joint_damping"),
+    ("plant", "coulomb_friction"),
+    ("sensor", "noise_std"),
+    ("sensor", "seed"),
+    ("actuator", "torque_limit"),
+    ("controller", "w_Q"),
+    ("controller", "w_R"),
+)
+"""Fields of a scenario that nothing here depends on; of the delay only what is believed counts."""
+
+
+class Prepared(NamedTuple):
+    """One run, ready to begin.
+
+    Attributes:
+        experiment: what is run.
+        law: of its torques.
+        planned: the motion that it follows.
+        previews: (k, p, 18) of it, for each sample.
+        tuner: what sets its weights, None where they are fixed.
+    """
+
+    experiment: Experiment
+    law: PredictiveLqi
+    planned: Trajectory
+    previews: Array
+    tuner: WeightsSource | None
+
+
+class Preparation:
+    """Of one scenario and all that differ from it in `_DRAWN` and in the true machine.
+
+    Args:
+        scenario: one of them.
+
+    Attributes:
+        when: the instants of a run.
+        references: (n, 12) pose and rates that are wanted at its looks.
+
+    Raises:
+        ConfigError: as `prepare`.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._base = prepare(scenario)
+        self._sizing = sizing_of(self._base)
+        self._ways: dict[bytes, CatchUp | None] = {}
+        self._previews: dict[int, tuple[Trajectory, Array]] = {}
+        self.when: Instants = instants_of(scenario.duration, scenario.controller.period)
+        reference = self._base.reference
+        self.references = np.array([evaluate(reference, t)[:NUM_STATE] for t in self.when.looks])
+
+    def experiment(self, scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
+        """What `prepare` would return.
+
+        Raises:
+            ConfigError: the scenario's fields do not go together.
+        """
+        scenario.check()
+        true = self._base.truth if truth is None else truth
+        return self._base._replace(scenario=scenario, truth=true, network=network_of(scenario))
+
+    def prepared(self, experiment: Experiment, tuner: MakeTuner | None = None) -> Prepared:
+        """Law and previews as of `control_law`, which says what may go wrong.
+
+        A tuner takes the place of the scenario's.
+        """
+        law = compose_law(experiment, self._sizing)
+        queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
+        if queue not in self._ways:
+            self._ways[queue] = way_onto(experiment, law)
+        way, motion = self._ways[queue], experiment.reference
+        if way is not None:
+            sc = experiment.scenario
+            motion, _ = way.plan(sc.controller.catch_up, experiment.planned_limit)
+        source = (tuner or weights_source)(experiment, law)
+        return Prepared(experiment, law, motion, self._preview(motion, law), source)
+
+    def _preview(self, motion: Trajectory, law: PredictiveLqi) -> Array:
+        """(k, p, 18), as of `loop.controller.Reference`."""
+        if id(motion) not in self._previews:
+            times = np.maximum(0.0, self.when.samples[:, None] + law.preview_times)
+            rows = [[evaluate(motion, t) for t in ahead] for ahead in times]
+            self._previews[id(motion)] = motion, np.array(rows)  # kept, so that its id is
+        return self._previews[id(motion)][1]
+
+
+def preparation_of(scenario: Scenario) -> Preparation:
+    """That of a scenario, made once for all with which it has it in common.
+
+    Raises:
+        ConfigError: as `prepare`.
+    """
+    return _preparation(_Key(scenario))
+
+
+class _Key:
+    """A scenario that is equal to others where they have their preparation in common."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        fields, believed = scenario_to_dict(scenario), believed_delay(scenario)
+        for section, name in _DRAWN:
+            del fields[section][name]
+        del fields["tuner"]
+        fields["delay"] = believed.steps, believed.fraction
+        fields["link"] = plain(scenario.assumed_link)
+        fields["controller"] |= {"delay_steps": None, "delay_fraction": None}
+        machines = scenario.mechanism, scenario.plant.mechanism
+        files = [resolve("mechanism", name) for name in machines if name is not None]
+        named = getattr(scenario.reference, "file", None), scenario.controller.calibration
+        files += [Path(name) for name in named if name is not None]
+        self._key = json.dumps(fields, default=str), *(_stamp(file) for file in files)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """By which another content of a file shows."""
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; expected a file") from None
+    return found.st_mtime_ns, found.st_size
+
+
+@lru_cache(maxsize=16)
+def _preparation(key: _Key) -> Preparation:
+    with one_blas_thread:
+        return Preparation(key.scenario)
 
 
 class Ending(NamedTuple):

@@ -9,9 +9,9 @@ from itertools import product
 from typing import Final
 
 from stewart_drake.loop.controller_margin import ControllerMargin
-from stewart_drake.loop.experiment import Experiment, true_dynamics
+from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.results import RunSummary
-from stewart_drake.loop.servo_design import quickest_crank
+from stewart_drake.loop.servos import quickest_crank
 from stewart_drake.scenario.config import Scenario
 
 TOLERABLE: Final = 1e5
@@ -53,7 +53,7 @@ def stiff_friction(experiment: Experiment) -> str | None:
     plant = experiment.scenario.plant
     if plant.kind != "multibody" or plant.coulomb_friction == 0:
         return None
-    quickest = quickest_crank(true_dynamics(experiment), experiment)
+    quickest = quickest_crank(experiment.true_dynamics(), experiment)
     longest = 2 * plant.coulomb_speed / (plant.coulomb_friction * quickest)
     if plant.time_step <= longest:
         return None

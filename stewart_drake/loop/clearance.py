@@ -18,7 +18,7 @@ from pydrake.geometry import Capsule, Cylinder, GeometryId, QueryObject, Role, S
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
 
-from stewart_drake.loop.multibody import add_mechanism, set_pose
+from stewart_drake.loop.platforms import add_mechanism, set_pose
 from stewart_drake.mechanism.clearance import LINKS, center_lines, proportions, segment_distances
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along

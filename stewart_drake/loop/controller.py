@@ -1,11 +1,15 @@
-"""The control law as a Drake system."""
+"""The controllers and their reference as Drake systems."""
 
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    LeafSystem,
+)
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -13,9 +17,11 @@ from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.core_law import AnyMemory, serving
 from stewart_drake.law.late import LateObserver
 from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.sampling import Sample, SteppedLaw, weak
+from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
+from stewart_drake.loop.sampling import Sample, SteppedLaw, declare_constant, weak
 from stewart_drake.scenario.signals import (
     NUM_PARAMETERS,
     NUM_REFERENCE,
@@ -25,7 +31,46 @@ from stewart_drake.scenario.signals import (
     WEIGHTS,
     ports_of,
 )
+from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
+
+
+class Reference(LeafSystem):
+    """What the plate shall do: now, and ahead for a controller that looks ahead.
+
+    Output:  reference(t) = [pose; rates; accelerations] of `true_motion`,
+             preview(t)   = the same of `planned_motion` at t + each of `preview_times`.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | reference | output | 18 | rad, m and their time derivatives | continuous |
+    | preview | output | 18 len(preview_times) | the same | continuous |
+
+    Args:
+        true_motion: what tracking is judged by, a trajectory (6, 1).
+        planned_motion: what the controller follows; it may approach the true motion smoothly.
+        preview_times: (p,) in s from now.
+    """
+
+    def __init__(
+        self, true_motion: Trajectory, planned_motion: Trajectory, preview_times: Array
+    ) -> None:
+        super().__init__()
+        self._true, self._planned = true_motion, planned_motion
+        self._times = np.array(preview_times)
+        time_only = {self.time_ticket()}
+        self.DeclareVectorOutputPort("reference", NUM_REFERENCE, weak(self._now), time_only)
+        size = NUM_REFERENCE * len(self._times)
+        self.DeclareVectorOutputPort("preview", size, weak(self._ahead), time_only)
+
+    def _now(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(evaluate(self._true, context.get_time()))
+
+    def _ahead(self, context: Context, output: BasicVector) -> None:
+        t = context.get_time()
+        values = [evaluate(self._planned, max(0.0, t + ahead)) for ahead in self._times]
+        output.SetFromVector(np.concatenate(values))
+
 
 HELD: Final[dict[str, Callable[[AnyMemory], Array]]] = {
     "torque_commanded": lambda memory: memory.torque,
@@ -170,3 +215,128 @@ class DelayLqiController(SteppedLaw):
 
     def _left(self, context: Context, output: AbstractValue) -> None:
         output.set_value(self._step.Eval(context))
+
+
+class ServoController(SteppedLaw):
+    """Sends crank angles ahead, in the place of `loop.controller.DelayLqiController`.
+
+    With m the memory and `step` the law (`law.servo_preview.ServoPreview`):
+
+    Update:  every period m <- step(m, measurement, preview, report), and the time it took
+    Output:  command = step(m, measurement, preview, report).command, to be taken at the samples;
+             the others = parts of m, as of the last sample.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | measurement | input | 12 | rad, m, rad/s, m/s | read every period; NaN is lost |
+    | preview | input | 18 | rad, m and time derivatives | read every period |
+    | report | input | of `law.servos.ReportLayout` | N m | read every period; NaN is lost |
+    | age | input | 1 | s, whole periods | of measurement and report; 0 where unconnected |
+    | command | output | 18 | rad, rad/s, N m | direct feedthrough |
+    | estimate | output | 12 | rad, m, rad/s, m/s | direct feedthrough |
+    | torque | output | 6 | N m, that servos asked for | held |
+    | torque_commanded | output | 6 | the same | held |
+    | integral, weights_used | output | 6, 2 | | NaN |
+    | the others | output | as of `DelayLqiController` | | held |
+
+    Args:
+        law: the control law.
+        command: (18,) that was sent before t = 0.
+    """
+
+    def __init__(self, law: ServoPreview, command: Array) -> None:
+        super().__init__()
+        self._law = law
+        self._served = serving(law).law
+        first = self._served.initial_memory(command)
+        self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
+        self._preview = self.DeclareVectorInputPort("preview", NUM_REFERENCE)
+        self._report = self.DeclareVectorInputPort("report", law.reports.size)
+        self._age = self.DeclareVectorInputPort("age", 1)
+        self._begin(first, law.timeline.period)
+        self._put_out("command", NUM_REFERENCE, lambda m: m.command, now=True)
+        self._put_out("estimate", NUM_STATE, lambda m: m.belief.state, now=True)
+        self._put_out("torque", NUM_TORQUES, HELD["torque_commanded"])
+        held = held_by(law.plant.dynamics)
+        for port, signal in ports_of("controller").items():
+            part = held[signal.name]
+            self._put_out(port, len(part(first)), part)
+
+    def _prepared(self, context: Context) -> Callable[[], ServoMemory]:
+        age = float(np.asarray(self._age.Eval(context))[0]) if self._age.HasValue(context) else 0.0
+        measurement = Measurement.of(np.asarray(self._measurement.Eval(context)), age)
+        reference = np.reshape(np.asarray(self._preview.Eval(context)), (-1, NUM_REFERENCE))
+        motion, report = Preview(self._law.preview_times, reference), self._report.Eval(context)
+        memory = self.sample(context).memory
+        return lambda: self._served.step(memory, measurement, motion, np.asarray(report))
+
+
+_KNOWN: Final = ("torque_commanded", "measurement")
+"""Signals that a controller has whose inside is not known."""
+
+
+class OwnMemory(NamedTuple):
+    """The last sample, in the words of the shipped controller's memory.
+
+    `torque` (6,) as asked for, `in_flight` (1, 6) what the limit let through of it, `measurement`
+    (12,) that was read, NaN before the first, `counts` of what is seen from outside.
+    """
+
+    torque: Array
+    in_flight: Array
+    measurement: Array
+    counts: Counts
+
+
+class SampledController(SteppedLaw):
+    """Reads a controller's torque every period, in the place of `DelayLqiController`.
+
+    Update:  every period  s <- [T_k; measurement], T_k the torque that the controller puts out
+             then, or the last one where that is no number.
+    Output:  torque = T_k, to be taken at the samples; the others as of the last sample.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | measurement | input | 12 | rad, m, rad/s, m/s | read every period |
+    | own_torque | input | 6 | N m | read every period |
+    | torque | output | 6 | N m | direct feedthrough |
+    | torque_commanded | output | 6 | N m | held |
+    | measurement_used | output | 12 | as measurement | held, NaN before the first sample |
+    | the others of the shipped controller | output | as of `scenario.signals.SIGNALS` | | NaN |
+
+    Args:
+        period: s.
+        torque_limit: of each motor, N m, infinite for none.
+    """
+
+    def __init__(self, period: float, torque_limit: float) -> None:
+        super().__init__()
+        self._limit = torque_limit
+        nothing = np.zeros(NUM_TORQUES)
+        first = OwnMemory(nothing, nothing[None], np.full(NUM_STATE, np.nan), Counts())
+        self._measurement = self.DeclareVectorInputPort("measurement", NUM_STATE)
+        self._own = self.DeclareVectorInputPort("own_torque", NUM_TORQUES)
+        self._begin(first, period)
+        self._put_out("torque", NUM_TORQUES, HELD["torque_commanded"], now=True)
+        for port, signal in ports_of("controller").items():
+            if signal.name in _KNOWN:
+                self._put_out(port, signal.size, HELD[signal.name])
+            else:
+                declare_constant(self, port, np.full(signal.size, np.nan))
+
+    def _prepared(self, context: Context) -> Callable[[], OwnMemory]:
+        last, measurement = self.sample(context).memory, np.array(self._measurement.Eval(context))
+
+        def step() -> OwnMemory:
+            torque, causes = np.array(self._own.Eval(context)), []
+            if not np.all(np.isfinite(measurement)):
+                causes.append("measurements_missing")
+            if not np.all(np.isfinite(torque)):
+                causes.append("nonfinite_torque")
+                torque = last.torque
+            if np.any(np.abs(torque) >= self._limit):
+                causes.append("saturated_steps")
+            sent = np.clip(torque, -self._limit, self._limit)[None]
+            return OwnMemory(torque, sent, measurement, last.counts.plus(*causes))
+
+        return step

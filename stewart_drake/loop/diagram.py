@@ -18,22 +18,20 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.channel import Channel, Wire
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.controller import DelayLqiController, reported
+from stewart_drake.loop.controller import (
+    DelayLqiController,
+    Reference,
+    SampledController,
+    ServoController,
+    reported,
+)
 from stewart_drake.loop.exact import ExactPlant
-from stewart_drake.loop.experiment import Experiment, concrete
 from stewart_drake.loop.kinds import LINKS, PLANTS, SENSORS, wire
 from stewart_drake.loop.law_design import control_law, first_queue, followed_motion
-from stewart_drake.loop.own import SampledController
+from stewart_drake.loop.link import LateMeasurements
 from stewart_drake.loop.platforms import MultibodyStewart, StartCheck, add_to_torque
-from stewart_drake.loop.reference import Reference
-from stewart_drake.loop.sensor import LateMeasurements
-from stewart_drake.loop.servo_design import (
-    ServoController,
-    commands_in_flight,
-    servo_law,
-    servo_loop,
-)
-from stewart_drake.loop.servos import Servos
+from stewart_drake.loop.preparation import Experiment, concrete
+from stewart_drake.loop.servos import Servos, commands_in_flight, servo_law, servo_loop
 from stewart_drake.loop.tuner import AnnTuner, DensityWindow, LawTuner, weights_source
 from stewart_drake.scenario.config import (
     Scenario,

@@ -21,19 +21,12 @@ from stewart_drake.law.observers import NoObserver, Observer, ParameterObserver
 from stewart_drake.law.sensing import Sensing, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import reported
-from stewart_drake.loop.delay_chain import DelayChain
 from stewart_drake.loop.exact import ExactPlant
-from stewart_drake.loop.experiment import (
-    Experiment,
-    limits_of,
-    motion_scale,
-    torques_in_flight,
-    true_dynamics,
-)
+from stewart_drake.loop.link import DelayChain, PlayoutBuffer, VaryingDelay
 from stewart_drake.loop.platforms import MultibodyStewart
-from stewart_drake.loop.playout import PlayoutBuffer
+from stewart_drake.loop.preparation import Experiment
+from stewart_drake.loop.sampling import declare_constant
 from stewart_drake.loop.sensor import Encoders, Sensor
-from stewart_drake.loop.varying_delay import VaryingDelay, declare_constant
 from stewart_drake.scenario.calibration import OFFSETS
 from stewart_drake.scenario.config import (
     EncoderSensorConfig,
@@ -80,13 +73,13 @@ class LinkKind(NamedTuple):
 
 
 def _sensor(config: StateSensorConfig, experiment: Experiment) -> Sensor:
-    period, motion = experiment.scenario.controller.period, motion_scale(experiment)
+    period, motion = experiment.scenario.controller.period, experiment.motion_scale
     return Sensor(np.array(config.noise_std), config.seed, period, config.faults, motion)
 
 
 def _state_sensing(config: StateSensorConfig, experiment: Experiment) -> Sensing:
     anywhere = experiment.scenario.plant.kind == "paper"
-    return StateSensing(np.array(config.noise_std), motion_scale(experiment), anywhere)
+    return StateSensing(np.array(config.noise_std), experiment.motion_scale, anywhere)
 
 
 def _observer(config: StateSensorConfig, settings: FilterSettings | None) -> Observer:
@@ -97,12 +90,12 @@ def _observer(config: StateSensorConfig, settings: FilterSettings | None) -> Obs
 
 def _encoders(c: EncoderSensorConfig, experiment: Experiment) -> Encoders:
     truth, period = experiment.truth, experiment.scenario.controller.period
-    cranks = np.abs(truth.jacobian(experiment.start[POSE])) @ motion_scale(experiment)
+    cranks = np.abs(truth.jacobian(experiment.start[POSE])) @ experiment.motion_scale
     return Encoders(truth, c.bits, c.samples, c.offset, c.seed, period, c.faults, cranks)
 
 
 def _encoder_sensing(config: EncoderSensorConfig, experiment: Experiment) -> Sensing:
-    rates, motion = experiment.scenario.controller.prior.rates, motion_scale(experiment)
+    rates, motion = experiment.scenario.controller.prior.rates, experiment.motion_scale
     calibration, estimated = experiment.calibration, OFFSETS[0] in experiment.nominal.free
     known = None if calibration is None or estimated else calibration
     return EncoderSensing(
@@ -139,7 +132,7 @@ def wire(experiment: Experiment, queue: Array, carries: Carried) -> System:
 
 
 def _torque_wire(link: WireConfig, experiment: Experiment, *_: Any) -> System:
-    return wire(experiment, torques_in_flight(experiment, experiment.scenario.true_delay), "torque")
+    return wire(experiment, experiment.torques_in_flight(experiment.scenario.true_delay), "torque")
 
 
 def _playout(link: NetworkConfig, experiment: Experiment, channel: Channel, reports: int) -> System:
@@ -150,7 +143,7 @@ def _playout(link: NetworkConfig, experiment: Experiment, channel: Channel, repo
         period,
         forward_times(sc, number_sent(sc.duration, period)),
         delay,
-        torques_in_flight(experiment, delay),
+        experiment.torques_in_flight(delay),
         rows=repeats + channel.torques,
         repeats=repeats,
         dry=link.dry,
@@ -190,8 +183,8 @@ def _multibody(experiment: Experiment, wrench: bool, meshcat: Meshcat | None) ->
 
 
 def _exact(experiment: Experiment, wrench: bool, meshcat: Meshcat | None) -> ExactPlant:
-    truth = true_dynamics(experiment, biased=False)
-    return ExactPlant(truth, experiment.start, wrench, limits_of(experiment))
+    truth = experiment.true_dynamics(biased=False)
+    return ExactPlant(truth, experiment.start, wrench, experiment.limits)
 
 
 MakePlant = Callable[[Experiment, bool, Meshcat | None], ExactPlant | MultibodyStewart]

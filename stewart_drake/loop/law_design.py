@@ -50,20 +50,12 @@ from stewart_drake.law.startup import (
     weight_scales,
 )
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.controller import DelayLqiController
-from stewart_drake.loop.experiment import (
-    Experiment,
-    believed_delay,
-    calibration_of,
-    motion_scale,
-    planned_limit,
-    torques_in_flight,
-)
+from stewart_drake.loop.controller import DelayLqiController, Reference
 from stewart_drake.loop.kinds import LINKS, REPORTS, SENSORS
 from stewart_drake.loop.own import Own, own_motion
-from stewart_drake.loop.reference import Reference
+from stewart_drake.loop.preparation import Experiment, calibration_of
 from stewart_drake.mechanism.geometry import plate_radius
-from stewart_drake.scenario.calibration import OFFSETS
+from stewart_drake.scenario.calibration import OFFSETS, believed_delay
 from stewart_drake.scenario.config import (
     ControllerConfig,
     Scenario,
@@ -145,17 +137,17 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         sizing: `sizing_of` it, where that is known.
 
     Raises:
-        ConfigError: the scenario asks for no law that sends torques; see `loop.servo_design`.
+        ConfigError: the scenario asks for no law that sends torques; see `loop.servos`.
     """
     sc, nominal = experiment.scenario, experiment.nominal
     if found := differing(sc, {"controller.command": "torque"}):
         raise ConfigError(found.problem(hint=", for a law that closes its loop across the delay"))
-    c, motion = sc.controller, motion_scale(experiment)
+    c, motion = sc.controller, experiment.motion_scale
     sensor, link = SENSORS[type(sc.sensor)], LINKS[type(sc.link)]
     timeline = Timeline(c.period, believed_delay(sc))
     substeps, peak_torque, least = sizing or sizing_of(experiment)
     torque_scale = max(least, peak_torque)
-    plate, asked = experiment.mechanism.plate.mass, planned_limit(sc)
+    plate, asked = experiment.mechanism.plate.mass, experiment.planned_limit
     parameters = estimated_parameters(experiment, torque_scale)
     settings = filter_settings(motion, plate, torque_scale, asked, c.period, parameters)
     observer = sensor.observer(sc.sensor, settings if c.estimate else None)
@@ -200,7 +192,7 @@ def estimated_parameters(experiment: Experiment, torque_scale: float) -> Paramet
     found = usual_parameters(
         machine.plate.mass,
         torque_scale,
-        planned_limit(sc),
+        experiment.planned_limit,
         plate_radius(machine),
         experiment.nominal.free,
     )
@@ -255,7 +247,7 @@ def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, floa
     way = way_onto(experiment, law)
     if way is None:
         return law, experiment.reference, 0.0
-    return law, *way.plan(sc.controller.catch_up, planned_limit(sc))
+    return law, *way.plan(sc.controller.catch_up, experiment.planned_limit)
 
 
 def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
@@ -263,7 +255,7 @@ def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
     sc, nominal, timeline = experiment.scenario, experiment.nominal, law.timeline
     if sc.start != "rest" or sc.controller.catch_up == 0:
         return None
-    state, queue = experiment.start, torques_in_flight(experiment, timeline.delay)
+    state, queue = experiment.start, experiment.torques_in_flight(timeline.delay)
     if len(queue):
         state = nominal.predict(state, *timeline.until_next(queue), law.plant.substeps)[-1]
     return CatchUp(nominal, experiment.reference, state, timeline.eta, sc.controller.period)
@@ -276,8 +268,8 @@ def first_queue(experiment: Experiment, law: PredictiveLqi) -> Array:
     longest delay.
     """
     if not isinstance(law.observer, DelayObserver):
-        return torques_in_flight(experiment, law.timeline.delay)
-    return torques_in_flight(experiment, Delay(law.observer.kept(law.timeline.period)))
+        return experiment.torques_in_flight(law.timeline.delay)
+    return experiment.torques_in_flight(Delay(law.observer.kept(law.timeline.period)))
 
 
 def followed_motion(

@@ -17,7 +17,7 @@ from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.compiled import Compiled
 from stewart_drake.law.core_law import CompiledLaw, CoreMemory
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.experiment import Experiment, torques_in_flight, true_dynamics
+from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sensor import white_noises
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
@@ -215,7 +215,7 @@ def uncovered(scenario: Scenario) -> str | None:
 def _wire_of(experiment: Experiment, number: int) -> tuple[Link, Array, Array]:
     """Return the link of an experiment, its memory at t = 0, and the delays (number,) in s."""
     sc, delay = experiment.scenario, experiment.scenario.true_delay
-    period, queue = sc.controller.period, torques_in_flight(experiment, delay)
+    period, queue = sc.controller.period, experiment.torques_in_flight(delay)
     delays = np.full(number, delay.eta(period))
     if not sc.delay.constant:
         drawn = torque_delays(sc)
@@ -245,7 +245,7 @@ def run_loop(experiment: Experiment, when: Instants, law: Law) -> Course:
     sc, sensor = experiment.scenario, experiment.scenario.sensor
     assert sensor.kind == "state"
     noise = np.array(sensor.noise_std)
-    truth = true_dynamics(experiment, biased=False)
+    truth = experiment.true_dynamics(biased=False)
     accuracy = SHARE * sc.plant.accuracy
     plant = NativePlant(truth, experiment.start, when.looks, accuracy, LONGEST_STEP)
     number = len(when.samples)

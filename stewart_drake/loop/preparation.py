@@ -1,181 +1,319 @@
-"""What many runs of one scenario have in common, computed once in a process.
+"""A scenario with its machine, plant, reference and start state, checked against each other."""
 
-Runs differ in what a machine is, in its disturbances, its noise, its torque limit. Mechanism and
-motion, their check, the sizes that the law takes from them, the ways onto the reference and its
-previews stay.
-"""
-
-import json
-from collections.abc import Callable
-from functools import lru_cache
-from pathlib import Path
-from typing import Final, NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.dynamics.threads import one_blas_thread
+from stewart_drake.dynamics.frozen_map import Band, FrozenDynamics
+from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
+from stewart_drake.dynamics.workspace import Failure, Limits, Workspace, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.files.schema import plain
-from stewart_drake.law.catch_up import CatchUp
-from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.experiment import (
-    Experiment,
+from stewart_drake.law.startup import STILL, initial_queue
+from stewart_drake.loop.own import NOTHING, Own, own_motion, take
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import Mechanism, fingerprint, with_rotors
+from stewart_drake.scenario.calibration import (
+    OFFSETS,
+    Calibration,
     believed_delay,
-    network_of,
-    planned_limit,
-    prepare,
-    torques_in_flight,
+    calibration_file,
 )
-from stewart_drake.loop.law_design import compose_law, sizing_of, way_onto
-from stewart_drake.loop.native_loop import Instants, instants_of
-from stewart_drake.loop.tuner import weights_source
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.scenario.signals import NUM_STATE
-from stewart_drake.scenario.trajectories import evaluate
-from stewart_drake.tuner.source import WeightsSource
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.signals import (
+    BIAS,
+    COULOMB,
+    DAMPING,
+    PARAMETERS,
+    PAYLOAD,
+    PLANT_PARAMETERS,
+    POSE,
+    POSITION,
+)
+from stewart_drake.scenario.trajectories import evaluate, make_reference, motion_range, peak_to_peak
+from stewart_drake.tuner.network import DEFAULT, Network, load_network
 from stewart_drake.types import Array
 
-MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
-"""What sets the weights of an experiment with such a law, None where they are fixed."""
-
-_DRAWN: Final = (
-    ("plant", "payload_mass"),
-    ("plant", "torque_bias"),
-    ("plant", "joint_damping"),
-    ("plant", "coulomb_friction"),
-    ("sensor", "noise_std"),
-    ("sensor", "seed"),
-    ("actuator", "torque_limit"),
-    ("controller", "w_Q"),
-    ("controller", "w_R"),
-)
-"""Fields of a scenario that nothing here depends on; of the delay only what is believed counts."""
+MAX_FROZEN_ERROR = 10.0
+"""Largest error of the paper's plant, which has no workspace, in peak-to-peaks of the reference."""
+REACH_CHECK_PERIOD = 0.02
+"""s between the instants at which a reference is checked against the workspace."""
+_ESTIMATED = {
+    "torque_bias": PARAMETERS[BIAS],
+    "payload": (PARAMETERS[PAYLOAD],),
+    "damping": (PARAMETERS[DAMPING],),
+    "coulomb": (PLANT_PARAMETERS[COULOMB],),
+    "offsets": OFFSETS,
+}
+"""Parameters for each word of `controller.estimate`."""
 
 
-class Prepared(NamedTuple):
-    """One run, ready to begin.
+class Experiment(NamedTuple):
+    """A scenario with all objects that the loop is built from.
 
     Attributes:
-        experiment: what is run.
-        law: of its torques.
-        planned: the motion that it follows.
-        previews: (k, p, 18) of it, for each sample.
-        tuner: what sets its weights, None where they are fixed.
+        scenario: the scenario.
+        mechanism: machine that the controller assumes.
+        truth: machine that is simulated.
+        reference: 6 x 1 trajectory of the pose.
+        peak_to_peak: (6,) of the reference, rad and m, 0 where it is constant.
+        nominal: dynamics that the controller assumes.
+        start: (12,) state at t = 0.
+        network: network that sets the weights, or None.
+        own: systems, reference and law of the user.
+        calibration: calibrated parameters of the machine, known to the controller, or None.
     """
 
-    experiment: Experiment
-    law: PredictiveLqi
-    planned: Trajectory
-    previews: Array
-    tuner: WeightsSource | None
+    scenario: Scenario
+    mechanism: Mechanism
+    truth: Mechanism
+    reference: Trajectory
+    peak_to_peak: Array
+    nominal: StewartDynamics
+    start: Array
+    network: Network | None
+    own: Own = NOTHING
+    calibration: Calibration | None = None
+
+    def __repr__(self) -> str:
+        return f"Experiment({self.mechanism}, {self.scenario})"
+
+    @property
+    def torque_limit(self) -> float:
+        """Limit of each motor, N m, infinite for none: the scenario's, else the true machine's."""
+        own = self.scenario.actuator.torque_limit
+        frozen = self.scenario.plant.kind == "paper"  # a plant without motors
+        limit = (None if frozen else self.truth.effort_limit) if own is None else own
+        return math.inf if limit is None or limit == "none" else limit
+
+    @property
+    def planned_limit(self) -> float | None:
+        """Limit in N m for plans and priors, or None.
+
+        Only the scenario's limit counts: that of a mechanism clips torques without changing plans.
+        """
+        asked = self.scenario.actuator.torque_limit
+        return None if asked == "none" else asked
+
+    @property
+    def tuned(self) -> bool:
+        """Whether a tuner of the scenario sets the weights."""
+        return self.scenario.tuner.kind != "fixed"
+
+    @property
+    def scale(self) -> Array:
+        """(6,) A_i of equation (47): the peak to peak, 1 where the reference is constant."""
+        return np.where(self.peak_to_peak > 0, self.peak_to_peak, 1.0)
+
+    @property
+    def motion_scale(self) -> Array:
+        """(6,) rad and m: half the reference's peak to peak, STILL where it is constant."""
+        still = STILL * np.repeat([1.0, self.mechanism.crank_lengths.min()], 3)
+        return np.where(self.peak_to_peak > 0, self.peak_to_peak / 2, still)
+
+    @property
+    def limits(self) -> Limits:
+        """Limits of the plate's motion."""
+        if self.scenario.plant.kind != "paper":
+            return Workspace(self.truth)
+        reference = self.reference
+        return Band(lambda time: reference.value(time)[:, 0], MAX_FROZEN_ERROR * self.scale)
+
+    def true_dynamics(self, *, biased: bool = True) -> StewartDynamics:
+        """Return the dynamics of the simulated plant, exact for any engine.
+
+        Without the torque bias, `biased=False`, they are those of the loop's plant: there the bias
+        is added before the plant, after the torques are recorded.
+        """
+        plant = self.scenario.plant
+        parameters = np.array(plant.parameters)
+        parameters[BIAS] *= biased
+        return type(self.nominal)(self.truth, plant.gravity, parameters)
+
+    def torques_in_flight(self, delay: Delay) -> Array:
+        """Return the torques (L, 6) in N m in flight at t = 0 for a delay, within the limit."""
+        sc, limit = self.scenario, self.torque_limit
+        period = sc.controller.period
+        queue = initial_queue(sc.queue, self.nominal, self.reference, period, delay)
+        return np.clip(queue, -limit, limit)
+
+    def reference_failure(self) -> Failure | None:
+        """Return the first failure of the reference to stay in the workspace, or None."""
+        for t in check_instants(self.scenario.duration):
+            failure = diagnose(self.mechanism, t, self.reference.value(t)[:, 0])
+            if failure is not None:
+                return failure
+        return None
 
 
-class Preparation:
-    """Of one scenario and all that differ from it in `_DRAWN` and in the true machine.
+def check_instants(duration: float) -> Array:
+    """Return instants for checks of the workspace, s: every REACH_CHECK_PERIOD, and the last."""
+    return np.append(np.arange(0.0, duration - 1e-9, REACH_CHECK_PERIOD), duration)
+
+
+def first_pose_text(pose: Array, mechanism: Mechanism) -> str:
+    """Return the first position of a reference and home, which shows a wrong unit or origin."""
+    first, home = (
+        ", ".join(f"{1e3 * value:.6g}" for value in where[POSITION])
+        for where in (pose, mechanism.home)
+    )
+    return f"it begins at x, y, z = {first} mm, home is at {home} mm"
+
+
+def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHING) -> Experiment:
+    """Prepare a scenario and check that its reference stays in the workspace.
 
     Args:
-        scenario: one of them.
-
-    Attributes:
-        when: the instants of a run.
-        references: (n, 12) pose and rates that are wanted at its looks.
+        scenario: what to run.
+        truth: the machine to simulate, that of the scenario's plant if None.
+        own: systems, reference and law of the user.
 
     Raises:
-        ConfigError: as `prepare`.
+        ConfigError: one line; also where the reference leaves the workspace, with time and leg.
     """
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._base = prepare(scenario)
-        self._sizing = sizing_of(self._base)
-        self._ways: dict[bytes, CatchUp | None] = {}
-        self._previews: dict[int, tuple[Trajectory, Array]] = {}
-        self.when: Instants = instants_of(scenario.duration, scenario.controller.period)
-        reference = self._base.reference
-        self.references = np.array([evaluate(reference, t)[:NUM_STATE] for t in self.when.looks])
-
-    def experiment(self, scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
-        """What `prepare` would return.
-
-        Raises:
-            ConfigError: the scenario's fields do not go together.
-        """
-        scenario.check()
-        true = self._base.truth if truth is None else truth
-        return self._base._replace(scenario=scenario, truth=true, network=network_of(scenario))
-
-    def prepared(self, experiment: Experiment, tuner: MakeTuner | None = None) -> Prepared:
-        """Law and previews as of `control_law`, which says what may go wrong.
-
-        A tuner takes the place of the scenario's.
-        """
-        law = compose_law(experiment, self._sizing)
-        queue = torques_in_flight(experiment, law.timeline.delay).tobytes()
-        if queue not in self._ways:
-            self._ways[queue] = way_onto(experiment, law)
-        way, motion = self._ways[queue], experiment.reference
-        if way is not None:
-            sc = experiment.scenario
-            motion, _ = way.plan(sc.controller.catch_up, planned_limit(sc))
-        source = (tuner or weights_source)(experiment, law)
-        return Prepared(experiment, law, motion, self._preview(motion, law), source)
-
-    def _preview(self, motion: Trajectory, law: PredictiveLqi) -> Array:
-        """(k, p, 18), as of `loop.reference.Reference`."""
-        if id(motion) not in self._previews:
-            times = np.maximum(0.0, self.when.samples[:, None] + law.preview_times)
-            rows = [[evaluate(motion, t) for t in ahead] for ahead in times]
-            self._previews[id(motion)] = motion, np.array(rows)  # kept, so that its id is
-        return self._previews[id(motion)][1]
+    experiment = assemble(scenario, truth, own)
+    failure = experiment.reference_failure()
+    if failure is not None:
+        first = experiment.reference.value(0.0)[:, 0]
+        short = failure.leg is not None and failure.margin < 0
+        raise ConfigError(
+            f"reference: {failure.reason} at t = {failure.time:.2f} s"
+            + (f", short by {-1e3 * failure.margin:.3g} mm" if short else "")
+            + "; expected a motion within reach"
+            + (
+                ", such as one of smaller amplitude"
+                if failure.time > 0
+                else f": {first_pose_text(first, experiment.mechanism)}"
+            )
+        )
+    outside = diagnose(experiment.truth, 0.0, experiment.start[POSE])
+    if outside is not None:
+        raise ConfigError(
+            f"plant.mechanism: got {experiment.truth.name}, which does not reach the first pose "
+            f"({outside.reason}); expected a machine that does"
+        )
+    return experiment
 
 
-def preparation_of(scenario: Scenario) -> Preparation:
-    """That of a scenario, made once for all with which it has it in common.
+def concrete(
+    scenario: Scenario | Experiment, true_mechanism: Mechanism | None = None, **own: Any
+) -> Experiment:
+    """Prepare a scenario with the user's systems, or return an Experiment as it is.
+
+    Args:
+        scenario: either.
+        true_mechanism: the machine to simulate, that of the scenario's plant if None.
+        **own: see `loop.simulation.simulate`.
 
     Raises:
-        ConfigError: as `prepare`.
+        ConfigError: bad input, an unreachable reference.
+        TypeError: systems of the user with an Experiment, which already has its own.
     """
-    return _preparation(_Key(scenario))
+    if not isinstance(scenario, Experiment):
+        return prepare(scenario, true_mechanism, take(own))
+    for name, thing in ({"true_mechanism": true_mechanism} | own).items():
+        if thing is not None:
+            raise TypeError(f"{name}: got one with an Experiment, which has its own; expected None")
+    return scenario
 
 
-class _Key:
-    """A scenario that is equal to others where they have their preparation in common."""
+def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHING) -> Experiment:
+    """Prepare a scenario without the check of its reference.
 
-    def __init__(self, scenario: Scenario) -> None:
-        self.scenario = scenario
-        fields, believed = scenario_to_dict(scenario), believed_delay(scenario)
-        for section, name in _DRAWN:
-            del fields[section][name]
-        del fields["tuner"]
-        fields["delay"] = believed.steps, believed.fraction
-        fields["link"] = plain(scenario.assumed_link)
-        fields["controller"] |= {"delay_steps": None, "delay_fraction": None}
-        machines = scenario.mechanism, scenario.plant.mechanism
-        files = [resolve("mechanism", name) for name in machines if name is not None]
-        named = getattr(scenario.reference, "file", None), scenario.controller.calibration
-        files += [Path(name) for name in named if name is not None]
-        self._key = json.dumps(fields, default=str), *(_stamp(file) for file in files)
+    Raises:
+        ConfigError: one line.
+    """
+    scenario.check()
+    network = network_of(scenario)
+    drawn = load_mechanism(scenario.mechanism)
+    calibration = calibration_of(scenario, drawn)
+    rotors = scenario.actuator.reflected_inertia
+    mechanism = with_rotors(drawn, rotors)
+    if own.reference is None:
+        reference = make_reference(scenario.reference, scenario.duration)
+        span = peak_to_peak(scenario.reference, reference, scenario.duration)
+    else:
+        reference = own_motion(own.reference, scenario.duration)
+        span = motion_range(reference, scenario.duration)
+    start = evaluate(reference, 0.0)[:12]
+    if scenario.start == "rest":
+        start[6:] = 0.0
+    parameters = plant_parameters()
+    for i, name in enumerate(PLANT_PARAMETERS):
+        value = None if calibration is None else calibration.value(name)
+        parameters[i] = parameters[i] if value is None else value
+    dynamics = FrozenDynamics if scenario.plant.kind == "paper" else StewartDynamics
+    return Experiment(
+        scenario=scenario,
+        mechanism=mechanism,
+        truth=with_rotors(simulated_machine(scenario) if truth is None else truth, rotors),
+        reference=reference,
+        peak_to_peak=span,
+        nominal=dynamics(mechanism, scenario.plant.gravity, parameters, _estimated(scenario)),
+        start=start,
+        network=network,
+        own=own,
+        calibration=calibration,
+    )
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and self._key == other._key
 
-    def __hash__(self) -> int:
-        return hash(self._key)
+def _estimated(scenario: Scenario) -> tuple[str, ...]:
+    """Return the names of the estimated parameters, those of the plant first.
+
+    Without any, return the eight recorded ones, which linear models then take as known.
+    """
+    chosen = scenario.controller.estimate
+    return tuple(name for group in chosen for name in _ESTIMATED[group]) or PARAMETERS
 
 
-def _stamp(path: Path) -> tuple[int, int]:
-    """By which another content of a file shows."""
+def simulated_machine(scenario: Scenario) -> Mechanism:
+    """Return the machine of the scenario's plant, by default that of the controller.
+
+    Raises:
+        ConfigError: one line.
+    """
+    name = scenario.plant.mechanism
+    if name is None:
+        return load_mechanism(scenario.mechanism)
     try:
-        found = path.stat()
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; expected a file") from None
-    return found.st_mtime_ns, found.st_size
+        return load_mechanism(resolve("mechanism", name))
+    except ConfigError as error:
+        raise ConfigError(f"plant.{error}") from None
 
 
-@lru_cache(maxsize=16)
-def _preparation(key: _Key) -> Preparation:
-    with one_blas_thread:
-        return Preparation(key.scenario)
+def calibration_of(scenario: Scenario, mechanism: Mechanism) -> Calibration | None:
+    """Return the calibration that the controller uses, checked against its machine.
+
+    Raises:
+        ConfigError: one line.
+    """
+    own, calibration = fingerprint(mechanism), calibration_file(scenario)
+    if calibration is None:
+        return None
+    if calibration.mechanism != own:
+        raise ConfigError(
+            f"controller.calibration: got {scenario.controller.calibration}, of another machine "
+            f"({calibration.mechanism}); expected one of {mechanism.name} ({own})"
+        )
+    if problem := scenario.delay_max_problem(believed_delay(scenario)):
+        raise ConfigError(problem)
+    return calibration
+
+
+def network_of(scenario: Scenario) -> Network | None:
+    """Return the network of the scenario's tuner, or None for a tuner of another kind.
+
+    Raises:
+        ConfigError: the file is missing or holds no network; one line.
+    """
+    tuner = scenario.tuner
+    if tuner.kind != "ann":
+        return None
+    try:
+        path = resolve("weights", tuner.weights or DEFAULT)
+    except ConfigError as error:
+        raise ConfigError(f"tuner.{error}") from None
+    return load_network(path)

@@ -12,11 +12,11 @@ from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.schema import plain
 from stewart_drake.files.versions import versions
 from stewart_drake.law.memory import Counts
-from stewart_drake.loop import metrics
+from stewart_drake.loop import results as metrics
 from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.loop.diagram import ClosedLoop
-from stewart_drake.loop.experiment import Experiment, waits_at_rest
-from stewart_drake.loop.results import DelaySummary, RunSummary
+from stewart_drake.loop.preparation import Experiment
+from stewart_drake.loop.results import DelaySummary, RunSummary, waits_at_rest
 from stewart_drake.loop.tuner import AnnTuner, LawTuner
 from stewart_drake.scenario.loading import scenario_to_dict, scenario_yaml
 from stewart_drake.scenario.signals import (

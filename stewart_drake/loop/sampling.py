@@ -156,3 +156,12 @@ class SteppedLaw(LeafSystem):
 
     def _update(self, context: Context, state: State) -> None:
         state.get_mutable_abstract_state(int(self._last)).set_value(self._step.Eval(context))
+
+
+def declare_constant(system: LeafSystem, name: str, value: Array) -> None:
+    """Declare an output port (n,) of a system that never changes."""
+
+    def put_out(context: Context, output: BasicVector) -> None:
+        output.SetFromVector(value)
+
+    system.DeclareVectorOutputPort(name, len(value), put_out, {system.nothing_ticket()})

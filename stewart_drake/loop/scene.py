@@ -14,8 +14,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, Diagram
 
 from stewart_drake.loop.diagram import ClosedLoop
-from stewart_drake.loop.multibody import set_pose
-from stewart_drake.loop.platforms import build_viewer
+from stewart_drake.loop.platforms import build_viewer, set_pose
 from stewart_drake.loop.sampling import let_go
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, rotation

@@ -14,12 +14,10 @@ from pydrake.systems.framework import (
     State,
 )
 
-from stewart_drake.core.link import Link
 from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.fault_config import SPIKE
-from stewart_drake.scenario.link import SIMULTANEOUS
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, NUM_STATE, POSE
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
@@ -166,72 +164,6 @@ class Sensor(LeafSystem):
 
     def _remember(self, context: Context, state: DiscreteValues) -> None:
         state.set_value(self.get_output_port().Eval(context))
-
-
-class LateMeasurements(LeafSystem):
-    """Hands on, at each sample, the newest measurement that has arrived since the one before.
-
-    With y_j what is measured at j dt, which takes tau_j, and n_k the newest j with
-    j dt + tau_j <= k dt:
-
-    Update:  at k dt  y_k is under way.
-    Output:  measurement = y_{n_k}, age = (k - n_k) dt, where n_k is newer than n_{k-1}; else all
-             NaN and age = 0. One that was overtaken is dropped.
-
-    | port | direction | size | unit | rate |
-    | --- | --- | --- | --- | --- |
-    | measured | input | size | as measured | read every period |
-    | measurement | output | size | the same | meant to be read at samples |
-    | age | output | 1 | s | the same |
-
-    Args:
-        period: dt in s.
-        times: (n,) tau_j in s, infinite for one that is lost; further ones are lost.
-        size: of the measurement.
-    """
-
-    def __init__(self, period: float, times: Array, size: int) -> None:
-        super().__init__()
-        self._times, self._period = np.asarray(times, dtype=np.float64), period
-        longest = self._times.max(initial=0.0, where=np.isfinite(self._times))
-        kept, together = int(longest / period) + 2, SIMULTANEOUS * period
-        self._link = Link(size, kept, period, wire=True, together=together)
-        self._memory = self.DeclareDiscreteState(self._link.start())
-        self._measured = self.DeclareVectorInputPort("measured", size)
-        self.DeclareVectorOutputPort("measurement", size, weak(self._measurement))
-        self.DeclareVectorOutputPort("age", 1, weak(self._age))
-        update_every(self, period, self._take)
-
-    def _now(self, context: Context) -> Array:
-        """Return the memory of the link, with what is measured now whether or not it is taken."""
-        memory = np.array(context.get_discrete_state(self._memory).value())
-        k = round(context.get_time() / self._period)
-        if self._link.number(memory, "taken") == k:
-            waits = self._times[k] if k < len(self._times) else np.inf
-            now, y = k * self._period, np.asarray(self._measured.Eval(context))
-            self._link.take(memory, now, k + 1, now + waits, y[None])
-            if self._link.next_change(memory) <= now + SIMULTANEOUS * self._period:
-                self._link.change(memory, now)
-        return memory
-
-    def _take(self, context: Context, state: State) -> None:
-        state.get_mutable_discrete_state(self._memory).SetFromVector(self._now(context))
-
-    def _given(self, memory: Array) -> Array | None:
-        """Return what arrived in the last period, or None."""
-        arrived, begun = self._link.acted(memory)[0], self._link.number(memory, "taken") - 2
-        there = self._link.number(memory, "acted") > 0
-        new = arrived[0] > (begun + SIMULTANEOUS) * self._period
-        return arrived[1:] if there and new else None
-
-    def _measurement(self, context: Context, output: BasicVector) -> None:
-        given = self._given(self._now(context))
-        output.SetFromVector(np.full(self._link.size, np.nan) if given is None else given)
-
-    def _age(self, context: Context, output: BasicVector) -> None:
-        memory = self._now(context)
-        behind = self._link.number(memory, "taken") - self._link.number(memory, "newest")
-        output.SetFromVector([0.0 if self._given(memory) is None else behind * self._period])
 
 
 _PHASES: Final = 7

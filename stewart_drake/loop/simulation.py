@@ -17,8 +17,8 @@ from stewart_drake.loop.cautions import cautions_after, cautions_before
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
 from stewart_drake.loop.exact import set_accuracy
-from stewart_drake.loop.experiment import Experiment, concrete
 from stewart_drake.loop.own import OwnLaw, OwnReference, OwnSystem
+from stewart_drake.loop.preparation import Experiment, concrete
 from stewart_drake.loop.recording import Recorder, summarize
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.sampling import let_go

@@ -21,7 +21,7 @@ from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.startup import INSTANTS, TOLERANCE, least_torque, reference_torque
-from stewart_drake.loop.experiment import Experiment, motion_scale
+from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import Sample, update_every, weak
 from stewart_drake.scenario.config import AnnTunerConfig, FixedTunerConfig, RuleTunerConfig
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, RATES, WEIGHTS
@@ -287,7 +287,7 @@ def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
             f"sensor.kind {sc.sensor.kind!r} and a sensor.delay of {sc.sensor.delay:g} s; expected "
             "'fixed', or measurements of the state, of now"
         )
-    motion = np.tile(motion_scale(experiment), 2)
+    motion = np.tile(experiment.motion_scale, 2)
     nominal, reference = experiment.nominal, experiment.reference
     torque = max(least_torque(nominal), reference_torque(nominal, reference, sc.duration))
     observer, prior = law.observer, None
@@ -308,4 +308,4 @@ def angular_frequency(experiment: Experiment) -> float:
     """rad/s, of the reference: its largest rate over half its peak to peak; of a sine its own."""
     times = spread_instants(experiment.scenario.duration, INSTANTS)
     rates = np.array([evaluate(experiment.reference, t)[RATES] for t in times])
-    return float((np.abs(rates).max(axis=0) / motion_scale(experiment)).max())
+    return float((np.abs(rates).max(axis=0) / experiment.motion_scale).max())

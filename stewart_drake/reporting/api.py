@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, ParamSpec, TypeVar
 
 from stewart_drake.loop import simulation
-from stewart_drake.loop.experiment import simulated_machine
+from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.loop.results import SimulationResult as LoopResult
 from stewart_drake.reporting.analyses import ANALYSES, RENAMED, analyze, options_of, words_of
 from stewart_drake.reporting.results import AnalysisResult, ComparisonResult, SimulationResult

@@ -16,7 +16,7 @@ import numpy as np
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.loop.experiment import assemble, reference_failure
+from stewart_drake.loop.preparation import assemble
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
@@ -141,7 +141,7 @@ def collect(
     """
     settings = tuple(settings)
     scenario = load_compatible(scenario_name, controller, settings)
-    failure = reference_failure(assemble(scenario))
+    failure = assemble(scenario).reference_failure()
     scenarios: dict[str, Scenario] = {}
     rows: set[str] = set()
     if failure is None:

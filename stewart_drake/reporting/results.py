@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.loop import results as loop_results
-from stewart_drake.loop.experiment import simulated_machine
+from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.studies.compare import save_comparison
 

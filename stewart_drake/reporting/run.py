@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Final
 
-from stewart_drake.loop.experiment import assemble, check_instants
+from stewart_drake.loop.preparation import assemble, check_instants
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting.document import (
     Block,

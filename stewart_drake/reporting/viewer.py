@@ -10,8 +10,7 @@ from pydrake.geometry import Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
 from stewart_drake.dynamics.workspace import Failure, diagnose
-from stewart_drake.loop.multibody import set_pose
-from stewart_drake.loop.platforms import build_viewer
+from stewart_drake.loop.platforms import build_viewer, set_pose
 from stewart_drake.loop.sampling import let_go
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import rotation

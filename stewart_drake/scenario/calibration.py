@@ -10,6 +10,8 @@ import pydantic.dataclasses
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.yamlio import brief, load_yaml, validate, yaml_text
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.signals import COULOMB_SPEED, LEGS, PLANT_PARAMETERS
 from stewart_drake.types import Array
@@ -138,3 +140,31 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
         "covariance": calibration.covariance.tolist(),
     }
     write_whole(Path(path), yaml_text(data))
+
+
+def calibration_file(scenario: Scenario) -> Calibration | None:
+    """Return the content of the file `controller.calibration`, or None without one.
+
+    Raises:
+        ConfigError: one line.
+    """
+    if scenario.controller.calibration is None:
+        return None
+    try:
+        return load_calibration(scenario.controller.calibration)
+    except ConfigError as error:
+        raise ConfigError(f"controller.calibration: {error}") from None
+
+
+def believed_delay(scenario: Scenario) -> Delay:
+    """Return the delay that the controller assumes: set, else calibrated, else the true one.
+
+    Over a network the play-out bound sets the delay, with or without a calibration.
+    """
+    controller = scenario.controller
+    if controller.delay_steps is not None:
+        return Delay(controller.delay_steps, controller.delay_fraction or 0.0)
+    known = None if scenario.link.kind == "network" else calibration_file(scenario)
+    if known is not None and (seconds := known.value(DELAY)) is not None:
+        return Delay.of(seconds, controller.period)
+    return scenario.true_delay

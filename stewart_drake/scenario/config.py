@@ -594,7 +594,7 @@ class Scenario:
     def _delay_problem(self) -> str | None:
         c = self.controller
         if c.delay_estimator == "none" or (c.delay_steps is None and c.calibration is not None):
-            return None  # what is known may say a delay, see `loop.experiment`
+            return None  # what is known may say a delay, see `loop.preparation`
         if c.delay_steps is None:
             return self.delay_max_problem(self.true_delay)
         return self.delay_max_problem(Delay(c.delay_steps, c.delay_fraction or 0.0))

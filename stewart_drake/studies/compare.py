@@ -20,10 +20,10 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.files.resources import resolve
-from stewart_drake.loop.experiment import believed_delay
 from stewart_drake.loop.own import OwnReference
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario, ServoActuatorConfig
 from stewart_drake.scenario.loading import load_comparison, load_compatible, read_scenario
 from stewart_drake.studies.jobs import run_jobs

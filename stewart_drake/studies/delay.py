@@ -28,16 +28,11 @@ from stewart_drake.law.stability import (
     worst_margins,
 )
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
-from stewart_drake.loop.experiment import (
-    assemble,
-    believed_delay,
-    reference_failure,
-    true_dynamics,
-    waits_at_rest,
-)
 from stewart_drake.loop.law_design import quadratic_cost
-from stewart_drake.loop.metrics import delay_floor
+from stewart_drake.loop.preparation import assemble
+from stewart_drake.loop.results import delay_floor, waits_at_rest
 from stewart_drake.mechanism.assembly import torque_map
+from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig, WaypointsConfig
@@ -370,8 +365,8 @@ def loop_margins(found: Basis, delays: Iterable[int] = DELAYS) -> list[LoopMargi
     """
     experiment, sc = found.experiment, found.experiment.scenario
     c, pose = sc.controller, evaluate(experiment.reference, 0.0)[POSE]
-    plant = linear_model(*true_dynamics(experiment).linearize(pose))
-    known = true_dynamics(experiment) if c.estimate else experiment.nominal
+    plant = linear_model(*experiment.true_dynamics().linearize(pose))
+    known = experiment.true_dynamics() if c.estimate else experiment.nominal
     predictor = design = linear_model(*known.linearize(pose))
     if c.model == "paper":
         design = double_integrators(torque_map(experiment.mechanism, pose, c.torque_map))
@@ -482,7 +477,7 @@ def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[lis
                 delay=replace(scenario.delay, steps=steps),
             )
             key = f"mu{steps}-x{factor}"
-            failure = reference_failure(assemble(variant))
+            failure = assemble(variant).reference_failure()
             if failure is None:
                 variants[key] = variant
                 cells[key] = Cell(steps, factor, "not_run", math.nan, math.nan)

@@ -17,7 +17,7 @@ from numpy.random import Generator
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.startup import reference_torque
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay

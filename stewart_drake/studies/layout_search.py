@@ -19,7 +19,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as checked
 from scipy.optimize import Bounds, differential_evolution
 
-from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import load_json, sealed_json
@@ -27,20 +27,14 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import validate, yaml_text
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.clearance import ClearanceScene
-from stewart_drake.loop.experiment import (
-    Experiment,
-    assemble,
-    check_instants,
-    known_values,
-    with_motors,
-)
+from stewart_drake.loop.preparation import Experiment, assemble, check_instants
 from stewart_drake.mechanism.files import (
     MechanismSpec,
     build_mechanism,
     load_mechanism,
     mechanism_spec,
 )
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.geometry import Mechanism, with_rotors
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.clearance import Nearest, clearance_along
@@ -444,7 +438,9 @@ def _missed(problem: Problem, measures: Mapping[str, float]) -> dict[str, float]
 def _nominal(mechanism: Mechanism, scenario: Scenario) -> StewartDynamics:
     """The plant that the controller knows, as `assemble` makes it."""
     return StewartDynamics(
-        with_motors(mechanism, scenario), scenario.plant.gravity, known_values(None)
+        with_rotors(mechanism, scenario.actuator.reflected_inertia),
+        scenario.plant.gravity,
+        plant_parameters(),
     )
 
 

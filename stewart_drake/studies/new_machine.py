@@ -26,7 +26,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.law.startup import reference_torque
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
-from stewart_drake.loop.experiment import prepare
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import PatternSpec, load_mechanism, pattern_legs
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import Legs, leg_geometry, reachable_heights

@@ -36,7 +36,7 @@ def study_robustness(
         As `run_jobs`, and ConfigError for a scenario that does not suit, and for an undisturbed run
             that does not complete.
     """
-    from stewart_drake.loop.experiment import prepare
+    from stewart_drake.loop.preparation import prepare
     from stewart_drake.scenario.loading import scenario_to_dict
     from stewart_drake.studies.jobs import run_jobs
     from stewart_drake.studies.robustness_result import RobustnessStudy, table

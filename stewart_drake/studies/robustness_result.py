@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.files.versions import versions
-from stewart_drake.loop.experiment import Experiment
+from stewart_drake.loop.preparation import Experiment
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.runs import Outcome, loops_of
 from stewart_drake.studies.statistics import (

@@ -20,15 +20,10 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import validate
 from stewart_drake.law.startup import INSTANTS
 from stewart_drake.loop.bulk import run_in_bulk
-from stewart_drake.loop.experiment import (
-    Experiment,
-    assemble,
-    believed_delay,
-    motion_scale,
-    simulated_machine,
-)
+from stewart_drake.loop.preparation import Experiment, assemble, simulated_machine
 from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
+from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
@@ -154,7 +149,7 @@ def add_noise(truth: Truth, share: float) -> None:
     """
     if share != 0 and truth.scenario.sensor.kind == "state":
         moving = dataclasses.asdict(truth.scenario) | {"reference": truth.fields["reference"]}
-        motion = motion_scale(assemble(validate(Scenario, moving, "drawn")))
+        motion = assemble(validate(Scenario, moving, "drawn")).motion_scale
         sensor = truth.fields["sensor"]
         std = np.array(sensor["noise_std"]) + share * np.tile(motion, 2)
         sensor["noise_std"] = std.tolist()
@@ -294,7 +289,7 @@ def scales_of(experiment: Experiment, commanded: float) -> Scales:
     sizing = size_motors(experiment.nominal, experiment.reference, times)
     return Scales(
         plate_mass=experiment.mechanism.plate.mass,
-        motion=tuple(motion_scale(experiment).tolist()),
+        motion=tuple(experiment.motion_scale.tolist()),
         torque=float(np.abs(sizing.torque).max()),
         speed=float(np.abs(sizing.speed).max()),
         crank=float(experiment.mechanism.crank_lengths.mean()),

@@ -10,14 +10,7 @@ from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.stability import amplification, fastest_pole
 from stewart_drake.law.startup import least_torque, reference_torques
 from stewart_drake.loop.controller_margin import INSTANTS, ControllerMargin, true_model
-from stewart_drake.loop.experiment import (
-    REACH_CHECK_PERIOD,
-    Experiment,
-    assemble,
-    motion_scale,
-    reference_failure,
-    true_dynamics,
-)
+from stewart_drake.loop.preparation import REACH_CHECK_PERIOD, Experiment, assemble
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.types import Array
@@ -67,7 +60,7 @@ def basis(scenario: Scenario) -> Basis:
     """
     experiment = assemble(scenario)
     mechanism, reference = experiment.mechanism, experiment.reference
-    failure = reference_failure(experiment)
+    failure = experiment.reference_failure()
     end, torque = _end(scenario.duration, failure), 0.0
     if end > 0:
         torques = reference_torques(experiment.nominal, reference, end)
@@ -76,7 +69,7 @@ def basis(scenario: Scenario) -> Basis:
         experiment=experiment,
         failure=failure,
         home_failure=diagnose(mechanism, 0.0, mechanism.home),
-        motion=motion_scale(experiment),
+        motion=experiment.motion_scale,
         torque=max(torque, least_torque(experiment.nominal)),
     )
 
@@ -164,7 +157,7 @@ def delay_verdict(experiment: Experiment) -> Verdict:
 
 def pole_in_motion(experiment: Experiment, time: float) -> float:
     """Return the fastest pole of `true_model`, 1/s, 0 if nothing grows; `time` in s."""
-    return fastest_pole(true_model(experiment, true_dynamics(experiment), time).A)
+    return fastest_pole(true_model(experiment, experiment.true_dynamics(), time).A)
 
 
 def milliseconds(seconds: float) -> str:

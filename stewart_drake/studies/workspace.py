@@ -10,12 +10,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose
-from stewart_drake.loop.experiment import (
-    Experiment,
-    assemble,
-    check_instants,
-    first_pose_text,
-)
+from stewart_drake.loop.preparation import Experiment, assemble, check_instants, first_pose_text
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import ACCELERATIONS, COORDINATES, LEGS, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate

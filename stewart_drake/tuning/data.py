@@ -28,9 +28,8 @@ from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.versions import versions
 from stewart_drake.files.yamlio import brief
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.bulk import Ending, run_in_bulk
-from stewart_drake.loop.experiment import Experiment
-from stewart_drake.loop.preparation import MakeTuner
+from stewart_drake.loop.bulk import Ending, MakeTuner, run_in_bulk
+from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.tuner import health_of
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict

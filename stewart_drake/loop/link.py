@@ -1,0 +1,403 @@
+"""The links of a loop as Drake systems: a constant or varying delay, packets, late measurements."""
+
+from abc import abstractmethod
+from typing import Final, Literal
+
+import numpy as np
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    LeafSystem,
+    State,
+)
+
+from stewart_drake.core.link import FULL, Link
+from stewart_drake.loop.sampling import declare_constant, update_every, weak
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.link import SIMULTANEOUS, releases
+from stewart_drake.scenario.signals import (
+    CARRIED,
+    NUM_TORQUES,
+    PACKETS,
+    Carried,
+)
+from stewart_drake.scenario.timing import event_time
+from stewart_drake.types import Array
+
+
+class LinkSystem(LeafSystem):
+    """A link of core/link.h as a system: its memory is the state, its commands come at samples."""
+
+    def _begin(self, link: Link, period: float, rows: int, delay: Delay, queue: Array) -> None:
+        """Declare input, state and samples. `queue` (L, size) is what is under way at t = 0.
+
+        Raises:
+            ValueError: a queue of the wrong shape.
+        """
+        queue, size = np.asarray(queue, np.float64), link.size
+        if queue.shape != (delay.queue_length, size):
+            raise ValueError(
+                f"queue: got shape {queue.shape}; expected {(delay.queue_length, size)}"
+            )
+        self._link, self._period = link, period
+        self._commanded = self.DeclareVectorInputPort("commanded", rows * size)
+        memory, first = link.start(), (delay.periods - len(queue)) * period
+        if len(queue):
+            link.assume(memory, first, queue[0])
+            link.begin(memory, first, queue)
+        else:
+            link.assume(memory, np.nan, np.zeros(size))
+        self._memory = self.DeclareDiscreteState(memory)
+        update_every(self, period, self._take)
+
+    @abstractmethod
+    def _send(self, memory: Array, number: int, command: Array) -> int:
+        """Let the link take the command of a sample, and return what it says."""
+
+    def _take(self, context: Context, state: State) -> None:
+        # Of what another event of this instant has left: it may be an arrival.
+        memory = self._of(state)
+        number = self._taken(memory)
+        said = self._send(memory, number, self._commanded.Eval(context))
+        assert said != FULL, "more commands are under way than there is place for"
+        self._change(memory, number * self._period)
+
+    def _change(self, memory: Array, time: float) -> None:
+        if self._link.next_change(memory) <= time + SIMULTANEOUS * self._period:
+            self._link.change(memory, time)
+
+    def _of(self, state: Context | State) -> Array:
+        if isinstance(state, State):
+            return np.asarray(state.get_mutable_discrete_state(self._memory).get_mutable_value())
+        return np.asarray(state.get_discrete_state(self._memory).value())
+
+    def _taken(self, memory: Array) -> int:
+        return int(self._link.number(memory, "taken"))
+
+    def _put_out(self, name: str, columns: slice) -> None:
+        """Declare an output of what acts: of [when it began to; command]."""
+        size = len(range(*columns.indices(1 + self._link.size)))
+        ticket = self.discrete_state_ticket(self._memory)
+        self.DeclareVectorOutputPort(name, size, weak(self._output, columns), {ticket})
+
+    def _output(self, columns: slice, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._link.acted(self._of(context))[0, columns])
+
+
+class Wire(LinkSystem):
+    """A link on which every command acts when it arrives."""
+
+    def _lay(self, period: float, kept: int, delay: Delay, queue: Array, carries: Carried) -> None:
+        """Declare all, with place for so many commands under way beyond the queue."""
+        kept += delay.queue_length
+        link = Link(CARRIED[carries], kept, period, wire=True, together=SIMULTANEOUS * period)
+        self._begin(link, period, 1, delay, queue)
+        self._put_out(carries, slice(1, None))
+        if carries == "command":
+            self._put_out("arrived", slice(0, 1))
+
+    @abstractmethod
+    def _arrival(self, number: int) -> float:
+        """Return when the command of a sample arrives, s."""
+
+    def _send(self, memory: Array, number: int, command: Array) -> int:
+        now, at = number * self._period, self._arrival(number)
+        return self._link.take(memory, now, number + 1, at, command[None])
+
+
+class DelayChain(Wire):
+    """Holds torques back for eta = mu dt + eta0.
+
+    With T_k the input at t = k dt:
+
+    Initialise: queue = [T_{-mu}, ..., T_{-1}], preceded by T_{-mu-1} when eta0 > 0; the oldest
+                acts first.
+    Update:     at k dt        T_k is under way,
+                at k dt + eta0 applied <- T_{k-mu}.
+    Output:     torque = applied, hence T_k during [(k + mu) dt + eta0, (k + 1 + mu) dt + eta0).
+
+    Updates of one instant all read what was there before, and a multibody plant's step is one of
+    them. So these come slightly earlier (`scenario.timing.event_time`), the first at
+    initialisation: a plant
+    that steps at t feels the torque released at t.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | commanded | input | 6, or n | N m | read every period |
+    | torque, or `carries` | output | the same | N m | piecewise constant |
+    | arrived | output | 1, with commands | s, when that arrived; NaN for nothing yet | the same |
+
+    Args:
+        period: dt in s.
+        steps: mu.
+        fraction: eta0 / dt, in [0, 1).
+        queue: (L, n) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
+        carries: what it delays: torques, of six motors, or commands to servos.
+
+    Raises:
+        ValueError: a queue of the wrong shape.
+    """
+
+    def __init__(
+        self, period: float, steps: int, fraction: float, queue: Array, carries: Carried = "torque"
+    ) -> None:
+        super().__init__()
+        self._delay = Delay(steps, fraction)
+        self._lay(period, steps + 2, self._delay, queue, carries)
+        if fraction > 0:
+            self.DeclarePeriodicUnrestrictedUpdateEvent(
+                event_time(period), event_time(fraction * period), weak(self._release)
+            )
+
+    def _arrival(self, number: int) -> float:
+        return (number + self._delay.periods) * self._period
+
+    def _release(self, context: Context, state: State) -> None:
+        memory = self._of(state)
+        self._change(memory, (self._taken(memory) - 1 + self._delay.fraction) * self._period)
+
+
+_ONCE: Final = 1e9
+"""s, the period of an event that comes once: longer than any run."""
+
+
+class VaryingDelay(Wire):
+    """Holds torque k back for eta_k, each for a time of its own.
+
+    With T_k the input at t = k dt, which arrives at a_k = k dt + eta_k:
+
+    Initialise: T_{-L}, ..., T_{-1} are under way and arrive at (k + mu) dt + eta0.
+    Update:     at k dt        T_k is under way,
+                at a_k         applied <- T_k, unless a newer one has arrived before.
+    Output:     torque = applied.
+
+    The order of arrival is not kept: a torque that was overtaken never acts
+    (`scenario.link.takes_effect`). All arrivals are known beforehand. Each is a separate event, so
+    that an integrator stops there. As in `DelayChain` they come slightly early.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | commanded | input | 6, or n | N m | read every period |
+    | torque, or `carries` | output | the same | N m | piecewise constant |
+    | arrived | output | 1, with commands | s, when that arrived; NaN for nothing yet | the same |
+    | delay | output | 1 | s, of the torque sent last | held |
+    | packets | output | 5 | 1, NaN: nothing is sent in packets | constant |
+
+    Args:
+        period: dt in s.
+        delays: (n,) eta_k of T_0 to T_{n-1}, s; the last of them stays.
+        delay: mu and eta0, those of the torques sent before t = 0.
+        queue: (L, n) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
+        carries: as of `DelayChain`.
+
+    Raises:
+        ValueError: a queue of the wrong shape, a delay that is negative or no number.
+    """
+
+    def __init__(
+        self,
+        period: float,
+        delays: Array,
+        delay: Delay,
+        queue: Array,
+        carries: Carried = "torque",
+    ) -> None:
+        super().__init__()
+        delays = np.asarray(delays, np.float64)
+        if delays.ndim != 1 or not len(delays) or not np.all(delays >= 0):
+            raise ValueError("delays: got an empty or negative one; expected (n,) of at least 0 s")
+        self._delays = np.where(delays > SIMULTANEOUS * period, delays, 0.0)
+        longest = self._delays.max(initial=0.0, where=np.isfinite(delays))
+        self._lay(period, int(longest / period) + 2, delay, queue, carries)
+        ticket = self.discrete_state_ticket(self._memory)
+        self.DeclareVectorOutputPort("delay", 1, weak(self._delay), {ticket})
+        declare_constant(self, "packets", np.full(len(PACKETS), np.nan))
+        numbers, times = releases(period, delays, delay)
+        # Where a torque arrives as it is sent, its sample is the event.
+        for time in times[(times > 0) & (times != period * numbers)].tolist():
+            arrive = weak(self._arrive, time)
+            self.DeclarePeriodicUnrestrictedUpdateEvent(_ONCE, event_time(time), arrive)
+
+    def _arrival(self, number: int) -> float:
+        return float(number * self._period + self._delays[min(number, len(self._delays) - 1)])
+
+    def _arrive(self, time: float, context: Context, state: State) -> None:
+        self._change(self._of(state), time)
+
+    def _delay(self, context: Context, output: BasicVector) -> None:
+        sent = max(self._taken(self._of(context)), 1)
+        output.SetFromVector([self._delays[min(sent, len(self._delays)) - 1]])
+
+
+class PlayoutBuffer(LinkSystem):
+    """Plays torques from packets at their times, whatever the packets' own delays.
+
+    Packet k, sent at t = k dt, arrives d_k later or never. Its row c is T_{k-r+c}, which shall act
+    from (k - r + c) dt + eta on, for a period, eta = mu dt + eta0. With j = s - mu:
+
+    Update:  at k dt        packet k is under way,
+             at s dt + eta0 applied <- T_j of the newest packet with a row for it that has arrived;
+                            queue, for j < 0; else what a dry buffer does.
+    Output:  torque = applied.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | commanded | input | 6 rows | N m, T_{k-r} first | read every period |
+    | torque | output | 6 | N m | piecewise constant |
+    | delay | output | 1 | s, eta | constant |
+    | packets | output | 5 | counts, `scenario.signals.PACKETS` | piecewise constant |
+    | report | output | history (1 + 6) | which of the last packets have arrived, then the torques
+      that acted in the last periods, each the newest first | meant to be read at samples |
+
+    Args:
+        period: dt in s.
+        times: (n,) d_k in s, infinite for a packet that is lost; further ones are lost.
+        delay: mu and eta0.
+        queue: (L, 6) torques for j = -L to -1, L = mu, or mu + 1 when eta0 > 0.
+        rows: in a packet.
+        repeats: r.
+        dry: `hold` the last torque or put out `zero`.
+        history: how far back a report goes, in periods.
+
+    Raises:
+        ValueError: a queue of the wrong shape.
+    """
+
+    def __init__(
+        self,
+        period: float,
+        times: Array,
+        delay: Delay,
+        queue: Array,
+        *,
+        rows: int = 1,
+        repeats: int = 0,
+        dry: Literal["hold", "zero"] = "hold",
+        history: int = 1,
+    ) -> None:
+        super().__init__()
+        self._delay, self._rows, self._repeats = delay, rows, repeats
+        self._arrivals = period * np.arange(len(times)) + np.asarray(times, dtype=np.float64)
+        # A packet is of use from when it is sent until its last row was due.
+        kept = (delay.steps + rows + 2) * rows + delay.queue_length
+        holds, together = dry == "hold", SIMULTANEOUS * period
+        given = NUM_TORQUES, kept, period
+        link = Link(*given, wire=False, holds=holds, history=history, together=together)
+        self._begin(link, period, rows, delay, queue)
+        self._put_out("torque", slice(1, None))
+        self.DeclareVectorOutputPort("delay", 1, weak(self._eta), {self.nothing_ticket()})
+        memory, timed = self.discrete_state_ticket(self._memory), self.time_ticket()
+        self.DeclareVectorOutputPort("packets", len(PACKETS), weak(self._count), {memory})
+        size = history * (1 + NUM_TORQUES)
+        self.DeclareVectorOutputPort("report", size, weak(self._report), {memory, timed})
+        if delay.fraction > 0:
+            early, offset = event_time(period), event_time(delay.fraction * period)
+            self.DeclarePeriodicUnrestrictedUpdateEvent(early, offset, weak(self._play))
+
+    def _send(self, memory: Array, number: int, command: Array) -> int:
+        arrival = self._arrivals[number] if number < len(self._arrivals) else np.inf
+        first = (number - self._repeats + self._delay.periods) * self._period
+        packet = command.reshape(self._rows, NUM_TORQUES)
+        now = number * self._period
+        return self._link.take(memory, now, number + 1, first, packet, arrival)
+
+    def _change(self, memory: Array, time: float) -> None:
+        """Begin a period, with a torque or dry."""
+        if self._delay.fraction == 0:
+            self._link.change(memory, time)
+
+    def _play(self, context: Context, state: State) -> None:
+        memory = self._of(state)
+        period = self._taken(memory) - 1 + self._delay.fraction
+        self._link.change(memory, period * self._period)
+
+    def _eta(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector([self._delay.eta(self._period)])
+
+    def _count(self, context: Context, output: BasicVector) -> None:
+        memory, period = self._of(context), self._period
+        taken, last = self._taken(memory), self._link.number(memory, "last")
+        begun = 0 if np.isinf(last) else round(last / period - self._delay.fraction) + 1
+        lost = ~np.isfinite(self._arrivals[:taken])
+        # Packets whose first row's time has come: of this period and those before.
+        due = max(0, min(begun - self._delay.steps + self._repeats, taken))
+        wanted = period * (np.arange(due) + self._delay.periods - self._repeats + SIMULTANEOUS)
+        arrived = self._arrivals[:due]
+        late = np.isfinite(arrived) & (arrived > wanted)
+        played, dry = (self._link.number(memory, name) for name in ("played", "dry"))
+        output.SetFromVector([taken, lost.sum(), late.sum(), played, dry])
+
+    def _report(self, context: Context, output: BasicVector) -> None:
+        memory = self._of(context)
+        past = self._link.acted(memory)[:, 1:]
+        packets = self._taken(memory) - 1 - np.arange(len(past))
+        here = (packets >= 0) & (packets < len(self._arrivals))
+        now = context.get_time() + SIMULTANEOUS * self._period
+        flags = here & (self._arrivals[np.where(here, packets, 0)] <= now)
+        output.SetFromVector(np.concatenate([flags, past.ravel()]))
+
+
+class LateMeasurements(LeafSystem):
+    """Hands on, at each sample, the newest measurement that has arrived since the one before.
+
+    With y_j what is measured at j dt, which takes tau_j, and n_k the newest j with
+    j dt + tau_j <= k dt:
+
+    Update:  at k dt  y_k is under way.
+    Output:  measurement = y_{n_k}, age = (k - n_k) dt, where n_k is newer than n_{k-1}; else all
+             NaN and age = 0. One that was overtaken is dropped.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | measured | input | size | as measured | read every period |
+    | measurement | output | size | the same | meant to be read at samples |
+    | age | output | 1 | s | the same |
+
+    Args:
+        period: dt in s.
+        times: (n,) tau_j in s, infinite for one that is lost; further ones are lost.
+        size: of the measurement.
+    """
+
+    def __init__(self, period: float, times: Array, size: int) -> None:
+        super().__init__()
+        self._times, self._period = np.asarray(times, dtype=np.float64), period
+        longest = self._times.max(initial=0.0, where=np.isfinite(self._times))
+        kept, together = int(longest / period) + 2, SIMULTANEOUS * period
+        self._link = Link(size, kept, period, wire=True, together=together)
+        self._memory = self.DeclareDiscreteState(self._link.start())
+        self._measured = self.DeclareVectorInputPort("measured", size)
+        self.DeclareVectorOutputPort("measurement", size, weak(self._measurement))
+        self.DeclareVectorOutputPort("age", 1, weak(self._age))
+        update_every(self, period, self._take)
+
+    def _now(self, context: Context) -> Array:
+        """Return the memory of the link, with what is measured now whether or not it is taken."""
+        memory = np.array(context.get_discrete_state(self._memory).value())
+        k = round(context.get_time() / self._period)
+        if self._link.number(memory, "taken") == k:
+            waits = self._times[k] if k < len(self._times) else np.inf
+            now, y = k * self._period, np.asarray(self._measured.Eval(context))
+            self._link.take(memory, now, k + 1, now + waits, y[None])
+            if self._link.next_change(memory) <= now + SIMULTANEOUS * self._period:
+                self._link.change(memory, now)
+        return memory
+
+    def _take(self, context: Context, state: State) -> None:
+        state.get_mutable_discrete_state(self._memory).SetFromVector(self._now(context))
+
+    def _given(self, memory: Array) -> Array | None:
+        """Return what arrived in the last period, or None."""
+        arrived, begun = self._link.acted(memory)[0], self._link.number(memory, "taken") - 2
+        there = self._link.number(memory, "acted") > 0
+        new = arrived[0] > (begun + SIMULTANEOUS) * self._period
+        return arrived[1:] if there and new else None
+
+    def _measurement(self, context: Context, output: BasicVector) -> None:
+        given = self._given(self._now(context))
+        output.SetFromVector(np.full(self._link.size, np.nan) if given is None else given)
+
+    def _age(self, context: Context, output: BasicVector) -> None:
+        memory = self._now(context)
+        behind = self._link.number(memory, "taken") - self._link.number(memory, "newest")
+        output.SetFromVector([0.0 if self._given(memory) is None else behind * self._period])
