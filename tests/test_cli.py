@@ -217,7 +217,7 @@ def test_list_describes_everything_shipped(capsys):
     for kind in KINDS:
         for name in shipped(kind):
             assert any(line.split()[:1] == [name] for line in out.splitlines())
-    assert "LQR that knows of no delay" in out
+    assert "LQR that ignores the delay" in out
 
 
 def test_model_sdf_is_the_models(tmp_path, capsys):

@@ -33,7 +33,7 @@ from stewart_drake.loop.scene import pointer, ring
 
 Array = NDArray[np.float64]
 
-SHOWN: Final = {"lqi": "a controller that knows of no delay", "predictor_lqi": "predictor_lqi"}
+SHOWN: Final = {"lqi": "a controller that ignores the delay", "predictor_lqi": "predictor_lqi"}
 SECONDS: Final = 7.0
 FRAMES_PER_S: Final = 10
 SIZE: Final = (400, 330)
