@@ -61,14 +61,6 @@ def test_the_canvas_shows_a_machine(replay):
     assert ((green > red + 0.15) & (green > blue + 0.05)).sum() > 200, "no green reference"
 
 
-def test_the_animation_advances_by_itself(replay):
-    replay.evaluate("player.reset(); player.play()")
-    first, image = replay.evaluate("player.time"), scene(replay)
-    replay.wait(f"player.time > {first} + 0.8")
-    assert np.abs(scene(replay) - image).max() > 0.2
-    assert 0 < replay.evaluate("Number(slider.value)") <= 3.0
-
-
 def test_the_button_and_the_space_bar_play_and_pause(replay):
     replay.evaluate("button.click()")
     replay.wait("!player.playing && button.textContent === 'Play'")

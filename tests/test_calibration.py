@@ -217,16 +217,6 @@ def test_a_known_delay_is_believed_where_nothing_else_is_said(file):
     assert believed_delay(experiment().scenario) == Delay(8)
 
 
-def test_a_path_starts_from_the_file_that_says_it(file):
-    scenario, controller = file.parent / "my.yaml", file.parent / "law.yaml"
-    scenario.write_text("controller: {calibration: calibration.yaml}\nplant: {mechanism: ./m.yaml}")
-    controller.write_text("calibration: calibration.yaml")
-    found = sd.load_scenario(scenario)
-    assert found.controller.calibration == str(file)
-    assert found.plant.mechanism == str(file.parent / "m.yaml")
-    assert sd.load_scenario("paper", controller).controller.calibration == str(file)
-
-
 @pytest.mark.parametrize(
     ("change", "given", "message"),
     [

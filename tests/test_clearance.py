@@ -1,6 +1,5 @@
 """Clearances against closed forms and second implementations: segments, boxes, cylinders."""
 
-import dataclasses
 import json
 from itertools import combinations, product
 
@@ -24,9 +23,7 @@ from stewart_drake.mechanism.clearance import (
 )
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import (
-    leg_geometry,
     legs_along,
-    reach_margins,
 )
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.clearance import clearance_along, study_clearance
@@ -75,23 +72,6 @@ def test_segments_in_the_plane(q, v, wanted):
     assert found == pytest.approx(wanted, abs=1e-12)
 
 
-@given(seed=seeds)
-@seeded
-def test_legs_along_a_motion_are_those_of_each_pose(seed):
-    rng = np.random.default_rng(seed)
-    mechanism = random_mechanism(rng)
-    poses = np.array([random_pose(rng, mechanism) for _ in range(3)])
-    many = legs_along(mechanism, poses)
-    for k, pose in enumerate(poses):
-        one = leg_geometry(mechanism, pose)
-        for field in dataclasses.fields(one):
-            np.testing.assert_allclose(
-                getattr(many, field.name)[k], getattr(one, field.name), rtol=1e-12, atol=1e-12
-            )
-        margins = reach_margins(mechanism, poses)[k]
-        np.testing.assert_allclose(margins, reach_margins(mechanism, pose), atol=1e-15)
-
-
 def test_out_of_reach_there_are_no_legs():
     far = PAPER.home + [0, 0, 0, 0, 0, 1.0]
     legs = legs_along(PAPER, np.array([PAPER.home, far]))
@@ -131,15 +111,6 @@ def test_rods_are_as_far_apart_as_least_squares_says(seed):
         ends = home.p_WT[i], along[i], home.p_WT[j], along[j]
         apart = distance(*ends) - 2 * radius
         assert found[Pair(f"rod {i + 1}", f"rod {j + 1}")] == pytest.approx(apart, abs=1e-6)
-
-
-def test_lines_that_cross_are_two_radii_deep():
-    """In the reference mechanism, at home, the legs of a pair are mirror images of each other."""
-    scene = ClearanceScene(PAPER, base=False)
-    found = dict(zip(scene.pairs, scene.distances(PAPER.home), strict=True))
-    for first, second in (("1", "2"), ("3", "4"), ("5", "6")):
-        crossing = found[Pair(f"rod {first}", f"rod {second}")]
-        assert crossing == pytest.approx(-2 * proportions(PAPER).rod_radius, abs=1e-6)
 
 
 def nearest_in_box(point, half):

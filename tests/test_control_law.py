@@ -6,7 +6,6 @@ import functools
 import numpy as np
 import pytest
 
-from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law import cost as cost_module
 from stewart_drake.law.delay_model import delayed_model
 from stewart_drake.law.design_models import MultibodyModel
@@ -576,22 +575,6 @@ def test_bad_weights_keep_the_last_good_gain(weights):
     assert np.all(np.isfinite(after.torque))
 
 
-@pytest.mark.parametrize("controller", ["lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi"])
-def test_the_same_inputs_give_the_same_bytes(controller):
-    reference = sine(0.3)
-
-    def outcome():
-        law = law_of(controller=controller)
-        queue = np.zeros((law.timeline.queue_length, 6))
-        return Loop(law, reference, queue=queue).run(6).memories
-
-    for one, other in zip(outcome(), outcome(), strict=True):
-        for name in ("torque", "integral", "in_flight", "gain"):
-            assert np.array_equal(getattr(one, name), getattr(other, name))
-        assert np.array_equal(one.belief.state, other.belief.state)
-        assert one.counts == other.counts
-
-
 def test_a_step_changes_nothing_it_was_given():
     law = law_of("delay.steps=2")
     memory, preview = sampled(law), at_home(law)
@@ -626,9 +609,3 @@ def test_a_motion_of_one_radian_peak_to_peak_is_no_constant():
         weights, _, _ = weight_scales("bryson", experiment.nominal, experiment.peak_to_peak, 1.0)
         assert weights[2] == pytest.approx((0.03 * amplitude) ** -2)
     assert scales[0] == pytest.approx(scales[1], rel=1e-3)
-
-
-def test_the_nominal_plant_of_the_law_is_the_scenarios():
-    assert isinstance(law_of().plant.dynamics, StewartDynamics)
-    assert law_of("plant.gravity=true", "delay.steps=0").plant.dynamics.gravity == 9.81
-    assert not law_of("plant.payload_mass=1.0").plant.dynamics.parameters.any()

@@ -212,12 +212,6 @@ def test_only_the_predictor_is_stable_on_the_papers_experiment():
     assert verdicts == dict.fromkeys(CONTROLLERS, False) | {"predictor_lqi": True}
 
 
-def test_twice_as_many_instants_tell_the_same(monkeypatch):
-    usual = judged(scenario("plant.kind=exact")).margins
-    monkeypatch.setattr("stewart_drake.loop.controller_margin.INSTANTS", 60)
-    assert usual == pytest.approx(judged(scenario("plant.kind=exact")).margins, rel=0.1)
-
-
 def test_a_delay_of_very_many_periods_is_not_judged_but_told():
     experiment = prepare(scenario("delay.steps=900", "plant.kind=exact"))
     found = controller_margin(experiment)

@@ -74,17 +74,6 @@ def test_a_run_comes_back_as_a_motion(run, tmp_path):
     assert again.status == "completed" and again.accumulated_error < 0.01
 
 
-@pytest.mark.parametrize("period", [0.03, 0.01])
-def test_a_log_between_the_grid_comes_back_too(period, tmp_path):
-    settings = ("plant.kind=exact", "duration=0.5", f"controller.period={period}", *ON_REFERENCE)
-    signals = sd.simulate(
-        sd.load_scenario("paper", settings=settings), judge_stability=False
-    ).signals
-    times, poses = read_csv(write_csv(signals, tmp_path / "run.csv"))
-    np.testing.assert_allclose(times, signals.time.values, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(poses, signals.pose.values, rtol=1e-11, atol=1e-12)
-
-
 def test_an_exported_file_must_be_whole_in_its_motion_only(run, tmp_path):
     path = write_csv(run.signals, tmp_path / "run.csv")
     lines = path.read_text().splitlines()

@@ -39,7 +39,6 @@ from stewart_drake.tuner.source import ratio_of, weights_of
 from stewart_drake.tuning.data import (
     LOST,
     WATCHED,
-    cells,
     cost,
     data_hash,
     load_data,
@@ -103,12 +102,6 @@ def test_the_papers_grid_has_180_runs_and_18000_rows():
     assert len({(c.delay_steps, c.frequency) for c in family.conditions.values()}) == 20
 
 
-def test_the_grid_varies_nothing_else():
-    one = paper_grid(base()).conditions["delay10_frequency4"].scenario
-    plain = base("delay.steps=10", "reference.frequency=4")
-    assert dataclasses.asdict(one) == dataclasses.asdict(plain)
-
-
 def test_nine_pairs_are_seven_gains():
     dynamics = StewartDynamics(load_mechanism("paper"), gravity=False)
     model = linear_model(*dynamics.linearize(load_mechanism("paper").home))
@@ -119,19 +112,6 @@ def test_nine_pairs_are_seven_gains():
         if not any(np.allclose(K, other, rtol=1e-6, atol=1e-9) for other in distinct):
             distinct.append(K)
     assert len(PAIRS) == 9 and len(distinct) == 7
-
-
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        (("reference.kind=hold",), "reference.kind"),
-        (("duration=5",), "duration"),
-        (("controller.period=0.03",), "controller.period"),
-    ],
-)
-def test_scenarios_that_do_not_suit_are_refused(settings, said):
-    with pytest.raises(ConfigError, match=said):
-        paper_grid(load_scenario("paper", settings=("plant.kind=exact", *settings)))
 
 
 # ---------------------------------------------------------------- the rows
@@ -218,10 +198,6 @@ def made_up(error, weights=PAIRS):
     )
 
 
-def test_labels_as_run_are_the_weights(data):
-    np.testing.assert_array_equal(labels(data, "as_run"), data.weights)
-
-
 def test_the_best_in_a_cell_labels_all_its_runs():
     error = np.arange(9.0, 0.0, -1.0)
     error[5] = 0.1  # (1, 4)
@@ -250,13 +226,6 @@ def test_torque_can_outweigh_the_error():
 def test_a_cell_without_a_survivor_has_no_best():
     assert np.isnan(labels(made_up([np.nan] * 9), "best_in_cell")).all()
     assert np.isnan(labels(made_up([np.nan] * 9), "best_in_cell_torque")).all()
-
-
-def test_cells_differ_in_weights_only(data):
-    found = cells(data)
-    assert sorted(map(len, found)) == [3, 3]
-    for members in found:
-        assert len({float(data.delay_steps[i]) for i in members}) == 1
 
 
 # ---------------------------------------------------------------- drawn conditions

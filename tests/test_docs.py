@@ -25,7 +25,6 @@ import itertools
 import os
 import re
 import shlex
-import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,8 +62,6 @@ FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```[ \t]*$", re.DOTALL | re.MULTILIN
 CODE = re.compile(r"`([^`\n]+)`")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 SUFFIXES = (".py", ".md", ".yaml", ".sdf", ".xml", ".toml", ".txt", ".json", ".c", ".h", ".ipynb")
-WRITTEN = re.compile(r"(?<![\w*])\*([\w-]+\.[a-z]\w{0,4})\*(?![\w*])")
-"""A file's name in italics."""
 
 
 class Block(NamedTuple):
@@ -319,21 +316,6 @@ def test_what_is_named_exists(path):
 
 
 @pytest.mark.parametrize("path", DOCS, ids=document)
-def test_files_in_italics_exist_or_are_written(path):
-    shown = "".join(match[0] for match in FENCE.finditer(path.read_text(encoding="utf-8")))
-    missing = [
-        name
-        for name in WRITTEN.findall(prose(path))
-        if name not in files()
-        and name not in sources()
-        and name not in shown
-        # A figure's file is its name in the code with a suffix that is chosen elsewhere.
-        and f'"{name.rpartition(".")[0]}"' not in sources()
-    ]
-    assert not missing
-
-
-@pytest.mark.parametrize("path", DOCS, ids=document)
 def test_names_for_the_reference_exist(path):
     for name in re.findall(r"^::: stewart_drake\.?(.*)$", prose(path), re.MULTILINE):
         assert not name or is_name(name), name
@@ -386,15 +368,6 @@ def test_the_site_has_every_page_once():
     pages = {"README.md" if path == "index.md" else path for path in shown}
     assert len(pages) == len(shown)
     assert pages == {document(path).removeprefix("docs/") for path in DOCS}
-
-
-def test_names_of_0_1_that_are_gone_are_gone():
-    assert len(gone()) > 10
-    for name in gone():
-        assert importlib.util.find_spec(f"stewart_drake.{name.partition('.')[0]}") is None or not (
-            is_name(name)
-        ), name
-        assert name.rpartition(".")[2] not in dir(ClosedLoop)
 
 
 # ------------------------------------------------------------------ code blocks
@@ -499,14 +472,6 @@ def test_architecture_shows_the_loop_as_it_is():
     assert preview % 18 == 0
     exported = {diagram.get_output_port(i).get_name() for i in range(diagram.num_output_ports())}
     assert all(f"`{name}`" in text for name in exported)
-
-
-def test_the_citation_is_of_this_version():
-    cited = load_yaml(ROOT / "CITATION.cff")
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert cited["version"] == project["version"]
-    assert cited["license"] == project["license"]
-    assert cited["authors"] == project["authors"]
 
 
 # ------------------------------------------------------------------ figures

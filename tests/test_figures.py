@@ -87,19 +87,6 @@ def test_a_controller_without_estimator_has_no_parameters_to_show(drawn):
     assert list(drawn) == ["states", "errors", "torques"]
 
 
-def test_packets_are_a_strip_below_the_torques(drawn):
-    settings = ("plant.kind=exact", "duration=1.5", "link.kind=network", "link.playout=0.7")
-    result = simulate(load_scenario("paper", settings=settings), judge_stability=False)
-    run_figures(result, "unused")
-    *_, strip = drawn["torques"].axes
-    assert len(drawn["torques"].axes) == 7
-    counts = result.signals.packets.values[-1]
-    assert counts[2] > 0 and counts[0] == 16
-    for lines, label, count in zip(strip.collections, strip.get_yticklabels(), counts, strict=True):
-        assert len(lines.get_segments()) == count  # no two of a kind between two looks
-        assert label.get_text().split()[1] == f"{count:.0f}"
-
-
 def test_axes_name_their_units(run, drawn):
     run_figures(run, "unused")
     for name, units in {

@@ -66,14 +66,6 @@ def test_robustness_tells_the_unit_of_everything_that_it_varies(capsys):
         assert f"{name}: {unit}" in " ".join(error.split()) and len(error.splitlines()) == 1
 
 
-def test_no_summary_is_cut_off_in_the_list_of_commands(capsys):
-    for words in ([], ["model"], ["analyze"], ["tune"]):
-        assert main([*words, "--help"]) == 0
-        out = capsys.readouterr().out
-        assert all(len(line) <= 80 for line in out.splitlines())
-        assert "..." not in out.partition("Commands:")[2]
-
-
 # ---------------------------------------------------------------- completion
 
 

@@ -75,13 +75,6 @@ def test_the_plate_stays_where_it_is_until_the_first_torque_acts(gravity):
     assert not fallen.queue.any()
 
 
-def test_repr_and_parts():
-    law = law_of(sd.load_scenario("paper"))
-    assert repr(law).startswith("DesignedLaw(every 0.1 s, delay 0.8 s, ")
-    assert law.law.timeline.steps == 8 and law.law.timeline.fraction == 0
-    assert law.controller().GetInputPort("measurement").size() == 12
-
-
 def test_what_is_known_of_the_machine_is_the_prior_and_not_the_delay(tmp_path):
     path = tmp_path / "calibration.yaml"
     names, mean = ("payload_mass", "delay"), np.array([0.1, 0.33])

@@ -98,15 +98,6 @@ def test_older_torques_than_the_delay_needs_change_nothing():
 # The plant as it is known.
 
 
-def test_motors_let_through_what_is_within_their_limit():
-    motors = TorqueLimit(0.5)
-    asked = np.array([-1.0, -0.5, 0.0, 0.2, 0.5, 3.0])
-    assert np.array_equal(motors.let_through(asked), [-0.5, -0.5, 0.0, 0.2, 0.5, 0.5])
-    assert motors.reached(motors.let_through(asked)) and not motors.reached(np.full(6, 0.49))
-    assert np.array_equal(TorqueLimit().let_through(1e300 * asked), 1e300 * asked)
-    assert not TorqueLimit().reached(1e300 * asked)
-
-
 def test_strong_torques_are_integrated_in_finer_steps():
     for size, steps in ((0.5, 2), (0.51, 2 * VIGOROUS)):
         torques = np.zeros((3, 6))
@@ -356,18 +347,6 @@ def test_shapes_never_change_whatever_happens(controller, settings):
     assert loop.memory.counts.bad_measurements >= 2
     names = {field.name for field in dataclasses.fields(Memory)}
     assert not names & {"seconds", "time", "clock"}
-
-
-def test_the_same_sample_leaves_the_same_memory():
-    """Nothing in it depends on when it was computed, or on what a part saw before."""
-    law = law_of("delay.steps=2")
-
-    def once():
-        loop = Loop(law, sine(0.3)).run(3)
-        memory, estimate = loop.memory, loop.memory.belief.estimate
-        return [memory.torque, memory.gain, memory.in_flight, estimate.mean, estimate.covariance]
-
-    assert all(np.array_equal(a, b) for a, b in zip(once(), once(), strict=True))
 
 
 def test_a_preview_of_other_instants_is_a_mistake():

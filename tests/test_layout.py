@@ -172,19 +172,6 @@ def test_a_space_that_is_none_is_one_line(vary, keep, word):
         space_around(SPEC, vary, keep)
 
 
-def test_usual_bounds_are_numbers_that_a_file_may_hold():
-    assert SPEC.pattern is not None
-    turned = dataclasses.replace(
-        SPEC, pattern=dataclasses.replace(SPEC.pattern, rotation_deg=330.0)
-    )
-    assert space_around(turned, {}, ()).bounds["rotation_deg"] == (270.0, 360.0)
-
-
-def test_a_machine_told_leg_by_leg_has_no_numbers_to_vary():
-    with pytest.raises(ConfigError, match="leg by leg; expected one with a pattern"):
-        space_around(dataclasses.replace(SPEC, pattern=None), {}, ())
-
-
 # ------------------------------------------------------------------ the search
 
 

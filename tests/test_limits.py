@@ -188,15 +188,6 @@ def test_margins_of_one_motor_agree_with_python_control(steps):
     assert 1 / T.value <= up * 1.001
 
 
-def test_first_instability_of_a_scalar_loop():
-    """e' = a e - g k e leaves the circle at g k = 1 + a."""
-    a, k = 0.9, 0.5
-    limit = first_instability(lambda by: np.array([[a - (1 + by) * k]]), 1e-3, 100.0)
-    assert 1 + limit == pytest.approx((1 + a) / k, rel=1e-3)
-    assert first_instability(lambda by: np.array([[0.5]]), 1e-3, 10.0) == math.inf
-    assert first_instability(lambda by: np.array([[1.5 - by]]), 1e-3, 10.0) == 0
-
-
 def test_a_wrong_gain_of_the_motors_is_what_the_recurrence_shows():
     model, K = loop(3)
     limit = first_instability(lambda by: closed_loop(model, K, 1 + by), 1e-3, 10.0)
@@ -275,16 +266,3 @@ def test_weights_that_hardly_act_keep_the_faithful_controllers_stable(controller
     settings = ("plant.kind=exact", f"controller.w_Q={weight}")
     (m,) = loop_margins(basis(sd.load_scenario("paper", controller, settings)), ())
     assert m.radius == pytest.approx(found, rel=1e-6)
-
-
-def test_zero_delay_cannot_be_shorter():
-    assert margins(steps=0).earlier == math.inf
-
-
-def test_linear_model_of_the_plant_is_the_loops():
-    """The loop is closed around the plant at the reference's first pose, not around its model."""
-    case = found()
-    pose = case.experiment.reference.value(0.0)[:, 0]
-    plant = linear_model(*case.experiment.nominal.linearize(pose))
-    assert plant.B.shape == (12, 6)
-    assert case.torque == pytest.approx(0.0133, rel=0.01)

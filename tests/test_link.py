@@ -158,12 +158,6 @@ def test_jitter_is_white_seeded_and_never_before_its_time():
 # On the plants.
 
 
-def test_a_delay_that_does_not_change_takes_the_plain_chain():
-    assert type(build_closed_loop(scenario()).GetSubsystemByName("delay_chain")) is DelayChain
-    loop = build_closed_loop(scenario("delay.seed=3", "delay.jump_time=2"))
-    assert type(loop.GetSubsystemByName("delay_chain")) is DelayChain
-
-
 @pytest.mark.parametrize(
     "course",
     [

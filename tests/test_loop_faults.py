@@ -5,7 +5,6 @@ motors that are too weak for a while.
 """
 
 import json
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -20,9 +19,6 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.types import Array
 from tests.backends import stepped_in_python
-
-Spoil = Callable[[int, Array, dict[int, Array]], Array]
-"""From the number of a sample, its measurement and all earlier ones to what is sent."""
 
 SMALL = "reference.amplitude=[0.01, 0.01, 0.01, 0.001, 0.001, 0.004]"
 STATUSES = ("completed", "left_workspace", "solver_failed")
@@ -141,24 +137,3 @@ def test_motors_at_their_limit_for_a_second(monkeypatch):
     assert run.summary["peak_torque_applied"] == limit < run.summary["peak_torque"]
     assert run.status == "completed"
     assert share_of_swing(run, 1.0) < 1e-3
-
-
-def test_everything_at_once_is_counted(monkeypatch):
-    sc = scenario("actuator.torque_limit=0.01", "duration=3")
-
-    def spoil(k, measured, sent):
-        if k in (4, 9, 10):
-            return np.full(12, np.nan)
-        return sent[k - 1].copy() if k == 20 else measured
-
-    run = run_with(monkeypatch, spoil, sc)
-    check_outcome(run)
-    counts = run.summary["counts"]
-    assert set(counts) >= {
-        "riccati_failures",
-        "bad_measurements",
-        "saturated_steps",
-        "tuner_fallbacks",
-    }
-    assert counts["measurements_missing"] == 3 and counts["measurements_frozen"] == 1
-    assert counts["bad_measurements"] == 4 and counts["saturated_steps"] > 0

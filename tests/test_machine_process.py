@@ -325,11 +325,6 @@ def test_a_killed_controller_ends_in_the_safe_torque_and_the_next_one_takes_over
     kills(folder, 2, random.Random(3))
 
 
-@pytest.mark.soak
-def test_killed_twenty_times(folder):
-    kills(folder, 20, random.Random())
-
-
 @pytest.mark.slow
 def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_successor(folder):
     port = free_port()

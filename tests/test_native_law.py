@@ -1,6 +1,5 @@
 """The law in C against the law in Python, step by step, and the Riccati equation behind it."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -27,7 +26,6 @@ from stewart_drake.types import Array
 from tests.mechanisms import PAPER, random_mechanism
 from tests.test_riccati import riccati_gain
 
-Spoil = Callable[[int, Array], Array]
 NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-3,1e-3,1e-3,1e-4,1e-4,1e-4]"
 DIRTY = (
     NOISE,
@@ -393,12 +391,6 @@ def test_a_part_of_ones_own_is_stepped_in_python():
     )
     assert serving(law).backend == "native"
     assert serving(mine) == (mine, "python (controller.replan)")
-
-
-def test_a_law_of_the_paper_is_stepped_in_python():
-    assert serving(law_of("controller.prediction=linear")).backend == (
-        "python (controller.prediction)"
-    )
 
 
 SPARE, UNTOUCHED = 500, 12345.678

@@ -13,7 +13,6 @@ from pydrake.trajectories import FunctionHandleTrajectory, PiecewisePolynomial
 import stewart_drake as sd
 from stewart_drake.loop.own import take
 from stewart_drake.loop.preparation import prepare
-from stewart_drake.scenario.trajectories import make_reference
 
 ROOT = Path(__file__).resolve().parents[1]
 FAST = ("plant.kind=exact", "delay.steps=0", "controller.period=0.01", "start=on_reference")
@@ -113,14 +112,6 @@ def test_disturbing_torque_is_the_same_as_a_bias(plant):
 
     pushed = sd.simulate(scenario(*settings), disturbance=Pushed, judge_stability=False)
     np.testing.assert_allclose(pushed.signals.pose, biased.signals.pose, atol=1e-12)
-
-
-@pytest.mark.parametrize("port", ["torque", "wrench"])
-def test_a_disturbance_of_nothing_changes_nothing(port):
-    sc = sd.load_scenario("paper", settings=("plant.kind=multibody", "duration=1"))
-    plain = sd.simulate(sc, judge_stability=False)
-    pushed = sd.simulate(sc, disturbance=disturbance(port), judge_stability=False)
-    np.testing.assert_array_equal(pushed.signals.pose, plain.signals.pose)
 
 
 # ------------------------------------------------------------------ sampling, counts, exceptions
@@ -278,22 +269,6 @@ def test_a_tuner_needs_the_shipped_controller():
 
 
 # ------------------------------------------------------------------ reference
-
-
-def test_own_reference_is_followed_like_the_same_one_of_a_scenario():
-    sc = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=2"))
-    same = make_reference(sc.reference, sc.duration)
-    own = sd.simulate(sc, reference=same, judge_stability=False)
-    other = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=2"))
-    other.reference.amplitude = [0.0] * 6
-    replaced = sd.simulate(other, reference=same, judge_stability=False)
-    np.testing.assert_array_equal(own.signals.pose, replaced.signals.pose)
-    assert own.summary["own"] == {"reference": "FunctionHandleTrajectory"}
-    shipped = sd.simulate(sc, judge_stability=False)
-    assert shipped.summary["own"] == {}
-    # What it is measured by, the range within 2 s, is all that differs.
-    scale = np.abs(own.signals.error.values - shipped.signals.error.values).max()
-    assert scale < 1e-3
 
 
 def test_own_reference_that_ends_is_held_there():

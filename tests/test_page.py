@@ -1,6 +1,5 @@
 """The analysis page: one file, nothing fetched, whatever the names in it are."""
 
-import pickle
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -157,24 +156,6 @@ def test_every_kind_of_block_is_on_a_page():
     assert words[words.index("mass") + 1] == "4 kg" and len(outline.all("dd")) == 2
     assert "Warning: Look out." in words and "a:\n  b: <1>" in words
     assert [frame["srcdoc"] for frame in outline.all("iframe")] == ["<p>in"]
-
-
-def test_a_figure_is_drawn_when_a_page_needs_it_and_is_sent_drawn():
-    drawn = []
-
-    def draw():
-        drawn.append(picture().drawn)
-        return drawn[-1]
-
-    lazy = Picture(draw, "a line")
-    shown = document(sections=[Section("One", lazy)])
-    shown.plain()
-    assert drawn == []
-    sent = pickle.loads(pickle.dumps(shown))
-    assert len(drawn) == 1
-    assert isinstance(sent.sections[0].blocks[0].figure, Figure)
-    assert html(sent, MADE).count("<img") == 1 and html(shown, MADE).count("<img") == 1
-    assert len(drawn) == 1
 
 
 def test_command_lines_are_quoted_for_a_shell():

@@ -32,48 +32,8 @@ def small(tmp_path_factory):
     return write_page(Document("A page", "Fine.", sections), MADE, path)
 
 
-def box(tab, selector):
-    return tab.evaluate(f"document.querySelector('{selector}').getBoundingClientRect().toJSON()")
-
-
-def press(tab, key, code, text=""):
-    for kind in ("keyDown", "keyUp"):
-        tab.call(
-            "Input.dispatchKeyEvent",
-            type=kind,
-            key=key,
-            code=key,
-            windowsVirtualKeyCode=code,
-            **({"text": text} if text and kind == "keyDown" else {}),
-        )
-
-
 def enlarged(tab):
     return tab.evaluate("document.querySelector('.figure:popover-open') !== null")
-
-
-@pytest.mark.parametrize("width", [NARROW, 1280])
-def test_a_figure_is_enlarged_and_put_back_by_hand_and_by_keys(tab, small, width):
-    tab.open(small, width, 800)
-    before, height = box(tab, ".figure img"), tab.evaluate("document.body.scrollHeight")
-    assert before["width"] <= width
-    place = {"x": before["x"] + 50, "y": before["y"] + 50, "button": "left", "clickCount": 1}
-    tab.call("Input.dispatchMouseEvent", type="mousePressed", **place)
-    tab.call("Input.dispatchMouseEvent", type="mouseReleased", **place)
-    assert enlarged(tab)
-    assert box(tab, ".figure img")["width"] >= max(960, width)
-    there = tab.evaluate("document.body.scrollHeight")
-    assert there == pytest.approx(height, abs=2), "the page behind jumps"
-    scrolls = "(f => f.scrollWidth > f.clientWidth)(document.querySelector('.figure'))"
-    assert tab.evaluate(scrolls) == (width == NARROW)
-    press(tab, "Escape", 27)
-    tab.wait("document.querySelector('.figure:popover-open') === null")
-    assert box(tab, ".figure img") == before
-    tab.evaluate("document.querySelector('.figure button').focus()")
-    press(tab, "Enter", 13, "\r")
-    assert enlarged(tab)
-    press(tab, "Enter", 13, "\r")
-    assert not enlarged(tab)
 
 
 @pytest.mark.parametrize("width", [NARROW, 1280])

@@ -39,17 +39,6 @@ def test_a_box_stays_on_the_plate_while_it_moves(X_WB, capsys):
     np.testing.assert_allclose(places[1:, 2], resting, atol=1e-4, err_msg="it fell or bounced")
 
 
-def test_without_shapes_that_touch_the_box_falls_through(monkeypatch):
-    module = example()
-    add = sd.AddStewartPlatform
-
-    def bare(*arguments, **options):
-        return add(*arguments, **{**options, "collision": False})
-
-    monkeypatch.setattr(sd, "AddStewartPlatform", bare)
-    assert module.main()[-1, 2] < -1
-
-
 def deck_height(mechanism):
     """Of the plate's upper side above its COM, read from the model's own disc."""
     builder = DiagramBuilder()

@@ -97,18 +97,6 @@ def test_every_command_has_a_function(words):
     assert f"`sd.{name}`" in documented
 
 
-def test_functions_of_the_tuner_take_its_options(tmp_path):
-    data = sd.make_tuner_data(tmp_path, settings=("duration=10",), disturbed=1, seed=3, workers=1)
-    assert data.summary["conditions"] == 1 and data.summary["seed"] == 3
-    assert "of each g is" in data.table() and (tmp_path / "dataset.nc").is_file()
-    with pytest.raises(sd.ConfigError, match="draws: got 20 without --family"):
-        sd.make_tuner_data(tmp_path, draws=20)
-    with pytest.raises(sd.ConfigError, match="labels: got as_run with --regret"):
-        sd.train_tuner(tmp_path, tmp_path / "net.json", regret=True, labels="as_run")
-    with pytest.raises(TypeError, match="scenarios"):
-        sd.make_tuner_data(tmp_path, scenarios=2)
-
-
 @pytest.mark.slow
 def test_a_machine_and_a_live_run_from_python():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
@@ -123,13 +111,3 @@ def test_a_machine_and_a_live_run_from_python():
         run = sd.run_live("paper", f"127.0.0.1:{port}", duration=1.0, accept_jitter=True)
         assert run.summary["live"]["samples"] > 5 and run.table()
         assert serving.result(20)["runs"] == 1
-
-
-@pytest.mark.slow
-def test_commands_have_functions(tmp_path):
-    run = sd.simulate(sd.load_scenario("desktop", settings=(*SETTINGS[:1], "duration=0.1")))
-    run.save(tmp_path)
-    text = sd.export_csv(tmp_path / "signals.nc", tmp_path / "signals.csv")
-    assert text.startswith("time[s],pose_roll[rad]") and (tmp_path / "signals.csv").is_file()
-    assert any(path.name == "Makefile" for path in sd.export_c("desktop", tmp_path / "board"))
-    assert sd.model_sdf("desktop").startswith("<?xml") and sd.check_model("desktop").summary

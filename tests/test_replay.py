@@ -6,15 +6,10 @@ import re
 
 import numpy as np
 import pytest
-from pydrake.geometry import Meshcat, MeshcatParams
 
 import stewart_drake as sd
 from stewart_drake.dynamics.workspace import Failure
-from stewart_drake.files.resources import shipped
 from stewart_drake.loop import scene
-from stewart_drake.loop.platforms import build_viewer
-from stewart_drake.loop.sampling import let_go
-from stewart_drake.loop.scene import CRANK_PARTS, crank_paths, pointer, ring
 from stewart_drake.reporting import replay as replay_module
 from stewart_drake.reporting.replay import replay_html
 from stewart_drake.scenario.signals import LEGS
@@ -52,26 +47,6 @@ def test_every_frame_of_an_exact_run_closes_the_loops_of_the_model(run, monkeypa
     assert max(gaps) < 1e-12
     html = meshcat.StaticHtml()
     assert "<html" in html.lower() and len(html) > 100_000
-
-
-@pytest.mark.parametrize("name", shipped("mechanism"))
-def test_the_viewer_has_what_the_page_colours(name):
-    mechanism = sd.load_mechanism(name)
-    meshcat = Meshcat(MeshcatParams(host="localhost"))
-    diagram, plant, _ = build_viewer(mechanism, meshcat)
-    diagram.ForcedPublish(diagram.CreateDefaultContext())
-    paths = crank_paths(mechanism.name)
-    assert plant.num_actuators() == len(paths) == 6
-    for parts in paths:
-        assert [part[-1] for part in parts] == list(CRANK_PARTS)
-        assert all(meshcat.HasPath("/" + "/".join(part)) for part in parts)
-    let_go(diagram)  # and with it Meshcat, in this thread
-
-
-def test_the_reference_is_shown_as_a_ghost_and_as_a_path(run):
-    meshcat = replay_module.replay(run.signals, PAPER)
-    for path in ("/reference/ring", "/reference/pointer", "/paths/reference", "/paths/plate"):
-        assert meshcat.HasPath(path)
 
 
 def test_the_page_holds_what_the_run_was_like(run):
@@ -117,12 +92,3 @@ def test_a_run_that_ends_outside_is_shown_up_to_there(run):
     signals.pose.values[-3:, 5] += 1.0
     outside = dataclasses.replace(run, signals=signals)
     assert "off by" in replay_html(outside, PAPER, "outside")
-
-
-def test_the_ring_is_a_closed_surface_around_the_plate():
-    for vertices, faces in (ring(0.1), pointer(0.1)):
-        edges = np.sort(np.hstack([faces[[0, 1]], faces[[1, 2]], faces[[2, 0]]]), axis=0)
-        _, counts = np.unique(edges, axis=1, return_counts=True)
-        assert (counts == 2).all(), "every edge belongs to two triangles"
-        assert np.hypot(*vertices[:2]).min() > 0.1, "the plate stays visible"
-        assert set(np.unique(faces)) == set(range(vertices.shape[1]))

@@ -2,7 +2,6 @@
 
 import json
 import os
-import pickle
 import re
 import time
 from dataclasses import replace
@@ -16,18 +15,15 @@ from stewart_drake.files.yamlio import load_yaml
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.reporting import report as report_document
-from stewart_drake.reporting.document import Document, Paragraph, Picture, Table, number, wrap
+from stewart_drake.reporting.document import Document
 from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.page import html as html_of
 from stewart_drake.reporting.report import ANALYSES, collect, mean_error
 from stewart_drake.reporting.results import AnalysisResult
-from stewart_drake.reporting.run import comparison_document
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
-from stewart_drake.tuner.network import save_network
 from tests.browser import needs_chromium
 from tests.screen import too_long
-from tests.test_network import small_network
 
 EXACT = ("plant.kind=exact",)
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
@@ -78,10 +74,6 @@ def text_of(html):
 # ---------------------------------------------------------------- what it holds
 
 
-def test_there_are_three_files_and_no_half_ones(report):
-    assert sorted(os.listdir(report)) == ["replay.html", "report.html", "summary.json"]
-
-
 def test_the_summary_agrees_with_the_commands_of_their_own(summary, tmp_path, capsys):
     assert main(["simulate", "paper", *SETTINGS, "--json"]) == 0
     own = json.loads(capsys.readouterr().out)
@@ -115,44 +107,6 @@ def test_table_ii_has_the_papers_numbers_and_ours(html, summary):
     ours = float(table[LABELS["predictor_lqi"]][2])
     own = summary["controllers"]["predictor_lqi"]["accumulated_error"]
     assert ours == pytest.approx(own, rel=5e-3)
-
-
-def test_commanded_and_applied_torques_are_told_apart(html, summary):
-    """The LQI asks for thirteen times what ever acts, as the plate is lost before it arrives."""
-    rows = re.findall(r"<tr>\s*(.*?)</tr>", html.partition("Table II")[2], re.DOTALL)
-    heads = [text_of(head) for head in re.findall(r"<th[^>]*>(.*?)</th>", rows[0], re.DOTALL)]
-    row = next(row for row in rows if LABELS["delay_lqi"] in row)
-    cells = re.findall(r"<td[^>]*>(.*?)</td>", row, re.DOTALL)
-    shown = dict(zip((" ".join(head.split()[:2]) for head in heads), cells, strict=True))
-    own = summary["controllers"]["delay_lqi"]
-    assert float(shown["commanded peak"]) == pytest.approx(own["peak_torque"], rel=0.05)
-    assert float(shown["applied peak"]) == pytest.approx(own["peak_torque_applied"], rel=0.05)
-    assert own["peak_torque"] > 10 * own["peak_torque_applied"]
-    assert "applied torques of the delay-aware LQI" in text_of(html)
-
-
-def test_figures_of_the_paper_are_redrawn_with_their_captions(html):
-    text = text_of(html)
-    for figure in ("5(a)", "5(b)", "7(a)", "7(b)"):
-        assert f"As figure {figure} of the paper" in text
-    assert ("As figure 6 of the paper" in text) != ("its weights are not shown" in text)
-
-
-def test_another_motion_is_not_held_against_the_papers_numbers():
-    settings = ("plant.kind=exact", "duration=1.0", "reference.frequency=0.5")
-    run = simulate(load_scenario("paper", settings=settings))
-    found = collect_of(run.scenario, run=run, comparison={"delay_lqi": run})
-    page = report_document.document(found, "n")
-    (section,) = (section for section in page.sections if "compared" in section.heading)
-    (table,) = section.all(Table)
-    assert table.rows[0][0] == LABELS["delay_lqi"] and "80" not in table.rows[0]
-    words = [paragraph.text for paragraph in section.all(Paragraph)]
-    assert not any("paper" in text for text in (*words, *table.columns, table.caption))
-    assert not any("paper" in picture.caption for picture in section.all(Picture))
-    text = comparison_document({"delay_lqi": run}).plain()
-    assert (
-        "paper" not in text and " 80 " not in text and all(len(s) <= 80 for s in text.split("\n"))
-    )
 
 
 def test_the_scenario_in_it_runs_again(html, tmp_path):
@@ -228,61 +182,6 @@ def test_a_machine_is_called_by_its_name_and_not_by_its_file(tmp_path):
     assert page.facts["mechanism"] == "ruler"
 
 
-def test_who_completes_is_told_and_how_the_delay_was_found():
-    settings = ("plant.kind=exact", "duration=2.5", "controller.delay_steps=6")
-    lost, found = (
-        simulate(load_scenario("paper", name, settings)) for name in ("delay_lqi", "adaptive_lqi")
-    )
-    compared = {"delay_lqi": lost, "adaptive_lqi": found}
-    one = collect_of(lost.scenario, run=lost, comparison=compared)
-    page = report_document.document(one, "mine")
-    error = number(found.accumulated_error)
-    assert page.verdict.endswith(f"LQI, delay found completes it, with an E_ac of {error} % s.")
-    captions = [picture.caption for section in page.sections for picture in section.all(Picture)]
-    said = "How LQI, delay found found the delay: with its band, and its error."
-    assert f"{said} {report_document.WIDE}" in captions
-    assert "Applied torques of LQI, delay found." in captions
-    assert not any("packets" in caption for caption in captions)
-    alone = collect_of(lost.scenario, run=lost, comparison={"delay_lqi": lost})
-    assert "completes" not in report_document.document(alone, "mine").verdict
-
-
-def test_no_line_is_broken_before_a_unit_or_in_it():
-    for unit in ("N m", "mN m", "kg", "deg", "mm", "s", "%", "% s"):
-        for room in range(60, 81):
-            lines = wrap("x" * room + f" of 12.5 {unit}, and more").splitlines()
-            assert any(f"12.5 {unit}," in line for line in lines)
-            assert all(len(line) <= 80 for line in lines)
-
-
-def test_what_is_not_plain_is_told_at_the_top():
-    plain = {"mechanism", "reference", "delay", "plant", "controller", "start"}
-    for controller, settings, told in (
-        (None, [], {}),
-        (
-            None,
-            ["link.kind=network", "link.low=0.5", "link.high=0.9"],
-            {
-                "link": "network, packets take 0.5 to 0.9 s, 5 % lost, play-out bound 0.9 s; "
-                "measurements at once"
-            },
-        ),
-        (
-            "adaptive_lqi",
-            ["sensor.kind=encoders", "sensor.samples=5"],
-            {"sensor": "encoders, of 14 bit, 5 in a period"},
-        ),
-        ("servo_preview", ["actuator.kind=servo"], {"motors": "position servos, 10 Hz"}),
-        (None, ["tuner.kind=rule"], {"weights": "set by a rule"}),
-    ):
-        short = ["plant.kind=exact", "duration=0.3", *settings]
-        scenario = load_scenario("paper", controller, short)
-        facts = report_document.document(collect_of(scenario), "paper").facts
-        assert {name: facts[name] for name in facts.keys() - plain} == told
-        assert ("delay estimator constant" in facts["controller"]) == (controller == "adaptive_lqi")
-        assert ("sent ahead" in facts["controller"]) == (controller == "servo_preview")
-
-
 def test_a_motion_out_of_reach_gets_a_report_without_runs(tmp_path, capsys, monkeypatch):
     def only_workspace(scenario, scenarios, progress):
         assert not scenarios
@@ -329,47 +228,6 @@ def test_the_tuners_runs_are_there_where_there_is_a_network(monkeypatch, tmp_pat
     # One that is asked for is run, beside the comparison, which stays.
     collect(mine, controller="servo_preview")
     assert jobs[report_document._OWN].controller.command == "cranks"
-
-
-def test_a_row_of_the_comparison_may_have_any_name(monkeypatch, tmp_path):
-    def done(jobs, function, folder, **options):
-        paths = {key: tmp_path / key for key in jobs}
-        for path in paths.values():
-            assert path.name.isalnum()
-            path.write_bytes(pickle.dumps(path.name))
-        return paths
-
-    monkeypatch.setattr(report_document, "run_jobs", done)
-    mine = tmp_path / "mine.yaml"
-    mine.write_text("compare: {delay: {controller: lqi, w_R: 2.0}, run it: {controller: lqi}}")
-    found = collect(mine, EXACT)
-    assert found.analyses == {name: name for name in ANALYSES}
-    assert {*CONTROLLERS, "delay", "run it"} <= set(found.comparison)
-    assert found.run is not None and len(set(found.comparison.values())) == len(found.comparison)
-
-
-def test_figure_6_and_the_tuned_rows_are_of_the_tuners_runs(tmp_path):
-    save_network(small_network(), tmp_path / "network.json")
-    short = ("plant.kind=exact", "duration=1.0")
-    tuner = ("tuner.kind=ann", f"tuner.weights={tmp_path / 'network.json'}")
-    plain = simulate(load_scenario("paper", settings=short))
-    tuned = {
-        name: simulate(load_scenario("paper", name, (*short, *tuner)))
-        for name in ("delay_lqr", "delay_lqi", "predictor_lqi")
-    }
-    found = collect_of(plain.scenario, run=plain, comparison={"lqi": plain}, tuned=tuned)
-    sections = report_document.document(found, "n").sections
-    (section,) = (section for section in sections if "compared" in section.heading)
-    (table,) = section.all(Table)
-    labels = [row[0] for row in table.rows]
-    assert labels == [LABELS["lqi"], *(f"{LABELS[name]}, tuned" for name in tuned)]
-    assert [row[1] for row in table.rows] == ["NaN", "225", "80", "-"]
-    captions = [picture.caption for picture in section.all(Picture)]
-    assert sum("figure 6" in caption for caption in captions) == 1
-    shown = next(p.drawn for p in section.all(Picture) if "figure 6" in p.caption)
-    titles = [ax.get_title() for ax in shown.axes if ax.get_title()]
-    assert titles == [LABELS[name] for name in tuned]
-    assert not any("weights are not shown" in one.text for one in section.all(Paragraph))
 
 
 # ---------------------------------------------------------------- in a browser

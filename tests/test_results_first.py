@@ -9,7 +9,6 @@ import joblib
 import pytest
 
 from stewart_drake.cli import main
-from stewart_drake.cli import run as run_command
 from stewart_drake.reporting import (
     figures,
     hautus,
@@ -72,17 +71,6 @@ def test_a_report_that_cannot_be_drawn_leaves_its_numbers(tmp_path, monkeypatch,
     assert main(["report", "--quiet", "--out", str(tmp_path)]) == 0
     assert capsys.readouterr().err.startswith("warning: report.html could not be drawn")
     assert names(tmp_path) == {"summary.json"}
-
-
-@pytest.mark.slow
-def test_figures_of_an_earlier_run_do_not_stay_beside_new_results(tmp_path, monkeypatch):
-    arguments = ["simulate", *EXACT, "--quiet", "--out", str(tmp_path)]
-    assert main(arguments) == 0
-    drawn = {name for name in names(tmp_path) if name.endswith((".png", ".svg"))}
-    assert len(drawn) == 8 and drawn <= set(run_command._pictures(run_command.RUN_FIGURES))
-    monkeypatch.setattr(figures, "draw_run", broken(tmp_path))
-    assert main(arguments) == 0
-    assert names(tmp_path) == {"summary.json", "signals.nc"}
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ import functools
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,11 +31,8 @@ from stewart_drake.studies.statistics import auc_interval, explain
 from stewart_drake.studies.study_options import Ranges, RobustnessOptions, read_ranges
 from stewart_drake.studies.uncertainty import (
     MACHINE,
-    About,
-    Quantity,
     Scales,
     draw,
-    draw_from,
     drawn,
     run_draw,
     scales_of,
@@ -46,7 +42,6 @@ from tests.screen import too_long
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
-ROOT = Path(__file__).resolve().parents[1]
 SCALES = Scales(4.0, (0.26, 0.26, 0.26, 0.02, 0.02, 0.08), 0.0133, 0.95, 0.11, 0.1, 0.66)
 MOTION = [math.radians(15)] * 3 + [0.02, 0.02, 0.08]
 NOTHING = dict.fromkeys(
@@ -193,28 +188,6 @@ def test_a_range_of_its_own_leaves_the_other_draws_alone(name):
         one = draw(Ranges(), SCALES, short(), 0, i)
         other = draw(replace(Ranges(), **changed), SCALES, short(), 0, i)
         assert one | {name: other[name]} == other
-
-
-def test_a_new_quantity_is_one_entry_and_leaves_the_other_draws_alone():
-    """Here for how long nothing is measured, told in ms, in half of the runs."""
-
-    def lose(truth, time):
-        truth.fields["sensor"]["faults"] = [{"kind": "missing", "from": 0.1, "to": 0.1 + time}]
-
-    loss = Quantity(lambda rng, about: rng.uniform(0, 0.1), lose, "ms", 1e3, sometimes=True)
-    scenario, about = short(), About(Ranges(), SCALES, short())
-    values = []
-    for i in range(40):
-        fixed = draw_from(MACHINE, np.random.default_rng(i), about)
-        more = draw_from({**MACHINE, "silence": loss._replace(sometimes=False)},
-                         np.random.default_rng(i), about)  # fmt: skip
-        assert {name: more[name] for name in MACHINE} == fixed
-        values.append(draw_from({"silence": loss}, np.random.default_rng(i), about)["silence"])
-    assert 8 < values.count(0.0) < 32
-    assert loss.told(max(values)) == pytest.approx(1e3 * max(values))
-    truth = drawn({"silence": loss}, scenario, PAPER, {"silence": 0.05})
-    assert truth.as_scenario().sensor.faults != []
-    assert truth.machine() is PAPER and scenario.sensor.faults == []
 
 
 def test_draws_fill_their_ranges():

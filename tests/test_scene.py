@@ -1,6 +1,5 @@
 """Runs are shown live in Meshcat: where the machine is, where it should be, what its motors do."""
 
-import contextlib
 import gc
 import socket
 import time
@@ -11,7 +10,7 @@ import pytest
 from pydrake.geometry import Meshcat, MeshcatParams
 
 import stewart_drake as sd
-from stewart_drake.loop.scene import Scene, crank_paths, full_color, torque_color, torque_shares
+from stewart_drake.loop.scene import crank_paths, full_color, torque_color, torque_shares
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.reporting.replay import replay
 from stewart_drake.scenario.signals import LEGS
@@ -83,32 +82,6 @@ def test_a_live_run_keeps_to_real_time(meshcat):
     assert ended - began > 0.9 * (end - start)
     unpaced = sd.simulate(scenario, judge_stability=False)
     np.testing.assert_array_equal(unpaced.signals.pose, run.signals.pose)
-
-
-@pytest.mark.parametrize("name", ["paper", "paper_clear", "desktop", "motion_base"])
-def test_the_camera_sees_a_machine_of_any_size(name):
-    aimed = []
-
-    class Watched(Meshcat):
-        def SetCameraPose(self, eye, target):
-            super().SetCameraPose(eye, target)
-            aimed.append((eye, target))
-
-    machine = sd.load_mechanism(name)
-    Scene(machine, Watched(MeshcatParams(host="localhost"))).close()
-    [(eye, target)] = aimed
-    points = np.vstack([machine.p_WS, machine.p_PQ + machine.home[3:]])
-    size = np.linalg.norm(np.ptp(points, axis=0))
-    assert np.all(points.min(axis=0) <= target) and np.all(target <= points.max(axis=0))
-    assert size < np.linalg.norm(eye - target) < 3 * size
-
-
-def test_a_scene_begins_without_the_colours_of_the_one_before(meshcat):
-    with contextlib.closing(Scene(PAPER, meshcat)) as scene:
-        scene.paint(np.ones(6))
-    assert meshcat._GetPackedProperty(crank(3), "color")
-    Scene(PAPER, meshcat).close()
-    assert not meshcat._GetPackedProperty(crank(3), "color")
 
 
 def test_colours_are_of_the_usual_torque():

@@ -141,15 +141,6 @@ def test_names_do_not_collide_with_those_inside(name):
     assert plant.num_actuated_dofs() == 6
 
 
-def test_two_machines_fit_into_one_plant():
-    plant = MultibodyPlant(time_step=1e-3)
-    for name in ("left", "right"):
-        document = to_sdformat(dataclasses.replace(PAPER, name=name))
-        Parser(plant).AddModelsFromString(document, "sdf")
-    plant.Finalize()
-    assert plant.num_constraints() == plant.num_actuated_dofs() == 12
-
-
 # ------------------------------------------------------------------ what it says
 
 
@@ -232,14 +223,6 @@ def test_frames_stand_where_the_mechanism_has_its_joints(mechanism):
         p_WQ, _ = pose(f"plate_joint_{leg}")
         np.testing.assert_allclose(p_WQ, p_WP + R_WP @ mechanism.p_PQ[i], atol=1e-13)
     assert gaps(mechanism, plant, context)[0] < 1e-12
-
-
-@pytest.mark.parametrize("link", ["crank", "rod"])
-def test_links_that_should_be_vertical_are(link):
-    plant, context = parse(with_vertical(link))
-    for leg in LEGS:
-        X_WL = plant.GetBodyByName(f"{link}_{leg}").EvalPoseInWorld(context)
-        np.testing.assert_allclose(X_WL.rotation().matrix()[:, 0], [0, 0, 1], atol=1e-14)
 
 
 # ------------------------------------------------------------------ the loops

@@ -7,13 +7,12 @@ import pytest
 
 import stewart_drake.loop.kinds as kinds_module
 from stewart_drake.core.library import core
-from stewart_drake.files.yamlio import parse_yaml
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.observers import ParameterObserver
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.scenario.loading import load_scenario, scenario_to_dict, scenario_yaml
+from stewart_drake.scenario.loading import load_scenario
 from tests.test_control_law import HOME, Loop, law_of, nominal_queue, sine, step
 
 PATIENCE = core().lib.STEWART_PATIENCE
@@ -24,9 +23,6 @@ COUNT = {
     "missing": "measurements_missing",
     "spike": "measurements_rejected",
 }
-AMPLITUDES = [0.2617993878] * 3 + [0.02, 0.02, 0.08]
-NOISE = f"sensor.noise_std={[1e-3 * a for a in AMPLITUDES * 2]}"
-"""A thousandth of the motion, and that per s."""
 
 
 def on_reference(*settings, controller=None):
@@ -71,16 +67,6 @@ def test_spikes_of_all_sizes_are_told_from_motion(size):
     assert run.status == "completed"
     assert bad(run) == {"measurements_rejected": 10}
     assert run.accumulated_error < 0.03
-
-
-def test_the_same_under_noise():
-    well = simulate(on_reference(NOISE), judge_stability=False)
-    assert not bad(well)
-    for kind, count in COUNT.items():
-        ill = simulate(on_reference(NOISE, fault(kind)), judge_stability=False)
-        assert ill.status == "completed"
-        assert bad(ill) == {count: 10}
-        assert ill.accumulated_error < 1.1 * well.accumulated_error
 
 
 @pytest.mark.slow
@@ -242,17 +228,6 @@ def test_the_sensors_faults_by_hand():
     assert Sensor(np.zeros(12), 0, 0.1).CreateDefaultContext().num_total_states() == 0
 
 
-def test_faults_in_a_scenario_come_back_as_they_were_written():
-    given = [{"kind": "frozen", "from": 4.0, "to": 5.0}, {"kind": "spike", "from": 1.0, "to": 2.0}]
-    sc = load_scenario("paper")
-    assert sc.sensor.faults == []
-    sc.sensor.faults = given
-    sc.check()
-    assert scenario_to_dict(sc)["sensor"]["faults"] == given
-    assert parse_yaml(scenario_yaml(sc), "text")["sensor"]["faults"] == given
-    assert dataclasses.asdict(sc)["sensor"]["faults"] == given
-
-
 # What is a mistake in a program reaches its author.
 
 
@@ -277,19 +252,6 @@ def seven(observer):
     columns = {f.name: getattr(known, f.name) for f in dataclasses.fields(known)}
     fewer = {name: column[:7] for name, column in columns.items() if column is not None}
     return dataclasses.replace(observer.settings, parameters=dataclasses.replace(known, **fewer))
-
-
-def test_the_causes_are_counted_apart():
-    assert Counts().plus("unreachable", None, "measurements_frozen") == Counts(
-        unreachable=1, measurements_frozen=1
-    )
-    counts = Counts(1, 2, 3, 4, 5, 6, 7)
-    assert counts.bad_measurements == counts.summary()["bad_measurements"] == 15
-    assert list(simulate(on_reference("duration=0.1")).summary["counts"]) == [
-        *Counts._fields,
-        "bad_measurements",
-        "tuner_fallbacks",
-    ]
 
 
 def test_a_share_of_the_samples_is_struck():

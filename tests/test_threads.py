@@ -1,15 +1,12 @@
 """Runs in several threads of one process give, bit for bit, what each gives alone."""
 
 import itertools
-import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from threadpoolctl import OpenBLASController, threadpool_info, threadpool_limits
 
 import stewart_drake as sd
 from stewart_drake.dynamics.native_functions import functions_of
-from stewart_drake.loop import simulation
 
 ON_REFERENCE = ("start=on_reference", "queue=reference")
 
@@ -48,40 +45,3 @@ def test_forty_runs_in_eight_threads_are_those_alone():
     settings = list(variants(1.0))
     assert len(settings) == 40
     assert differing(settings, threads=8) == []
-
-
-def blas_threads():
-    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
-
-
-def test_linear_algebra_stays_on_one_thread_until_the_last_run_ends(monkeypatch):
-    """Of two runs that overlap, neither the first to begin nor the first to end decides alone."""
-    begun, both = threading.Event(), threading.Event()
-    seen = []
-
-    def run(experiment, *_):
-        seen.append(blas_threads())
-        if experiment.scenario.duration == 1.0:
-            begun.set()
-            assert both.wait(10)
-        else:
-            both.set()
-            first.result(10)  # it has ended meanwhile
-            seen.append(blas_threads())
-
-    monkeypatch.setattr(simulation, "_run", run)
-    with ThreadPoolExecutor(2) as pool:
-        pool.submit(set_blas_threads, 2).result(10)
-        assert blas_threads() == {2}
-        first = pool.submit(simulation.simulate, sd.Scenario(duration=1.0), judge_stability=False)
-        assert begun.wait(10)
-        pool.submit(simulation.simulate, sd.Scenario(duration=2.0), judge_stability=False).result(
-            10
-        )
-        assert seen == [{1}] * 3
-        assert blas_threads() == {2}
-
-
-def set_blas_threads(number):
-    threadpool_limits(number, user_api="blas")
-    OpenBLASController.clear_controlling_thread()

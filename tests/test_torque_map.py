@@ -117,8 +117,3 @@ def test_map_over_predicts_angular_accelerations_about_twofold():
 def test_poses_out_of_reach_are_refused():
     with pytest.raises(UnreachablePoseError):
         torque_map(PAPER, PAPER.home + [0, 0, 0, 0, 0, 0.3])
-
-
-def test_plain_lists_are_accepted():
-    pose = [0.1, -0.1, 0.05, 0.01, 0.02, 0.4]
-    np.testing.assert_array_equal(torque_map(PAPER, pose), torque_map(PAPER, np.array(pose)))

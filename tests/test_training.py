@@ -6,16 +6,17 @@ from typing import get_args
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.optimize import least_squares
 
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.signals import TUNER_INPUTS
-from stewart_drake.studies.families import FAMILIES, PAIRS, RATIOS
-from stewart_drake.tuner.network import Kind, load_network, save_network
+from stewart_drake.studies.families import PAIRS, RATIOS
+from stewart_drake.tuner.network import load_network, save_network
 from stewart_drake.tuner.source import ratio_of
 from stewart_drake.tuning import training
 from stewart_drake.tuning.data import data_hash
-from stewart_drake.tuning.options import DataOptions, Split, TrainingOptions
+from stewart_drake.tuning.options import Split
 from stewart_drake.tuning.training import (
     Curves,
     RegretTrainer,
@@ -117,36 +118,14 @@ def test_the_jacobian_is_that_of_finite_differences():
 # ---------------------------------------------------------------- the solver
 
 
-def oracle(theta, u, y, hidden, iterations=500):
-    """Levenberg-Marquardt by dense normal equations and a Jacobian by hand."""
+def oracle(theta, u, y, hidden):
+    """Return the minimum and its cost by scipy's dense solver, with differences as a Jacobian."""
 
     def residual(x):
         return (numpy_outputs(x, u, hidden) - y).ravel()
 
-    def jacobian(x):
-        W1, b1, W2, _ = unpack(x, u.shape[1], hidden)
-        s = 1 / (1 + np.exp(-(u @ W1.T + b1)))
-        slope = s * (1 - s)
-        rows = []
-        for k in range(2):
-            db1 = slope * W2[k]
-            dW1 = db1[:, :, None] * u[:, None, :]
-            dW2, db2 = np.zeros((len(u), 2, hidden)), np.zeros((len(u), 2))
-            dW2[:, k], db2[:, k] = s, 1
-            parts = (dW1, db1, dW2, db2)
-            rows.append(np.hstack([part.reshape(len(u), -1) for part in parts]))
-        return np.stack(rows, axis=1).reshape(2 * len(u), -1)
-
-    damping, r = 1e-3, residual(theta)
-    for _ in range(iterations):
-        J = jacobian(theta)
-        step = -np.linalg.solve(J.T @ J + damping * np.eye(len(theta)), J.T @ r)
-        trial = residual(theta + step)
-        if trial @ trial < r @ r:
-            theta, r, damping = theta + step, trial, damping / 3
-        else:
-            damping *= 2
-    return theta, float(r @ r)
+    found = least_squares(residual, theta, xtol=1e-15, ftol=1e-15, gtol=1e-12)
+    return found.x, 2 * found.cost
 
 
 def test_training_finds_the_minimum_that_a_dense_solver_finds():
@@ -226,14 +205,6 @@ def test_rows_after_a_failure_are_not_trained_on(data):
     assert len(rows.inputs) == data.sizes["run"] * 100 - 60
     assert (rows.runs == 3).sum() == 40
     assert np.isfinite(rows.inputs).all()
-
-
-def test_the_options_offer_what_there_is():
-    def offered(options, name):
-        return get_args(get_args(options.model_fields[name].annotation)[0])
-
-    assert offered(TrainingOptions, "density") == get_args(Kind)
-    assert offered(DataOptions, "family") == tuple(FAMILIES)
 
 
 @pytest.mark.parametrize("split", get_args(Split))
@@ -316,14 +287,6 @@ def test_a_network_learns_to_lose_little_where_it_was_not_trained():
     assert lost < 0.1 * fresh.regret.mean(axis=0).min()
     assert network.start == pytest.approx(10 ** (np.array([0.5, -0.5]) * curves.best_ratio))
     assert np.prod(network(np.zeros(18))) == pytest.approx(1.0)
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_network_by_regret():
-    curves = synthetic(30)
-    found = [(one := RegretTrainer(curves, n)).fit(one.start, [one.rows], 1) for n in (4, 4, 5)]
-    assert np.array_equal(found[0], found[1])
-    assert not np.array_equal(found[0], found[2])
 
 
 def family_data(curves):

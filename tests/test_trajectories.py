@@ -1,17 +1,14 @@
 """References: exact derivatives, smooth joints, defined for all time, honest about bad files."""
 
 import math
-from typing import Literal
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic.dataclasses import dataclass
 from pydrake.trajectories import PiecewisePolynomial
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.reference_config import (
     CsvConfig,
     HoldConfig,
@@ -63,26 +60,6 @@ def assert_smooth(trajectory, knots, atol=1e-4):
 # Sine and hold
 
 
-@dataclass(config=STRICT)
-class RampConfig:
-    """A kind of reference that the package does not have."""
-
-    kind: Literal["ramp"] = "ramp"
-    rate: float = 0.01
-
-
-def test_a_kind_of_reference_is_a_class_and_how_to_make_its_motion():
-    @make_reference.register(RampConfig)
-    def _ramp(config, duration):
-        poses = np.column_stack([[0.0] * 6, [0.0] * 5 + [config.rate]])
-        return PiecewisePolynomial.FirstOrderHold([0.0, 1.0], poses)
-
-    ramp = RampConfig(rate=0.02)
-    assert peak_to_peak(ramp, make_reference(ramp, 0.5), 0.5) == pytest.approx([0] * 5 + [0.01])
-    with pytest.raises(TypeError, match="got a str"):
-        make_reference("sine", 1.0)
-
-
 def test_the_sine_is_the_papers_equation_46():
     trajectory = make_reference(SineConfig(), 10.0)
     amplitude = np.array([0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08])
@@ -112,12 +89,6 @@ def test_the_derivatives_of_a_sine_are_exact(frequency, unit, amplitude, t):
     np.testing.assert_allclose(
         third, -(omega**2) * evaluate(trajectory, t)[RATES], atol=1e-9 * (1 + omega**3)
     )
-
-
-def test_a_hold_stands_still_for_ever():
-    trajectory = make_reference(HoldConfig(offset=HOME), 10.0)
-    for t in (0.0, 3.0, 1e6):
-        np.testing.assert_array_equal(evaluate(trajectory, t), HOME + [0.0] * 12)
 
 
 # Waypoints
@@ -154,14 +125,6 @@ def test_two_waypoints_are_the_minimum_jerk_motion():
     for s in np.linspace(0, 1, 11):
         expected = 0.4 * (10 * s**3 - 15 * s**4 + 6 * s**5)
         np.testing.assert_allclose(evaluate(trajectory, 2 * s)[POSE], expected, atol=1e-15)
-
-
-def test_the_plate_dwells_between_two_equal_waypoints():
-    there = [0.1, 0.0, 0.0, 0.0, 0.0, 0.4]
-    config = WaypointsConfig(times=[0.0, 1.0, 2.0, 3.0], poses=[HOME, there, there, HOME])
-    trajectory = make_reference(config, 3.0)
-    for t in (1.0, 1.3, 1.9, 2.0):
-        np.testing.assert_allclose(evaluate(trajectory, t), there + [0.0] * 12, atol=1e-13)
 
 
 def test_waypoints_from_a_file_are_the_same(tmp_path):

@@ -9,9 +9,7 @@ from hypothesis.extra.numpy import arrays
 import stewart_drake as sd
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.sensor import Sensor
-from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.loop.tuner import AnnTuner, DensityWindow
-from stewart_drake.scenario.timing import look_time
 from stewart_drake.tuner.network import NUM_INPUTS, densities, save_network
 from stewart_drake.tuner.source import MAX_FACTOR, tune
 from tests.test_network import small_network, torch_twin
@@ -197,28 +195,6 @@ def test_recorded_densities_are_those_of_the_recorded_signals(tmp_path, kind):
     size = np.abs(expected)
     assert np.all(np.abs(s.density.values - expected) <= 1e-11 + 1e-12 * size * np.maximum(size, 1))
     assert list(s.tuner_input.values[[0, 6, 12]]) == ["error_phi", "rate_error_phi", "torque_1"]
-
-
-def test_the_window_holds_what_the_density_is_taken_of(tmp_path):
-    """Recorded density and `densities` of the very samples, to 1e-12."""
-    loop = build_closed_loop(scenario(tmp_path, None, "duration=4.0"))
-    window = loop.GetSubsystemByName("density")
-    simulator = make_simulator(loop)
-    context = simulator.get_context()
-    simulator.Initialize()
-    samples, found = [], []
-    for k in range(41):
-        if k:
-            simulator.AdvanceTo(look_time(0.1 * k))
-        samples.append(window.window(window.GetMyContextFromRoot(context))[-1].copy())
-        found.append(loop.GetOutputPort("density").Eval(context))
-        np.testing.assert_array_equal(
-            samples[-1][12:], loop.GetOutputPort("torque_commanded").Eval(context)
-        )
-        state = loop.GetOutputPort("state").Eval(context)
-        reference = loop.GetOutputPort("reference").Eval(context)
-        np.testing.assert_allclose(samples[-1][:12], state - reference[:12], atol=1e-12)
-    np.testing.assert_allclose(found, densities(samples), rtol=1e-12)
 
 
 def subsystems(loop):

@@ -120,15 +120,6 @@ def test_wrenches_are_what_shortens_rods_on_locked_cranks():
     np.testing.assert_allclose(wrenches(PAPER, legs), rows, atol=1e-9)
 
 
-def test_parallel_rods_do_not_hold_the_plate():
-    """Six parallel forces span three directions: no yaw, no shift."""
-    mechanism = parallel_rods()
-    W = wrenches(mechanism, leg_geometry(mechanism, mechanism.home))
-    np.testing.assert_allclose(np.linalg.svd(W, compute_uv=False)[3:], 0, atol=1e-12)
-    found = measure(mechanism, mechanism.home)
-    assert abs(found.parallel) < 1e-12 and found.margin < 0 and np.isnan(found.condition)
-
-
 def test_the_condition_grows_like_the_root_of_the_distance_to_a_dead_centre():
     mechanism = stretched()
     distances = np.array([1e-3, 1e-4])
@@ -219,17 +210,6 @@ def test_a_motion_is_checked_up_to_its_end_and_not_beyond(later, fits):
     scenario = dataclasses.replace(heave(0.2), duration=leaves + later)
     assert (study_workspace(scenario).exit is None) is fits
     assert (assemble(scenario).reference_failure() is None) is fits
-
-
-def test_the_largest_heave_is_the_shorter_travel():
-    """Hence the scaled scenario is accepted, and one a permille larger is not."""
-    t = travel(PAPER)[5]
-    study = study_workspace(heave(0.05))
-    np.testing.assert_allclose(study.factor.value, min(t.high, -t.low) / 0.05, rtol=1e-4)
-    assert study.factor.limited and study.exit is None
-    prepare(heave(0.05 * study.factor.value))
-    with pytest.raises(ConfigError, match="reach"):
-        prepare(heave(0.05 * study.factor.value * 1.001))
 
 
 @pytest.mark.parametrize("name", shipped("scenario"))
