@@ -102,7 +102,7 @@ def of_ranges(seed: int, motion: Path, calm: float) -> Truth:
     experiment = prepare(scenario)
     scales = uncertainty.scales_of(experiment, calm)
     one = uncertainty.draw(Ranges(), scales, scenario, FRESH, seed)
-    changed = uncertainty.drawn(uncertainty.MACHINE, scenario, experiment.mechanism, one)
+    changed = uncertainty.apply_draw(uncertainty.MACHINE, scenario, experiment.mechanism, one)
     machine, drawn = changed.machine(), changed.as_scenario()
     values = truth_of(machine, drawn)
     values[6] += machine.plate.mass - experiment.mechanism.plate.mass

@@ -23,7 +23,7 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.study_options import Ranges
-from stewart_drake.studies.uncertainty import MACHINE, Draw, draw, drawn, run_draw, scales_of
+from stewart_drake.studies.uncertainty import MACHINE, Draw, apply_draw, draw, run_draw, scales_of
 
 TIMED: Final = 5
 """Every so many runs, one is timed in Drake."""
@@ -38,7 +38,7 @@ def timed(call: Callable[[], Any]) -> tuple[float, Any]:
 
 def in_drake(scenario: Scenario, one: Draw) -> sd.SimulationResult:
     """A run as a simulation."""
-    changed = drawn(MACHINE, scenario, sd.load_mechanism(scenario.mechanism), one)
+    changed = apply_draw(MACHINE, scenario, sd.load_mechanism(scenario.mechanism), one)
     return simulate(changed.as_scenario(), true_mechanism=changed.machine(), judge_stability=False)
 
 

@@ -22,7 +22,7 @@ from stewart_drake.loop.controller_margin import controller_margin
 from stewart_drake.loop.preparation import check_instants, prepare
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.scenario.loading import load_comparison
-from stewart_drake.studies.reach import largest_factor
+from stewart_drake.studies.workspace_map import largest_factor
 
 AMPLITUDE = np.array([np.pi / 12] * 3 + [0.02, 0.02, 0.08])
 ROWS = ("delay_lqr", "delay_lqi", "delay_lqi_sum", "delay_lqi_200")

@@ -13,7 +13,7 @@ from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.config import NetworkConfig
 from stewart_drake.scenario.link import forward_times, link_text
 from stewart_drake.scenario.loading import scenario_yaml
-from stewart_drake.studies.uncertainty import MACHINE, drawn
+from stewart_drake.studies.uncertainty import MACHINE, apply_draw
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -96,6 +96,6 @@ def test_machines_that_are_drawn_keep_the_network():
     """Delay and jitter are of a wire: over a network they neither change nor break the link."""
     scenario = network()
     one = {"delay": 0.02, "jitter": 0.003, "link_seed": 1}
-    other = drawn(MACHINE, scenario, load_mechanism("paper"), one).as_scenario()
+    other = apply_draw(MACHINE, scenario, load_mechanism("paper"), one).as_scenario()
     other.check()
     assert other.assumed_link == scenario.assumed_link

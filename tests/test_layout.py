@@ -17,7 +17,7 @@ from stewart_drake.mechanism.files import build_mechanism, load_mechanism, mecha
 from stewart_drake.mechanism.geometry import bar_inertia
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.layout_search import (
+from stewart_drake.studies.layout import (
     Found,
     Layout,
     LayoutStudy,
@@ -29,17 +29,17 @@ from stewart_drake.studies.layout_space import (
     MEASURES,
     PARAMETERS,
     Arrangement,
-    Wish,
+    Requirements,
     geometry,
     motion_of,
     own_values,
     peak_torque,
+    requirements,
     space_around,
-    wish_of,
 )
-from stewart_drake.studies.reach import margins_along
 from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.workspace import size_motors
+from stewart_drake.studies.workspace_map import margins_along
 from tests.mechanisms import PAPER
 from tests.screen import too_long
 
@@ -100,12 +100,15 @@ def test_joint_angles_are_those_of_the_link_frames():
     assert found["crank_joint_deg"] == pytest.approx(np.rad2deg(max(leans)), rel=1e-9)
 
 
-def test_a_wish_tells_which_limits_are_missed_and_by_which_share():
-    wish = wish_of("reach", {"clearance": 0.01, "condition": 4.0}, {"clearance": 1.0})
-    missed = wish.missed({"clearance": 0.004, "condition": 5.0, "reach": 0.1})
+def test_requirements_say_which_limits_are_missed_and_by_which_share():
+    wanted = requirements("reach", {"clearance": 0.01, "condition": 4.0}, {"clearance": 1.0})
+    missed = wanted.missed({"clearance": 0.004, "condition": 5.0, "reach": 0.1})
     assert missed == pytest.approx({"clearance": 0.6, "condition": 0.25})
-    assert wish.missed({"clearance": 0.01, "condition": 4.0}) == {}
-    assert wish.cost({"reach": 0.1}) == -0.1 and Wish({}, "torque").cost({"torque": 2.0}) == 2.0
+    assert wanted.missed({"clearance": 0.01, "condition": 4.0}) == {}
+    assert (
+        wanted.cost({"reach": 0.1}) == -0.1
+        and Requirements({}, "torque").cost({"torque": 2.0}) == 2.0
+    )
 
 
 # ------------------------------------------------------------------ the space
@@ -176,11 +179,11 @@ def test_a_space_that_is_none_is_one_line(vary, keep, word):
 
 
 def test_a_search_keeps_limits_and_betters_the_goal(monkeypatch):
-    monkeypatch.setattr("stewart_drake.studies.layout_search.POPULATION", 3)
+    monkeypatch.setattr("stewart_drake.studies.layout.POPULATION", 3)
     asked = problem(limits={"reach": 0.005, "clearance": -1.0}, vary={"crank": (0.1, 0.12)})
     found = json.loads(search(asked, OWN, 3, 0, 4))
     values, own = np.array(found["values"]), asked.trial(own_values(SPEC), OWN)
-    assert found["missed"] == {} and not asked.wish.missed(own)
+    assert found["missed"] == {} and not asked.requirements.missed(own)
     # The machine itself is among the first, so that nothing worse is found, but for rounding.
     assert found["measures"]["condition"] < 1.001 * own["condition"]
     for value, (low, high) in zip(values, asked.space.ranges(OWN), strict=True):
@@ -248,7 +251,7 @@ def test_errata_another_layout_is_conditioned_better():
     ):
         other[PARAMETERS.index(name)] = value
     ours, theirs = asked.trial(own_values(SPEC), OWN), asked.trial(other, OWN)
-    assert not asked.wish.missed(theirs)
+    assert not asked.requirements.missed(theirs)
     assert ours["condition"] == pytest.approx(5.07, abs=0.01)
     assert theirs["condition"] == pytest.approx(3.73, abs=0.01)
     assert theirs["reach"] == pytest.approx(0.0103, abs=1e-4)
@@ -270,7 +273,7 @@ def in_process(monkeypatch):
         return (call() for call in calls)
 
     monkeypatch.setattr("stewart_drake.studies.jobs._on_this_machine", here)
-    monkeypatch.setattr("stewart_drake.studies.layout_search.POPULATION", 2)
+    monkeypatch.setattr("stewart_drake.studies.layout.POPULATION", 2)
     return done
 
 

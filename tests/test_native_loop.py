@@ -27,7 +27,7 @@ from stewart_drake.mechanism.geometry import Body
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.study_options import Ranges
-from stewart_drake.studies.uncertainty import MACHINE, draw, drawn, scales_of
+from stewart_drake.studies.uncertainty import MACHINE, apply_draw, draw, scales_of
 from tests.mechanisms import PAPER
 
 NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
@@ -129,7 +129,7 @@ def assert_drawn(indices, duration):
     """Machines as of `analyze robustness`, from rest, in Drake and in C."""
     one = scenario("paper", f"duration={duration}")
     for index in indices:
-        changed = drawn(MACHINE, one, PAPER, draw(Ranges(), scales(), one, 9, index))
+        changed = apply_draw(MACHINE, one, PAPER, draw(Ranges(), scales(), one, 9, index))
         variant, truth = changed.as_scenario(), changed.machine()
         found = run_in_bulk(variant, truth)
         assert found.loop == "native"

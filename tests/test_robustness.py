@@ -23,17 +23,16 @@ from stewart_drake.mechanism import kinematics
 from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.reporting.robustness import document
 from stewart_drake.scenario.config import StateSensorConfig
-from stewart_drake.studies import statistics, uncertainty
-from stewart_drake.studies.robustness import study_robustness
-from stewart_drake.studies.robustness_result import RobustnessStudy, factor_values, table
+from stewart_drake.studies import robustness, statistics
+from stewart_drake.studies.robustness import RobustnessStudy, factor_values, study_robustness, table
 from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.statistics import auc_interval, explain
 from stewart_drake.studies.study_options import Ranges, RobustnessOptions, read_ranges
 from stewart_drake.studies.uncertainty import (
     MACHINE,
     Scales,
+    apply_draw,
     draw,
-    drawn,
     run_draw,
     scales_of,
 )
@@ -58,14 +57,14 @@ def short(**changes):
 
 
 def changed(scenario, one):
-    return drawn(MACHINE, scenario, PAPER, one).as_scenario()
+    return apply_draw(MACHINE, scenario, PAPER, one).as_scenario()
 
 
 def machine(payload, one):
     """The paper's machine, of a scenario with a payload in kg, as it was drawn."""
     scenario = short()
     scenario.plant.payload_mass = payload
-    return drawn(MACHINE, scenario, PAPER, one).machine()
+    return apply_draw(MACHINE, scenario, PAPER, one).machine()
 
 
 # ---------------------------------------------------------------- statistics
@@ -743,7 +742,7 @@ def test_ctrl_c(tmp_path, monkeypatch, capsys):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(uncertainty, "run_jobs", interrupted)
+    monkeypatch.setattr(robustness, "run_jobs", interrupted)
     assert main(["analyze", "robustness", "--out", str(tmp_path)]) == 130
     assert "finished runs are kept" in capsys.readouterr().err
     assert main(["analyze", "robustness"]) == 130

@@ -15,7 +15,7 @@ from stewart_drake.reporting.run import table_two_blocks
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.studies.compare import CONTROLLERS, comparison_summary, label
-from stewart_drake.studies.reach import largest_factor
+from stewart_drake.studies.workspace_map import largest_factor
 from tests.mechanisms import PAPER
 
 

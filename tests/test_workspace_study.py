@@ -23,16 +23,14 @@ from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rot
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import HoldConfig, SineConfig
 from stewart_drake.scenario.trajectories import make_reference
-from stewart_drake.studies.reach import (
-    LARGEST_FACTOR,
-    first_exit,
-    largest_factor,
-    margins_along,
-)
 from stewart_drake.studies.workspace import size_motors, study_workspace
 from stewart_drake.studies.workspace_map import (
+    LARGEST_FACTOR,
     characteristic_length,
+    first_exit,
+    largest_factor,
     last_inside,
+    margins_along,
     measure,
     sections,
     travel,

@@ -17,7 +17,7 @@ from stewart_drake.reporting.document import (
     number,
 )
 from stewart_drake.reporting.mechanism import mechanism_figure
-from stewart_drake.studies.layout_search import INSTANTS, Layout, LayoutStudy
+from stewart_drake.studies.layout import INSTANTS, Layout, LayoutStudy
 from stewart_drake.studies.layout_space import MEASURES, PARAMETERS
 
 _RUN: Final = {"completed": "completed", "refused": "does not reach the motion"}
@@ -27,7 +27,7 @@ _TONES: Final[dict[str, Tone]] = {"yes": "good", "partly": "fair"}
 def document(study: LayoutStudy) -> Document:
     """Return what was found beside the machine that the search began from."""
     machines = [study.before, *study.layouts]
-    goal = study.problem.wish.goal
+    goal = study.problem.requirements.goal
     near = {
         one.name: f"{one.nearest.pair}, {number(1e3 * one.nearest.distance)} mm at "
         f"t = {one.nearest.time:.2f} s" + (", they cross" if one.nearest.distance < 0 else "")
@@ -76,7 +76,7 @@ def _compared(study: LayoutStudy, machines: list[Layout]) -> Table:
     rows: list[tuple[str, str, Callable[[Layout], str]]] = []
     for name, measure in MEASURES.items():
         unit = "" if measure.shown == "-" else f" [{measure.shown}]"
-        limit = study.problem.wish.limits.get(name)
+        limit = study.problem.requirements.limits.get(name)
         sign = "≥" if measure.more else "≤"
         asked = "" if limit is None else f"{sign} {limit * measure.factor:g}"
         rows.append((name.removesuffix("_deg") + unit, asked, partial(measured, name)))

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from stewart_drake.reporting.document import Document, Table, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw, limit
 from stewart_drake.reporting.style import LIMIT, RUN, TRUTH
-from stewart_drake.studies.robustness_result import (
+from stewart_drake.studies.robustness import (
     QUANTILES,
     Influence,
     RobustnessStudy,
@@ -86,7 +86,7 @@ def document(study: RobustnessStudy) -> Document:
         kept=lambda one: int(np.sum(~one.failed)),
         strong=[title(one.factor) for one in found.found],
         for_error=list(dict.fromkeys(title(one.factor.strip("|")) for one in errors)),
-        beside=study.beside and list({"as asked": study, **study.others}.items()),
+        beside=study.also and list({"as asked": study, **study.others}.items()),
         quantiles=[(q, study.quantile(q)) for q in QUANTILES],
         distribution_figure=partial(distribution_figure, study),
         influences=influences,

@@ -20,8 +20,8 @@ from stewart_drake.reporting.document import (
 from stewart_drake.scenario.config import ControllerConfig, Scenario
 from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.studies.compare import PAPER_ERRORS, is_papers, label
-from stewart_drake.studies.reach import largest_factor
 from stewart_drake.studies.verdict import loop_word
+from stewart_drake.studies.workspace_map import largest_factor
 
 _COLUMNS: Final = {
     "controller": "\ncontroller",

@@ -1,8 +1,8 @@
 """Whether the parts of a machine touch: along a motion, and around home.
 
-Distances are those of `loop.clearance`; a negative one is by how far two parts are in each other.
-Links are cranks, rods and plate. The base with its motors is reported apart: the drawing
-chooses where its disc lies, not the machine.
+Distances are those of `loop.clearance`; a negative one is the depth of an overlap. Links are
+cranks, rods and plate. The base with its motors is reported apart, because the place of its disc is
+a choice of the drawing, not a property of the machine.
 """
 
 from typing import Any, Final, NamedTuple
@@ -13,22 +13,20 @@ from stewart_drake.loop.clearance import ClearanceScene, Pair
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import reach_margins
 from stewart_drake.scenario.signals import NUM_COORDINATES
-from stewart_drake.studies.workspace_map import Section, Travel, last_inside
+from stewart_drake.studies.workspace_map import Section, Travel, last_inside, pose_in_section
 from stewart_drake.types import Array
 
 EVERY: Final = 3
-"""Interval of the poses of a section that are checked, along both sides."""
+"""Grid stride: every third pose of a section is checked, along both sides."""
 _STEPS: Final = 60
 
 
 class Nearest(NamedTuple):
-    """Two parts where they come nearest to each other."""
+    """Two parts at their least distance in m (negative: overlap), at a time in s."""
 
     pair: Pair
     distance: float
-    """m, negative where they are in each other."""
     time: float
-    """s"""
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -36,16 +34,19 @@ class Nearest(NamedTuple):
 
 
 class ClearanceAlong(NamedTuple):
-    """Along a motion, as far as the legs reach."""
+    """Clearance along a motion, as far as the legs reach.
+
+    Attributes:
+        time: (n,) s.
+        links: (n,) m, of the nearest two links; NaN out of reach.
+        base: (n,) m, of the part nearest to the base or its motors; NaN out of reach.
+        nearest: least distance of every pair, the nearest first; empty if no pose is in reach.
+    """
 
     time: Array
-    """(n,) s."""
     links: Array
-    """(n,) m, of the nearest two links; NaN out of reach."""
     base: Array
-    """(n,) m, of the part nearest to the base or its motors; NaN out of reach."""
     nearest: list[Nearest]
-    """Of every pair, the nearest first; empty where no pose is in reach."""
 
     def least(self, fixed: bool) -> Nearest | None:
         """Return the nearest pair of links, or (`fixed`) the nearest pair with the base."""
@@ -69,9 +70,9 @@ class ClearanceAlong(NamedTuple):
 
 
 class ClearTravel(NamedTuple):
-    """How far one coordinate goes from home, the others staying, until links touch; rad or m.
+    """Travel of one coordinate from home, the others staying, until links touch; rad or m.
 
-    A pair is None where the workspace ends before any two touch; `low` and `high` are then its end.
+    A pair is None if the workspace ends before any two touch; `low` and `high` are then its end.
     """
 
     coordinate: str
@@ -80,24 +81,33 @@ class ClearTravel(NamedTuple):
     low_pair: Pair | None
     high_pair: Pair | None
 
+    @property
+    def summary(self) -> dict[str, Any]:
+        pairs = {"low_pair": self.low_pair, "high_pair": self.high_pair}
+        return self._asdict() | {k: None if p is None else list(p) for k, p in pairs.items()}
+
 
 class ClearSection(NamedTuple):
-    """Distances in a section of the workspace; arrays (len(y), len(x))."""
+    """Distances in a section of the workspace.
+
+    `distance` (len(y), len(x)) in m is that of the nearest two links, NaN outside the workspace.
+    `touching` is the share of the poses inside at which links touch; NaN without any.
+    """
 
     x: Array
     y: Array
     distance: Array
-    """m, of the nearest two links; NaN outside the workspace."""
     touching: float
-    """Share of the poses inside at which links touch; NaN without any."""
 
 
 class ClearanceStudy(NamedTuple):
-    """Clearance of a machine along a motion and around home."""
+    """Clearance of a machine along a motion and around home.
+
+    `home` has the nearest two links at home, None for a home pose outside the workspace.
+    """
 
     along: ClearanceAlong
     home: Nearest | None
-    """The nearest two links at home, or None from a home pose outside the workspace."""
     travel: list[ClearTravel]
     sections: list[ClearSection]
 
@@ -105,7 +115,7 @@ class ClearanceStudy(NamedTuple):
     def verdict(self) -> str:
         least, disc = self.along.least(fixed=False), self.along.disc
         if least is None:
-            return "no pose of it is in reach, so that nothing is known of links that touch"
+            return "no pose is in reach, so that nothing is known of links that touch"
         where = f"{least.pair}, t = {least.time:.2f} s"
         drawn = ""
         if disc is not None and disc.distance < 0:
@@ -119,18 +129,17 @@ class ClearanceStudy(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        least, base = self.along.least(fixed=False), self.along.least(fixed=True)
+        pairs = {
+            "least": self.along.least(fixed=False),
+            "base": self.along.least(fixed=True),
+            "home": self.home,
+        }
         return {
             "verdict": self.verdict,
-            "least": None if least is None else least.summary,
-            "base": None if base is None else base.summary,
-            "home": None if self.home is None else self.home.summary,
+            **{name: None if one is None else one.summary for name, one in pairs.items()},
             "touching": [one.summary for one in self.along.touching],
             "pairs": [one.summary for one in self.along.nearest],
-            "travel": [
-                t._asdict() | {"low_pair": _named(t.low_pair), "high_pair": _named(t.high_pair)}
-                for t in self.travel
-            ],
+            "travel": [one.summary for one in self.travel],
             "touching_share_of_sections": [section.touching for section in self.sections],
         }
 
@@ -142,12 +151,11 @@ def study_clearance(
     travel: list[Travel],
     sections: list[Section],
 ) -> ClearanceStudy:
-    """Along a motion of `poses` (n, 6) at `time` (n,), and in the workspace as it was found."""
+    """Check a motion of `poses` (n, 6) at `time` (n,), and the given parts of the workspace."""
     links = ClearanceScene(mechanism, base=False)
-    at_home = links.distances(mechanism.home) if travel else None
     return ClearanceStudy(
         along=clearance_along(ClearanceScene(mechanism), mechanism, time, poses),
-        home=None if at_home is None else _nearest(links, at_home),
+        home=_nearest(links, mechanism.home) if travel else None,
         travel=[_clear_travel(links, mechanism, k, one) for k, one in enumerate(travel)],
         sections=[_clear_section(links, mechanism, one) for one in sections],
     )
@@ -156,7 +164,7 @@ def study_clearance(
 def clearance_along(
     scene: ClearanceScene, mechanism: Mechanism, time: Array, poses: Array
 ) -> ClearanceAlong:
-    """At the poses (n, 6), those out of reach left out."""
+    """Return the clearance at the poses (n, 6) that are in reach."""
     distances = np.full((len(time), len(scene.pairs)), np.nan)
     for k in np.flatnonzero((reach_margins(mechanism, poses) > 0).all(axis=1)):
         distances[k] = scene.distances(poses[k])
@@ -175,7 +183,8 @@ def clearance_along(
     )
 
 
-def _nearest(scene: ClearanceScene, distances: Array) -> Nearest:
+def _nearest(scene: ClearanceScene, pose: Array) -> Nearest:
+    distances = scene.distances(pose)
     k = int(distances.argmin())
     return Nearest(scene.pairs[k], float(distances[k]), 0.0)
 
@@ -186,18 +195,18 @@ def _clear_travel(
     axis = np.eye(NUM_COORDINATES)[number]
 
     def end(limit: float, direction: float) -> tuple[float, Pair | None]:
+        def at(s: float) -> Array:
+            return mechanism.home + s * direction * axis
+
         def clear(s: float) -> bool:
-            return bool(scene.distances(mechanism.home + s * direction * axis).min() >= 0)
+            return bool(scene.distances(at(s)).min() >= 0)
 
         if not clear(0.0):
-            return 0.0, _nearest(scene, scene.distances(mechanism.home)).pair
-        # A hair inside: at the very end rounding may put a leg out of reach.
+            return 0.0, _nearest(scene, mechanism.home).pair
+        # Slightly inside: at the very end rounding may put a leg out of reach.
         limit *= 1 - 1e-6
         s = last_inside(clear, limit, _STEPS, tolerance=1e-3 * limit)
-        if s == limit:
-            return s, None
-        beyond = mechanism.home + (s + 1e-3 * limit) * direction * axis
-        return s, _nearest(scene, scene.distances(beyond)).pair
+        return s, None if s == limit else _nearest(scene, at(s + 1e-3 * limit)).pair
 
     (low, low_pair), (high, high_pair) = end(-whole.low, -1.0), end(whole.high, 1.0)
     return ClearTravel(whole.coordinate, 0.0 - low, high, low_pair, high_pair)
@@ -208,12 +217,7 @@ def _clear_section(scene: ClearanceScene, mechanism: Mechanism, section: Section
     inside = np.isfinite(section.condition[::EVERY, ::EVERY])
     distance = np.full(inside.shape, np.nan)
     for j, i in zip(*np.nonzero(inside), strict=True):
-        pose = mechanism.home.copy()
-        pose[[section.first, section.second]] = x[i], y[j]
+        pose = pose_in_section(mechanism, (section.first, section.second), x[i], y[j])
         distance[j, i] = scene.distances(pose).min()
     seen = distance[inside]
     return ClearSection(x, y, distance, float(np.mean(seen < 0)) if len(seen) else np.nan)
-
-
-def _named(pair: Pair | None) -> list[str] | None:
-    return None if pair is None else list(pair)

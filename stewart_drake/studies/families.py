@@ -28,13 +28,13 @@ from stewart_drake.studies.uncertainty import (
     Draw,
     Model,
     Quantity,
-    Truth,
-    add_bias,
+    Variant,
     add_noise,
     add_payload,
+    add_to,
+    apply_draw,
     draw_from,
     draw_seed,
-    drawn,
     seed_noise,
 )
 from stewart_drake.tuner.source import weights_of
@@ -168,24 +168,25 @@ def _disturbed_bias(rng: Generator, standard: Standard) -> tuple[float, ...]:
     return tuple((4e-3 * standard.torque * rng.standard_normal(6)).tolist())
 
 
-def _set_delay(truth: Truth, steps: int) -> None:
-    truth.fields["delay"]["steps"] = steps
+def _set_delay(variant: Variant, steps: int) -> None:
+    variant.fields["delay"]["steps"] = steps
 
 
-def _set_believed_delay(truth: Truth, steps: int) -> None:
-    _set_delay(truth, steps)
-    truth.fields["controller"] |= {"delay_steps": steps, "delay_fraction": 0.0}
+def _set_believed_delay(variant: Variant, steps: int) -> None:
+    _set_delay(variant, steps)
+    variant.fields["controller"] |= {"delay_steps": steps, "delay_fraction": 0.0}
 
 
-def _set_frequency(truth: Truth, frequency: float) -> None:
-    truth.fields["reference"] |= {"frequency": frequency, "frequency_unit": "rad/s"}
+def _set_frequency(variant: Variant, frequency: float) -> None:
+    variant.fields["reference"] |= {"frequency": frequency, "frequency_unit": "rad/s"}
 
 
-def _set_amplitude(truth: Truth, share: float) -> None:
-    reference = truth.fields["reference"]
+def _set_amplitude(variant: Variant, share: float) -> None:
+    reference = variant.fields["reference"]
     reference["amplitude"] = [share * a for a in reference["amplitude"]]
 
 
+_add_bias: Final = add_to("plant", "torque_bias")
 DISTURBED: Final[Model] = {
     # Whole periods, 0 and 15 included, which the controller knows.
     "delay_steps": Quantity(lambda rng, _: int(rng.integers(0, 16)), _set_delay),
@@ -194,7 +195,7 @@ DISTURBED: Final[Model] = {
     # Share of the scenario's own amplitudes.
     "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.3, 1.0)), _set_amplitude),
     # Of each motor; its standard deviation is a share of the standard torque.
-    "torque_bias": Quantity(_disturbed_bias, add_bias, sometimes=True),
+    "torque_bias": Quantity(_disturbed_bias, _add_bias, sometimes=True),
     # kg, up to a tenth of the plate's.
     "payload_mass": Quantity(
         lambda rng, standard: float(rng.uniform(0.0, 0.1 * standard.plate_mass)),
@@ -266,30 +267,30 @@ def _draw_fault(rng: Generator, about: About) -> tuple[float, ...]:
     return tuple(value if i == kind else float(i == 3) for i, value in enumerate(sizes))
 
 
-def _effort(truth: Truth) -> float:
+def _effort(variant: Variant) -> float:
     """Return the torque of the motion as it is, over that of the standard one."""
-    base, now = truth.scenario.reference, truth.fields["reference"]
+    base, now = variant.scenario.reference, variant.fields["reference"]
     assert base.kind == "sine"
     share = max(abs(a / b) for a, b in zip(now["amplitude"], base.amplitude, strict=True) if b != 0)
     return max(LEAST_TORQUE, share * now["frequency"] ** 2)
 
 
-def _set_bias(truth: Truth, bias: tuple[float, ...]) -> None:
-    add_bias(truth, tuple(_effort(truth) * b for b in bias))
+def _set_bias(variant: Variant, bias: tuple[float, ...]) -> None:
+    _add_bias(variant, tuple(_effort(variant) * b for b in bias))
 
 
-def _set_fault(truth: Truth, fault: tuple[float, ...]) -> None:
+def _set_fault(variant: Variant, fault: tuple[float, ...]) -> None:
     offset, jitter, friction, noise = fault
-    delay, period = truth.fields["delay"], truth.scenario.controller.period
+    delay, period = variant.fields["delay"], variant.scenario.controller.period
     late = Delay.of(max(0.0, delay["steps"] * period + offset), period)
     delay |= {"steps": late.steps, "fraction": late.fraction, "jitter_std": jitter}
-    truth.fields["plant"]["coulomb_friction"] += _effort(truth) * friction
-    std = truth.fields["sensor"]["noise_std"]
-    truth.fields["sensor"]["noise_std"] = [noise * s for s in std]
+    variant.fields["plant"]["coulomb_friction"] += _effort(variant) * friction
+    std = variant.fields["sensor"]["noise_std"]
+    variant.fields["sensor"]["noise_std"] = [noise * s for s in std]
 
 
-def _seed_jitter(truth: Truth, seed: int) -> None:
-    truth.fields["delay"]["seed"] = seed
+def _seed_jitter(variant: Variant, seed: int) -> None:
+    variant.fields["delay"]["seed"] = seed
 
 
 FAULTY: Final[Model] = {
@@ -327,7 +328,7 @@ def _draws(model: Model, about: Any, number: int, seed: int, stream: int) -> lis
 def vary(model: Model, base: Scenario, one: Draw) -> Scenario:
     """Return a copy of a scenario with what was drawn, applied in the order of the model."""
     in_order = {name: one[name] for name in model}
-    return drawn(model, base, load_mechanism(base.mechanism), in_order).as_scenario()
+    return apply_draw(model, base, load_mechanism(base.mechanism), in_order).as_scenario()
 
 
 # ---------------------------------------------------------------- the families

@@ -1,47 +1,309 @@
-"""Search of the layouts and lengths of a machine that suit a motion.
+"""Search of the layout and the lengths of a machine for a motion.
 
-Drake is imported by the search, not by its options.
+For every arrangement of the legs (`studies.layout_space`) SciPy's differential evolution looks for
+the numbers that make the goal best within the limits. Trials are compared first by reach, then by
+the limits that they miss, then by the goal. Each is only computed if the one before is in order, so
+that most trials cost little. The best few are written as machine files, read back, measured with
+the shapes themselves (`loop.clearance`) and run through the scenario.
 """
 
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, Final, NamedTuple
 
+import numpy as np
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass as checked
+from scipy.optimize import Bounds, differential_evolution
+
+from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
+from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
+from stewart_drake.files.jsonio import load_json, sealed_json
+from stewart_drake.files.resources import resolve
+from stewart_drake.files.yamlio import validate, yaml_text
+from stewart_drake.loop.bulk import run_in_bulk
+from stewart_drake.loop.clearance import ClearanceScene
+from stewart_drake.loop.preparation import Experiment, assemble, check_instants
+from stewart_drake.mechanism.files import (
+    MechanismSpec,
+    build_mechanism,
+    load_mechanism,
+    mechanism_spec,
+)
+from stewart_drake.mechanism.geometry import Mechanism, with_rotors
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import scenario_to_dict
+from stewart_drake.studies.clearance import Nearest, clearance_along
+from stewart_drake.studies.jobs import Progress, part_of, run_jobs
+from stewart_drake.studies.layout_space import (
+    DIGITS,
+    MEASURES,
+    PARAMETERS,
+    Arrangement,
+    Motion,
+    Requirements,
+    Space,
+    geometry,
+    least_reach,
+    motion_of,
+    own_values,
+    peak_torque,
+    requirements,
+    singular,
+    space_around,
+)
+from stewart_drake.studies.runs import Outcome, outcome_of
 from stewart_drake.studies.study_options import LayoutOptions
+from stewart_drake.types import Array
 
-if TYPE_CHECKING:
-    from stewart_drake.scenario.config import Scenario
-    from stewart_drake.studies.jobs import Progress
-    from stewart_drake.studies.layout_search import LayoutStudy
+INSTANTS: Final = 48
+"""Instants of the motion at which a trial is measured, in addition to those of its extremes."""
+POPULATION: Final = 8
+"""Trials per generation and number that varies."""
+_PENALTY: Final = 1e9
+"""Cost above any goal's: once for missed limits, twice for missing reach."""
+_SAME: Final = 0.02
+"""Layouts that differ by less in every number, as a share of the bounds, are the same."""
+_REACH, _APART = 0.05, 0.05
+"""Usual limits of reach and clearance, in cranks of the machine the search begins from."""
+_USUAL: Final = {"transmission": 0.3, "plate_joint_deg": 45.0, "crank_joint_deg": 45.0}
+_MAX_BYTES: Final = 1_000_000
+_STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+@checked(config=_STRICT)
+class Found:
+    """Result of one search, as its file keeps it.
+
+    Attributes:
+        order, branches: of the arrangement.
+        values: of `layout_space.PARAMETERS`.
+        measures: by name; empty if the motion is out of reach.
+        missed: limits that are not kept, by name, and by which share.
+        evaluations: number of layouts tried.
+    """
+
+    order: list[int]
+    branches: list[int]
+    values: list[float]
+    measures: dict[str, float]
+    missed: dict[str, float]
+    evaluations: int
+
+
+@checked(config=_STRICT)
+class Judged:
+    """Measures and run of a machine, as their file keeps them."""
+
+    measures: dict[str, float]
+    nearest: Nearest | None
+    outcome: Outcome
+
+
+class Layout(NamedTuple):
+    """Machine with its measures and its run.
+
+    Attributes:
+        name: of its file, without the suffix; of the scenario's own machine its name.
+        order: (6,): joint of the plate that each leg takes.
+        values: of `layout_space.PARAMETERS`.
+        measures: at all instants that are checked, with the shapes themselves; only the reach if a
+            pose is out of reach.
+        missed: limits that are not kept, by name, and by which share.
+        nearest: the two links at their least distance.
+        outcome: of the scenario with this machine.
+    """
+
+    name: str
+    mechanism: Mechanism
+    order: tuple[int, ...]
+    values: Array
+    measures: dict[str, float]
+    missed: dict[str, float]
+    nearest: Nearest | None
+    outcome: Outcome
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "parameters": dict(zip(PARAMETERS, self.values.tolist(), strict=True)),
+            "plate_order": list(self.order),
+            "branches": self.mechanism.branches.tolist(),
+            "measures": self.measures,
+            "missed": self.missed,
+            "nearest": None if self.nearest is None else self.nearest.summary,
+            "run": dataclasses.asdict(self.outcome),
+        }
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Problem of a search; it is sent to other processes.
+
+    Attributes:
+        scenario: with the motion.
+        space: of layouts.
+        motion: home and the reference at `INSTANTS`.
+        requirements: limits and goal.
+    """
+
+    scenario: Scenario
+    space: Space
+    motion: Motion
+    requirements: Requirements
+
+    def trial(self, values: Sequence[float] | Array, arrangement: Arrangement) -> dict[str, float]:
+        """Return the measures of a layout, as far as the limits before them are kept."""
+        legs = self.space.legs(values, arrangement)
+        # A crank as long as its rod cannot turn.
+        spare = float((legs.rod_lengths - legs.crank_lengths).min())
+        reach = min(least_reach(legs, self.motion), spare)
+        if reach <= 0:
+            return {"reach": reach}
+        found, wanted = geometry(legs, self.motion), self.requirements
+        asks_torque = "torque" in wanted.limits or wanted.goal == "torque"
+        if wanted.missed(found) or singular(found) or not asks_torque:
+            return found
+        machine = build_mechanism(self.space.machine(values, arrangement, "trial"))
+        plant = StewartDynamics(
+            with_rotors(machine, self.scenario.actuator.reflected_inertia),
+            self.scenario.plant.gravity,
+            plant_parameters(),
+        )
+        return found | {"torque": peak_torque(plant, self.motion)}
+
+    def cost(self, found: Mapping[str, float]) -> float:
+        """Return the cost of a trial: reach first, then limits, then the goal."""
+        if "condition" not in found:
+            return 2 * _PENALTY * (1 - found["reach"] / self.rod)
+        missed = sum(self.requirements.missed(found).values()) + singular(found)
+        if missed > 0:
+            share = missed / (1 + missed)
+            return _PENALTY * (1 + share / 2 if "torque" not in found else (1 + share) / 2)
+        return self.requirements.cost(found)
+
+    def missed(self, measures: Mapping[str, float]) -> dict[str, float]:
+        """Return limits that are not kept; `reach` and `parallel` count without a limit too."""
+        if "condition" not in measures:
+            return {"reach": 1 - measures["reach"] / self.rod}
+        off = singular(measures) / SINGULARITY_LIMIT
+        return self.requirements.missed(measures) | ({"parallel": off} if off else {})
+
+    @property
+    def rod(self) -> float:
+        """Length of a rod in m, the scale of missing reach."""
+        return float(own_values(self.space.spec)[PARAMETERS.index("rod")])
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Plain data that all searches depend on."""
+        return {
+            "scenario": scenario_to_dict(self.scenario),
+            "machine": _plain(self.space.spec),
+            "bounds": {name: list(pair) for name, pair in self.space.bounds.items()},
+            "offset_from_centre": self.space.offset_from_centre,
+            "kept": list(self.space.kept),
+            "limits": self.requirements.limits,
+            "goal": self.requirements.goal,
+        }
+
+
+@dataclass(frozen=True)
+class LayoutStudy:
+    """Result of `layout`.
+
+    Attributes:
+        problem: of the searches.
+        seed, starts, generations: as asked for.
+        searches: result of each, by its key.
+        before: the scenario's own machine.
+        layouts: the best few, the best first.
+    """
+
+    problem: Problem
+    seed: int
+    starts: int
+    generations: int
+    searches: dict[str, Found]
+    before: Layout
+    layouts: list[Layout]
+
+    @property
+    def evaluations(self) -> int:
+        return sum(found.evaluations for found in self.searches.values())
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the files and folders of the study."""
+        return [*(f"{one.name}.yaml" for one in self.layouts), "searches/", "judged/"]
+
+    @property
+    def verdict(self) -> str:
+        tried = f"of {self.evaluations} layouts in {len(self.searches)} searches"
+        if not self.layouts:
+            least = min(self.searches.values(), key=lambda one: self.problem.cost(one.measures))
+            missing = ", ".join(f"{name} by {100 * s:.3g} %" for name, s in least.missed.items())
+            return f"no: {tried} none keeps the limits; the nearest misses {missing}"
+        best, goal = self.layouts[0], self.problem.requirements.goal
+        reached = f"no {goal} at every instant"
+        if goal in best.measures:
+            value = f"{MEASURES[goal].factor * best.measures[goal]:.3g} {MEASURES[goal].shown}"
+            reached = f"a {goal} of {value.rstrip(' -')}"
+        done = sum(one.outcome.status == "completed" for one in self.layouts)
+        count = len(self.layouts)
+        run = f"{done} of {count} complete"
+        if done == count:
+            run = "it completes" if count == 1 else "all of them complete"
+        kept = done == count and not any(one.missed for one in self.layouts)
+        return f"{'yes' if kept else 'partly'}: {tried} the best has {reached}; {run} the scenario"
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        return {
+            "verdict": self.verdict,
+            **self.problem.summary,
+            "seed": self.seed,
+            "starts": self.starts,
+            "generations": self.generations,
+            "evaluations": self.evaluations,
+            "searches": {
+                key: {"measures": one.measures, "missed": one.missed}
+                for key, one in self.searches.items()
+            },
+            "before": self.before.summary,
+            "layouts": [one.summary for one in self.layouts],
+        }
 
 
 def study_layout(
-    scenario: "Scenario",
+    scenario: Scenario,
     directory: str | Path,
     options: LayoutOptions,
-    progress: "Progress | None" = None,
-) -> "LayoutStudy":
-    """Search machines for a scenario's motion, or go on with that; the best are written.
+    progress: Progress | None = None,
+) -> LayoutStudy:
+    """Search machines for a scenario's motion, or continue a search; write the best.
 
     Args:
-        scenario: its machine, which has a pattern, is what the search begins from.
-        directory: machines go there, finished searches below it.
+        scenario: its machine, which has a pattern, is the start of the search.
+        directory: of the machines; finished searches go below it.
         options: see `LayoutOptions`.
         progress: as `run_jobs` takes it.
 
     Raises:
-        As `run_jobs`, and ConfigError for what does not suit.
+        As `run_jobs`, and ConfigError for a scenario or options that do not suit.
     """
-    from stewart_drake.studies import layout_search
-    from stewart_drake.studies.jobs import run_jobs
-    from stewart_drake.studies.layout_space import own_values
-
     best, starts, generations = options.best, options.starts, options.generations
-    workers, seed, folder = options.workers, options.seed, Path(directory)
-    problem = layout_search.problem_of(
+    seed, folder = options.seed, Path(directory)
+    problem = problem_of(
         scenario, options.goal, options.limits or {}, options.vary or {}, options.keep
     )
-    settings = problem.summary | {"seed": seed, "generations": generations}
     jobs = {
         f"{arrangement.key}_{start}": (problem, arrangement, seed, start, generations)
         for arrangement in problem.space.arrangements()
@@ -49,45 +311,176 @@ def study_layout(
     }
     searches = run_jobs(
         jobs,
-        layout_search.search,
+        search,
         folder / "searches",
-        settings=settings,
-        read=layout_search.read_found,
-        workers=workers,
-        scheduler=options.scheduler,
-        progress=_part(progress, 0, len(jobs) + best + 1),
+        settings=problem.summary | {"seed": seed, "generations": generations},
+        read=partial(_read, Found, "the file of a search"),
+        progress=part_of(progress, 0, len(jobs) + best + 1),
+        **options.jobs,
     )
-    chosen = layout_search.best_of(problem, list(searches.values()), best)
-    texts = {
-        f"layout_{k}": layout_search.text(problem, one, f"layout_{k}")
-        for k, one in enumerate(chosen, 1)
-    }
-    layout_search.remove_more(folder, len(texts))
+    chosen = _best_of(problem, list(searches.values()), best)
+    texts = {}
+    for k, one in enumerate(chosen, 1):
+        arrangement = Arrangement(tuple(one.order), tuple(one.branches), 0.0)
+        machine = problem.space.machine(one.values, arrangement, f"layout_{k}")
+        texts[machine.name] = yaml_text(_plain(machine))
     for name, text in texts.items():
         write_whole(folder / f"{name}.yaml", text)
+    number = len(texts) + 1
+    while (old := folder / f"layout_{number}.yaml").exists():  # of an earlier start
+        old.unlink()
+        number += 1
     own = scenario.mechanism
     places = {"before": own} | {name: str((folder / f"{name}.yaml").resolve()) for name in texts}
     judged = run_jobs(
         {key: (problem, place) for key, place in places.items()},
-        layout_search.judge,
+        judge,
         folder / "judged",
         settings=problem.summary | {"machines": texts},
-        read=layout_search.read_judged,
-        workers=workers,
-        progress=_part(progress, len(jobs), len(jobs) + len(places)),
+        read=partial(_read, Judged, "the file of a judgement"),
+        workers=options.workers,
+        progress=part_of(progress, len(jobs), len(jobs) + len(places)),
     )
-    layouts = [
-        layout_search.layout(problem, key, places[key], one.order, one.values, judged[key])
-        for key, one in zip(texts, chosen, strict=True)
-    ]
-    spec, order = problem.space.spec, problem.space.pattern.plate_order
-    before = layout_search.layout(problem, "before", own, order, own_values(spec), judged["before"])
-    before = before._replace(name=before.mechanism.name)
-    return layout_search.LayoutStudy(problem, seed, starts, generations, searches, before, layouts)
+
+    def layout(key: str, order: Sequence[int], values: Sequence[float] | Array) -> Layout:
+        one, mechanism = judged[key], load_mechanism(places[key])
+        name, missed = key if key in texts else mechanism.name, problem.missed(one.measures)
+        order, values = tuple(order), np.array(values)
+        return Layout(
+            name, mechanism, order, values, one.measures, missed, one.nearest, one.outcome
+        )
+
+    space = problem.space
+    before = layout("before", space.pattern.plate_order, own_values(space.spec))
+    layouts = [layout(key, one.order, one.values) for key, one in zip(texts, chosen, strict=True)]
+    return LayoutStudy(problem, seed, starts, generations, searches, before, layouts)
 
 
-def _part(progress: "Progress | None", before: int, whole: int) -> "Progress | None":
-    """Return the progress of jobs that are part of more."""
-    if progress is None:
-        return None
-    return lambda done, _: progress(before + done, whole)
+def problem_of(
+    scenario: Scenario,
+    goal: str,
+    limits: Mapping[str, float],
+    vary: Mapping[str, tuple[float, float]],
+    keep: Sequence[str],
+) -> Problem:
+    """Return the problem of a search.
+
+    Raises:
+        ConfigError: one line.
+    """
+    for field, value in (
+        ("plant.mechanism", scenario.plant.mechanism),
+        ("controller.calibration", scenario.controller.calibration),
+    ):
+        if value is not None:
+            raise ConfigError(
+                f"{field}: got {value}; expected null, as the machine is searched for"
+            )
+    experiment, spec = assemble(scenario), mechanism_spec(resolve("mechanism", scenario.mechanism))
+    space = space_around(spec, vary, keep)
+    crank = float(own_values(spec)[PARAMETERS.index("crank")])
+    usual = {"reach": _REACH * crank, "clearance": _APART * crank, **_USUAL}
+    if math.isfinite(experiment.torque_limit):
+        usual["torque"] = experiment.torque_limit
+    motion = motion_of(experiment.mechanism.home, experiment.reference, _instants(experiment))
+    return Problem(scenario, space, motion, requirements(goal, limits, usual))
+
+
+def _instants(experiment: Experiment) -> Array:
+    """Return evenly spaced instants, and those at which a coordinate is largest or least."""
+    duration = experiment.scenario.duration
+    every = check_instants(duration)
+    poses = np.array([experiment.reference.value(t)[:, 0] for t in every])
+    extreme = every[np.concatenate([poses.argmin(axis=0), poses.argmax(axis=0)])]
+    return np.unique(np.concatenate([np.linspace(0.0, duration, INSTANTS), extreme]))
+
+
+def search(
+    problem: Problem, arrangement: Arrangement, seed: int, start: int, generations: int
+) -> bytes:
+    """Search the best layout of one arrangement; return its file."""
+    space = problem.space
+    low, high = np.array(space.ranges(arrangement)).T
+    free = low < high
+    # The machine itself is the first trial of its own arrangement, so that no worse one is found.
+    own = own_values(space.spec)
+    is_own = list(arrangement.order) == space.pattern.plate_order
+    is_own &= list(arrangement.branches) == space.pattern.branches
+    known = start == 0 and is_own and bool(np.all((low <= own) & (own <= high)))
+
+    def whole(some: Array) -> Array:
+        values = low.copy()
+        values[free] = some
+        return values
+
+    stream = [seed, start, *arrangement.order, *(b + 1 for b in arrangement.branches)]
+    found = differential_evolution(
+        lambda some: problem.cost(problem.trial(whole(some), arrangement)),
+        Bounds(low[free], high[free]),
+        maxiter=generations,
+        popsize=POPULATION,
+        seed=np.random.default_rng(stream),
+        x0=own[free] if known else None,
+        polish=False,
+        tol=1e-6,
+    )
+    exact = problem.missed(problem.trial(whole(found.x), arrangement))
+    for digits in (DIGITS, 2 * DIGITS):  # the best lies on limits, which rounding may miss
+        values = space.rounded(whole(found.x), digits)
+        measures = problem.trial(values, arrangement)
+        missed = problem.missed(measures)
+        if missed.keys() <= exact.keys():
+            break
+    order, branches = list(arrangement.order), list(arrangement.branches)
+    kept = Found(order, branches, values.tolist(), _finite(measures), missed, int(found.nfev))
+    return sealed_json(dataclasses.asdict(kept))
+
+
+def judge(problem: Problem, machine: str) -> bytes:
+    """Measure a machine, by name or file, at all instants, and run it; return the file."""
+    scenario = dataclasses.replace(problem.scenario, mechanism=machine)
+    experiment = assemble(scenario)
+    mechanism, time = experiment.mechanism, check_instants(scenario.duration)
+    motion = motion_of(mechanism.home, experiment.reference, time)
+    links = ClearanceScene(mechanism, base=False)
+    least = clearance_along(links, mechanism, time, motion.wanted[:, :6]).least(fixed=False)
+    measures = {"reach": least_reach(mechanism, motion)}
+    if measures["reach"] > 0 and least is not None:
+        measures = geometry(mechanism, motion)
+        if not singular(measures):
+            measures["torque"] = peak_torque(experiment.nominal, motion)
+        measures["clearance"] = least.distance
+    try:
+        outcome = outcome_of(run_in_bulk(scenario))
+    except ConfigError as error:
+        outcome = Outcome("refused", str(error), time=0.0)
+    return sealed_json(dataclasses.asdict(Judged(_finite(measures), least, outcome)))
+
+
+def _best_of(problem: Problem, found: list[Found], best: int) -> list[Found]:
+    """Return those that keep the limits and differ, the best first."""
+    spans = np.array([max(high - low, 1e-12) for low, high in problem.space.bounds.values()])
+    chosen: list[Found] = []
+    for one in sorted(found, key=lambda one: problem.cost(one.measures)):
+        alike = any(
+            (one.order, one.branches) == (other.order, other.branches)
+            and np.all(np.abs(np.subtract(one.values, other.values)) <= _SAME * spans)
+            for other in chosen
+        )
+        if not one.missed and not alike and len(chosen) < best:
+            chosen.append(one)
+    return chosen
+
+
+def _plain(spec: MechanismSpec) -> dict[str, Any]:
+    """Return the contents of a file, without fields that are null."""
+    return {key: value for key, value in dataclasses.asdict(spec).items() if value is not None}
+
+
+def _finite(measures: Mapping[str, float]) -> dict[str, float]:
+    """Return finite measures; a motion through a singularity has an infinite condition number."""
+    return {name: float(value) for name, value in measures.items() if math.isfinite(value)}
+
+
+def _read(kind: type[Any], expected: str, path: Path) -> Any:
+    return validate(kind, load_json(path, _MAX_BYTES, expected, sealed=True), str(path))

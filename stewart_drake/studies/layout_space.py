@@ -3,9 +3,9 @@
 A point of the space is a value for each of `PARAMETERS`, together with an arrangement: which joint
 of the plate each leg takes, and which crank solution. Both have a pattern's threefold symmetry.
 
-Measures are the worst over the motion and home. The search takes them at some tens of instants with
-the distances of `mechanism.clearance`, which are too small rather than too large; the judgement of
-what was found at all instants that are checked, with the shapes themselves.
+Measures are the worst over the motion and home. The search computes them at some tens of instants,
+with the distances of `mechanism.clearance`, which are lower bounds. The result is judged at all
+instants that are checked, with the shapes themselves.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,6 @@ from stewart_drake.mechanism.files import (
     pattern_legs,
 )
 from stewart_drake.mechanism.kinematics import (
-    LegGeometry,
     Legs,
     legs_along,
     reach_margins,
@@ -37,19 +36,25 @@ from stewart_drake.mechanism.kinematics import (
 )
 from stewart_drake.scenario.signals import ACCELERATIONS, ANGLES, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.studies.workspace_map import rate_gains, wrenches
 from stewart_drake.types import Array
 
 
 class Measure(NamedTuple):
-    """Something that is asked of a layout."""
+    """Quantity that a layout is judged by.
+
+    Attributes:
+        more: whether more is better.
+        unit: in files.
+        factor: from `unit` to `shown`.
+        shown: unit for readers.
+        text: meaning.
+    """
 
     more: bool
-    """Whether more is better."""
     unit: str
     factor: float
-    """From SI to what a person reads."""
     shown: str
-    """The unit of that."""
     text: str
 
 
@@ -72,72 +77,68 @@ MEASURES: Final = {
 
 
 class Motion(NamedTuple):
-    """Home, and then a reference at some instants."""
+    """Home and a reference at some instants.
+
+    Attributes:
+        poses: (n, 6) rad, m; the first is home.
+        wanted: (n - 1, 18) pose, rates and accelerations of the reference.
+    """
 
     poses: Array
-    """(n, 6) rad, m; the first is home."""
     wanted: Array
-    """(n - 1, 18) pose, rates and accelerations of the reference."""
 
 
 def motion_of(home: Array, reference: Trajectory, time: Array) -> Motion:
-    """The motion at the instants (m,) in s, home (6,) before it."""
+    """Return the motion at the instants (m,) in s, after home (6,)."""
     wanted = np.array([evaluate(reference, t) for t in time])
     return Motion(np.vstack([home, wanted[:, POSE]]), wanted)
 
 
 def least_reach(legs: Legs, motion: Motion) -> float:
-    """m, negative where a pose is out of reach."""
+    """Return the least reach margin in m, negative if a pose is out of reach."""
     return float(reach_margins(legs, motion.poses).min())
 
 
 def geometry(mechanism: Legs, motion: Motion) -> dict[str, float]:
-    """All measures but the torque, of a machine that reaches every pose, and `parallel`.
+    """Return all measures but the torque, and `parallel`; every pose must be in reach.
 
-    `parallel`: least det W, with its sign at home made positive; see `studies.workspace_map`.
+    `parallel` is the least det W, positive at home; see `studies.workspace_map`.
     """
     legs = legs_along(mechanism, motion.poses)
-    length = np.linalg.norm(mechanism.p_PQ, axis=1).mean()
-    wrenches = np.concatenate([np.cross(legs.p_PQ_W, legs.rod) / length, legs.rod], axis=-1)
-    parallel = np.linalg.det(wrenches)
-    values = np.linalg.svd(
-        wrenches / (mechanism.crank_lengths * legs.transmission)[..., None], compute_uv=False
-    )
-    # At a parallel singularity the least value is zero, and infinite is what that amounts to.
-    with np.errstate(divide="ignore"):
+    W = wrenches(mechanism, legs)
+    parallel, values = np.linalg.det(W), rate_gains(mechanism, legs, W)
+    with np.errstate(divide="ignore"):  # infinite at a parallel singularity
         condition = float((values[:, 0] / values[:, -1]).max())
     lean = np.einsum("nli,li->nl", legs.rod, mechanism.R_WS[:, :, 2])
+    # The angle between a rod in the frame of the plate and the same at home.
+    rods = legs.rod @ rotation(motion.poses[:, ANGLES])
+    turns = np.arccos(np.clip(np.einsum("nli,li->nl", rods, rods[0]), -1.0, 1.0))
     return {
         "reach": least_reach(mechanism, motion),
         "transmission": float(np.abs(legs.transmission).min()),
         "condition": condition,
         "clearance": float(clearances(mechanism, motion.poses, legs).min()),
-        "plate_joint_deg": float(np.rad2deg(_turns(legs, motion.poses).max())),
+        "plate_joint_deg": float(np.rad2deg(turns.max())),
         "crank_joint_deg": float(np.rad2deg(np.abs(np.arcsin(np.clip(lean, -1, 1))).max())),
         "parallel": float((np.sign(parallel[0]) * parallel).min()),
     }
 
 
-def _turns(legs: LegGeometry, poses: Array) -> Array:
-    """Angles (n, 6) in rad between a rod as the plate sees it and as it saw it at home."""
-    R_WP = rotation(poses[:, ANGLES])
-    seen = legs.rod @ R_WP
-    return np.arccos(np.clip(np.einsum("nli,li->nl", seen, seen[0]), -1.0, 1.0))
-
-
 def peak_torque(dynamics: StewartDynamics, motion: Motion) -> float:
-    """N m, of any motor, to follow the reference exactly."""
+    """Return the largest torque in N m of any motor that follows the reference exactly."""
     torques = [
         dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in motion.wanted
     ]
     return float(np.abs(torques).max())
 
 
-class Wish(NamedTuple):
-    """Limits of a layout, and the goal of the search."""
+class Requirements(NamedTuple):
+    """Limits of a layout by measure, and the goal of the search.
+
+    A limit is the least value if more is better, else the largest.
+    """
 
     limits: dict[str, float]
-    """By measure: the least value where more is better, else the largest."""
     goal: str
 
     def missed(self, found: Mapping[str, float]) -> dict[str, float]:
@@ -154,8 +155,10 @@ class Wish(NamedTuple):
         return -found[self.goal] if MEASURES[self.goal].more else found[self.goal]
 
 
-def wish_of(goal: str, limits: Mapping[str, float], usual: Mapping[str, float]) -> Wish:
-    """Limits as asked for, and as usual where nothing was asked.
+def requirements(
+    goal: str, limits: Mapping[str, float], usual: Mapping[str, float]
+) -> Requirements:
+    """Return the goal with the given limits, and the usual ones for other measures.
 
     Raises:
         ConfigError: an unknown measure, or a limit that is not a number.
@@ -169,7 +172,7 @@ def wish_of(goal: str, limits: Mapping[str, float], usual: Mapping[str, float]) 
         if not np.isfinite(value):
             raise ConfigError(f"--limit {name}: got {value:g}; expected a number")
     merged = {**usual, **limits}
-    return Wish({name: merged[name] for name in MEASURES if name in merged}, goal)
+    return Requirements({name: merged[name] for name in MEASURES if name in merged}, goal)
 
 
 def singular(found: Mapping[str, float]) -> float:
@@ -189,27 +192,30 @@ PARAMETERS: Final = (
     "crank",
     "rod",
 )
-"""What is varied: fields of `mechanism.files.PatternSpec`, and lengths of crank and rod in m."""
+"""Numbers that vary: fields of `mechanism.files.PatternSpec`, lengths of crank and rod in m."""
 CHOICES: Final = ("plate_order", "branches")
-"""What is chosen from a few."""
+"""Discrete properties that vary."""
 _LENGTHS: Final = ("base_radius", "plate_radius", "crank", "rod")
 DIGITS: Final = 4
-"""Decimals that are enough: of lengths in m a tenth of a millimetre."""
+"""Decimals of a found value: tenths of a millimetre."""
 
 
 class Arrangement(NamedTuple):
-    """How the legs go, for all three pairs alike."""
+    """Order and crank solutions of the legs, the same for all three pairs.
+
+    Attributes:
+        order: (6,): leg i takes joint order[i] of the plate.
+        branches: (6,) of -1 or 1.
+        centre_deg: plate offset at which a pair's joints are symmetric about it.
+    """
 
     order: tuple[int, ...]
-    """(6,): leg i takes joint order[i] of the plate."""
     branches: tuple[int, ...]
-    """(6,) of -1 or 1."""
     centre_deg: float
-    """The plate offset that puts a pair's joints as far to the left of it as to the right."""
 
     @property
     def key(self) -> str:
-        """Text for the name of a file."""
+        """Part of the name of a file."""
         signs = "".join("+" if branch > 0 else "-" for branch in self.branches[:2])
         return f"joints{''.join(map(str, self.order))}_cranks{signs}"
 
@@ -219,10 +225,9 @@ class Space:
     """Set of the layouts to choose from.
 
     Attributes:
-        spec: of the machine that the search begins from; what is not varied stays as it is there.
-        bounds: lowest and highest value by parameter; of the plate's offset, where it is not kept,
-            from the arrangement's centre.
-        kept: of `CHOICES`, what stays as in `spec`.
+        spec: of the machine that the search begins from; everything that does not vary stays.
+        bounds: lowest and highest value by parameter.
+        kept: those of `CHOICES` that stay as in `spec`.
         offset_from_centre: whether the plate's offset is counted from the arrangement's centre.
     """
 
@@ -233,12 +238,11 @@ class Space:
 
     @property
     def pattern(self) -> PatternSpec:
-        """Pattern of the machine that the search begins from."""
         assert self.spec.pattern is not None
         return self.spec.pattern
 
     def arrangements(self) -> list[Arrangement]:
-        """All of them, that of the machine itself first."""
+        """Return all arrangements, that of the machine itself first."""
         own_order, own_branches = tuple(self.pattern.plate_order), tuple(self.pattern.branches)
         neighbours, pairs = (5, 0, 1, 2, 3, 4), (0, 1, 2, 3, 4, 5)
         orders, signs = [own_order, neighbours, pairs], [own_branches]
@@ -249,44 +253,47 @@ class Space:
         return [Arrangement(order, branches, _centre(order)) for order, branches in unique]
 
     def ranges(self, arrangement: Arrangement) -> list[tuple[float, float]]:
-        """Bounds of `PARAMETERS` for one arrangement."""
+        """Return the bounds of `PARAMETERS` for one arrangement."""
         shift = arrangement.centre_deg if self.offset_from_centre else 0.0
         return [
             (low + shift, high + shift) if name == "plate_offset_deg" else (low, high)
             for name, (low, high) in self.bounds.items()
         ]
 
-    def legs(self, values: Sequence[float] | Array, arrangement: Arrangement) -> Legs:
-        """Return the legs, which kinematics needs."""
+    def _pattern(
+        self, values: Sequence[float] | Array, arrangement: Arrangement
+    ) -> tuple[PatternSpec, float, float]:
+        """Return the pattern, and the lengths of crank and rod."""
         named = dict(zip(PARAMETERS, map(float, values), strict=True))
         crank, rod = named.pop("crank"), named.pop("rod")
-        return pattern_legs(self._pattern(named, arrangement), crank, rod)
+        order, branches = list(arrangement.order), list(arrangement.branches)
+        pattern = replace(self.pattern, plate_order=order, branches=branches, **named)  # type: ignore[arg-type]
+        return pattern, crank, rod
+
+    def legs(self, values: Sequence[float] | Array, arrangement: Arrangement) -> Legs:
+        """Return the legs for kinematics."""
+        return pattern_legs(*self._pattern(values, arrangement))
 
     def machine(
         self, values: Sequence[float] | Array, arrangement: Arrangement, name: str
     ) -> MechanismSpec:
-        """A machine file's contents.
+        """Return the contents of a machine file.
 
         A longer link of the same section has a mass that grows with its length, and moments that
-        grow with the cube of it; the plate keeps its mass and is as wide as its joints. All three
-        moments of a body are scaled alike, so that there is still a body that has them: the small
-        one along a link is taken as more than it is.
+        grow with the cube of it. The plate keeps its mass and is as wide as its joints. All three
+        moments of a body are scaled alike, so that a body with them exists; the small one along a
+        link is overestimated.
         """
-        named = dict(zip(PARAMETERS, map(float, values), strict=True))
-        crank, rod = named.pop("crank"), named.pop("rod")
-        wider = named["plate_radius"] / self.pattern.plate_radius
+        pattern, crank, rod = self._pattern(values, arrangement)
+        wider = pattern.plate_radius / self.pattern.plate_radius
         return replace(
             self.spec,
             name=name,
-            pattern=self._pattern(named, arrangement),
+            pattern=pattern,
             crank=_longer(self.spec.crank, crank),
             rod=_longer(self.spec.rod, rod),
-            plate=BodySpec(self.spec.plate.mass, _times(self.spec.plate.inertia, wider**2)),
+            plate=BodySpec(self.spec.plate.mass, _scaled(self.spec.plate.inertia, wider**2)),
         )
-
-    def _pattern(self, named: Mapping[str, float], arrangement: Arrangement) -> PatternSpec:
-        order, branches = list(arrangement.order), list(arrangement.branches)
-        return replace(self.pattern, plate_order=order, branches=branches, **named)
 
     def rounded(self, values: Array, digits: int = DIGITS) -> Array:
         """Return values rounded to `digits` decimals, except those that do not vary."""
@@ -297,16 +304,16 @@ class Space:
 def space_around(
     spec: MechanismSpec, vary: Mapping[str, tuple[float, float]], keep: Sequence[str]
 ) -> Space:
-    """The space about a machine: half to twice its lengths, all angles, unless said otherwise.
+    """Return the layouts around a machine: by default half to twice its lengths, and all angles.
 
     Args:
         spec: of a machine with a pattern.
-        vary: bounds, lowest and highest, by parameter; equal ones fix it.
+        vary: lowest and highest value by parameter; equal ones fix it.
         keep: parameters and choices that stay as they are.
 
     Raises:
         ConfigError: a machine without a pattern, names that are unknown or both varied and kept,
-            bounds the wrong way round, or beyond what a machine's file may hold.
+            wrong bounds.
     """
     if spec.pattern is None:
         raise ConfigError(
@@ -351,8 +358,8 @@ def space_around(
 
 
 def own_values(spec: MechanismSpec) -> Array:
-    """`PARAMETERS` of a machine with a pattern; of lengths leg by leg their mean."""
-    return np.array([_own(spec)[name] for name in PARAMETERS])
+    """Return `PARAMETERS` of a machine with a pattern; the mean of lengths given leg by leg."""
+    return np.array(list(_own(spec).values()))
 
 
 def _own(spec: MechanismSpec) -> dict[str, float]:
@@ -364,7 +371,7 @@ def _own(spec: MechanismSpec) -> dict[str, float]:
 
 
 def _centre(order: tuple[int, ...]) -> float:
-    """Minus the mean azimuth of the first two legs' joints as seen from their own pair, degrees."""
+    """Return minus the mean azimuth of the joints of legs 1 and 2 about their pair, degrees."""
     azimuths = [(120.0 * (joint // 2) + 180.0) % 360.0 - 180.0 for joint in order[:2]]
     return -float(np.mean(azimuths))
 
@@ -372,14 +379,14 @@ def _centre(order: tuple[int, ...]) -> float:
 def _longer(spec: LinkSpec, length: float) -> LinkSpec:
     ratio = length / float(np.mean(spec.length))
     return replace(
-        spec, length=length, mass=spec.mass * ratio, inertia=_times(spec.inertia, ratio**3)
+        spec, length=length, mass=spec.mass * ratio, inertia=_scaled(spec.inertia, ratio**3)
     )
 
 
-def _times(moments: list[float] | None, factor: float) -> list[float] | None:
+def _scaled(moments: list[float] | None, factor: float) -> list[float] | None:
     if moments is None or factor == 1:
         return moments
     larger = [factor * moment for moment in moments]
-    # Of a flat plate one is the sum of the other two, which it must not exceed by rounding.
+    # One moment of a flat plate is the sum of the other two; rounding must not lift it above.
     sums = [larger[1] + larger[2], larger[2] + larger[0], larger[0] + larger[1]]
     return [min(one, (1 - 1e-15) * most) for one, most in zip(larger, sums, strict=True)]

@@ -126,7 +126,7 @@ class LinkStudy:
     def summary(self) -> dict[str, Any]:
         return {
             "best_bound": None if self.best is None else self.best.bound,
-            "default_bound": self.usual,
+            "usual_bound": self.usual,
             "survivable_loss": self.survivable,
             "runs": self.runs,
             "bounds": [cell.summary for cell in self.bounds],

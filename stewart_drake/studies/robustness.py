@@ -1,88 +1,311 @@
-"""Monte Carlo study of a scenario: many runs, each with one drawn machine.
+"""Monte Carlo study of a scenario: many runs, each with one drawn machine."""
 
-Drake is imported by the study, not by its options.
-"""
-
+import csv
 import dataclasses
+import io
+import math
+import re
+from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Final, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials, write_whole
+from stewart_drake.files.versions import versions
+from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import scenario_to_dict
+from stewart_drake.studies.jobs import Progress, run_jobs
+from stewart_drake.studies.runs import Outcome, loops_of, read_outcome
+from stewart_drake.studies.statistics import (
+    Correlation,
+    Explanation,
+    Interval,
+    explain,
+    holm,
+    quantile_interval,
+    rank_correlation,
+    wilson_interval,
+)
 from stewart_drake.studies.study_options import Ranges, RobustnessOptions
+from stewart_drake.studies.uncertainty import MACHINE, Draw, Scales, draw, run_draw, scales_of
+from stewart_drake.types import Array
 
-if TYPE_CHECKING:
-    from stewart_drake.studies.jobs import Progress
-    from stewart_drake.studies.robustness_result import RobustnessStudy
+QUANTILES: Final = (0.5, 0.75, 0.9, 0.95, 0.99)
+SIGNED: Final = tuple(name for name, one in MACHINE.items() if one.signed)
+"""Quantities with a sign; their sizes are ranked too, as |payload| and |delay|."""
+
+
+class Influence(NamedTuple):
+    """Correlation of a quantity with the outcome.
+
+    Attributes:
+        factor, unit: of the quantity.
+        error: with E_ac among the runs that completed.
+        error_p: its p-value, adjusted by Holm over all quantities.
+        failure: with failing (1 or 0) among all runs.
+        failure_p: its p-value, adjusted.
+    """
+
+    factor: str
+    unit: str
+    error: Correlation
+    error_p: float
+    failure: Correlation
+    failure_p: float
+
+    @property
+    def strength(self) -> float:
+        """The larger of the two |rho|; -1 for a quantity that never changed."""
+        return max(-1.0 if math.isnan(c.rho) else abs(c.rho) for c in (self.error, self.failure))
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        return {
+            "factor": self.factor,
+            "unit": self.unit,
+            "error": self.error._asdict() | {"adjusted_p": self.error_p},
+            "failure": self.failure._asdict() | {"adjusted_p": self.failure_p},
+        }
+
+
+class RobustnessStudy(NamedTuple):
+    """Monte Carlo study; the i-th draw belongs to the i-th outcome.
+
+    Attributes:
+        experiment: of the scenario.
+        ranges, scales, seed: of the draws.
+        limit: E_ac in % s above which a completed run counts as failed, or None.
+        undisturbed: outcome of the scenario itself.
+        draws, outcomes: of the machines.
+        also: by name of another controller, its undisturbed outcome and those on the same draws.
+    """
+
+    experiment: Experiment
+    ranges: Ranges
+    scales: Scales
+    seed: int
+    limit: float | None
+    undisturbed: Outcome
+    draws: list[Draw]
+    outcomes: list[Outcome]
+    also: dict[str, tuple[Outcome, list[Outcome]]] = {}
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the files and folders of the study."""
+        return ["runs.csv", "runs/"]
+
+    @property
+    def others(self) -> "dict[str, RobustnessStudy]":
+        """The same study with each of the other controllers."""
+        return {
+            name: self._replace(undisturbed=undisturbed, outcomes=outcomes, also={})
+            for name, (undisturbed, outcomes) in self.also.items()
+        }
+
+    @property
+    def failed(self) -> NDArray[np.bool_]:
+        """(n,) whether a run left the workspace, or ended above the limit."""
+        return np.array([self.reason_of(one) != "" for one in self.outcomes], dtype=bool)
+
+    @property
+    def errors(self) -> Array:
+        """(n,) E_ac in % s, NaN for a run that did not complete."""
+        return np.array([one.error for one in self.outcomes])
+
+    @property
+    def success(self) -> Interval:
+        """Share of runs that did not fail."""
+        return wilson_interval(int(np.sum(~self.failed)), len(self.outcomes))
+
+    def reason_of(self, outcome: Outcome) -> str:
+        """Return why a run counts as failed, without the number of the leg, or an empty text."""
+        if outcome.status != "completed":
+            return re.sub(r"\bleg \d\b", "a leg", outcome.reason)
+        if self.limit is not None and not outcome.error <= self.limit:
+            return f"completed with E_ac above {self.limit:g} % s"
+        return ""
+
+    @property
+    def reasons(self) -> dict[str, int]:
+        """Number of failures by reason, the most frequent first."""
+        counts = Counter(self.reason_of(one) for one in self.outcomes)
+        return {reason: n for reason, n in counts.most_common() if reason}
+
+    @property
+    def loops(self) -> dict[str, int]:
+        """Number of runs by what ran them, see `loop.bulk.Ending`."""
+        return loops_of(self.outcomes)
+
+    def quantile(self, probability: float) -> Interval:
+        """Return a quantile of E_ac over all runs, % s; an incomplete run counts as infinite."""
+        return quantile_interval(np.where(np.isnan(self.errors), np.inf, self.errors), probability)
+
+    def influences(self) -> list[Influence]:
+        """Return one per factor and per size of a signed one, the strongest first."""
+        values, done = factor_values(self.draws), ~np.isnan(self.errors)
+        error = {name: rank_correlation(x[done], self.errors[done]) for name, x in values.items()}
+        failure = {name: rank_correlation(x, self.failed) for name, x in values.items()}
+        error_p = holm([one.p_value for one in error.values()])
+        failure_p = holm([one.p_value for one in failure.values()])
+        found = [
+            Influence(name, unit_of(name), error[name], p, failure[name], q)
+            for name, p, q in zip(values, error_p, failure_p, strict=True)
+        ]
+        return sorted(found, key=lambda one: -one.strength)
+
+    @property
+    def explanation(self) -> Explanation:
+        """How the failing runs differ from the others."""
+        return explain(factor_values(self.draws), self.failed)
+
+    @property
+    def _common_summary(self) -> dict[str, Any]:
+        """The part of the summary that other controllers have too."""
+        return {
+            "success": {"runs": int(np.sum(~self.failed)), **self.success._asdict()},
+            "failures": self.reasons,
+            "E_ac_of_all": {str(q): self.quantile(q)._asdict() for q in QUANTILES},
+            "undisturbed": dataclasses.asdict(self.undisturbed),
+        }
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Content of `summary.json`; E_ac in % s, infinite quantiles (failed runs) as null."""
+        done, of_completed = np.isfinite(self.errors), None
+        if done.any():
+            of_completed = {
+                str(q): quantile_interval(self.errors[done], q)._asdict() for q in QUANTILES
+            }
+        by_leg = Counter(one.leg for one in self.outcomes if one.leg is not None)
+        return {
+            "runs": len(self.outcomes),
+            "seed": self.seed,
+            **self._common_summary,
+            "limit": self.limit,
+            "completed": int(done.sum()),
+            "failures_by_leg": {str(leg): by_leg[leg] for leg in sorted(by_leg)},
+            "E_ac_of_completed": of_completed,
+            "influences": [one.summary for one in self.influences()],
+            "explanation": self.explanation.summary,
+            "loops": self.loops,
+            "beside": {name: one._common_summary for name, one in self.others.items()},
+            "ranges": dataclasses.asdict(self.ranges),
+            "scales": self.scales._asdict(),
+            "scenario": scenario_to_dict(self.experiment.scenario),
+            "versions": versions(),
+        }
 
 
 def study_robustness(
     scenario: Scenario,
     directory: str | Path,
     options: RobustnessOptions,
-    progress: "Progress | None" = None,
-) -> "RobustnessStudy":
-    """Run a scenario undisturbed and then with drawn machines, or go on with an earlier study.
-
-    Nothing is drawn where an undisturbed run, with this or another controller, does not complete.
+    progress: Progress | None = None,
+) -> RobustnessStudy:
+    """Run a scenario undisturbed and then with drawn machines, or continue an earlier study.
 
     Args:
         scenario: to run; draws add to its own disturbances.
-        directory: for runs.csv; the runs are kept in runs/. More runs may be asked for later.
+        directory: of runs.csv; the runs are kept in runs/. A later call may ask for more runs.
         options: see `RobustnessOptions`. Names in `also` become names of folders.
         progress: as `run_jobs` takes it.
 
     Raises:
         As `run_jobs`, and ConfigError for a scenario that does not suit, and for an undisturbed run
-            that does not complete.
+            that does not complete, also with another controller.
     """
-    from stewart_drake.loop.preparation import prepare
-    from stewart_drake.scenario.loading import scenario_to_dict
-    from stewart_drake.studies.jobs import run_jobs
-    from stewart_drake.studies.robustness_result import RobustnessStudy, table
-    from stewart_drake.studies.runs import read_outcome
-    from stewart_drake.studies.uncertainty import draw, run_draw, scales_of, undisturbed_run
-
-    ranges, seed, also = options.ranges or Ranges(), options.seed, dict(options.also or {})
+    ranges, seed = options.ranges or Ranges(), options.seed
     experiment, directory = prepare(scenario), Path(directory)
-    settings: dict[str, Any] = {
-        "scenario": scenario_to_dict(scenario),
-        "ranges": dataclasses.asdict(ranges),
-        "seed": seed,
-    }
-    common: dict[str, Any] = {
-        "settings": settings,
-        "workers": options.workers,
-        "scheduler": options.scheduler,
-        "read": read_outcome,
-    }
-    undisturbed = undisturbed_run(scenario, "", directory / "runs", common)
-    alone = {
-        name: undisturbed_run(other, name, directory / f"runs_{name}", common)
-        for name, other in also.items()
-    }
-    scales = scales_of(experiment, undisturbed.peak_torque)
+    drawn_with = {"ranges": dataclasses.asdict(ranges), "seed": seed}
+
+    def run(
+        name: str, scenario: Scenario, draws: dict[str, Draw], progress: Progress | None = None
+    ) -> list[Outcome]:
+        found = run_jobs(
+            {key: (scenario, one) for key, one in draws.items()},
+            run_draw,
+            directory / (f"runs_{name}" if name else "runs"),
+            settings={"scenario": scenario_to_dict(scenario), **drawn_with},
+            read=read_outcome,
+            progress=progress,
+            **options.jobs,
+        )
+        return list(found.values())
+
+    controllers = {"": scenario, **(options.also or {})}
+    undisturbed = {}
+    for name, one in controllers.items():
+        (undisturbed[name],) = run(name, one, {"undisturbed": {}})
+        _check_undisturbed(name, undisturbed[name])
+    scales = scales_of(experiment, undisturbed[""].peak_torque)
     draws = [draw(ranges, scales, scenario, seed, index) for index in range(options.runs)]
-    jobs = {f"run{i:06d}": (scenario, one) for i, one in enumerate(draws)}
-    outcomes = run_jobs(jobs, run_draw, directory / "runs", progress=progress, **common)
-    others = {}
-    for name, other in also.items():
-        common["settings"] = settings | {"scenario": scenario_to_dict(other)}
-        again = {key: (other, d) for key, (_, d) in jobs.items()}
-        place = directory / f"runs_{name}"
-        found = run_jobs(again, run_draw, place, progress=progress, **common)
-        others[name] = (alone[name], list(found.values()))
+    named = {f"run{i:06d}": one for i, one in enumerate(draws)}
+    outcomes = {name: run(name, one, named, progress) for name, one in controllers.items()}
     study = RobustnessStudy(
         experiment,
         ranges,
         scales,
         seed,
         options.limit,
-        undisturbed,
+        undisturbed[""],
         draws,
-        list(outcomes.values()),
-        others,
+        outcomes[""],
+        {name: (undisturbed[name], outcomes[name]) for name in controllers if name},
     )
     remove_partials(directory)
     write_whole(directory / "runs.csv", table(study))
     return study
+
+
+def _check_undisturbed(name: str, one: Outcome) -> None:
+    if one.status != "completed":
+        raise ConfigError(
+            f"robustness{f' with {name}' if name else ''}: the undisturbed run fails at "
+            f"{one.time:.2f} s ({one.reason}), so no machine was drawn; expected a scenario and a "
+            "controller that complete undisturbed"
+        )
+
+
+def unit_of(factor: str) -> str:
+    """Return the unit of a factor, or of its size."""
+    return MACHINE[factor.strip("|")].unit
+
+
+def factors(draws: list[Draw]) -> dict[str, str]:
+    """Return the ranked quantities with their units; of several numbers the rms counts."""
+    return {
+        name: one.unit
+        for name, one in MACHINE.items()
+        if one.unit
+        and (not one.optional or any(name in d and one.in_unit(d[name]) != 0 for d in draws))
+    }
+
+
+def factor_values(draws: list[Draw]) -> dict[str, Array]:
+    """Return (n,) of each factor in its unit, and of the sizes of those with a sign."""
+    arrays = {
+        name: np.array([MACHINE[name].in_unit(one[name]) for one in draws], dtype=np.float64)
+        for name in factors(draws)
+    }
+    return arrays | {f"|{name}|": np.abs(arrays[name]) for name in SIGNED}
+
+
+def table(study: RobustnessStudy) -> str:
+    """Return all runs as CSV, a row each; a missing number is empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    units, values = factors(study.draws), factor_values(study.draws)
+    head = [f"{name} [{unit}]" for name, unit in units.items()]
+    writer.writerow(
+        ["run", "status", "reason", "leg", "time [s]", "E_ac [% s]", "peak_torque [N m]", *head]
+    )
+    for i, one in enumerate(study.outcomes):
+        numbers = [one.time, one.error, one.peak_torque, *(values[name][i] for name in units)]
+        cells = [repr(float(v)) if math.isfinite(v) else "" for v in numbers]
+        writer.writerow([i, one.status, study.reason_of(one), one.leg or "", *cells])
+    return text.getvalue()

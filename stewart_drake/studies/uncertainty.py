@@ -1,16 +1,15 @@
-"""Unknown quantities of a machine: their draws, what they change, and runs with them.
+"""Unknown quantities of a machine: their draws, their effect, and runs with them.
 
-A quantity says how it is drawn, what it changes, and its unit; a model is a table of them by
-name. The table's order is that of the random numbers, so that a new quantity goes to its end and
-leaves all other draws as they were. A draw adds to what the scenario says already. All scales are
-those of the machine and its motion, so that the same shares suit any mechanism.
+A quantity has a function that draws it, one that applies it, and a unit; a model is a table of
+quantities by name. The table's order is that of the random numbers, so that a new quantity goes to
+its end and leaves all other draws as they were. A draw adds to the values of the scenario. All
+scales are those of the machine and its motion, so that the same shares suit any mechanism.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -25,27 +24,25 @@ from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
 from stewart_drake.scenario.trajectories import spread_instants
-from stewart_drake.studies.jobs import run_jobs
 from stewart_drake.studies.runs import Outcome, outcome_of, run_file
 from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.workspace import rms, size_motors
 
 Draw = dict[str, Any]
-"""What was drawn by name of the quantity, SI units: a number, a tuple of them, or None for nothing.
-Empty it changes nothing."""
+"""Drawn values by name of the quantity, SI units: a number, a tuple of them, or None. An empty draw
+changes nothing."""
 
 
 @dataclass
-class Truth:
-    """A scenario and its machine while a draw changes them; the controller's belief stays.
+class Variant:
+    """Scenario and machine with a draw applied; the controller's belief stays.
 
     Attributes:
-        scenario, mechanism: as they were.
-        fields: of the scenario, as they are.
-        parts: fields of the mechanism that are others.
+        scenario, mechanism: without the draw.
+        fields: of the scenario with the draw.
+        parts: fields of the mechanism that the draw changes.
     """
 
     scenario: Scenario
@@ -54,15 +51,15 @@ class Truth:
     parts: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def as_scenario(self) -> Scenario:
-        """The scenario as it is.
+        """Return the scenario with the draw.
 
         Raises:
-            ConfigError: what was drawn is beyond what a scenario may hold.
+            ConfigError: a drawn value is not accepted by the scenario.
         """
         return validate(Scenario, self.fields, "drawn")
 
     def machine(self) -> Mechanism:
-        """The machine as it is.
+        """Return the machine with the draw.
 
         Raises:
             ConfigError, UnreachablePoseError: such parts cannot be assembled at home.
@@ -71,25 +68,28 @@ class Truth:
 
 
 class Quantity(NamedTuple):
-    """One thing that is not known."""
+    """Unknown quantity.
+
+    Attributes:
+        draw: function of random numbers and the context of its model. It takes the same number of
+            random numbers for any range, so that a narrower range leaves other draws unchanged.
+        apply: changes `fields` or `parts` of a variant.
+        unit: in results; empty for a quantity that is not reported.
+        per_unit: number of units in one of SI.
+        signed: whether the sign matters.
+        sometimes: whether it is absent, 0, in half of the draws.
+        optional: whether it is reported only if it is drawn at all.
+    """
 
     draw: Callable[[Generator, Any], Any]
-    """From random numbers and what its model draws with. It takes the same number of random numbers
-    for any range, so that a narrower range leaves the other draws unchanged."""
-    apply: Callable[[Truth, Any], None]
-    """Changes `fields` or `parts`."""
+    apply: Callable[[Variant, Any], None]
     unit: str = ""
-    """Unit in results; empty for a quantity that is not reported."""
     per_unit: float = 1.0
-    """Units in one of SI."""
     signed: bool = False
-    """Either direction may hurt."""
     sometimes: bool = False
-    """Absent, 0, in half of the draws."""
     optional: bool = False
-    """Told only where it is drawn at all."""
 
-    def told(self, value: Any) -> float:
+    def in_unit(self, value: Any) -> float:
         """Return the value in its unit: the rms of several numbers, infinite for None."""
         if value is None:
             return math.inf
@@ -100,173 +100,158 @@ Model = Mapping[str, Quantity]
 
 
 def draw_from(model: Model, rng: Generator, about: Any) -> Draw:
-    """One draw of all quantities; `about` is what the model's quantities are drawn with."""
+    """Draw all quantities of a model in the context `about`."""
     some = [name for name, quantity in model.items() if quantity.sometimes]
-    there = dict(zip(some, rng.integers(2, size=len(some)), strict=True)) if some else {}
+    present = dict(zip(some, rng.integers(2, size=len(some)), strict=True)) if some else {}
     one: Draw = {}
     for name, quantity in model.items():
         value = quantity.draw(rng, about)
-        one[name] = _times(there[name], value) if name in there else value
+        if name in present:
+            times = present[name]
+            several = isinstance(value, tuple)
+            value = tuple(float(times * x) for x in value) if several else float(times * value)
+        one[name] = value
     return one
 
 
-def drawn(model: Model, scenario: Scenario, mechanism: Mechanism, one: Draw) -> Truth:
-    """A scenario and its mechanism with what was drawn; they themselves stay as they are."""
-    truth = Truth(scenario, mechanism, dataclasses.asdict(scenario))
+def apply_draw(model: Model, scenario: Scenario, mechanism: Mechanism, one: Draw) -> Variant:
+    """Return a scenario and its mechanism with a draw."""
+    variant = Variant(scenario, mechanism, dataclasses.asdict(scenario))
     for name, value in one.items():
-        model[name].apply(truth, value)
-    return truth
+        model[name].apply(variant, value)
+    return variant
 
 
-def _times(there: int, value: Any) -> Any:
-    return (
-        tuple(_times(there, x) for x in value) if isinstance(value, tuple) else float(there * value)
-    )
+# ---------------------------------------------------------------- effects
 
 
-# ---------------------------------------------------------------- what quantities change
+def add_to(section: str, field: str) -> Callable[[Variant, Any], None]:
+    """Return a function that adds a number, or several, to a field of the scenario."""
+
+    def apply(variant: Variant, value: Any) -> None:
+        fields = variant.fields[section]
+        if isinstance(value, tuple):
+            fields[field] = [a + b for a, b in zip(fields[field], value, strict=True)]
+        else:
+            fields[field] += value
+
+    return apply
 
 
-def add_payload(truth: Truth, mass: float) -> None:
+def add_payload(variant: Variant, mass: float) -> None:
     """Add kg at the plate's centre of mass; a mass below the payload is taken off the plate."""
-    plant, plate = truth.fields["plant"], truth.mechanism.plate
+    plant, plate = variant.fields["plant"], variant.mechanism.plate
     total = plant["payload_mass"] + mass
     plant["payload_mass"] = max(0.0, total)
     if total < 0:
-        truth.parts["plate"] = Body(plate.mass + total, plate.inertia)
+        variant.parts["plate"] = Body(plate.mass + total, plate.inertia)
 
 
-def add_bias(truth: Truth, bias: tuple[float, ...]) -> None:
-    """Add a bias (6,) in N m at the shafts."""
-    plant = truth.fields["plant"]
-    plant["torque_bias"] = [a + b for a, b in zip(plant["torque_bias"], bias, strict=True)]
-
-
-def add_noise(truth: Truth, share: float) -> None:
+def add_noise(variant: Variant, share: float) -> None:
     """Add noise; its standard deviation is a share of half the reference's peak to peak.
 
-    Encoders have no other noise than their codes.
+    The only noise of encoders is that of their codes.
     """
-    if share != 0 and truth.scenario.sensor.kind == "state":
-        moving = dataclasses.asdict(truth.scenario) | {"reference": truth.fields["reference"]}
+    if share != 0 and variant.scenario.sensor.kind == "state":
+        moving = dataclasses.asdict(variant.scenario)
+        moving["reference"] = variant.fields["reference"]
         motion = assemble(validate(Scenario, moving, "drawn")).motion_scale
-        sensor = truth.fields["sensor"]
+        sensor = variant.fields["sensor"]
         std = np.array(sensor["noise_std"]) + share * np.tile(motion, 2)
         sensor["noise_std"] = std.tolist()
 
 
-def seed_noise(truth: Truth, seed: int) -> None:
+def seed_noise(variant: Variant, seed: int) -> None:
     """Set the seed of drawn noise, or of the phases of encoders; else a sensor keeps its seed."""
-    fields, sensor = truth.fields["sensor"], truth.scenario.sensor
+    fields, sensor = variant.fields["sensor"], variant.scenario.sensor
     if sensor.kind != "state" or fields["noise_std"] != sensor.noise_std:
-        truth.fields["sensor"]["seed"] = seed
+        fields["seed"] = seed
 
 
 def draw_seed(rng: Generator, _: Any) -> int:
-    """A seed for the sensor."""
     return int(rng.integers(2**31))
 
 
-def _over_network(truth: Truth) -> bool:
-    return truth.scenario.link.kind == "network"
+def _over_network(variant: Variant) -> bool:
+    return variant.scenario.link.kind == "network"
 
 
-def _jitter(truth: Truth, std: float) -> None:
-    if _over_network(truth):
-        return
-    truth.fields["delay"]["jitter_std"] += std
+def _add_jitter(variant: Variant, std: float) -> None:
+    if not _over_network(variant):
+        variant.fields["delay"]["jitter_std"] += std
 
 
-def _lose(truth: Truth, share: float) -> None:
-    """Lose a share of the packets or measurements that arrive."""
-    place = _lossy(truth)
-    place["loss"] += share * (1 - place["loss"])
+def _lose(variant: Variant, share: float) -> None:
+    """Lose a share of the packets of a network, or of the measurements, that arrive."""
+    section = variant.fields["link" if _over_network(variant) else "sensor"]
+    section["loss"] += share * (1 - section["loss"])
 
 
-def _lossy(truth: Truth) -> dict[str, Any]:
-    """Return the section with the loss: a network of packets, else the sensor of measurements."""
-    return truth.fields["link" if _over_network(truth) else "sensor"]
-
-
-def _seed_link(truth: Truth, seed: int) -> None:
+def _seed_link(variant: Variant, seed: int) -> None:
     """Set the seed of drawn jitter and losses; an unchanged link keeps its seed."""
-    if truth.fields["delay"]["jitter_std"] != truth.scenario.delay.jitter_std:
-        truth.fields["delay"]["seed"] = seed
-    own = dataclasses.asdict(truth.scenario)
-    for place in ("link", "sensor"):
-        if truth.fields[place].get("loss") != own[place].get("loss"):
-            truth.fields[place]["seed"] = seed
+    own = dataclasses.asdict(variant.scenario)
+    for section, field in (("delay", "jitter_std"), ("link", "loss"), ("sensor", "loss")):
+        if variant.fields[section].get(field) != own[section].get(field):
+            variant.fields[section]["seed"] = seed
 
 
-def _limit_torque(truth: Truth, limit: float | None) -> None:
+def _limit_torque(variant: Variant, limit: float | None) -> None:
     if limit is not None:
-        truth.fields["actuator"]["torque_limit"] = limit
+        variant.fields["actuator"]["torque_limit"] = limit
 
 
-def _damp(truth: Truth, damping: float) -> None:
-    truth.fields["plant"]["joint_damping"] += damping
-
-
-def _rub(truth: Truth, friction: float) -> None:
-    truth.fields["plant"]["coulomb_friction"] += friction
-
-
-def _move_payload(truth: Truth, errors: tuple[float, ...]) -> None:
-    plant = truth.fields["plant"]
-    place = plant["payload_position"]
-    plant["payload_position"] = [a + b for a, b in zip(place, errors, strict=True)]
-
-
-def _delay(truth: Truth, late: float) -> None:
-    if _over_network(truth):  # whose buffer sets the delay
+def _add_delay(variant: Variant, late: float) -> None:
+    """Add a delay in s that is unknown to the controller; over a network the buffer sets it."""
+    if _over_network(variant):
         return
-    sc, believed = truth.scenario, believed_delay(truth.scenario)
+    sc, believed = variant.scenario, believed_delay(variant.scenario)
     fraction = sc.delay.fraction + late / sc.controller.period
     whole = math.floor(fraction + 1e-9)
-    truth.fields["delay"] |= {
+    variant.fields["delay"] |= {
         "steps": sc.delay.steps + whole,
         "fraction": round(max(0.0, fraction - whole), 12),
     }
-    told = {"delay_steps": believed.steps, "delay_fraction": believed.fraction}
-    truth.fields["controller"] |= told
+    belief = {"delay_steps": believed.steps, "delay_fraction": believed.fraction}
+    variant.fields["controller"] |= belief
 
 
-def _lengthen(truth: Truth, errors: tuple[float, ...]) -> None:
-    if any(errors):
-        cranks, rods = np.reshape(errors, (2, NUM_LEGS))
-        m = truth.mechanism
-        lengths = {"crank_lengths": m.crank_lengths + cranks, "rod_lengths": m.rod_lengths + rods}
-        truth.parts |= lengths
+def _add_to_machine(*names: str) -> Callable[[Variant, tuple[float, ...]], None]:
+    """Return a function that adds errors to arrays of the mechanism, one after the other."""
+
+    def apply(variant: Variant, errors: tuple[float, ...]) -> None:
+        if any(errors):
+            arrays = [getattr(variant.mechanism, name) for name in names]
+            split = np.reshape(errors, (len(names), *arrays[0].shape))
+            variant.parts |= {n: a + e for n, a, e in zip(names, arrays, split, strict=True)}
+
+    return apply
 
 
-def _move_anchors(truth: Truth, errors: tuple[float, ...]) -> None:
-    if any(errors):
-        shafts, joints = np.reshape(errors, (2, NUM_LEGS, 3))
-        m = truth.mechanism
-        truth.parts |= {"p_WS": m.p_WS + shafts, "p_PQ": m.p_PQ + joints}
-
-
-# ---------------------------------------------------------------- a machine out of all possible
+# ---------------------------------------------------------------- the unknown machine
 
 
 class Scales(NamedTuple):
-    """Scales that shares refer to, SI units."""
+    """Scales of the drawn shares, SI units.
+
+    Attributes:
+        plate_mass: kg.
+        motion: (6,) half the reference's peak to peak, rad and m.
+        torque: largest on the reference, N m.
+        speed: largest crank rate on the reference, rad/s.
+        crank: mean length, m.
+        period: of the controller, s.
+        commanded: largest torque that the undisturbed run commands, N m.
+        torque_limit: that of the undisturbed run, N m, infinite for none.
+    """
 
     plate_mass: float
     motion: tuple[float, ...]
-    """(6,) half the reference's peak to peak, rad and m."""
     torque: float
-    """Largest on the reference, N m."""
     speed: float
-    """Largest crank rate on the reference, rad/s."""
     crank: float
-    """Mean length, m."""
     period: float
-    """Of the controller, s."""
     commanded: float
-    """Largest torque that the undisturbed run commands, N m."""
     torque_limit: float = math.inf
-    """That of the undisturbed run, N m, infinite for none."""
 
 
 class About(NamedTuple):
@@ -278,7 +263,7 @@ class About(NamedTuple):
 
 
 def scales_of(experiment: Experiment, commanded: float) -> Scales:
-    """The scales of an experiment.
+    """Return the scales of an experiment.
 
     Args:
         experiment: as `prepare` returns it.
@@ -300,20 +285,35 @@ def scales_of(experiment: Experiment, commanded: float) -> Scales:
 
 
 def draw(ranges: Ranges, scales: Scales, scenario: Scenario, seed: int, index: int) -> Draw:
-    """The machine with this index; it does not depend on any other, nor on their number."""
+    """Draw the machine with this index; it does not depend on any other, nor on their number."""
     rng = Generator(np.random.Philox(np.random.SeedSequence([seed, index])))
     return draw_from(MACHINE, rng, About(ranges, scales, scenario))
 
 
-def _of_random_size(rng: Generator, number: int, largest: float) -> tuple[float, ...]:
-    """Draw values whose rms is uniform in [0, largest], in a uniform direction."""
-    size, direction = largest * rng.uniform(), rng.standard_normal(number)
-    return tuple((size * np.sqrt(number) / np.linalg.norm(direction) * direction).tolist())
+def _vector(name: str, scale: str, number: int) -> Callable[[Generator, About], tuple[float, ...]]:
+    """Return a draw of values with an rms uniform from 0 to the range, in a uniform direction."""
+
+    def draw(rng: Generator, about: About) -> tuple[float, ...]:
+        largest = getattr(about.ranges, name) * getattr(about.scales, scale)
+        size, direction = largest * rng.uniform(), rng.standard_normal(number)
+        return tuple((size * np.sqrt(number) / np.linalg.norm(direction) * direction).tolist())
+
+    return draw
+
+
+def _number(name: str, scale: str = "", low: float = 0.0) -> Callable[[Generator, About], float]:
+    """Return a draw of a number, uniform from `low` (0 or -1) to 1 times the range."""
+
+    def draw(rng: Generator, about: About) -> float:
+        largest = getattr(about.ranges, name) * (getattr(about.scales, scale) if scale else 1.0)
+        return float(largest * rng.uniform(low, 1))
+
+    return draw
 
 
 def _draw_limit(rng: Generator, about: About) -> float | None:
     strength, scales, own = rng.uniform(), about.scales, about.scenario.actuator.torque_limit
-    # Where the undisturbed run takes no torque, as at rest without gravity, a limit has no scale.
+    # If the undisturbed run takes no torque, as at rest without gravity, a limit has no scale.
     if about.ranges.torque_limit is None or scales.commanded == 0:
         return own if isinstance(own, float) else None
     low, high = about.ranges.torque_limit
@@ -330,78 +330,52 @@ def _draw_delay(rng: Generator, about: About) -> float:
     r, period, plant = about.ranges, about.scales.period, about.scenario.plant
     steps = math.floor((2 * r.delay_steps + 1) * rng.uniform()) - r.delay_steps
     late = steps + r.delay * rng.uniform(-1, 1)
-    if plant.kind == "multibody":  # which sees torques change at its own steps only
+    if plant.kind == "multibody":  # torques change at its own steps only
         late = round(late * period / plant.time_step) * plant.time_step / period
     # Nothing acts before it is computed.
     return period * float(max(late, -about.scenario.true_delay.periods))
 
 
 MACHINE: Final[Model] = {
-    "payload": Quantity(
-        lambda rng, a: float(a.ranges.payload * a.scales.plate_mass * rng.uniform(-1, 1)),
-        add_payload, "kg", signed=True,
-    ),
+    "payload": Quantity(_number("payload", "plate_mass", -1), add_payload, "kg", signed=True),
     "torque_bias": Quantity(
-        lambda rng, a: _of_random_size(rng, NUM_TORQUES, a.ranges.torque_bias * a.scales.torque),
-        add_bias, "mN m", 1e3,
+        _vector("torque_bias", "torque", NUM_TORQUES), add_to("plant", "torque_bias"), "mN m", 1e3
     ),
-    "noise": Quantity(lambda rng, a: float(a.ranges.noise * rng.uniform()), add_noise, "%", 100),
+    "noise": Quantity(_number("noise"), add_noise, "%", 100),
     "torque_limit": Quantity(_draw_limit, _limit_torque, "N m"),
-    "damping": Quantity(_draw_damping, _damp, "mN m s/rad", 1e3),
-    "delay": Quantity(_draw_delay, _delay, "ms", 1e3, signed=True),
+    "damping": Quantity(_draw_damping, add_to("plant", "joint_damping"), "mN m s/rad", 1e3),
+    "delay": Quantity(_draw_delay, _add_delay, "ms", 1e3, signed=True),
     "lengths": Quantity(
-        lambda rng, a: _of_random_size(rng, 2 * NUM_LEGS, a.ranges.lengths * a.scales.crank),
-        _lengthen, "mm", 1e3,
+        _vector("lengths", "crank", 2 * NUM_LEGS),
+        _add_to_machine("crank_lengths", "rod_lengths"), "mm", 1e3,
     ),
     "anchors": Quantity(
-        lambda rng, a: _of_random_size(rng, 6 * NUM_LEGS, a.ranges.anchors * a.scales.crank),
-        _move_anchors, "mm", 1e3,
+        _vector("anchors", "crank", 6 * NUM_LEGS), _add_to_machine("p_WS", "p_PQ"), "mm", 1e3
     ),
     "seed": Quantity(draw_seed, seed_noise),
     "coulomb": Quantity(
-        lambda rng, a: float(a.ranges.coulomb * a.scales.torque * rng.uniform()),
-        _rub, "mN m", 1e3, optional=True,
-    ),
-    "payload_position": Quantity(
-        lambda rng, a: _of_random_size(rng, 3, a.ranges.payload_position * a.scales.crank),
-        _move_payload, "mm", 1e3, optional=True,
-    ),
-    "jitter": Quantity(
-        lambda rng, a: float(a.ranges.jitter * a.scales.period * rng.uniform()), _jitter, "ms", 1e3,
+        _number("coulomb", "torque"), add_to("plant", "coulomb_friction"), "mN m", 1e3,
         optional=True,
     ),
-    "loss": Quantity(
-        lambda rng, a: float(a.ranges.loss * rng.uniform()), _lose, "%", 100, optional=True
+    "payload_position": Quantity(
+        _vector("payload_position", "crank", 3), add_to("plant", "payload_position"), "mm", 1e3,
+        optional=True,
     ),
+    "jitter": Quantity(_number("jitter", "period"), _add_jitter, "ms", 1e3, optional=True),
+    "loss": Quantity(_number("loss"), _lose, "%", 100, optional=True),
     "link_seed": Quantity(draw_seed, _seed_link),
 }  # fmt: skip
-"""True less believed value of each quantity of `Ranges`."""
-
-
-# ---------------------------------------------------------------- runs
-
-
-def undisturbed_run(scenario: Scenario, name: str, folder: Path, common: dict[str, Any]) -> Outcome:
-    settings = common["settings"] | {"scenario": scenario_to_dict(scenario)}
-    first = {"undisturbed": (scenario, Draw())}
-    one = run_jobs(first, run_draw, folder, **(common | {"settings": settings}))["undisturbed"]
-    if one.status != "completed":
-        raise ConfigError(
-            f"robustness{f' with {name}' if name else ''}: the undisturbed run fails at "
-            f"{one.time:.2f} s ({one.reason}), so no machine was drawn; expected a scenario and a "
-            "controller that complete undisturbed"
-        )
-    return one
+"""True minus believed value of each quantity of `Ranges`."""
 
 
 def run_draw(scenario: Scenario, one: Draw) -> bytes:
-    """The file of one run of a scenario with what was drawn."""
+    """Run a scenario with a draw; return the file of the run."""
     return run_file(_run(scenario, one), one)
 
 
 def _run(scenario: Scenario, one: Draw) -> Outcome:
     try:
-        changed = drawn(MACHINE, scenario, simulated_machine(scenario), one)
+        changed = apply_draw(MACHINE, scenario, simulated_machine(scenario), one)
         variant = changed.as_scenario()
     except ConfigError as error:
         return Outcome("refused", str(error), time=0.0)

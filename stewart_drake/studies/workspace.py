@@ -15,17 +15,15 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import ACCELERATIONS, COORDINATES, LEGS, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.clearance import ClearanceStudy, study_clearance
-from stewart_drake.studies.reach import (
+from stewart_drake.studies.workspace_map import (
     Factor,
     Margins,
-    first_exit,
-    largest_factor,
-    margins_along,
-)
-from stewart_drake.studies.workspace_map import (
     Section,
     Travel,
     characteristic_length,
+    first_exit,
+    largest_factor,
+    margins_along,
     measure,
     sections,
     travel,
@@ -34,14 +32,11 @@ from stewart_drake.types import Array
 
 
 class Sizing(NamedTuple):
-    """Along a motion; arrays (n, 6), a column per crank."""
+    """Motor torque (N m) and crank rate (rad/s) along a motion, (n, 6); `time` (n,) in s."""
 
     time: Array
-    """(n,) s."""
     torque: Array
-    """N m, friction and payload as the dynamics' own parameters say."""
     speed: Array
-    """Crank rates, rad/s."""
 
     @property
     def power(self) -> Array:
@@ -49,10 +44,9 @@ class Sizing(NamedTuple):
         return self.torque * self.speed
 
     def summary(self, torque_limit: float | None) -> list[dict[str, Any]]:
-        """Per leg the peak and rms of torque (N m), speed (rad/s) and power (W), least power too.
+        """Return peak and rms of torque (N m), speed (rad/s) and power (W) of each leg.
 
-        Args:
-            torque_limit: N m, or None; `use_of_limit` is the peak's share of it.
+        `use_of_limit` is the peak's share of the torque limit in N m.
         """
         torque, speed, power = np.abs(self.torque), np.abs(self.speed), self.power
         return [
@@ -65,21 +59,19 @@ class Sizing(NamedTuple):
                 "peak_power": power[:, i].max(),
                 "least_power": power[:, i].min(),
                 "rms_power": rms(power[:, i]),
-                "use_of_limit": np.nan
-                if torque_limit is None
-                else torque[:, i].max() / torque_limit,
+                "use_of_limit": torque[:, i].max() / (torque_limit or np.nan),
             }
             for i in range(len(LEGS))
         ]
 
 
 def rms(values: Array) -> float:
-    """Root mean square of evenly spaced values."""
+    """Return the root mean square of evenly spaced values."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def size_motors(dynamics: StewartDynamics, reference: Trajectory, time: Array) -> Sizing:
-    """The motors' part in following a reference exactly, at the instants `time` (n,) in s.
+    """Return torques and crank rates that follow a reference exactly, at `time` (n,) in s.
 
     T = inverse dynamics of (X, X', X''), crank rates = J X'.
 
@@ -97,14 +89,14 @@ class WorkspaceStudy:
     """Result of `analyze workspace`.
 
     Attributes:
-        experiment: the scenario made concrete, reachable or not.
+        experiment: of the scenario, reachable or not.
         home: why the home pose is unusable, or None.
         exit: when and why the reference first leaves the workspace, or None.
         margins: along the reference.
         factor: largest amplitude factor that fits.
         travel: per coordinate from home; empty with a bad home pose.
         sections: through home; empty with a bad home pose.
-        sizing: of the motors, or None where the reference leaves the workspace.
+        sizing: of the motors, or None if the reference leaves the workspace.
         clearance: whether links touch, along the reference and around home.
     """
 
@@ -134,20 +126,18 @@ class WorkspaceStudy:
     def verdict(self) -> str:
         opening = "" if self.home is None else f"the home pose is singular ({self.home.reason}); "
         time, leg, margin = self.worst
+        closing = f"{self._amplitude}; {self.clearance.verdict}"
         if self.exit is None:
             return (
                 f"yes: {opening}the reference stays in the workspace, leg {leg} is nearest to the "
-                f"end of its reach with {1e3 * margin:.3g} mm left at t = {time:.2f} s; "
-                f"{self._amplitude}; {self.clearance.verdict}"
+                f"end of its reach with {1e3 * margin:.3g} mm left at t = {time:.2f} s; {closing}"
             )
-        short = (
-            f", at worst leg {leg} is short by {-1e3 * margin:.3g} mm at t = {time:.2f} s"
-            if margin < 0
-            else ""
-        )
+        short = ""
+        if margin < 0:
+            short = f", at worst leg {leg} is short by {-1e3 * margin:.3g} mm at t = {time:.2f} s"
         return (
             f"no: {opening}the reference leaves the workspace at t = {self.exit.time:.3f} s, "
-            f"{self.exit.reason}{short}; {self._amplitude}; {self.clearance.verdict}"
+            f"{self.exit.reason}{short}; {closing}"
         )
 
     @property
@@ -156,18 +146,17 @@ class WorkspaceStudy:
         if np.isnan(value):
             return "it does not move"
         if value == 0:
-            home = self.experiment.mechanism
-            return (
-                f"not even its first pose is inside: {first_pose_text(self.margins.pose[0], home)}"
-            )
+            pose = first_pose_text(self.margins.pose[0], self.experiment.mechanism)
+            return f"not even its first pose is inside: {pose}"
         if not self.factor.limited:
             return f"{value:g} times the amplitude fits, more was not tried"
-        return f"the largest amplitude that fits is {self.factor.told} times this one"
+        return f"the largest amplitude that fits is {self.factor.rounded} times this one"
 
     @property
     def summary(self) -> dict[str, Any]:
         """Content of `summary.json`, SI units; NaN for a missing value."""
         m, (time, leg, margin) = self.margins, self.worst
+        mechanism = self.experiment.mechanism
         return {
             "verdict": self.verdict,
             "fits": self.home is None and self.exit is None,
@@ -186,12 +175,12 @@ class WorkspaceStudy:
                 }
                 for i in range(len(LEGS))
             ],
-            "characteristic_length": characteristic_length(self.experiment.mechanism),
+            "characteristic_length": characteristic_length(mechanism),
             "least_parallel": m.parallel.min(),
             "least_held": least(m.held),
             "worst_condition": -least(-m.condition),
             "worst_play": -least(-m.play),
-            "home": measure(self.experiment.mechanism, self.experiment.mechanism.home)._asdict(),
+            "home": measure(mechanism, mechanism.home)._asdict(),
             "travel": [t._asdict() for t in self.travel],
             "sections": [_bounds(section) for section in self.sections],
             "clearance": self.clearance.summary,
@@ -227,9 +216,10 @@ def study_workspace(scenario: Scenario) -> WorkspaceStudy:
 
 
 def _bounds(section: Section) -> dict[str, Any]:
-    """Extent of a section and the share of its window that the workspace fills."""
+    """Return the extent of a section and its best condition number."""
     inside = np.isfinite(section.condition)
-    found = {"coordinates": [COORDINATES[section.first], COORDINATES[section.second]]}
+    found: dict[str, Any] = {}
+    found["coordinates"] = [COORDINATES[section.first], COORDINATES[section.second]]
     for axis, values, used in (
         ("x", section.x, inside.any(axis=0)),
         ("y", section.y, inside.any(axis=1)),
@@ -240,6 +230,6 @@ def _bounds(section: Section) -> dict[str, Any]:
 
 
 def least(values: Array) -> float:
-    """The least of the numbers in an array, NaN where there are none."""
+    """Return the least of the numbers in an array, NaN for none."""
     numbers = values[np.isfinite(values)]
     return float(numbers.min()) if len(numbers) else np.nan

@@ -1,8 +1,8 @@
-"""The workspace around home: how singular a pose is, travel of each coordinate, and sections.
+"""The workspace around home and along a motion: singularity measures, travel, sections, scaling.
 
 Rod i pushes the plate with a force along the unit vector r_i at b_i from the centre of mass: the
 unit-free wrench w_i = [b_i x r_i / rho; r_i], rho the mean distance of the plate joints from it.
-With W = [w_1 ... w_6] and the twist made alike in its parts, [rho omega; v] in m/s,
+With W = [w_1 ... w_6] and the twist scaled alike, [rho omega; v] in m/s,
 
     crank rates = A [rho omega; v],    A = diag(1 / (u_i t_i)) W',    t_i = r_i . tangent_i.
 
@@ -16,79 +16,210 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.trajectories import Trajectory
 from scipy.ndimage import label
 
-from stewart_drake.dynamics.workspace import diagnose, home_sign, margin, standing
+from stewart_drake.dynamics.workspace import Failure, diagnose, home_sign, margin, standing
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import LegGeometry, leg_geometry
+from stewart_drake.mechanism.kinematics import LegGeometry, Legs, leg_geometry
 from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES
 from stewart_drake.types import Array
 
+SECTIONS: Final = ((3, 4), (3, 5), (0, 1), (2, 5))
+"""Pairs of coordinates: x-y, x-z, roll-pitch, yaw-z; the other four stay as at home."""
+POINTS: Final = 51
+"""Poses along each side of a section."""
+LARGEST_FACTOR: Final = 3.0
+"""Largest factor on an amplitude that is tried."""
+FACTOR_STEP: Final = 0.05
+"""Step of the scan for the first amplitude that does not fit."""
+_STEPS: Final = 200
+_BISECTIONS: Final = 30
+_WIDER: Final = 2.0
+"""Width of the first look at a section, in travels: a tilted plate may have more room."""
+_ROUGH: Final = 31
+_RIM: Final = 0.06
+_TIME_TOLERANCE: Final = 1e-9
+_FACTOR_TOLERANCE: Final = 1e-6
+
+
+# ---------------------------------------------------------------- one pose
+
 
 class Measures(NamedTuple):
-    """Measures of one pose; NaN from `transmission` on for a pose outside the workspace."""
+    """Measures of one pose; NaN from `transmission` on for a pose outside the workspace.
+
+    Attributes:
+        reach: (6,) reach margin of each leg, m, negative out of reach.
+        sines: (6,) of the cranks' angles off dead centre, negative out of reach.
+        parallel: det W, positive at home, 0 at a parallel singularity.
+        margin: positive inside the workspace, see `dynamics.workspace.margin`.
+        transmission: (6,) |r . tangent|: share of a crank's push along its rod.
+        held: least singular value of W: how firmly the rods hold the plate in their weakest
+            direction.
+        condition: largest over least singular value of A; 1 for a machine that is alike in all
+            directions.
+        play: m per rad, 1 / least singular value of A: how far crank errors of norm 1 move the
+            plate.
+    """
 
     reach: Array
-    """(6,) reach margin of each leg, m, negative where short."""
     sines: Array
-    """(6,) of the cranks' angles off dead centre, 0 there, negative out of reach."""
     parallel: float
-    """det W with its sign at home made positive, 0 at a parallel singularity."""
     margin: float
-    """Positive inside the workspace, see `dynamics.workspace.margin`."""
     transmission: Array
-    """(6,) |r . tangent|: share of a crank's push that goes along its rod."""
     held: float
-    """Least singular value of W: how firmly the rods hold the plate in their weakest direction."""
     condition: float
-    """Largest over least singular value of A; 1 is a machine alike in all directions."""
     play: float
-    """m per rad, 1 / least singular value of A: how far crank errors of norm 1 move the plate."""
 
 
-def characteristic_length(mechanism: Mechanism) -> float:
-    """rho in m, mean distance of the plate joints from the plate's centre of mass."""
+def characteristic_length(mechanism: Legs) -> float:
+    """Return rho in m, the mean distance of the plate joints from the plate's centre of mass."""
     return float(np.linalg.norm(mechanism.p_PQ, axis=1).mean())
 
 
+def wrenches(mechanism: Legs, legs: LegGeometry) -> Array:
+    """Return W (..., 6, 6), a column per rod, of the legs at some poses."""
+    moments = np.cross(legs.p_PQ_W, legs.rod) / characteristic_length(mechanism)
+    return np.concatenate([moments, legs.rod], axis=-1).swapaxes(-1, -2)
+
+
+def rate_gains(mechanism: Legs, legs: LegGeometry, W: Array) -> Array:
+    """Return the singular values (..., 6) of A, the largest first."""
+    A = W.swapaxes(-1, -2) / (mechanism.crank_lengths * legs.transmission)[..., None]
+    return np.linalg.svd(A, compute_uv=False)
+
+
 def measure(mechanism: Mechanism, pose: Array) -> Measures:
-    """All measures of a pose (6,), which may be out of reach."""
+    """Return all measures of a pose (6,), which may be out of reach."""
     pose = np.asarray(pose, dtype=np.float64)
     now, sign = standing(mechanism, pose), home_sign(mechanism)
     rest = (np.full(6, np.nan), np.nan, np.nan, np.nan)
     if now.margin > 0:
         legs = leg_geometry(mechanism, pose)
         W = wrenches(mechanism, legs)
-        A = W.T / (mechanism.crank_lengths * legs.transmission)[:, None]
-        values = np.linalg.svd(A, compute_uv=False)
+        values = rate_gains(mechanism, legs, W)
         held = float(np.linalg.svd(W, compute_uv=False)[-1])
         rest = (np.abs(legs.transmission), held, values[0] / values[-1], 1 / values[-1])
     parallel = (sign or 1.0) * now.parallel
     return Measures(mechanism.reach_margins(pose), now.sines, parallel, now.margin, *rest)
 
 
-def wrenches(mechanism: Mechanism, legs: LegGeometry) -> Array:
-    """W (6, 6), a column per rod, of the legs at a pose."""
-    moments = np.cross(legs.p_PQ_W, legs.rod) / characteristic_length(mechanism)
-    return np.hstack([moments, legs.rod]).T
+# ---------------------------------------------------------------- along a motion
 
 
-SECTIONS: Final = ((3, 4), (3, 5), (0, 1), (2, 5))
-"""Pairs of coordinates: x-y, x-z, roll-pitch, yaw-z; the other four stay as at home."""
-POINTS: Final = 51
-"""Poses along each side of a section."""
-_STEPS: Final = 200
-_BISECTIONS: Final = 30
-_WIDER: Final = 2.0
-"""A section is first looked for this many travels wide: leaning may give room to shift."""
-_ROUGH: Final = 31
-_RIM: Final = 0.06
+class Margins(NamedTuple):
+    """Measures along a motion, arrays (n,) or (n, 6); see `Measures`."""
+
+    time: Array
+    pose: Array
+    reach: Array
+    sines: Array
+    parallel: Array
+    transmission: Array
+    held: Array
+    condition: Array
+    play: Array
+
+
+class Factor(NamedTuple):
+    """Largest factor by which a motion can be scaled about its first pose.
+
+    `value` is NaN for a motion that does not move; 0 if its first pose is outside the workspace;
+    `LARGEST_FACTOR` with `limited` False if that much fits.
+    """
+
+    value: float
+    limited: bool
+
+    @property
+    def rounded(self) -> str:
+        """Value rounded down, so that this motion does fit."""
+        return f"{np.floor(1e3 * self.value) / 1e3:g}"
+
+
+def margins_along(mechanism: Mechanism, reference: Trajectory, time: Array) -> Margins:
+    """Return all measures of a reference at the instants (n,) in s."""
+    poses = np.array([reference.value(t)[:, 0] for t in time])
+    rows = [measure(mechanism, pose) for pose in poses]
+    columns = {
+        name: np.array([getattr(row, name) for row in rows])
+        for name in Margins._fields
+        if name not in ("time", "pose")
+    }
+    return Margins(time=time, pose=poses, **columns)
+
+
+def first_exit(mechanism: Mechanism, reference: Trajectory, time: Array) -> Failure | None:
+    """Return why a reference leaves the workspace, and when to 1e-9 s; None if it never does.
+
+    An excursion that is shorter than the spacing of `time` (n,) can go unseen.
+    """
+
+    def failure(t: float) -> Failure | None:
+        return diagnose(mechanism, float(t), reference.value(t)[:, 0])
+
+    for k, t in enumerate(time):
+        if failure(t) is not None:
+            before = time[max(k - 1, 0)]
+            return failure(border(lambda s: failure(s) is None, before, t, _TIME_TOLERANCE)[1])
+    return None
+
+
+def largest_factor(mechanism: Mechanism, reference: Trajectory, time: Array) -> Factor:
+    """Return the largest f so that X(0) + f (X(t) - X(0)) is inside at all of `time` (n,).
+
+    For a sine, f scales its amplitude. Workspaces are not convex: a motion that does not fit may
+    fit again when it is larger. So f is the end of the first range that fits, found by a scan in
+    steps of `FACTOR_STEP` and bisection; a gap narrower than a step can go unseen.
+    """
+    poses = np.array([reference.value(t)[:, 0] for t in time])
+    change = poses - poses[0]
+
+    def fits(factor: float) -> bool:
+        return all(margin(mechanism, poses[0] + factor * row) > 0 for row in change)
+
+    if not fits(0.0):
+        return Factor(0.0, True)
+    if not change.any():
+        return Factor(np.nan, False)
+    steps = round(LARGEST_FACTOR / FACTOR_STEP)
+    factor = last_inside(fits, LARGEST_FACTOR, steps, _FACTOR_TOLERANCE)
+    return Factor(factor, factor < LARGEST_FACTOR)
+
+
+def border(
+    inside: Callable[[float], bool], low: float, high: float, tolerance: float
+) -> tuple[float, float]:
+    """Return two numbers closer than a tolerance, the first inside and the second not."""
+    while high - low > tolerance:
+        middle = (low + high) / 2
+        low, high = (middle, high) if inside(middle) else (low, middle)
+    return low, high
+
+
+def last_inside(
+    inside: Callable[[float], bool], limit: float, steps: int = _STEPS, tolerance: float = 0.0
+) -> float:
+    """Return the largest s in [0, limit] with everything before it inside.
+
+    The scan finds the first exit unless one is narrower than a step; `inside(0)` holds. The
+    default tolerance is that of 30 bisections of a step.
+    """
+    step = limit / steps
+    last = next((k for k in range(steps) if not inside((k + 1) * step)), None)
+    if last is None:
+        return limit
+    return border(inside, last * step, (last + 1) * step, tolerance or step / 2**_BISECTIONS)[0]
+
+
+# ---------------------------------------------------------------- around home
 
 
 class Travel(NamedTuple):
-    """How far one coordinate goes from home while the others stay, rad or m from home.
+    """Travel of one coordinate from home while the others stay, rad or m from home.
 
-    `low_reason` and `high_reason` say what ends it; "" where nothing did within half a turn or a
+    `low_reason` and `high_reason` say what ends it; empty if nothing did within half a turn or a
     rod's length.
     """
 
@@ -100,72 +231,51 @@ class Travel(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A section of the workspace through home; arrays (len(y), len(x)).
+    """Section of the workspace through home; arrays (len(y), len(x)), axes in rad or m.
 
-    `condition` is NaN outside the part that is connected with home within the section; `margin` is
-    positive in that part and zero on its border, see `dynamics.workspace.margin`.
+    `first` and `second` are the indices of the coordinates along x and y. `condition` is NaN
+    outside the part that is connected with home within the section; `margin` is positive in that
+    part and zero on its border, see `dynamics.workspace.margin`.
     """
 
     first: int
-    """Index of the coordinate along x."""
     second: int
     x: Array
-    """rad or m."""
     y: Array
     condition: Array
     margin: Array
 
 
-def border(
-    inside: Callable[[float], bool], low: float, high: float, tolerance: float
-) -> tuple[float, float]:
-    """Two numbers so close to each other, the first inside and the second not, by bisection."""
-    while high - low > tolerance:
-        middle = (low + high) / 2
-        low, high = (middle, high) if inside(middle) else (low, middle)
-    return low, high
-
-
-def last_inside(
-    inside: Callable[[float], bool], limit: float, steps: int = _STEPS, tolerance: float = 0.0
-) -> float:
-    """Largest s in [0, limit] with everything before it inside.
-
-    The scan finds the first exit unless one is narrower than a step; `inside(0)` holds. The
-    tolerance, if none is given, is that of 30 bisections of a step.
-    """
-    step = limit / steps
-    last = next((k for k in range(steps) if not inside((k + 1) * step)), None)
-    if last is None:
-        return limit
-    return border(inside, last * step, (last + 1) * step, tolerance or step / 2**_BISECTIONS)[0]
-
-
 def travel(mechanism: Mechanism) -> list[Travel]:
-    """The travel of all six coordinates; none from a home pose outside the workspace."""
-    if diagnose(mechanism, 0.0, mechanism.home) is not None:
+    """Return the travel of all six coordinates; empty for a home pose outside the workspace."""
+    home = mechanism.home
+    if diagnose(mechanism, 0.0, home) is not None:
         return []
+
+    def end(direction: Array, limit: float) -> tuple[float, str]:
+        last = last_inside(lambda s: margin(mechanism, home + s * direction) > 0, limit)
+        failure = diagnose(mechanism, 0.0, home + (last + 1e-6 * limit) * direction)
+        return last, "" if last == limit or failure is None else failure.reason
+
     limits = [np.pi] * 3 + [float(mechanism.rod_lengths.max())] * 3
     found = []
-    for k, limit in enumerate(limits):
-        axis = np.eye(NUM_COORDINATES)[k]
-        (low, why_low), (high, why_high) = (_end(mechanism, d * axis, limit) for d in (-1, 1))
-        found.append(Travel(COORDINATES[k], -low, high, why_low, why_high))
+    for name, axis, limit in zip(COORDINATES, np.eye(NUM_COORDINATES), limits, strict=True):
+        (low, why_low), (high, why_high) = end(-axis, limit), end(axis, limit)
+        found.append(Travel(name, -low, high, why_low, why_high))
     return found
 
 
 def sections(mechanism: Mechanism, points: int = POINTS) -> list[Section]:
-    """The sections `SECTIONS`; none from a home pose outside the workspace."""
+    """Return the sections `SECTIONS`; empty for a home pose outside the workspace."""
     spans = [(t.low, t.high) for t in travel(mechanism)]
     return [_section(mechanism, pair, spans, points) for pair in SECTIONS if spans]
 
 
-def _end(mechanism: Mechanism, direction: Array, limit: float) -> tuple[float, str]:
-    """How far it goes from home in a direction, and what is there."""
-    home = mechanism.home
-    end = last_inside(lambda s: margin(mechanism, home + s * direction) > 0, limit)
-    failure = diagnose(mechanism, 0.0, home + (end + 1e-6 * limit) * direction)
-    return end, "" if end == limit or failure is None else failure.reason
+def pose_in_section(mechanism: Mechanism, pair: tuple[int, int], a: float, b: float) -> Array:
+    """Return the home pose with two other coordinates."""
+    pose = mechanism.home.copy()
+    pose[list(pair)] = a, b
+    return pose
 
 
 def _section(
@@ -175,21 +285,24 @@ def _section(
     x_range, y_range = (
         (home[i] + _WIDER * spans[k][0], home[i] + _WIDER * spans[k][1]) for i, k in enumerate(pair)
     )
-    # Twice: over a window that is surely too large, then over what the workspace fills of it.
+
+    def at(a: float, b: float) -> Array:
+        return pose_in_section(mechanism, pair, a, b)
+
+    # Twice: over a window that is surely too large, then over the part that the workspace fills.
     for number in (_ROUGH, points):
         x, y = np.linspace(*x_range, number), np.linspace(*y_range, number)
-        inside = np.array([[margin(mechanism, _at(mechanism, pair, a, b)) for a in x] for b in y])
+        inside = np.array([[margin(mechanism, at(a, b)) for a in x] for b in y])
         connected = _connected(inside > 0, np.hypot(*np.meshgrid(x - home[0], y - home[1])))
         x_range, y_range = _window(x, connected), _window(y, connected.T)
     condition = np.full(connected.shape, np.nan)
     for j, i in zip(*np.nonzero(connected), strict=True):
-        pose = _at(mechanism, pair, float(x[i]), float(y[j]))
-        condition[j, i] = measure(mechanism, pose).condition
+        condition[j, i] = measure(mechanism, at(x[i], y[j])).condition
     return Section(*pair, x, y, condition, np.where(connected, inside, -np.abs(inside)))
 
 
 def _connected(inside: NDArray[np.bool_], distance: Array) -> NDArray[np.bool_]:
-    """The part of `inside` that holds the point nearest to home."""
+    """Return the part of `inside` that holds the point nearest to home."""
     if not inside.any():
         return inside
     parts, _ = label(inside)
@@ -198,14 +311,8 @@ def _connected(inside: NDArray[np.bool_], distance: Array) -> NDArray[np.bool_]:
 
 
 def _window(axis: Array, inside: NDArray[np.bool_]) -> tuple[float, float]:
-    """The part of an axis over the inside, with a rim; all of it where nothing is inside."""
+    """Return the part of an axis over the inside, with a rim; all of it if nothing is inside."""
     used = np.asarray(inside.any(axis=0))
     ends = axis[used][[0, -1]] if used.any() else axis[[0, -1]]
     rim = axis[1] - axis[0] + _RIM * (ends[1] - ends[0])
     return float(ends[0] - rim), float(ends[1] + rim)
-
-
-def _at(mechanism: Mechanism, pair: tuple[int, int], a: float, b: float) -> Array:
-    pose = mechanism.home.copy()
-    pose[list(pair)] = a, b
-    return pose
