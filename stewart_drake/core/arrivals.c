@@ -1,8 +1,8 @@
 /* See arrivals.h. */
 
 #include "arrivals.h"
+#include "short.h"
 
-#define U STEWART_MOTORS
 #define FURTHEST ((real)1e3) /* s; up to there periods are told apart */
 
 static real arrival(const stewart_arrivals *a, int i)

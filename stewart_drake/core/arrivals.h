@@ -1,7 +1,6 @@
 /* Which torque acts when, for a delay of any length that may drift. */
 
-#ifndef STEWART_ARRIVALS_H
-#define STEWART_ARRIVALS_H
+#pragma once
 
 #include "machine.h"
 
@@ -38,5 +37,3 @@ int stewart_switches(const stewart_arrivals *arrivals, real begin, real end, int
    `in_flight` (flights, 6) has the oldest first; all before the last `sent` do not count. */
 int stewart_within(const stewart_arrivals *arrivals, int flights, const real *in_flight, real begin,
                    real end, int newest, real *torques, real *durations);
-
-#endif

@@ -14,9 +14,8 @@
    is kept: the delay is found by comparing filters (delay_search.c). */
 
 #include "delay.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define U STEWART_MOTORS
 #define MOST STEWART_MAX_SCHEDULE
 
 #define ITERATIONS 6 /* at the most, while the delay is hardly known */
@@ -60,11 +59,7 @@ void stewart_guess_keep_root(int n, const real *L, stewart_guess *guess)
 
 real stewart_guess_std(const stewart_guess *guess, int n)
 {
-    const real *row = guess->numbers + n + (n - 2) * (n - 1) / 2;
-    real square = 0;
-    for (int j = 0; j < n - 1; j++)
-        square += row[j] * row[j];
-    return REAL(sqrt)(square);
+    return stewart_norm(n - 1, guess->numbers + n + (n - 2) * (n - 1) / 2);
 }
 
 /* ---- one period ------------------------------------------------------------------------------- */
@@ -266,14 +261,6 @@ static real timing_of(const stewart_delay *d, const stewart_guess *guess)
     return guess->timing > least ? guess->timing : least;
 }
 
-static real deviation(int n, const real *L, int i)
-{
-    real square = 0;
-    for (int j = 0; j < n; j++)
-        square += L[n * i + j] * L[n * i + j];
-    return REAL(sqrt)(square);
-}
-
 /* Noise of the model, and of torques early or late by a variance `used`, where it is linearised. */
 static int set_noise(Model *a, const real *xi, real used, stewart_scratch scratch)
 {
@@ -405,7 +392,7 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
 {
     const stewart_delay *d = a->period->delay;
     const int n = a->n, m = a->m, p = d->machine->estimated;
-    const int free_eta = deviation(n, L, n - 2) > 0, free_rate = deviation(n, L, n - 1) > 0;
+    const int free_eta = stewart_norm(n, L + n * (n - 2)) > 0, free_rate = stewart_norm(n, L + n * (n - 1)) > 0;
     real *lower = stewart_take(&scratch, n), *upper = stewart_take(&scratch, n);
     real *C = a->instant.C, distance, spread;
     if (std > d->period / 10) {
@@ -461,7 +448,7 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
 {
     const stewart_delay *d = a->period->delay;
     const int n = a->n;
-    const real dt = d->period, std = deviation(n, L, n - 2), timing = timing_of(d, guess);
+    const real dt = d->period, std = stewart_norm(n, L + n * (n - 2)), timing = timing_of(d, guess);
     const real used = timing > least ? timing : least;
     real *xi = stewart_take(&scratch, n), *posterior = stewart_take(&scratch, n * n);
     real *R = stewart_take(&scratch, n * n), *W = stewart_take(&scratch, n * (n + MOST));
@@ -554,7 +541,7 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
     a.instant.J = stewart_take(&scratch, m * X);
     stewart_guess_root(guess, n, L);
     for (int i = 0; i < p; i++)
-        if (!(deviation(n, L, X + i) <= KNOWN * d->usual_std[i])) /* or NaN */
+        if (!(stewart_norm(n, L + n * (X + i)) <= KNOWN * d->usual_std[i])) /* or NaN */
             a.exact = 1;
     const int goes = stewart_period_at(t, guess->numbers, a.exact, a.first, a.first + X, scratch);
     if (y && goes) {

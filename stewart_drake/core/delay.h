@@ -1,7 +1,6 @@
 /* State, parameters and an unknown delay: the filter of one hypothesis, and the search among them. */
 
-#ifndef STEWART_DELAY_H
-#define STEWART_DELAY_H
+#pragma once
 
 #include "arrivals.h"
 #include "instant.h"
@@ -122,5 +121,3 @@ void stewart_delay_start(const stewart_delay *delay, int flights, stewart_delay_
 void stewart_delay_observe(const stewart_delay *delay, int flights, const real *in_flight,
                            const real *y, const real *near, stewart_delay_memory *memory,
                            stewart_scratch scratch);
-
-#endif

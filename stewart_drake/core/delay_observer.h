@@ -1,8 +1,7 @@
 /* Observers of an unknown delay. `sensing` of the law is `stewart_state_sensor` or
    `stewart_encoders`, `estimation` is `stewart_delay_settings`. */
 
-#ifndef STEWART_DELAY_OBSERVER_H
-#define STEWART_DELAY_OBSERVER_H
+#pragma once
 
 #include "delay.h"
 #include "law.h"
@@ -10,11 +9,9 @@
 /* `delay` without machine and sensing, which are the law's. */
 typedef struct {
     stewart_delay delay;
-    int values; /* of a sample alone: 12, or 6 of encoders */
+    int values; /* of one sample */
     int most;   /* torques that act until the next one does, at the most */
 } stewart_delay_settings;
 
 extern const stewart_observer stewart_delay_observer; /* of the measured state */
 extern const stewart_observer stewart_encoder_delay_observer;
-
-#endif

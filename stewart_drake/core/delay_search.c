@@ -15,9 +15,7 @@
    best few, and one that fits alone takes over. */
 
 #include "delay.h"
-
-#define X STEWART_STATES
-#define U STEWART_MOTORS
+#include "short.h"
 
 #define LEAD 7       /* log of the odds at which the search is over */
 #define FORGOTTEN 14 /* log of the odds at which a cell is dropped */
@@ -158,16 +156,6 @@ static void spawn(Search *s, int k, stewart_scratch scratch)
     stewart_guess_keep_root(n, L, cell);
 }
 
-static void transpose(int n, real *A)
-{
-    for (int i = 0; i < n; i++)
-        for (int j = 0; j < i; j++) {
-            const real a = A[n * i + j];
-            A[n * i + j] = A[n * j + i];
-            A[n * j + i] = a;
-        }
-}
-
 /* State (12) from one measurement alone, and the lower triangular root (12, 12) of its covariance. */
 static int start_of(const stewart_sensing *sensing, const real *y, const real *near, real *state,
                     real *root, stewart_scratch scratch)
@@ -175,10 +163,10 @@ static int start_of(const stewart_sensing *sensing, const real *y, const real *n
     real W[X * X];
     if (!sensing->start(sensing, y, near, state, W, scratch))
         return 0;
-    transpose(X, W);
+    stewart_transpose(X, W);
     stewart_fill(X * X, 0, root);
     stewart_absorb(X, X, root, W, scratch);
-    transpose(X, root);
+    stewart_transpose(X, root);
     return 1;
 }
 

@@ -2,12 +2,7 @@
 
 #include "design.h"
 #include "observer.h"
-
-#define X STEWART_STATES
-#define U STEWART_MOTORS
-#define ROW STEWART_REFERENCE
-
-static const real SQRT_3 = (real)1.7320508075688772;
+#include "short.h"
 
 int stewart_order(const stewart_cost *cost, int pending)
 {

@@ -1,7 +1,6 @@
 /* The gain: a linear model of the error where the next torque acts, its cost, and the feedforward. */
 
-#ifndef STEWART_DESIGN_H
-#define STEWART_DESIGN_H
+#pragma once
 
 #include "machine.h"
 #include "riccati.h"
@@ -50,5 +49,3 @@ void stewart_feed_back(const stewart_cost *cost, const real *K, const real *erro
 
 int stewart_linearize_scratch(void);
 int stewart_gain_scratch(const stewart_cost *cost, int pending);
-
-#endif

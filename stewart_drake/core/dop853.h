@@ -1,7 +1,6 @@
 /* Runge-Kutta steps of order 8 with error control, and the polynomial of order 7 within each. */
 
-#ifndef DOP853_H
-#define DOP853_H
+#pragma once
 
 #define STATES 12
 #define STAGES 16
@@ -31,5 +30,3 @@ int dop853_step(dop853 *s, double end);
 
 /* The state at a time within the last step. */
 void dop853_at(dop853 *s, double time, double *x);
-
-#endif

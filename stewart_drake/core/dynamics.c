@@ -5,36 +5,36 @@
 #include "dynamics.h"
 
 #include "equations.h"
+#include "short.h"
 
 #if PARAMETERS != STEWART_PARAMETERS || GEOMETRY != STEWART_GEOMETRY
 #error "dynamics.h and equations.h are of different equations"
 #endif
 
-#define NUM_LEGS 6
 #define SUMS 28 /* numbers of `equations.Sums`, each triangle of a symmetric matrix once */
-#define COMMON (NUM_LEGS * LEG_NUMBERS) /* where the geometry goes on after the legs */
+#define COMMON (LEGS * LEG_NUMBERS) /* where the geometry goes on after the legs */
 
 /* `equations.slip` of six cranks. */
 static void slips(const real *crank_rates, const real *parameters, real *slip)
 {
-    for (int leg = 0; leg < NUM_LEGS; leg++)
+    for (int leg = 0; leg < LEGS; leg++)
         slip[leg] = REAL(tanh)(crank_rates[leg] / parameters[COULOMB_SPEED]);
 }
 
 /* Plate and legs, summed, B' by columns, rates and slips of the cranks. */
 typedef struct {
-    real sums[SUMS], arms[36], rates[NUM_LEGS], slip[NUM_LEGS];
+    real sums[SUMS], arms[36], rates[LEGS], slip[LEGS];
 } Motion;
 
 static void motion(const stewart_plant *plant, const real *pose, const real *rates, Motion *m)
 {
     const real *legs = plant->geometry, *common = legs + COMMON, *parameters = plant->parameters;
-    real moving[21], added[SUMS * NUM_LEGS];
+    real moving[21], added[SUMS * LEGS];
     plate_motion(pose, rates, parameters, plant->gravity, common, moving, m->sums);
     leg_motion(moving, common, legs, added, m->arms, m->rates);
     for (int i = 0; i < SUMS; i++)
-        for (int leg = 0; leg < NUM_LEGS; leg++)
-            m->sums[i] += added[NUM_LEGS * i + leg];
+        for (int leg = 0; leg < LEGS; leg++)
+            m->sums[i] += added[LEGS * i + leg];
     /* They cost a tenth of all this, and nobody reads them without Coulomb friction. */
     memset(m->slip, 0, sizeof m->slip);
     if (parameters[COULOMB] != 0)
@@ -86,26 +86,26 @@ void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, 
 {
     const real *legs = plant->geometry, *common = legs + COMMON;
     const real *parameters = plant->parameters, *gravity = plant->gravity;
-    real mass[36], arm_rates[NUM_LEGS], slip[NUM_LEGS];
-    real change_of_legs[72 * NUM_LEGS], mass_of_legs[36 * NUM_LEGS];
+    real mass[36], arm_rates[LEGS], slip[LEGS];
+    real change_of_legs[72 * LEGS], mass_of_legs[36 * LEGS];
     plate_derivatives(pose, rates, accelerations, parameters, gravity, common, dF_dx, mass);
     crank_rates(pose, rates, legs, arm_rates);
     slips(arm_rates, parameters, slip);
     leg_derivatives(pose, rates, accelerations, parameters, gravity, common, legs, torque, parameters,
                     slip, change_of_legs, mass_of_legs, B);
     for (int i = 0; i < 72; i++)
-        for (int leg = 0; leg < NUM_LEGS; leg++)
-            dF_dx[i] += change_of_legs[NUM_LEGS * i + leg];
+        for (int leg = 0; leg < LEGS; leg++)
+            dF_dx[i] += change_of_legs[LEGS * i + leg];
     for (int i = 0; i < 36; i++)
-        for (int leg = 0; leg < NUM_LEGS; leg++)
-            mass[i] += mass_of_legs[NUM_LEGS * i + leg];
+        for (int leg = 0; leg < LEGS; leg++)
+            mass[i] += mass_of_legs[LEGS * i + leg];
     pose_derivatives(pose, rates, accelerations, parameters, gravity, mass, B, arm_rates, slip, dF_dp,
                      M);
 }
 
 void stewart_measures(const real *geometry, const real *pose, const real *angles, real *measures)
 {
-    real sines[NUM_LEGS], wrenches[36];
+    real sines[LEGS], wrenches[36];
     if (angles)
         leg_measures_of_tree(pose, geometry + COMMON, geometry, angles, sines, wrenches);
     else

@@ -1,7 +1,6 @@
 /* The equations of motion of a machine. No state, no allocation: any thread may call. */
 
-#ifndef STEWART_DYNAMICS_H
-#define STEWART_DYNAMICS_H
+#pragma once
 
 #include "real.h"
 
@@ -49,5 +48,3 @@ void stewart_measures(const real *geometry, const real *pose, const real *angles
 
 /* Advance a state (12) by one step of h seconds of the classical Runge-Kutta method. */
 void stewart_move(const stewart_plant *plant, const real *torque, real h, real *state);
-
-#endif

@@ -2,10 +2,8 @@
 
 #include "encoder_filter.h"
 #include "filter_attempt.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define U STEWART_MOTORS
-#define LEGS 6
 #define MAX_ROWS 18 /* six legs at three nodes */
 #define ITERATIONS 6
 #define SMALL ((real)0.1) /* a correction of so many standard deviations needs no second iteration */
@@ -262,4 +260,10 @@ static int start_scratch(const stewart_filter *filter)
     return stewart_encoder_scratch(filter->sensing->kind);
 }
 
-const stewart_legs stewart_encoder_legs = {attempt, attempt_scratch, moved, start_scratch};
+static void count_still(const stewart_sensing *sensing, const real *values, const real *last, real *still)
+{
+    stewart_encoders_stood(sensing->kind, values, last, still);
+}
+
+const stewart_legs stewart_encoder_legs = {attempt, attempt_scratch, moved, start_scratch,
+                                           count_still};

@@ -1,7 +1,6 @@
 /* The filter for encoders: legs at several instants of a period. */
 
-#ifndef STEWART_ENCODER_FILTER_H
-#define STEWART_ENCODER_FILTER_H
+#pragma once
 
 #include "encoders.h"
 #include "filter.h"
@@ -10,5 +9,3 @@
 
 /* `legs` of a filter whose sensing is `stewart_encoder_sensing`. */
 extern const stewart_legs stewart_encoder_legs;
-
-#endif

@@ -1,9 +1,8 @@
 /* See encoders.h. */
 
 #include "encoders.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define LEGS 6
 #define MAX_NODES 3
 #define ENOUGH ((real)0.3)  /* share of a leg's samples that are needed for it to count */
 #define STANDS_OUT 8        /* median absolute deviations by which a residual stands out (Hampel) */
@@ -12,9 +11,10 @@
 #define LAST_FEW 9          /* samples that fix the angle at the last of them */
 #define PAIRS (LAST_FEW * (LAST_FEW - 1) / 2)
 
-static int is_enough(const stewart_encoders *encoders, int number)
+/* Whether `number` of N samples are enough for a leg. */
+static int is_enough(const stewart_encoders *encoders, int N, int number)
 {
-    return number >= encoders->nodes && (real)number >= ENOUGH * (real)encoders->samples;
+    return number >= (N > 1 ? encoders->nodes : 1) && (real)number >= ENOUGH * (real)N;
 }
 
 /* Instant of a sample in [-1, 1]. */
@@ -64,8 +64,8 @@ static void seen_of_encoders(const stewart_sensing *sensing, const real *state, 
     stewart_crank_angles(encoders->geometry, state, values);
     for (int i = 0; i < LEGS; i++)
         values[i] += encoders->offset[i];
-    for (int n = 1; n < encoders->samples; n++)
-        stewart_copy(LEGS, values, values + LEGS * n);
+    for (int n = LEGS; n < sensing->size; n += LEGS)
+        stewart_copy(LEGS, values, values + n);
 }
 
 static void jacobian_of_encoders(const stewart_sensing *sensing, const real *state, real *J)
@@ -73,20 +73,20 @@ static void jacobian_of_encoders(const stewart_sensing *sensing, const real *sta
     const stewart_encoders *encoders = sensing->kind;
     real one[LEGS * 6];
     stewart_crank_jacobian(encoders->geometry, state, one);
-    stewart_fill(LEGS * encoders->samples * X, 0, J);
-    for (int row = 0; row < LEGS * encoders->samples; row++)
+    stewart_fill(sensing->size * X, 0, J);
+    for (int row = 0; row < sensing->size; row++)
         stewart_copy(6, one + 6 * (row % LEGS), J + X * row);
 }
 
 /* Angle (rad) of a leg at the last sample; NaN for none. With more than M of them by the line through
    the last few whose slope and height are medians (Theil and Sen): a few wrong ones do no harm. */
-static real last_angle(const stewart_encoders *encoders, const real *values, int leg)
+static real last_angle(int N, const real *values, int leg)
 {
     real t[LAST_FEW], y[LAST_FEW], slopes[PAIRS];
     int number = 0, pairs = 0;
-    for (int n = encoders->samples - 1; n >= 0 && number < LAST_FEW; n--)
+    for (int n = N - 1; n >= 0 && number < LAST_FEW; n--)
         if (isfinite(values[LEGS * n + leg])) {
-            t[number] = (real)(n + 1) / (real)encoders->samples - 1;
+            t[number] = (real)(n + 1) / (real)N - 1;
             y[number++] = values[LEGS * n + leg];
         }
     if (number <= MAX_NODES)
@@ -114,7 +114,7 @@ static int start_of_encoders(const stewart_sensing *sensing, const real *values,
     const real *expected = near && stewart_all_finite(X, near) ? near : encoders->declared;
     stewart_crank_angles(encoders->geometry, expected, angles);
     for (int leg = 0; leg < LEGS; leg++) {
-        const real angle = last_angle(encoders, values, leg);
+        const real angle = last_angle(sensing->size / LEGS, values, leg);
         known[leg] = isfinite(angle);
         if (known[leg])
             angles[leg] = angle - encoders->offset[leg];
@@ -142,22 +142,39 @@ static int start_of_encoders(const stewart_sensing *sensing, const real *values,
     return 1;
 }
 
-stewart_sensing stewart_encoder_sensing(const stewart_encoders *encoders)
+static int fault_of_encoders(const stewart_sensing *sensing, const real *geometry, real period,
+                             const real *values, const real *last)
 {
-    return (stewart_sensing){LEGS * encoders->samples, encoders->noise_std, encoders,
-                             seen_of_encoders,        jacobian_of_encoders, start_of_encoders, NULL};
+    const int N = sensing->size / LEGS;
+    (void)geometry, (void)period, (void)last;
+    for (int leg = 0; leg < LEGS; leg++) {
+        int number = 0;
+        for (int n = 0; n < N; n++)
+            number += isfinite(values[LEGS * n + leg]) != 0;
+        if (is_enough(sensing->kind, N, number))
+            return 0;
+    }
+    return STEWART_MISSING;
+}
+
+stewart_sensing stewart_encoder_sensing(const void *sensor)
+{
+    const stewart_encoders *encoders = sensor;
+    return (stewart_sensing){LEGS * encoders->samples, encoders->noise_std, encoders, seen_of_encoders,
+                             jacobian_of_encoders, start_of_encoders, fault_of_encoders, NULL};
+}
+
+stewart_sensing stewart_newest_encoders(const void *sensor)
+{
+    stewart_sensing sensing = stewart_encoder_sensing(sensor);
+    sensing.size = LEGS;
+    return sensing;
 }
 
 int stewart_encoder_fault(const stewart_encoders *encoders, const real *values)
 {
-    for (int leg = 0; leg < LEGS; leg++) {
-        int number = 0;
-        for (int n = 0; n < encoders->samples; n++)
-            number += isfinite(values[LEGS * n + leg]) != 0;
-        if (is_enough(encoders, number))
-            return 0;
-    }
-    return STEWART_MISSING;
+    const stewart_sensing sensing = stewart_encoder_sensing(encoders);
+    return fault_of_encoders(&sensing, NULL, 0, values, NULL);
 }
 
 /* How often the codes of a leg changed, since the last of the period before. */
@@ -274,7 +291,7 @@ void stewart_read(const stewart_encoders *encoders, const real *values, const re
         reading->odd[leg] = N > MAX_NODES && reject(encoders, shown, leg, angles, scratch);
         for (int n = 0; n < N; n++)
             number += isfinite(angles[LEGS * n + leg]) != 0;
-        const int counts = is_enough(encoders, number) && project(encoders, angles, leg, K, squares);
+        const int counts = is_enough(encoders, N, number) && project(encoders, angles, leg, K, squares);
         changes = changes_of(encoders, angles, last, leg);
         if (encoders->quantum > 0 && number) {
             share = (real)changes / (real)number; /* independent samples over samples */

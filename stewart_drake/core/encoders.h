@@ -1,7 +1,6 @@
 /* Motor encoders: what is measured of six crank angles within a period. */
 
-#ifndef STEWART_ENCODERS_H
-#define STEWART_ENCODERS_H
+#pragma once
 
 #include "kinematics.h"
 #include "sensing.h"
@@ -21,7 +20,9 @@ typedef struct {
     const real *noise_std;         /* (6 N) */
 } stewart_encoders;
 
-stewart_sensing stewart_encoder_sensing(const stewart_encoders *encoders);
+/* The sensor of a `stewart_encoders`, and that of the last sample of a period alone. */
+stewart_sensing stewart_encoder_sensing(const void *sensor);
+stewart_sensing stewart_newest_encoders(const void *sensor);
 
 /* What is wrong with values (6 N), or 0: they are of use as long as one leg is. */
 int stewart_encoder_fault(const stewart_encoders *encoders, const real *values);
@@ -65,5 +66,3 @@ void stewart_beside(const stewart_encoders *encoders, const stewart_reading *rea
 
 /* Scratch of `start` and `stewart_read`: numbers at the most. */
 int stewart_encoder_scratch(const stewart_encoders *encoders);
-
-#endif

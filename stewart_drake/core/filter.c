@@ -1,10 +1,8 @@
 /* See filter.h. */
 
 #include "filter_attempt.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define U STEWART_MOTORS
-#define LEGS 6
 #define ITERATIONS 4 /* at the most; one does once the parameters are roughly known */
 #define KNOWN ((real)0.01) /* a parameter is known when its deviation is this share of the usual one */
 #define LEARNT ((real)0.3) /* the same, for parameters that are good enough over a few periods */
@@ -23,19 +21,11 @@ stewart_posterior stewart_posterior_at(real *numbers, int n, int m)
 
 static int size_of(const stewart_filter *filter) { return X + filter->machine->estimated; }
 
-static real length(int n, const real *x)
-{
-    real sum = 0;
-    for (int i = 0; i < n; i++)
-        sum += x[i] * x[i];
-    return REAL(sqrt)(sum);
-}
-
 static int is_known(const stewart_filter *filter, const real *root, real share)
 {
     const int n = size_of(filter);
     for (int i = X; i < n; i++)
-        if (!(length(n, root + n * i) <= share * filter->usual_std[i - X])) /* or NaN */
+        if (!(stewart_norm(n, root + n * i) <= share * filter->usual_std[i - X])) /* or NaN */
             return 0;
     return 1;
 }

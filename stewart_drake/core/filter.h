@@ -9,8 +9,7 @@
    drive the filter: y_k corrects x_{k-1} and theta, and x_k follows by the model. The error of one step
    of the model counts as noise of y_k there, and widens the covariance of x_k. */
 
-#ifndef STEWART_FILTER_H
-#define STEWART_FILTER_H
+#pragma once
 
 #include "instant.h"
 
@@ -93,5 +92,3 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques);
    moves the pose for what is left of the period. */
 void stewart_kicks(const stewart_machine *machine, const stewart_interval *period, const real *state,
                    const real *theta, real *squares);
-
-#endif

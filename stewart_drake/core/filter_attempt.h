@@ -1,7 +1,6 @@
 /* One attempt of the filter at a period and a measurement, for filter.c and encoder_filter.c. */
 
-#ifndef STEWART_FILTER_ATTEMPT_H
-#define STEWART_FILTER_ATTEMPT_H
+#pragma once
 
 #include "filter.h"
 
@@ -44,6 +43,6 @@ struct stewart_legs {
        the offsets. Returns 0 where there are none. Scratch: 36 numbers. */
     int (*moved)(const stewart_filter *filter, const real *state, real *B, stewart_scratch scratch);
     int (*start_scratch)(const stewart_filter *filter); /* of `start` of the sensing */
+    /* Count in `still` (6) the periods for which the code of each leg has been constant. */
+    void (*count_still)(const stewart_sensing *sensing, const real *values, const real *last, real *still);
 };
-
-#endif

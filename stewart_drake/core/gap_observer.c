@@ -13,9 +13,8 @@
        q_p^2 n + q_v^2 dt^2 (0^2 + 1^2 + ... + (n - 1)^2)   and   q_v^2 n. */
 
 #include "observing.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define U STEWART_MOTORS
 #define LONGEST_GAP 10 /* periods that are worth the time; after more the filter goes on by itself */
 
 static int estimated(const stewart_law *law) { return law->machine.estimated; }
@@ -45,12 +44,12 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
     real *known = stewart_take(&scratch, size), *last = stewart_take(&scratch, m);
     real longer[X];
     const stewart_sensing sensing = stewart_sensing_of(law);
-    stewart_filter filter = stewart_filter_of(law, &sensing, NULL);
+    stewart_filter filter = stewart_filter_of(law, &sensing);
     stewart_copy(size, memory, known);
     stewart_copy(m, memory + size, last);
     const stewart_posterior before = stewart_posterior_at(known, n, m);
     const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
-    const int status = stewart_state_filter_observe(law, memory, number, torques, values, scratch);
+    const int status = stewart_filtered_observe(law, memory, number, torques, values, scratch);
     const int had_anchor = *periods > 0, parts = (int)*pieces;
     stewart_interval period = stewart_last_interval(law, number, torques, &scratch);
     const stewart_history history = {last, NULL};
@@ -89,8 +88,8 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
 static int gap_scratch(const stewart_law *law)
 {
     const stewart_sensing sensing = stewart_sensing_of(law);
-    const stewart_filter filter = stewart_filter_of(law, &sensing, NULL);
-    return stewart_state_filter_scratch(law) + stewart_estimate_numbers(law) + law->measured +
+    const stewart_filter filter = stewart_filter_of(law, &sensing);
+    return stewart_filtered_scratch(law) + stewart_estimate_numbers(law) + law->measured +
            (U + 1) * 2 + stewart_filter_scratch(&filter, GAP_TORQUES);
 }
 
@@ -98,5 +97,5 @@ const stewart_observer stewart_gap_observer = {
     gap_memory,               gap_scratch,                 gap_start,
     gap_observe,              stewart_filtered_tell,       stewart_plain_assume,
     stewart_filtered_restart, stewart_filtered_parameters, stewart_known_last_period,
-    1,
+    1,                        stewart_state_sensing,
 };

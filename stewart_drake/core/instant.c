@@ -1,8 +1,8 @@
 /* See instant.h. */
 
 #include "instant.h"
+#include "short.h"
 
-#define X STEWART_STATES
 #define SMALL ((real)0.1) /* standard deviations; a shorter correction ends the iterations */
 
 void stewart_seen(const stewart_sensing *sensing, const real *state, real *values)

@@ -1,7 +1,6 @@
 /* A Kalman update by a measurement at one instant, the end of a period. */
 
-#ifndef STEWART_INSTANT_H
-#define STEWART_INSTANT_H
+#pragma once
 
 #include "kalman.h"
 #include "sensing.h"
@@ -43,5 +42,3 @@ typedef struct {
    small if it is so beside the noise: what linearising leaves out is of second order. */
 int stewart_instant_rows(void *model, const real *xi, real *e, real *H, stewart_scratch scratch);
 int stewart_instant_settle(void *model, const real *xi, const real *better, stewart_scratch scratch);
-
-#endif

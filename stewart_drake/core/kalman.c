@@ -1,8 +1,8 @@
 /* See kalman.h. */
 
 #include "kalman.h"
+#include "short.h"
 
-#define STATES 12 /* of the plate, the first of xi */
 #define MAX STEWART_MAX_BOUNDED
 #define BEYOND ((real)1e-9) /* standard deviations out of bounds that are rounding */
 #ifdef STEWART_FLOAT
@@ -94,19 +94,19 @@ void stewart_root_of_prediction(int n, const real *H, const real *std, real *L,
 {
     real *R = stewart_take(&scratch, n * n), *W = stewart_take(&scratch, n * n);
     stewart_fill(n * n, 0, R);
-    for (int i = 0; i < STATES; i++)
+    for (int i = 0; i < X; i++)
         R[(n + 1) * i] = std[i];
     for (int i = 0; i < n; i++) /* W = (F L)' */
         for (int j = 0; j < n; j++)
             W[n * j + i] = L[n * i + j];
     for (int j = 0; j < n; j++) {
-        real *w = W + n * j, moved[STATES];
-        for (int i = 0; i < STATES; i++) {
+        real *w = W + n * j, moved[X];
+        for (int i = 0; i < X; i++) {
             moved[i] = 0;
             for (int k = 0; k < n; k++)
                 moved[i] += H[n * i + k] * w[k];
         }
-        stewart_copy(STATES, moved, w);
+        stewart_copy(X, moved, w);
     }
     stewart_absorb(n, n, R, W, scratch);
     for (int i = 0; i < n; i++)
@@ -138,14 +138,6 @@ int stewart_root(int n, real *P)
     return stewart_all_finite(n * n, P);
 }
 
-static real dot(int n, const real *x, const real *y)
-{
-    real sum = 0;
-    for (int i = 0; i < n; i++)
-        sum += x[i] * y[i];
-    return sum;
-}
-
 static real clipped(real x, real lower, real upper)
 {
     return x < lower ? lower : x > upper ? upper : x;
@@ -166,7 +158,7 @@ static int pushed(Held *h, int n, const real *mean, const real *L, real *P)
         for (int a = 0; a < h->number; a++) {
             h->push[a] = mean[h->at[a]] - h->value[a];
             for (int b = 0; b < h->number; b++)
-                P[h->number * a + b] = dot(n, L + n * h->at[a], L + n * h->at[b]);
+                P[h->number * a + b] = stewart_dot(n, L + n * h->at[a], L + n * h->at[b]);
         }
         if (!stewart_solve(h->number, 1, P, h->push) || !stewart_all_finite(h->number, h->push))
             return 0;
@@ -206,7 +198,7 @@ int stewart_within_bounds(int n, const real *mean, const real *L, const real *lo
             const real beyond = moved[i] - clipped(moved[i], lower[i], upper[i]);
             if (beyond == 0)
                 continue;
-            const real excess = REAL(fabs)(beyond) / REAL(sqrt)(dot(n, L + n * i, L + n * i));
+            const real excess = REAL(fabs)(beyond) / stewart_norm(n, L + n * i);
             if (!isfinite(excess))
                 return 0;
             if (excess > furthest) {
@@ -231,7 +223,7 @@ int stewart_within_bounds(int n, const real *mean, const real *L, const real *lo
             for (int i = 0; i < n; i++)
                 along[i] += h.push[a] * L[n * h.at[a] + i];
         for (int i = 0; i < n; i++)
-            moved[i] = mean[i] - dot(n, L + n * i, along);
+            moved[i] = mean[i] - stewart_dot(n, L + n * i, along);
     }
     for (int i = 0; i < n; i++)
         moved[i] = clipped(moved[i], lower[i], upper[i]);
@@ -272,7 +264,7 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
             stewart_two_rows(STEWART_SET, n, h, next, 1, filter->root, n, n, w, other);
         }
         for (int i = 0; i < m; i++)
-            W[N * i + n] = e[i] + dot(n, H + n * i, moved);
+            W[N * i + n] = e[i] + stewart_dot(n, H + n * i, moved);
         stewart_fill(N * N, 0, R);
         for (int i = 0; i < n; i++)
             R[(N + 1) * i] = 1;

@@ -1,7 +1,6 @@
 /* One Kalman update in square-root form, iterated, for every filter of the law. */
 
-#ifndef STEWART_KALMAN_H
-#define STEWART_KALMAN_H
+#pragma once
 
 #include "matrix.h"
 
@@ -54,5 +53,3 @@ int stewart_root(int n, real *P);
    Scratch: n + STEWART_MAX_BOUNDED^2 numbers. */
 int stewart_within_bounds(int n, const real *mean, const real *L, const real *lower,
                           const real *upper, real *moved, stewart_scratch scratch);
-
-#endif

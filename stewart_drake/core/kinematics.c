@@ -2,8 +2,8 @@
 
 #include "dynamics.h"
 #include "kinematics.h"
+#include "short.h"
 
-#define LEGS 6
 #define NEWTON_STEPS 50
 #define LEAST_STEP ((real)1e-3) /* share of Newton's */
 #define WRONG_BRANCH ((real)1e-5)

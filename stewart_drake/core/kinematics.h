@@ -1,7 +1,6 @@
 /* Crank angles of a pose, their Jacobian, and the pose of crank angles. */
 
-#ifndef STEWART_KINEMATICS_H
-#define STEWART_KINEMATICS_H
+#pragma once
 
 #include "matrix.h"
 
@@ -32,5 +31,3 @@ int stewart_crank_jacobian(const real *geometry, const real *pose, real *J);
    none, or one of another crank branch. Scratch: 48 numbers. */
 int stewart_forward_kinematics(const real *geometry, const real *angles, real *pose,
                                stewart_scratch scratch);
-
-#endif

@@ -9,14 +9,10 @@
 
 #include "law.h"
 #include "reference.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define U STEWART_MOTORS
-#define ROW STEWART_REFERENCE
 #define MOST_COUNTED ((real)1e6)
 #define CATCH_UP ((real)0.3) /* s, of a way back */
-
-static const real GAUSS_NODES[2] = {(real)0.21132486540518713, (real)0.7886751345948129};
 
 /* ---- the memory ------------------------------------------------------------------------------- */
 

@@ -9,15 +9,13 @@
    Nothing is allocated, nothing kept but in the memory that the caller hands over: one vector of
    numbers, counts and flags too, whose fields `law.layout` names. */
 
-#ifndef STEWART_LAW_H
-#define STEWART_LAW_H
+#pragma once
 
 #define STEWART_REPORTED 10 /* periods of which a machine reports torques, at the most */
 
 #include "design.h"
 #include "observer.h"
 #include "packets.h"
-#include "sensing.h"
 
 /* A field of the memory: its place, and its size as a matrix. */
 typedef struct {
@@ -158,9 +156,6 @@ void stewart_note_acted(const stewart_law *law, real *memory, int ago, int numbe
 /* A `stewart_preview_function`: `about` points to all rows that are asked for. */
 void stewart_given_rows(void *about, int number, const real *times, real *rows);
 
-/* The sensor of an observer of the measured state. */
-stewart_sensing stewart_sensing_of(const stewart_law *law);
-
 /* The torque as the motors let it through; whether that is another one. */
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited);
 
@@ -172,5 +167,3 @@ stewart_schedule stewart_schedule_of(const stewart_law *law, int periods, const 
    torque that acts next. */
 void stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
                           stewart_schedule *schedule, const real **following, stewart_scratch *scratch);
-
-#endif

@@ -4,8 +4,7 @@
 
    Times are numbers of any unit, double so that nanoseconds are exact for a hundred days. */
 
-#ifndef STEWART_LINK_H
-#define STEWART_LINK_H
+#pragma once
 
 #include "real.h"
 
@@ -72,5 +71,3 @@ void stewart_link_safe(const stewart_link *link, double *memory, double time, in
 
 /* The command (size) that acts. */
 const double *stewart_link_current(const double *memory);
-
-#endif

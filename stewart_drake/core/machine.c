@@ -1,14 +1,10 @@
 /* See machine.h. */
 
 #include "machine.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define U STEWART_MOTORS
 #define VIGOROUS 2
 #define DEAD_CENTRE_SINE ((real)0.01) /* dynamics/equations.py */
-
-static const real GAUSS_NODES[2] = {(real)0.21132486540518713, (real)0.7886751345948129};
-static const real SQRT_3 = (real)1.7320508075688772;
 
 void stewart_believe(const stewart_machine *machine, const real *theta, stewart_belief *belief)
 {

@@ -1,7 +1,6 @@
 /* What the controller knows of a machine, and the motion of its plate under known torques. */
 
-#ifndef STEWART_MACHINE_H
-#define STEWART_MACHINE_H
+#pragma once
 
 #include "dynamics.h"
 #include "matrix.h"
@@ -82,5 +81,3 @@ int stewart_transitions_along(const stewart_machine *machine, const real *xi,
                               stewart_scratch scratch);
 
 int stewart_transitions_scratch(int estimated);
-
-#endif

@@ -1,4 +1,4 @@
-/* Small matrices: see matrix.h. */
+/* See matrix.h. */
 
 #include <string.h>
 
@@ -23,15 +23,34 @@ void stewart_fill(int n, real value, real *x)
         x[i] = value;
 }
 
+real stewart_dot(int n, const real *x, const real *y)
+{
+    real sum = 0;
+    for (int i = 0; i < n; i++)
+        sum += x[i] * y[i];
+    return sum;
+}
+
+real stewart_norm(int n, const real *x) { return REAL(sqrt)(stewart_dot(n, x, x)); }
+
+void stewart_transpose(int n, real *A)
+{
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < i; j++) {
+            const real a = A[n * i + j];
+            A[n * i + j] = A[n * j + i];
+            A[n * j + i] = a;
+        }
+}
+
 /* c <- (c +) s: one sum of a tile. */
 static inline void put(int how, real s, real *c)
 {
     *c = how == STEWART_SET ? s : how == STEWART_ADD ? *c + s : *c - s;
 }
 
-/* Twelve sums at a time, each with a name: a compiler keeps them in registers, of which a Cortex-M has
-   16 in double precision, and sums in an array it does not. A loop of unknown length is one that no
-   compiler takes apart, to put several p of one sum into a vector: vectors are for several j. */
+/* Twelve named sums at a time: a compiler keeps these in the 16 double registers of a Cortex-M, but not
+   sums in an array. The endless loop prevents vectors over p; vectors are for several j. */
 void stewart_two_rows(int how, int k, const real *a0, const real *a1, int next, const real *b,
                       int m, int columns, real *c0, real *c1)
 {
@@ -84,36 +103,41 @@ void stewart_two_rows(int how, int k, const real *a0, const real *a1, int next, 
     }
 }
 
-/* The last of an odd number of rows is computed twice. */
-void stewart_multiply(int n, int k, int m, const real *A, const real *B, real *restrict C)
+/* C = A B of rows of A that begin `row` numbers apart, their elements `next`; an odd last row is computed
+   twice. */
+static void product(int n, int k, int m, const real *A, int row, int next, const real *B, real *C)
 {
     for (int i = 0; i < n; i += 2) {
-        const int other = i + 1 < n;
-        stewart_two_rows(STEWART_SET, k, A + k * i, A + k * (i + other), 1, B, m, m, C + m * i,
-                         C + m * (i + other));
+        const int j = i + 1 < n ? i + 1 : i;
+        stewart_two_rows(STEWART_SET, k, A + row * i, A + row * j, next, B, m, m, C + m * i, C + m * j);
     }
 }
 
-void stewart_multiply_transpose(int n, int k, int m, const real *A, const real *B,
-                                real *restrict C)
+void stewart_multiply(int n, int k, int m, const real *A, const real *B, real *restrict C)
 {
-    for (int i = 0; i < n; i += 2) {
-        const int other = i + 1 < n;
-        stewart_two_rows(STEWART_SET, k, A + i, A + i + other, n, B, m, m, C + m * i,
-                         C + m * (i + other));
-    }
+    product(n, k, m, A, k, 1, B, C);
+}
+
+void stewart_multiply_transpose(int n, int k, int m, const real *A, const real *B, real *restrict C)
+{
+    product(n, k, m, A, 1, n, B, C);
 }
 
 void stewart_multiply_by_transpose(int n, int k, int m, const real *A, const real *B,
                                    real *restrict C)
 {
     for (int i = 0; i < n; i++)
-        for (int j = 0; j < m; j++) {
-            real sum = 0;
-            for (int p = 0; p < k; p++)
-                sum += A[k * i + p] * B[k * j + p];
-            C[m * i + j] = sum;
-        }
+        for (int j = 0; j < m; j++)
+            C[m * i + j] = stewart_dot(k, A + k * i, B + k * j);
+}
+
+void stewart_swap_rows(int n, real *a, real *b)
+{
+    for (int j = 0; j < n; j++) {
+        const real kept = a[j];
+        a[j] = b[j];
+        b[j] = kept;
+    }
 }
 
 int stewart_solve(int n, int m, real *A, real *restrict B)
@@ -125,16 +149,8 @@ int stewart_solve(int n, int m, real *A, real *restrict B)
                 best = i;
         if (!(REAL(fabs)(A[n * best + k]) > 0)) /* or NaN */
             return 0;
-        for (int j = 0; j < n; j++) {
-            real a = A[n * best + j];
-            A[n * best + j] = A[n * k + j];
-            A[n * k + j] = a;
-        }
-        for (int j = 0; j < m; j++) {
-            real b = B[m * best + j];
-            B[m * best + j] = B[m * k + j];
-            B[m * k + j] = b;
-        }
+        stewart_swap_rows(n, A + n * best, A + n * k);
+        stewart_swap_rows(m, B + m * best, B + m * k);
         for (int i = k + 1; i < n; i++) {
             real f = A[n * i + k] / A[n * k + k];
             for (int j = k + 1; j < n; j++)
@@ -172,33 +188,6 @@ int stewart_cholesky(int n, real *A)
             row[i] = 0;
     }
     return 1;
-}
-
-void stewart_triangularize(int m, int n, real *A)
-{
-    for (int k = 0; k < n; k++) {
-        real square = 0, alpha, top = A[n * k + k];
-        for (int i = k; i < m; i++)
-            square += A[n * i + k] * A[n * i + k];
-        alpha = REAL(sqrt)(square);
-        if (top > 0)
-            alpha = -alpha;
-        real v0 = top - alpha, beta = -v0 * alpha; /* |v|^2 / 2 of v = column - alpha e1 */
-        if (!(beta > 0)) /* the column is 0 already */
-            continue;
-        for (int j = k + 1; j < n; j++) {
-            real sum = v0 * A[n * k + j];
-            for (int i = k + 1; i < m; i++)
-                sum += A[n * i + k] * A[n * i + j];
-            sum /= beta;
-            A[n * k + j] -= sum * v0;
-            for (int i = k + 1; i < m; i++)
-                A[n * i + j] -= sum * A[n * i + k];
-        }
-        A[n * k + k] = alpha;
-        for (int i = k + 1; i < m; i++)
-            A[n * i + k] = 0;
-    }
 }
 
 /* With phi(A) = sum A^k / (k+1)!,  exp(A) = 1 + A phi(A) and S = phi(A) B. The sum is taken for

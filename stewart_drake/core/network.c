@@ -1,10 +1,7 @@
 /* A channel of packets: each sample sends a plan, of which the buffer at the machine plays what comes. */
 
 #include "law.h"
-
-#define X STEWART_STATES
-#define U STEWART_MOTORS
-#define ROW STEWART_REFERENCE
+#include "short.h"
 
 static int network_memory(const stewart_law *law) { return stewart_packets_memory(law->packets); }
 

@@ -1,17 +1,9 @@
 /* Observers of a plate whose delay is known, with a filter and without: see observers.h. */
 
 #include "observing.h"
-
-#define X STEWART_STATES
-#define U STEWART_MOTORS
-#define LEGS 6
+#include "short.h"
 
 static int estimated(const stewart_law *law) { return law->machine.estimated; }
-
-int stewart_estimate_numbers(const stewart_law *law)
-{
-    return stewart_posterior_size(X + estimated(law), law->measured);
-}
 
 void stewart_move_on(const stewart_law *law, int number, const real *torques, real *state,
                      stewart_scratch scratch)
@@ -28,26 +20,16 @@ int stewart_moving_scratch(const stewart_law *law)
     return (X + U + 1) * (law->parts > 0 ? law->parts : 2) + 2;
 }
 
-void stewart_keep_last(const stewart_law *law, const real *values, real *last)
+void stewart_keep_last(int number, const real *values, real *last)
 {
-    for (int i = 0; i < law->measured; i++)
+    for (int i = 0; i < number; i++)
         if (isfinite(values[i]))
             last[i] = values[i];
 }
 
-void stewart_known_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
-{
-    (void)memory;
-    stewart_fill(estimated(law), (real)NAN, std);
-    for (int i = 0; i < estimated(law); i++) {
-        const int at = law->machine.place[i];
-        theta[i] = at < 0 ? 0 : law->machine.parameters[at];
-    }
-}
-
 void stewart_known_last_period(const stewart_law *law, const real *memory, int number,
-                               const real *torques, stewart_schedule *schedule, const real **following,
-                               stewart_scratch *scratch)
+                               const real *torques, stewart_schedule *schedule,
+                               const real **following, stewart_scratch *scratch)
 {
     (void)memory;
     stewart_last_periods(law, number, torques, 1, schedule, following, scratch);
@@ -62,13 +44,23 @@ void stewart_plain_start(const stewart_law *law, real *memory)
     stewart_fill(stewart_plain_memory(law), (real)NAN, memory);
 }
 
+void stewart_plain_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
+{
+    (void)memory;
+    stewart_fill(estimated(law), (real)NAN, std);
+    for (int i = 0; i < estimated(law); i++) {
+        const int at = law->machine.place[i];
+        theta[i] = at < 0 ? 0 : law->machine.parameters[at];
+    }
+}
+
 void stewart_plain_tell(const stewart_law *law, const real *memory, int number, const real *torques,
                         stewart_outlook *outlook, stewart_scratch *scratch)
 {
     real std[STEWART_MAX_ESTIMATED];
     (void)number, (void)torques, (void)scratch;
     stewart_copy(X, memory, outlook->state);
-    stewart_known_parameters(law, memory, outlook->theta, std);
+    stewart_plain_parameters(law, memory, outlook->theta, std);
 }
 
 void stewart_plain_assume(const stewart_law *law, real *memory, const real *state)
@@ -83,20 +75,18 @@ void stewart_plain_restart(const stewart_law *law, real *memory)
     stewart_fill(X, (real)NAN, memory);
 }
 
-/* The state as it is measured; by the model where the measurement has a fault. */
+/* The measured state; the model's prediction where the measurement has a fault. */
 static int state_observe(const stewart_law *law, real *memory, int number, const real *torques,
                          const real *values, stewart_scratch scratch)
 {
-    real *state = memory, *last = memory + X;
-    real *root = stewart_take(&scratch, X * X);
+    real *state = memory, *last = memory + X, *root = stewart_take(&scratch, X * X);
     const stewart_sensing sensing = stewart_sensing_of(law);
-    int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
+    const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
     const int had_state = stewart_all_finite(X, state);
-    stewart_keep_last(law, values, last);
-    if (fault || !sensing.start(&sensing, values, had_state ? state : NULL, state, root, scratch)) {
-        if (had_state)
-            stewart_move_on(law, number, torques, state, scratch);
-    }
+    stewart_keep_last(law->measured, values, last);
+    if ((fault || !sensing.start(&sensing, values, had_state ? state : NULL, state, root, scratch))
+        && had_state)
+        stewart_move_on(law, number, torques, state, scratch);
     return fault << STEWART_CAUSES_AT;
 }
 
@@ -105,25 +95,20 @@ static int state_scratch(const stewart_law *law) { return X * X + stewart_moving
 const stewart_observer stewart_state_observer = {
     stewart_plain_memory,  state_scratch,            stewart_plain_start,
     state_observe,         stewart_plain_tell,       stewart_plain_assume,
-    stewart_plain_restart, stewart_known_parameters, stewart_known_last_period,
-    1,
+    stewart_plain_restart, stewart_plain_parameters, stewart_known_last_period,
+    1,                     stewart_state_sensing,
 };
 
 /* ---- with a filter ------------------------------------------------------------------------------- */
 
+int stewart_estimate_numbers(const stewart_law *law)
+{
+    return stewart_posterior_size(X + estimated(law), law->measured);
+}
+
 int stewart_filtered_memory(const stewart_law *law)
 {
     return stewart_estimate_numbers(law) + law->measured + LEGS;
-}
-
-void stewart_filtered_start(const stewart_law *law, real *memory)
-{
-    const stewart_filter_settings *settings = law->estimation;
-    const stewart_posterior e = stewart_posterior_at(memory, X + estimated(law), law->measured);
-    stewart_fill(stewart_filtered_memory(law), (real)NAN, memory);
-    stewart_copy(estimated(law), settings->prior, e.mean + X);
-    *e.outliers = *e.unseen = *e.partly = 0;
-    stewart_fill(LEGS, 0, memory + stewart_estimate_numbers(law) + law->measured);
 }
 
 void stewart_filtered_restart(const stewart_law *law, real *memory)
@@ -134,7 +119,15 @@ void stewart_filtered_restart(const stewart_law *law, real *memory)
     stewart_fill(n * n, (real)NAN, e.root);
     stewart_fill(law->measured, (real)NAN, e.outlier);
     *e.outliers = *e.unseen = *e.partly = 0;
-    stewart_fill(LEGS, 0, memory + stewart_estimate_numbers(law) + law->measured);
+    stewart_fill(LEGS, 0, memory + stewart_filtered_memory(law) - LEGS);
+}
+
+void stewart_filtered_start(const stewart_law *law, real *memory)
+{
+    const stewart_filter_settings *settings = law->estimation;
+    stewart_fill(stewart_filtered_memory(law), (real)NAN, memory);
+    stewart_filtered_restart(law, memory);
+    stewart_copy(estimated(law), settings->prior, memory + X);
 }
 
 void stewart_filtered_tell(const stewart_law *law, const real *memory, int number,
@@ -145,33 +138,25 @@ void stewart_filtered_tell(const stewart_law *law, const real *memory, int numbe
     stewart_copy(estimated(law), memory + X, outlook->theta);
 }
 
-void stewart_filtered_parameters(const stewart_law *law, const real *memory, real *theta,
-                                 real *std)
+void stewart_filtered_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
 {
     const int n = X + estimated(law);
     stewart_copy(estimated(law), memory + X, theta);
-    for (int i = X; i < n; i++) {
-        const real *row = memory + n + n * i;
-        real sum = 0;
-        for (int j = 0; j < n; j++)
-            sum += row[j] * row[j];
-        std[i - X] = REAL(sqrt)(sum);
-    }
+    for (int i = X; i < n; i++)
+        std[i - X] = stewart_norm(n, memory + n + n * i);
 }
 
-stewart_filter stewart_filter_of(const stewart_law *law, const stewart_sensing *sensing,
-                                 const stewart_legs *legs)
+stewart_filter stewart_filter_of(const stewart_law *law, const stewart_sensing *sensing)
 {
-    const stewart_filter_settings *settings = law->estimation;
-    stewart_filter filter = settings->filter;
+    stewart_filter filter = ((const stewart_filter_settings *)law->estimation)->filter;
     filter.machine = &law->machine;
     filter.sensing = sensing;
-    filter.legs = legs;
+    filter.legs = sensing->legs;
     return filter;
 }
 
 stewart_interval stewart_last_interval(const stewart_law *law, int number, const real *torques,
-                                 stewart_scratch *scratch)
+                                       stewart_scratch *scratch)
 {
     stewart_interval period;
     stewart_last_periods(law, number, torques, 1, &period.schedule, &period.following, scratch);
@@ -180,19 +165,22 @@ stewart_interval stewart_last_interval(const stewart_law *law, int number, const
     return period;
 }
 
-int stewart_filtered_observe(const stewart_law *law, const stewart_sensing *sensing,
-                             const stewart_legs *legs, int fault, real *memory, int number,
-                             const real *torques, const real *values, stewart_scratch scratch)
+int stewart_filtered_observe(const stewart_law *law, real *memory, int number, const real *torques,
+                             const real *values, stewart_scratch scratch)
 {
     const int n = X + estimated(law), m = law->measured;
+    const stewart_sensing sensing = stewart_sensing_of(law);
+    const stewart_filter filter = stewart_filter_of(law, &sensing);
     const stewart_posterior e = stewart_posterior_at(memory, n, m);
     real *kept = memory + stewart_estimate_numbers(law), *last = stewart_take(&scratch, m);
-    const stewart_filter filter = stewart_filter_of(law, sensing, legs);
+    const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, kept);
     const stewart_interval period = stewart_last_interval(law, number, torques, &scratch);
     const stewart_history history = {last, kept + m};
     int same = 1;
+    if (sensing.legs)
+        sensing.legs->count_still(&sensing, values, kept, kept + m);
     stewart_copy(m, kept, last);
-    stewart_keep_last(law, values, kept);
+    stewart_keep_last(m, values, kept);
     for (int i = 0; i < m; i++)
         same &= values[i] == last[i];
     if (isnan(e.root[0])) {
@@ -207,42 +195,26 @@ int stewart_filtered_observe(const stewart_law *law, const stewart_sensing *sens
         return fault << STEWART_CAUSES_AT;
     }
     stewart_filter_advance(&filter, &period, fault ? NULL : values, &history, memory, scratch);
-    int status = (fault | (int)*e.partly) << STEWART_CAUSES_AT;
-    if (*e.outliers > 0 && same) { /* such a one said so before: it is no second witness */
+    if (*e.outliers > 0 && same) { /* a repeated outlier does not confirm the one before */
         *e.outliers = 0;
         return STEWART_MEASUREMENT_FROZEN;
     }
-    return *e.outliers > 0 ? STEWART_MEASUREMENT_REJECTED : status;
+    return *e.outliers > 0 ? STEWART_MEASUREMENT_REJECTED
+                           : (fault | (int)*e.partly) << STEWART_CAUSES_AT;
 }
 
-int stewart_filtered_scratch(const stewart_law *law, const stewart_sensing *sensing,
-                             const stewart_legs *legs)
+int stewart_filtered_scratch(const stewart_law *law)
 {
-    const stewart_filter filter = stewart_filter_of(law, sensing, legs);
+    const stewart_sensing sensing = stewart_sensing_of(law);
+    const stewart_filter filter = stewart_filter_of(law, &sensing);
     const int parts = law->parts > 0 ? law->parts * STEWART_REPORTED : 2;
     return law->measured + X + estimated(law) + (U + 1) * parts + stewart_moving_scratch(law) +
            stewart_filter_scratch(&filter, parts);
 }
 
-int stewart_state_filter_observe(const stewart_law *law, real *memory, int number,
-                                 const real *torques, const real *values, stewart_scratch scratch)
-{
-    const stewart_sensing sensing = stewart_sensing_of(law);
-    const real *last = memory + stewart_estimate_numbers(law);
-    const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
-    return stewart_filtered_observe(law, &sensing, NULL, fault, memory, number, torques, values,
-                                    scratch);
-}
-
-int stewart_state_filter_scratch(const stewart_law *law)
-{
-    const stewart_sensing sensing = stewart_sensing_of(law);
-    return stewart_filtered_scratch(law, &sensing, NULL);
-}
-
 const stewart_observer stewart_filter_observer = {
-    stewart_filtered_memory,      stewart_state_filter_scratch, stewart_filtered_start,
-    stewart_state_filter_observe, stewart_filtered_tell,        stewart_plain_assume,
-    stewart_filtered_restart,     stewart_filtered_parameters,  stewart_known_last_period,
-    1,
+    stewart_filtered_memory,  stewart_filtered_scratch,    stewart_filtered_start,
+    stewart_filtered_observe, stewart_filtered_tell,       stewart_plain_assume,
+    stewart_filtered_restart, stewart_filtered_parameters, stewart_known_last_period,
+    1,                        stewart_state_sensing,
 };

@@ -1,8 +1,7 @@
 /* Observers of a plate whose delay is known. What they assume is `sensing` and `estimation` of the law:
    `stewart_state_sensor` or `stewart_encoders`, and `stewart_filter_settings`. */
 
-#ifndef STEWART_OBSERVERS_H
-#define STEWART_OBSERVERS_H
+#pragma once
 
 #include "filter.h"
 #include "law.h"
@@ -21,5 +20,3 @@ extern const stewart_observer stewart_gap_observer; /* a filter for measurements
 /* Of encoders. */
 extern const stewart_observer stewart_differences_observer; /* without a filter */
 extern const stewart_observer stewart_encoder_observer;
-
-#endif

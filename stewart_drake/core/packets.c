@@ -4,8 +4,7 @@
 
 #include "matrix.h"
 #include "packets.h"
-
-#define U 6
+#include "short.h"
 
 /* The law changes its mind only for what is so many times as probable as what was decided. A change
    makes it correct what it thinks has gone wrong, and correct that again if it has not. */

@@ -1,7 +1,6 @@
 /* What the controller believes to be in flight over a network. */
 
-#ifndef STEWART_PACKETS_H
-#define STEWART_PACKETS_H
+#pragma once
 
 #include "scratch.h"
 
@@ -59,5 +58,3 @@ void stewart_packets_send(const stewart_packets *packets, real *memory, const re
    last: number of torques of which a source is asked for, > d. */
 int stewart_packet_chances(const stewart_packets *packets, int known, const real *arrived, int since,
                            int last, int d, real *chances, stewart_scratch scratch);
-
-#endif

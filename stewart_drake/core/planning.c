@@ -2,10 +2,8 @@
 
 #include "planning.h"
 #include "reference.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define U STEWART_MOTORS
-#define ROW 18
 #define ROUNDS 12 /* Newton steps */
 
 /* By which a plan may miss the reference: rad, shares of the reach, and per s. */
@@ -24,9 +22,6 @@
 #define DEAD_CENTRE_SINE ((real)0.01)
 #define SINGULARITY_LIMIT ((real)1e-3)
 #define PITCH_LIMIT ((real)1.4835298641951802)
-
-static const real GAUSS_NODES[2] = {(real)0.21132486540518713, (real)0.7886751345948129};
-static const real SQRT_3 = (real)1.7320508075688772;
 
 /* ---- the model ---------------------------------------------------------------------------------- */
 

@@ -1,8 +1,7 @@
 /* Ways of the plate onto its reference that held torques can follow without error, and the pieces of
    which such a way consists. A row has 18 numbers: pose, rates and accelerations. */
 
-#ifndef STEWART_PLANNING_H
-#define STEWART_PLANNING_H
+#pragma once
 
 #include "machine.h"
 
@@ -58,5 +57,3 @@ int stewart_is_off(const real *size, const real *state, const real *wanted, int 
 /* The row of a way at an instant. Before a piece the pose goes on the straight line that its first
    rates continue. Returns 0 after the last piece. */
 int stewart_along(int number, const real *pieces, real time, real *row);
-
-#endif

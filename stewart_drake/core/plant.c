@@ -4,9 +4,7 @@
 
 #include "dop853.h"
 #include "plant.h"
-
-#define X STEWART_STATES
-#define U STEWART_MOTORS
+#include "short.h"
 
 #ifndef SOURCE
 #define SOURCE ""

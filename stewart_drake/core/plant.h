@@ -4,8 +4,7 @@
    the state at any time. A run ends where the plate leaves its workspace. Nothing is allocated: any
    thread may call. */
 
-#ifndef STEWART_PLANT_H
-#define STEWART_PLANT_H
+#pragma once
 
 #include "link.h"
 #include "tuner.h"
@@ -79,5 +78,3 @@ typedef struct {
 } stewart_law_in_loop;
 
 int stewart_closed_loop_of_law(stewart_run *run, stewart_loop *loop, stewart_law_in_loop *law);
-
-#endif

@@ -1,7 +1,6 @@
 /* The type of all numbers, and the functions of <math.h> for it: REAL(sqrt)(x). */
 
-#ifndef STEWART_REAL_H
-#define STEWART_REAL_H
+#pragma once
 
 #include <math.h>
 
@@ -16,6 +15,4 @@ typedef float real;
 #else
 typedef double real;
 #define REAL(function) function
-#endif
-
 #endif

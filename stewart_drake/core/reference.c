@@ -1,9 +1,8 @@
 /* See reference.h. */
 
 #include "reference.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define ROW STEWART_REFERENCE
 #define FURTHER ((real)1.25) /* times as far as to its rest, a continued motion stays within reach */
 #define DOUBLINGS 6          /* of the rate at which it comes to rest, at the most */
 #define CATCH_UP ((real)0.3) /* s, of a way back */

@@ -1,8 +1,7 @@
 /* The reference between the instants at which it is known, and the way back onto it after a gap.
    A row has 18 numbers: pose, rates and accelerations. */
 
-#ifndef STEWART_REFERENCE_H
-#define STEWART_REFERENCE_H
+#pragma once
 
 #include "design.h"
 
@@ -42,5 +41,3 @@ void stewart_go_on_way_back(stewart_way_back *way, real period);
 
 /* Adds the offset `time` s after its beginning to a row. */
 void stewart_add_offset(stewart_way_back way, real period, real time, real *row);
-
-#endif

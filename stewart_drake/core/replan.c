@@ -1,9 +1,8 @@
 /* See replan.h. */
 
 #include "replan.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define ROW STEWART_REFERENCE
 #define PIECE STEWART_PIECE
 
 /* Memory: samples since the plan was made, its pieces, how many. Times of pieces are from that sample. */

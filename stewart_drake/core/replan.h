@@ -6,8 +6,7 @@
    reference. What is followed is the predicted way, then the plan, then the reference: there is no error
    left to feed back, and the integral begins anew. */
 
-#ifndef STEWART_REPLAN_H
-#define STEWART_REPLAN_H
+#pragma once
 
 #include "law.h"
 #include "planning.h"
@@ -20,5 +19,3 @@ typedef struct {
 } stewart_replan;
 
 extern const stewart_planner stewart_replanner;
-
-#endif

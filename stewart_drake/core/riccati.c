@@ -46,25 +46,6 @@ static void add_symmetric(int n, int k, const real *X, const real *Y, real *S)
     mirror(n, S);
 }
 
-static void transpose(int n, real *A)
-{
-    for (int i = 0; i < n; i++)
-        for (int j = 0; j < i; j++) {
-            const real a = A[n * i + j];
-            A[n * i + j] = A[n * j + i];
-            A[n * j + i] = a;
-        }
-}
-
-static void swap_rows(int n, real *a, real *b)
-{
-    for (int j = 0; j < n; j++) {
-        const real kept = a[j];
-        a[j] = b[j];
-        b[j] = kept;
-    }
-}
-
 /* x_j <- f (x_j - c y_j) */
 static void reduce(int columns, real f, real c, const real *y, real *x)
 {
@@ -101,7 +82,7 @@ static int factor(int n, real *W, int *pivot)
                 return 0;
             pivot[k] = best;
             if (best != k)
-                swap_rows(n, W + n * best, W + n * k);
+                stewart_swap_rows(n, W + n * best, W + n * k);
             for (int i = k + 1; i < n; i++) {
                 const real f = W[n * i + k] /= W[n * k + k];
                 for (int j = k + 1; j < first + BLOCK; j++)
@@ -118,7 +99,7 @@ static void solve(int n, const real *W, const int *pivot, int symmetric, real *X
 {
     for (int k = 0; k < n; k++)
         if (pivot[k] != k)
-            swap_rows(n, X + n * pivot[k], X + n * k);
+            stewart_swap_rows(n, X + n * pivot[k], X + n * k);
     forward(n, n, W, n, X);
     for (int i = n - 2; i >= 0; i -= 2) {
         const real *w = W + n * i + i;
@@ -131,14 +112,6 @@ static void solve(int n, const real *W, const int *pivot, int symmetric, real *X
     }
     if (symmetric)
         mirror(n, X);
-}
-
-static real norm(int n, const real *A)
-{
-    real sum = 0;
-    for (int i = 0; i < n * n; i++)
-        sum += A[i] * A[i];
-    return REAL(sqrt)(sum);
 }
 
 /* X <- L^-1 X (6, n), of a lower triangular L. */
@@ -228,7 +201,7 @@ static int double_once(int n, const real *A, const real *B, const real *Q, const
 static int doubled(int n, real *A, real *G, real *H, stewart_scratch scratch)
 {
     real *W = stewart_take(&scratch, n * n), *V = stewart_take(&scratch, n * n);
-    real *next = stewart_take(&scratch, n * n), left = norm(n, A);
+    real *next = stewart_take(&scratch, n * n), left = stewart_norm(n * n, A);
     int pivot[STEWART_MAX_ORDER], count = 1;
     for (; !(left < VANISHED); count++) {
         if (!isfinite(left) || count == DOUBLINGS)
@@ -242,9 +215,9 @@ static int doubled(int n, real *A, real *G, real *H, stewart_scratch scratch)
         solve(n, W, pivot, 0, V); /* W^-1 A */
         stewart_multiply_transpose(n, n, n, H, V, next);
         add_symmetric(n, n, A, next, H);
-        transpose(n, A);
+        stewart_transpose(n, A);
         stewart_multiply_transpose(n, n, n, A, V, next);
-        left = norm(n, next);
+        left = stewart_norm(n * n, next);
         if (left < VANISHED) /* G is not needed any more */
             continue;
         stewart_copy(n * n, G, V);
@@ -264,7 +237,7 @@ static real residual(int n, const real *A, const real *B, const real *Q, const r
     stewart_multiply_transpose(n, n, n, PA, F, E);
     for (int i = 0; i < n * n; i++)
         E[i] += Q[i] - P[i];
-    return norm(n, E) / norm(n, P);
+    return stewart_norm(n * n, E) / stewart_norm(n * n, P);
 }
 
 /* One step of Newton's from the residual E: P <- P + sum F^k' E F^k, F = A - B K (Kleinman, 1968),
@@ -275,7 +248,7 @@ static void correct(int n, real *F, real *E, real *P, stewart_scratch scratch)
     for (int i = 0; i < n; i++)
         for (int j = 0; j < i; j++)
             E[n * j + i] = E[n * i + j] = (E[n * i + j] + E[n * j + i]) / 2;
-    for (int count = 0; count < DOUBLINGS && norm(n, F) > (real)1e-3; count++) {
+    for (int count = 0; count < DOUBLINGS && stewart_norm(n * n, F) > (real)1e-3; count++) {
         stewart_multiply_transpose(n, n, n, E, F, product);
         add_symmetric(n, n, F, product, E);
         stewart_multiply(n, n, n, F, F, product);

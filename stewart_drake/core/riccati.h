@@ -1,7 +1,6 @@
 /* The discrete algebraic Riccati equation by structure-preserving doubling. */
 
-#ifndef STEWART_RICCATI_H
-#define STEWART_RICCATI_H
+#pragma once
 
 #include "matrix.h"
 
@@ -18,5 +17,3 @@ int stewart_lqr(int n, const real *A, const real *B, const real *Q, const real *
                 stewart_scratch scratch);
 
 int stewart_lqr_scratch(int n);
-
-#endif

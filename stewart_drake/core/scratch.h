@@ -1,7 +1,6 @@
 /* Place to compute in, taken from one block that the caller has. */
 
-#ifndef STEWART_SCRATCH_H
-#define STEWART_SCRATCH_H
+#pragma once
 
 #include <stddef.h>
 
@@ -19,5 +18,3 @@ static inline real *stewart_take(stewart_scratch *scratch, int numbers)
     scratch->next += numbers;
     return taken;
 }
-
-#endif

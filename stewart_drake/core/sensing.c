@@ -1,8 +1,8 @@
 /* See sensing.h. */
 
 #include "sensing.h"
+#include "short.h"
 
-#define X STEWART_STATES
 #define MOVED ((real)1e-3)     /* share of the motion that a pose goes within a period to have moved */
 #define NOISY ((real)1048576)  /* noise of so many units in the last place repeats once in a million */
 #define SIGMAS 6               /* by which rates may be off without saying that anything moved */
@@ -26,9 +26,11 @@ static int fault_of_state(const stewart_sensing *sensing, const real *geometry, 
     return stewart_state_fault(sensing->kind, geometry, period, values, last);
 }
 
-stewart_sensing stewart_state_sensing(const stewart_state_sensor *sensor)
+stewart_sensing stewart_state_sensing(const void *kind)
 {
-    return (stewart_sensing){X, sensor->noise_std, sensor, NULL, NULL, start_of_state, fault_of_state};
+    const stewart_state_sensor *sensor = kind;
+    return (stewart_sensing){X,    sensor->noise_std, kind,           NULL,
+                             NULL, start_of_state,    fault_of_state, NULL};
 }
 
 int stewart_state_fault(const stewart_state_sensor *sensor, const real *geometry, real period,

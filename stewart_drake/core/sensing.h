@@ -1,7 +1,6 @@
 /* What is measured, y = h(x) + noise: its model, how to begin from it, what of it is no use. */
 
-#ifndef STEWART_SENSING_H
-#define STEWART_SENSING_H
+#pragma once
 
 #include "machine.h"
 
@@ -29,6 +28,7 @@ typedef struct stewart_sensing {
                  real *state, real *root, stewart_scratch scratch);
     int (*fault)(const struct stewart_sensing *sensing, const real *geometry, real period,
                  const real *values, const real *last);
+    const struct stewart_legs *legs; /* how a filter reads encoders within a period, or NULL */
 } stewart_sensing;
 
 /* Pose and rates. */
@@ -38,7 +38,7 @@ typedef struct {
     int anywhere;                   /* whether poses out of the machine's reach are believed */
 } stewart_state_sensor;
 
-stewart_sensing stewart_state_sensing(const stewart_state_sensor *sensor);
+stewart_sensing stewart_state_sensing(const void *sensor); /* `stewart_state_sensor` */
 
 /* What is wrong with values (12), or 0; `last` (12) are those before, `period` s ago.
 
@@ -53,5 +53,3 @@ stewart_sensing stewart_state_sensing(const stewart_state_sensor *sensor);
    pose and rates and is not frozen. A pose that the machine cannot have is rejected. */
 int stewart_state_fault(const stewart_state_sensor *sensor, const real *geometry, real period,
                         const real *values, const real *last);
-
-#endif

@@ -1,10 +1,8 @@
 /* See servo.h. */
 
 #include "servo.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define U STEWART_MOTORS
-#define ROW STEWART_REFERENCE
 #define SATURATED 6 /* place of this cause among the counts */
 
 static int width(const stewart_servo *servo) { return U * servo->law.parts + 1; }

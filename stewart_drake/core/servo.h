@@ -8,8 +8,7 @@
    finds of the machine goes into T_ff. It needs the torques that acted; these depend on what the servos
    saw, and the machine reports them with the measurement. */
 
-#ifndef STEWART_SERVO_H
-#define STEWART_SERVO_H
+#pragma once
 
 #include "kinematics.h"
 #include "law.h"
@@ -52,5 +51,3 @@ void stewart_servo_start(const stewart_servo *servo, real *memory, const real *c
    reference is asked for once, at `eta + dt`. Returns what went wrong, bits of `stewart_status`. */
 int stewart_servo_step(const stewart_servo *servo, real *memory, real *scratch,
                        const stewart_sample *sample, const real *report, real *command);
-
-#endif

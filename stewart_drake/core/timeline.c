@@ -1,14 +1,13 @@
 /* A delay that is known: which torque acts when, and what the motors let through. See law.h. */
 
 #include "law.h"
-
-#define U STEWART_MOTORS
+#include "short.h"
 
 int stewart_queue_length(const stewart_law *law) { return law->steps + (law->fraction > 0); }
 
 stewart_sensing stewart_sensing_of(const stewart_law *law)
 {
-    return law->described ? *law->described : stewart_state_sensing(law->sensing);
+    return law->described ? *law->described : law->observer->sensing(law->sensing);
 }
 
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited)

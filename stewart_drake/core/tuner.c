@@ -18,9 +18,8 @@
 #include <string.h>
 
 #include "tuner.h"
+#include "short.h"
 
-#define X STEWART_STATES
-#define U STEWART_MOTORS
 #define N STEWART_WINDOW
 #define MODEL_ERROR ((real)2e-4) /* law/filter_settings.py */
 #define HUGEST ((real)1e6)       /* of what has no limit, in units of what is usual */

@@ -1,7 +1,6 @@
 /* Weights of the law at run time: what they are decided by, and who decides. */
 
-#ifndef STEWART_TUNER_H
-#define STEWART_TUNER_H
+#pragma once
 
 #include "law.h"
 
@@ -49,5 +48,3 @@ int stewart_tuned_step(const stewart_law *law, const stewart_tuner *tuner, real 
                        const real *wanted, real *torque);
 
 int stewart_tuned_step_scratch(const stewart_law *law);
-
-#endif

@@ -40,7 +40,7 @@ from stewart_drake.tuner.compiled import compiled_tuner
 from stewart_drake.types import Array
 
 SOURCES: Final = (
-    *("real.h", "scratch.h", "equations.h", "packets.h", "observer.h", "law.h"),
+    *("real.h", "short.h", "scratch.h", "equations.h", "packets.h", "observer.h", "law.h"),
     *("matrix", "dynamics", "machine", "riccati", "design", "timeline.c"),
 )
 """Sources of core/ that every law needs; a name without a suffix stands for header and source."""
