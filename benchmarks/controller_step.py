@@ -27,7 +27,7 @@ from stewart_drake.law.core_law import Serving
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
-from stewart_drake.law.observers import NoObserver, ParameterObserver
+from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictors import NonlinearPredictor
 from stewart_drake.loop import controller
 
@@ -37,8 +37,7 @@ REPEATS = 300
 SCENARIOS = {"paper": ["duration=10.0"], "gravity": ["duration=2.0"]}
 ESTIMATORS = {"parameters": "[torque_bias,payload,damping]", "none": "[]"}
 PARTS = {
-    "observe": (NoObserver, "observe"),
-    "observe, estimate": (ParameterObserver, "observe"),
+    "observe": (CoreObserver, "observe"),
     "predict": (NonlinearPredictor, "ahead"),
     "feedforward": (Feedforward, "held"),
     "linear model": (DesignModel, "at"),

@@ -19,7 +19,7 @@ from _page import run_sections, size
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
-from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop import sampling
 from stewart_drake.loop.diagram import build_closed_loop
@@ -41,13 +41,13 @@ class CpuTime:
     perf_counter = staticmethod(time.thread_time)
 
 
-class InPython(ParameterObserver):
+class InPython(CoreObserver):
     """As it is, but not known to the law in C."""
 
 
 def in_python(law: PredictiveLqi) -> PredictiveLqi:
     """The law of a measured state in the language of that of encoders."""
-    return replace(law, observer=InPython(cast(ParameterObserver, law.observer).settings))
+    return replace(law, observer=InPython(cast(CoreObserver, law.observer).settings))
 
 
 def median_step(settings: Sequence[str], seed: int) -> float:

@@ -11,7 +11,7 @@ import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.law.filter_settings import CHANCE, EXACT, usual_parameters
-from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.observers import CoreObserver
 from stewart_drake.loop.law_design import GENTLE, compose_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.geometry import Body, fingerprint
@@ -180,7 +180,7 @@ def experiment(*given):
 
 
 def observer(law):
-    assert isinstance(law.observer, ParameterObserver)
+    assert isinstance(law.observer, CoreObserver)
     return law.observer
 
 
@@ -204,7 +204,7 @@ def test_without_a_file_the_law_is_as_machine_and_motion_say():
     found = experiment()
     assert found.calibration is None
     law = compose_law(found)
-    prior, torque = observer(law).settings.parameters, law.plant.gentle_torque / GENTLE
+    prior, torque = observer(law).settings.parameters, law.plant.coarse_torque_limit / GENTLE
     assert not prior.prior.any()
     expected = [0.3 * torque] * 6 + [PAPER.plate.mass / 4, 0.1 * torque]
     assert prior.std == pytest.approx(expected, rel=1e-12)

@@ -23,7 +23,7 @@ from stewart_drake.law.holds import (
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import Preview
-from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.predictors import LinearPredictor, NonlinearPredictor
 from stewart_drake.law.riccati import RiccatiError, full_gain
 from stewart_drake.law.startup import weight_scales
@@ -593,7 +593,7 @@ def test_a_duration_of_whole_periods_designs_the_same_law(frequency, whole, odd)
     motion = (f"reference.frequency={frequency}", "reference.frequency_unit=Hz", "delay.steps=1")
     one, other = (law_of(*motion, f"duration={d}") for d in (whole, odd))
     assert one.cost.torques == pytest.approx(other.cost.torques, rel=0.02)
-    assert one.plant.gentle_torque == pytest.approx(other.plant.gentle_torque, rel=0.02)
+    assert one.plant.coarse_torque_limit == pytest.approx(other.plant.coarse_torque_limit, rel=0.02)
     assert one.plant.substeps == other.plant.substeps
 
 

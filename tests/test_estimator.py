@@ -12,19 +12,17 @@ from scipy.stats import chi2
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.belief import Estimate
 from stewart_drake.law.compiled import machine_of
 from stewart_drake.law.filter_settings import FilterSettings, ParameterSet, filter_settings
 from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.motors import TorqueLimit
-from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.law.observers import ParameterObserver
-from stewart_drake.law.parameter_filter import ParameterFilter, Period
+from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import BIAS, DAMPING, PARAMETER_UNITS, PARAMETERS, PAYLOAD
 from stewart_drake.types import Array
+from tests.filters import Filter, FilterEstimate, Period
 from tests.mechanisms import PAPER
 from tests.oracles import central_difference, relative
 
@@ -51,7 +49,7 @@ PATIENCE = core().lib.STEWART_PATIENCE
 
 def filter_of(noise_std, settings=SETTINGS):
     """Of pose and rates, measured with that noise (12,)."""
-    return ParameterFilter(PLANT, StateSensing(noise_std, AMPLITUDE), settings)
+    return Filter(PLANT, StateSensing(noise_std, AMPLITUDE), settings)
 
 
 ASSUMED = filter_of(NOISE)
@@ -59,12 +57,12 @@ ASSUMED = filter_of(NOISE)
 
 def start(y, assumed=ASSUMED):
     """From a measurement (12,) alone."""
-    return assumed.start(Measurement.of(y), np.zeros(8))
+    return assumed.start(y, np.zeros(8))
 
 
 def advance(estimate, period, y, assumed=ASSUMED):
     """A period, and a measurement (12,) or none at its end."""
-    return assumed.advance(estimate, period, None if y is None else Measurement.of(y))
+    return assumed.advance(estimate, period, y)
 
 
 def transition(dynamics, xi, period):
@@ -74,7 +72,8 @@ def transition(dynamics, xi, period):
     schedule = [number, c.at(period.torques), c.at(period.durations), period.substeps]
     given = (c.at(xi), c.ffi.new("stewart_schedule *", schedule), 1, c.at(states), c.at(H))
     scratch = c.scratch(c.lib.stewart_transitions_scratch(8))
-    assert c.lib.stewart_transitions(machine_of(dynamics).it, *given, scratch)
+    machine = machine_of(NominalPlant(dynamics, 1, np.inf, TorqueLimit()))
+    assert c.lib.stewart_transitions(machine.it, *given, scratch)
     F[:12] = H[-1]
     return states[-1], F
 
@@ -98,7 +97,7 @@ class Run(NamedTuple):
     measurements: Array
     inputs: list[tuple[Array, Array]]
     """Torques and durations of every period."""
-    estimates: list[Estimate]
+    estimates: list[FilterEstimate]
 
 
 def acted(torques, durations, substeps=SUBSTEPS):
@@ -224,7 +223,7 @@ def test_kicks_are_what_early_and_late_torques_do(split, tolerance, late):
     c, kick, following = core(), np.empty(12), three[1].copy()  # one change alone
     schedule = [len(torques), c.at(torques), c.at(durations), 8]
     period = c.ffi.new("stewart_interval *", [schedule, c.at(following)])
-    machine = machine_of(PLANT).it
+    machine = machine_of(NominalPlant(PLANT, 1, np.inf, TorqueLimit())).it
     c.lib.stewart_kicks(machine, period, c.at(after), c.at(theta), c.at(kick))
     kick = np.sqrt(kick)
 
@@ -359,7 +358,7 @@ def test_a_prior_other_than_zero_is_where_the_filter_begins():
     """A payload known to 10 g that is not what was measured stays what it is."""
     prior = np.eye(8)[PAYLOAD] * 0.5
     known = dataclasses.replace(KNOWN, prior=prior, std=np.array([0.03] * 6 + [0.01, 0.01]))
-    observer = ParameterObserver(dataclasses.replace(SETTINGS, parameters=known))
+    observer = CoreObserver(dataclasses.replace(SETTINGS, parameters=known))
     plant = NominalPlant(PLANT, SUBSTEPS, 10.0, TorqueLimit())
     sensing = StateSensing(NOISE, AMPLITUDE)
     belief = observer.start(Timeline(PERIOD, Delay(0, 0.0)), sensing, plant)
@@ -368,7 +367,7 @@ def test_a_prior_other_than_zero_is_where_the_filter_begins():
     for k, y in enumerate(result.measurements):
         flew = np.zeros((1, 6)) if k == 0 else result.inputs[k - 1][0]
         belief = observer.observe(belief, Measurement.of(y), flew, sensing, plant)
-    assert belief.fault is None
+    assert belief.faults == ()
     assert belief.parameters[PAYLOAD] == pytest.approx(0.5, abs=0.03)
     assert belief.estimate.parameter_std[PAYLOAD] < 0.0101
 

@@ -9,11 +9,9 @@ import stewart_drake as sd
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import THETA
 from stewart_drake.law.filter_settings import filter_settings
-from stewart_drake.law.gaps import LONGEST, GapObserver
 from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.motors import TorqueLimit
-from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.simulation import simulate
@@ -28,6 +26,7 @@ PLANT = NominalPlant(DYNAMICS, 20, 1.0, TorqueLimit())
 SETTINGS = replace(
     filter_settings(AMPLITUDES, 4.0, 0.02, None, DT), model_std=np.full(12, 1e-7), timing_std=1e-6
 )
+LONGEST = 10  # gap in periods, as in core/gap_observer.c
 NOISE = 1e-3 * np.tile(AMPLITUDES, 2)
 SENSING = StateSensing(NOISE, AMPLITUDES)
 HOME = np.concatenate([PAPER.home, np.zeros(6)])
@@ -64,10 +63,10 @@ def test_what_was_learnt_before_a_gap_counts_after_it():
     squares, narrower = [], []
     for seed in range(40):
         theta = drawn(seed)
-        looked, x = watched(GapObserver(SETTINGS), theta, GAP, seed)
+        looked, x = watched(CoreObserver(SETTINGS, gaps=True), theta, GAP, seed)
         off = looked.estimate.mean - np.concatenate([x, theta])
         squares.append(off @ np.linalg.solve(looked.estimate.covariance, off))
-        without, _ = watched(ParameterObserver(SETTINGS), theta, GAP, seed)
+        without, _ = watched(CoreObserver(SETTINGS), theta, GAP, seed)
         narrower.append(without.estimate.parameter_std / looked.estimate.parameter_std)
     assert 16 < np.mean(squares) < 24
     assert np.median(narrower, axis=0).min() > 3
@@ -75,16 +74,16 @@ def test_what_was_learnt_before_a_gap_counts_after_it():
 
 def test_without_a_gap_nothing_is_other():
     theta = drawn(0)
-    one, _ = watched(GapObserver(SETTINGS), theta, (True,) * 8, 0)
-    other, _ = watched(ParameterObserver(SETTINGS), theta, (True,) * 8, 0)
+    one, _ = watched(CoreObserver(SETTINGS, gaps=True), theta, (True,) * 8, 0)
+    other, _ = watched(CoreObserver(SETTINGS), theta, (True,) * 8, 0)
     assert np.array_equal(one.estimate.mean, other.estimate.mean)
     assert np.array_equal(one.estimate.covariance, other.estimate.covariance)
 
 
 def test_a_gap_that_is_too_long_is_left_to_the_filter():
     theta, there = drawn(1), (True, True, *[False] * (LONGEST + 1), True)
-    one, _ = watched(GapObserver(SETTINGS), theta, there, 0)
-    other, _ = watched(ParameterObserver(SETTINGS), theta, there, 0)
+    one, _ = watched(CoreObserver(SETTINGS, gaps=True), theta, there, 0)
+    other, _ = watched(CoreObserver(SETTINGS), theta, there, 0)
     assert np.array_equal(one.estimate.mean[THETA], other.estimate.mean[THETA])
 
 

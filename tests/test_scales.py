@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.resources import data_root
-from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.riccati import full_gain, lqr
 from stewart_drake.law.startup import machine_torque
 from stewart_drake.loop import preparation as experiment_module
@@ -191,5 +191,5 @@ def test_what_the_law_believes_of_the_paper_is_in_its_order_of_magnitude():
     law, _, _ = control_law(prepare(load_scenario("paper")))
     machine = machine_torque(law.plant.dynamics)
     assert 0.03 < machine < 0.1
-    assert isinstance(law.observer, ParameterObserver)
-    assert law.plant.gentle_torque == pytest.approx(3 * machine)
+    assert isinstance(law.observer, CoreObserver)
+    assert law.plant.coarse_torque_limit == pytest.approx(3 * machine)

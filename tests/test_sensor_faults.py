@@ -7,8 +7,9 @@ import pytest
 
 import stewart_drake.loop.kinds as kinds_module
 from stewart_drake.core.library import core
+from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
-from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.loop.sensor import Sensor
 from stewart_drake.loop.simulation import simulate
@@ -135,7 +136,8 @@ def test_a_sensor_that_comes_back_is_believed_again():
     loop = Loop(law, reference, queue=nominal_queue(law, reference))
     loop.run(5 + 4 * PATIENCE, frozen)
     assert loop.memory.counts == Counts(measurements_frozen=4 * PATIENCE)
-    assert loop.memory.belief.estimate.unseen == 4 * PATIENCE
+    unseen = 20 + 20 * 20 + 12 + 1  # after mean, root, outlier and number of outliers
+    assert loop.memory.belief.memory[unseen] == 4 * PATIENCE
     loop.run(1, frozen)
     estimate = loop.memory.belief.estimate
     assert estimate.unseen == estimate.outliers == 0
@@ -239,11 +241,21 @@ def test_a_wrong_shape_is_an_exception(wrong):
         "errors": {"cost": dataclasses.replace(law.cost, errors=np.ones(5))},
         "torques": {"cost": dataclasses.replace(law.cost, torques=np.ones(5))},
         "noise": {"sensing": StateSensing(np.zeros(11), np.ones(6))},
-        "parameters": {"observer": ParameterObserver(seven(law.observer))},
+        "parameters": {"observer": CoreObserver(seven(law.observer))},
     }
-    law.warm_up()
+    take_a_sample(law)
     with pytest.raises(ValueError):
-        dataclasses.replace(law, **parts[wrong]).warm_up()
+        take_a_sample(dataclasses.replace(law, **parts[wrong]))
+
+
+def take_a_sample(law):
+    memory, home = law.initial_memory(np.zeros((2, 6))), HOME
+
+    def motion(times):
+        return np.tile(home, (len(times), 1))
+
+    for _ in range(2):
+        memory = law.step(memory, Measurement.of(home[:12]), motion, np.ones(2))
 
 
 def seven(observer):

@@ -11,11 +11,11 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.export.motion import knots
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Report
-from stewart_drake.law.core_law import max_schedule_length, uncovered
-from stewart_drake.law.delay_observer import DelayObserver
+from stewart_drake.law.core_law import uncovered
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion, Motion
+from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.planner import Rejoin
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
@@ -77,7 +77,7 @@ class Recorded:
         """Whether the law asks for the reference at instants that it finds itself."""
         law = self.law
         return isinstance(law, PredictiveLqi) and (
-            isinstance(law.observer, DelayObserver) or isinstance(law.planner, Rejoin)
+            law.finds_delay or isinstance(law.planner, Rejoin)
         )
 
     def tabulated(self, motion: Motion, duration: float) -> Motion:
@@ -98,8 +98,9 @@ class Recorded:
         law, period = self.law, self.law.timeline.period
         assert isinstance(law, PredictiveLqi)
         most = law.timeline.queue_length
-        if isinstance(law.observer, DelayObserver):
-            most = max_schedule_length(law.observer, period)
+        if law.finds_delay:
+            assert isinstance(law.observer, CoreObserver)
+            most = law.observer.max_schedule_length(period)
         plan = law.planner.duration if isinstance(law.planner, Rejoin) else 0.0
         return plan + (most + 4) * period
 

@@ -1,11 +1,8 @@
 """The control law, composed of small parts: state in, state out, no LeafSystem."""
 
-from stewart_drake.law.arrivals import Arrivals
 from stewart_drake.law.channel import Channel, Packets, Wire
 from stewart_drake.law.cost import QuadraticCost
-from stewart_drake.law.delay_observer import DelayObserver
 from stewart_drake.law.design_models import DesignModel, MultibodyModel, PaperModel
-from stewart_drake.law.encoder_observers import DifferencesObserver, EncoderObserver
 from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
@@ -13,14 +10,11 @@ from stewart_drake.law.feedforward import (
     InverseDynamicsFeedforward,
     NoFeedforward,
 )
-from stewart_drake.law.gaps import GapObserver
-from stewart_drake.law.late import LateObserver
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion
-from stewart_drake.law.motors import TorqueLimit
-from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.law.observers import NoObserver, Observer, ParameterObserver
+from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.law.observers import CoreObserver, DelaySettings, Observer
 from stewart_drake.law.planner import NoPlanner, Planner, Rejoin
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import (
@@ -31,36 +25,31 @@ from stewart_drake.law.predictors import (
 )
 from stewart_drake.law.sensing import Sensing, StateSensing
 from stewart_drake.law.servo_preview import ServoPreview
-from stewart_drake.law.timeline import Timeline
+from stewart_drake.law.timeline import Arrivals, Timeline
 
 __all__ = [
     "ArrivalPredictor",
     "Arrivals",
     "Channel",
-    "DelayObserver",
+    "CoreObserver",
+    "DelaySettings",
     "DesignModel",
-    "DifferencesObserver",
-    "EncoderObserver",
     "EncoderSensing",
     "EquilibriumFeedforward",
     "Feedforward",
-    "GapObserver",
     "InverseDynamicsFeedforward",
     "KnownMotion",
-    "LateObserver",
     "LinearPredictor",
     "Measurement",
     "Memory",
     "MultibodyModel",
     "NoFeedforward",
-    "NoObserver",
     "NoPlanner",
     "NominalPlant",
     "NonlinearPredictor",
     "Observer",
     "Packets",
     "PaperModel",
-    "ParameterObserver",
     "Planner",
     "PredictiveLqi",
     "Predictor",

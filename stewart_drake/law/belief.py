@@ -1,4 +1,4 @@
-"""What an observer believes: state, parameters, their covariance, delay, what it rejected."""
+"""Result of an observer: state, parameters, their covariance, and the delay."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -14,43 +14,29 @@ THETA = slice(NUM_STATE, None)
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is known of [state; p parameters].
+    """Mean and covariance of [state; p parameters].
 
     Attributes:
-        mean: (12 + p,); a state of NaN before there is any.
+        mean: (12 + p,); a state of NaN before the first measurement.
         covariance: (12 + p, 12 + p); NaN where nothing is estimated.
-        outlier: (m,) the last outlier, NaN without one.
-        outliers: how many in a row, up to the last measurement, bear each other out.
-        unseen: periods since a measurement was last used.
-        partly: why values of that were left out, as names of counts.
-        root: (12 + p, 12 + p) L with L L' the covariance; NaN where no filter has made one.
     """
 
     mean: Array
     covariance: Array
-    outlier: Array
-    outliers: int = 0
-    unseen: int = 0
-    partly: tuple[str, ...] = ()
-    root: Array = None  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        if self.root is None:
-            object.__setattr__(self, "root", np.full_like(self.covariance, np.nan))
 
     @property
     def state(self) -> Array:
-        """(12,)."""
+        """Pose and rates (12,)."""
         return self.mean[:NUM_STATE]
 
     @property
     def parameters(self) -> Array:
-        """(p,)."""
+        """Parameters (p,) of the plant and the sensor."""
         return self.mean[THETA]
 
     @property
     def parameter_std(self) -> Array:
-        """(p,); NaN where nothing is estimated."""
+        """Standard deviations (p,); NaN where nothing is estimated."""
         return np.sqrt(np.diag(self.covariance)[THETA])
 
     @property
@@ -61,68 +47,69 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Belief:
-    """What an observer hands to the law, and gets back at the next sample.
+    """Estimate after a sample, which the observer gets back at the next one.
 
     Attributes:
         estimate: of state and parameters.
-        timeline: the delay that it believes in.
-        measured: (m,) last value of each measured quantity that was there; NaN before any.
-        fault: why the model stood in for the last measurement, as the name of a count, or None.
-        partly: why it did so for some of its values, the same.
-        still: as of `law.sensing.Sensing.stood`.
-        feeds_back: whether it is good enough to act on; else the feedforward goes on alone.
-        caution: how many times as much torques weigh as they should.
+        timeline: clock with the estimated delay.
+        measured: (m,) last valid value of each measured quantity; NaN before the first.
+        faults: causes for which the model replaced the last measurement or a part of it, as
+            names of counts.
+        partial: number of these that concern single values only.
+        feeds_back: whether the estimate may be fed back; otherwise the feedforward acts alone.
+        caution: factor on the weight of torques.
         settled: whether the delay is known.
-        found: whether it has just been found, or is another than before.
+        found: whether the delay was found, or changed, at this sample.
         delay_mean, delay_std: s, of the delay; NaN where it is not estimated.
+        memory: numbers of an observer of the core.
     """
 
     estimate: Estimate
     timeline: Timeline
     measured: Array
-    fault: str | None = None
-    partly: tuple[str, ...] = ()
-    still: Array = field(default_factory=lambda: np.zeros(0))
+    faults: tuple[str, ...] = ()
+    partial: int = 0
     feeds_back: bool = True
     caution: float = 1.0
     settled: bool = True
     found: bool = False
     delay_mean: float = math.nan
     delay_std: float = math.nan
+    memory: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def nothing(cls, timeline: Timeline, size: int, parameters: Array) -> "Belief":
-        """Before any of m = `size` values were measured, with parameters (p,) for a guess."""
+        """Return the belief before the first of `size` values, with parameters (p,)."""
         mean = np.concatenate([np.full(NUM_STATE, np.nan), parameters])
         unknown = np.full((len(mean), len(mean)), np.nan)
-        return cls(Estimate(mean, unknown, np.full(size, np.nan)), timeline, np.full(size, np.nan))
+        return cls(Estimate(mean, unknown), timeline, np.full(size, np.nan))
 
     @property
     def state(self) -> Array:
-        """(12,); NaN before there is any."""
+        """State (12,); NaN before the first measurement."""
         return self.estimate.state
 
     @property
     def parameters(self) -> Array:
-        """(p,)."""
+        """Parameters (p,)."""
         return self.estimate.parameters
 
     @property
     def delay(self) -> Array:
-        """(1,) s, as it is estimated, else as it is believed."""
+        """Delay (1,) in s: the estimate, or the assumed one."""
         return np.array([self.timeline.eta if math.isnan(self.delay_mean) else self.delay_mean])
 
     @property
     def has_state(self) -> bool:
-        """Whether there is a state to go on with."""
+        """Whether the state is finite."""
         return bool(np.all(np.isfinite(self.state)))
 
     def assuming(self, parameters: Array) -> "Belief":
-        """The same with other parameters (p,)."""
+        """Return the belief with other parameters (p,)."""
         mean = np.concatenate([self.state, parameters])
         return replace(self, estimate=replace(self.estimate, mean=mean))
 
     def at(self, state: Array) -> "Belief":
-        """The same in another state (12,)."""
+        """Return the belief in another state (12,)."""
         mean = np.concatenate([state, self.parameters])
         return replace(self, estimate=replace(self.estimate, mean=mean))

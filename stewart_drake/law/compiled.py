@@ -1,14 +1,14 @@
-"""Structures of the core for parts of the law, made once for each part."""
+"""Structures of the core for parts of the law, each made once."""
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.frozen_map import FrozenDynamics
-from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.scenario.signals import PLANT_PARAMETERS
 from stewart_drake.types import Array
@@ -20,37 +20,51 @@ class Compiled(NamedTuple):
     """A structure of the core.
 
     Attributes:
-        it: the pointer to it.
-        keeps: what it points to.
-        raised: errors of parts in Python that C has called.
+        it: pointer to it.
+        keeps: objects that it points to.
+        raised: errors of Python parts that C has called.
     """
 
     it: Any
     keeps: tuple[Any, ...] = ()
     raised: tuple[list[BaseException], ...] = ()
 
-    def require_calm(self) -> None:
-        """Raise the first error of a part in Python since the last call."""
+    def raise_errors(self) -> None:
+        """Raise the first error of a Python part since the last call."""
         for errors in self.raised:
             if errors:
                 first = errors[0]
                 errors.clear()
                 raise first
 
+    def pointed(self) -> list[Any]:
+        """Return the structure and all arrays and structures that it points to."""
+        return [self.it, *_flat(self.keeps)]
+
+
+def _flat(kept: Any) -> list[Any]:
+    if isinstance(kept, Compiled):
+        return kept.pointed()
+    if isinstance(kept, Mapping):
+        kept = tuple(kept.values())
+    if isinstance(kept, tuple):
+        return [one for part in kept for one in _flat(part)]
+    return [kept] if isinstance(kept, np.ndarray | core().ffi.CData) else []
+
 
 class Once(Generic[Made]):
-    """A function of objects that is called once for the same ones, the last 64 of them.
+    """Function of objects and numbers that is called once for the same ones, the last 64 of them.
 
-    Unlike a cache of the standard library's it does not ask them whether they are equal.
+    Objects are compared by identity, since those that hold arrays have no hash.
     """
 
     def __init__(self, make: Callable[..., Made]) -> None:
         self._make = make
-        self._made: OrderedDict[tuple[int, ...], tuple[tuple[Any, ...], Made]] = OrderedDict()
+        self._made: OrderedDict[tuple[Any, ...], tuple[tuple[Any, ...], Made]] = OrderedDict()
 
     def __call__(self, *parts: Any) -> Made:
-        """Return what was made of these objects, or make it."""
-        key = tuple(map(id, parts))
+        """Return the result for these objects and numbers."""
+        key = tuple(part if isinstance(part, int | float) else id(part) for part in parts)
         found = self._made.get(key)  # which holds the parts, so that no other has their id
         if found is None:
             found = parts, self._make(*parts)
@@ -61,7 +75,7 @@ class Once(Generic[Made]):
 
 
 def numbers(values: Any, *shape: int) -> Array:
-    """Return a copy of numbers that C can read; of any shape if none is given.
+    """Return a copy of numbers that C can read, of a certain shape if one is given.
 
     Raises:
         ValueError: another shape.
@@ -72,6 +86,11 @@ def numbers(values: Any, *shape: int) -> Array:
     return copied
 
 
+def address_of(pointer: Any) -> int:
+    """Return the address of a C structure."""
+    return int(core().ffi.cast("intptr_t", pointer))
+
+
 @Once
 def geometry(mechanism: Mechanism) -> Array:
     """Return the numbers of a machine, for C."""
@@ -79,15 +98,15 @@ def geometry(mechanism: Mechanism) -> Array:
 
 
 @Once
-def machine_of(dynamics: StewartDynamics) -> Compiled:
-    """Return the `stewart_machine` of a plant, for predictions whose substeps are given."""
-    machine, names = core().ffi.new("stewart_machine *"), dynamics.free
+def machine_of(plant: NominalPlant) -> Compiled:
+    """Return the `stewart_machine` of a plant."""
+    machine, dynamics = core().ffi.new("stewart_machine *"), plant.dynamics
     machine.geometry = list(geometry(dynamics.mechanism))
     machine.parameters = list(dynamics.plant_parameters)
-    machine.gravity, machine.torque_limit = dynamics.gravity, np.inf
-    machine.gentle_torque, machine.substeps = np.inf, 1
-    machine.estimated = len(names)
-    for i, name in enumerate(names):
+    machine.gravity, machine.torque_limit = dynamics.gravity, plant.motors.limit
+    machine.gentle_torque, machine.substeps = plant.coarse_torque_limit, plant.substeps
+    machine.estimated = len(dynamics.free)
+    for i, name in enumerate(dynamics.free):
         machine.place[i] = PLANT_PARAMETERS.index(name) if name in PLANT_PARAMETERS else -1
     if not isinstance(dynamics, FrozenDynamics):
         return Compiled(machine)

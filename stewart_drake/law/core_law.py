@@ -5,9 +5,7 @@ same kernels. Memory is one flat vector; `CoreMemory` reads its fields by the
 names of `law.memory.Memory`.
 """
 
-import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
@@ -19,41 +17,30 @@ from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.catch_up import periods_of
 from stewart_drake.law.channel import Packets, Report, Sent, Wire, report_of, structures
-from stewart_drake.law.compiled import Compiled, numbers
+from stewart_drake.law.compiled import Compiled, address_of, machine_of
 from stewart_drake.law.cost import QuadraticCost
-from stewart_drake.law.delay_observer import DelayObserver, compiled_delay, read_delay
 from stewart_drake.law.design_models import MultibodyModel
-from stewart_drake.law.encoder_observers import DifferencesObserver, EncoderObserver
-from stewart_drake.law.encoder_sensing import EncoderSensing, encoders_of
+from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
     InverseDynamicsFeedforward,
     NoFeedforward,
 )
-from stewart_drake.law.filter_settings import FilterSettings
-from stewart_drake.law.gaps import GapObserver
-from stewart_drake.law.late import LateObserver
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import KnownMotion, Motion
-from stewart_drake.law.motors import TorqueLimit
-from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.law.observers import NoObserver, ParameterObserver
-from stewart_drake.law.parameter_filter import compiled_filter, estimate_of
+from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.law.observers import CoreObserver, belief_of, part_of
 from stewart_drake.law.planner import NoPlanner, Rejoin
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import ArrivalPredictor, NonlinearPredictor
-from stewart_drake.law.sensing import Sensing, StateSensing, state_sensor
+from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
-    NUM_LEGS,
     NUM_REFERENCE,
-    NUM_STATE,
     NUM_TORQUES,
-    PLANT_PARAMETERS,
     WEIGHTS,
 )
 from stewart_drake.types import Array
@@ -69,162 +56,6 @@ _FEEDFORWARDS: Final = {
 }
 
 
-class Part(NamedTuple):
-    """An observer as the core has it.
-
-    Attributes:
-        name: of its table of functions.
-        sensing: C structure of the sensor.
-        estimation: C structure of its assumptions, or None.
-        belief: what it believes, from a memory of the law.
-        sources: of the core that it is made of, see `export.controller.SOURCES`.
-    """
-
-    name: str
-    sensing: Compiled
-    estimation: Compiled | None
-    belief: Callable[["CoreMemory"], Belief]
-    sources: tuple[str, ...]
-
-
-_STATE: Final[tuple[str, ...]] = ("instant", "kalman", "sensing")
-_ENCODERS: Final[tuple[str, ...]] = ("encoders", "kinematics")
-_KNOWN: Final[tuple[str, ...]] = ("observers", "observing.h", "filter", "filter_attempt.h", *_STATE)
-_WITHIN: Final[tuple[str, ...]] = (*_KNOWN, *_ENCODERS, "encoder_observers.c", "encoder_filter")
-_UNKNOWN: Final[tuple[str, ...]] = (
-    *("delay_observer", "delay_observing.h", "delay", "delay_search.c", "arrivals"),
-    *_STATE,
-)
-"""Sources: what all observers need; encoders; observers of the state with a known delay,
-of encoders with one, which are read within periods, of the state with an unknown one."""
-
-
-def _sensor(sensing: Sensing) -> Compiled | None:
-    if type(sensing) is StateSensing:
-        return state_sensor(sensing)
-    return encoders_of(sensing) if type(sensing) is EncoderSensing else None
-
-
-def _plain(law: PredictiveLqi | ServoPreview) -> Part | None:
-    sensing = _sensor(law.sensing)
-    if sensing is None:
-        return None
-    kind, sources = "state", _KNOWN
-    if isinstance(law.sensing, EncoderSensing):
-        kind, sources = "differences", _WITHIN
-    return Part(f"stewart_{kind}_observer", sensing, None, _nothing_estimated, sources)
-
-
-def _filter(law: PredictiveLqi | ServoPreview) -> Part | None:
-    sensing, observer = _sensor(law.sensing), observer_of(law)
-    if sensing is None or law.plant.dynamics.free != observer.settings.parameters.names:
-        return None
-    kind, sources = "filter", _KNOWN
-    if isinstance(law.sensing, EncoderSensing):
-        if isinstance(observer, GapObserver):
-            return None
-        kind, sources = "encoder", _WITHIN
-    elif isinstance(observer, GapObserver):
-        kind, sources = "gap", (*_KNOWN, "gap_observer.c")
-    return Part(
-        f"stewart_{kind}_observer",
-        sensing,
-        filter_settings_of(law.plant.dynamics, law.sensing, observer.settings),
-        _estimated,
-        sources,
-    )
-
-
-def _delay(law: PredictiveLqi | ServoPreview) -> Part | None:
-    sensing, observer = _sensor(law.sensing), law.observer
-    assert isinstance(observer, DelayObserver)
-    if sensing is None or law.plant.dynamics.free != observer.settings.parameters.names:
-        return None
-    c, period = core(), law.timeline.period
-    compiled = compiled_delay(observer, law.sensing, law.plant, period)
-    it = c.ffi.new("stewart_delay_settings *")
-    it.delay = compiled.it[0]
-    it.delay.machine = it.delay.sensing = c.ffi.NULL  # the law's
-    it.values, it.most = NUM_STATE, max_schedule_length(observer, period)
-    name, sources = "stewart_delay_observer", _UNKNOWN
-    if isinstance(law.sensing, EncoderSensing):
-        name, it.values = "stewart_encoder_delay_observer", NUM_LEGS
-        sources = (*_UNKNOWN, *_ENCODERS, "encoder_delay_observer.c")
-    return Part(name, sensing, Compiled(it, (compiled,)), _delay_believed, sources)
-
-
-def max_schedule_length(observer: DelayObserver, period: float) -> int:
-    """Return the most torques that act one after the other until the next one does.
-
-    Changes come a period apart, up to 1.5 times the longest delay where that grows the fastest.
-    """
-    return math.ceil(1.5 * observer.delay.longest / period) + 4
-
-
-def _delay_believed(memory: "CoreMemory") -> Belief:
-    law, flights = memory.law, len(memory.in_flight)
-    nothing = law.observer.start(law.timeline, law.sensing, law.plant)
-    sizes = len(memory.field("parameters")), nothing.estimate.outlier.size, flights
-    size, m = core().lib.stewart_delay_size(*sizes), sizes[1]
-    numbers_ = memory.field("observer")
-    believed = replace(nothing, numbers=numbers_[:size], flights=flights)
-    read = read_delay(replace(believed, measured=numbers_[size : size + m]))
-    return read.at(memory.field("state"))
-
-
-def filter_settings_of(
-    dynamics: StewartDynamics, sensing: Sensing, settings: FilterSettings
-) -> Compiled:
-    """Return the `stewart_filter_settings` of a filter."""
-    c = core()
-    compiled = compiled_filter(dynamics, sensing, settings)
-    it, prior = c.ffi.new("stewart_filter_settings *"), numbers(settings.parameters.prior)
-    it.filter = compiled.it[0]
-    it.filter.machine = it.filter.sensing = it.filter.legs = c.ffi.NULL  # the law's
-    it.prior = c.at(prior)
-    return Compiled(it, (compiled, prior))
-
-
-def _nothing_estimated(memory: "CoreMemory") -> Belief:
-    law = memory.law
-    known = law.plant.dynamics.parameters
-    nothing = Belief.nothing(law.timeline, law.sensing.size, known).at(memory.field("state"))
-    return replace(nothing, measured=memory.field("observer")[-law.sensing.size :])
-
-
-def _estimated(memory: "CoreMemory") -> Belief:
-    law, numbers_ = memory.law, memory.field("observer")
-    m, n = law.sensing.size, NUM_STATE + len(memory.field("parameters"))
-    size = core().lib.stewart_posterior_size(n, m)
-    estimate = estimate_of(numbers_[:size], n, m)
-    mean = np.concatenate([memory.field("state"), memory.field("parameters")])
-    last = numbers_[size : size + m]
-    return Belief(replace(estimate, mean=mean), law.timeline, last, partly=estimate.partly)
-
-
-OBSERVERS: Final[Mapping[type, Callable[[Any], Part | None]]] = {
-    NoObserver: _plain,
-    DifferencesObserver: _plain,
-    ParameterObserver: _filter,
-    EncoderObserver: _filter,
-    GapObserver: _filter,
-    DelayObserver: _delay,
-}
-"""What the core has of each kind of observer; None for a sensing that it has not."""
-
-
-def observer_of(law: PredictiveLqi | ServoPreview) -> Any:
-    """Return the observer of a law, of measurements of now."""
-    observer: Any = law.observer
-    return observer.observer if type(observer) is LateObserver else observer
-
-
-def part_of(law: PredictiveLqi | ServoPreview) -> Part | None:
-    """Return what the core has of the observer of a law, or None."""
-    make = OBSERVERS.get(type(observer_of(law)))
-    return None if make is None else make(law)
-
-
 def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
     """Return the field of a scenario whose part the core has not, or None.
 
@@ -233,8 +64,8 @@ def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
     covered = {
         "law": type(law) in (PredictiveLqi, ServoPreview) and type(law.plant) is NominalPlant,
         "plant.kind": type(law.plant.dynamics) is StewartDynamics,
-        "sensor.kind": _sensor(law.sensing) is not None,
-        "controller.estimate": part_of(law) is not None,
+        "sensor.kind": type(law.sensing) in (StateSensing, EncoderSensing),
+        "controller.estimate": type(law.observer) is CoreObserver,
         "controller.feedforward": type(law.feedforward) in _FEEDFORWARDS,
         "actuator.kind": type(law.plant.motors) is TorqueLimit,
     }
@@ -252,7 +83,7 @@ def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
 
 def _predictor(law: PredictiveLqi) -> type:
     """Return the kind of prediction that the core has for the observer of a law."""
-    return ArrivalPredictor if isinstance(law.observer, DelayObserver) else NonlinearPredictor
+    return ArrivalPredictor if law.finds_delay else NonlinearPredictor
 
 
 class CompiledLaw:
@@ -272,11 +103,12 @@ class CompiledLaw:
     """
 
     def __init__(self, law: PredictiveLqi | ServoPreview) -> None:
-        c, part = core(), part_of(law)
-        assert part is not None
-        self.law, self.observer = law, part
+        c, observer = core(), law.observer
+        assert isinstance(observer, CoreObserver)
+        part = part_of(observer, law.sensing, law.plant, law.timeline.period)
+        self.law, self._part = law, part
         self.tables: dict[int, str] = {}
-        self.keep = [one for known in (part.sensing, part.estimation) for one in _flat(known)]
+        self.keep = [one for it in (part.sensor, part.estimation) if it for one in it.pointed()]
         if isinstance(law, PredictiveLqi):
             self.data = c.ffi.new("stewart_law *")
             self.sources: tuple[str, ...] = ("reference", "law.c", *part.sources)
@@ -297,17 +129,15 @@ class CompiledLaw:
 
     def _fill(self, data: Any) -> None:
         """Fill in what both kinds of laws have."""
-        c, law, part = core(), self.law, self.observer
-        fill_machine(law.plant, data.machine)
-        timeline = law.timeline
+        c, law, part, timeline = core(), self.law, self._part, self.law.timeline
+        machine = machine_of(law.plant)
+        data.machine = machine.it[0]
+        self.keep += machine.pointed()
         data.period, data.steps, data.fraction = timeline.period, timeline.steps, timeline.fraction
         data.measured, data.rows = law.sensing.size, len(law.preview_times)
         data.cost.feedforward = getattr(c.lib, _FEEDFORWARDS[type(law.feedforward)])
-        data.observer = c.ffi.addressof(c.lib, part.name)
-        self.tables[address_of(data.observer)] = part.name
-        data.sensing = part.sensing.it
-        if part.estimation is not None:
-            data.estimation = part.estimation.it
+        part.fill(data)
+        self.tables[address_of(data.observer)] = part.table
 
     def _of_torques(self, law: PredictiveLqi) -> None:
         c, d, cost = core(), self.data, law.cost
@@ -315,11 +145,11 @@ class CompiledLaw:
         d.cost.integrates = int(cost.integrals is not None)
         d.cost.integrals = (np.zeros(6) if cost.integrals is None else cost.integrals).tolist()
         d.kept, d.silence = law.kept, law.silence
-        if isinstance(law.observer, DelayObserver):  # which finds steps and fraction itself
-            d.kept, d.steps, d.fraction = law.kept + law.observer.kept(d.period), 0, 0.0
-            d.rows = 1 + max_schedule_length(law.observer, d.period) + 6
-        if isinstance(law.observer, LateObserver):
-            d.longest_wait = law.observer.longest
+        d.longest_wait, observer = law.longest_wait, law.observer
+        assert isinstance(observer, CoreObserver)
+        if law.finds_delay:  # it finds steps and fraction itself
+            d.kept, d.steps, d.fraction = law.kept + observer.kept(d.period), 0, 0.0
+            d.rows = 1 + observer.max_schedule_length(d.period) + 6
         if isinstance(law.channel, Packets):
             d.channel = c.ffi.addressof(c.lib, "stewart_network")
             d.packets, *arrays = structures(law.channel)
@@ -332,8 +162,9 @@ class CompiledLaw:
     def _plans(self, planner: Rejoin) -> None:
         c, d, law = core(), self.data, self.law
         plan, until = c.ffi.new("stewart_replan *"), law.timeline.queue_length
-        if isinstance(law.observer, DelayObserver):
-            until = max_schedule_length(law.observer, d.period)
+        if law.finds_delay:
+            assert isinstance(law.observer, CoreObserver)
+            until = law.observer.max_schedule_length(d.period)
         plan.periods, plan.until = periods_of(planner.duration, d.period), until
         plan.size, plan.sign = planner.size.tolist(), home_sign(law.plant.mechanism)
         d.planner, d.planning = c.ffi.addressof(c.lib, "stewart_replanner"), plan
@@ -362,34 +193,6 @@ class CompiledLaw:
         else:
             c.lib.stewart_servo_start(self.data, c.at(memory), c.at(first))
         return memory
-
-
-def address_of(pointer: Any) -> int:
-    """Return the place of a C structure."""
-    return int(core().ffi.cast("intptr_t", pointer))
-
-
-def _flat(kept: Any) -> list[Any]:
-    """Return arrays and C structures, and those that they point to."""
-    if isinstance(kept, Compiled):
-        return [kept.it, *_flat(kept.keeps)]
-    if isinstance(kept, Mapping):
-        return _flat(tuple(kept.values()))
-    if isinstance(kept, tuple):
-        return [one for part in kept for one in _flat(part)]
-    return [kept] if isinstance(kept, np.ndarray | core().ffi.CData) else []
-
-
-def fill_machine(plant: NominalPlant, machine: Any) -> None:
-    """Fill in a `stewart_machine`."""
-    dynamics = plant.dynamics
-    machine.geometry = geometry_of(plant.mechanism).tolist()
-    machine.parameters = dynamics.plant_parameters.tolist()
-    machine.gravity, machine.substeps = dynamics.gravity, plant.substeps
-    machine.torque_limit, machine.gentle_torque = plant.motors.limit, plant.gentle_torque
-    machine.estimated = len(dynamics.free)
-    for i, name in enumerate(dynamics.free):
-        machine.place[i] = PLANT_PARAMETERS.index(name) if name in PLANT_PARAMETERS else -1
 
 
 @dataclass(frozen=True)
@@ -460,7 +263,10 @@ class CoreMemory:
     @cached_property
     def belief(self) -> Belief:
         """State of now, parameters, covariance at the last measurement."""
-        return self.compiled.observer.belief(self)
+        law, data = self.law, self.compiled.data
+        given = data if isinstance(law, PredictiveLqi) else core().ffi.addressof(data, "law")
+        belief = belief_of(law.observer, given, self.field("observer"), law.timeline)
+        return belief.at(self.field("state"))
 
     def without_error(self) -> "CoreMemory":
         """Return the same with nothing integrated."""
@@ -479,13 +285,10 @@ class CoreLqi:
     def __init__(self, law: PredictiveLqi) -> None:
         self._law, self._compiled = law, CompiledLaw(law)
         self._scratch = self._compiled.scratch
-        self._late = isinstance(law.observer, LateObserver)
 
     def initial_memory(self, queue: Array) -> CoreMemory:
         """Return the memory before the first sample; the queue (L, 6) is that of the delay."""
-        length = self._law.timeline.queue_length
-        if isinstance(self._law.observer, DelayObserver):
-            length = self._law.observer.kept(self._law.timeline.period)
+        length = self._law.queue_length
         if queue.shape != (length, NUM_TORQUES):
             raise ValueError(f"queue: got shape {queue.shape}; expected {(length, NUM_TORQUES)}")
         return CoreMemory(self._compiled.start(queue), self._compiled)
@@ -500,8 +303,7 @@ class CoreLqi:
     ) -> CoreMemory:
         """Take one sample, as `PredictiveLqi.step` does."""
         law, c = self._law, core()
-        if not self._late:
-            measurement.require_fresh()
+        law.require_age(measurement)
         values, weights = measurement.known(law.sensing.size), _row_major(weights)
         if weights.shape != (len(WEIGHTS),):
             raise ValueError(f"weights: got shape {weights.shape}; expected {(len(WEIGHTS),)}")
@@ -513,7 +315,7 @@ class CoreLqi:
         sample.weights = weights.tolist()
         data, scratch, torque = memory.data.copy(), np.empty(self._scratch), np.empty(NUM_TORQUES)
         c.lib.stewart_step(self._compiled.data, c.at(data), c.at(scratch), sample, c.at(torque))
-        asked.require_calm()
+        asked.raise_errors()
         return CoreMemory(data, self._compiled)
 
     def _asked(self, sample: Any, motion: Motion) -> Compiled:
@@ -522,7 +324,7 @@ class CoreLqi:
         Where the delay is known the instants are, too, and all rows are given beforehand.
         """
         law, c = self._law, core()
-        if not isinstance(law.observer, DelayObserver) and isinstance(law.planner, NoPlanner):
+        if not law.finds_delay and isinstance(law.planner, NoPlanner):
             rows = _row_major(motion(law.preview_times))
             _check_rows(law, rows)
             sample.reference, sample.about = c.lib.stewart_given_rows, c.at(rows)

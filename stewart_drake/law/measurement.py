@@ -1,4 +1,4 @@
-"""What a sensor says at one instant."""
+"""Measurement of one instant."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from stewart_drake.types import Array
 
 @dataclass(frozen=True)
 class Measurement:
-    """Values of one sample; what is lost is marked, not left to a number to tell.
+    """Values of one sample, of which some may be missing.
 
     Attributes:
-        values: (m,) in the units of the sensing; means nothing where it is not valid.
+        values: (m,) in the units of the sensing; meaningless where not valid.
         valid: (m,) which of them are there.
         age: s since they were taken.
     """
@@ -24,7 +24,7 @@ class Measurement:
 
     @classmethod
     def of(cls, values: Array, age: float = 0.0) -> "Measurement":
-        """From values (m,) of which those that are lost are no finite numbers."""
+        """Return a measurement from values (m,), of which the missing ones are not finite."""
         values = np.array(values, np.float64)
         return cls(values, np.isfinite(values), age)
 
@@ -33,12 +33,8 @@ class Measurement:
         """Whether every value is there."""
         return bool(np.all(self.valid))
 
-    def after(self, last: Array) -> Array:
-        """(m,) the last value of each that was there; `last` (m,) is that before."""
-        return np.where(self.valid, self.values, last)
-
     def known(self, size: int) -> Array:
-        """Return the values (size,), NaN in the place of those that are lost.
+        """Return the values (size,), NaN for the missing ones.
 
         Raises:
             ValueError: another number of values.
@@ -48,11 +44,6 @@ class Measurement:
             raise ValueError(f"measurement: got shape {values.shape}; expected {(size,)}")
         return values
 
-    def require_fresh(self) -> None:
-        """For who takes the values for those of now.
-
-        Raises:
-            ValueError: they are older.
-        """
-        if self.age != 0:
-            raise ValueError(f"measurement: got an age of {self.age} s; expected 0")
+    def missing(self) -> "Measurement":
+        """Return a measurement of the same size without any value."""
+        return Measurement(self.values, np.zeros_like(self.valid))

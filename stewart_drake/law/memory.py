@@ -62,7 +62,7 @@ class Memory:
         in_flight: (n > L, 6) torques, oldest first; the last is the newest. The last L are the
             queue; the one before them (and, where eta0 > 0, the first of them) acted during the
             last period. They are what the limit has let through.
-        belief: of the observer, at the last sample.
+        belief: at the last sample.
         measurement: (m,) at the last sample, as it came; NaN before the first.
         error: (6,) pose error at the last sample.
         integral: (6,) of the pose error.
@@ -74,6 +74,8 @@ class Memory:
         sent: what the channel remembers.
         reference: that was given, with numbers for what was missing; NaN before there was any.
         followed: (p, 18) the same with the way back after a gap.
+        delayed: belief at the last measurement, where it may be late, else None.
+        lag: age of that belief, periods.
         path: (n, 38) pieces that were planned in flight, or None.
         silence: samples that are still to go on without feedback.
         gap: whether the last row of the last preview was missing.
@@ -94,6 +96,8 @@ class Memory:
     sent: Sent
     reference: Previewed
     followed: Array
+    delayed: Belief | None = None
+    lag: int = 0
     path: Array | None = None
     silence: int = 0
     gap: bool = False

@@ -1,48 +1,63 @@
-"""The plant as the controller knows it: equations, how finely they are integrated, motors."""
+"""Model of the plant in the controller: equations of motion, integration steps, torque limit."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.motors import TorqueLimit
 from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.types import Array
 
-VIGOROUS = 2
+FINE_SUBSTEP_FACTOR = 2
+
+
+@dataclass(frozen=True)
+class TorqueLimit:
+    """Limit of each motor in N m, infinite for none. The loop applies it after the law."""
+
+    limit: float = math.inf
+
+    def saturate(self, torques: Array) -> Array:
+        """Return torques (..., 6) within the limit."""
+        return np.clip(torques, -self.limit, self.limit)
+
+    def reached(self, torques: Array) -> bool:
+        """Return whether any of the torques (..., 6) is at the limit or beyond."""
+        return bool(np.any(np.abs(torques) >= self.limit))
 
 
 @dataclass(frozen=True)
 class NominalPlant:
-    """What every part of the law predicts and designs with.
+    """Plant model for prediction and design.
 
     Attributes:
-        dynamics: its parameters are what is known beforehand.
+        dynamics: with the parameters that are known beforehand.
         substeps: Runge-Kutta steps per torque.
-        gentle_torque: N m; where a torque exceeds it, VIGOROUS times as many.
-        motors: that the torques go through.
+        coarse_torque_limit: N m; above it FINE_SUBSTEP_FACTOR times as many steps are taken.
+        motors: limit that the torques pass.
     """
 
     dynamics: StewartDynamics
     substeps: int
-    gentle_torque: float
+    coarse_torque_limit: float
     motors: TorqueLimit
 
     @property
     def mechanism(self) -> Mechanism:
-        """Its geometry."""
+        """Geometry of the machine."""
         return self.dynamics.mechanism
 
     def substeps_for(self, torques: Array) -> int:
-        """Runge-Kutta steps per torque for a prediction through these torques (n, 6)."""
-        vigorous = np.abs(torques).max(initial=0.0) > self.gentle_torque
-        return self.substeps * (VIGOROUS if vigorous else 1)
+        """Return the Runge-Kutta steps per torque for a prediction with torques (n, 6)."""
+        fine = np.abs(torques).max(initial=0.0) > self.coarse_torque_limit
+        return self.substeps * (FINE_SUBSTEP_FACTOR if fine else 1)
 
     def predict(
         self, state: Array, schedule: TorqueSchedule, parameters: Array | None = None
     ) -> Array:
-        """States (n, 12) after each of n torques, from a state (12,); None is as known before."""
+        """Return the states (n, 12) after each of n torques; None: the known parameters."""
         torques, durations = schedule
         substeps = self.substeps_for(torques)
         return self.dynamics.predict(state, torques, durations, substeps, parameters)

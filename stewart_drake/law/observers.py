@@ -1,27 +1,49 @@
-"""Where the plate is, and what it is: from measurements and from the torques that acted."""
+"""Observers: state, parameters and delay from measurements and the torques that acted.
 
+The recurrences are tables of functions of core/, see observer.h. `CoreObserver` selects one by the
+sensor and by what is to be estimated:
+
+| settings | delay | sensor of the state | encoders |
+| --- | --- | --- | --- |
+| None | None | the measurement as it comes | forward kinematics and differences |
+| given | None | filter of filter.h; with `gaps` that of gap_observer.c | encoder_filter.c |
+| given | given | delay.h and delay_search.c | the same, of the last sample of a period |
+"""
+
+import math
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from functools import cache
+from typing import Any, Final, Literal, NamedTuple, Protocol
 
 import numpy as np
+from scipy.special import chdtri
 
-from stewart_drake.law.belief import Belief
+from stewart_drake.core.library import core
+from stewart_drake.law.belief import Belief, Estimate
+from stewart_drake.law.compiled import Compiled, Once, machine_of, numbers
+from stewart_drake.law.encoder_sensing import EncoderSensing, encoders_of
 from stewart_drake.law.filter_settings import FilterSettings
 from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.memory import Counts
 from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.law.parameter_filter import ParameterFilter, Period
-from stewart_drake.law.sensing import Sensing
-from stewart_drake.law.timeline import Timeline
+from stewart_drake.law.sensing import Sensing, StateSensing, described, state_sensor
+from stewart_drake.law.timeline import Arrivals, Timeline
+from stewart_drake.scenario.calibration import OFFSETS
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, NUM_TORQUES
 from stewart_drake.types import Array
 
-AnyBelief = TypeVar("AnyBelief", bound=Belief)
+OUTLIER: Final = 1e-6
+"""Probability of an outlier under the assumptions of the filter."""
+TIMING_STD: Final = 2e-4
+"""Least standard deviation of the instant of a single torque, s, where the delay is estimated."""
 
 
 class Observer(Protocol):
     """A kind of observer: belief in, belief out. Instances are immutable."""
 
     def start(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Belief:
-        """What is believed before the first sample, with the delay that is assumed then."""
+        """Return the belief before the first sample, with the assumed delay."""
         ...
 
     def observe(
@@ -32,59 +54,93 @@ class Observer(Protocol):
         sensing: Sensing,
         plant: NominalPlant,
     ) -> Belief:
-        """One period, then a measurement at its end.
+        """Take one period, then a measurement at its end.
 
         Args:
             belief: after the last sample.
             measurement: of this one, as it came.
-            in_flight: (n, 6) as of `memory.Memory`, before this sample's torque.
-            sensing: what is measured.
-            plant: as it is known.
+            in_flight: (n, 6) torques, oldest first, before this sample's torque.
+            sensing: model of the sensor.
+            plant: model of the plant.
 
         Returns:
-            The new belief, its `measured` and its `fault` too. Its state may be NaN only as long as
-            there was no measurement without a fault; the law then takes the reference's.
+            The new belief. Its state may be NaN until the first measurement without a fault; the
+            law then uses the reference.
         """
         ...
 
 
 @dataclass(frozen=True)
-class NoObserver:
-    """Takes the measurement as it is, and goes on by the model where it has a fault."""
+class DelaySettings:
+    """Prior of the delay and of its changes.
 
-    def start(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Belief:
-        """The parameters are what is known of the plant, for good."""
-        return Belief.nothing(timeline, sensing.size, plant.dynamics.parameters)
+    Attributes:
+        mean, std: s, of the prior.
+        longest: s.
+        walk: s per root s, of the delay itself.
+        rate_std: s/s, of its rate; 0 for none.
+        rate_walk: s/s per root s.
+        quiet: whether nothing is fed back before the delay is found.
+        timing_std: s, least standard deviation of the instant of a single torque.
+    """
 
-    def observe(
-        self,
-        belief: Belief,
-        measurement: Measurement,
-        in_flight: Array,
-        sensing: Sensing,
-        plant: NominalPlant,
-    ) -> Belief:
-        """See `Observer.observe`."""
-        after = told(belief, measurement, sensing, plant)
-        first = sensing.start(measurement, belief.state) if after.fault is None else None
-        if first is not None:
-            return after.at(first.state)
-        return after.at(moved(belief, in_flight, plant)) if belief.has_state else after
+    mean: float
+    std: float
+    longest: float
+    walk: float = 0.0
+    rate_std: float = 0.0
+    rate_walk: float = 0.0
+    quiet: bool = False
+    timing_std: float = TIMING_STD
+
+    @classmethod
+    def of(
+        cls,
+        kind: Literal["constant", "drifting"],
+        mean: float,
+        std: float,
+        longest: float,
+        quiet: bool,
+    ) -> "DelaySettings":
+        """Return the prior of a constant delay, or of one with an unknown rate."""
+        drift = (0.0, 0.0, 0.0) if kind == "constant" else (3e-4, 0.02, 5e-3)
+        return cls(mean, std, longest, *drift, quiet)
 
 
 @dataclass(frozen=True)
-class ParameterObserver:
-    """The filter of `law.parameter_filter` over state and parameters.
+class CoreObserver:
+    """Observer of the core.
 
     Attributes:
-        settings: what it assumes.
+        settings: of the filter; None: nothing is estimated beside the state.
+        delay: prior of an unknown delay; None: the delay is known.
+        gaps: whether the filter corrects the estimate before a gap between measurements.
     """
 
-    settings: FilterSettings
+    settings: FilterSettings | None = None
+    delay: DelaySettings | None = None
+    gaps: bool = False
+
+    def kept(self, period: float) -> int:
+        """Return the number of torques to keep in flight beyond the assumed delay."""
+        return 0 if self.delay is None else math.ceil(self.delay.longest / period) + 2
+
+    def max_schedule_length(self, period: float) -> int:
+        """Return the most torques that act until the next one, where the delay is estimated.
+
+        Changes are a period apart, up to 1.5 times the longest delay if that grows the fastest.
+        """
+        assert self.delay is not None
+        return math.ceil(1.5 * self.delay.longest / period) + 4
 
     def start(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Belief:
-        """The parameters are those of the prior, until the first measurement."""
-        return Belief.nothing(timeline, sensing.size, self.settings.parameters.prior)
+        if self.delay is not None:
+            before = np.zeros((1, NUM_TORQUES))
+            timeline = Arrivals(timeline.period, Delay(0), self.delay.mean, before=before)
+        law = self.law(timeline, sensing, plant)
+        memory = np.empty(law.it.observer.memory(law.it))
+        law.it.observer.start(law.it, core().at(memory))
+        return belief_of(self, law.it, memory, timeline)
 
     def observe(
         self,
@@ -94,52 +150,225 @@ class ParameterObserver:
         sensing: Sensing,
         plant: NominalPlant,
     ) -> Belief:
-        """See `Observer.observe`."""
-        after = told(belief, measurement, sensing, plant)
-        ekf = self.filter(belief.measured, after.still, sensing, plant)
-        usable = measurement if after.fault is None else None
-        if not belief.estimate.uncertain:
-            first = None if usable is None else ekf.start(usable, belief.parameters, belief.state)
-            if first is not None:
-                return replace(after, estimate=first, partly=first.partly)
-            return after.at(moved(belief, in_flight, plant)) if belief.has_state else after
-        schedule, following = belief.timeline.last_period(in_flight)
-        period = Period(*schedule, following, plant.substeps_for(schedule.torques))
-        estimate, fault = ekf.advance(belief.estimate, period, usable), after.fault
-        if estimate.outliers > 0:
-            fault = "measurements_rejected"
-            # Such a one said so before: it is no second witness.
-            if np.array_equal(measurement.values, belief.measured):
-                fault, estimate = "measurements_frozen", replace(estimate, outliers=0)
-        return replace(after, estimate=estimate, fault=fault, partly=estimate.partly)
+        timeline, c = belief.timeline, core()
+        law = self.law(timeline, sensing, plant)
+        observer, memory = law.it.observer, belief.memory.copy()
+        if self.delay is None:
+            if not timeline.parts:
+                timeline.queue(in_flight)  # refuses too few torques
+            known = belief.estimate.mean if self.settings else belief.state
+            memory[: len(known)] = known  # the caller may have set another state
+            last = _last_values(self, law.it)
+            memory[last : last + sensing.size] = belief.measured
+        else:
+            if len(in_flight) != 1 + law.it.kept:
+                raise ValueError(f"in_flight: got {len(in_flight)}; expected {1 + law.it.kept}")
+            observer.assume(law.it, c.at(memory), c.at(numbers(belief.state)))
+        values, torques = measurement.known(sensing.size), numbers(in_flight)
+        given = c.at(memory), len(torques), c.at(torques), c.at(values)
+        status = observer.observe(law.it, *given, c.scratch(observer.scratch(law.it)))
+        law.raise_errors()
+        return belief_of(self, law.it, memory, timeline, status)
 
-    def filter(
-        self, last: Array, still: Array, sensing: Sensing, plant: NominalPlant
-    ) -> ParameterFilter:
-        """The filter of a sample.
-
-        Args:
-            last: (m,) what was measured before.
-            still: as of `Sensing.stood`.
-            sensing: what is measured.
-            plant: as it is known.
-        """
-        return ParameterFilter(plant.dynamics, sensing, self.settings)
+    def law(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Compiled:
+        """Return a `stewart_law` with all that the observer reads of it."""
+        clock = timeline.period, timeline.steps, timeline.fraction, timeline.parts
+        return _law_of(self, sensing, plant, *clock)
 
 
-def told(
-    belief: AnyBelief, measurement: Measurement, sensing: Sensing, plant: NominalPlant
-) -> AnyBelief:
-    """The belief with what was measured, and what is wrong with that, and nothing made of it."""
-    measurement.require_fresh()
-    period = belief.timeline.period
-    fault = sensing.fault(measurement, belief.measured, period, plant.mechanism)
-    still = sensing.stood(measurement, belief.measured, belief.still)
-    measured = measurement.after(belief.measured)
-    return replace(belief, measured=measured, fault=fault, partly=(), still=still)
+class Part(NamedTuple):
+    """An observer in the core.
+
+    Attributes:
+        table: name of its table of functions.
+        sensor: C structure of the sensor.
+        own: whether the sensor is written in Python.
+        estimation: C structure of its assumptions, or None.
+        sources: files of the core for it, see `export.controller.SOURCES`.
+    """
+
+    table: str
+    sensor: Compiled
+    own: bool
+    estimation: Compiled | None
+    sources: tuple[str, ...]
+
+    def fill(self, law: Any) -> None:
+        """Set the observer of a `stewart_law`."""
+        law.observer = core().ffi.addressof(core().lib, self.table)
+        if self.own:
+            law.described = self.sensor.it
+        else:
+            law.sensing = self.sensor.it
+        if self.estimation is not None:
+            law.estimation = self.estimation.it
 
 
-def moved(belief: Belief, in_flight: Array, plant: NominalPlant) -> Array:
-    """The state (12,) a period later, by the model alone."""
-    schedule, _ = belief.timeline.last_period(in_flight)
-    return plant.predict(belief.state, schedule)[-1]
+_STATE: Final = ("instant", "kalman", "sensing")
+_ENCODERS: Final = ("encoders", "kinematics")
+_KNOWN: Final = ("observers", "observing.h", "filter", "filter_attempt.h", *_STATE)
+_UNKNOWN: Final = (
+    *("delay_observer", "delay_observing.h", "delay", "delay_search.c", "arrivals"),
+    *_STATE,
+)
+"""Sources for a known and for an unknown delay."""
+
+
+def part_of(observer: CoreObserver, sensing: Sensing, plant: NominalPlant, period: float) -> Part:
+    """Return the observer in the core for a sensor and a plant."""
+    own, within = type(sensing) is not StateSensing, type(sensing) is EncoderSensing
+    if within:
+        sensor, own = encoders_of(sensing), False
+    else:
+        sensor = described(sensing, plant.mechanism) if own else state_sensor(sensing)
+    sources: tuple[str, ...] = (*_KNOWN, *_ENCODERS) if within else _KNOWN
+    kind, estimation, settings = "differences" if within else "state", None, observer.settings
+    if settings is not None and settings.parameters.names != tuple(plant.dynamics.free):
+        free = ", ".join(plant.dynamics.free)
+        raise ValueError(f"settings.parameters: got other names than those of the plant: {free}")
+    if settings is not None and observer.delay is not None:
+        kind = "encoder_delay" if within else "delay"
+        sources = (*_UNKNOWN, *_ENCODERS, "encoder_delay_observer.c") if within else _UNKNOWN
+        size = NUM_LEGS if within else sensing.size
+        estimation = _delay_settings_of(observer, settings, size, period)
+    elif settings is not None:
+        kind = "encoder" if within else "gap" if observer.gaps else "filter"
+        estimation = filter_settings_of(settings, sensing.size)
+        if kind == "gap":
+            sources += ("gap_observer.c",)
+    if within and observer.delay is None:
+        sources += ("encoder_observers.c", "encoder_filter")
+    return Part(f"stewart_{kind}_observer", sensor, own, estimation, sources)
+
+
+@Once
+def _law_of(
+    observer: CoreObserver,
+    sensing: Sensing,
+    plant: NominalPlant,
+    period: float,
+    steps: int,
+    fraction: float,
+    parts: int,
+) -> Compiled:
+    """Return a `stewart_law` with all that an observer reads of it."""
+    law, machine = core().ffi.new("stewart_law *"), machine_of(plant)
+    part = part_of(observer, sensing, plant, period)
+    part.fill(law)
+    law.machine, law.period, law.parts = machine.it[0], period, parts
+    law.measured, law.kept = sensing.size, observer.kept(period)
+    if observer.delay is None:
+        law.steps, law.fraction = steps, fraction
+    return Compiled(law, (machine, part.sensor, part.estimation), part.sensor.raised)
+
+
+@cache
+def _gate(size: int) -> float:
+    """Return the squared normalised innovation above which `size` values are an outlier."""
+    return float(chdtri(size, OUTLIER))
+
+
+@Once
+def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
+    """Return the `stewart_filter_settings` of a filter for `size` measured values."""
+    c, known, p = core(), settings.parameters, len(settings.parameters.names)
+    free = np.full(NUM_STATE, np.inf)
+    it, prior = c.ffi.new("stewart_filter_settings *"), numbers(known.prior)
+    arrays = {
+        "model_std": numbers(settings.model_std, NUM_STATE),
+        "prior_root": numbers(np.linalg.cholesky(known.covariance), p, p),
+        "usual_std": numbers(known.usual_std, p),
+        "lower": numbers([*-free, *known.lower], NUM_STATE + p),
+        "upper": numbers([*free, *known.upper], NUM_STATE + p),
+    }
+    it.prior, it.filter.gate, it.filter.timing_std = c.at(prior), _gate(size), settings.timing_std
+    it.filter.offsets = known.names.index(OFFSETS[0]) if OFFSETS[0] in known.names else -1
+    for name, array in arrays.items():
+        setattr(it.filter, name, c.at(array))
+    return Compiled(it, (prior, arrays))
+
+
+def _delay_settings_of(
+    observer: CoreObserver, settings: FilterSettings, size: int, period: float
+) -> Compiled:
+    """Return the `stewart_delay_settings` for `size` values of one instant."""
+    c, prior, delay = core(), settings.parameters, observer.delay
+    assert delay is not None
+    it = c.ffi.new("stewart_delay_settings *")
+    it.values, it.most = size, observer.max_schedule_length(period)
+    arrays = {
+        "prior_root": numbers(np.linalg.cholesky(prior.covariance)),
+        **{name: numbers(getattr(prior, name)) for name in ("prior", "std", "usual_std")},
+        **{name: numbers(getattr(prior, name)) for name in ("lower", "upper")},
+    }
+    for name, array in arrays.items():
+        setattr(it.delay, name, c.at(array))
+    it.delay.period, it.delay.gate, it.delay.believed = period, _gate(size), delay.mean
+    it.delay.model_std, it.delay.first_timing = list(settings.model_std), settings.timing_std
+    it.delay.delay_std, it.delay.quiet = delay.std, delay.quiet
+    for name in ("longest", "timing_std", "walk", "rate_std", "rate_walk"):
+        setattr(it.delay, name, getattr(delay, name))
+    return Compiled(it, (arrays,))
+
+
+def _last_values(observer: CoreObserver, law: Any) -> int:
+    """Return the place of the last values in the memory of an observer of a known delay."""
+    size = core().lib.stewart_posterior_size(NUM_STATE + law.machine.estimated, law.measured)
+    return int(size) if observer.settings is not None else NUM_STATE
+
+
+def belief_of(
+    observer: CoreObserver, law: Any, memory: Array, timeline: Timeline, status: int = 0
+) -> Belief:
+    """Return the belief that the memory of an observer of the core holds.
+
+    Args:
+        observer: the observer.
+        law: `stewart_law *` with it.
+        memory: of the observer, which the belief keeps.
+        timeline: the assumed one.
+        status: of the last sample, bits of `stewart_status`.
+    """
+    c, p = core(), law.machine.estimated
+    faults = tuple(name for i, name in enumerate(Counts._fields) if status >> i & 1)
+    if observer.delay is not None:
+        return _delay_belief(law, memory, timeline, faults)
+    n, m, last = NUM_STATE + p, law.measured, _last_values(observer, law)
+    measured = memory[last : last + m]
+    if observer.settings is not None:
+        mean, root, rest = np.split(memory[:last], [n, n + n * n])
+        L, partial = root.reshape(n, n), int(rest[-1]).bit_count()
+        return Belief(Estimate(mean, L @ L.T), timeline, measured, faults, partial, memory=memory)
+    theta, std = np.empty(p), np.empty(p)
+    law.observer.parameters(law, *map(c.at, (memory, theta, std)))
+    belief = Belief.nothing(timeline, m, theta).at(memory[:NUM_STATE])
+    return replace(belief, measured=measured, faults=faults, memory=memory)
+
+
+def _delay_belief(law: Any, memory: Array, timeline: Timeline, faults: tuple[str, ...]) -> Belief:
+    c, p, flights = core(), law.machine.estimated, 1 + law.kept
+    settings = c.ffi.cast("stewart_delay_settings *", law.estimation)
+    m, n, first = settings.values, NUM_STATE + p + 2, c.lib.STEWART_DELAY_NUMBERS
+    it = c.ffi.cast("stewart_delay_memory *", c.at(memory))
+    last, state = memory[-NUM_STATE - m : -NUM_STATE], memory[-NUM_STATE:]
+    belief = Belief.nothing(timeline, m, np.array(c.ffi.unpack(settings.delay.prior, p)))
+    if it.known:
+        best, L = c.lib.stewart_delay_guess(p, m, flights, it, int(it.best)), np.zeros((n, n))
+        c.lib.stewart_guess_root(best, n, c.at(L))
+        mean, root = np.array(c.ffi.unpack(best.numbers, n))[:-2], L[:-2, :-2]
+        belief = replace(belief, estimate=Estimate(mean, root @ root.T))
+    others = max(flights - 1, 1)
+    before = memory[first : first + NUM_TORQUES * others].reshape(others, NUM_TORQUES)
+    return replace(
+        belief.at(state),
+        timeline=Arrivals(timeline.period, Delay(0), it.eta, it.rate, int(it.sent), before),
+        measured=last,
+        faults=faults,
+        feeds_back=bool(it.feeds_back),
+        caution=it.caution,
+        settled=bool(it.settled),
+        found=bool(it.found),
+        delay_mean=it.mean,
+        delay_std=it.std,
+        memory=memory,
+    )

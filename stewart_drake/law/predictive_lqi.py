@@ -29,7 +29,7 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import Motion, Previewed, between, completed, interpolated
 from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.law.observers import Observer
+from stewart_drake.law.observers import CoreObserver, Observer
 from stewart_drake.law.planner import NoPlanner, Planner
 from stewart_drake.law.predictors import Ahead, Predictor
 from stewart_drake.law.return_path import ReturnPath
@@ -39,7 +39,6 @@ from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
-    NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
     POSE,
@@ -99,7 +98,9 @@ class PredictiveLqi:
         silence: samples at the start at which nothing is fed back: what they tell is of a plate on
             which nothing of the controller's acts, and noise.
         channel: how torques get to the motors.
-        kept: how many torques are remembered beyond those of the delay, for late measurements.
+        kept: number of torques in flight beyond those of the delay, for late measurements.
+        longest_wait: periods to wait for a late measurement before the model continues; 0:
+            measurements are of the present.
     """
 
     timeline: Timeline
@@ -112,8 +113,28 @@ class PredictiveLqi:
     cost: QuadraticCost
     channel: Channel = field(default_factory=Wire)
     kept: int = 0
+    longest_wait: int = 0
     planner: Planner = field(default_factory=NoPlanner)
     silence: int = 0
+
+    @property
+    def estimates(self) -> bool:
+        """Whether the observer estimates parameters."""
+        return not (isinstance(self.observer, CoreObserver) and self.observer.settings is None)
+
+    @property
+    def finds_delay(self) -> bool:
+        """Whether the observer estimates the delay."""
+        return isinstance(self.observer, CoreObserver) and self.observer.delay is not None
+
+    def require_age(self, measurement: Measurement) -> None:
+        """Check that a measurement is of the present, unless the law waits for late ones.
+
+        Raises:
+            ValueError: it is older.
+        """
+        if measurement.age != 0 and self.longest_wait == 0:
+            raise ValueError(f"measurement: got an age of {measurement.age} s; expected 0")
 
     @cached_property
     def preview_times(self) -> Array:
@@ -129,18 +150,13 @@ class PredictiveLqi:
         )
         return np.concatenate([at, nodes, *further])
 
-    def warm_up(self) -> None:
-        """Take two samples at home, so that no later one waits for functions to be compiled."""
-        home = np.concatenate([self.plant.mechanism.home, np.zeros(NUM_COORDINATES)])
-        wanted = np.concatenate([home, np.zeros(NUM_REFERENCE - NUM_STATE)])
-        said = Measurement.of(self.sensing.seen(home))
-        for torque in (0.0, 2 * self.plant.gentle_torque):
-            queue = np.full((self.timeline.queue_length, NUM_TORQUES), torque)
-            memory = self.initial_memory(queue)
-            for _ in range(2):
-                memory = self.step(
-                    memory, said, lambda times: np.tile(wanted, (len(times), 1)), np.ones(2)
-                )
+    @property
+    def queue_length(self) -> int:
+        """Torques in flight at the start."""
+        if self.finds_delay:
+            assert isinstance(self.observer, CoreObserver)
+            return self.observer.kept(self.timeline.period)
+        return self.timeline.queue_length
 
     def initial_memory(self, queue: Array) -> Memory:
         """Before the first sample.
@@ -197,9 +213,7 @@ class PredictiveLqi:
             memory.sent, memory.in_flight, memory.belief.timeline, report
         )
         memory = replace(memory, in_flight=in_flight)
-        belief = self.observer.observe(
-            memory.belief, measurement, memory.in_flight, self.sensing, self.plant
-        )
+        belief, delayed, lag = self._observe(memory, measurement)
         followed = self.planner.follow(memory.path, belief, memory.in_flight, motion, self.plant)
         if followed.anew:
             memory = memory.without_error()
@@ -219,12 +233,14 @@ class PredictiveLqi:
         nonfinite = not np.all(np.isfinite(torque))
         if nonfinite:
             torque = memory.torque
-        limited = self.plant.motors.let_through(torque)
+        limited = self.plant.motors.saturate(torque)
         saturated = bool(np.any(limited != torque))
         plan = self._plan(limited, guide, ahead, queue, gain, preview[nodes_end:])
         return Memory(
             in_flight=np.vstack([memory.in_flight[1:], limited]),
             belief=belief,
+            delayed=delayed if self.longest_wait else None,
+            lag=lag,
             measurement=measurement.values,
             error=error,
             integral=integral,
@@ -232,8 +248,7 @@ class PredictiveLqi:
             torque=torque,
             weights=np.array(weights),
             counts=memory.counts.plus(
-                belief.fault,
-                *belief.partly,
+                *belief.faults,
                 trouble,
                 "nonfinite_torque" if nonfinite else None,
                 "saturated_steps" if saturated else None,
@@ -249,6 +264,35 @@ class PredictiveLqi:
             plan=plan,
             sent=self.channel.send(sent, plan, memory.in_flight),
         )
+
+    def _observe(self, memory: Memory, measurement: Measurement) -> tuple[Belief, Belief, int]:
+        """Return the belief now, the belief at the last measurement, and its age in periods.
+
+        A measurement that is m periods old describes the state m periods ago. The observer runs
+        so many periods behind, and its estimate is predicted with the torques that acted since:
+
+            x(t_k) = f(x(t_k - m dt), torques of the last m periods, theta).
+        """
+        self.require_age(measurement)
+        age = round(measurement.age / self.timeline.period)
+        valid = bool(np.any(measurement.valid)) and age >= 0
+        target = min(age, self.longest_wait) if valid else self.longest_wait
+        delayed = memory.belief if memory.delayed is None else memory.delayed
+        lag, flown = memory.lag + 1, memory.in_flight
+        faults, partial = (() if valid else ("measurements_missing",)), 0
+        while lag > target:
+            lag -= 1
+            fresh = valid and lag == age
+            given = replace(measurement, age=0.0) if fresh else measurement.missing()
+            before = flown[: len(flown) - lag]
+            delayed = self.observer.observe(delayed, given, before, self.sensing, self.plant)
+            if fresh:
+                faults, partial = delayed.faults, delayed.partial
+        belief = replace(delayed, faults=faults, partial=partial)
+        if lag and delayed.has_state:
+            schedule = delayed.timeline.last_periods(flown, lag)
+            belief = belief.at(self.plant.predict(delayed.state, schedule, delayed.parameters)[-1])
+        return belief, delayed, lag
 
     def _previewed(self, memory: Memory, belief: Belief, motion: Motion) -> Wanted:
         """Return the reference to follow now: the given one, and after a gap the way back onto it.
@@ -408,7 +452,7 @@ class PredictiveLqi:
                 seen = np.concatenate([error - offset, self.cost.sees(integral), late])
                 torque = torque - gain @ seen if _is_there(gain) else torque
             usable = bool(np.all(np.isfinite(torque)))
-            plan.append(plant.motors.let_through(torque) if usable else plan[-1])
+            plan.append(plant.motors.saturate(torque) if usable else plan[-1])
         return np.array(plan)
 
     def _design(

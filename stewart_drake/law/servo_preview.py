@@ -25,37 +25,17 @@ from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import Observer
 from stewart_drake.law.sensing import Sensing
 from stewart_drake.law.servos import Reported, ReportLayout
-from stewart_drake.law.timeline import Timeline, TorqueSchedule
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.signals import (
     MODEL_TORQUE,
     NUM_COORDINATES,
-    NUM_STATE,
     NUM_TORQUES,
     POSE,
     RATES,
     WEIGHTS,
 )
 from stewart_drake.types import Array
-
-
-@dataclass(frozen=True)
-class ReportedTimeline(Timeline):
-    """A clock for torques that are reported, not remembered.
-
-    Attributes:
-        parts: torques per period.
-    """
-
-    parts: int
-
-    def last_period(self, in_flight: Array) -> tuple[TorqueSchedule, Array]:
-        """What acted since the last measurement: all of the torques (n, 6), a part of dt each.
-
-        What acts next the servos decide; the last torque stands for it.
-        """
-        durations = np.full(len(in_flight), self.period / self.parts)
-        return TorqueSchedule(in_flight, durations), in_flight[-1]
 
 
 @dataclass(frozen=True)
@@ -97,7 +77,7 @@ class ServoPreview:
         reports: how the machine tells what acted.
     """
 
-    timeline: ReportedTimeline
+    timeline: Timeline
     plant: NominalPlant
     sensing: Sensing
     observer: Observer
@@ -119,15 +99,6 @@ class ServoPreview:
         rates = self.plant.dynamics.actuation_map(wanted[POSE]).T @ wanted[RATES]
         torque = self.feedforward.at(wanted, self.plant.dynamics, parameters)
         return np.concatenate([angles, rates, torque])
-
-    def warm_up(self) -> None:
-        """Take three samples at home, so that no later one waits for functions to be compiled."""
-        home = np.concatenate([self.plant.mechanism.home, np.zeros(2 * NUM_COORDINATES)])
-        memory = self.initial_memory(self.command(home, self.plant.dynamics.parameters))
-        said = Measurement.of(self.sensing.seen(home[:NUM_STATE]))
-        for _ in range(3):
-            report = np.zeros(self.reports.size)
-            memory = self.step(memory, said, lambda times: np.tile(home, (len(times), 1)), report)
 
     def initial_memory(self, command: Array) -> ServoMemory:
         """Before the first sample, with a command (18,) for the one that was sent last."""
@@ -165,7 +136,7 @@ class ServoPreview:
             said = self.reports.read(report, behind - age)
             belief, behind = self._observed(belief, replace(measurement, age=0.0), said), age
         else:
-            belief = replace(belief, fault="measurements_missing")
+            belief = replace(belief, faults=("measurements_missing",))
         command, trouble = self._ahead(memory.command, motion(self.preview_times)[0], belief)
         saturated = 0 if said is None else said.saturated
         asked = memory.torque if said is None else said.asked
@@ -176,8 +147,8 @@ class ServoPreview:
             behind=behind,
             measurement=measurement.values,
             torque=asked,
-            in_flight=self.plant.motors.let_through(asked)[None],
-            counts=memory.counts.plus(belief.fault, trouble, *["saturated_steps"] * saturated),
+            in_flight=self.plant.motors.saturate(asked)[None],
+            counts=memory.counts.plus(*belief.faults, trouble, *["saturated_steps"] * saturated),
         )
 
     def _observed(self, belief: Belief, measurement: Measurement, said: Reported | None) -> Belief:

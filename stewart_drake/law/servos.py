@@ -26,7 +26,7 @@ import numpy as np
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.holds import cubic
-from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.scenario.signals import (
     MODEL_TORQUE,
     NUM_REFERENCE,

@@ -1,16 +1,17 @@
-"""Periods, delays and torques in flight: what acted when, and what will.
+"""Periods, delays and torques in flight: the torques that acted, and those that will act.
 
 The torque computed at t = k dt acts during [t + eta, t + eta + dt), eta = (mu + eta0 / dt) dt. With
 eta0 = 0 each period has one torque; with eta0 > 0 it has two, the older one for its first eta0.
-Nobody else does arithmetic with them.
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from stewart_drake.core.library import core
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.types import Array
 
 
@@ -23,34 +24,36 @@ class TorqueSchedule(NamedTuple):
 
 @dataclass(frozen=True)
 class Timeline:
-    """The controller's clock and the delay that it believes in.
+    """Clock of the controller, with the assumed delay.
 
     Attributes:
         period: dt in s.
         delay: eta, in periods.
+        parts: torques per period that the machine reports; 0: the law remembers its own.
     """
 
     period: float
     delay: Delay
+    parts: int = field(default=0, kw_only=True)
 
     @property
     def steps(self) -> int:
-        """mu, whole periods of delay."""
+        """Whole periods of delay, mu."""
         return self.delay.steps
 
     @property
     def fraction(self) -> float:
-        """eta0 / dt, in [0, 1)."""
+        """Rest of the delay eta0 / dt, in [0, 1)."""
         return self.delay.fraction
 
     @property
     def eta(self) -> float:
-        """The whole delay, s."""
+        """Delay of the torque that is computed now, s."""
         return self.delay.eta(self.period)
 
     @property
     def queue_length(self) -> int:
-        """Torques in flight at a sampling instant."""
+        """Torques in flight at a sampling instant, L."""
         return self.delay.queue_length
 
     @property
@@ -60,15 +63,15 @@ class Timeline:
 
     @property
     def samples(self) -> Array:
-        """(mu,) samples from now, s, up to the last before the next torque begins to act."""
+        """Sampling instants (mu,), s from now, up to the last before the next torque acts."""
         return self.period * np.arange(1.0, self.steps + 1)
 
     def holds(self, first: int, last: int) -> Array:
-        """Beginnings, s from now, of the holds `first` to `last`; 0 is that of the next torque."""
+        """Return when holds `first` to `last` begin, s from now; 0 is that of the next torque."""
         return np.asarray(self.eta + self.period * np.arange(first, last + 1))
 
     def schedule(self, in_flight: Array) -> TorqueSchedule:
-        """What acts in all whole periods that torques (n, 6), the oldest first, cover."""
+        """Return the schedule of all whole periods that torques (n, 6), oldest first, cover."""
         if self.fraction == 0:
             return TorqueSchedule(in_flight, np.full(len(in_flight), self.period))
         # Each torque acts for the end of one period and the beginning of the next.
@@ -77,16 +80,54 @@ class Timeline:
         return TorqueSchedule(torques, np.tile(split, len(in_flight) - 1))
 
     def queue(self, in_flight: Array) -> Array:
-        """(L, 6) of torques (n > L, 6), the oldest first, those that are still to act.
+        """Return the torques (L, 6) that are still to act, of (n > L, 6), oldest first.
 
         Raises:
             ValueError: fewer torques than the delay takes.
         """
-        return self._since_last_sample(in_flight)[1:]
+        return self._since(in_flight, 1)[1:]
 
-    def _since_last_sample(self, in_flight: Array) -> Array:
-        """(L + 1, 6), what acted in the last period too."""
-        longest = len(in_flight) - 1
+    def until_next(self, queue: Array) -> TorqueSchedule:
+        """Return the schedule from now until the next torque acts, of torques in flight (L, 6)."""
+        holds = np.full(len(queue), self.period)
+        if self.fraction > 0:
+            holds[0] = self.fraction * self.period  # the oldest has acted for the rest of its hold
+        return TorqueSchedule(queue, holds)
+
+    def last_periods(self, in_flight: Array, number: int) -> TorqueSchedule:
+        """Return the schedule of the last `number` >= 1 periods, of torques (n, 6).
+
+        Raises:
+            ValueError: fewer torques than that takes.
+        """
+        torques, durations = self.schedule(self._since(in_flight, number))
+        n = number * self.per_period
+        return TorqueSchedule(torques[:n], durations[:n])
+
+    def next_period(self, queue: Array) -> TorqueSchedule:
+        """Return the schedule of the period that the oldest of torques (n, 6) begins."""
+        torques, durations = self.schedule(queue)
+        return TorqueSchedule(torques[: self.per_period], durations[: self.per_period])
+
+    def last_period(self, in_flight: Array) -> tuple[TorqueSchedule, Array]:
+        """Return the schedule since the last sample, and the torque (6,) that acts next.
+
+        Without a delay that one is still to be computed, and with reported torques the servos
+        decide it: the last torque stands for it.
+
+        Args:
+            in_flight: (n > L, 6) torques, oldest first; with `parts` the reported ones.
+        """
+        if self.parts:
+            parts = np.full(len(in_flight), self.period / self.parts)
+            return TorqueSchedule(in_flight, parts), in_flight[-1]
+        torques, durations = self.schedule(self._since(in_flight, 1))
+        n = self.per_period
+        return TorqueSchedule(torques[:n], durations[:n]), torques[min(n, len(torques) - 1)]
+
+    def _since(self, in_flight: Array, periods: int) -> Array:
+        """Return the torques (L + periods, 6) that act from so many periods ago on."""
+        longest = len(in_flight) - periods
         if longest < self.queue_length:
             raise ValueError(
                 f"delay: {longest} torques are kept in flight; expected at least the "
@@ -94,43 +135,75 @@ class Timeline:
             )
         return in_flight[longest - self.queue_length :]
 
+
+@dataclass(frozen=True, eq=False)
+class Arrivals(Timeline):
+    """Timeline for a delay of any length that may drift, see core/arrivals.h.
+
+    The error is regulated where the next torque begins to act. Seen from there no part of a period
+    is left, so that the design has a delay of whole periods.
+
+    Attributes:
+        arrival: eta in s, of a torque that arrives now; infinite if none ever arrives.
+        rate: of eta, s/s.
+        sent: number of torques in flight that the controller computed, the newest ones.
+        before: (b, 6) N m, torques in the periods from now on until the first of those arrives;
+            the last one continues.
+    """
+
+    arrival: float = 0.0
+    rate: float = 0.0
+    sent: int = 0
+    before: Array = field(default_factory=lambda: np.zeros((1, NUM_TORQUES)))
+
+    @property
+    def eta(self) -> float:
+        """Delay of the torque that is computed now, s."""
+        return self.arrival * (1 + self.rate)
+
+    @property
+    def samples(self) -> Array:
+        """Instants (s,), s from now, at which another torque begins to act, then the next one."""
+        view, at = self._compiled(), np.empty(self._most(self.eta))
+        number = core().lib.stewart_switches(view, 0.0, self.eta, -1, core().at(at))
+        return np.append(at[:number], self.eta)
+
+    def queue(self, in_flight: Array) -> Array:
+        """Return all torques: `until_next` selects among them."""
+        return in_flight
+
     def until_next(self, queue: Array) -> TorqueSchedule:
-        """What acts from now until the next torque does, of torques in flight (L, 6)."""
-        holds = np.full(len(queue), self.period)
-        if self.fraction > 0:
-            holds[0] = self.fraction * self.period  # the oldest has acted for the rest of its hold
-        return TorqueSchedule(queue, holds)
-
-    def last_periods(self, in_flight: Array, number: int) -> TorqueSchedule:
-        """What acted in the last `number` >= 1 periods, of torques (n, 6), the oldest first.
-
-        Raises:
-            ValueError: fewer torques than that takes.
-        """
-        longest = len(in_flight) - number
-        if longest < self.queue_length:
-            raise ValueError(
-                f"delay: {len(in_flight)} torques are kept; expected at least "
-                f"{self.queue_length + number}"
-            )
-        torques, durations = self.schedule(in_flight[longest - self.queue_length :])
-        n = number * self.per_period
-        return TorqueSchedule(torques[:n], durations[:n])
-
-    def next_period(self, queue: Array) -> TorqueSchedule:
-        """What acts in the period in which the oldest of torques (n, 6) begins it."""
-        torques, durations = self.schedule(queue)
-        n = self.per_period
-        return TorqueSchedule(torques[:n], durations[:n])
+        """Return the schedule from now until the next torque acts."""
+        return self.within(queue, 0.0, self.eta)
 
     def last_period(self, in_flight: Array) -> tuple[TorqueSchedule, Array]:
-        """What acted since the last sample, and the torque (6,) that acts next.
+        """Return the schedule since the last sample, and the torque (6,) that acts next."""
+        schedule = self.within(in_flight, -self.period, 0.0)
+        return schedule, self.within(in_flight, 0.0, self.period).torques[0]
 
-        Without a delay that one is still to be computed: no change is known.
+    def within(
+        self, in_flight: Array, begin: float, end: float, newest: int = -1
+    ) -> TorqueSchedule:
+        """Return the schedule between two instants, s from now.
 
         Args:
-            in_flight: (n > L, 6) torques, the oldest first.
+            in_flight: (n, 6) torques, oldest first; those before the last `sent` are not used.
+            begin, end: s.
+            newest: sample of the last torque: -1 before this sample's is computed, 0 after it.
         """
-        torques, durations = self.schedule(self._since_last_sample(in_flight))
-        n = self.per_period
-        return TorqueSchedule(torques[:n], durations[:n]), torques[min(n, len(torques) - 1)]
+        queue = np.ascontiguousarray(in_flight)
+        durations = np.empty(self._most(end))
+        torques, c = np.empty((len(durations), NUM_TORQUES)), core()
+        number = c.lib.stewart_within(
+            *(self._compiled(), len(queue), c.at(queue), begin, end, newest),
+            *(c.at(torques), c.at(durations)),
+        )
+        return TorqueSchedule(torques[:number], durations[:number])
+
+    def _compiled(self) -> Any:
+        """Return the `stewart_arrivals`; `before` must be contiguous and outlive it."""
+        numbers = (self.period, self.arrival, self.rate, self.sent, len(self.before))
+        return core().ffi.new("stewart_arrivals *", (*numbers, core().at(self.before)))
+
+    def _most(self, end: float) -> int:
+        return int(core().lib.stewart_arrivals_most(self._compiled(), end))

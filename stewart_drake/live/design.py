@@ -18,7 +18,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.core_law import serving
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion
-from stewart_drake.law.motors import TorqueLimit
+from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.live.contact import Link
 from stewart_drake.live.protocol import (

@@ -117,7 +117,7 @@ class LiveRecord(Record):
             "std_s": belief.delay_std,
         }
         seen = {signal.exported: self._held[signal.name](memory) for signal in _HELD}
-        seen["measurement"] = measurement.after(np.full_like(measurement.values, np.nan))
+        seen["measurement"] = measurement.known(measurement.values.size)
         row = seen | {
             "state": state,
             "reference": wanted[:NUM_STATE],

@@ -15,7 +15,6 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.core_law import AnyMemory, serving
-from stewart_drake.law.late import LateObserver
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
@@ -126,7 +125,7 @@ class DelayLqiController(SteppedLaw):
     | measurement | input | 12, or 6 N | rad, m, rad/s, m/s | read every period; NaN is lost |
     | preview | input | 18 p | rad, m and time derivatives | read every period |
     | weights | input | 2 | w_Q, w_R | read every period |
-    | age | input | 1 | s, whole periods | of the measurement; only with a `LateObserver` |
+    | age | input | 1 | s, whole periods | of the measurement; only if it may be late |
     | report | input | 7 h | as of `PlayoutBuffer`, NaN is lost | only with a channel of packets |
     | plan | output | 6 (r + N) | N m, the packet to be sent | the same; direct feedthrough |
     | torque | output | 6 | N m | direct feedthrough |
@@ -164,8 +163,7 @@ class DelayLqiController(SteppedLaw):
         preview_size = NUM_REFERENCE * len(self._times)
         self._preview = self.DeclareVectorInputPort("preview", preview_size)
         self._weights = self.DeclareVectorInputPort("weights", len(WEIGHTS))
-        late = isinstance(law.observer, LateObserver)
-        self._age = self.DeclareVectorInputPort("age", 1) if late else None
+        self._age = self.DeclareVectorInputPort("age", 1) if law.longest_wait else None
         sends = isinstance(law.channel, Packets)
         size = reported(law.kept) * (1 + NUM_TORQUES)
         self._report = self.DeclareVectorInputPort("report", size) if sends else None

@@ -36,10 +36,8 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.delay_model import chain
-from stewart_drake.law.delay_observer import DelayObserver
-from stewart_drake.law.encoder_observers import DifferencesObserver
+from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.error_model import ContinuousModel, linear_model
-from stewart_drake.law.observers import NoObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError, law_gain
 from stewart_drake.law.stability import (
@@ -193,7 +191,7 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
         problem = "the true machine does not reach all of the reference"
     elif sc.link.kind == "network" or longest_wait(sc):
         problem = "its packets or measurements do not all take the same time"
-    elif isinstance(law.observer, DifferencesObserver):
+    elif isinstance(law.sensing, EncoderSensing) and not law.estimates:
         problem = "its rates are differences of measured poses"
     elif not sc.delay.constant:
         problem = "its delay changes"
@@ -217,8 +215,8 @@ def controller_margin(experiment: Experiment, until: float | None = None) -> Con
         margins=margins,
         pole=poles[fastest],
         pole_time=float(times[fastest]),
-        estimated=_estimates(law),
-        delay_found=isinstance(law.observer, DelayObserver),
+        estimated=law.estimates,
+        delay_found=law.finds_delay,
         tuned=experiment.tuned,
         problem=problem,
         loops=tuple(loops),
@@ -252,7 +250,7 @@ def loop_at(experiment: Experiment, time: float) -> LinearLoop:
 def _law_at_last(experiment: Experiment) -> PredictiveLqi:
     """Return the law, with the true delay if it estimates that."""
     law = compose_law(experiment)
-    if not isinstance(law.observer, DelayObserver):
+    if not law.finds_delay:
         return law
     return replace(law, timeline=replace(law.timeline, delay=experiment.scenario.true_delay))
 
@@ -272,15 +270,11 @@ def _loops(
     return loops
 
 
-def _estimates(law: PredictiveLqi) -> bool:
-    return not isinstance(law.observer, NoObserver)
-
-
 def _gain(experiment: Experiment, truth: StewartDynamics, law: PredictiveLqi, time: float) -> Array:
     """Return `law_gain` of a law about the reference at `time` in s."""
     plant, timeline, c = law.plant, law.timeline, experiment.scenario.controller
     known = plant.dynamics
-    theta = known.free_of(truth.plant_parameters) if _estimates(law) else known.parameters
+    theta = known.free_of(truth.plant_parameters) if law.estimates else known.parameters
     x = evaluate(experiment.reference, time)
     # The torques in flight move the true plant; the model's torque is the feedforward.
     acting = truth.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])

@@ -13,11 +13,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import System
 
 from stewart_drake.law.channel import Channel, Packets, Wire
-from stewart_drake.law.encoder_observers import DifferencesObserver, EncoderObserver
 from stewart_drake.law.encoder_sensing import EncoderSensing
-from stewart_drake.law.filter_settings import FilterSettings
-from stewart_drake.law.gaps import GapObserver
-from stewart_drake.law.observers import NoObserver, Observer, ParameterObserver
 from stewart_drake.law.sensing import Sensing, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import reported
@@ -49,13 +45,10 @@ class SensorKind(NamedTuple):
     Attributes:
         system: the sensor, a Drake system with the ports `state` and `measurement`.
         sensing: part of the law that knows what is measured.
-        observer: part of the law that estimates from it, with the settings of its filter, or None
-            where nothing is to be estimated.
     """
 
     system: Callable[[Any, Experiment], System]
     sensing: Callable[[Any, Experiment], Sensing]
-    observer: Callable[[Any, FilterSettings | None], Observer]
 
 
 class LinkKind(NamedTuple):
@@ -82,12 +75,6 @@ def _state_sensing(config: StateSensorConfig, experiment: Experiment) -> Sensing
     return StateSensing(np.array(config.noise_std), experiment.motion_scale, anywhere)
 
 
-def _observer(config: StateSensorConfig, settings: FilterSettings | None) -> Observer:
-    if settings is None:
-        return NoObserver()
-    return GapObserver(settings) if config.loss > 0 else ParameterObserver(settings)
-
-
 def _encoders(c: EncoderSensorConfig, experiment: Experiment) -> Encoders:
     truth, period = experiment.truth, experiment.scenario.controller.period
     cranks = np.abs(truth.jacobian(experiment.start[POSE])) @ experiment.motion_scale
@@ -109,13 +96,9 @@ def _encoder_sensing(config: EncoderSensorConfig, experiment: Experiment) -> Sen
     )
 
 
-def _encoder_observer(config: EncoderSensorConfig, settings: FilterSettings | None) -> Observer:
-    return DifferencesObserver() if settings is None else EncoderObserver(settings)
-
-
 SENSORS: Final[Mapping[type, SensorKind]] = {
-    StateSensorConfig: SensorKind(_sensor, _state_sensing, _observer),
-    EncoderSensorConfig: SensorKind(_encoders, _encoder_sensing, _encoder_observer),
+    StateSensorConfig: SensorKind(_sensor, _state_sensing),
+    EncoderSensorConfig: SensorKind(_encoders, _encoder_sensing),
 }
 
 

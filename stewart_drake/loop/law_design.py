@@ -18,7 +18,6 @@ from stewart_drake.files.yamlio import validate
 from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.channel import Packets
 from stewart_drake.law.cost import QuadraticCost
-from stewart_drake.law.delay_observer import DelayObserver, delay_settings
 from stewart_drake.law.design_models import MultibodyModel, PaperModel
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
@@ -31,9 +30,8 @@ from stewart_drake.law.filter_settings import (
     filter_settings,
     usual_parameters,
 )
-from stewart_drake.law.late import LateObserver
-from stewart_drake.law.motors import TorqueLimit
-from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.law.observers import CoreObserver, DelaySettings
 from stewart_drake.law.planner import NoPlanner, Rejoin
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import (
@@ -150,11 +148,10 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     plate, asked = experiment.mechanism.plate.mass, experiment.planned_limit
     parameters = estimated_parameters(experiment, torque_scale)
     settings = filter_settings(motion, plate, torque_scale, asked, c.period, parameters)
-    observer = sensor.observer(sc.sensor, settings if c.estimate else None)
+    gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
+    observer = CoreObserver(settings if c.estimate else None, gaps=gaps)
     quiet = c.open_loop_start and sc.start == "rest"
     waits = longest_wait(sc)
-    if waits:
-        observer = LateObserver(observer, waits)
     channel = link.channel(sc.link, experiment, timeline, waits)
     motors = TorqueLimit(experiment.torque_limit)
     law = PredictiveLqi(
@@ -167,14 +164,16 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         model=PaperModel(c.torque_map) if c.model == "paper" else MultibodyModel(),
         cost=quadratic_cost(experiment, peak_torque),
         channel=channel,
+        longest_wait=waits,
         kept=waits + (REPORTS if isinstance(channel, Packets) else 0),
         silence=_until_seen(timeline.delay, waits) if quiet else 0,
     )
     if c.delay_estimator != "none":
-        delay = delay_settings(c.delay_estimator, c.delay_std, c.delay_max)
+        prior = timeline.eta, c.delay_std, c.delay_max
+        delay = DelaySettings.of(c.delay_estimator, *prior, quiet)
         law = replace(
             law,
-            observer=DelayObserver(settings, delay, timeline.eta, quiet),
+            observer=CoreObserver(settings, delay),
             predictor=ArrivalPredictor(),
             planner=Rejoin(c.replan, experiment.scale) if c.replan > 0 else NoPlanner(),
             silence=0,  # until the delay is found
@@ -243,7 +242,6 @@ def longest_wait(scenario: Scenario) -> int:
 def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, float]:
     """The control law, the motion it follows, and the length of the blend onto the reference."""
     sc, law = experiment.scenario, compose_law(experiment)
-    law.warm_up()
     way = way_onto(experiment, law)
     if way is None:
         return law, experiment.reference, 0.0
@@ -267,16 +265,15 @@ def first_queue(experiment: Experiment, law: PredictiveLqi) -> Array:
     One that does not know the delay has more: what acts in each period until its own do, up to the
     longest delay.
     """
-    if not isinstance(law.observer, DelayObserver):
-        return experiment.torques_in_flight(law.timeline.delay)
-    return experiment.torques_in_flight(Delay(law.observer.kept(law.timeline.period)))
+    delay = Delay(law.queue_length) if law.finds_delay else law.timeline.delay
+    return experiment.torques_in_flight(delay)
 
 
 def followed_motion(
     law: PredictiveLqi, planned: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, Trajectory] | None:
     """Return the motions that a law with a delay estimator reads at any instant, or None."""
-    return (planned, reference) if isinstance(law.observer, DelayObserver) else None
+    return (planned, reference) if law.finds_delay else None
 
 
 _HORIZON = 10.0

@@ -205,9 +205,9 @@ def has_measured(memory: Any, before: Counts) -> bool:
         before: its counts at the sample before.
     """
     belief = getattr(memory, "belief", None)  # a controller of the user's own has none
-    partly = 0 if belief is None else len(belief.partly)
+    partial = 0 if belief is None else belief.partial
     more: int = memory.counts.bad_measurements - before.bad_measurements
-    return more <= partly
+    return more <= partial
 
 
 def _variable(signal: Signal, values: Array) -> tuple[tuple[str, ...], Array, dict[str, str]]:

@@ -14,11 +14,10 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.catch_up import PIECE, shortest
-from stewart_drake.law.late import LateObserver
-from stewart_drake.law.motors import TorqueLimit
-from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.nominal import TorqueLimit
+from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.servo_preview import ReportedTimeline, ServoPreview
+from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.law.servos import (
     ReportLayout,
     Segment,
@@ -28,6 +27,7 @@ from stewart_drake.law.servos import (
     still,
 )
 from stewart_drake.law.startup import INSTANTS
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.preparation import Experiment
@@ -141,7 +141,7 @@ class Servos(LeafSystem):
         with suppress(UnreachablePoseError):
             cranks = self._cranks(np.asarray(self._state.Eval(context)))
             asked = self._loop.torque(setpoint, wanted[MODEL_TORQUE], cranks)
-        put_out = np.vstack([before.put_out[1:], self._loop.motors.let_through(asked)])
+        put_out = np.vstack([before.put_out[1:], self._loop.motors.saturate(asked)])
         after = ServoState(segment, arrived, setpoint, asked, put_out)
         state.get_mutable_abstract_state(int(self._memory)).set_value(after)
 
@@ -222,11 +222,12 @@ def compose_servo_law(experiment: Experiment) -> ServoPreview:
     period, ticks = like.timeline.period, _ticks(experiment.scenario)
     wanted = max(1, round(period / _PART))
     parts = next(n for n in range(min(wanted, ticks), 0, -1) if ticks % n == 0)
-    observer = like.observer.observer if isinstance(like.observer, LateObserver) else like.observer
-    if isinstance(observer, ParameterObserver):  # what acted when is not guessed but reported
+    observer = like.observer
+    if isinstance(observer, CoreObserver) and observer.settings is not None:
+        # The machine reports which torque acted when.
         observer = replace(observer, settings=replace(observer.settings, timing_std=0.0))
     law = ServoPreview(
-        timeline=ReportedTimeline(period, like.timeline.delay, parts),
+        timeline=Timeline(period, like.timeline.delay, parts=parts),
         plant=replace(like.plant, substeps=1),
         sensing=like.sensing,
         observer=observer,
@@ -247,7 +248,6 @@ def _law_for_torques(experiment: Experiment) -> PredictiveLqi:
 def servo_law(experiment: Experiment) -> tuple[ServoPreview, Trajectory, float]:
     """The law, the motion that it follows, and the length of the blend onto the reference."""
     sc, law = experiment.scenario, compose_servo_law(experiment)
-    law.warm_up()
     period, eta, reference = law.timeline.period, law.timeline.eta, experiment.reference
     if sc.start != "rest" or sc.controller.catch_up == 0:
         return law, reference, 0.0

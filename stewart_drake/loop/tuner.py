@@ -15,9 +15,7 @@ from pydrake.systems.framework import (
 )
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.delay_observer import DelayObserver
-from stewart_drake.law.late import LateObserver
-from stewart_drake.law.observers import ParameterObserver
+from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.startup import INSTANTS, TOLERANCE, least_torque, reference_torque
@@ -281,7 +279,7 @@ def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
     """
     sc = experiment.scenario
     sensing = law.sensing
-    if not isinstance(sensing, StateSensing) or isinstance(law.observer, LateObserver):
+    if not isinstance(sensing, StateSensing) or law.longest_wait:
         raise ConfigError(
             f"tuner.kind: got {sc.tuner.kind!r}, which goes by the law's predictions, with "
             f"sensor.kind {sc.sensor.kind!r} and a sensor.delay of {sc.sensor.delay:g} s; expected "
@@ -291,7 +289,7 @@ def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
     nominal, reference = experiment.nominal, experiment.reference
     torque = max(least_torque(nominal), reference_torque(nominal, reference, sc.duration))
     observer, prior = law.observer, None
-    if isinstance(observer, ParameterObserver | DelayObserver):
+    if isinstance(observer, CoreObserver) and observer.settings is not None:
         prior = observer.settings.parameters.std
     return HealthFeatures(
         plant=law.plant,
