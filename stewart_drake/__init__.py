@@ -21,9 +21,10 @@ _PUBLIC: Final = {
     "mechanism.kinematics": "ForwardKinematicsError UnreachablePoseError",
     "reporting.api": "compare report simulate " + " ".join("_".join(words_of(n)) for n in ANALYSES),
     "reporting.results": "AnalysisResult ComparisonResult SimulationResult",
-    "scenario.config": "ActuatorConfig ControllerConfig DelayConfig EncoderSensorConfig LinkConfig "
-    "NetworkConfig PlantConfig Scenario SensorConfig ServoActuatorConfig StateSensorConfig "
-    "TorqueActuatorConfig TunerConfig WireConfig",
+    "scenario.config": "ActuatorConfig ControllerConfig DelayConfig EncoderSensorConfig "
+    "PlantConfig Scenario SensorConfig ServoActuatorConfig StateSensorConfig TorqueActuatorConfig "
+    "TunerConfig",
+    "scenario.link_config": "LinkConfig NetworkConfig WireConfig",
     "scenario.loading": "load_scenario",
     "scenario.reference_config": "CsvConfig HoldConfig ReferenceConfig SineConfig WaypointsConfig",
 }

@@ -42,8 +42,6 @@ from stewart_drake.scenario.config import ActuatorConfig as ActuatorConfig
 from stewart_drake.scenario.config import ControllerConfig as ControllerConfig
 from stewart_drake.scenario.config import DelayConfig as DelayConfig
 from stewart_drake.scenario.config import EncoderSensorConfig as EncoderSensorConfig
-from stewart_drake.scenario.config import LinkConfig as LinkConfig
-from stewart_drake.scenario.config import NetworkConfig as NetworkConfig
 from stewart_drake.scenario.config import PlantConfig as PlantConfig
 from stewart_drake.scenario.config import Scenario as Scenario
 from stewart_drake.scenario.config import SensorConfig as SensorConfig
@@ -51,7 +49,9 @@ from stewart_drake.scenario.config import ServoActuatorConfig as ServoActuatorCo
 from stewart_drake.scenario.config import StateSensorConfig as StateSensorConfig
 from stewart_drake.scenario.config import TorqueActuatorConfig as TorqueActuatorConfig
 from stewart_drake.scenario.config import TunerConfig as TunerConfig
-from stewart_drake.scenario.config import WireConfig as WireConfig
+from stewart_drake.scenario.link_config import LinkConfig as LinkConfig
+from stewart_drake.scenario.link_config import NetworkConfig as NetworkConfig
+from stewart_drake.scenario.link_config import WireConfig as WireConfig
 from stewart_drake.scenario.loading import load_scenario as load_scenario
 from stewart_drake.scenario.reference_config import CsvConfig as CsvConfig
 from stewart_drake.scenario.reference_config import HoldConfig as HoldConfig

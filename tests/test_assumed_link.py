@@ -10,8 +10,8 @@ from stewart_drake.loop.bulk import preparation_of
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.scenario.config import NetworkConfig
 from stewart_drake.scenario.link import forward_times, link_text
+from stewart_drake.scenario.link_config import NetworkConfig
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.studies.uncertainty import MACHINE, apply_draw
 

@@ -7,7 +7,7 @@ import pytest
 
 from stewart_drake.core.library import core
 from stewart_drake.law.channel import Packets, structure
-from stewart_drake.scenario.config import PacketsConfig
+from stewart_drake.scenario.link_config import PacketsConfig
 from stewart_drake.scenario.packets import (
     BurstChain,
     default_bound,

@@ -22,8 +22,8 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.reporting.link import document
 from stewart_drake.reporting.page import Provenance, html
-from stewart_drake.scenario.config import NetworkConfig, PacketsConfig
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.link_config import NetworkConfig, PacketsConfig
 from stewart_drake.scenario.packets import (
     default_bound,
     in_time,
@@ -399,7 +399,7 @@ def test_the_bound_is_a_whole_number_of_a_multibody_plants_steps():
 
 def test_a_network_on_which_nothing_ever_comes_is_refused_at_once():
     for times in ("link.low=0", "link.high=1e4"), ("link.playout=101",):
-        with pytest.raises(ConfigError, match="torques wait for more than 1000 periods"):
+        with pytest.raises(ConfigError, match="a delay of more than 1000 periods"):
             scenario("link.kind=network", *times)
     slow = "link.return={distribution: lognormal, median: 1.0e6, sigma: 10}"
     with pytest.raises(ConfigError, match=r"link\.return: got measurements"):

@@ -143,7 +143,7 @@ def test_waypoints_from_a_file_are_the_same(tmp_path):
         ([0, 1], [HOME] * 3, ["poses: got 3 poses", "expected 2"]),
         ([0, 1], [HOME, [0, 1.6, 0, 0, 0, 0]], ["poses[1][1]: got 1.6 rad", "90 degrees"]),
         ([0, 1], [HOME, [0, 0, 3.5, 0, 0, 0]], ["poses[1][2]: got 3.5 rad", "unwrap"]),
-        ([0, 1], [HOME, [0, 0, 0, 2e3, 0, 0]], ["poses[1][3]: got 2000.0", "1000"]),
+        ([0, 1], [HOME, [0, 0, 0, 2e3, 0, 0]], ["poses[1][3]: got 2000 m", "1000"]),
     ],
 )
 def test_bad_waypoints_are_refused(times, poses, parts, tmp_path):
@@ -245,7 +245,7 @@ BAD_CSV = {
     ),
     "far in millimetres": (
         changed(1, "0.1,0,0,0,0,0,-2e6").replace("z[m]", "z[mm]"),
-        ["row 3", "z[mm]: got -2000000.0; expected a finite number below 1e+06 mm"],
+        ["row 3", "z[mm]: got -2000000 mm; expected a finite number below 1e+06 mm"],
     ),
     "open quote": (changed(1, '"0.1,0,0,0,0,0,0.38'), ["is not CSV", "inside string"]),
     "moving end": (MOVING, ["last row", " x at 0.5 s", "duration"]),

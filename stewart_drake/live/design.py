@@ -29,8 +29,9 @@ from stewart_drake.live.protocol import (
 )
 from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.preparation import Experiment, prepare
-from stewart_drake.scenario.config import NetworkConfig, Scenario
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
+from stewart_drake.scenario.link_config import NetworkConfig
 from stewart_drake.scenario.packets import default_bound
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate

@@ -24,7 +24,8 @@ from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LiveSummary, SimulationResult
-from stewart_drake.scenario.config import DelayConfig, Scenario, WireConfig
+from stewart_drake.scenario.config import DelayConfig, Scenario
+from stewart_drake.scenario.link_config import WireConfig
 from stewart_drake.studies.verdict import milliseconds
 from stewart_drake.types import Array
 

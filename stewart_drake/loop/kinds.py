@@ -24,13 +24,9 @@ from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import declare_constant
 from stewart_drake.loop.sensor import Encoders, Sensor
 from stewart_drake.scenario.calibration import OFFSETS
-from stewart_drake.scenario.config import (
-    EncoderSensorConfig,
-    NetworkConfig,
-    StateSensorConfig,
-    WireConfig,
-)
+from stewart_drake.scenario.config import EncoderSensorConfig, StateSensorConfig
 from stewart_drake.scenario.link import forward_times, number_sent, torque_delays
+from stewart_drake.scenario.link_config import NetworkConfig, WireConfig
 from stewart_drake.scenario.packets import BurstChain, in_time
 from stewart_drake.scenario.signals import PACKETS, POSE, Carried
 from stewart_drake.types import Array

@@ -17,7 +17,7 @@ from pydrake.systems.framework import (
 from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along
-from stewart_drake.scenario.fault_config import SPIKE
+from stewart_drake.scenario.field_types import SPIKE
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, NUM_STATE, POSE
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 import pydantic.dataclasses
+from pydantic import AfterValidator
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
@@ -17,12 +18,13 @@ from stewart_drake.scenario.signals import COULOMB_SPEED, LEGS, PLANT_PARAMETERS
 from stewart_drake.types import Array
 
 DELAY: Final = "delay"
-"""Between computing a torque and feeling it, s."""
+"""Name of the delay of a torque, s."""
 OFFSETS: Final = tuple(f"offset_A{leg}" for leg in LEGS)
-"""Of the motors' encoders: what they say less the crank's angle, rad."""
+"""Names of the encoders' offsets: reading minus crank angle, rad."""
 CALIBRATED: Final = (*PLANT_PARAMETERS, DELAY, *OFFSETS)
+"""Names of all parameters that a calibration can have."""
 ROUNDING: Final = 1e-9
-"""Of a covariance, as a share, that makes it neither unsymmetric nor negative."""
+"""Relative error of a covariance that counts as rounding."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Calibration:
         mechanism: fingerprint of the machine's numbers, `mechanism.geometry.fingerprint`.
         names: (n,) out of CALIBRATED, each at the most once; SI units.
         mean: (n,).
-        covariance: (n, n); zero where something is known exactly.
+        covariance: (n, n); zero for exactly known parameters.
 
     Raises:
         ConfigError: one line, opened by the attribute.
@@ -46,13 +48,6 @@ class Calibration:
 
     def __post_init__(self) -> None:
         n, mean, P = len(self.names), np.array(self.mean), np.array(self.covariance)
-        for name in self.names:
-            if name not in CALIBRATED:
-                raise ConfigError(
-                    f"names: got {brief(name)}; expected some of {', '.join(CALIBRATED)}"
-                )
-        if len(set(self.names)) < n:
-            raise ConfigError(f"names: got {', '.join(self.names)}; expected each once")
         for field, value, shape in (("mean", mean, (n,)), ("covariance", P, (n, n))):
             if value.shape != shape:
                 raise ConfigError(
@@ -61,12 +56,11 @@ class Calibration:
             if not np.all(np.isfinite(value)):
                 raise ConfigError(f"{field}: got {brief(value.tolist())}; expected finite numbers")
         self._check_covariance(P)
-        speed = self.value(PLANT_PARAMETERS[COULOMB_SPEED])
-        if speed is not None and not speed > 0:
-            raise ConfigError(f"mean: got a coulomb_speed of {speed:g} rad/s; expected above 0")
-        delay = self.value(DELAY)
-        if delay is not None and not delay >= 0:
-            raise ConfigError(f"mean: got a delay of {delay:g} s; expected 0 or more")
+        least = {PLANT_PARAMETERS[COULOMB_SPEED]: (1e-300, "above 0"), DELAY: (0.0, "0 or more")}
+        for name, (low, accepted) in least.items():
+            value = self.value(name)
+            if value is not None and value < low:
+                raise ConfigError(f"mean: got a {name} of {value:g}; expected {accepted}")
 
     def _check_covariance(self, P: Array) -> None:
         variances = np.diag(P)
@@ -75,11 +69,12 @@ class Calibration:
                 raise ConfigError(
                     f"covariance: got a variance of {variance:g} for {name}; expected 0 or more"
                 )
-        # In units of the standard deviations; what is known exactly goes together with nothing.
+        # In units of the standard deviations; an exactly known parameter has no correlation.
         std = np.sqrt(np.where(variances > 0, variances, 1.0))
         scaled = P / np.outer(std, std)
-        if np.abs(scaled - scaled.T).max(initial=0.0) > ROUNDING:
-            i, j = np.unravel_index(np.abs(scaled - scaled.T).argmax(), P.shape)
+        skew = np.abs(scaled - scaled.T)
+        if skew.max(initial=0.0) > ROUNDING:
+            i, j = np.unravel_index(skew.argmax(), P.shape)
             raise ConfigError(
                 f"covariance: got {P[i, j]:g} and {P[j, i]:g} for {self.names[i]} and "
                 f"{self.names[j]}; expected a symmetric matrix"
@@ -87,19 +82,25 @@ class Calibration:
         least = np.linalg.eigvalsh((scaled + scaled.T) / 2).min(initial=0.0)
         if least < -ROUNDING * max(1, len(P)):
             raise ConfigError(
-                f"covariance: got one with an eigenvalue of {least:.3g}, in units of its standard "
+                f"covariance: got an eigenvalue of {least:.3g}, in units of the standard "
                 "deviations; expected none below 0"
             )
 
     def value(self, name: str) -> float | None:
-        """The mean of one, None where nothing is known of it."""
+        """Return the mean of one parameter, None for one that is not calibrated."""
         return float(self.mean[self.names.index(name)]) if name in self.names else None
+
+
+def _check_names(names: list[str]) -> list[str]:
+    if len(set(names)) < len(names) or not {*names} <= {*CALIBRATED}:
+        raise ValueError(f"some of {', '.join(CALIBRATED)}, each once")
+    return names
 
 
 @pydantic.dataclasses.dataclass(config=STRICT)
 class _File:
     mechanism: str
-    names: list[str]
+    names: Annotated[list[str], AfterValidator(_check_names)]
     mean: list[float]
     covariance: list[list[float]]
 
@@ -111,22 +112,16 @@ def load_calibration(path: str | Path) -> Calibration:
         path: a YAML file with the keys `mechanism`, `names`, `mean`, `covariance`.
 
     Raises:
-        ConfigError: unreadable, or what `Calibration` refuses; one line, opened by the path.
+        ConfigError: unreadable, or refused by `Calibration`; one line, opened by the path.
     """
     found = validate(_File, load_yaml(path), str(path))
     n = len(found.names)
     for row in found.covariance:
         if len(row) != n:
-            raise ConfigError(
-                f"{path}: covariance: got a row of {len(row)} numbers; expected {n}, as of names"
-            )
+            raise ConfigError(f"{path}: covariance: got {len(row)} numbers in a row; expected {n}")
+    covariance = np.array(found.covariance).reshape(len(found.covariance), n)
     try:
-        return Calibration(
-            found.mechanism,
-            tuple(found.names),
-            np.array(found.mean),
-            np.array(found.covariance).reshape(len(found.covariance), n),
-        )
+        return Calibration(found.mechanism, tuple(found.names), np.array(found.mean), covariance)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
 

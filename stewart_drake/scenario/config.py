@@ -8,7 +8,7 @@ import dataclasses
 from dataclasses import field
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, ConfigDict, Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
@@ -16,31 +16,37 @@ from stewart_drake.files.schema import ByKind
 from stewart_drake.files.yamlio import brief, differences, validate
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.dependencies import contradiction
-from stewart_drake.scenario.fault_config import SensorFault, fault_problem
 from stewart_drake.scenario.field_types import (
     MOST_PERIODS,
     STRICT,
     Deviation,
     Fraction,
+    LegFault,
+    Length,
+    Loss,
     Name,
     Positive,
     Seconds,
     Seed,
+    SensorFault,
     Six,
     Steps,
     TorqueLimit,
     Weight,
 )
+from stewart_drake.scenario.link_config import (
+    ASSUMED_TIMES,
+    LinkConfig,
+    NetworkConfig,
+    WireConfig,
+)
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
 from stewart_drake.scenario.renames import CONTROLLER
 from stewart_drake.scenario.signals import DEFAULT_COULOMB_SPEED
-from stewart_drake.scenario.timing import (
-    METRIC_PERIOD,
-    log_problem,
-    samples_problem,
-    step_problem,
-    whole_problem,
-)
+from stewart_drake.scenario.timing import METRIC_PERIOD, log_problem, step_problem
+
+_Friction = Annotated[float, Field(ge=0, le=1e3)]
+_SensorDelay = Annotated[float, Field(ge=0, le=100)]
 
 
 @dataclass(config=STRICT)
@@ -50,18 +56,18 @@ class PlantConfig:
     Attributes:
         kind: `multibody` (MultibodyPlant with constraints, fixed steps), `exact` (closed-form
             dynamics, error-controlled integration) or `paper` (the paper's torque map, frozen at
-            home, for the controller too; without limits: lost is an error above ten times the
-            motion's peak to peak).
+            home, for the controller too; without limits, the plate counts as lost for an error
+            above ten times the motion's peak to peak).
         gravity: whether gravity acts, 9.81 m/s^2; false stands for a counterbalanced platform.
         time_step: of the multibody plant, s.
         accuracy: of the exact plant's integrator, relative, 1e-12 to 1e-2.
         payload_mass: a point mass, kg.
         torque_bias: added to each motor's torque, N m.
         joint_damping: viscous damping on each crank shaft, N m s/rad.
-        mechanism: the machine that is simulated, a shipped name or a path; null is the one that the
-            controller knows, the scenario's `mechanism`.
+        mechanism: the simulated machine, a shipped name or a path; null is that of the controller,
+            the scenario's `mechanism`.
         coulomb_friction: on each crank shaft, N m, times tanh(rate / coulomb_speed).
-        coulomb_speed: over which that builds up, rad/s.
+        coulomb_speed: scale of the rate in that, rad/s.
         payload_position: of the payload in the plate's frame, from its centre of mass, m.
     """
 
@@ -71,28 +77,28 @@ class PlantConfig:
     accuracy: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-8
     payload_mass: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     torque_bias: Six = field(default_factory=lambda: [0.0] * 6)
-    joint_damping: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    joint_damping: _Friction = 0.0
     mechanism: Name | None = None
-    coulomb_friction: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    coulomb_friction: _Friction = 0.0
     coulomb_speed: Annotated[float, Field(ge=1e-6, le=1e3)] = DEFAULT_COULOMB_SPEED
-    payload_position: Annotated[
-        list[Annotated[float, Field(ge=-1e3, le=1e3)]], Field(min_length=3, max_length=3)
-    ] = field(default_factory=lambda: [0.0] * 3)
+    payload_position: Annotated[list[Length], Field(min_length=3, max_length=3)] = field(
+        default_factory=lambda: [0.0] * 3
+    )
 
     @property
     def parameters(self) -> list[float]:
-        """All of the plant, in the order of `scenario.signals.PLANT_PARAMETERS`."""
+        """All parameters, in the order of `scenario.signals.PLANT_PARAMETERS`."""
         shafts = (self.joint_damping, self.coulomb_friction, self.coulomb_speed)
         return [*self.torque_bias, self.payload_mass, *shafts, *self.payload_position]
 
     @property
     def step(self) -> float | None:
-        """Step of a discrete plant, s, None of a continuous one."""
+        """Step of a discrete plant, s, None for a continuous one."""
         return self.time_step if self.kind == "multibody" else None
 
     @property
     def without_engine(self) -> "PlantConfig":
-        """The same, exact where it is the multibody one."""
+        """The same plant, exact instead of multibody."""
         if self.kind != "multibody":
             return self
         return dataclasses.replace(self, kind="exact")
@@ -100,20 +106,20 @@ class PlantConfig:
 
 @dataclass(config=STRICT)
 class DelayConfig:
-    """The true delay between computing a torque and feeling it, by when it was computed.
+    """The true delay of a torque, by the time t at which it is computed.
 
-    A torque computed at t waits for (steps + fraction) dt + drift t + swing sin(swing_frequency t),
-    from `jump_time` on plus jump, plus jitter, in all at least 0: `scenario.link.torque_delays`.
+    It is (steps + fraction) dt + drift t + swing sin(swing_frequency t),
+    from `jump_time` on plus jump, plus jitter, and at least 0: `scenario.link.torque_delays`.
 
     Attributes:
         steps: whole controller periods.
-        fraction: a further part of one period, 0 to below 1; less than 1e-9 is 0.
+        fraction: further part of a period, 0 to below 1; less than 1e-9 is 0.
         drift: growth of the delay, s/s.
         swing: amplitude of a slow change, s.
         swing_frequency: of that, rad/s.
-        jump: a change all at once, s.
-        jump_time: when that is, s.
-        jitter_std: standard deviation of what differs from torque to torque, s.
+        jump: sudden change, s.
+        jump_time: of the jump, s.
+        jitter_std: standard deviation of the jitter from torque to torque, s.
         seed: of the jitter.
     """
 
@@ -129,7 +135,7 @@ class DelayConfig:
 
     @property
     def constant(self) -> bool:
-        """Whether every torque waits as long."""
+        """Whether all torques have the same delay."""
         return self.drift == self.swing == self.jump == self.jitter_std == 0
 
 
@@ -137,16 +143,15 @@ class DelayConfig:
 class PriorConfig:
     """Prior standard deviations of the estimated parameters.
 
-    null is what `controller.calibration` says, and without it what machine and motion say. A number
-    stands before both.
+    A null is taken from `controller.calibration`, and without one from machine and motion.
 
     Attributes:
         torque_bias: of each motor, N m; null is 0.3 of the torque that the motion takes.
         payload: kg; null is a quarter of the plate.
         damping: N m s/rad; null is 0.1 s/rad times the torque that the motion takes.
-        rates: of the plate at the first sample, of which encoders tell nothing, rad/s and m/s; null
+        rates: of the plate at the first sample, which encoders do not measure, rad/s and m/s; null
             is half the motion's peak to peak per second.
-        offsets: of an encoder's mounting, rad; null is 0.1 degrees.
+        offsets: mounting of an encoder, rad; null is 0.1 degrees.
     """
 
     torque_bias: Positive | None = None
@@ -174,53 +179,53 @@ def _check_catch_up(duration: float) -> float:
 
 
 Estimate = Annotated[list[str], AfterValidator(_check_estimate)]
-"""Names of what is estimated, in a fixed order."""
+"""Names of estimated parameters, in a fixed order."""
 
 
 @dataclass(config=STRICT)
 class ControllerConfig:
-    """The controller and what it believes.
+    """The controller and its assumptions.
 
     Attributes:
         period: between two torques, s.
         integral: whether the error is also integrated.
-        delay_steps: whole periods of delay that the controller believes in, 0 for none; null is
-            the true delay.
-        delay_fraction: the further part of a period that it believes in, less than 1e-9 is 0;
-            null is the true one where `delay_steps` is null too, else 0.
+        delay_steps: whole periods of the assumed delay, 0 for none; null is the true delay.
+        delay_fraction: further part of a period of it, less than 1e-9 is 0; null is the true one
+            where `delay_steps` is null too, else 0.
         prediction: across the delay, by the `linear` design model or the `nonlinear` dynamics.
         feedforward: `none`, `equilibrium` torque, or `inverse_dynamics` of the reference.
-        model: behind gain and prediction, `paper` (massless legs) or `multibody`.
+        model: for gain and prediction, `paper` (massless legs) or `multibody`.
         torque_map: of the paper's model, from `virtual_work` or as `printed`.
-        estimate: parameters of the machine that are estimated: `torque_bias`, `payload` and
-            `damping`, with or without `coulomb`, the Coulomb friction of the shafts at the
-            `coulomb_speed` of the calibration, else 0.02 rad/s, and `offsets`, the mounting of
-            encoders, for `sensor.kind` encoders and a known delay; empty for none.
+        estimate: estimated parameters of the machine: `torque_bias`, `payload` and `damping`, with
+            or without `coulomb`, the Coulomb friction of the shafts at the `coulomb_speed` of the
+            calibration, else 0.02 rad/s, and `offsets`, the mounting of encoders, for
+            `sensor.kind` encoders and a known delay; empty for none.
         w_Q: weight of the errors.
         w_R: weight of the torques.
-        integral_weight: of the integrals beside the errors, which share w_Q.
-        weight_scaling: `bryson` (by what the reference asks for) or `identity`.
-        packet_torques: how many torques a packet holds, for the next one and further periods; over
-            a network, where `delay_steps` is not 0.
-        packet_repeats: how many earlier torques it says again, each for a period more of delay.
+        integral_weight: weight of the integrals relative to the errors.
+        weight_scaling: `bryson` (by the range of the reference) or `identity`.
+        packet_torques: number of torques in a packet, for the next and further periods; over a
+            network, where `delay_steps` is not 0.
+        packet_repeats: number of earlier torques that a packet repeats, each for a period more of
+            delay.
         catch_up: blend onto the reference after a start from rest, s; 0 is none, null the shortest
             one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
-        command: what is sent to the motors: a `torque` each, or `cranks`: to servos, crank angles
-            and rates of the reference for the instant at which they are reached, and the torque
-            that `feedforward` says. With `cranks` nothing is fed back but what `estimate` finds,
-            and only period, delay, feedforward, estimate and catch_up count.
-        delay_estimator: `none`; or the delay is estimated, beginning with the one that is believed
-            in, as `constant`, or as `drifting` with a rate of its own.
-        delay_std: of that belief, s.
-        delay_max: longest delay that is thought possible, s.
+        command: sent to the motors: a `torque` each, or for servos `cranks`: crank angles and
+            rates of the reference for the time of arrival, and the torque of `feedforward`. With
+            `cranks` there is no feedback but the result of `estimate`, and only period, delay,
+            feedforward, estimate and catch_up have an effect.
+        delay_estimator: `none`; or the delay is estimated, starting with the assumed one, as
+            `constant`, or as `drifting` at a rate that is estimated too.
+        delay_std: prior standard deviation of the delay, s.
+        delay_max: longest possible delay, s.
         open_loop_start: whether a start from rest has no feedback before the first own torque can
             have acted.
-        replan: duration of a plan back onto the reference, s; 0 for none. With a delay estimator,
-            where the prediction is off the reference, as when the delay was found or has jumped.
-        prior: standard deviations of what is estimated, a section of its own; null all of them.
+        replan: duration of a plan back onto the reference, s; 0 for none. Planned with a delay
+            estimator where the prediction is off the reference, as after a jump of the delay.
+        prior: section of prior standard deviations; null is the default of each.
         calibration: a file of the machine's parameters with their covariance, as `identify` writes
-            it: means and covariance of what is estimated, and the values of what is not. Its delay
-            is assumed where `delay_steps` is null.
+            it: means and covariance of the estimated ones, values of the others. Its delay is
+            assumed where `delay_steps` is null.
     """
 
     renamed = CONTROLLER  # not annotated: no field
@@ -252,12 +257,12 @@ class ControllerConfig:
 
 @dataclass(config=STRICT)
 class TorqueActuatorConfig:
-    """Motors that give the torque that arrives, within their limit.
+    """Motors that apply the torque that arrives, within their limit.
 
     Attributes:
         kind: `torque`.
         torque_limit: of each motor, N m; null is the mechanism's `motor.effort_limit`, the text
-            `none` no limit. Only a number is also planned with, see `ControllerConfig.catch_up`.
+            `none` no limit. The catch-up respects a number only, see `ControllerConfig.catch_up`.
     """
 
     reflected_inertia = 0.0  # not annotated: no field
@@ -267,17 +272,17 @@ class TorqueActuatorConfig:
 
 @dataclass(config=STRICT)
 class ServoActuatorConfig:
-    """Position servos: a local loop at each motor that follows the crank angle which arrives.
+    """Position servos: a local loop at each motor that follows the commanded crank angle.
 
-    It puts out J (w^2 (a_r - a) + 2 d w (a_r' - a')) and the torque that came with the angle, at
+    Its torque is J (w^2 (a_r - a) + 2 d w (a_r' - a')) plus the torque of the command, computed at
     least 1000 times a second; w = 2 pi bandwidth, d the damping, J the mean inertia per motor at
-    home, that of the rotors included. See `law.servos`.
+    home, with the rotors. See `law.servos`.
 
     Attributes:
         kind: `servo`.
         bandwidth: Hz.
         damping: relative to critical damping, for an inertia of J.
-        speed_limit: of the angle that is followed, rad/s; null is none.
+        speed_limit: of the commanded angle, rad/s; null is none.
         gear_ratio: turns of the rotor per turn of the crank.
         rotor_inertia: about the rotor's axis, kg m^2; at the crank gear_ratio^2 times as much.
         torque_limit: at the crank, as of `TorqueActuatorConfig`.
@@ -302,13 +307,13 @@ ActuatorConfig = Annotated[AnyActuator, ByKind()]
 
 
 def compatible_actuator(command: str, actuator: AnyActuator) -> AnyActuator:
-    """Motors of the kind that a controller's command is for: these, or others of their limit."""
+    """Return these motors, or others with their limit that accept a controller's command."""
     wanted = TorqueActuatorConfig if command == "torque" else ServoActuatorConfig
     return actuator if actuator.kind == wanted.kind else wanted(torque_limit=actuator.torque_limit)
 
 
 def with_actuator(given: dict[str, Any], change: Any, where: str) -> AnyActuator:
-    """The motors of a section of a file, and of a row of `compare` that is laid over it.
+    """Return the motors of a section of a file, with a row of `compare` laid over it.
 
     Raises:
         ConfigError: in one line, opened by `where`.
@@ -318,103 +323,16 @@ def with_actuator(given: dict[str, Any], change: Any, where: str) -> AnyActuator
 
 
 @dataclass(config=STRICT)
-class WireConfig:
-    """A link between controller and motors that delays every torque by `delay`, and loses none.
-
-    Attributes:
-        kind: `wire`.
-    """
-
-    back, burst, acknowledged, follows_delay = None, 1, True, False  # not annotated: no fields
-    kind: Literal["wire"] = "wire"
-
-
-@dataclass(config=STRICT)
-class PacketsConfig:
-    """How long packets are under way, and how many are lost.
-
-    Attributes:
-        distribution: of the time under way, `uniform` from `low` to `high`, or `lognormal`.
-        low, high: of the uniform one, s; null otherwise.
-        median: of the lognormal one, s; null otherwise.
-        sigma: of the lognormal one, standard deviation of its logarithm; null otherwise.
-        loss: share of the packets that never arrive.
-        burst: number of packets in a row that are lost together.
-    """
-
-    distribution: Literal["uniform", "lognormal"] = "uniform"
-    low: Seconds | None = None
-    high: Seconds | None = None
-    median: Positive | None = None
-    sigma: Annotated[float, Field(gt=0, le=10)] | None = None
-    loss: Annotated[float, Field(ge=0, le=0.99)] = 0.05
-    burst: Annotated[int, Field(ge=1, le=1000)] = 1
-
-    def times_problem(self, where: str) -> str | None:
-        """Return what is wrong with the times, or None."""
-        used = ("low", "high") if self.distribution == "uniform" else ("median", "sigma")
-        for name in ("low", "high", "median", "sigma"):
-            value = getattr(self, name)
-            if (value is None) == (name in used):
-                got, expected = ("null", "a number") if name in used else (f"{value:g}", "null")
-                return (
-                    f"{where}.{name}: got {got} with distribution {self.distribution!r}; "
-                    f"expected {expected}"
-                )
-        if self.low is not None and self.high is not None and self.low > self.high:
-            return f"{where}.low: got {self.low:g} s; expected at most high, {self.high:g} s"
-        return None
-
-
-@dataclass(config=STRICT | ConfigDict(populate_by_name=True))
-class NetworkConfig(PacketsConfig):
-    """Packets of torques with the times at which they shall act, and a buffer at the machine.
-
-    Each packet takes a time of its own, see `PacketsConfig`. Without `low` and `high` a uniform one
-    is between 0.8 and 1.2 times the constant delay that `delay` gives, for which nothing else uses
-    `delay`; `Scenario.assumed_link` has the numbers. A torque acts at its time, a bound later than
-    it was sent. Where no packet has brought one for a period, the buffer is dry. Clocks agree.
-
-    Attributes:
-        kind: `network`.
-        playout: the bound, s; null is the one that makes late packets as rare as lost ones
-            (`scenario.packets.default_bound`). The controller adds its `packet_repeats` periods.
-        dry: what a dry buffer does, `hold` the last torque or put out `zero`.
-        back: `return` in files, how measurements come back, with times of its own; null is at once
-            and all of them.
-        acknowledged: whether each measurement tells which packets have arrived and what has acted.
-        seed: of times and losses.
-    """
-
-    kind: Literal["network"] = "network"
-    playout: Seconds | None = None
-    dry: Literal["hold", "zero"] = "hold"
-    back: PacketsConfig | None = Field(default=None, alias="return")
-    acknowledged: bool = True
-    seed: Seed = 0
-
-    @property
-    def follows_delay(self) -> bool:
-        """Whether the times of packets are those of the scenario's delay."""
-        return self.distribution == "uniform" and self.low is None and self.high is None
-
-
-LinkConfig = Annotated[WireConfig | NetworkConfig, ByKind()]
-ASSUMED_TIMES: Final = (0.8, 1.2)
-"""Shortest and longest time under way, in delays, of a network without `low` and `high`."""
-
-
-@dataclass(config=STRICT)
 class StateSensorConfig:
     """The measurement of pose and rates.
 
     Attributes:
         kind: `state`.
         noise_std: of [pose; rates], in rad, m, rad/s and m/s.
-        delay: between measuring and having the measurement, s; by the next sample after that.
+        delay: age of a measurement when it arrives, s; it is used at the next sample after that.
         loss: share of the measurements that are lost.
         seed: of the noise, of spikes and losses; the same seed gives the same run.
-        faults: when it measures nothing, the same again, or nonsense; see `fault_config`.
+        faults: frozen, missing or wrong measurements, see `field_types.SensorFault`.
     """
 
     measures_state, samples = True, None  # not annotated: no fields
@@ -422,14 +340,10 @@ class StateSensorConfig:
     noise_std: Annotated[list[Deviation], Field(min_length=12, max_length=12)] = field(
         default_factory=lambda: [0.0] * 12
     )
-    delay: Annotated[float, Field(ge=0, le=100)] = 0.0
-    loss: Annotated[float, Field(ge=0, le=0.99)] = 0.0
+    delay: _SensorDelay = 0.0
+    loss: Loss = 0.0
     seed: Seed = 0
     faults: list[SensorFault] = field(default_factory=list)
-
-    def problem(self) -> str | None:
-        """Return what is wrong with the faults, or None."""
-        return fault_problem(self.faults, legs=False)
 
 
 @dataclass(config=STRICT)
@@ -439,12 +353,12 @@ class EncoderSensorConfig:
     Attributes:
         kind: `encoders`.
         bits: of a turn; null is exact.
-        samples: how often each is read per period of the controller, the last time at its sample.
-        offset: of each encoder on its shaft, which the controller is not told, rad.
-        delay: between measuring and having the measurement, s; by the next sample after that.
+        samples: readings of each encoder per period of the controller, the last one at its sample.
+        offset: of each encoder on its shaft, unknown to the controller, rad.
+        delay: age of a measurement when it arrives, s; it is used at the next sample after that.
         loss: share of the measurements, those of a period each, that are lost.
-        seed: of where codes begin, of spikes and losses; the same seed gives the same run.
-        faults: when legs measure nothing, the same again, or nonsense; see `fault_config`.
+        seed: of the first code's place, of spikes and losses; the same seed gives the same run.
+        faults: frozen, missing or wrong readings of legs, see `field_types.LegFault`.
     """
 
     measures_state = False  # not annotated: no field
@@ -452,14 +366,10 @@ class EncoderSensorConfig:
     bits: Annotated[int, Field(ge=4, le=32)] | None = 14
     samples: Annotated[int, Field(ge=1, le=1000)] = 1
     offset: Six = field(default_factory=lambda: [0.0] * 6)
-    delay: Annotated[float, Field(ge=0, le=100)] = 0.0
-    loss: Annotated[float, Field(ge=0, le=0.99)] = 0.0
+    delay: _SensorDelay = 0.0
+    loss: Loss = 0.0
     seed: Seed = 0
-    faults: list[SensorFault] = field(default_factory=list)
-
-    def problem(self) -> str | None:
-        """Return what is wrong with the faults, or None."""
-        return fault_problem(self.faults, legs=True)
+    faults: list[LegFault] = field(default_factory=list)
 
 
 SensorConfig = Annotated[StateSensorConfig | EncoderSensorConfig, ByKind()]
@@ -467,7 +377,7 @@ SensorConfig = Annotated[StateSensorConfig | EncoderSensorConfig, ByKind()]
 
 @dataclass(config=STRICT)
 class FixedTunerConfig:
-    """w_Q and w_R stay those of the controller.
+    """Constant w_Q and w_R, those of the controller.
 
     Attributes:
         kind: `fixed`.
@@ -478,9 +388,9 @@ class FixedTunerConfig:
 
 @dataclass(config=STRICT)
 class AnnTunerConfig:
-    """A neural network sets w_Q and w_R while the controller runs.
+    """A neural network that sets w_Q and w_R at run time.
 
-    It starts from the controller's w_Q and w_R and goes back to them where it fails.
+    It starts from the controller's w_Q and w_R and returns to them where it fails.
 
     Attributes:
         kind: `ann`.
@@ -493,14 +403,14 @@ class AnnTunerConfig:
 
 @dataclass(config=STRICT)
 class RuleTunerConfig:
-    """Two lines set w_Q / w_R: a constant while predictions hold, less where they do not.
+    """A piecewise linear rule for w_Q / w_R: constant for small innovations, then falling.
 
     log10(w_Q / w_R) = ratio - slope max(0, x - knee), x the logarithm of the last three seconds'
     largest innovation; see `tuner.source.Rule`.
 
     Attributes:
         kind: `rule`.
-        ratio, slope, knee: see above; null is what was found for controllers with an estimator,
+        ratio, slope, knee: see above; null is the shipped value for controllers with an estimator,
             or without one.
     """
 
@@ -522,15 +432,15 @@ class Scenario:
         duration: of the simulation, s.
         start: `rest` (at the reference's first pose, zero rates) or `on_reference`.
         queue: torques in flight at t = 0: `zero`, `equilibrium`, or `reference` (the inverse
-            dynamics of the reference). With servos the cranks of the first pose, or of the
-            reference, are in flight too, where the controller sends torques with such torques.
+            dynamics of the reference). With servos also the cranks of the first pose, or those of
+            the reference where the torques are.
         reference, plant, delay, link, controller, actuator, sensor, tuner: the sections; all but
-            plant, delay and controller come in kinds, each a class of its own.
+            plant, delay and controller come in kinds, each a class.
         log_period: of the recorded signals, s; null is every 20 ms and every sample of the
-            controller. The multibody plant is seen on its own steps only, so that it must be a
-            multiple of `plant.time_step`. What is measured of a run does not depend on it.
-        compare: what `compare` lays over each controller last, by its name. Another name is one
-            row more, of the shipped or own file that its `controller` says; `actuator` in a row is
+            controller. The multibody plant is recorded at its own steps only, so that it must be a
+            multiple of `plant.time_step`. Figures of merit do not depend on it.
+        compare: fields that `compare` lays over each controller last, by its name. Another name is
+            a further row, of the shipped or own file in its `controller`; `actuator` in a row is
             laid over that section.
     """
 
@@ -569,11 +479,9 @@ class Scenario:
             low, high = (round(share * eta, 12) for share in ASSUMED_TIMES)
             link = dataclasses.replace(link, low=low, high=high)
         if link.playout is None:
-            from stewart_drake.scenario.packets import (
-                default_bound,
-            )  # numpy, which --help goes without
+            from stewart_drake.scenario import packets  # numpy, which --help does not import
 
-            bound = default_bound(link, c.packet_repeats, c.period)
+            bound = packets.default_bound(link, c.packet_repeats, c.period)
             link = dataclasses.replace(link, playout=bound)
         return link
 
@@ -591,62 +499,62 @@ class Scenario:
         """The true delay in s."""
         return self.true_delay.eta(self.controller.period)
 
-    def _delay_problem(self) -> str | None:
-        c = self.controller
-        if c.delay_estimator == "none" or (c.delay_steps is None and c.calibration is not None):
-            return None  # what is known may say a delay, see `loop.preparation`
-        if c.delay_steps is None:
-            return self.delay_max_problem(self.true_delay)
-        return self.delay_max_problem(Delay(c.delay_steps, c.delay_fraction or 0.0))
-
-    def delay_max_problem(self, believed: Delay) -> str | None:
-        """Return what is wrong with the longest delay that an estimator thinks possible, or None.
+    def delay_max_problem(self, assumed: Delay | None = None) -> str | None:
+        """Return why an estimator's longest delay excludes the assumed one, or None.
 
         Args:
-            believed: the delay that the controller assumes at first.
+            assumed: the delay that the controller assumes at first; None is that of the scenario,
+                unless a calibration may have another.
         """
         c = self.controller
-        if c.delay_estimator == "none" or believed.eta(c.period) <= c.delay_max:
+        if c.delay_estimator == "none":
+            return None
+        if assumed is None and c.delay_steps is not None:
+            assumed = Delay(c.delay_steps, c.delay_fraction or 0.0)
+        elif assumed is None and c.calibration is None:
+            assumed = self.true_delay
+        if assumed is None or assumed.eta(c.period) <= c.delay_max:
             return None
         return (
-            f"controller.delay_max: got {c.delay_max:g} s, less than the "
-            f"{believed.eta(c.period):g} s that are believed in; expected as much or more"
+            f"controller.delay_max: got {c.delay_max:g} s, less than the assumed delay of "
+            f"{assumed.eta(c.period):g} s; expected as much or more"
         )
 
     def _times_problem(self, link: NetworkConfig) -> str | None:
-        """Return what is wrong with the times of packets, or None."""
+        """Return the first problem with the transit times, or None."""
         if not link.follows_delay:
-            return link.times_problem("link")
-        nothing = self.delay.steps + self.delay.fraction == 0
-        if self.delay.constant and not nothing:
-            return dataclasses.replace(link, low=0.0, high=0.0).times_problem("link")
+            return link.problem("link")
+        zero = self.delay.steps + self.delay.fraction == 0
+        if self.delay.constant and not zero:
+            return dataclasses.replace(link, low=0.0, high=0.0).problem("link")
+        low, high = ASSUMED_TIMES
         return (
-            f"link.low: got null with a delay that is {'0' if nothing else 'not constant'}; "
-            "expected link.low and link.high in s, or a constant delay, of which they are then "
-            f"{ASSUMED_TIMES[0]:g} and {ASSUMED_TIMES[1]:g} times"
+            f"link.low: got null with a delay that is {'0' if zero else 'not constant'}; expected "
+            f"link.low and link.high in s, or a constant delay, of which null is {low:g} and "
+            f"{high:g} times"
         )
 
     def _network_problem(self) -> str | None:
-        """Return what is wrong with a network and with what is believed of it, or None."""
+        """Return the first problem with a network and the assumptions about it, or None."""
         link = self.link
         if link.kind == "wire":
             return None
-        back = link.back.times_problem("link.return") if link.back else None
+        back = link.back.problem("link.return") if link.back else None
         if problem := self._times_problem(link) or back:
             return problem
         if self.true_delay.steps <= MOST_PERIODS:
             return None
         bound = "null" if link.playout is None else f"{link.playout:g} s"
         return (
-            f"link.playout: got {bound}, with which torques wait for more than {MOST_PERIODS} "
-            "periods; expected a shorter one, or a quicker network"
+            f"link.playout: got {bound}, a delay of more than {MOST_PERIODS} periods; expected a "
+            "shorter bound, or a faster network"
         )
 
     def check(self, where: str = "scenario") -> None:
-        """Checks every field again, and everything that takes several of them.
+        """Check every field again, and all rules that take several of them.
 
         Args:
-            where: what the scenario is, opening the message.
+            where: opening of a message.
 
         Raises:
             ConfigError: the first problem, in one line.
@@ -658,16 +566,15 @@ class Scenario:
         problem = (
             self.reference.problem()
             or contradiction(self)
-            or self.sensor.problem()
             or self._network_problem()
-            or self._delay_problem()
+            or self.delay_max_problem()
             or (self.step_problem(step) if step else log_problem(self.log_period, self.duration))
         )
         if problem:
             raise ConfigError(f"{where}: {problem}")
 
     def check_rows(self, where: str) -> None:
-        """Checks what `compare` says, each row by itself.
+        """Check each row of `compare` by itself.
 
         Raises:
             ConfigError: the first problem, in one line, opened by `where`.
@@ -675,7 +582,7 @@ class Scenario:
         for row, change in self.compare.items():
             place, fields = f"{where}: compare.{row}", dict(change)
             if "/" in row:
-                raise ConfigError(f"{place}: names its signals' file; expected no slash")
+                raise ConfigError(f"{place}: names a file of signals; expected no slash")
             controller = fields.pop("controller", row)
             if not isinstance(controller, str):
                 raise ConfigError(f"{place}: controller: got {brief(controller)}; expected text")
@@ -683,13 +590,12 @@ class Scenario:
             validate(ControllerConfig, fields, place)
 
     def step_problem(self, step: float) -> str | None:
-        """Return what does not fit a discrete plant with steps of `step` s, or None."""
-        period, link, sensor = self.controller.period, self.link, self.sensor
-        fraction, bound, samples = self.delay.fraction, None, None
-        if link.kind == "network":
-            fraction = 0.0
-            bound = link.playout and whole_problem("link.playout", link.playout, step)
-        if sensor.samples is not None:
-            samples = samples_problem(sensor.samples, period, step)
-        logged = log_problem(self.log_period, self.duration, step)
-        return samples or step_problem(step, period, fraction) or bound or logged
+        """Return the first number that does not fit a plant with steps of `step` s, or None."""
+        link, networked = self.link, self.link.kind == "network"
+        return step_problem(
+            step,
+            self.controller.period,
+            fraction=0.0 if networked else self.delay.fraction,
+            samples=self.sensor.samples,
+            playout=link.playout if link.kind == "network" else None,
+        ) or log_problem(self.log_period, self.duration, step)

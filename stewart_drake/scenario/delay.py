@@ -1,4 +1,4 @@
-"""The delay between a torque and its effect, as a value: what is true of it, or believed."""
+"""The delay between a torque and its effect as a value, true or assumed."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ class Delay:
 
     Attributes:
         steps: mu, whole periods.
-        fraction: eta0 / dt, the further part of a period, in [0, 1).
+        fraction: eta0 / dt, further part of a period, in [0, 1).
 
     Raises:
         ValueError: steps or fraction outside their range.
@@ -29,7 +29,7 @@ class Delay:
 
     @classmethod
     def of(cls, eta: float, period: float) -> "Delay":
-        """A delay of eta s; less than LEAST_FRACTION of a period beyond a whole one is none."""
+        """Return a delay of eta s; less than LEAST_FRACTION beyond a whole period is none."""
         periods = max(0.0, eta / period)
         steps = int(periods + LEAST_FRACTION)
         fraction = periods - steps
@@ -37,14 +37,14 @@ class Delay:
 
     @property
     def periods(self) -> float:
-        """The whole of it in periods."""
+        """The whole delay in periods."""
         return self.steps + self.fraction
 
     def eta(self, period: float) -> float:
-        """The whole of it in s, for a period in s."""
+        """Return the whole delay in s, for a period in s."""
         return self.periods * period
 
     @property
     def queue_length(self) -> int:
-        """Torques of earlier samples that still act, or will: mu, one more when eta0 > 0."""
+        """Number of torques of earlier samples in flight or acting: mu, one more for eta0 > 0."""
         return self.steps + (1 if self.fraction > 0 else 0)

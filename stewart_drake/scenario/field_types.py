@@ -1,8 +1,9 @@
 """Types of the scenario's fields, each with its range; shared by the sections."""
 
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal, NotRequired
 
-from pydantic import AfterValidator, ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field, with_config
+from typing_extensions import TypedDict  # which pydantic wants before Python 3.12
 
 from stewart_drake.files.yamlio import one_message
 from stewart_drake.scenario.timing import LEAST_FRACTION
@@ -10,15 +11,17 @@ from stewart_drake.scenario.timing import LEAST_FRACTION
 STRICT: Final = ConfigDict(
     extra="forbid", strict=True, allow_inf_nan=False, validate_assignment=True
 )
-"""Of every section: nothing is guessed, and assignments are checked too."""
+"""Configuration of every section: nothing is guessed, and assignments are checked too."""
 MOST_PERIODS: Final = 1000
-"""Of a delay: as many torques are in flight."""
+"""Largest delay in periods, which is the number of torques in flight."""
 
-# Limits far beyond any platform keep squares and products of what a file says finite.
+# Limits far beyond any platform keep squares and products finite.
 Positive = Annotated[float, Field(gt=0, le=1e6)]
 Weight = Annotated[float, Field(gt=0, le=1e12)]
 Seconds = Annotated[float, Field(ge=0, le=1e5)]
 Deviation = Annotated[float, Field(ge=0, le=1e3)]
+Length = Annotated[float, Field(ge=-1e3, le=1e3)]
+Loss = Annotated[float, Field(ge=0, le=0.99)]
 Fraction = Annotated[
     float, Field(ge=0, lt=1), AfterValidator(lambda f: f if f >= LEAST_FRACTION else 0.0)
 ]
@@ -29,5 +32,49 @@ TorqueLimit = Annotated[
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Steps = Annotated[int, Field(ge=0, le=MOST_PERIODS)]
 Row = Annotated[list[float], Field(min_length=6, max_length=6)]
-Six = Annotated[list[Annotated[float, Field(ge=-1e3, le=1e3)]], Field(min_length=6, max_length=6)]
+Six = Annotated[list[Length], Field(min_length=6, max_length=6)]
 Name = Annotated[str, Field(min_length=1)]
+
+SPIKE: Final = 10.0
+"""Default `size` of a spike."""
+
+# A mapping and not a dataclass, because Python reserves the name `from`.
+_Fault = TypedDict(
+    "_Fault",
+    {
+        "kind": Literal["frozen", "missing", "spike"],
+        "leg": NotRequired[Annotated[int, Field(ge=1, le=6)] | None],
+        "from": Seconds,
+        "to": Seconds,
+        "size": NotRequired[Annotated[float, Field(gt=0, le=1e6)] | None],
+        "share": NotRequired[Annotated[float, Field(gt=0, le=1)] | None],
+    },
+)
+with_config(ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))(_Fault)
+
+
+def _check_fault(fault: Any) -> Any:
+    for name, kinds in {"size": ("spike",), "share": ("missing", "spike")}.items():
+        if fault.get(name) is not None and fault["kind"] not in kinds:
+            raise ValueError(f"{name} with kind {' or '.join(kinds)} only")
+    if not fault["from"] < fault["to"]:
+        raise ValueError("`to` after `from`")
+    return fault
+
+
+def _check_no_leg(fault: Any) -> Any:
+    if fault.get("leg") is not None:
+        raise ValueError("leg null: pose and rates of the plate are measured, not the legs")
+    return fault
+
+
+LegFault = Annotated[_Fault, AfterValidator(_check_fault)]
+"""One fault of encoders, from `from` up to but not at `to`, in s.
+
+`frozen` repeats the last measurement before it, `missing` measures nothing, and `spike` is off by
+`size` (default SPIKE) times the motion of each coordinate or crank, times a number drawn anew at
+every sample from the standard normal distribution. `leg` null is all six. A `missing` or a `spike`
+with a `share` affects that share of the samples, drawn independently for each and for each leg.
+"""
+SensorFault = Annotated[LegFault, AfterValidator(_check_no_leg)]
+"""One fault of a measurement of pose and rates, see `LegFault`."""

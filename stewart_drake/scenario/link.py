@@ -8,31 +8,27 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.scenario.config import (
-    ASSUMED_TIMES,
-    DelayConfig,
-    PacketsConfig,
-    Scenario,
-)
+from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.link_config import ASSUMED_TIMES, PacketsConfig
 from stewart_drake.scenario.packets import BACK, SENSOR, packet_times
 from stewart_drake.types import Array
 
 SIMULTANEOUS: Final = 1e-9
-"""Of a period; what is so close to each other has no order."""
+"""Of a period; events closer to each other have no order."""
 
 
 def number_sent(duration: float, period: float) -> int:
-    """Samples of a run, the one at t = 0 and one at its end among them."""
+    """Return the number of samples of a run, with those at t = 0 and at its end."""
     return int(duration / period + 1e-9) + 1
 
 
 def delay_at(delay: DelayConfig, period: float, times: Array) -> Array:
-    """eta(t) in s of what is sent at `times`, before jitter, at least 0.
+    """Return eta(t) in s of torques sent at `times`, before jitter, at least 0.
 
         eta(t) = (steps + fraction) dt + drift t + swing sin(omega t) + jump [t >= jump_time]
 
-    Before t = 0 it was what it is without the last three.
+    Before t = 0 the last three terms are zero.
     """
     began = np.maximum(times, 0.0)
     eta = Delay(delay.steps, delay.fraction).eta(period) + delay.drift * began
@@ -42,9 +38,9 @@ def delay_at(delay: DelayConfig, period: float, times: Array) -> Array:
 
 
 def torque_delays(scenario: Scenario) -> Array:
-    """(n,) s, the true delay of every torque of a run over a wire, the jitter in it.
+    """Return the true delay (n,) of every torque of a run over a wire with its jitter, s.
 
-    The multibody plant feels torques at its own steps, so that they arrive at the nearest one.
+    Torques arrive at the nearest step of the multibody plant.
     """
     delay, period = scenario.delay, scenario.controller.period
     sent: Array = np.arange(number_sent(scenario.duration, period), dtype=np.float64) * period
@@ -59,24 +55,23 @@ def torque_delays(scenario: Scenario) -> Array:
 def takes_effect(arrivals: Array, together: float = 0.0) -> NDArray[np.bool_]:
     """Return which of (n,) torques ever act: those that arrive before every newer one.
 
-    The motors take the newest torque that has arrived, whatever comes after it: one that was
-    overtaken says what was right for an earlier instant. Of several that arrive within `together`,
-    in s, the newest acts.
+    The motors apply the newest torque that has arrived; one that was overtaken is out of date. Of
+    several that arrive within `together`, in s, the newest acts.
     """
     earliest_newer = np.minimum.accumulate(np.append(arrivals, np.inf)[::-1])[::-1][1:]
     return np.isfinite(arrivals) & (arrivals + together < earliest_newer)
 
 
 def releases(period: float, delays: Array, delay: Delay) -> tuple[NDArray[np.int64], Array]:
-    """Return the torques that ever act over a wire, and when they begin to, s, in that order.
+    """Return the torques that ever act over a wire, and their arrivals in s, in that order.
 
-    Torque k >= 0 is sent at k dt and waits for `delays[k]`; torques -L to -1 were sent before, each
-    a period after the other, and wait for `delay`, of which L is the length of the queue.
+    Torque k >= 0 is sent at k dt and has the delay `delays[k]`. Torques -L to -1 were sent before,
+    one a period, with the delay `delay` and its queue length L.
 
     Args:
         period: dt in s.
-        delays: (n,) s; what is less than 1e-9 of a period is 0.
-        delay: of those sent before t = 0.
+        delays: (n,) s; less than 1e-9 of a period is 0.
+        delay: of torques sent before t = 0.
     """
     length = delay.queue_length
     waits = np.where(delays > SIMULTANEOUS * period, delays, 0.0)
@@ -88,21 +83,21 @@ def releases(period: float, delays: Array, delay: Delay) -> tuple[NDArray[np.int
 
 
 def forward_times(scenario: Scenario, number: int) -> Array:
-    """Return for how long each packet of torques (number,) is under way, s; infinite if lost."""
+    """Return the transit time (number,) of each packet of torques, s; infinite if lost."""
     link = scenario.assumed_link
     return np.zeros(number) if link.kind == "wire" else packet_times(link, number, link.seed)
 
 
 def sensor_times(scenario: Scenario, number: int) -> Array:
     """Return times (number,) from sample to measurement, s; infinite where it is lost."""
-    sc = scenario.sensor
-    none_late = PacketsConfig(low=0.0, high=0.0, loss=sc.loss)
-    lost = packet_times(none_late, number, sc.seed, SENSOR)
-    return sc.delay + np.where(np.isfinite(lost), 0.0, np.inf)
+    sensor = scenario.sensor
+    at_once = PacketsConfig(low=0.0, high=0.0, loss=sensor.loss)
+    lost = np.isinf(packet_times(at_once, number, sensor.seed, SENSOR))
+    return sensor.delay + np.where(lost, np.inf, 0.0)
 
 
 def return_times(scenario: Scenario, number: int) -> Array:
-    """Return for how long each measurement (number,) is under way, s; infinite if it is lost."""
+    """Return the transit time (number,) of each measurement, s; infinite if it is lost."""
     link = scenario.link
     if link.kind == "wire" or link.back is None:
         return np.zeros(number)
@@ -116,7 +111,7 @@ def measurement_times(scenario: Scenario) -> Array:
 
 
 def link_text(scenario: Scenario) -> str | None:
-    """Return the assumed network in a few words, None for a wire."""
+    """Return the assumed network in words, None for a wire."""
     link = scenario.assumed_link
     if link.kind == "wire":
         return None

@@ -2,8 +2,8 @@
 
 Precedence, lowest first: the scenario file, a controller laid over it, single settings. Each layer
 is checked on its own, so that a message names the place to mend. A field that is set where it has
-no effect is refused (`scenario.dependencies`), unless a layer above it made it so: then it is
-dropped.
+no effect is refused (`scenario.dependencies`), unless a higher layer removed the effect: then it
+is dropped.
 """
 
 import dataclasses
@@ -36,16 +36,16 @@ def load_scenario(
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
 ) -> Scenario:
-    """Reads and checks a scenario.
+    """Read and check a scenario.
 
     Args:
         name_or_path: a shipped name or a YAML file. Paths inside the file start from its folder;
-            what the file leaves out keeps its default.
+            missing fields keep their defaults.
         controller: a controller to lay over it, as `load_controller` takes it.
         settings: `section.field=value` or `field=value`, the value in YAML, e.g.
-            `plant.gravity=true`; paths start from the working directory. A setting of a
-            section's kind also drops what the file says for another kind. `overlay=dirty` lays the
-            fields of a shipped overlay or a YAML file over the scenario.
+            `plant.gravity=true`; paths start from the working directory. A setting of a section's
+            kind also drops the file's fields of another kind. `overlay=dirty` lays the fields of a
+            shipped overlay or a YAML file over the scenario.
 
     Raises:
         ConfigError: the first problem, in one line.
@@ -53,7 +53,7 @@ def load_scenario(
     read = read_scenario(name_or_path, controller, settings)
     read.scenario.check(read.where)
     for idle in idle_fields(read.scenario):
-        if place := read.asker(idle):
+        if place := read.place_to_mend(idle):
             raise ConfigError(f"{place}: {idle.problem}")
     return _without_idle(read.scenario)
 
@@ -68,10 +68,10 @@ def load_compatible(
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
 ) -> Scenario:
-    """As `load_scenario`, for one of several controllers on a scenario.
+    """Read a scenario as `load_scenario`, for one of several controllers.
 
-    What the scenario says of servos is for controllers that send cranks. Others drive the same
-    machine without them, within the same torque limit. Fields without an effect are not refused.
+    A scenario's servos are for controllers that send cranks. Others drive the same machine without
+    them, within the same torque limit. Fields without an effect are not refused.
     """
     scenario, where, *_ = read_scenario(name_or_path, controller, settings)
     scenario.actuator = compatible_actuator(scenario.controller.command, scenario.actuator)
@@ -84,7 +84,7 @@ class Read(NamedTuple):
 
     Attributes:
         scenario: its fields are checked one by one only.
-        where: what it is, for messages.
+        where: opening of a message.
         places: the file, or "settings", that set a field last, by the field's dotted name.
         idle: names of the fields without an effect in the scenario's file by itself.
         path: of that file.
@@ -96,10 +96,10 @@ class Read(NamedTuple):
     idle: set[str]
     path: str
 
-    def asker(self, idle: Idle) -> str | None:
-        """Return the place that is to be mended, None if a layer above made the field idle.
+    def place_to_mend(self, idle: Idle) -> str | None:
+        """Return the place that set an idle field, None if a higher layer made it idle.
 
-        A controller's file is for scenarios of any kind: only its own fields are to fit.
+        A controller's file is for scenarios of any kind: only its own fields must fit.
         """
         place = self.places.get(idle.field)
         if place == self.path:
@@ -112,7 +112,7 @@ def read_scenario(
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
 ) -> Read:
-    """Read a scenario, its fields checked one by one only."""
+    """Read a scenario and check its fields one by one only."""
     path = resolve("scenario", name_or_path)
     data = load_yaml(path)
     _drop_foreign_nulls(data)
@@ -122,7 +122,7 @@ def read_scenario(
     if controller is not None:
         laid = load_controller(controller)
         places |= dict.fromkeys(_dotted_names({"controller": laid}), str(controller))
-        data["controller"] = {**data.get("controller", {}), **laid}
+        data["controller"] = data.get("controller", {}) | laid
     overlay = _parse_settings(settings, data)
     places |= dict.fromkeys(_dotted_names(overlay), _SETTINGS)
     for name, change in overlay.items():
@@ -132,7 +132,7 @@ def read_scenario(
 
 
 def _dotted_names(data: dict[str, Any], above: str = "") -> Iterator[str]:
-    """Every field in the data, with those that it is in."""
+    """Yield the name of every field in the data, and of the sections."""
     for name, value in data.items():
         yield f"{above}{name}"
         if isinstance(value, dict):
@@ -140,20 +140,17 @@ def _dotted_names(data: dict[str, Any], above: str = "") -> Iterator[str]:
 
 
 def _without_idle(scenario: Scenario) -> Scenario:
-    """The scenario with fields without an effect at their defaults."""
+    """Return the scenario with the defaults of fields without an effect."""
     for idle in idle_fields(scenario):
         reset(scenario, idle.field)
     return scenario
 
 
 def load_controller(name_or_path: str | Path) -> dict[str, Any]:
-    """Reads a controller: the fields of the scenario's `controller` section that it sets.
+    """Read a controller: fields of the scenario's section `controller` and their values.
 
     Args:
-        name_or_path: a shipped name or a YAML file of flat keys.
-
-    Returns:
-        The keys listed in the file and their values, checked; `period` is never among them.
+        name_or_path: a shipped name or a YAML file of flat keys, without `period`.
 
     Raises:
         ConfigError: unreadable file, unknown key, bad value, or a `period`.
@@ -176,10 +173,10 @@ def load_comparison(
     settings: Iterable[str] = (),
     refuse_idle: bool = True,
 ) -> dict[str, Scenario]:
-    """Reads a scenario once for every controller, and for every further row of its `compare`.
+    """Read a scenario once for every controller, and for every further row of its `compare`.
 
-    What `settings` say of the delay that is believed in does not change a controller that knows of
-    none. Each has motors that understand it, see `load_compatible`.
+    Settings of the assumed delay do not change a controller that assumes none. Each row has
+    compatible motors, see `load_compatible`.
 
     Args:
         name_or_path, settings: as of `load_scenario`.
@@ -194,15 +191,16 @@ def load_comparison(
     """
     settings = tuple(settings)
     others = tuple(s for s in settings if not s.strip().startswith("controller.delay_"))
-    unchecked = read_scenario(name_or_path, settings=settings)
-    unchecked.scenario.check_rows(unchecked.where)
-    changes, rows = unchecked.scenario.compare, {}
-    everywhere = {one.field for one in idle_fields(unchecked.scenario)}
+    read = read_scenario(name_or_path, settings=settings)
+    read.scenario.check_rows(read.where)
+    changes, rows = read.scenario.compare, {}
+    everywhere = {one.field for one in idle_fields(read.scenario)}
     for row in dict.fromkeys([*controllers, *changes]):
         where, change = f"{name_or_path}: compare.{row}", dict(changes.get(row, {}))
         controller, actuator = change.pop("controller", row), change.pop("actuator", {})
-        blind = load_controller(controller).get("delay_steps") == 0
-        scenario = read_scenario(name_or_path, controller, others if blind else settings).scenario
+        ignores_delay = load_controller(controller).get("delay_steps") == 0
+        own = others if ignores_delay else settings
+        scenario = read_scenario(name_or_path, controller, own).scenario
         changed = dataclasses.asdict(scenario.controller) | change
         scenario.controller = validate(ControllerConfig, changed, where)
         motors = compatible_actuator(scenario.controller.command, scenario.actuator)
@@ -213,24 +211,24 @@ def load_comparison(
             raise ConfigError(f"{where}: {idle[field].problem}")
         everywhere &= idle.keys()
         rows[row] = _without_idle(scenario)
-    for one in idle_fields(unchecked.scenario) if refuse_idle else ():
-        if one.field in everywhere and (place := unchecked.asker(one)):
+    for one in idle_fields(read.scenario) if refuse_idle else ():
+        if one.field in everywhere and (place := read.place_to_mend(one)):
             raise ConfigError(f"{place}: {one.problem}")
     return rows
 
 
 def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
-    """The scenario as plain data that JSON and YAML can hold, and `load_scenario` reads back."""
+    """Return the scenario as plain data that `load_scenario` reads back from JSON or YAML."""
     return plain(scenario)
 
 
 def scenario_yaml(scenario: Scenario) -> str:
-    """The scenario as the text of a file that `load_scenario` reads back."""
+    """Return the scenario as the text of a file that `load_scenario` reads back."""
     return yaml_text(scenario_to_dict(scenario))
 
 
 def setting_choices() -> list[str]:
-    """The beginning of every setting, `plant.time_step=`; whole where values can be counted."""
+    """Return the beginning of every setting, `plant.time_step=`; whole for words and booleans."""
     choices: dict[str, None] = {}  # kinds have fields in common
     for name, hint in typing.get_type_hints(Scenario).items():
         members = [m for m in (*typing.get_args(hint), hint) if dataclasses.is_dataclass(m)]
@@ -240,19 +238,17 @@ def setting_choices() -> list[str]:
             for field, inner in typing.get_type_hints(member).items()
         ]
         for field, inner in hints or [(name, hint)]:
-            values: tuple[Any, ...] = ("",)
-            if inner is bool:
-                values = ("true", "false")
-            elif typing.get_origin(inner) is typing.Literal:
-                values = typing.get_args(inner)
+            is_literal = typing.get_origin(inner) is typing.Literal
+            values = typing.get_args(inner) if is_literal else ("",)
+            values = ("true", "false") if inner is bool else values
             choices |= dict.fromkeys(f"{field}={value}" for value in values)
     return [*choices, *(f"{_OVERLAY}={name}" for name in shipped("overlay"))]
 
 
 def _parse_settings(settings: Iterable[str], data: dict[str, Any]) -> dict[str, Any]:
-    """Settings for a scenario's data as a partial one; of two for one field the later one counts.
+    """Return settings as a partial scenario; of two for one field the later one counts.
 
-    The kind of a section that any of them touches is said in what is returned.
+    A section with kinds that a setting touches has its kind in the result.
     """
     changes = [_parse_setting(setting) for setting in settings]
     for section, kinds in _KINDS.items():
@@ -272,7 +268,7 @@ def _parse_settings(settings: Iterable[str], data: dict[str, Any]) -> dict[str, 
 
 
 def _parse_setting(setting: str) -> dict[str, Any]:
-    """One setting as a partial scenario."""
+    """Return one setting as a partial scenario."""
     key, equals, text = setting.partition("=")
     if key.strip() == _OVERLAY and text:
         path = resolve("overlay", text.strip())
@@ -291,7 +287,7 @@ def _parse_setting(setting: str) -> dict[str, Any]:
 
 
 def _laid_over(name: str, below: Any, above: Any) -> Any:
-    """A scenario's field under a checked change; a new kind drops what it does not know."""
+    """Return a scenario's field under a checked change; a new kind drops fields of others."""
     if not isinstance(above, dict):
         return above
     kept = below or {}
@@ -302,30 +298,31 @@ def _laid_over(name: str, below: Any, above: Any) -> Any:
 
 
 def _drop_foreign_nulls(data: dict[str, Any]) -> None:
-    """Forget a null for a field of another kind: it says that there is none, as in older files."""
+    """Remove nulls for fields of another kind, which files of 0.1 have."""
     for section, kinds in _KINDS.items():
         given = data.get(section)
-        if not isinstance(given, dict):
-            continue
-        own = kinds.get(str(given.get("kind", next(iter(kinds)))))
-        foreign = {name for kind in kinds.values() for name in field_names(kind)}
-        for name in foreign - set(field_names(own)) if own else ():
-            if name in given and given[name] is None:
+        if isinstance(given, dict) and (
+            own := kinds.get(str(given.get("kind", next(iter(kinds)))))
+        ):
+            foreign = {n for kind in kinds.values() for n in field_names(kind)} - {
+                *field_names(own)
+            }
+            for name in foreign & {n for n, value in given.items() if value is None}:
                 del given[name]
 
 
 def _make_paths_absolute(data: dict[str, Any], folder: Path) -> None:
-    """Ties every relative path in `data` to the folder it was written for; names stay names."""
+    """Make every relative path in `data` absolute against a folder; shipped names stay."""
 
-    def tie(fields: dict[str, Any], name: str) -> None:
-        value = fields.get(name)
-        if isinstance(value, str) and (name in _FILES or is_path(value)):
-            fields[name] = str(absolute_path(value, folder))
+    def resolved(fields: dict[str, Any], *names: str) -> None:
+        for name in names:
+            value = fields.get(name)
+            if isinstance(value, str) and (name in _FILES or is_path(value)):
+                fields[name] = str(absolute_path(value, folder))
 
-    tie(data, "mechanism")
-    tie(data.get("plant", {}), "mechanism")
+    resolved(data, "mechanism")
+    resolved(data.get("plant", {}), "mechanism")
     for fields in (data.get("controller", {}), *data.get("compare", {}).values()):
-        tie(fields, "calibration")
-        tie(fields, "controller")  # of a row of `compare`
-    tie(data.get("reference", {}), "file")
-    tie(data.get("tuner", {}), "weights")
+        resolved(fields, "calibration", "controller")  # the latter in a row of `compare`
+    resolved(data.get("reference", {}), "file")
+    resolved(data.get("tuner", {}), "weights")

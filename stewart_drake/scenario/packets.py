@@ -1,4 +1,4 @@
-"""How long packets are under way, how many are lost, and the play-out bound that follows.
+"""Transit times and losses of packets, and the play-out bound that follows.
 
 Everything is drawn beforehand from a seed, so that the same scenario gives the same run.
 """
@@ -6,42 +6,31 @@ Everything is drawn beforehand from a seed, so that the same scenario gives the 
 from bisect import bisect_left
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stewart_drake.scenario.field_types import MOST_PERIODS
+from stewart_drake.scenario.link_config import PacketsConfig
 from stewart_drake.types import Array
 
 FORWARD, BACK, SENSOR = range(3)
 """Streams of random numbers of one seed."""
 RARE: Final = 1.5
-"""Torques that are missing, by those that would be with no packet late."""
+"""Accepted share of missing torques, relative to that without late packets."""
 ALMOST_NONE: Final = 1e-3
-"""Share of torques that may be late where no packet is lost."""
+"""Accepted share of late torques where no packet is lost."""
 
 
-class PacketTimes(Protocol):
-    """Fields of `scenario.config.PacketsConfig`."""
-
-    distribution: Literal["uniform", "lognormal"]
-    low: float | None
-    high: float | None
-    median: float | None
-    sigma: float | None
-    loss: float
-    burst: int
-
-
-def times_under_way(config: PacketTimes) -> Any:
-    """The distribution of the time in s that a packet takes, as scipy has it."""
-    from scipy.stats import lognorm, uniform  # a fifth of a second, which others need not wait
+def times_under_way(config: PacketsConfig) -> Any:
+    """Return scipy's distribution of the transit time in s."""
+    from scipy.stats import lognorm, uniform  # takes a fifth of a second to import
 
     if config.distribution == "uniform":
-        assert config.low is not None and config.high is not None  # see `Scenario.assumed_link`
+        assert config.low is not None and config.high is not None
         return uniform(config.low, max(config.high - config.low, 1e-12))
-    assert config.sigma is not None and config.median is not None  # or it is refused
+    assert config.sigma is not None and config.median is not None
     return lognorm(s=config.sigma, scale=config.median)
 
 
@@ -76,7 +65,7 @@ class BurstChain:
         return np.append(shares, 1 - self.loss)
 
     def after(self, shares: Array) -> Array:
-        """Return the weights (burst + 1,) of the states one packet later."""
+        """Return the distribution (burst + 1,) of the state one packet later."""
         later = np.empty_like(shares)
         later[1:] = (1 - self.begins) * shares[:-1]
         later[-1] += (1 - self.begins) * shares[-1]
@@ -89,13 +78,13 @@ class BurstChain:
         return self.begins * values[..., :1] + (1 - self.begins) * values[..., longer]
 
     def probability_none_in_time(self, late: Array) -> float:
-        """Return the probability that of consecutive packets each is lost or late.
+        """Return the probability that each of consecutive packets is lost or late.
 
-        The weights of the states are carried from packet to packet; at each the weight of "kept" is
-        multiplied with the probability that this packet is late.
+        The distribution of the state is advanced packet by packet. At each the probability of
+        "kept" is multiplied by the probability that this packet is late.
 
         Args:
-            late: (n,) probability that each is late if it is not lost.
+            late: (n,) probability that a packet is late if it is not lost.
         """
         shares = self.stationary.copy()
         shares[-1] *= late[0]
@@ -110,47 +99,46 @@ NO_LOSSES: Final = BurstChain(0.0, 1)
 
 def losses(number: int, loss: float, burst: int, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Draw which of `number` packets are lost: a `BurstChain` from its stationary state."""
-    # Bursts of before the first packet have random numbers of their own.
+    # Bursts that began before the first packet come from another stream of random numbers.
     earlier = np.random.Generator(rng.bit_generator.jumped()).random(burst - 1)  # type: ignore[attr-defined]
     begins = np.append(earlier, rng.random(number)) < BurstChain(loss, burst).begins
     return np.convolve(begins, np.ones(burst), "valid") > 0.5
 
 
-def packet_times(config: PacketTimes, number: int, seed: int, stream: int = FORWARD) -> Array:
-    """Return the time in s that each packet is under way, infinite for a lost one."""
+def packet_times(config: PacketsConfig, number: int, seed: int, stream: int = FORWARD) -> Array:
+    """Return the transit time (number,) of each packet in s, infinite for a lost one."""
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, stream, 0]))
-    # Two streams, so that the time of a packet does not depend on how many are lost.
+    # Two streams, so that the time of a packet does not depend on the losses.
     times = times_under_way(config).ppf(rng.random(number))
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 1, stream, 0]))
     return np.where(losses(number, config.loss, config.burst, rng), np.inf, times)
 
 
-def in_time(config: PacketTimes, time: ArrayLike) -> Array:
-    """Return F: the probability that a packet which is not lost has arrived after `time` s."""
+def in_time(config: PacketsConfig, time: ArrayLike) -> Array:
+    """Return F, the probability that a packet has arrived after `time` s unless it is lost."""
     return np.asarray(times_under_way(config).cdf(np.asarray(time) + 1e-9))
 
 
-def torque_missing(config: PacketTimes, bound: float, repeats: int, period: float) -> float:
-    """Return the probability that a torque is not there in time, in none of its 1 + r packets.
+def torque_missing(config: PacketsConfig, bound: float, repeats: int, period: float) -> float:
+    """Return the probability that none of the 1 + r packets with a torque is in time.
 
-    Sent one after the other they have B + r dt, ..., B + dt, B left (theory.md, section 25).
+    Sent one after the other, they may take B + r dt, ..., B + dt, B (theory.md, section 25).
     """
     late = 1 - in_time(config, bound + period * np.arange(repeats + 1))
     return BurstChain(config.loss, config.burst).probability_none_in_time(late)
 
 
-def default_bound(config: PacketTimes, repeats: int, period: float) -> float:
-    """Return the least bound in s, in whole periods, at which being late is rarer than being lost.
+def default_bound(config: PacketsConfig, repeats: int, period: float) -> float:
+    """Return the least bound in s, in whole periods, with late packets rarer than lost ones.
 
-    A longer one cannot bring back what is lost, and costs delay. A torque is missing with a
-    probability q(B) that falls to q(inf), that of losing all its packets (`torque_missing`). Wanted
-    is the least B with q(B) <= RARE q(inf), or ALMOST_NONE. Bounds beyond MOST_PERIODS, which no
-    delay may have, are not tried.
+    A torque is missing with a probability q(B) that falls to q(inf), that of losing all its packets
+    (`torque_missing`). The bound is the least B with q(B) <= RARE q(inf), or ALMOST_NONE, and at
+    most MOST_PERIODS. A longer bound costs delay and recovers no loss.
     """
     all_lost = BurstChain(config.loss, config.burst).probability_none_in_time(np.zeros(repeats + 1))
     enough = max(RARE * all_lost, ALMOST_NONE)
 
-    def there(steps: int) -> bool:
+    def is_enough(steps: int) -> bool:
         return torque_missing(config, steps * period, repeats, period) <= enough
 
-    return bisect_left(range(MOST_PERIODS + 1), True, key=there) * period
+    return bisect_left(range(MOST_PERIODS + 1), True, key=is_enough) * period

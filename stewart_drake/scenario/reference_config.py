@@ -1,4 +1,4 @@
-"""The motions that the plate can be asked to follow, as a scenario describes them, by kind.
+"""The reference motion, as a scenario describes it, by kind.
 
 `scenario.trajectories.make_reference` makes the motion itself.
 """
@@ -14,6 +14,13 @@ from stewart_drake.files.schema import ByKind
 from stewart_drake.scenario.field_types import STRICT, Name, Row, Seconds, Six
 
 
+def _pitch_problem(largest: float) -> str | None:
+    if largest < math.pi / 2:
+        return None
+    expected = "|offset| + |amplitude| below pi/2, where roll and yaw stay distinct"
+    return f"reference.offset: the pitch reaches {largest:.4g} rad; expected {expected}"
+
+
 @dataclass(config=STRICT)
 class SineConfig:
     """offset + amplitude sin(frequency t).
@@ -21,7 +28,7 @@ class SineConfig:
     Attributes:
         kind: `sine`.
         amplitude: [roll, pitch, yaw, x, y, z] in rad and m.
-        offset: the middle of it, rad and m.
+        offset: middle of the motion, rad and m.
         frequency: in `frequency_unit`.
         frequency_unit: `rad/s` or `Hz`.
     """
@@ -36,11 +43,11 @@ class SineConfig:
 
     @property
     def angular_frequency(self) -> float:
-        """The frequency in rad/s, whatever its unit."""
+        """Frequency in rad/s."""
         return self.frequency * (2 * math.pi if self.frequency_unit == "Hz" else 1.0)
 
     def problem(self) -> str | None:
-        """What is wrong with fields that are well formed one by one, or None."""
+        """Return the first rule between the fields that is broken, or None."""
         return _pitch_problem(abs(self.amplitude[1]) + abs(self.offset[1]))
 
 
@@ -57,7 +64,7 @@ class HoldConfig:
     offset: Six = field(default_factory=lambda: [0.0, 0.0, 0.0, 0.0, 0.0, 0.38])
 
     def problem(self) -> str | None:
-        """What is wrong with fields that are well formed one by one, or None."""
+        """Return the first rule between the fields that is broken, or None."""
         return _pitch_problem(abs(self.offset[1]))
 
 
@@ -78,7 +85,7 @@ class WaypointsConfig:
     file: Name | None = None
 
     def problem(self) -> str | None:
-        """What is wrong with fields that are well formed one by one, or None."""
+        """Return the first rule between the fields that is broken, or None."""
         if self.file is not None:
             if self.times is None and self.poses is None:
                 return None
@@ -87,10 +94,8 @@ class WaypointsConfig:
             missing = "times" if self.times is None else "poses"
             return f"reference.{missing}: got None; expected times and poses, or a file"
         if len(self.times) != len(self.poses):
-            return (
-                f"reference.poses: got {len(self.poses)} poses; expected {len(self.times)}, one "
-                "per time"
-            )
+            found, expected = len(self.poses), len(self.times)
+            return f"reference.poses: got {found} poses; expected {expected}, one per time"
         return None
 
 
@@ -107,17 +112,10 @@ class CsvConfig:
     file: Name | None = None
 
     def problem(self) -> str | None:
-        """What is wrong with fields that are well formed one by one, or None."""
+        """Return the first rule between the fields that is broken, or None."""
         if self.file is None:
             return "reference.file: got None; expected the CSV file that kind csv reads"
         return None
 
 
 ReferenceConfig = Annotated[SineConfig | HoldConfig | WaypointsConfig | CsvConfig, ByKind()]
-
-
-def _pitch_problem(largest: float) -> str | None:
-    if largest < math.pi / 2:
-        return None
-    expected = "|offset| + |amplitude| below pi/2, where roll and yaw stay distinct"
-    return f"reference.offset: the pitch reaches {largest:.4g} rad; expected {expected}"

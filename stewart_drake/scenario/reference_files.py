@@ -18,7 +18,6 @@ from stewart_drake.files.yamlio import load_yaml, validate
 from stewart_drake.scenario.field_types import Row, Seconds
 from stewart_drake.scenario.reference_config import WaypointsConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES
-from stewart_drake.scenario.smoothness import roughest
 from stewart_drake.types import Array
 
 _POSE: Final = "pose_"
@@ -37,6 +36,10 @@ _MAX_GAP: Final = 10
 """Largest step over the median step."""
 _MAX_SIZE: Final = 1e3
 """rad or m."""
+_MAX_KINK: Final = 0.05
+"""Largest kink, as a share of the largest peak to peak of the angles, or of the positions."""
+_LEAST_KINK: Final = 1e-3
+"""rad, m; less is noise of a sensor, not a jump."""
 
 
 @dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
@@ -49,43 +52,32 @@ def waypoints(config: WaypointsConfig) -> tuple[Array, Array]:
     """Return the waypoints of a scenario's section, from its lists or its file.
 
     Raises:
-        ConfigError: see `read_waypoints` and `check_waypoints`.
+        ConfigError: see `read_waypoints`.
     """
     if config.file is not None:
         return read_waypoints(config.file)
-    if config.times is None or config.poses is None:
-        raise ConfigError("reference.times: got None; expected times and poses, or a file")
-    return check_waypoints(config.times, config.poses, "reference.")
+    if problem := config.problem():
+        raise ConfigError(problem)
+    return _checked_waypoints(config.times, config.poses, "reference.")
 
 
 def read_waypoints(path: str | Path) -> tuple[Array, Array]:
     """Read `times` (s) and `poses` (rad, m) from a YAML file.
 
     Raises:
-        ConfigError: see `load_yaml`, `validate` and `check_waypoints`.
+        ConfigError: not such a file, not one pose per time, or see `_check_samples`.
     """
     data = validate(_WaypointFile, load_yaml(path), str(path))
-    return check_waypoints(data.times, data.poses, f"{path}: ")
-
-
-def check_waypoints(
-    times: list[float], poses: list[list[float]], where: str
-) -> tuple[Array, Array]:
-    """Return waypoints as arrays.
-
-    Args:
-        times: s.
-        poses: one of six numbers per time, rad and m.
-        where: opening of a message, before the field's name.
-
-    Raises:
-        ConfigError: there is not one pose per time, or see `_check_samples`.
-    """
-    if len(poses) != len(times):
+    if len(data.poses) != len(data.times):
         raise ConfigError(
-            f"{where}poses: got {len(poses)} poses; expected {len(times)}, one per time"
+            f"{path}: poses: got {len(data.poses)} poses; expected {len(data.times)}, one per time"
         )
+    return _checked_waypoints(data.times, data.poses, f"{path}: ")
 
+
+def _checked_waypoints(
+    times: list[float] | None, poses: list[list[float]] | None, where: str
+) -> tuple[Array, Array]:
     def place(row: int, name: str) -> str:
         if name == "time":
             return f"{where}times[{row}]"
@@ -122,8 +114,7 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
         )
     _check_samples(times, poses, table.place, table.scales)
     if len(times) < _MIN_ROWS:
-        plural = "" if len(times) == 1 else "s"
-        raise ConfigError(f"{path}: got {len(times)} sample{plural}; expected at least {_MIN_ROWS}")
+        raise ConfigError(f"{path}: got {len(times)} samples; expected at least {_MIN_ROWS}")
     steps = np.diff(times)
     widest, median = int(np.argmax(steps)), float(np.median(steps))
     if steps[widest] > _MAX_GAP * median:
@@ -132,7 +123,7 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
             f"expected steps near the median of {median:.6g} s, fill the gap by resampling"
         )
     times[0] = 0.0
-    kink = roughest(times, poses)
+    kink = _worst_kink(times, poses)
     if kink is not None:
         row, axis, size = kink
         name = COORDINATE_NAMES[axis]
@@ -160,34 +151,56 @@ def _check_samples(
         ConfigError: the first sample that breaks a rule.
     """
 
-    def told(row: int, axis: int, value: float | None = None) -> tuple[str, str, str]:
-        """Return place, value and unit of a coordinate."""
-        name = COORDINATE_NAMES[axis]
-        scale = scales[name]
-        value = float(poses[row, axis]) if value is None else value
-        return place(row, name), f"{value / scale:.6g}", _unit(name, scale)
+    def check(bad: Array, problem: str, limit: float = 0.0, before: bool = False) -> None:
+        for row, axis in np.argwhere(bad)[:1]:
+            row, name = int(row) + before, COORDINATE_NAMES[axis]
+            scale = scales[name]
+            unit, previous = _unit(name, scale), ""
+            if before:
+                previous = f" after {poses[row - 1, axis] / scale:.6g}"
+            got = f"{float(poses[row, axis]) / scale:.9g} {unit}{previous}"
+            expected = problem.format(limit=f"{limit / scale:.6g} {unit}")
+            raise ConfigError(f"{place(row, name)}: got {got}; expected {expected}")
 
     for row in 1 + np.flatnonzero(np.diff(times) < _MIN_STEP)[:1]:
         raise ConfigError(
             f"{place(row, 'time')}: got {float(times[row])!r} after {float(times[row - 1])!r}; "
             "expected increasing times"
         )
-    for row, axis in np.argwhere(np.abs(poses) >= _MAX_SIZE)[:1]:
-        where, most, unit = told(row, axis, _MAX_SIZE)
-        size = float(poses[row, axis]) / scales[COORDINATE_NAMES[axis]]
-        raise ConfigError(f"{where}: got {size!r}; expected a finite number below {most} {unit}")
-    for row in np.flatnonzero(np.abs(poses[:, 1]) >= math.pi / 2)[:1]:
-        where, value, unit = told(row, 1)
-        most, degrees = told(row, 1, math.pi / 2)[1], "" if unit == "deg" else ", 90 degrees"
-        raise ConfigError(
-            f"{where}: got {value} {unit}; expected a pitch within {most} {unit}{degrees}"
-        )
-    for row, axis in np.argwhere(np.abs(np.diff(poses[:, :3], axis=0)) > math.pi)[:1]:
-        where, value, unit = told(row + 1, axis)
-        raise ConfigError(
-            f"{where}: got {value} {unit} after {told(row, axis)[1]}; expected no jump by a turn, "
-            "unwrap it"
-        )
+    check(np.abs(poses) >= _MAX_SIZE, "a finite number below {limit}", _MAX_SIZE)
+    steep = np.abs(poses[:, :2]) >= [[math.inf, math.pi / 2]]
+    check(steep, "a pitch within {limit}, 90 degrees", math.pi / 2)
+    jumps = np.abs(np.diff(poses[:, :3], axis=0)) > math.pi
+    check(jumps, "no jump by a turn, unwrap it", before=True)
+
+
+def _worst_kink(times: Array, poses: Array) -> tuple[int, int, float] | None:
+    """Return row, column and size of the worst kink of samples (n,), (n, 6), None if smooth.
+
+    A sample should lie near the cubic through the two before and the two after it. With equal
+    steps h the difference is the fourth difference over 6, (omega h)^4 / 6 of a sine's amplitude:
+    1.3 % of its peak to peak with ten samples per period, 5 % with seven. A jump shows by half its
+    size, a glitch with all of it. Ends are seen as neighbours only. The limit is a share of the
+    largest peak to peak among the angles, or the positions, since one may be still but for noise.
+    """
+    if len(times) < 5:
+        return None
+    near = np.array([-2, -1, 1, 2])
+    at = np.arange(2, len(times) - 2)
+    t = times[at[:, None] + near] - times[at][:, None]
+    weights = np.ones_like(t)  # Lagrange's, at zero
+    for i in range(4):
+        for j in range(4):
+            if i != j:
+                weights[:, i] *= t[:, j] / (t[:, j] - t[:, i])
+    kinks = np.abs(poses[at] - np.einsum("ki,kic->kc", weights, poses[at[:, None] + near]))
+    spans = np.ptp(poses, axis=0)
+    largest = np.repeat([spans[:3].max(), spans[3:].max()], 3)
+    excess = kinks / np.maximum(_MAX_KINK * largest, _LEAST_KINK)
+    row, column = np.unravel_index(excess.argmax(), excess.shape)
+    if excess[row, column] <= 1:
+        return None
+    return int(at[row]), int(column), float(kinks[row, column])
 
 
 def _unit(name: str, scale: float) -> str:

@@ -1,7 +1,7 @@
-"""Fields of scenarios of 0.2 that have another name today.
+"""Fields of scenarios that were renamed since 0.2.
 
-A file that a person writes is refused with the new name, see `files.yamlio.validate`. What the
-program wrote is read under today's names.
+A file that a person writes is refused with the new name, see `files.yamlio.validate`. A file that
+the program wrote is read under the new names.
 """
 
 from typing import Any, Final
@@ -18,7 +18,7 @@ CONTROLLER: Final = {
 
 
 def with_new_names(scenario: dict[str, Any]) -> dict[str, Any]:
-    """Return the data of a scenario that the program wrote, 0.2 included, under today's names."""
+    """Return the data of a scenario that the program wrote, 0.2 included, under the new names."""
     given = scenario.get("controller")
     if not isinstance(given, dict):
         return scenario

@@ -7,11 +7,11 @@ from typing import Final, Literal, NamedTuple
 
 COORDINATES: Final = ("phi", "theta", "psi", "x", "y", "z")
 COORDINATE_NAMES: Final = ("roll", "pitch", "yaw", "x", "y", "z")
-"""The same for a person, and in files that a person writes."""
+"""Names of the coordinates for users and in their files."""
 COORDINATE_UNITS: Final = ("rad", "rad", "rad", "m", "m", "m")
 RATE_UNITS: Final = ("rad/s", "rad/s", "rad/s", "m/s", "m/s", "m/s")
 LEGS: Final = (1, 2, 3, 4, 5, 6)
-"""Legs are numbered from one wherever a person reads the number."""
+"""Numbers of the legs, from one."""
 
 NUM_LEGS: Final = 6
 NUM_COORDINATES: Final = 6
@@ -33,13 +33,13 @@ POSITION: Final = slice(3, 6)
 SETPOINT: Final = slice(0, 12)
 """Crank angles (6) and rates (6) inside a command to servos, which has the size of a reference."""
 MODEL_TORQUE: Final = slice(12, 18)
-"""Torques (6) inside it."""
+"""Torques (6) inside such a command."""
 Carried = Literal["torque", "command"]
 CARRIED: Final[dict[Carried, int]] = {"torque": NUM_TORQUES, "command": NUM_REFERENCE}
-"""What can be on the way to the motors, and its size."""
+"""Size of each kind of command to the motors."""
 
 PARAMETERS: Final = (*(f"torque_bias_{leg}" for leg in LEGS), "payload_mass", "joint_damping")
-"""Constant plant parameters that nobody tells the controller, in this order."""
+"""Constant plant parameters that are unknown to the controller."""
 PARAMETER_UNITS: Final = (*("N m",) * 6, "kg", "N m s/rad")
 NUM_PARAMETERS: Final = len(PARAMETERS)
 BIAS: Final = slice(0, 6)
@@ -52,35 +52,34 @@ PLANT_PARAMETERS: Final = (
     "coulomb_speed",
     *(f"payload_position_{axis}" for axis in "xyz"),
 )
-"""All constants of the equations of motion that are not the mechanism's, in their order."""
+"""All constants of the equations of motion that are not the mechanism's."""
 PLANT_PARAMETER_UNITS: Final = (*PARAMETER_UNITS, "N m", "rad/s", "m", "m", "m")
 NUM_PLANT_PARAMETERS: Final = len(PLANT_PARAMETERS)
 COULOMB: Final = 8
 COULOMB_SPEED: Final = 9
 PAYLOAD_POSITION: Final = slice(10, 13)
 DEFAULT_COULOMB_SPEED: Final = 0.02
-"""rad/s, where nothing else is said."""
+"""rad/s."""
 
 WEIGHTS: Final = ("w_Q", "w_R")
 
 PACKETS: Final = ("sent", "lost", "late", "played", "dry")
-"""Counts of a link with packets: late are those that came after their first torque's time, played
-and dry the periods in which a torque of a packet acted, and in which there was none.
-"""
+"""Counts of a link with packets: late ones arrived after their first torque's time; played and dry
+are periods with and without a torque of a packet."""
 
 TUNER_INPUTS: Final = (
     *(f"error_{name}" for name in COORDINATES),
     *(f"rate_error_{name}" for name in COORDINATES),
     *(f"torque_{leg}" for leg in LEGS),
 )
-"""What densities are taken of: `sample` = [state error(12); commanded torque(6)]."""
+"""Inputs of densities: `sample` = [state error(12); commanded torque(6)]."""
 
 STATE: Final = (*COORDINATES, *(f"{name}_dot" for name in COORDINATES))
-"""Labels of a state's twelve components."""
+"""Labels of a state."""
 
 
 class Dimension(NamedTuple):
-    """What the components of signals are called, and what that is."""
+    """Labels of the components of signals, and their meaning."""
 
     labels: tuple[str, ...] | tuple[int, ...]
     long_name: str
@@ -93,31 +92,31 @@ DIMENSIONS: Final[dict[str, Dimension]] = {
     ),
     "leg": Dimension(LEGS, "legs and their motors, numbered from one"),
     "weight": Dimension(WEIGHTS, "weight of the errors, weight of the torques"),
-    "parameter": Dimension(PARAMETERS, "parameters that nobody tells the controller"),
-    "tuner_input": Dimension(TUNER_INPUTS, "what a density is taken of"),
+    "parameter": Dimension(PARAMETERS, "parameters that are unknown to the controller"),
+    "tuner_input": Dimension(TUNER_INPUTS, "inputs of a density"),
     "state": Dimension(STATE, "coordinates, then their time derivatives"),
-    "packet": Dimension(PACKETS, "what became of packets, and of the periods they are for"),
+    "packet": Dimension(PACKETS, "counts of packets, and of periods"),
 }
 
 
 class Quantity(NamedTuple):
-    """What signals can be of: their dimension, None for a single number, and components' units."""
+    """Dimension of a signal, None for a single number, and units of its components."""
 
     dimension: str | None
     units: tuple[str, ...]
 
 
 class Signal(NamedTuple):
-    """A signal of a run: one line of the table below, from which everything else follows.
+    """A signal of a run: one row of the table below, from which everything else follows.
 
     Attributes:
         name: in the record.
-        quantity: what it is of.
-        long_name: what it is.
-        source: the system that has it, or "system.port" where that port is called otherwise; "" for
-            what the record computes.
-        port: of the closed loop, where it is not called as the signal is.
-        part: of the port's components, where it is not all of them.
+        quantity: dimension and units.
+        long_name: meaning.
+        source: its system, or "system.port" for a port of another name; "" for a signal that the
+            record computes.
+        port: of the closed loop, if its name is not the signal's.
+        part: of the port's components.
     """
 
     name: str
@@ -129,7 +128,7 @@ class Signal(NamedTuple):
 
     @property
     def labels(self) -> tuple[str, ...] | tuple[int, ...]:
-        """Of the components; none for a single number."""
+        """Labels of the components; none for a single number."""
         return DIMENSIONS[self.quantity.dimension].labels if self.quantity.dimension else ()
 
     @property
@@ -139,23 +138,23 @@ class Signal(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """In one text: one for all where they agree, else one per component."""
+        """Common unit, or units of all components."""
         units = self.quantity.units
         return ", ".join(units[:1] if len(set(units)) == 1 else units)
 
     @property
     def exported(self) -> str:
-        """Its port of the closed loop."""
+        """Port of the closed loop."""
         return self.port or self.name
 
     @property
     def system(self) -> str:
-        """The system that has it."""
+        """System that has it."""
         return self.source.partition(".")[0]
 
     @property
     def system_port(self) -> str:
-        """The port of that system."""
+        """Port of that system."""
         return self.source.partition(".")[2] or self.exported
 
 
@@ -173,33 +172,19 @@ _PACKETS: Final = Quantity("packet", ("1",) * len(PACKETS))
 _TABLE: Final = (
     Signal("pose", _POSE, "pose of the plate", "plant", "state", POSE),
     Signal("rates", _RATES, "time derivatives of the pose", "plant", "state", RATES),
-    Signal("reference", _POSE, "pose that is asked for", "reference", part=POSE),
-    Signal(
-        "reference_rates",
-        _RATES,
-        "time derivatives of the reference",
-        "reference",
-        "reference",
-        RATES,
-    ),
+    Signal("reference", _POSE, "reference pose", "reference", part=POSE),
+    Signal("reference_rates", _RATES, "its time derivatives", "reference", "reference", RATES),
     Signal("error", _POSE, "pose minus reference"),
-    Signal("integral", _INTEGRAL, "integral of the error that the controller has", "controller"),
+    Signal("integral", _INTEGRAL, "integral of the error in the controller", "controller"),
     Signal("torque_commanded", _TORQUE, "motor torque computed at the last sample", "controller"),
-    Signal(
-        "torque_applied", _TORQUE, "motor torque that arrives at the plant", "delay_chain.torque"
-    ),
+    Signal("torque_applied", _TORQUE, "motor torque at the plant", "delay_chain.torque"),
     Signal("weights", _WEIGHTS, "weights that the controller used", "controller", "weights_used"),
     Signal("parameters", _PARAMETERS, "estimate of the plant's parameters", "controller"),
     Signal("parameter_std", _PARAMETERS, "standard deviation of that estimate", "controller"),
     Signal("density", _DENSITY, "density (45)", "density"),
-    Signal(
-        "measurement",
-        _STATE,
-        "pose and rates that the controller got",
-        "controller.measurement_used",
-    ),
-    Signal("state_estimate", _STATE, "pose and rates that the controller goes on", "controller"),
-    Signal("delay_estimate", _SECONDS, "delay that the controller believes in", "controller"),
+    Signal("measurement", _STATE, "measured pose and rates", "controller.measurement_used"),
+    Signal("state_estimate", _STATE, "estimated pose and rates", "controller"),
+    Signal("delay_estimate", _SECONDS, "delay that the controller assumes", "controller"),
     Signal(
         "delay_std",
         _SECONDS,
@@ -212,37 +197,35 @@ _TABLE: Final = (
 SIGNALS: Final[dict[str, Signal]] = {signal.name: signal for signal in _TABLE}
 """By name, in the order of the record. Held signals show the value from an instant on.
 
-From here come the ports of the closed loop, those that the controller holds, the record, and names,
-units and labels in `signals.nc` and CSV. A new signal is one line, and a port of its source; for
-the controller that is an entry in `loop.controller.HELD`.
+The ports of the closed loop, the record, and names, units and labels in `signals.nc` and CSV follow
+from it. A new signal is one row, and a port of its source; for the controller that is an entry in
+`loop.controller.HELD`.
 """
 
 
 def run_signals(samples: int | None) -> dict[str, Signal]:
-    """SIGNALS of a run whose encoders are read so many times a period; None is without any."""
+    """Return the signals of a run with this number of encoder readings a period, or without any."""
     if samples is None:
         return SIGNALS
     angles = Quantity("encoder", ("rad",) * (NUM_LEGS * samples))
-    said = SIGNALS["measurement"]._replace(
-        quantity=angles, long_name="crank angles that the controller got"
-    )
-    return SIGNALS | {"measurement": said}
+    measured = SIGNALS["measurement"]._replace(quantity=angles, long_name="measured crank angles")
+    return SIGNALS | {"measurement": measured}
 
 
 def run_dimensions(samples: int | None) -> dict[str, Dimension]:
-    """DIMENSIONS of `run_signals`."""
+    """Return the dimensions of `run_signals`."""
     if samples is None:
         return DIMENSIONS
     labels = tuple(f"A{leg}[{n}]" for n in range(samples) for leg in LEGS)
-    said = "encoders of the legs, and the samples of each within a period, the oldest first"
-    return DIMENSIONS | {"encoder": Dimension(labels, said)}
+    meaning = "encoders of the legs, and the readings of each within a period, the oldest first"
+    return DIMENSIONS | {"encoder": Dimension(labels, meaning)}
 
 
 def exported_ports() -> dict[str, tuple[str, str]]:
-    """Port of the closed loop -> system and its port, in the order of SIGNALS."""
+    """Return system and its port by port of the closed loop, in the order of SIGNALS."""
     return {s.exported: (s.system, s.system_port) for s in SIGNALS.values() if s.source}
 
 
 def ports_of(system: str) -> dict[str, Signal]:
-    """The signals that a system has ports for, by port."""
+    """Return the signals of a system by its ports."""
     return {s.system_port: s for s in SIGNALS.values() if s.system == system}

@@ -1,16 +1,16 @@
-"""Which steps, periods and delays fit each other."""
+"""Steps, periods and delays that fit each other."""
 
 import math
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 METRIC_PERIOD: Final = 0.02
-"""s; the grid of the accumulated error, which the steps of a discrete plant have to hit."""
+"""Grid of the accumulated error, s, which the steps of a discrete plant have to hit."""
 MOST_INSTANTS: Final = 5_000_000
-"""In a log of the user's own period; each takes 1 kB of memory."""
+"""Largest number of instants in a log with its own period; each takes 1 kB of memory."""
 
 SERVO_RATE: Final = 1000.0
-"""Hz; how often at least servos compute their torques."""
+"""Least rate at which servos compute their torques, Hz."""
 
 LEAST_FRACTION: Final = 1e-9
 """Of a period. A delay's part below it is 0: events so close to each other lose their order."""
@@ -21,7 +21,7 @@ _LOOK: Final = 1 - 5e-15
 
 
 class Instant(NamedTuple):
-    """When to look at a running loop in s, and for whom: the metric, the controller, the log."""
+    """Time of an observation of a running loop in s, and its users: metric, controller, log."""
 
     time: float
     on_grid: bool
@@ -30,12 +30,11 @@ class Instant(NamedTuple):
 
 
 def instants(end: float, period: float, log_period: float | None) -> Iterator[Instant]:
-    """All instants of a run of `end` s with a controller of this period; the last one is `end`.
+    """Yield all instants of a run of `end` s with a controller of this period, up to `end`.
 
     The log has the multiples of `log_period`, or with None the metric's grid and every sample.
     """
-
-    import numpy as np  # which --help, by way of the scenario's fields, goes without
+    import numpy as np  # which --help, by way of the scenario's fields, does not import
 
     def multiples(step: float) -> set[float]:
         # Grid and samples that agree but for rounding are one instant.
@@ -49,7 +48,7 @@ def instants(end: float, period: float, log_period: float | None) -> Iterator[In
 
 
 def event_time(nominal: float) -> float:
-    """Period or offset of an event that must precede a discrete plant's step of the same instant.
+    """Return the period or offset of an event before a discrete plant's step of the same instant.
 
     Drake takes the k-th event at offset + k * period, rounded: 3 * 0.1 is one ulp later than
     300 * 0.001, so that a 1 ms plant would have stepped to t + 1 ms before a controller of 0.1 s
@@ -59,26 +58,26 @@ def event_time(nominal: float) -> float:
 
 
 def servo_time(nominal: float) -> float:
-    """As `event_time`, for an event that follows those and still precedes a look at the loop.
+    """Return the same for an event after those of `event_time` and before `look_time`.
 
-    Servos read at once what has just arrived, and the plant what they make of it.
+    Servos read a command at its arrival, and the plant reads their torque.
     """
     return nominal * _SERVO
 
 
 def look_time(nominal: float) -> float:
-    """When to look at a running loop so as to see t = `nominal`.
+    """Return the time to observe a running loop at t = `nominal`.
 
-    After the events of that instant, before a discrete plant's step out of it.
+    It is after the events of that instant and before a discrete plant's step from it.
     """
     return nominal * _LOOK
 
 
 def servo_ticks(period: float, time_step: float | None) -> int:
-    """Samples of the servos' local loops in a period of the controller, in s.
+    """Return the number of samples of the servos' local loops in a period of the controller.
 
-    As few as make it at least SERVO_RATE a second; with a discrete plant of this step in s every
-    one on a step, which also is the most.
+    It is the least for a rate of SERVO_RATE. With a discrete plant every sample is at one of its
+    steps; one at each step is the most. Both times are in s.
     """
     wanted = max(1, math.ceil(period * SERVO_RATE - 1e-9))
     if time_step is None:
@@ -87,73 +86,70 @@ def servo_ticks(period: float, time_step: float | None) -> int:
     return next((n for n in range(wanted, steps) if steps % n == 0), steps)
 
 
-def step_problem(time_step: float, period: float, fraction: float) -> str | None:
-    """What is wrong with the steps of a discrete plant, which sees events on its own steps only.
+def step_problem(
+    step: float,
+    period: float,
+    fraction: float = 0.0,
+    samples: int | None = None,
+    playout: float | None = None,
+) -> str | None:
+    """Return the first number that does not fit a discrete plant, which has events at steps only.
+
+    The metric's grid, the period, the delay's fraction and the play-out bound must be whole numbers
+    of steps (to 1e-9, relative), and the period divided by the sensor's samples too.
 
     Args:
-        time_step: of the plant, s.
+        step: of the plant, s.
         period: of the controller, s.
-        fraction: of a period, by which the delay exceeds a whole number of periods.
+        fraction: of a period, of the delay beyond whole periods.
+        samples: of the sensor per period, or None.
+        playout: bound of a network, s, or None.
 
     Returns:
-        None where the metric's grid, the period and the fraction are whole numbers of steps (to
-        1e-9, relative); else the scenario field to change, its value, and the nearest that fits.
+        The scenario field to change, its value, and the nearest that fits; or None.
     """
-    if not _is_whole(METRIC_PERIOD / time_step):
-        nearest = _nearest_step(time_step, period)
+    if not _is_whole(METRIC_PERIOD / step):
+        nearest = _nearest_step(step, period)
         return (
-            f"plant.time_step: got {time_step!r}; expected {METRIC_PERIOD} s divided by a whole "
+            f"plant.time_step: got {step!r}; expected {METRIC_PERIOD} s divided by a whole "
             f"number, nearest {nearest!r}"
         )
-    problem, steps = whole_problem("controller.period", period, time_step), period / time_step
-    if problem:
+    if problem := _multiple_problem("controller.period", period, step):
         return problem
-    delayed = fraction * steps
-    if not _is_whole(delayed):
-        nearest = min(round(delayed), round(steps) - 1) / round(steps)
+    steps = period / step
+    if samples is not None and not _is_whole(steps / samples):
+        fitting = [n for n in range(1, round(steps) + 1) if round(steps) % n == 0]
         return (
-            f"delay.fraction: got {fraction!r}, {delayed:.6g} steps; expected a whole number of "
-            f"plant.time_step ({time_step!r} s) within the period, nearest {nearest!r}"
+            f"sensor.samples: got {samples}; expected a number that divides the {round(steps)} "
+            f"steps of a period, nearest {min(fitting, key=lambda n: abs(n - samples))}"
         )
-    return None
+    if not _is_whole(fraction * steps):
+        nearest = min(round(fraction * steps), round(steps) - 1) / round(steps)
+        return (
+            f"delay.fraction: got {fraction!r}, {fraction * steps:.6g} steps; expected a whole "
+            f"number of plant.time_step ({step!r} s) within the period, nearest {nearest!r}"
+        )
+    return _multiple_problem("link.playout", playout, step) if playout else None
 
 
-def samples_problem(samples: int, period: float, time_step: float) -> str | None:
-    """What is wrong with samples per period of s for a discrete plant, or None."""
-    steps = period / time_step
-    if not _is_whole(steps) or _is_whole(steps / samples):
-        return None  # the former is told elsewhere
-    fitting = [n for n in range(1, round(steps) + 1) if round(steps) % n == 0]
-    nearest = min(fitting, key=lambda n: abs(n - samples))
-    return (
-        f"sensor.samples: got {samples}; expected a number by which a period has whole steps of "
-        f"plant.time_step ({time_step!r} s), nearest {nearest}"
-    )
-
-
-def whole_problem(field: str, value: float, time_step: float) -> str | None:
-    """What is wrong with a field of the scenario in s that has to fit a discrete plant, or None."""
-    if _is_whole(value / time_step):
+def _multiple_problem(field: str, value: float, step: float) -> str | None:
+    """Return that a field in s is not a multiple of a discrete plant's step, or None."""
+    if _is_whole(value / step):
         return None
-    nearest = _tidy(max(1, round(value / time_step)) * time_step)
+    nearest = float(f"{max(1, round(value / step)) * step:.12g}")
     return (
-        f"{field}: got {value!r}; expected a whole number of plant.time_step ({time_step!r} s), "
+        f"{field}: got {value!r}; expected a whole number of plant.time_step ({step!r} s), "
         f"nearest {nearest!r}"
     )
 
 
-def log_problem(
-    log_period: float | None, duration: float, time_step: float | None = None
-) -> str | None:
-    """What is wrong with the period of a log.
+def log_problem(log_period: float | None, duration: float, step: float | None = None) -> str | None:
+    """Return the problem with the period of a log, or None.
 
     Args:
         log_period: s, or None for the usual instants.
         duration: of the run, s.
-        time_step: of a discrete plant, which is seen on its own steps only, or None.
-
-    Returns:
-        None, or the scenario field to change, its value, and what fits.
+        step: of a discrete plant, which is recorded at its own steps only, or None.
     """
     if log_period is None:
         return None
@@ -163,26 +159,20 @@ def log_problem(
             f"log_period: got {log_period!r}; expected at least {least:.4g} s, {MOST_INSTANTS} "
             f"instants in duration {duration!r}, or null"
         )
-    problem = time_step and whole_problem("log_period", log_period, time_step)
+    problem = step and _multiple_problem("log_period", log_period, step)
     return f"{problem}, or null" if problem else None
 
 
-def _nearest_step(time_step: float, period: float) -> float:
-    """The nearest step that divides the metric's grid and, if one close by does, the period."""
-    parts = max(1, round(METRIC_PERIOD / time_step))
+def _nearest_step(step: float, period: float) -> float:
+    """Return the nearest divisor of the metric's grid, if possible one of the period too."""
+    parts = max(1, round(METRIC_PERIOD / step))
     nearby = sorted(
-        range(max(1, parts - 1000), parts + 1000),
-        key=lambda n: abs(METRIC_PERIOD / n - time_step),
+        range(max(1, parts - 1000), parts + 1000), key=lambda n: abs(METRIC_PERIOD / n - step)
     )
     fitting = (n for n in nearby if _is_whole(period * n / METRIC_PERIOD))
     return METRIC_PERIOD / next(fitting, parts)
 
 
 def _is_whole(ratio: float) -> bool:
-    # A ratio that rounds to zero is no step at all, unless it is zero.
+    # Relative, so that a ratio that rounds to zero counts only if it is zero.
     return abs(ratio - round(ratio)) <= 1e-9 * abs(ratio)
-
-
-def _tidy(value: float) -> float:
-    """`value` without the last digits that a product of decimals carries."""
-    return float(f"{value:.12g}")

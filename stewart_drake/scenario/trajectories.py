@@ -39,12 +39,11 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.types import Array
 
 _CONSTANT: Final = 1e-9
-"""A coordinate that moves less than this, in rad or beside its largest position in m, is constant:
-rounding is no motion."""
+"""Range in rad, or relative to the largest position, below which a coordinate is constant."""
 _GRID: Final = 1e-3
-"""s; the grid on which the peak-to-peak of a sampled reference is read."""
+"""Step at which the peak-to-peak of a sampled reference is read, s."""
 _INSTANT: Final = 1e-6
-"""s; what is shorter is no piece of its own, its derivatives would be rounding errors."""
+"""Least length of a piece, s; derivatives of a shorter one would be rounding errors."""
 _STOP_SPEED: Final = 1e-3
 """rad/s or m/s; a motion that ends slower than this, or than the share below, is at rest."""
 _STOP_SHARE: Final = 0.05
@@ -54,9 +53,9 @@ _GOLDEN: Final = (math.sqrt(5) - 1) / 2
 
 @singledispatch
 def make_reference(config: ReferenceConfig, duration: float) -> Trajectory:
-    """The motion that `config` describes; every kind of reference registers its own.
+    """Return the motion of a section `reference`; each kind registers its own function.
 
-    Waypoints are left and reached at rest, the first, the last, and wherever two neighbours are
+    Waypoints are left and reached at rest in the first, the last, and wherever two neighbours are
     the same pose; in between the pose is twice continuously differentiable. A CSV motion is the
     cubic spline through its samples, with third derivatives continuous next to its ends. Before
     the first and after the last sample of either the pose is constant.
@@ -100,13 +99,12 @@ def _constant(config: HoldConfig, duration: float) -> Trajectory:
 @make_reference.register
 def _sampled(config: CsvConfig, duration: float) -> Trajectory:
     if config.file is None:
-        raise ConfigError("reference.file: got None; expected a CSV file")
-    times, poses = read_csv(config.file)
-    return _through_samples(times, poses, duration, config.file)
+        raise ConfigError(config.problem() or "")
+    return _through_samples(*read_csv(config.file), duration, config.file)
 
 
 def evaluate(trajectory: Trajectory, t: float) -> Array:
-    """`[pose; rates; accelerations]`, (18,), of `trajectory` at time `t` (s)."""
+    """Return [pose; rates; accelerations] (18,) at a time in s."""
     result = np.empty(NUM_REFERENCE)
     result[POSE] = trajectory.value(t)[:, 0]
     result[RATES] = trajectory.EvalDerivative(t, 1)[:, 0]
@@ -115,60 +113,42 @@ def evaluate(trajectory: Trajectory, t: float) -> Array:
 
 
 def spread_instants(duration: float, number: int) -> Array:
-    """Where to look at a motion of unknown period: an instant (number,) in each equal part.
+    """Return instants (number,) to sample a motion of unknown period, one in each equal part.
 
-    Evenly spaced ones may all fall on the same phase, such as on the zeros of a sine of 0.5 Hz
-    that is looked at once a second. These sit at the places of the golden sequence in their parts,
-    so that whatever the period, the phases seen are spread evenly.
-
-    Args:
-        duration: s.
-        number: of instants, the first of which is 0.
+    Evenly spaced ones may all have the same phase, such as the zeros of a sine of 0.5 Hz that is
+    sampled once a second. Within their parts these are placed by the golden sequence, so that the
+    phases are spread evenly for any period. The first one is 0; times are in s.
     """
     k = np.arange(number)
     return duration / number * (k + k * _GOLDEN % 1)
 
 
 def peak_to_peak(config: ReferenceConfig, trajectory: Trajectory, duration: float) -> Array:
-    """How far the motion goes, which tracking errors are measured against.
+    """Return the range of the motion (6,), the scale of tracking errors, rad and m.
+
+    For a sine it is twice its amplitude, else the range within [0, duration]. It is 0 where the
+    coordinate is constant.
 
     Args:
         config: the scenario's section.
         trajectory: `make_reference(config, duration)`.
         duration: s.
-
-    Returns:
-        (6,) rad and m: for a sine twice its amplitude, whether or not `duration` shows all of it;
-        else the range within [0, duration]. It is 0 where the coordinate is constant.
     """
-    return _told(_span(config, trajectory, duration), trajectory)
+    if isinstance(config, SineConfig):
+        return _without_rounding(2 * np.abs(np.array(config.amplitude)), trajectory)
+    return motion_range(trajectory, duration)
 
 
 def motion_range(trajectory: Trajectory, duration: float) -> Array:
-    """(6,) rad and m, the range of any motion within [0, duration], 0 where it is constant."""
-    return _told(_range(trajectory, duration), trajectory)
-
-
-def _told(span: Array, trajectory: Trajectory) -> Array:
-    """`span` (6,) without what is rounding."""
-    furthest = np.abs(trajectory.value(0.0)[POSITION, 0]).max() + span[POSITION].max()
-    return np.where(span < _CONSTANT * np.repeat([1.0, furthest], 3), 0.0, span)
-
-
-@singledispatch
-def _span(config: ReferenceConfig, trajectory: Trajectory, duration: float) -> Array:
-    return _range(trajectory, duration)
-
-
-def _range(trajectory: Trajectory, duration: float) -> Array:
+    """Return the range (6,) of any motion within [0, duration], 0 where constant; rad and m."""
     samples = int(np.clip(math.ceil(duration / _GRID), 1000, 1_000_000)) + 1
     values = trajectory.vector_values(np.linspace(0.0, duration, samples))
-    return np.ptp(values, axis=1)
+    return _without_rounding(np.ptp(values, axis=1), trajectory)
 
 
-@_span.register
-def _span_of_sine(config: SineConfig, trajectory: Trajectory, duration: float) -> Array:
-    return 2 * np.abs(np.array(config.amplitude))
+def _without_rounding(span: Array, trajectory: Trajectory) -> Array:
+    furthest = np.abs(trajectory.value(0.0)[POSITION, 0]).max() + span[POSITION].max()
+    return np.where(span < _CONSTANT * np.repeat([1.0, furthest], 3), 0.0, span)
 
 
 def catch_up(
@@ -178,10 +158,10 @@ def catch_up(
     t_start: float,
     duration: float,
 ) -> Trajectory:
-    """A reference that leaves the start state smoothly and ends on `reference`.
+    """Return a reference that leaves the start state smoothly and ends on `reference`.
 
-    Up to `t_start` it goes on with the constant rates of the start, as a plate does that nothing
-    acts on yet; over the next `duration` it is the quintic that continues pose and rates with zero
+    Up to `t_start` it keeps the constant rates of the start, as a plate on which no torque acts
+    yet. Over the next `duration` it is the quintic that continues pose and rates with zero
     acceleration and reaches pose, rates and accelerations of the reference; then it is the
     reference.
 
@@ -219,9 +199,9 @@ Piece = tuple[float, Array, float, Array]
 
 
 def through_states(pieces: Sequence[Piece], reference: Trajectory) -> Trajectory:
-    """Quintics through given states, and `reference` from the end of the last one on.
+    """Return quintics through given states, followed by `reference`.
 
-    Before the first piece the pose goes on the straight line that its first rates continue.
+    Before the first piece the pose is on the straight line with its first rates.
 
     Args:
         pieces: one after the other; accelerations may jump between two.
@@ -243,8 +223,8 @@ def through_states(pieces: Sequence[Piece], reference: Trajectory) -> Trajectory
 
 @make_reference.register
 def _through_waypoints(config: WaypointsConfig, duration: float) -> Trajectory:
-    """Quintics with the knot rates and accelerations of a clamped cubic spline."""
-    from scipy.interpolate import CubicSpline  # slow to import; other references go without
+    """Return quintics with the knot rates and accelerations of a clamped cubic spline."""
+    from scipy.interpolate import CubicSpline  # slow to import
 
     times, poses = waypoints(config)
     same = np.all(np.diff(poses, axis=0) == 0, axis=1)
@@ -271,7 +251,7 @@ def _through_waypoints(config: WaypointsConfig, duration: float) -> Trajectory:
 
 
 def _through_samples(times: Array, poses: Array, duration: float, file: str) -> Trajectory:
-    from scipy.interpolate import CubicSpline  # slow to import; other references go without
+    from scipy.interpolate import CubicSpline  # slow to import
 
     # The free ends follow the samples; prescribed rest would bend the first and last interval of
     # a motion that was recorded on the move. A PiecewisePolynomial would be the same cubic, but
@@ -299,7 +279,7 @@ def _hold(pose: Array, start: float, end: float) -> Trajectory:
 
 
 def _quintic(t0: float, t1: float, start: Array, end: Array) -> BezierCurve:
-    """The quintic between two [pose; rates; accelerations].
+    """Return the quintic between two [pose; rates; accelerations].
 
     A Bezier curve of degree 5 over h = t1 - t0 has c' = 5 (c1 - c0) / h and
     c'' = 20 (c2 - 2 c1 + c0) / h^2 at its start, and the mirror image at its end.

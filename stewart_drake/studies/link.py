@@ -15,7 +15,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.scenario.config import NetworkConfig, Scenario
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.link_config import NetworkConfig
 from stewart_drake.scenario.packets import (
     default_bound,
     in_time,

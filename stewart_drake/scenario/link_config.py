@@ -1,0 +1,97 @@
+"""The link between controller and motors, as a scenario describes it, by kind."""
+
+from typing import Annotated, Final, Literal
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from stewart_drake.files.schema import ByKind
+from stewart_drake.scenario.field_types import STRICT, Loss, Positive, Seconds, Seed
+
+ASSUMED_TIMES: Final = (0.8, 1.2)
+"""Shortest and longest transit time, in delays, of a network without `low` and `high`."""
+
+
+@dataclass(config=STRICT)
+class WireConfig:
+    """A link that delays every torque by `delay`, and loses none.
+
+    Attributes:
+        kind: `wire`.
+    """
+
+    back, burst, acknowledged, follows_delay = None, 1, True, False  # not annotated: no fields
+    kind: Literal["wire"] = "wire"
+
+
+@dataclass(config=STRICT)
+class PacketsConfig:
+    """Transit times and losses of packets.
+
+    Attributes:
+        distribution: of the transit time, `uniform` from `low` to `high`, or `lognormal`.
+        low, high: of the uniform one, s; null otherwise.
+        median: of the lognormal one, s; null otherwise.
+        sigma: of the lognormal one, standard deviation of its logarithm; null otherwise.
+        loss: share of the packets that never arrive.
+        burst: number of packets in a row that are lost together.
+    """
+
+    distribution: Literal["uniform", "lognormal"] = "uniform"
+    low: Seconds | None = None
+    high: Seconds | None = None
+    median: Positive | None = None
+    sigma: Annotated[float, Field(gt=0, le=10)] | None = None
+    loss: Loss = 0.05
+    burst: Annotated[int, Field(ge=1, le=1000)] = 1
+
+    def problem(self, where: str) -> str | None:
+        """Return the first problem with the times, or None."""
+        used = ("low", "high") if self.distribution == "uniform" else ("median", "sigma")
+        for name in ("low", "high", "median", "sigma"):
+            value = getattr(self, name)
+            if (value is None) == (name in used):
+                got, expected = ("null", "a number") if name in used else (f"{value:g}", "null")
+                return (
+                    f"{where}.{name}: got {got} with distribution {self.distribution!r}; "
+                    f"expected {expected}"
+                )
+        if self.low is not None and self.high is not None and self.low > self.high:
+            return f"{where}.low: got {self.low:g} s; expected at most high, {self.high:g} s"
+        return None
+
+
+@dataclass(config=STRICT | ConfigDict(populate_by_name=True))
+class NetworkConfig(PacketsConfig):
+    """Packets of torques with the times at which they shall act, and a buffer at the machine.
+
+    A torque acts a bound later than it was sent. Where no packet has brought one for a period, the
+    buffer is dry. Clocks agree. Without `low` and `high` a uniform transit time is between 0.8 and
+    1.2 times the constant delay of the section `delay`; `Scenario.assumed_link` has the numbers.
+
+    Attributes:
+        kind: `network`.
+        playout: the bound, s; null is the one that makes late packets as rare as lost ones
+            (`scenario.packets.default_bound`). The controller adds its `packet_repeats` periods.
+        dry: output of a dry buffer, `hold` the last torque or `zero`.
+        back: `return` in files, transit times and losses of the measurements; null is at once and
+            all of them.
+        acknowledged: whether each measurement reports the packets that have arrived and the
+            torques that have acted.
+        seed: of times and losses.
+    """
+
+    kind: Literal["network"] = "network"
+    playout: Seconds | None = None
+    dry: Literal["hold", "zero"] = "hold"
+    back: PacketsConfig | None = Field(default=None, alias="return")
+    acknowledged: bool = True
+    seed: Seed = 0
+
+    @property
+    def follows_delay(self) -> bool:
+        """Whether the transit times follow from the scenario's delay."""
+        return self.distribution == "uniform" and self.low is None and self.high is None
+
+
+LinkConfig = Annotated[WireConfig | NetworkConfig, ByKind()]
