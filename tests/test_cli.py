@@ -114,7 +114,7 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys, monkeyp
     assert "left workspace" in rows[0] and "at 1.36 s, leg 2" in lines[lines.index(rows[0]) + 1]
     assert [row.split()[2] for row in rows] == ["NaN", "NaN", "225", "80", "-"]
     assert rows[-1].split()[4] == "15.2", "the delay floor stands beside E_ac"
-    heads = next(line for line in lines if "E_ac" in line)
+    heads = next(line for line in lines if "asked" in line)
     assert heads.split()[-4:-2] == ["asked", "acted"] and "(commanded)" in out
     # The LQI asked for a torque that never acted: the plate was gone before it arrived.
     assert [float(x) for x in rows[3].split()[-4:-2]] == [1.7, 0.13]

@@ -144,7 +144,7 @@ def collect_of(scenario, **changes):
         "run": changes.get("run") or simulate(scenario),
         "analyses": dict.fromkeys(ANALYSES, BLANK),
     }
-    return report_document.Collected(**(parts | changes))
+    return report_document.ReportData(**(parts | changes))
 
 
 def test_a_run_that_ends_early_is_told_at_once():

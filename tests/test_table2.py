@@ -11,7 +11,7 @@ from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.preparation import check_instants, prepare
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.reporting.document import Paragraph, Table
-from stewart_drake.reporting.run import table_two_blocks
+from stewart_drake.reporting.run import comparison_document
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.studies.compare import CONTROLLERS, comparison_summary, label
@@ -92,7 +92,7 @@ def short():
 
 def of_the_paper(results):
     """The table that has the paper's numbers, and the paragraphs below it."""
-    table, *told = table_two_blocks(results)
+    table, *told = comparison_document(results).sections[0].blocks
     assert isinstance(table, Table)
     return table, [block.text for block in told if isinstance(block, Paragraph)]
 
@@ -127,12 +127,12 @@ def test_it_is_shown_once_and_every_row_is_in_the_summary(short):
 
 
 def test_other_comparisons_have_no_such_table(short):
-    assert not table_two_blocks({name: short[name] for name in CONTROLLERS})
+    assert len(comparison_document({name: short[name] for name in CONTROLLERS}).sections) == 1
     settings = ["duration=0.3", "delay.steps=2"]
     other = sd.simulate(
         load_comparison("table2", (), settings)["delay_lqi_sum"], judge_stability=False
     )
-    assert not table_two_blocks({"delay_lqi_sum": other})
+    assert len(comparison_document({"delay_lqi_sum": other}).sections) == 1
 
 
 def test_more_room_alone_is_not_enough(tmp_path):

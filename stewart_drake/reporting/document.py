@@ -16,7 +16,7 @@ after rendering is left out. Numbers get three significant digits.
     @name caption            is the context's entry of this name: blocks, or a function that draws
                              a figure; a paragraph if it is True
       | head :: cell         below it is a column of a table of all `it` in the named items
-      | head :: brief :: cell    with the head on a terminal, where - leaves the column out
+      | head :: brief :: cell    with the head on a terminal; the head - leaves the column out
       | @other               has the columns of another table
     text
       + cell :: cell         below it are head and rows of a table
@@ -43,8 +43,6 @@ Tone = Literal["good", "fair", "bad", "plain"]
 
 WIDTH: Final = 80
 _NO_BREAK: Final = "\N{NO-BREAK SPACE}"
-_JOINED: Final = "\ue000"
-"""Placeholder for a no-break space, at which rich would break a line."""
 _TOGETHER: Final = (
     r"(?<=\d) (?=(?:%|mm|ms|s|N|mN|kg|deg)(?!\w))|(?<=N) (?=m\b)|(?<=\d %) (?=s\b)|(?<=beatable:) "
 )
@@ -152,7 +150,7 @@ class Table:
         for count, row in enumerate(self.rows, start=1):
             if len(row) != len(self.columns):
                 raise ValueError(
-                    f"row {count} has {len(row)} cells; expected one per column, {len(self.columns)}"
+                    f"row {count} has {len(row)} cells; expected {len(self.columns)}, as columns"
                 )
 
     @cached_property
@@ -173,25 +171,33 @@ class Table:
         from rich.text import Text
 
         heads = self.columns if isinstance(self.brief, bool) else self.brief
-        kept = {
-            k: head.replace(_NO_BREAK, _JOINED) for k, head in enumerate(heads) if head is not None
+        kept = {k: head for k, head in enumerate(heads) if head is not None}
+        cells = {
+            k: min(
+                _SHORT, max([1, *(len(line) for row in self.rows for line in row[k].split("\n"))])
+            )
+            for k in kept
         }
-        least = {
-            k: min(_SHORT, max(map(len, re.split("[ \n]", head) + _lines(self.rows, k))))
-            for k, head in kept.items()
-        }
-        gap = 2 if sum(least.values()) + 2 * len(least) <= WIDTH + 2 else 1
+        # The heads are wrapped as little as the width allows, but not narrower than their cells.
+        for gap, most in ((2, WIDTH), (2, 16), (2, 13), (2, 10), (2, 1), (1, 10), (1, 1)):
+            wrapped = {
+                k: textwrap.wrap(head, max(cells[k], most), break_long_words=False) or [""]
+                for k, head in kept.items()
+            }
+            widths = [max(cells[k], *map(len, wrapped[k])) for k in kept]
+            if sum(widths) + gap * (len(kept) - 1) <= WIDTH:
+                break
         grid = Grid(box=None, padding=(0, gap, 0, 0), pad_edge=False)
-        for k, head in kept.items():
+        for k, lines in wrapped.items():
             justify: Literal["right", "left"] = "right" if self.numeric[k] else "left"
-            grid.add_column(Text(head), justify=justify, min_width=least[k])
+            grid.add_column(Text("\n".join(lines)), justify=justify)
         for row in self.rows:
             grid.add_row(*(Text(row[k]) for k in kept))
         console = Console(width=WIDTH, file=StringIO(), color_system=None)
         with console.capture() as capture:
             console.print(grid)
-        lines = [line.rstrip() for line in capture.get().replace(_JOINED, " ").splitlines()]
-        return "\n".join([*([wrap(self.caption)] if self.caption else []), *lines])
+        shown = [line.rstrip() for line in capture.get().replace(_NO_BREAK, " ").splitlines()]
+        return "\n".join([*([wrap(self.caption)] if self.caption else []), *shown])
 
 
 @dataclass(frozen=True)
@@ -293,10 +299,6 @@ def _is_number(cell: str) -> bool:
     return text in ("", "-", "–", "∞", "NaN") or text.lstrip("+-−<>≤≥±* ")[:1].isdigit()
 
 
-def _lines(rows: Sequence[Sequence[str]], k: int) -> list[str]:
-    return [line for row in rows for line in row[k].split("\n")]
-
-
 def from_template(name: str, tone: Tone = "plain", /, **context: Any) -> Document:
     """Return the document that a template makes of its context."""
     top, *others = sections(name, **context)
@@ -317,7 +319,7 @@ def sections(name: str, /, **context: Any) -> list[Section]:
 
 
 class _Part(NamedTuple):
-    """A part of a template; `rows` are the pieces between :: of its lines that begin with `kind`."""
+    """A part of a template; `rows` are the pieces of its lines that begin with `kind`."""
 
     mark: str
     name: str
@@ -355,11 +357,13 @@ def _blocks(part: _Part, context: Mapping[str, Any]) -> Iterator[Block]:
 
 def _table(part: _Part, caption: str, items: Any, context: Mapping[str, Any]) -> Table:
     heads = [[one.render(context).replace("~", _NO_BREAK) for one in row[:-1]] for row in part.rows]
-    rows = [[row[-1].render(context, it=item).strip() for row in part.rows] for item in items]
+    kept = [k for k, names in enumerate(heads) if names[0] != "-"]
+    cells = [part.rows[k][-1] for k in kept]
+    rows = [[one.render(context, it=item).strip() for one in cells] for item in items]
     brief: bool | list[str | None] = part.mark == "@>"
     if any(len(names) > 1 for names in heads):
-        brief = [None if names[-1] == "-" else names[-1] for names in heads]
-    return Table([names[0] for names in heads], rows, caption, brief)
+        brief = [None if heads[k][-1] == "-" else heads[k][-1] for k in kept]
+    return Table([heads[k][0] for k in kept], rows, caption, brief)
 
 
 @cache

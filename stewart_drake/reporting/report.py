@@ -1,7 +1,7 @@
-"""Document of a scenario, to be shown to somebody else.
+"""The report on a scenario.
 
-How its own run went, the shipped controllers in the manner of the paper's Table II and figures 5, 6
-and 7, what the analyses say beforehand, and the scenario itself.
+It shows the scenario's own run, the shipped controllers in the manner of the paper's Table II and
+figures 5, 6 and 7, the analyses, and the scenario itself.
 """
 
 import pickle
@@ -14,14 +14,14 @@ from typing import Any, Final
 import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure
-from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.resources import resolve
+from stewart_drake.files.resources import shipped
 from stewart_drake.loop.preparation import assemble
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.reporting.analyses import analyze, options_of
 from stewart_drake.reporting.document import (
+    Block,
     Document,
     Frame,
     Listing,
@@ -41,40 +41,43 @@ from stewart_drake.reporting.figures import (
     weights_figure,
 )
 from stewart_drake.reporting.results import AnalysisResult
-from stewart_drake.reporting.run import comparison_blocks, run_blocks
+from stewart_drake.reporting.run import comparison_document, run_document
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link import link_text, number_sent
 from stewart_drake.scenario.loading import load_compatible, scenario_yaml
-from stewart_drake.studies.compare import LABELS, is_papers, label, shown
+from stewart_drake.studies import compare
+from stewart_drake.studies.compare import LABELS, is_papers, label
 from stewart_drake.studies.jobs import Job, Progress, run_jobs
 from stewart_drake.tuner.network import DEFAULT
 
 ANALYSES: Final = ("delay", "hautus", "workspace")
-"""In the order in which they are read."""
 _OWN: Final = ""
-"""The scenario's own run, which no row of a comparison is called."""
+"""Key of the scenario's own run; no row of a comparison has this name."""
 _TUNED: Final = "tuned-"
 GOOD: Final = 5.0
 POOR: Final = 25.0
-"""% of peak to peak: mean errors, once torques can act, up to which a run is good, and not bad."""
+"""Mean error in % of peak to peak up to which a run is good, and not bad."""
 FEW_BAD: Final = 0.01
 MANY_BAD: Final = 0.5
 """Bad measurements per sample up to which a run is good, and not bad."""
 
 _LEVELS: Final[tuple[Tone, ...]] = ("good", "fair", "bad")
-WIDE: Final = "The stated deviation is 1.6 to 2.6 times too large."
 _QUESTIONS: Final = {
     "delay": "Is the loop stable with its delay?",
     "hautus": "Can the models be controlled and observed?",
     "workspace": "Does the motion fit the machine?",
 }
+WIDE: Final = "The stated deviation is 1.6 to 2.6 times too large."
 _CAPTIONS: Final = {
     "states": "The plate's six coordinates.",
     "errors": "Their errors.",
+    "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay.",
     "torques_delay_lqr": "Applied torques of the delay-aware LQR, without integral action.",
     "torques_delay_lqi": "Applied torques of the delay-aware LQI, with integral action.",
     "torques_predictor_lqi": "Applied torques of the LQI with nonlinear prediction.",
-    "weights": "The weights that the tuner's network sets online.",
+    "delay": f"Estimated delay with its band, and its error. {WIDE}",
+    "parameters": "Plant parameters as the controller estimates them.",
+    "weights": "Weights that the tuner sets online.",
 }
 _PAPER_FIGURES: Final = {
     "states": "5(a)",
@@ -83,32 +86,23 @@ _PAPER_FIGURES: Final = {
     "torques_delay_lqi": "7(b)",
     "weights": "6",
 }
-"""Of the paper, which show the same for its experiment."""
-_RUN_CAPTIONS: Final = {
-    "states": "Where the plate was, and where it should have been.",
-    "errors": "The difference.",
-    "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay.",
-    "delay": f"The delay as it was found, with its band, and its error. {WIDE}",
-    "parameters": "Parameters of the plant, as the controller estimates them.",
-    "weights": "The weights that the tuner set.",
-}
+"""Figures of the paper with the same content, for its experiment."""
 _PACKETS_BELOW: Final = (
-    " Below: packets that were sent, lost, or late, and periods in which one was played, or the "
-    "buffer was dry."
+    " Below: packets sent, lost or late, and periods with a packet to play or with a dry buffer."
 )
 
 
 @dataclass(frozen=True)
-class Collected:
-    """Everything in a report.
+class ReportData:
+    """Content of a report.
 
     Attributes:
         scenario: as asked for.
-        failure: where the reference leaves the workspace, so that nothing was simulated, or None.
-        run: of the scenario as it stands; None with a `failure`.
-        comparison: the shipped controllers on it, by name.
-        tuned: those that know of the delay, with the tuner's weights; empty without a network.
-        analyses: by name, in the order of ANALYSES; without their studies.
+        failure: where the reference leaves the workspace; then there are no runs.
+        run: of the scenario; None with a `failure`.
+        comparison: runs of the shipped controllers, by name.
+        tuned: runs of the delay-aware controllers with the tuner's weights; none without a network.
+        analyses: results without their studies, by name in the order of ANALYSES.
     """
 
     scenario: Scenario
@@ -124,15 +118,15 @@ def collect(
     settings: Iterable[str] = (),
     progress: Progress | None = None,
     controller: str | Path | None = None,
-) -> Collected:
-    """Run and analyse a scenario, on all cores. A reference out of reach is analysed only.
+) -> ReportData:
+    """Run and analyse a scenario on all cores. A reference out of reach is analysed only.
 
     Args:
         scenario_name: a shipped name or a path.
         settings: as `load_scenario` takes them.
         progress: called for every finished run or analysis.
-        controller: laid over the scenario's own, a shipped name or a path; the shipped ones are
-            compared on the scenario without it.
+        controller: replaces the scenario's own in its run and the analyses; a shipped name or a
+            path.
 
     Raises:
         ConfigError: bad input.
@@ -145,7 +139,7 @@ def collect(
     scenarios: dict[str, Scenario] = {}
     rows: set[str] = set()
     if failure is None:
-        scenarios = shown(scenario_name, settings)
+        scenarios = compare.shown(scenario_name, settings)
         rows = set(scenarios)
         if scenario not in scenarios.values():
             scenarios[_OWN] = scenario
@@ -154,7 +148,7 @@ def collect(
             for name in TORQUE_CONTROLLERS:
                 scenarios[_TUNED + name] = load_compatible(scenario_name, name, tuned)
     done, analyses = _work(scenario, scenarios, progress)
-    return Collected(
+    return ReportData(
         scenario=scenario,
         failure=failure,
         run=next((done[key] for key, sc in scenarios.items() if sc == scenario), None),
@@ -165,55 +159,54 @@ def collect(
 
 
 def has_network(scenario: Scenario) -> bool:
-    """Whether there is a network whose weights can be shown beside the scenario's fixed ones."""
-    if scenario.tuner.kind == "ann":
-        return False  # the comparison itself has them
-    try:
-        resolve("weights", DEFAULT)
-    except ConfigError:
-        return False
-    return True
+    """Return whether the report adds runs with a network's weights."""
+    return scenario.tuner.kind != "ann" and DEFAULT in shipped("weights")
 
 
 def _work(
     scenario: Scenario, scenarios: dict[str, Scenario], progress: Progress | None
 ) -> tuple[dict[str, SimulationResult], dict[str, AnalysisResult]]:
-    """Results by the names of the scenarios, and the analyses by theirs."""
-    # The analyses first: they take longest.
+    """Return the runs by the names of the scenarios, and the analyses by theirs."""
+    # The analyses come first because they take longest.
     jobs: dict[str, Job] = {name: (name, scenario) for name in ANALYSES}
     jobs |= {f"run{i}": ("simulate", sc) for i, sc in enumerate(scenarios.values())}
     with TemporaryDirectory() as folder:
-        paths = run_jobs(jobs, _piece, folder, settings={}, suffix=".pickle", progress=progress)
-        # Written by our own workers a moment ago, into a folder that nobody else can write to.
+        paths = run_jobs(jobs, _job, folder, settings={}, suffix=".pickle", progress=progress)
         found: list[Any] = [pickle.loads(path.read_bytes()) for path in paths.values()]
-    answers, runs = found[: len(ANALYSES)], found[len(ANALYSES) :]
-    return dict(zip(scenarios, runs, strict=True)), dict(zip(ANALYSES, answers, strict=True))
+    analyses, runs = found[: len(ANALYSES)], found[len(ANALYSES) :]
+    return dict(zip(scenarios, runs, strict=True)), dict(zip(ANALYSES, analyses, strict=True))
 
 
-def _piece(what: str, scenario: Scenario) -> bytes:
+def _job(what: str, scenario: Scenario) -> bytes:
     return pickle.dumps(simulate(scenario) if what == "simulate" else _analyse(what, scenario))
 
 
 def _analyse(name: str, scenario: Scenario) -> AnalysisResult:
-    given = {"simulations": False} if name == "delay" else {}
-    options = options_of(name)(**given)
+    options = options_of(name)(**({"simulations": False} if name == "delay" else {}))
     found = analyze(name, scenario, options, command=f"stewart-drake analyze {name}")
-    return replace(found, study=None)  # what no process can send
+    return replace(found, study=None)  # a study cannot be pickled
 
 
 # ---------------------------------------------------------------- the document
 
 
-def document(found: Collected, name: str, replay: str = "") -> Document:
-    """The report.
+def document(found: ReportData, name: str, replay: str = "") -> Document:
+    """Return the report.
 
     Args:
-        found: what it is about.
+        found: its content.
         name: of the scenario.
-        replay: the replay's page, to be shown inside, or empty.
+        replay: page of the replay, to be shown inside, or empty.
     """
     text, tone = verdict(found)
-    compared, weights = _compared(found)
+    compared = draw_comparison(found.comparison)
+    if found.tuned:
+        compared["weights"] = weights_figure({LABELS[n]: run for n, run in found.tuned.items()})
+    own = found.run and _blocks(run_document(found.run))
+    if found.run and own:
+        below = _PACKETS_BELOW if has_packets(found.run) else ""
+        for what, figure in draw_run(found.run).items():
+            own.append(Picture(figure, _CAPTIONS[what] + below * (what == "torques")))
     made = from_template(
         "report",
         tone,
@@ -224,22 +217,53 @@ def document(found: Collected, name: str, replay: str = "") -> Document:
         link=link_text(found.scenario),
         failure=found.failure,
         replay=replay and Frame(replay),
-        run=found.run and [*run_blocks(found.run), *_run_pictures(found.run)],
-        comparison=found.comparison and comparison_blocks(found.comparison, found.tuned),
+        run=own,
+        comparison=found.comparison and _blocks(comparison_document(found.comparison, found.tuned)),
         papers=is_papers(found.scenario),
-        no_weights=not weights,
-        compared=compared,
+        no_weights="weights" not in compared,
+        compared=[
+            Picture(figure, _caption(what, is_papers(found.scenario)))
+            for what, figure in compared.items()
+        ],
     )
-    answers = {_QUESTIONS[key]: found.analyses[key] for key in ANALYSES}
-    made.sections.extend(_answer(question, answer) for question, answer in answers.items())
-    made.sections.extend(_details(question, answer) for question, answer in answers.items())
-    above = "Every field, in the format of a scenario file: saved as one it runs again."
+    answers = {_QUESTIONS[key]: found.analyses[key].document for key in ANALYSES}
+    for question, answer in answers.items():
+        pictures = [one for part in answer.sections for one in part.all(Picture)]
+        conclusion = Paragraph(sentence(answer.verdict), brief=True)
+        made.sections.append(Section(question, conclusion, *pictures))
+    for question, answer in answers.items():
+        details = [
+            f"{section.heading}. {block.text}" if isinstance(block, Paragraph) else block
+            for section in answer.sections
+            for block in section.blocks
+            if not isinstance(block, Picture)
+        ]
+        made.sections.append(Section(f"Details: {question}", *details, folded=True))
+    above = "Every field, in the format of a scenario file; saved as one, it runs again."
     listing = Listing(scenario_yaml(found.scenario))
     made.sections.append(Section("The scenario", above, listing, folded=True))
     return made
 
 
-def report_summary(found: Collected) -> dict[str, Any]:
+def _blocks(document: Document) -> list[Block]:
+    return [block for section in document.sections for block in section.blocks]
+
+
+def _caption(figure: str, of_paper: bool) -> str:
+    """Return the caption of a figure of the comparison."""
+    what, _, controller = figure.partition("_")
+    caption = _CAPTIONS.get(figure)
+    if caption is None and what == "delay":
+        caption = f"Delay estimated by {label(controller)}, with its band, and its error. {WIDE}"
+    caption = caption or f"Applied torques of {label(controller)}."
+    if of_paper and figure in _PAPER_FIGURES:
+        caption = (
+            f"As figure {_PAPER_FIGURES[figure]} of the paper: {caption[0].lower()}{caption[1:]}"
+        )
+    return caption
+
+
+def report_summary(found: ReportData) -> dict[str, Any]:
     """Return the content of summary.json; each part is as its own command writes it."""
     text, tone = verdict(found)
     return {
@@ -256,38 +280,45 @@ def report_summary(found: Collected) -> dict[str, Any]:
     }
 
 
-def verdict(found: Collected) -> tuple[str, Tone]:
-    """Return how the scenario went in a few sentences, and the level of the worst finding."""
+def verdict(found: ReportData) -> tuple[str, Tone]:
+    """Return the conclusion in a few sentences, and the level of the worst finding."""
     if found.run is None:
         return sentence(found.analyses["workspace"].verdict), "bad"
     run, s = found.run, found.run.summary
     if run.stopped is not None:
-        return (
+        text = (
             f"The run ended after {run.stopped.time:.2f} of {run.scenario.duration:g} s: "
-            f"{run.stopped.reason}.{_who_completes(found)}",
-            "bad",
+            f"{run.stopped.reason}."
         )
-    error, floor, mean = s["accumulated_error"], s["delay_floor"], mean_error(run)
+        runs = found.comparison.items()
+        done = {key: one.accumulated_error for key, one in runs if one.status == "completed"}
+        if done:
+            best = min(done, key=lambda name: done[name])
+            text += f" {label(best)} completes it, with an E_ac of {number(done[best])} % s."
+        return text, "bad"
     findings, duration = _findings(run), f"all of {run.scenario.duration:g} s"
-    told = {tone: "; ".join(one for level, one in findings if level == tone) for tone in _LEVELS}
+    bad, fair = (
+        "; ".join(text for level, text in findings if level == tone) for tone in ("bad", "fair")
+    )
     text = f"The plate follows its reference for {duration}: E_ac is "
-    if told["bad"]:
-        text = f"Not reliable: {told['bad']}. The run completed {duration}: E_ac is "
-    average = f"{number(mean, 2)} % of peak to peak on average"
+    if bad:
+        text = f"Not reliable: {bad}. The run completed {duration}: E_ac is "
+    error, floor = number(s["accumulated_error"]), s["delay_floor"]
+    average = f"{number(mean_error(run), 2)} % of peak to peak on average"
     if floor > 0:
         text += (
-            f"{number(error)} % s, of which {number(floor)} pass before any torque can act. The "
-            f"rest is {average}."
+            f"{error} % s. The time before any torque can act contributes {number(floor)} % s; "
+            f"the rest is {average}."
         )
     else:
-        text += f"{number(error)} % s, {average}."
-    if told["fair"]:
-        text += f" Caution: {told['fair']}."
+        text += f"{error} % s, {average}."
+    if fair:
+        text += f" Caution: {fair}."
     return text, max((level for level, _ in findings), key=_LEVELS.index, default="good")
 
 
 def _findings(run: SimulationResult) -> list[tuple[Tone, str]]:
-    """Return what speaks against a completed run, each with its level."""
+    """Return the weaknesses of a completed run, each with its level."""
     s, found, mean = run.summary, list[tuple[Tone, str]](), mean_error(run)
     margin, counts = s["controller_margin"], s["counts"]
     if margin is not None and margin["stable"] is False:
@@ -309,69 +340,8 @@ def _findings(run: SimulationResult) -> list[tuple[Tone, str]]:
     return found
 
 
-def _who_completes(found: Collected) -> str:
-    """The best of the other controllers that do, in a sentence, or nothing."""
-    done = {
-        name: run.accumulated_error
-        for name, run in found.comparison.items()
-        if run.status == "completed"
-    }
-    if not done:
-        return ""
-    best = min(done, key=lambda name: done[name])
-    return f" {label(best)} completes it, with an E_ac of {number(done[best])} % s."
-
-
 def mean_error(run: SimulationResult) -> float:
-    """% of peak to peak, over the time in which torques can act; NaN if the run ended early."""
+    """Return the mean error once torques can act, % of peak to peak; NaN if the run ended early."""
     s, sc = run.summary, run.scenario
-    blind = sc.eta if s["delay_floor"] else 0.0
-    left = sc.duration - blind
+    left = sc.duration - (sc.eta if s["delay_floor"] else 0.0)
     return float((s["accumulated_error"] - s["delay_floor"]) / left) if left > 0 else np.nan
-
-
-def _run_pictures(run: SimulationResult) -> list[Picture]:
-    below = {"torques": _PACKETS_BELOW} if has_packets(run) else {}
-    return [
-        Picture(figure, _RUN_CAPTIONS[name] + below.get(name, ""))
-        for name, figure in draw_run(run).items()
-    ]
-
-
-def _compared(found: Collected) -> tuple[list[Picture], bool]:
-    """Return the figures of the comparison, and whether weights of a tuner are among them."""
-    figures = draw_comparison(found.comparison)
-    if found.tuned:
-        figures["weights"] = weights_figure({LABELS[n]: run for n, run in found.tuned.items()})
-    pictures = []
-    for name, figure in figures.items():
-        caption = _CAPTIONS.get(name) or _caption_of(name)
-        if is_papers(found.scenario) and name in _PAPER_FIGURES:
-            below = caption[:1].lower() + caption[1:]
-            caption = f"As figure {_PAPER_FIGURES[name]} of the paper: {below}"
-        pictures.append(Picture(figure, caption))
-    return pictures, "weights" in figures
-
-
-def _caption_of(figure: str) -> str:
-    """Return the caption of a figure of a controller that is not always compared."""
-    what, _, controller = figure.partition("_")
-    if what == "delay":
-        return f"How {label(controller)} found the delay: with its band, and its error. {WIDE}"
-    return f"Applied torques of {label(controller)}."
-
-
-def _answer(question: str, answer: AnalysisResult) -> Section:
-    pictures = [one for part in answer.document.sections for one in part.all(Picture)]
-    return Section(question, Paragraph(sentence(answer.verdict), brief=True), *pictures)
-
-
-def _details(question: str, answer: AnalysisResult) -> Section:
-    """Return texts and tables of an analysis in one folded section."""
-    parts = [
-        f"{section.heading}. {block.text}" if isinstance(block, Paragraph) else block
-        for section in answer.document.sections
-        for block in section.blocks
-        if not isinstance(block, Picture)
-    ]
-    return Section(f"Details: {question}", *parts, folded=True)

@@ -151,9 +151,13 @@ def plain_log_ticks(axis: Axis) -> None:
 
 def powers_of_ten(axis: Axis) -> None:
     """Label a logarithmic axis with 10⁻³ and so on, as text: formulas take ten times as long."""
-    raised = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-    axis.set_major_formatter(lambda value, _: "10" + f"{round(np.log10(value))}".translate(raised))
+    axis.set_major_formatter(_power_of_ten)
     axis.set_minor_formatter(NullFormatter())
+
+
+def _power_of_ten(value: float, _: float) -> str:
+    raised = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+    return "10" + f"{round(np.log10(value))}".translate(raised)
 
 
 def write_figures(figures: Mapping[str, Figure], directory: str | Path) -> list[Path]:
