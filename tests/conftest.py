@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from stewart_drake.reporting import terminal
+from tests import building  # noqa: F401  (before the workers start: it makes their folder)
 from tests.browser import Browser, browser
 from tests.shorter import leave_blank
 

@@ -11,6 +11,7 @@ from stewart_drake.core import build
 from stewart_drake.export import controller as export_c
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.loading import load_scenario
+from tests.building import SANITIZED, c_compiler, make
 
 NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
 FAULTS = (
@@ -53,10 +54,7 @@ BITS = {"bad measurements and outliers": (8, 16, 32), "saturation, a fraction of
 
 @pytest.fixture(autouse=True)
 def compiler():
-    found = build.compiler()
-    if found is None or shutil.which("make") is None:
-        pytest.skip("there is no C compiler, or no make")
-    return found
+    return c_compiler()
 
 
 def exported(folder, name, settings, single=False):
@@ -72,15 +70,6 @@ def sources(folder):
     return [name.replace(".o", ".c") for name in export_c.objects(makefile)]
 
 
-def made(folder, target, *variables):
-    """What make says; it must succeed."""
-    done = subprocess.run(
-        ["make", "-s", *target.split(), *variables], cwd=folder, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [pytest.param(n, marks=() if n in QUICK else pytest.mark.soak) for n in RUNS]
@@ -89,11 +78,11 @@ def test_the_replay_is_exact(case, tmp_path):
     """1e-9 of the peak torque, the same statuses; strict, and under the sanitizers."""
     name, settings = RUNS[case]
     folder = exported(tmp_path, name, settings)
-    said = made(folder, "test")
+    said = make(folder, "test")
     assert int(said.split()[0]) >= 50 and "statuses that differ: 0" in said
     over_udp = (folder / "protocol.c").exists()
     assert said.endswith("protocol: as documented\n") == over_udp
-    made(folder, "check")
+    make(folder, "check")
     statuses = (folder / "stewart_test.c").read_text().split("status[STEPS] = {")[1].split("}")[0]
     seen = {int(status) for status in statuses.split(",")}
     for bit in BITS.get(case, ()):
@@ -107,8 +96,8 @@ def test_the_replay_of_servos_is_exact(sensor, tmp_path):
     settings = (*SHORT, "actuator.kind=servo", f"sensor.kind={sensor}")
     scenario = load_scenario("paper", "servo_preview", settings=settings)
     export_c.write(export_c.exported(scenario, measured=False), tmp_path)
-    assert "statuses that differ: 0" in made(tmp_path, "test")
-    made(tmp_path, "check")
+    assert "statuses that differ: 0" in make(tmp_path, "test")
+    make(tmp_path, "check")
     assert not (tmp_path / "law.c").exists()
 
 
@@ -118,7 +107,7 @@ def test_gravity_is_exported_as_it_is_shipped(tmp_path):
     scenario = load_scenario("gravity", settings=("duration=1.7",))
     assert scenario.plant.kind == "multibody"
     export_c.write(export_c.exported(scenario, measured=False), tmp_path)
-    said = made(tmp_path, "test")
+    said = make(tmp_path, "test")
     assert said.startswith("100 steps") and "statuses that differ: 0" in said
 
 
@@ -146,7 +135,7 @@ def test_other_compilers_and_processors(compiler, tmp_path):
         if shutil.which(needed) is None:
             pytest.skip(f"there is no {needed}")
     folder = exported(tmp_path, "paper", ("duration=2.0",))
-    assert "statuses that differ: 0" in made(
+    assert "statuses that differ: 0" in make(
         folder, "test", f"CC={compiler}", f"EMULATOR={emulator}"
     )
 
@@ -157,7 +146,7 @@ def test_a_controller_that_is_off_is_told(tmp_path):
     folder = exported(tmp_path, "paper", ("duration=2.0",))
     config, test = folder / "stewart_config.c", folder / "stewart_test.c"
     right = config.read_text(), test.read_text()
-    made(folder, "test", "CFLAGS=-O0")
+    make(folder, "test", "CFLAGS=-O0")
     for place, old, new in (
         (0, ".period = 0.1", ".period = 0.1000001"),
         (1, "status[STEPS] = {0", "status[STEPS] = {8"),
@@ -167,8 +156,7 @@ def test_a_controller_that_is_off_is_told(tmp_path):
         texts[place] = texts[place].replace(old, new)
         config.write_text(texts[0])
         test.write_text(texts[1])
-        done = subprocess.run(["make", "-s", "test", "CFLAGS=-O0"], cwd=folder, capture_output=True)
-        assert done.returncode != 0
+        make(folder, "test", "CFLAGS=-O0", fails=True)
 
 
 @pytest.mark.slow
@@ -186,7 +174,7 @@ def test_single_precision_is_close(name, settings, tmp_path):
     """1e-3 of the peak of the replay in double precision, over 10 s where the scenario has them."""
     scenario = load_scenario(name, settings=("plant.kind=exact", *settings))
     export_c.write(export_c.exported(scenario, single=True, measured=False), tmp_path)
-    said = made(tmp_path, "test")
+    said = make(tmp_path, "test")
     assert "tolerance 1e-03" in said and "statuses that differ: 0" in said
     assert 1e-9 < float(said.split("largest error ")[1].split()[0]) < 1e-3
 
@@ -217,7 +205,7 @@ def test_odd_inputs_are_survived(name, settings, tmp_path, compiler):
     """NaN, infinity, huge numbers, INT_MIN and INT_MAX, under both sanitizers."""
     folder = exported(tmp_path, name, (*settings, "duration=0.5"))
     shutil.copy(Path(__file__).with_name("odd_inputs.c"), folder)
-    options = ["-std=c99", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    options = ["-std=c99", "-O1", *SANITIZED]
     own = ["odd_inputs.c", *sources(folder), "stewart_motion.c"]
     command = [*compiler, *options, *own, "-lm", "-o", "odd_inputs"]
     subprocess.run(command, cwd=folder, check=True)

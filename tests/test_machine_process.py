@@ -4,7 +4,6 @@ import json
 import os
 import random
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -16,10 +15,10 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from stewart_drake.core import build
 from stewart_drake.export import controller as export_c
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
+from tests.building import SANITIZED, c_compiler, make
 from tests.live_driver import Driver, drive_in_real_time
 
 SETTINGS = ("plant.kind=exact", "duration=4.0")
@@ -103,17 +102,13 @@ def machine(*options, settings=SETTINGS):
 
 
 def exported(made, settings):
-    """What export-c writes, with the examples over UDP under the sanitizers."""
-    if build.compiler() is None or shutil.which("make") is None:
-        pytest.skip("there is no C compiler, or no make")
+    """Write what export-c writes, and compile the examples over UDP under the sanitizers."""
+    c_compiler()
     scenario = load_scenario("paper", settings=settings)
     export_c.write(export_c.exported(scenario, measured=False), made)
-    # What is long is tried under them by tests/test_export_c.py.
-    long, checked = ["dynamics.o", "riccati.o", "law.o"], "-fsanitize=address,undefined"
-    for targets, flags in ((long, "-O1"), (["udp"], f"-g {checked} -fno-sanitize-recover=all")):
-        command = ["make", "-s", *targets, f"CFLAGS={flags}"]
-        done = subprocess.run(command, cwd=made, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
+    # tests/test_export_c.py tries the long sources under them.
+    make(made, "dynamics.o", "riccati.o", "law.o", "CFLAGS=-O1")
+    make(made, "udp", f"CFLAGS={' '.join(SANITIZED)}")
     return made
 
 

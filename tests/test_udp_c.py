@@ -14,6 +14,7 @@ from stewart_drake.live.endpoint import LONGEST_KEY, SHORTEST_KEY, now
 from stewart_drake.live.protocol import ControllerMessage, MachineMessage, encode
 from stewart_drake.loop.peer import FAULTS, Fault
 from stewart_drake.scenario.loading import load_scenario
+from tests.building import SANITIZED, c_compiler
 from tests.live_driver import Driver
 from tests.test_machine_process import (
     COMMAND,
@@ -27,7 +28,6 @@ from tests.test_machine_process import (
 from tests.test_protocol import PLAN, changed
 
 __all__ = ["folder"]
-SANITIZED = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 TRIED = """
 #include <arpa/inet.h>
 #include <stdio.h>
@@ -66,9 +66,7 @@ int main(int argc, char **argv)
 @pytest.fixture(scope="module")
 def tried(tmp_path_factory):
     """udp.c under the sanitizers, with and without a source of random bytes."""
-    compiler = build.compiler()
-    if compiler is None:
-        pytest.skip("there is no C compiler")
+    compiler = c_compiler()
     made = tmp_path_factory.mktemp("udp")
     (made / "tried.c").write_text(TRIED)
     sources = [str(made / "tried.c"), str(TEMPLATES / "udp.c"), str(TEMPLATES / "protocol.c")]
