@@ -15,9 +15,17 @@ import stewart_drake as sd
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.law.catch_up import plan_catch_up
 from stewart_drake.loop import bulk
-from stewart_drake.loop.bulk import SampledLaw, ending_of, preparation_of, run_in_bulk
+from stewart_drake.loop.bulk import (
+    PythonController,
+    ending_of,
+    instants_of,
+    preparation_of,
+    run_in_bulk,
+    run_loop,
+    run_prepared,
+    uncovered,
+)
 from stewart_drake.loop.law_design import control_law
-from stewart_drake.loop.native_loop import InPython, instants_of, run_loop, uncovered
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.sampling import update_every
 from stewart_drake.loop.sensor import Sensor, white_noise, white_noises
@@ -31,6 +39,10 @@ from stewart_drake.studies.uncertainty import MACHINE, apply_draw, draw, scales_
 from tests.mechanisms import PAPER
 
 NOISE = "sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
+PACKETS = (
+    "link.kind=network", "link.low=0.1", "link.high=0.3", "link.loss=0.1", "link.playout=0.3",
+    "link.return={low: 0.02, high: 0.15, loss: 0.1}", "link.seed=3",
+)  # fmt: skip
 FOLLOWS = ("start=on_reference", "queue=reference")
 DIRTY = (
     *(NOISE, "sensor.seed=3", "plant.torque_bias=[.001,.002,0,0,-.001,0]"),
@@ -81,14 +93,28 @@ LOOPS = {
         "delay.fraction=0.3", "controller.delay_steps=8", *FOLLOWS, *DIRTY,
     ),
     "network": scenario("paper", "duration=2", "tuner.kind=ann", *FOLLOWS, *DIRTY),
+    "packets": scenario("paper", "duration=3", *PACKETS, *FOLLOWS, *DIRTY),
+    "packets between samples": scenario(
+        "paper", "duration=3", *PACKETS, "link.playout=0.33", "link.dry=zero", "link.seed=5", *DIRTY
+    ),
+    "packets one way": scenario(
+        "paper", "duration=3", *PACKETS[:4], "link.acknowledged=false", *FOLLOWS, *DIRTY
+    ),
+    "late measurements": scenario("paper", "duration=3", "sensor.delay=0.05", *FOLLOWS, *DIRTY),
+    "lost": scenario("paper", "duration=3", "sensor.loss=0.2", *FOLLOWS, *DIRTY),
+    "adaptive, late, from rest": scenario(
+        "paper", "duration=2.5", "controller.delay_estimator=constant", "delay.fraction=0.37",
+        "controller.delay_steps=7", "controller.replan=1.2",
+    ),
+    "packets, blind": scenario("paper", "duration=2", *PACKETS, *DIRTY, controller="delay_lqr"),
 }  # fmt: skip
 
 
 IN_PYTHON = {
     "blind": "native, law in Python (controller.prediction)",
+    "packets, blind": "native, law in Python (controller.prediction)",
     "linear": "native, law in Python (controller.prediction)",
     "printed": "native, law in Python (controller.model)",
-    "adaptive": "native, reference in Python (controller.delay_estimator)",
 }
 """What the core has not."""
 
@@ -151,7 +177,7 @@ def test_states_torques_and_measurements_are_drakes():
     preparation = preparation_of(one)
     prepared = preparation.prepared(preparation.experiment(one))
     wanted = preparation.references[preparation.when.sampled]
-    law = InPython(SampledLaw(prepared, preparation.when, wanted).torque)
+    law = PythonController(prepared, preparation.when, wanted)
     course = run_loop(prepared.experiment, preparation.when, law)
     signals = simulate(one, judge_stability=False).signals
     assert np.array_equal(signals.time.values, preparation.when.nominal)
@@ -173,9 +199,9 @@ def test_noise_is_drakes_to_the_last_bit():
     sensor = Sensor(np.array(one.sensor.noise_std), one.sensor.seed, one.controller.period)
     seen = []
 
-    def law(sample, measurement):
-        seen.append(measurement)
-        return np.zeros(6)
+    def law(sample, measured, report):
+        seen.append(measured.values)
+        return np.zeros(6), np.zeros((1, 6))
 
     still = dataclasses.replace(one, plant=dataclasses.replace(one.plant, torque_bias=[0.0] * 6))
     experiment = (
@@ -184,7 +210,7 @@ def test_noise_is_drakes_to_the_last_bit():
         ._replace(start=np.concatenate([PAPER.home, np.zeros(6)]))
     )
     queue = dataclasses.replace(still, queue="zero")
-    run_loop(experiment._replace(scenario=queue), preparation.when, InPython(law))
+    run_loop(experiment._replace(scenario=queue), preparation.when, law)
     state = np.concatenate([PAPER.home, np.zeros(6)])
     assert len(seen) == len(preparation.when.samples) > 10
     for k, measurement in enumerate(seen):
@@ -225,14 +251,14 @@ def test_what_a_law_raises_comes_through():
     experiment = preparation.experiment(LOOPS["from rest"])
     taken = []
 
-    def law(sample, measurement):
+    def law(sample, measured, report):
         taken.append(sample)
         if sample == 3:
             raise KeyboardInterrupt("stop")
-        return np.zeros(6)
+        return np.zeros(6), np.zeros((1, 6))
 
     with pytest.raises(KeyboardInterrupt, match="stop"):
-        run_loop(experiment, preparation.when, InPython(law))
+        run_loop(experiment, preparation.when, law)
     assert taken == [0, 1, 2, 3]
 
 
@@ -240,10 +266,7 @@ def test_what_a_law_raises_comes_through():
     ("field", "settings"),
     [
         ("plant.kind", ["plant.kind=multibody"]),
-        ("link.kind", ["link.kind=network"]),
         ("sensor.faults", ["sensor.faults=[{kind: missing, from: 0.05, to: 0.15}]"]),
-        ("sensor.delay", ["sensor.delay=0.1"]),
-        ("sensor.loss", ["sensor.loss=0.1"]),
     ],
 )
 def test_what_it_has_not_runs_in_drake_and_says_so(field, settings):
@@ -342,7 +365,7 @@ def error_without(start, missing):
     previews = prepared.previews.copy()
     for sample, part in missing.items():
         previews[sample][part] = np.nan
-    ending = bulk._in_c(preparation_of(experiment), prepared._replace(previews=previews))
+    ending = run_prepared(preparation_of(experiment), prepared._replace(previews=previews))
     assert ending.status == "completed" and ending.figures is not None
     return ending.figures.accumulated_error, ending.counts["references_missing"]
 
@@ -389,7 +412,7 @@ def error_of_a_later_start(samples_late):
     times = np.maximum(0.0, preparation.when.samples[:, None] + law.preview_times)
     previews = np.array([[evaluate(planned, t) for t in ahead] for ahead in times])
     previews[:samples_late] = np.concatenate([experiment.start[:6], np.zeros(12)])
-    ending = bulk._in_c(preparation, prepared._replace(previews=previews))
+    ending = run_prepared(preparation, prepared._replace(previews=previews))
     assert ending.figures is not None
     return ending.figures.accumulated_error
 

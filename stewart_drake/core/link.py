@@ -39,7 +39,7 @@ class Link:
         limit: float = math.inf,
     ) -> None:
         c = core()
-        self._at, self._lib, self.size, self._history = c.at, c.lib, size, history
+        self._at, self._lib, self.size, self.history = c.at, c.lib, size, history
         values = size, kept, history, wire, holds, period, together, limit
         self.data: Any = c.ffi.new("stewart_link *", values)
 
@@ -89,7 +89,7 @@ class Link:
     def acted(self, memory: Array) -> Array:
         """Return a view (h, 1 + size) of what has acted, after its time, the newest first."""
         begin = self._lib.STEWART_LINK_COMMANDS
-        return memory[begin : begin + self._history * (1 + self.size)].reshape(self._history, -1)
+        return memory[begin : begin + self.history * (1 + self.size)].reshape(self.history, -1)
 
     def number(self, memory: Array, name: str) -> float:
         """Return a number of the memory by its name in core/link.h, such as `taken`."""

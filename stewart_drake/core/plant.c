@@ -4,6 +4,7 @@
 
 #include "dop853.h"
 #include "plant.h"
+#include "reference.h"
 #include "short.h"
 
 #ifndef SOURCE
@@ -133,14 +134,57 @@ int stewart_open_loop(stewart_run *r, const stewart_drive *drives, long number)
     return ended(r, &s, how);
 }
 
+/* The report of a buffer: whether each of the last packets has arrived, and the torques that acted in
+   the last periods, the newest first. */
+static void write_report(const stewart_loop *o, long k, double *arrived)
+{
+    const double until = o->period * (double)k + o->link->together;
+    const double *acted = o->memory + STEWART_LINK_COMMANDS + 1;
+    for (long i = 0, packet = k - 1; i < o->reported; i++, packet--) {
+        arrived[i] = packet >= 0 && o->period * (double)packet + o->transit[packet] <= until;
+        stewart_copy(U, acted + (1 + U) * i, arrived + o->reported + U * i);
+    }
+}
+
+/* Send `values` (size) back at sample k; replace them by the newest that arrived in the last period, or
+   NaN. Returns their age in periods. */
+static int pass_back(const stewart_loop *o, long k, double *values)
+{
+    const stewart_link *back = o->back;
+    const double now = o->period * (double)k, *newest = o->back_memory + STEWART_LINK_COMMANDS;
+    double arrival = now + o->back_transit[k];
+    stewart_link_take(back, o->back_memory, now, (double)(k + 1), 0., arrival, 1, values);
+    if (stewart_link_next(back, o->back_memory) <= now + back->together)
+        stewart_link_change(back, o->back_memory, now);
+    int arrived = o->back_memory[STEWART_LINK_ACTED] > 0. &&
+                  newest[0] > now - o->period + back->together;
+    for (int i = 0; i < back->size; i++)
+        values[i] = arrived ? newest[1 + i] : (double)NAN;
+    return arrived ? (int)((double)(k + 1) - o->back_memory[STEWART_LINK_NEWEST]) : 0;
+}
+
 static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller law, void *about)
 {
     double *y = o->measured + X * k, *torque = o->asked + U * k, now = o->period * (double)k;
+    double *values = o->scratch, *arrived = values + X, *acted = arrived + o->reported;
+    double *command = acted + U * o->reported, arrival = now + o->transit[k];
+    stewart_report report = {o->reported, arrived, o->reported, acted, 0};
+    stewart_sample measured = {.measurement = y};
     for (int i = 0; i < X; i++)
-        y[i] = o->noise ? s->x[i] + o->noise[X * k + i] : s->x[i];
-    if (law(about, k, y, torque))
+        values[i] = o->noise ? s->x[i] + o->noise[X * k + i] : s->x[i];
+    write_report(o, k, arrived);
+    if (o->back)
+        measured.age = report.age = pass_back(o, k, values);
+    stewart_copy(X, values, y);
+    if (o->reported && !isnan(arrived[0]))
+        measured.report = &report;
+    if (law(about, k, &measured, torque, command))
         return STEWART_CONTROLLER_FAILED;
-    stewart_link_take(o->link, o->memory, now, (double)(k + 1), 0., now + o->delays[k], 1, torque);
+    if (o->link->wire)
+        stewart_link_take(o->link, o->memory, now, (double)(k + 1), 0., arrival, 1, command);
+    else
+        stewart_link_take(o->link, o->memory, now, (double)(k + 1), arrival,
+                          ((double)(k - o->repeats) + o->delay) * o->period, o->rows, command);
     o->taken = k + 1;
     return STEWART_INSIDE;
 }
@@ -171,20 +215,57 @@ int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law,
     }
 }
 
-static int step(void *about, long k, const double *measurement, double *torque)
+/* Row of a motion; before its first and after its last time that of there. */
+static void row_at(const stewart_motion *motion, double time, double *row)
+{
+    const double *times = motion->times;
+    long piece = 0, after = motion->number;
+    while (after - piece > 1) {
+        long middle = (piece + after) / 2;
+        *(times[middle] <= time ? &piece : &after) = middle;
+    }
+    const double *rows = motion->rows + 2 * STEWART_REFERENCE * piece;
+    double h = times[piece + 1] - times[piece], share = (time - times[piece]) / h;
+    stewart_between(rows, rows + STEWART_REFERENCE, h, fmin(fmax(share, 0.), 1.), row);
+}
+
+static void rows_of_plan(void *about, int number, const double *times, double *rows)
+{
+    const stewart_law_in_loop *in = about;
+    for (int i = 0; i < number; i++)
+        row_at(&in->planned, in->now + times[i], rows + STEWART_REFERENCE * i);
+}
+
+static void rows_of_goal(void *about, int number, const double *times, double *rows)
+{
+    const stewart_law_in_loop *in = about;
+    for (int i = 0; i < number; i++)
+        row_at(&in->goal, in->now + times[i], rows + STEWART_REFERENCE * i);
+}
+
+static int step(void *about, long k, const stewart_sample *measured, double *torque, double *command)
 {
     stewart_law_in_loop *in = about;
-    stewart_sample sample = {.measurement = measurement, .reference = stewart_given_rows};
-    sample.about = in->previews + STEWART_REFERENCE * in->rows * k;
-    stewart_copy(2, in->weights + 2 * k, sample.weights);
-    if (!in->tuner) {
-        stewart_step(in->law, in->memory, in->scratch, &sample, torque);
-        return 0;
+    const stewart_field *sent = &in->law->layout.channel;
+    stewart_sample sample = *measured;
+    sample.reference = rows_of_plan, sample.goal = rows_of_goal, sample.about = in;
+    in->now = in->period * (double)k;
+    if (in->previews) {
+        sample.reference = stewart_given_rows;
+        sample.about = (void *)(in->previews + STEWART_REFERENCE * in->preview_rows * k);
     }
-    stewart_tuned_step(in->law, in->tuner, in->memory, in->tuner_memory, in->scratch, &sample,
-                       in->wanted + X * k, torque);
-    stewart_copy(2, sample.weights, in->weights + 2 * k);
-    stewart_newest_row(in->tuner, in->tuner_memory, in->kept + in->columns * k);
+    stewart_copy(2, in->weights + 2 * k, sample.weights);
+    if (in->tuner) {
+        stewart_tuned_step(in->law, in->tuner, in->memory, in->tuner_memory, in->scratch, &sample,
+                           in->wanted + X * k, torque);
+        stewart_copy(2, sample.weights, in->weights + 2 * k);
+        stewart_newest_row(in->tuner, in->tuner_memory, in->kept + in->columns * k);
+    } else {
+        stewart_step(in->law, in->memory, in->scratch, &sample, torque);
+    }
+    if (in->law->channel) /* the newest packet is its last */
+        torque = in->memory + sent->at + sent->rows * sent->columns - U * in->rows;
+    stewart_copy(U * in->rows, torque, command);
     return 0;
 }
 

@@ -44,37 +44,56 @@ typedef struct {
 /* Run under drives (number), the first from the start on. Returns how the run has ended. */
 int stewart_open_loop(stewart_run *run, const stewart_drive *drives, long number);
 
-/* The torque (6) for a measurement (12) at a sample. Returns 0, or 1 to end the run. */
-typedef int (*stewart_controller)(void *about, long sample, const double *measurement,
-                                  double *torque);
+/* Controller at a sample: writes its torque (6) without limit, and the command (rows, 6) that it sends.
+   The sample has measurement, age and report only. Returns 0, or 1 to end the run. */
+typedef int (*stewart_controller)(void *about, long number, const stewart_sample *sample,
+                                  double *torque, double *command);
 
 /* Connection of a controller and the plant. */
 typedef struct {
     long samples;             /* in the run */
     const double *sampled;    /* (samples) instants, s */
     double period;            /* by the controller's clock, s */
-    const double *delays;     /* (samples) of the torques, s */
-    const stewart_link *link; /* a wire */
+    const stewart_link *link; /* to the motors: a wire, or a buffer of packets */
     double *memory;           /* of the link */
+    const double *transit;    /* (samples) of the commands, s; infinite for a lost one */
+    int rows;                 /* torques of a command, 1 on a wire */
+    int repeats;              /* of them before that of the sample */
+    double delay;             /* of a buffer, from a sample to the action of its torque, periods */
     const double *noise;      /* (samples, 12), or NULL */
+    const stewart_link *back; /* a wire for measurements and reports, or NULL: without delay */
+    double *back_memory;
+    const double *back_transit; /* (samples) s; infinite for a lost measurement */
+    int reported;               /* periods of a report, 0 for none */
     double bias[STEWART_MOTORS]; /* added to the torque at the plant */
-    double *measured;         /* (samples, 12) result */
+    double *scratch;          /* 12 + 7 reported + 6 rows numbers */
+    double *measured;         /* (samples, 12) result: as the controller gets them */
     double *asked;            /* (samples, 6) result: torques without limit */
     long taken;               /* result: samples */
 } stewart_loop;
 
 int stewart_closed_loop(stewart_run *run, stewart_loop *loop, stewart_controller law, void *about);
 
+/* A motion in pieces: quintics between rows of 18 numbers. */
+typedef struct {
+    long number;         /* pieces */
+    const double *times; /* (number + 1) ascending, s */
+    const double *rows;  /* (number, 2, 18) at both ends of each piece */
+} stewart_motion;
+
 /* The law of law.h as the controller; its memories have been started. */
 typedef struct {
     const stewart_law *law;
     const stewart_tuner *tuner; /* NULL for fixed weights */
     double *memory, *tuner_memory, *scratch;
-    double *previews;     /* (samples, rows, 18) */
+    const double *previews; /* (samples, preview_rows, 18), or NULL for the motions */
+    stewart_motion planned, goal;
+    double period, now; /* s; `now` is set at each sample */
     const double *wanted; /* (samples, 12) reference, for a tuner */
     double *weights;      /* (samples, 2) given, or result of the tuner */
     double *kept;         /* (samples, columns) result: rows of the tuner's window */
-    long rows, columns;
+    long preview_rows, columns;
+    int rows; /* torques of a command */
 } stewart_law_in_loop;
 
 int stewart_closed_loop_of_law(stewart_run *run, stewart_loop *loop, stewart_law_in_loop *law);

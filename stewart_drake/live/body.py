@@ -13,9 +13,9 @@ from pydrake.systems.analysis import Simulator, SimulatorStatus
 from stewart_drake.dynamics.open_loop import Drive, IntegrationError, integrate
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.loop.bulk import LONGEST_STEP, SHARE
 from stewart_drake.loop.diagram import build_machine
 from stewart_drake.loop.exact import set_accuracy
-from stewart_drake.loop.native_loop import LONGEST_STEP, SHARE
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sensor import white_noise
 from stewart_drake.scenario.dependencies import Accepted, differing

@@ -1,32 +1,36 @@
-"""One run of many: how it ended, and no record of it.
+"""Many runs without Drake: loop, link, law and tuner in C (theory.md, section 32).
 
-It takes the loop of core/plant.c where that has all that the scenario asks for, and Drake's where
-it has not; both come to the same.
+A scenario that core/plant.h does not cover runs in Drake's loop, with the same results. A law or a
+tuner with parts in Python is called by the loop in C at each sample.
 """
 
 import dataclasses
 import json
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.core.library import core
+from stewart_drake.core.link import Link
+from stewart_drake.dynamics.native_plant import Ended, NativePlant
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.files.schema import plain
 from stewart_drake.law import core_law
 from stewart_drake.law.catch_up import CatchUp
-from stewart_drake.law.core_law import AnyMemory
+from stewart_drake.law.channel import Packets, Report
+from stewart_drake.law.core_law import CompiledLaw, CoreMemory
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.loop.controller import reported
 from stewart_drake.loop.law_design import (
     compose_law,
     first_queue,
@@ -34,187 +38,122 @@ from stewart_drake.loop.law_design import (
     sizing_of,
     way_onto,
 )
-from stewart_drake.loop.native_loop import (
-    Course,
-    InC,
-    InPython,
-    Instants,
-    instants_of,
-    run_loop,
-    uncovered,
-)
 from stewart_drake.loop.preparation import Experiment, assemble, network_of, prepare
 from stewart_drake.loop.results import Figures, SimulationResult, accumulated_error, figures
+from stewart_drake.loop.sensor import white_noises
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.loop.tuner import weights_source
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.dependencies import Accepted, differing
+from stewart_drake.scenario.link import (
+    SIMULTANEOUS,
+    forward_times,
+    measurement_times,
+    torque_delays,
+)
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.scenario.signals import NUM_STATE, POSE, TUNER_INPUTS, WEIGHTS
+from stewart_drake.scenario.signals import (
+    NUM_STATE,
+    NUM_TORQUES,
+    POSE,
+    TUNER_INPUTS,
+    WEIGHTS,
+)
+from stewart_drake.scenario.timing import event_time, instants, look_time
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.tuner.compiled import compiled_tuner
 from stewart_drake.tuner.source import Decision, WeightsSource
 from stewart_drake.types import Array
 
-MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
-"""What sets the weights of an experiment with such a law, None where they are fixed."""
-
+SHARE: Final = 0.1
+"""Tolerance of an integration step over the scenario's accuracy. Steps of order 8 are long: one
+digit more costs a sixth."""
+LONGEST_STEP: Final = np.inf
+"""s; the state is looked at every 20 ms whatever the steps."""
+COVERED: Final[Accepted] = {
+    "plant.kind": "exact",
+    "actuator.kind": "torque",
+    "sensor.kind": "state",
+    "sensor.faults": [],
+}
+"""Values of the fields that the loop in C covers."""
 _DRAWN: Final = (
-    ("plant", "payload_mass"),
-    ("plant", "torque_bias"),
-    ("plant", "joint_damping"),
+    *(("plant", name) for name in ("payload_mass", "torque_bias", "joint_damping")),
     ("plant", "coulomb_friction"),
-    ("sensor", "noise_std"),
-    ("sensor", "seed"),
+    *(("sensor", name) for name in ("noise_std", "seed", "loss")),
     ("actuator", "torque_limit"),
-    ("controller", "w_Q"),
-    ("controller", "w_R"),
+    *(("controller", name) for name in ("w_Q", "w_R", "delay_steps", "delay_fraction")),
 )
-"""Fields of a scenario that nothing here depends on; of the delay only what is believed counts."""
+"""Fields of a scenario without effect on a `Preparation`; the believed delay counts instead."""
+_PREPARATIONS: Final = 16
+"""Number of preparations that a process keeps."""
+_NODES: Final = 5e-3
+"""s between the nodes of a motion. Quintics between them are wrong by 1e-10 of the accelerations for
+a sine of 1 Hz."""
+_BEFORE: Final = 1e-12
+"""s before a node, where the values on its left side are taken."""
+
+MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
+"""Returns the tuner of an experiment with a law, or None for fixed weights."""
 
 
-class Prepared(NamedTuple):
-    """One run, ready to begin.
-
-    Attributes:
-        experiment: what is run.
-        law: of its torques.
-        planned: the motion that it follows.
-        previews: (k, p, 18) of it, for each sample.
-        tuner: what sets its weights, None where they are fixed.
-    """
-
-    experiment: Experiment
-    law: PredictiveLqi
-    planned: Trajectory
-    previews: Array
-    tuner: WeightsSource | None
-
-
-class Preparation:
-    """Of one scenario and all that differ from it in `_DRAWN` and in the true machine.
-
-    Args:
-        scenario: one of them.
+class Instants(NamedTuple):
+    """Instants of a run at which Drake's simulator records and samples.
 
     Attributes:
-        when: the instants of a run.
-        references: (n, 12) pose and rates that are wanted at its looks.
-
-    Raises:
-        ConfigError: as `prepare`.
+        nominal: (n,) s, of the record.
+        looks: (n,) s, at which the state is recorded.
+        on_grid: (n,) whether the metric counts each.
+        sampled: (n,) whether the controller samples at each.
+        samples: (k,) s, of the controller's samples.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
-        self._base = prepare(scenario)
-        self._sizing = sizing_of(self._base)
-        self._ways: dict[bytes, CatchUp | None] = {}
-        self._previews: dict[int, tuple[Trajectory, Array]] = {}
-        self.when: Instants = instants_of(scenario.duration, scenario.controller.period)
-        reference = self._base.reference
-        self.references = np.array([evaluate(reference, t)[:NUM_STATE] for t in self.when.looks])
-
-    def experiment(self, scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
-        """What `prepare` would return.
-
-        Raises:
-            ConfigError: the scenario's fields do not go together.
-        """
-        scenario.check()
-        true = self._base.truth if truth is None else truth
-        return self._base._replace(scenario=scenario, truth=true, network=network_of(scenario))
-
-    def prepared(self, experiment: Experiment, tuner: MakeTuner | None = None) -> Prepared:
-        """Law and previews as of `control_law`, which says what may go wrong.
-
-        A tuner takes the place of the scenario's.
-        """
-        law = compose_law(experiment, self._sizing)
-        queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
-        if queue not in self._ways:
-            self._ways[queue] = way_onto(experiment, law)
-        way, motion = self._ways[queue], experiment.reference
-        if way is not None:
-            sc = experiment.scenario
-            motion, _ = way.plan(sc.controller.catch_up, experiment.planned_limit)
-        source = (tuner or weights_source)(experiment, law)
-        return Prepared(experiment, law, motion, self._preview(motion, law), source)
-
-    def _preview(self, motion: Trajectory, law: PredictiveLqi) -> Array:
-        """(k, p, 18), as of `loop.controller.Reference`."""
-        if id(motion) not in self._previews:
-            times = np.maximum(0.0, self.when.samples[:, None] + law.preview_times)
-            rows = [[evaluate(motion, t) for t in ahead] for ahead in times]
-            self._previews[id(motion)] = motion, np.array(rows)  # kept, so that its id is
-        return self._previews[id(motion)][1]
+    nominal: Array
+    looks: Array
+    on_grid: NDArray[np.bool_]
+    sampled: NDArray[np.bool_]
+    samples: Array
 
 
-def preparation_of(scenario: Scenario) -> Preparation:
-    """That of a scenario, made once for all with which it has it in common.
-
-    Raises:
-        ConfigError: as `prepare`.
-    """
-    return _preparation(_Key(scenario))
-
-
-class _Key:
-    """A scenario that is equal to others where they have their preparation in common."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self.scenario = scenario
-        fields, believed = scenario_to_dict(scenario), believed_delay(scenario)
-        for section, name in _DRAWN:
-            del fields[section][name]
-        del fields["tuner"]
-        fields["delay"] = believed.steps, believed.fraction
-        fields["link"] = plain(scenario.assumed_link)
-        fields["controller"] |= {"delay_steps": None, "delay_fraction": None}
-        machines = scenario.mechanism, scenario.plant.mechanism
-        files = [resolve("mechanism", name) for name in machines if name is not None]
-        named = getattr(scenario.reference, "file", None), scenario.controller.calibration
-        files += [Path(name) for name in named if name is not None]
-        self._key = json.dumps(fields, default=str), *(_stamp(file) for file in files)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
+def instants_of(duration: float, period: float) -> Instants:
+    """Return the instants of a run, for its duration and the controller's period in s."""
+    recorded = list(instants(duration, period, None))
+    nominal = np.array([one.time for one in recorded])
+    early = event_time(period)
+    samples = np.append(0.0, early + early * np.arange(int(duration / period) + 2))
+    return Instants(
+        nominal=nominal,
+        looks=look_time(1.0) * nominal,
+        on_grid=np.array([one.on_grid for one in recorded]),
+        sampled=np.array([one.sampled for one in recorded]),
+        samples=samples[samples <= look_time(duration)],
+    )
 
 
-def _stamp(path: Path) -> tuple[int, int]:
-    """By which another content of a file shows."""
-    try:
-        found = path.stat()
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; expected a file") from None
-    return found.st_mtime_ns, found.st_size
-
-
-@lru_cache(maxsize=16)
-def _preparation(key: _Key) -> Preparation:
-    with one_blas_thread:
-        return Preparation(key.scenario)
+def uncovered(scenario: Scenario) -> str | None:
+    """Return the field of a scenario that needs Drake's loop, or None."""
+    found = differing(scenario, COVERED)
+    return found and found.field
 
 
 class Ending(NamedTuple):
-    """How a run ended.
+    """End of a run.
 
     Attributes:
         status: as of `loop.results.RunSummary`.
         stopped: when and why it did not complete, or None.
-        figures: what it came to.
-        counts: what went wrong and was survived, by name, as in the summary.
+        figures: figures of merit.
+        counts: number of survived problems by name, as in the summary.
         samples: (k, 18) at the controller's samples [measurement - reference (12); torque that the
             law asked for (6)], in rad, m, rad/s, m/s and N m.
-        error_so_far: E_ac in % s up to the end, wherever that was; NaN where nothing ran.
+        error_so_far: E_ac in % s up to the end, complete or not; NaN where nothing ran.
         weights: (k, 2) w_Q and w_R at the samples.
-        rows: (k, n) what a tuner's features keep of each sample (`tuner.features`); n = 0 where
-            there is no tuner, or Drake ran it.
-        loop: what ran it: `native`, or what else, and what of the scenario made it necessary;
-            nothing where the true machine cannot stand where the run begins.
+        rows: (k, n) row of the tuner's window for each sample (`tuner.features`); n = 0 without a
+            tuner, and in Drake's loop.
+        loop: `native`, or the other loop and the field that made it necessary; empty if the true
+            machine cannot take the start pose.
     """
 
     status: str
@@ -228,31 +167,479 @@ class Ending(NamedTuple):
     loop: str
 
 
+# ---------------------------------------------------------------- shared by runs
+
+
+class Prepared(NamedTuple):
+    """One run, ready to begin.
+
+    Attributes:
+        experiment: the experiment.
+        law: the control law.
+        planned: motion that it follows.
+        previews: (k, p, 18) rows of that motion at each sample.
+        tuner: tuner of the weights, None for fixed ones.
+        motions: pieces of `planned` and of the reference, see `pieces_of`, for a law that reads them
+            at any instant, else empty.
+    """
+
+    experiment: Experiment
+    law: PredictiveLqi
+    planned: Trajectory
+    previews: Array
+    tuner: WeightsSource | None
+    motions: tuple[tuple[Array, Array], ...] = ()
+
+
+class Preparation:
+    """Common part of the runs of all scenarios that differ in `_DRAWN` and the true machine only.
+
+    Args:
+        scenario: one of them.
+
+    Attributes:
+        when: instants of a run.
+        references: (n, 12) pose and rates of the reference at its looks.
+
+    Raises:
+        ConfigError: as `prepare`.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._base = prepare(scenario)
+        self._sizing = sizing_of(self._base)
+        self._ways: dict[bytes, CatchUp | None] = {}
+        self._previews: dict[int, tuple[Trajectory, Array]] = {}
+        self._motions: dict[int, tuple[Trajectory, Any]] = {}
+        self.when: Instants = instants_of(scenario.duration, scenario.controller.period)
+        reference = self._base.reference
+        self.references = np.array([evaluate(reference, t)[:NUM_STATE] for t in self.when.looks])
+
+    def experiment(self, scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
+        """Return the result of `prepare` for a scenario.
+
+        Raises:
+            ConfigError: the scenario's fields contradict each other.
+        """
+        scenario.check()
+        true = self._base.truth if truth is None else truth
+        return self._base._replace(scenario=scenario, truth=true, network=network_of(scenario))
+
+    def prepared(self, experiment: Experiment, tuner: MakeTuner | None = None) -> Prepared:
+        """Compose law, motion and tuner of a run; `tuner` replaces the scenario's.
+
+        Raises:
+            ConfigError: as `law_design.control_law`.
+        """
+        law = compose_law(experiment, self._sizing)
+        queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
+        if queue not in self._ways:
+            self._ways[queue] = way_onto(experiment, law)
+        way, motion = self._ways[queue], experiment.reference
+        if way is not None:
+            catch_up = experiment.scenario.controller.catch_up
+            motion, _ = way.plan(catch_up, experiment.planned_limit)
+        source = (tuner or weights_source)(experiment, law)
+        previews = self._preview(motion, law)
+        followed, motions = followed_motion(law, motion, experiment.reference), ()
+        if followed is not None:
+            motions = tuple(self._pieces(one, followed) for one in followed)
+        return Prepared(experiment, law, motion, previews, source, motions)
+
+    def _preview(self, motion: Trajectory, law: PredictiveLqi) -> Array:
+        """Return the rows (k, p, 18) of `loop.controller.Reference` at all samples."""
+        if id(motion) not in self._previews:  # kept with its motion, which keeps the id
+            times = np.maximum(0.0, self.when.samples[:, None] + law.preview_times)
+            rows = [[evaluate(motion, t) for t in ahead] for ahead in times]
+            self._previews[id(motion)] = motion, np.array(rows)
+        return self._previews[id(motion)][1]
+
+    def _pieces(
+        self, motion: Trajectory, followed: tuple[Trajectory, Trajectory]
+    ) -> tuple[Array, Array]:
+        if id(motion) not in self._motions:
+            c = self._base.scenario.controller
+            ahead = (c.delay_max or 0.0) + c.replan + 20 * c.period
+            ahead += believed_delay(self._base.scenario).eta(c.period)
+            pieces = pieces_of(motion, followed, self._base.scenario.duration + 2 * ahead)
+            self._motions[id(motion)] = motion, pieces
+        pieces: tuple[Array, Array] = self._motions[id(motion)][1]
+        return pieces
+
+
+def pieces_of(
+    motion: Trajectory, joints: tuple[Trajectory, ...], until: float
+) -> tuple[Array, Array]:
+    """Return a motion in quintic pieces: nodes (n + 1,) in s, rows (n, 2, 18) at their ends.
+
+    The joints of piecewise trajectories are nodes, with the accelerations of either side.
+    """
+    ends = [
+        t for one in joints if hasattr(one, "get_segment_times") for t in one.get_segment_times()
+    ]
+    inner = [t for t in ends if 0 < t < until]
+    times = np.unique([*np.linspace(0.0, until, int(until / _NODES) + 2), *inner])
+    rows = np.array([evaluate(motion, t) for t in times])
+    pieces = np.stack([rows[:-1], rows[1:]], axis=1)
+    for k in np.searchsorted(times, inner):
+        pieces[k - 1, 1] = evaluate(motion, times[k] - _BEFORE)
+    return times, pieces
+
+
+_prepared: dict[tuple[Any, ...], Preparation] = {}
+
+
+def preparation_of(scenario: Scenario) -> Preparation:
+    """Return the preparation of a scenario, made once for all scenarios that share it.
+
+    Raises:
+        ConfigError: as `prepare`.
+    """
+    key = _key(scenario)
+    if key not in _prepared:
+        with one_blas_thread:
+            made = Preparation(scenario)
+        while len(_prepared) >= _PREPARATIONS:
+            _prepared.pop(next(iter(_prepared)), None)
+        _prepared[key] = made
+    return _prepared[key]
+
+
+def _key(scenario: Scenario) -> tuple[Any, ...]:
+    """Return a key that is equal for scenarios with the same preparation."""
+    fields, believed = scenario_to_dict(scenario), believed_delay(scenario)
+    for section, name in _DRAWN:
+        del fields[section][name]
+    del fields["tuner"]
+    fields["delay"] = believed.steps, believed.fraction
+    fields["link"] = scenario.link.kind
+    machines = scenario.mechanism, scenario.plant.mechanism
+    files = [resolve("mechanism", name) for name in machines if name is not None]
+    named = getattr(scenario.reference, "file", None), scenario.controller.calibration
+    files += [Path(name) for name in named if name is not None]
+    return json.dumps(fields, default=str), *(_stamp(file) for file in files)
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """Return time and size of a file, which change with its content."""
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; expected a file") from None
+    return found.st_mtime_ns, found.st_size
+
+
+# ---------------------------------------------------------------- the loop in C
+
+
+class Course(NamedTuple):
+    """Record of a loop.
+
+    Attributes:
+        states: (n, 12) at the looks up to the end.
+        measured: (k, 12) at the samples, as the controller got them.
+        asked: (k, 6) torques in N m that the law asked for there.
+        sent: (k, 6) the same within the limit.
+        stopped: reason of an early end, or None.
+    """
+
+    states: Array
+    measured: Array
+    asked: Array
+    sent: Array
+    stopped: Failure | None
+
+
+class CompiledController:
+    """Law and tuner in C.
+
+    Args:
+        prepared: a run with a law that `law.core_law.uncovered` accepts.
+        tuner: of `tuner.compiled`, or None.
+        wanted: (k, 12) reference at each sample, for a tuner.
+
+    Attributes:
+        weights: (k, 2) of each sample, after the run.
+        rows: (k, n) of the tuner's window, after the run, see `Ending`.
+    """
+
+    def __init__(self, prepared: Prepared, tuner: Any, wanted: Array) -> None:
+        c, config = core(), prepared.experiment.scenario.controller
+        self._compiled = CompiledLaw(prepared.law)
+        self._memory = self._compiled.start(first_queue(prepared.experiment, prepared.law))
+        samples = len(prepared.previews)
+        self.weights, self.rows = (
+            np.tile([config.w_Q, config.w_R], (samples, 1)),
+            np.empty((samples, 0)),
+        )
+        self._tuned, scratch = np.empty(0), self._compiled.scratch
+        if tuner is not None:
+            self._tuned = np.empty(c.lib.stewart_tuner_memory(tuner.it))
+            c.lib.stewart_tuner_start(tuner.it, c.at(self._tuned))
+            row = self._tuned.copy()
+            columns = c.lib.stewart_newest_row(tuner.it, c.at(self._tuned), c.at(row))
+            self.rows = np.empty((samples, columns))
+            scratch = c.lib.stewart_tuned_step_scratch(self._compiled.data)
+        previews = np.ascontiguousarray(prepared.previews)
+        self._kept = prepared, tuner, previews, np.ascontiguousarray(wanted), np.empty(scratch)
+        motions = [(len(rows), c.at(times), c.at(rows)) for times, rows in prepared.motions]
+        planned, goal = motions or [(0, c.ffi.NULL, c.ffi.NULL)] * 2
+        self.data = c.ffi.new(
+            "stewart_law_in_loop *",
+            {
+                "law": self._compiled.data,
+                "tuner": c.ffi.NULL if tuner is None else tuner.it,
+                "memory": c.at(self._memory),
+                "tuner_memory": c.at(self._tuned),
+                "scratch": c.at(self._kept[4]),
+                "previews": c.ffi.NULL if prepared.motions else c.at(previews),
+                "planned": planned,
+                "goal": goal,
+                "period": config.period,
+                "wanted": c.at(self._kept[3]),
+                "weights": c.at(self.weights),
+                "kept": c.at(self.rows),
+                "preview_rows": previews.shape[1],
+                "columns": self.rows.shape[1],
+            },
+        )
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of survived problems by cause, after the run."""
+        fallbacks = int(self._tuned[2]) if len(self._tuned) else 0
+        counts = CoreMemory(self._memory, self._compiled).counts
+        return counts.summary() | {"tuner_fallbacks": fallbacks}
+
+
+Controller = Callable[[int, Measurement, Report | None], tuple[Array, Array]]
+"""(sample, measurement, report of the link) -> torque (6,) without limit, torques (n, 6) to send."""
+
+
+class PythonController:
+    """Law and tuner of which at least one has a part in Python, a `Controller`.
+
+    Attributes:
+        weights: (2,) of each sample.
+        rows: rows of the tuner's window, see `Ending`.
+    """
+
+    def __init__(self, prepared: Prepared, when: Instants, wanted: Array) -> None:
+        experiment, law = prepared.experiment, prepared.law
+        c = experiment.scenario.controller
+        self._prepared, self._when, self._wanted = prepared, when, wanted
+        self._followed = followed_motion(law, prepared.planned, experiment.reference)
+        self._served = core_law.serving(law).law
+        self._memory: Any = self._served.initial_memory(first_queue(experiment, law))
+        self._fixed = Decision(np.array([c.w_Q, c.w_R]), False)
+        source = prepared.tuner
+        self._tuned: Any = None if source is None else source.start(self._memory)
+        self.weights: list[Array] = []
+        self.rows: list[Array] = []
+
+    def __call__(
+        self, sample: int, measured: Measurement, report: Report | None
+    ) -> tuple[Array, Array]:
+        law, source = self._prepared.law, self._prepared.tuner
+        motion: Motion = Preview(law.preview_times, self._prepared.previews[sample])
+        if self._followed is not None:
+            motion = KnownMotion(*self._followed, self._when.samples[sample])
+        decision = self._fixed if source is None else source.decide(self._tuned)
+        after = self._served.step(self._memory, measured, motion, decision.weights, report)
+        if source is not None:
+            self._tuned = source.observe(self._tuned, decision, after, self._wanted[sample])
+            self.rows.append(self._tuned.window[-1])
+        self.weights.append(decision.weights)
+        self._memory = after
+        packets = isinstance(law.channel, Packets)
+        return after.torque, after.sent.packets[-1] if packets else after.torque[None]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of survived problems by cause, so far."""
+        fallbacks = 0 if self._tuned is None else self._tuned.fallbacks
+        return self._memory.counts.summary() | {"tuner_fallbacks": fallbacks}
+
+
+def run_loop(
+    experiment: Experiment,
+    when: Instants,
+    controller: CompiledController | Controller,
+    law: PredictiveLqi | None = None,
+) -> Course:
+    """Run an experiment to its end.
+
+    Args:
+        experiment: with a scenario that is not `uncovered`.
+        when: `instants_of` its duration and period.
+        controller: the controller.
+        law: its law, for packets and reports; without it single torques are sent.
+
+    Raises:
+        IntegrationError: no step is short enough for the accuracy.
+        As the controller.
+    """
+    sc, sensor, number = experiment.scenario, experiment.scenario.sensor, len(when.samples)
+    assert sensor.kind == "state"
+    truth, accuracy = experiment.true_dynamics(biased=False), SHARE * sc.plant.accuracy
+    plant = NativePlant(truth, experiment.start, when.looks, accuracy, LONGEST_STEP)
+    noise, c = np.array(sensor.noise_std), core()
+    drawn = noise * white_noises(sensor.seed, number) if noise.any() else None
+    packets = law.channel if law is not None and isinstance(law.channel, Packets) else None
+    link, memory, transit = _motor_link(experiment, law, packets, number)
+    reports = link.history if packets is not None and sc.link.acknowledged else 0
+    late = np.append(measurement_times(sc), np.full(number, np.inf))[:number]
+    size = NUM_STATE + (1 + NUM_TORQUES) * reports
+    longest = int(late.max(initial=0.0, where=np.isfinite(late)) / sc.controller.period) + 2
+    together = SIMULTANEOUS * sc.controller.period
+    back = Link(size, longest, sc.controller.period, wire=True, together=together)
+    back_memory = back.start()
+    rows, repeats = (1, 0) if packets is None else (_rows(packets), packets.repeats)
+    scratch = np.empty(size + NUM_TORQUES * rows)
+    measured, asked = np.empty((number, NUM_STATE)), np.empty((number, NUM_TORQUES))
+    loop = c.ffi.new(
+        "stewart_loop *",
+        {
+            "samples": number,
+            "sampled": c.at(when.samples),
+            "period": sc.controller.period,
+            "link": link.data,
+            "memory": c.at(memory),
+            "transit": c.at(transit),
+            "rows": rows,
+            "repeats": repeats,
+            "delay": sc.true_delay.periods,
+            "noise": c.at(drawn),
+            "back": back.data if late.any() else c.ffi.NULL,
+            "back_memory": c.at(back_memory),
+            "back_transit": c.at(late),
+            "reported": reports,
+            "bias": list(sc.plant.torque_bias),
+            "scratch": c.at(scratch),
+            "measured": c.at(measured),
+            "asked": c.at(asked),
+        },
+    )
+    if isinstance(controller, CompiledController):
+        controller.data.rows = rows
+        ended = plant.call("closed_loop_of_law", loop, controller.data)
+    else:
+        ended = _call_back(plant, loop, controller)
+    if ended == Ended.TOO_SHORT_STEPS:
+        raise IntegrationError(f"no step is short enough at t = {plant.time:.6g} s")
+    stopped = None
+    if ended == Ended.LEFT:
+        stopped = diagnose(experiment.truth, plant.time, plant.final[POSE])
+    measured, asked = measured[: loop.taken], asked[: loop.taken]
+    sent = np.clip(asked, -experiment.torque_limit, experiment.torque_limit)
+    return Course(plant.states[: plant.seen], measured, asked, sent, stopped)
+
+
+def _rows(packets: Packets) -> int:
+    return packets.repeats + packets.torques
+
+
+def _motor_link(
+    experiment: Experiment, law: PredictiveLqi | None, packets: Packets | None, number: int
+) -> tuple[Link, Array, Array]:
+    """Return the link to the motors, its memory at t = 0, and the transit times (number,) in s.
+
+    It is that of `loop.link`: a wire, or a play-out buffer.
+    """
+    sc, delay, config = (
+        experiment.scenario,
+        experiment.scenario.true_delay,
+        experiment.scenario.link,
+    )
+    period, queue = sc.controller.period, experiment.torques_in_flight(delay)
+    transit = np.full(number, delay.eta(period))
+    history, rows, holds = 1, 1, True
+    if config.kind == "network":
+        transit = np.append(forward_times(sc, number), np.full(number, np.inf))[:number]
+        history, holds = 1 if law is None else reported(law.kept), config.dry == "hold"
+        rows = 1 if packets is None else _rows(packets)
+        kept = (delay.steps + rows + 2) * rows + delay.queue_length
+    else:
+        if not sc.delay.constant:
+            drawn = torque_delays(sc)
+            transit = drawn[np.minimum(np.arange(number), len(drawn) - 1)]
+        kept = len(queue) + int(transit.max(initial=0.0) / period) + 2
+    link = Link(
+        *(NUM_TORQUES, kept, period),
+        wire=config.kind == "wire",
+        holds=holds,
+        history=history,
+        together=SIMULTANEOUS * period,
+        limit=experiment.torque_limit,
+    )
+    memory, first = link.start(), (delay.periods - len(queue)) * period
+    if len(queue):
+        link.assume(memory, first, queue[0])
+        link.begin(memory, first, queue)
+    return link, memory, transit
+
+
+def _call_back(plant: NativePlant, loop: Any, controller: Controller) -> Ended:
+    """Run with a controller in Python, and raise its exceptions."""
+    ffi, raised = core().ffi, list[BaseException]()
+
+    def numbers(pointer: Any, *shape: int) -> Array:
+        values = np.frombuffer(ffi.buffer(pointer, 8 * int(np.prod(shape))), np.float64)
+        return values.reshape(shape)
+
+    def step(_: object, number: int, sample: Any, torque: Any, command: Any) -> int:
+        try:
+            age = sample.age * loop.period
+            measured = Measurement.of(numbers(sample.measurement, NUM_STATE), age)
+            told, report = sample.report, None
+            if told != ffi.NULL:
+                acted = numbers(told.acted, told.periods, NUM_TORQUES).copy()
+                report = Report(numbers(told.arrived, told.packets) > 0, acted, told.age)
+            asked, sent = controller(number, measured, report)
+            numbers(torque, NUM_TORQUES)[:] = asked
+            numbers(command, loop.rows, NUM_TORQUES)[:] = sent
+        except BaseException as error:  # which cannot pass through C
+            raised.append(error)
+            return 1
+        return 0
+
+    called = ffi.callback("stewart_controller", step)
+    ended = plant.call("closed_loop", loop, called, ffi.NULL)
+    if raised:
+        raise raised[0]
+    return ended
+
+
+# ---------------------------------------------------------------- one run
+
+
 def run_in_bulk(
     scenario: Scenario, truth: Mechanism | None = None, tuner: MakeTuner | None = None
 ) -> Ending:
-    """Run a scenario, without a judgement beforehand.
+    """Run a scenario, without a stability verdict.
 
     Args:
         scenario: what to run.
-        truth: the machine to simulate where it is not the one that the controller knows.
-        tuner: what sets the weights, in the place of the scenario's; not for Drake's loop.
+        truth: the machine to simulate, that of the scenario's plant if None.
+        tuner: replaces the scenario's tuner; not for Drake's loop.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
         KeyboardInterrupt: Ctrl-C.
-        ValueError: a tuner of one's own where only Drake's loop can run the scenario.
+        ValueError: a `tuner` with a scenario that only Drake's loop can run.
     """
     only_drake = uncovered(scenario)
-    if only_drake is not None and tuner is not None:
-        raise ValueError(f"tuner: got one for Drake's loop ({only_drake}); expected None")
     if only_drake is not None:
+        if tuner is not None:
+            raise ValueError(f"tuner: got one for Drake's loop ({only_drake}); expected None")
         outside = _outside(assemble(scenario, truth))
         return outside or _in_drake(scenario, truth, only_drake)
     preparation = preparation_of(scenario)
     experiment = preparation.experiment(scenario, truth)
     try:
-        return _outside(experiment) or _in_c(preparation, preparation.prepared(experiment, tuner))
+        return _outside(experiment) or run_prepared(
+            preparation, preparation.prepared(experiment, tuner)
+        )
     except IntegrationError:
         if tuner is not None:
             raise
@@ -260,7 +647,7 @@ def run_in_bulk(
 
 
 def _outside(experiment: Experiment) -> Ending | None:
-    """The end of a run whose true machine cannot stand where it begins."""
+    """Return the end of a run whose true machine cannot take the start pose, else None."""
     failure = diagnose(experiment.truth, 0.0, experiment.start[POSE])
     if failure is None:
         return None
@@ -270,129 +657,60 @@ def _outside(experiment: Experiment) -> Ending | None:
     return Ending("left_workspace", failure, nothing, counts, samples, np.nan, weights, rows, "")
 
 
-class SampledLaw:
-    """The law of a prepared run, sample by sample, and the tuner that sets its weights, if any.
+def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
+    """Run a prepared run in C, with law and tuner in C if the core has all their parts.
 
-    Attributes:
-        memory: as of the last sample.
-        tuner: what the tuner remembers, None where weights are fixed.
-        weights: (2,) of each sample.
-        rows: what the tuner's features keep of each, see `Ending`.
+    Raises:
+        IntegrationError: as `run_loop`.
     """
-
-    def __init__(self, prepared: Prepared, when: Instants, wanted: Array) -> None:
-        experiment, law = prepared.experiment, prepared.law
-        c = experiment.scenario.controller
-        self._law, self._previews, self._when = law, prepared.previews, when
-        self._wanted, self._fixed = wanted, Decision(np.array([c.w_Q, c.w_R]), False)
-        self._followed = followed_motion(law, prepared.planned, experiment.reference)
-        self._served = core_law.serving(law).law
-        self.memory: AnyMemory = self._served.initial_memory(first_queue(experiment, law))
-        self._source = prepared.tuner
-        self.tuner = None if self._source is None else self._source.start(self.memory)
-        self.weights: list[Array] = []
-        self.rows: list[Array] = []
-
-    def torque(self, sample: int, measurement: Array) -> Array:
-        """The torque (6,) of a sample."""
-        motion: Motion = Preview(self._law.preview_times, self._previews[sample])
-        if self._followed is not None:
-            motion = KnownMotion(*self._followed, self._when.samples[sample])
-        measured, decision = Measurement.of(measurement), self._fixed
-        if self._source is not None and self.tuner is not None:
-            decision = self._source.decide(self.tuner)
-        after = self._served.step(self.memory, measured, motion, decision.weights)
-        if self._source is not None and self.tuner is not None:
-            wanted = self._wanted[sample]
-            self.tuner = self._source.observe(self.tuner, decision, after, wanted)
-            self.rows.append(self.tuner.window[-1])
-        self.weights.append(decision.weights)
-        self.memory = after
-        return after.torque
-
-
-def _in_c(preparation: Preparation, prepared: Prepared) -> Ending:
-    experiment, law, when = prepared.experiment, prepared.law, preparation.when
-    only_python, wanted = core_law.uncovered(law), preparation.references[when.sampled]
-    tuner = None if prepared.tuner is None else compiled_tuner(prepared.tuner)
-    known = followed_motion(law, prepared.planned, experiment.reference) is None
-    if only_python is None and known and (prepared.tuner is None) == (tuner is None):
-        c = experiment.scenario.controller
-        weights = np.array([c.w_Q, c.w_R])
-        queue = first_queue(experiment, law)
-        in_c = InC(law, queue, prepared.previews, weights, tuner, wanted)
-        course = run_loop(experiment, when, in_c)
-        ending = _ending(preparation, prepared, course, in_c.counts, "native")
-        taken = len(course.asked)
-        return ending._replace(weights=in_c.weights[:taken], rows=in_c.rows[:taken])
-    sampled = SampledLaw(prepared, when, wanted)
+    law, when, source = prepared.law, preparation.when, prepared.tuner
+    wanted = preparation.references[when.sampled]
+    field, tuner = core_law.uncovered(law), None if source is None else compiled_tuner(source)
+    loop, controller = "native", None
+    if field is not None:
+        loop = f"native, law in Python ({field})"
+    elif source is not None and tuner is None:
+        loop = "native, weights in Python (tuner.kind)"
+    else:
+        controller = CompiledController(prepared, tuner, wanted)
+    if controller is None:
+        controller = PythonController(prepared, when, wanted)
     with one_blas_thread:
-        course = run_loop(experiment, when, InPython(sampled.torque))
-    loop = "native, weights in Python (tuner.kind)"
-    if only_python is not None:
-        loop = f"native, law in Python ({only_python})"
-    elif not known:
-        loop = "native, reference in Python (controller.delay_estimator)"
-    fallbacks = 0 if sampled.tuner is None else sampled.tuner.fallbacks
-    counts = sampled.memory.counts.summary() | {"tuner_fallbacks": fallbacks}
-    ending = _ending(preparation, prepared, course, counts, loop)
-    if sampled.tuner is None:
-        return ending
-    return ending._replace(weights=np.array(sampled.weights), rows=np.array(sampled.rows))
-
-
-def _ending(
-    preparation: Preparation,
-    prepared: Prepared,
-    course: Course,
-    counts: dict[str, int],
-    loop: str,
-) -> Ending:
-    when, looked = preparation.when, len(course.states)
+        course = run_loop(prepared.experiment, when, controller, law)
+    experiment, looked = prepared.experiment, len(course.states)
     error = course.states[:, POSE] - preparation.references[:looked, POSE]
     grid, sampled = when.on_grid[:looked], when.sampled[:looked]
-    taken = int(sampled.sum())
-    experiment = prepared.experiment
+    time, taken, done = when.nominal[:looked][grid], int(sampled.sum()), course.stopped is None
+    asked, sent, measured = (x[:taken] for x in (course.asked, course.sent, course.measured))
+    weights, rows = (np.array(x[:taken]) for x in (controller.weights, controller.rows))
     found = figures(
-        when.nominal[:looked][grid],
-        error[grid],
-        experiment.scale,
-        error[sampled],
-        course.asked[:taken],
-        course.sent[:taken],
-        experiment.scenario.controller,
-        course.stopped is None,
+        *(time, error[grid], experiment.scale, error[sampled]),
+        *(asked, sent, experiment.scenario.controller, done),
     )
-    status = "completed" if course.stopped is None else "left_workspace"
-    wanted = preparation.references[:looked][sampled]
-    samples = np.hstack([course.measured[:taken] - wanted, course.asked[:taken]])
-    so_far = accumulated_error(when.nominal[:looked][grid], error[grid], experiment.scale)
-    c = experiment.scenario.controller
-    weights = np.tile([c.w_Q, c.w_R], (taken, 1))
-    rows = np.empty((taken, 0))
-    return Ending(status, course.stopped, found, counts, samples, so_far, weights, rows, loop)
+    return Ending(
+        status="completed" if done else "left_workspace",
+        stopped=course.stopped,
+        figures=found,
+        counts=controller.counts,
+        samples=np.hstack([measured - wanted[:taken], asked]),
+        error_so_far=accumulated_error(time, error[grid], experiment.scale),
+        weights=weights.reshape(taken, len(WEIGHTS)),
+        rows=rows.reshape(taken, rows.size // max(taken, 1)),
+        loop=loop,
+    )
 
 
 def _in_drake(scenario: Scenario, truth: Mechanism | None, field: str) -> Ending:
-    # A log of one's own period need not hold the samples.
-    result = simulate(
-        dataclasses.replace(scenario, log_period=None), true_mechanism=truth, judge_stability=False
-    )
+    whole = dataclasses.replace(scenario, log_period=None)  # a log with all samples
+    result = simulate(whole, true_mechanism=truth, judge_stability=False)
     if result.status == "interrupted":
         raise KeyboardInterrupt
     return ending_of(result, f"drake, {field}")
 
 
 def ending_of(result: SimulationResult, loop: str = "drake") -> Ending:
-    """How a simulation ended, whose log holds every sample, as it does by default."""
-    summary = result.summary
-    found = Figures(
-        accumulated_error=summary["accumulated_error"],
-        cost=summary["cost"],
-        peak_torque=summary["peak_torque"],
-        rms_torque=summary["rms_torque"],
-        torque_variation=summary["torque_variation"],
-    )
+    """Return the end of a simulation; its log must hold every sample, as it does by default."""
+    summary: dict[str, Any] = {**result.summary}
     samples, signals = samples_of(result), result.signals
     so_far, weights = np.nan, np.empty((0, len(WEIGHTS)))
     if signals.sizes["time"]:
@@ -400,22 +718,28 @@ def ending_of(result: SimulationResult, loop: str = "drake") -> Ending:
         so_far = accumulated_error(signals.time.values, signals.error.values, scale)
         at = result.scenario.controller.period * np.arange(len(samples))
         weights = signals.weights.sel(time=at, method="nearest").values
-    rows, counts = np.empty((len(samples), 0)), summary["counts"]
     return Ending(
-        result.status, result.stopped, found, counts, samples, so_far, weights, rows, loop
+        status=result.status,
+        stopped=result.stopped,
+        figures=Figures(*(summary[name] for name in Figures._fields)),
+        counts=summary["counts"],
+        samples=samples,
+        error_so_far=so_far,
+        weights=weights,
+        rows=np.empty((len(samples), 0)),
+        loop=loop,
     )
 
 
 def samples_of(result: SimulationResult) -> Array:
-    """(k, 18), see `Ending`, of a log that holds every sample."""
+    """Return the samples (k, 18) of an `Ending` from a log that holds every sample."""
     signals, sc = result.signals, result.scenario
     if not signals.sizes["time"]:
         return np.empty((0, len(TUNER_INPUTS)))
-    # Held signals show the value from an instant on, so that of k dt is T_k.
+    # The log has the signals from an instant on, hence T_k at k dt.
     number = int(float(signals.time.values[-1]) / sc.controller.period + 1e-9) + 1
     at = sc.controller.period * np.arange(number)
     kept = signals.sel(time=at, method="nearest")
     wanted = np.hstack([kept.reference, kept.reference_rates])
-    # Where the state is not measured its estimate stands for it.
     state = kept.measurement if sc.sensor.measures_state else kept.state_estimate
     return np.hstack([state - wanted, kept.torque_commanded])
