@@ -78,14 +78,14 @@ def resolve(kind: Kind, name_or_path: str | Path, relative_to: Path | None = Non
         if os.path.exists(path):
             return path
         raise ConfigError(f"{kind}: no file {str(path)!r}; shipped names: {_nearest(kind, '')}")
-    name = str(name_or_path)
-    if name not in shipped(kind):
+    name, (folder, suffix) = str(name_or_path), _PLACES[kind]
+    path = data_root() / folder / f"{name}{suffix}"
+    if not name or not path.exists():
         raise ConfigError(
             f"{kind}: got {name!r}; expected one of {_nearest(kind, name)}, or a path "
             "(with a slash, or ending in .yaml, .yml or .json)"
         )
-    folder, suffix = _PLACES[kind]
-    return data_root() / folder / f"{name}{suffix}"
+    return path
 
 
 def _nearest(kind: Kind, name: str) -> str:

@@ -90,8 +90,8 @@ _DRAWN: Final = (
 _PREPARATIONS: Final = 16
 """Number of preparations that a process keeps."""
 _NODES: Final = 5e-3
-"""s between the nodes of a motion. Quintics between them are wrong by 1e-10 of the accelerations for
-a sine of 1 Hz."""
+"""s between the nodes of a motion. Quintics between them have errors of 1e-10 in accelerations for
+a 1 Hz sine."""
 _BEFORE: Final = 1e-12
 """s before a node, where the values on its left side are taken."""
 
@@ -179,7 +179,7 @@ class Prepared(NamedTuple):
         planned: motion that it follows.
         previews: (k, p, 18) rows of that motion at each sample.
         tuner: tuner of the weights, None for fixed ones.
-        motions: pieces of `planned` and of the reference, see `pieces_of`, for a law that reads them
+        motions: pieces of `planned` and of the reference (`pieces_of`), for a law that reads them
             at any instant, else empty.
     """
 
@@ -413,7 +413,7 @@ class CompiledController:
 
 
 Controller = Callable[[int, Measurement, Report | None], tuple[Array, Array]]
-"""(sample, measurement, report of the link) -> torque (6,) without limit, torques (n, 6) to send."""
+"""(sample, measurement, report) -> torque (6,) without limit, torques (n, 6) to send."""
 
 
 class PythonController:
@@ -488,7 +488,9 @@ def run_loop(
     packets = law.channel if law is not None and isinstance(law.channel, Packets) else None
     link, memory, transit = _motor_link(experiment, law, packets, number)
     reports = link.history if packets is not None and sc.link.acknowledged else 0
-    late = np.append(measurement_times(sc), np.full(number, np.inf))[:number]
+    late = np.zeros(number)
+    if sensor.delay or sensor.loss or sc.link.back is not None:
+        late = np.append(measurement_times(sc), np.full(number, np.inf))[:number]
     size = NUM_STATE + (1 + NUM_TORQUES) * reports
     longest = int(late.max(initial=0.0, where=np.isfinite(late)) / sc.controller.period) + 2
     together = SIMULTANEOUS * sc.controller.period
@@ -666,18 +668,17 @@ def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
     law, when, source = prepared.law, preparation.when, prepared.tuner
     wanted = preparation.references[when.sampled]
     field, tuner = core_law.uncovered(law), None if source is None else compiled_tuner(source)
-    loop, controller = "native", None
-    if field is not None:
-        loop = f"native, law in Python ({field})"
-    elif source is not None and tuner is None:
-        loop = "native, weights in Python (tuner.kind)"
+    experiment = prepared.experiment
+    controller: CompiledController | PythonController
+    if field is None and (source is None) == (tuner is None):
+        loop, controller = "native", CompiledController(prepared, tuner, wanted)
+        course = run_loop(experiment, when, controller, law)
     else:
-        controller = CompiledController(prepared, tuner, wanted)
-    if controller is None:
-        controller = PythonController(prepared, when, wanted)
-    with one_blas_thread:
-        course = run_loop(prepared.experiment, when, controller, law)
-    experiment, looked = prepared.experiment, len(course.states)
+        python = f"law in Python ({field})" if field else "weights in Python (tuner.kind)"
+        loop, controller = f"native, {python}", PythonController(prepared, when, wanted)
+        with one_blas_thread:
+            course = run_loop(experiment, when, controller, law)
+    looked = len(course.states)
     error = course.states[:, POSE] - preparation.references[:looked, POSE]
     grid, sampled = when.on_grid[:looked], when.sampled[:looked]
     time, taken, done = when.nominal[:looked][grid], int(sampled.sum()), course.stopped is None

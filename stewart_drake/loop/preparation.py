@@ -111,8 +111,7 @@ class Experiment(NamedTuple):
     @property
     def motion_scale(self) -> Array:
         """(6,) rad and m: half the reference's peak to peak, STILL where it is constant."""
-        still = STILL * np.repeat([1.0, self.mechanism.crank_lengths.min()], 3)
-        return np.where(self.peak_to_peak > 0, self.peak_to_peak / 2, still)
+        return motion_scale(self.peak_to_peak, self.mechanism)
 
     @property
     def limits(self) -> Limits:
@@ -147,6 +146,12 @@ class Experiment(NamedTuple):
             if failure is not None:
                 return failure
         return None
+
+
+def motion_scale(peak_to_peak: Array, mechanism: Mechanism) -> Array:
+    """Return half the peak to peak (6,), rad and m, or STILL where that is 0."""
+    still = STILL * np.repeat([1.0, mechanism.crank_lengths.min()], 3)
+    return np.where(peak_to_peak > 0, peak_to_peak / 2, still)
 
 
 def check_instants(duration: float) -> Array:

@@ -3,6 +3,7 @@
 Moments of inertia may be left out; `mechanism.geometry` estimates them.
 """
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -167,9 +168,16 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism:
     Raises:
         ConfigError: one line naming the file, the field, its value and what is allowed.
     """
-    path, spec = resolve("mechanism", name_or_path), mechanism_spec(name_or_path)
+    path = resolve("mechanism", name_or_path)
+    found = path.stat()
+    return _load(path, found.st_mtime_ns, found.st_size)
+
+
+@lru_cache(maxsize=16)
+def _load(path: Path, *unchanged: int) -> Mechanism:
+    """Read a file once until its time or size changes: a Monte Carlo run takes milliseconds."""
     try:
-        return build_mechanism(spec)
+        return build_mechanism(mechanism_spec(path))
     except (UnreachablePoseError, ConfigError) as error:
         raise ConfigError(f"{path}: {error}") from None
 

@@ -19,13 +19,14 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import validate
 from stewart_drake.law.startup import INSTANTS
 from stewart_drake.loop.bulk import run_in_bulk
-from stewart_drake.loop.preparation import Experiment, assemble, simulated_machine
+from stewart_drake.loop.preparation import Experiment, motion_scale, simulated_machine
+from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
-from stewart_drake.scenario.trajectories import spread_instants
+from stewart_drake.scenario.trajectories import make_reference, peak_to_peak, spread_instants
 from stewart_drake.studies.runs import Outcome, outcome_of, run_file
 from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.workspace import rms, size_motors
@@ -153,9 +154,12 @@ def add_noise(variant: Variant, share: float) -> None:
     The only noise of encoders is that of their codes.
     """
     if share != 0 and variant.scenario.sensor.kind == "state":
-        moving = dataclasses.asdict(variant.scenario)
-        moving["reference"] = variant.fields["reference"]
-        motion = assemble(validate(Scenario, moving, "drawn")).motion_scale
+        sc, reference = variant.scenario, variant.scenario.reference
+        if (fields := variant.fields["reference"]) != dataclasses.asdict(reference):
+            whole = dataclasses.asdict(sc) | {"reference": fields}
+            reference = validate(Scenario, whole, "drawn").reference
+        span = peak_to_peak(reference, make_reference(reference, sc.duration), sc.duration)
+        motion = motion_scale(span, load_mechanism(sc.mechanism))
         sensor = variant.fields["sensor"]
         std = np.array(sensor["noise_std"]) + share * np.tile(motion, 2)
         sensor["noise_std"] = std.tolist()
@@ -189,9 +193,9 @@ def _lose(variant: Variant, share: float) -> None:
 
 def _seed_link(variant: Variant, seed: int) -> None:
     """Set the seed of drawn jitter and losses; an unchanged link keeps its seed."""
-    own = dataclasses.asdict(variant.scenario)
     for section, field in (("delay", "jitter_std"), ("link", "loss"), ("sensor", "loss")):
-        if variant.fields[section].get(field) != own[section].get(field):
+        own = getattr(getattr(variant.scenario, section), field, None)
+        if variant.fields[section].get(field) != own:
             variant.fields[section]["seed"] = seed
 
 
