@@ -3,14 +3,13 @@
 #include "arrivals.h"
 #include "short.h"
 
-#define FURTHEST ((real)1e3) /* s; up to there periods are told apart */
+#define FURTHEST ((real)1e3) /* s, up to which periods are counted */
 
 static real arrival(const stewart_arrivals *a, int i)
 {
     return ((real)i * a->period + a->eta) * (1 + a->rate);
 }
 
-/* Number of periods up to an instant. */
 static int periods(const stewart_arrivals *a, real end)
 {
     if (!(end > 0))
@@ -43,7 +42,7 @@ int stewart_within(const stewart_arrivals *a, int flights, const real *in_flight
 {
     const int number = 1 + stewart_switches(a, begin, end, newest, durations + 1);
     static const real none[U];
-    int own = 0; /* of the controller's torques that have arrived */
+    int own = 0; /* controller's torques that have arrived */
     durations[0] = begin;
     for (int k = 0; k < number; k++) {
         const real start = durations[k], *torque;

@@ -16,24 +16,24 @@
        a_i = (i dt + eta) (1 + r).
 
    It acts until the next one arrives. Torques sent before t = 0 act until the first of the
-   controller's own arrives: all that is known of them is what acts in each period from now on. */
+   controller's own arrives; they are known by the torque in each period from now on. */
 typedef struct {
     real period; /* dt, s */
     real eta;    /* of a torque that arrives now, s; infinite for none ever */
     real rate;   /* of eta, s/s */
-    int sent;    /* number of the newest torques in flight that are the controller's own */
-    int before;  /* number of periods for which it is known what acts without them */
-    const real *others; /* (before, 6) N m, of those; the last for good, and 0 without any */
+    int sent;    /* number of torques in flight that are the controller's own, the newest */
+    int before;  /* number of `others` */
+    const real *others; /* (before, 6) N m, the torque of each period without own ones; the last stays */
 } stewart_arrivals;
 
-/* Most torques that act one after the other up to an instant, s from now. */
+/* Upper bound of the torques in a schedule up to an instant, s from now. */
 int stewart_arrivals_most(const stewart_arrivals *arrivals, real end);
 
-/* Instants in (begin, end) at which another torque begins to act, ascending, and their number.
-   `newest` is i of the last torque: -1 at a sample that is to compute one, 0 after it. */
+/* Instants in (begin, end) at which another torque begins to act, ascending; returns their number.
+   `newest` is i of the last torque: -1 before a sample's torque is computed, 0 after it. */
 int stewart_switches(const stewart_arrivals *arrivals, real begin, real end, int newest, real *at);
 
-/* Torques (n, 6) that act between two instants, one after the other, their durations (n), and n.
-   `in_flight` (flights, 6) has the oldest first; all before the last `sent` do not count. */
+/* Torque schedule between two instants: torques (n, 6) and durations (n); returns n. `in_flight`
+   (flights, 6) has the oldest first; only the last `sent` count. */
 int stewart_within(const stewart_arrivals *arrivals, int flights, const real *in_flight, real begin,
                    real end, int newest, real *torques, real *durations);

@@ -35,12 +35,12 @@ SOURCES = sorted(str(path) for path in FOLDER.glob("*.c"))
 
 
 def source_hash() -> str:
-    """Return the hash of the library's source, which the library carries."""
+    """Return the hash of the library's source; the library contains it."""
     return _hash(sorted(FOLDER.glob("*.[ch]")))
 
 
 def equations_hash() -> str:
-    """Return the hash of what writes equations.h, which the file carries."""
+    """Return the hash of the sources that write equations.h; the file begins with it."""
     dynamics = FOLDER.with_name("dynamics")
     return _hash([*(dynamics / f"{name}.py" for name in GENERATORS), FOLDER / "layout.py"])
 
@@ -80,8 +80,8 @@ def system_compiler() -> list[str] | None:
 def compiler() -> list[str] | None:
     """Return the command of the system's C compiler, else of the package ziglang; None without.
 
-    Zig's builds run with glibc 2.28 and later. Its checks of undefined behaviour, which it has on
-    by default, need a library of their own.
+    Zig's builds run with glibc 2.28 and later. Its checks of undefined behaviour are off, since
+    they need another library.
     """
     found = system_compiler()
     if found is None and importlib.util.find_spec("ziglang") is not None:
@@ -92,7 +92,7 @@ def compiler() -> list[str] | None:
 
 
 def compile_library(target: Path = LIBRARY) -> str | None:
-    """Compile into a file. Return None, or in one line why that failed."""
+    """Compile into a file. Return None, or one line with the reason of a failure."""
     command = compiler()
     if command is None:
         return "no C compiler found; install one, or the Python package ziglang"

@@ -1,6 +1,6 @@
 /* The filter over state, parameters and the delay, xi = [x; theta; eta; eta_dot]: see delay.h.
 
-   eta is the delay of what arrives now,
+   eta is the delay of a torque that arrives now,
 
        eta_{k+1} = eta_k + dt eta_dot_k + noise,   eta_dot_{k+1} = eta_dot_k + noise,
 
@@ -179,9 +179,9 @@ static real between(real low, real high, real std)
    the pose by that for the rest of the period. It does so in this period if c + j is within it, j its
    error: next to a sample with the probability Phi.
 
-   What was in flight at t = 0 was held from unknown instants, phi dt off the samples. Held mean
-   torques of changes dT per period leave the rates off by B dT dt phi (1 - phi) / 2 at the samples,
-   of which the mean square is BEFORE (B dT dt)^2 for phi uniform in [0, 1]. */
+   Torques in flight at t = 0 began at unknown instants, phi dt off the samples. Mean torques of changes
+   dT per period leave the rates off by B dT dt phi (1 - phi) / 2 at the samples. For phi uniform in
+   [0, 1] the mean square is BEFORE (B dT dt)^2. */
 int stewart_period_late(const stewart_period *t, const real *xi, const real *state, real std,
                         real *K, int *others, stewart_scratch scratch)
 {
@@ -467,7 +467,7 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
             return 0;
         L = posterior;
     }
-    real less_sure = 0; /* the mean delay is not known better than the timing of what was heard */
+    real less_sure = 0; /* the mean delay is not known better than the timing of these torques */
     if (after->heard > 0)
         less_sure = (timing_of(d, after) - timing) / after->heard;
     if (!(less_sure > 0))

@@ -1,6 +1,7 @@
 /* See design.h. */
 
 #include "design.h"
+#include "kinematics.h"
 #include "observer.h"
 #include "short.h"
 
@@ -15,7 +16,7 @@ int stewart_order(const stewart_cost *cost, int pending)
 
        T_k = mean_k - (s_{k+1} - s_{k-1}) / 24                                              (hold)
 
-   and the rates there differ by -dt/24 B (s_{k-1} + s_k), which is no error. */
+   and the rates there differ by -dt/24 B (s_{k-1} + s_k), which feedback must not correct. */
 void stewart_hold(const stewart_machine *machine, const stewart_cost *cost, const real *theta,
                   int pending, const real *nodes, stewart_held *held)
 {
@@ -42,8 +43,8 @@ void stewart_hold(const stewart_machine *machine, const stewart_cost *cost, cons
         }
 }
 
-/* Takes from an error what held torques put there at the sample whose error is regulated; with B of
-   the model. From -dt B s / 12 at the beginning of a hold on, when the share x of it has passed: rates
+/* Subtract from an error the offset that held torques cause at the sample whose error is regulated; with
+   B of the model. From -dt B s / 12 at the beginning of a hold on, when the share x of it has passed: rates
    -dt B s (1/12 - x (1 - x) / 2), pose -dt^2 B s x (1 - x) (1 - 2 x) / 12. */
 static void subtract_offset(real period, real fraction, const stewart_held *held, const real *B,
                             real *error)

@@ -17,7 +17,7 @@ typedef struct {
     int feedforward;
 } stewart_cost;
 
-/* Held torques: of that which is still to act for a part of its hold, if any, and of the next. */
+/* Torques of the holds: of the pending one, if any, and of the next. */
 typedef struct {
     real torque[2][6], change[4][6]; /* changes over the same holds and a neighbour each */
 } stewart_held;
@@ -30,9 +30,9 @@ int stewart_order(const stewart_cost *cost, int pending);
 void stewart_hold(const stewart_machine *machine, const stewart_cost *cost, const real *theta,
                   int pending, const real *nodes, stewart_held *held);
 
-/* Linear model where a torque acts: A (12, 12), B (12, 6) of the error. `error` (12) there loses what
-   held torques put there, which is no error; `fraction` of a period is what the torque that is still
-   to act has left. Returns 0, or one of the causes of `stewart_status` for which there is none. */
+/* Linear model where a torque acts: A (12, 12), B (12, 6) of the error. The offset that held torques
+   cause is subtracted from `error` (12); the pending torque acts for another `fraction` of a period.
+   Returns 0, or the cause of failure, of `stewart_status`. */
 int stewart_linearize(const stewart_machine *machine, const real *theta, real period, real fraction,
                       const real *state, const stewart_held *held, real *A, real *B, real *error,
                       stewart_scratch scratch);

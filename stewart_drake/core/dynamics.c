@@ -1,4 +1,4 @@
-/* The dynamics of a mechanism: see dynamics.h. What is long is written by a program, in equations.h. */
+/* See dynamics.h. The long expressions are generated, in equations.h. */
 
 #include <string.h>
 
@@ -11,8 +11,8 @@
 #error "dynamics.h and equations.h are of different equations"
 #endif
 
-#define SUMS 28 /* numbers of `equations.Sums`, each triangle of a symmetric matrix once */
-#define COMMON (LEGS * LEG_NUMBERS) /* where the geometry goes on after the legs */
+#define SUMS 28 /* numbers of `equations.Sums`, symmetric matrices as triangles */
+#define COMMON (LEGS * LEG_NUMBERS) /* place of the numbers after those of the legs */
 
 /* `equations.slip` of six cranks. */
 static void slips(const real *crank_rates, const real *parameters, real *slip)
@@ -35,7 +35,7 @@ static void motion(const stewart_plant *plant, const real *pose, const real *rat
     for (int i = 0; i < SUMS; i++)
         for (int leg = 0; leg < LEGS; leg++)
             m->sums[i] += added[LEGS * i + leg];
-    /* They cost a tenth of all this, and nobody reads them without Coulomb friction. */
+    /* A tenth of the time, and only needed with Coulomb friction. */
     memset(m->slip, 0, sizeof m->slip);
     if (parameters[COULOMB] != 0)
         slips(m->rates, parameters, m->slip);

@@ -8,7 +8,7 @@
 #define STEWART_GEOMETRY 121 /* numbers of a machine, see core/layout.py */
 #define STEWART_MEASURES 8   /* of the workspace */
 
-/* A machine, and what is known of it. */
+/* A machine and its parameters. */
 typedef struct {
     const real *geometry;   /* STEWART_GEOMETRY numbers */
     const real *parameters; /* STEWART_PARAMETERS: torque biases (6, N m), payload (kg), .. */

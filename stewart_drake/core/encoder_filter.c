@@ -6,15 +6,15 @@
 
 #define MAX_ROWS 18 /* six legs at three nodes */
 #define ITERATIONS 6
-#define SMALL ((real)0.1) /* a correction of so many standard deviations needs no second iteration */
+#define SMALL ((real)0.1) /* standard deviations; a shorter correction ends the iterations */
 #ifdef STEWART_FLOAT
 #define ROUNDING ((real)1e-5) /* of a time, as a share of the period */
 #else
 #define ROUNDING 1e-9
 #endif
 
-/* Cut what acts (number) at instants (n) in s too, ascending and within it: `pieces` takes number + n of
-   torques and durations, and `places` (n) which piece ends at each instant. */
+/* Cut a schedule (number) at instants (n), ascending, in s. There is place for number + n torques and
+   durations; `places` (n) are the pieces that end at the instants. */
 static stewart_schedule cut(const stewart_schedule *schedule, int n, const real *instants,
                           real *torques, real *durations, real *places)
 {
@@ -93,8 +93,8 @@ static int along(Legs *s, const real *xi, stewart_scratch scratch)
     return 1;
 }
 
-/* Causes for which legs were left out in part or wholly. */
-static int left_out(const Legs *s, const int *there)
+/* Reasons for which values of legs were left out. */
+static int causes_of(const Legs *s, const int *there)
 {
     int causes = s->reading.missing ? STEWART_MISSING : 0;
     for (int leg = 0; leg < LEGS; leg++) {
@@ -153,7 +153,7 @@ static int rows_of_legs(void *model, const real *xi, real *e, real *H, stewart_s
         }
         if (!(2 * kept > given))
             return -1;
-        a->partly = left_out(s, there);
+        a->left_out = causes_of(s, there);
     }
     for (int row = 0; row < rows; row++) {
         if (!s->kept[row])
@@ -227,7 +227,7 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
         return 0;
     stewart_attempt_predicted(a);
     if (!a->values)
-        return 1;
+        return stewart_attempt_ended(a, scratch);
     stewart_read(s.encoders, a->values, s.shown, history->last, history->still, &s.reading, scratch);
     const stewart_kalman update = {a->n,     LEGS * s.encoders->nodes, ITERATIONS, a->prior->mean,
                                    a->prior->root, f->lower, f->upper, &s, rows_of_legs, settle_legs};

@@ -7,7 +7,7 @@
 #define ENOUGH ((real)0.3)  /* share of a leg's samples that are needed for it to count */
 #define STANDS_OUT 8        /* median absolute deviations by which a residual stands out (Hampel) */
 #define CURVED 3            /* the same in spans from the 10th to the 90th percentile */
-#define FINEST ((real)1e-7) /* rad; to so much the crank angles of the model itself are right */
+#define FINEST ((real)1e-7) /* rad, accuracy of the model's crank angles */
 #define LAST_FEW 9          /* samples that fix the angle at the last of them */
 #define PAIRS (LAST_FEW * (LAST_FEW - 1) / 2)
 
@@ -42,7 +42,7 @@ static void sort(int n, real *x)
         }
 }
 
-/* The share of sorted numbers (n), with a line between two of them. */
+/* Quantile of sorted numbers (n), interpolated. */
 static real quantile(int n, const real *sorted, real share)
 {
     const real place = share * (real)(n - 1);
@@ -79,7 +79,7 @@ static void jacobian_of_encoders(const stewart_sensing *sensing, const real *sta
 }
 
 /* Angle (rad) of a leg at the last sample; NaN for none. With more than M of them by the line through
-   the last few whose slope and height are medians (Theil and Sen): a few wrong ones do no harm. */
+   the last few whose slope and height are medians (Theil and Sen), robust to a few wrong ones. */
 static real last_angle(int N, const real *values, int leg)
 {
     real t[LAST_FEW], y[LAST_FEW], slopes[PAIRS];
@@ -101,9 +101,8 @@ static real last_angle(int N, const real *values, int leg)
     return median(number, y);
 }
 
-/* Pose by forward kinematics, rates as they are expected. To first order the pose is as uncertain as
-   the angles, P = J^-1 R J^-T. A leg that is silent is taken to be where it is expected, to within the
-   motion. */
+/* Pose by forward kinematics, with the expected rates. To first order its covariance is P = J^-1 R J^-T.
+   A silent leg has its expected angle, with the size of the motion as standard deviation. */
 static int start_of_encoders(const stewart_sensing *sensing, const real *values, const real *near,
                              real *state, real *root, stewart_scratch scratch)
 {
@@ -177,7 +176,7 @@ int stewart_encoder_fault(const stewart_encoders *encoders, const real *values)
     return fault_of_encoders(&sensing, NULL, 0, values, NULL);
 }
 
-/* How often the codes of a leg changed, since the last of the period before. */
+/* Number of changes of a leg's code since the last sample of the period before. */
 static int changes_of(const stewart_encoders *encoders, const real *values, const real *last, int leg)
 {
     real before = last[LEGS * (encoders->samples - 1) + leg];
@@ -204,7 +203,7 @@ void stewart_encoders_stood(const stewart_encoders *encoders, const real *values
     }
 }
 
-/* NaN in the place of those values of a leg that stand out of their period (Hampel); whether any do. */
+/* Replace outliers of a leg within a period (Hampel) by NaN. Returns whether there are any. */
 static int reject(const stewart_encoders *encoders, const real *shown, int leg, real *values,
                   stewart_scratch scratch)
 {

@@ -63,21 +63,17 @@ void stewart_attempt_predicted(stewart_attempt *a)
     for (int i = 0; i < X; i++)
         a->drift[i] = REAL(sqrt)(f->model_std[i] * f->model_std[i]
                                  + f->timing_std * f->timing_std * squares[i]);
-    if (!a->linear)
-        return;
-    stewart_copy(X, a->end, a->linear->end);
-    stewart_copy(X, a->drift, a->linear->drift);
-    stewart_copy(X * a->n, a->last, a->linear->H);
-    a->linear->exists = 1;
 }
 
 int stewart_attempt_ended(stewart_attempt *a, stewart_scratch scratch)
 {
     const int n = a->n;
     const stewart_posterior *after = a->after;
+    if (!a->values)
+        stewart_copy(n * n, a->prior->root, after->root);
     stewart_root_of_prediction(n, a->last, a->drift, after->root, scratch);
     stewart_copy(X, a->end, after->mean);
-    *after->partly = (real)a->partly;
+    *after->left_out = (real)a->left_out;
     return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
 }
 
@@ -126,7 +122,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
         return 0;
     stewart_attempt_predicted(a);
     if (!a->values)
-        return 1;
+        return stewart_attempt_ended(a, scratch);
     if (!stewart_seen_root(f->sensing, a->end, 0, NULL, a->drift, s.instant.C, scratch))
         return 0;
     const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
@@ -136,29 +132,13 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     return distance <= f->gate && stewart_attempt_ended(a, scratch); /* NaN is not */
 }
 
-/* The prediction `after` a period, from a prior, by the model alone; returns 0 where it is not finite. */
-static int go_on(int n, const stewart_posterior *prior, const stewart_linear *linear,
-                 stewart_posterior *after, stewart_scratch scratch)
+/* Compute `after`; the attempt may be repeated with other values or another prior. Returns 0 for an
+   outlier, or without a finite result. */
+static int attempt(stewart_attempt *a, stewart_scratch scratch)
 {
-    stewart_copy(n, prior->mean, after->mean);
-    stewart_copy(X, linear->end, after->mean);
-    stewart_copy(n * n, prior->root, after->root);
-    stewart_root_of_prediction(n, linear->H, linear->drift, after->root, scratch);
-    *after->partly = 0;
-    return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
-}
-
-/* Mean and root `after` a period and values; `linear`, unless it is NULL, is about the prior, and all
-   that is found without values. Returns 0 for an outlier, or where there is no finite result. */
-static int attempt(const stewart_filter *f, const stewart_interval *period,
-                   const stewart_posterior *prior, const real *values,
-                   const stewart_history *history, stewart_linear *linear,
-                   stewart_posterior *after, stewart_scratch scratch)
-{
-    stewart_attempt a = {.filter = f, .n = size_of(f), .period = period, .prior = prior,
-                         .values = values, .history = history, .linear = linear, .after = after};
-    stewart_copy(a.n, prior->mean, after->mean);
-    return f->legs ? f->legs->attempt(&a, scratch) : attempt_sample(&a, scratch);
+    a->left_out = 0;
+    stewart_copy(a->n, a->prior->mean, a->after->mean);
+    return a->filter->legs ? a->filter->legs->attempt(a, scratch) : attempt_sample(a, scratch);
 }
 
 int stewart_filter_start(const stewart_filter *filter, const real *values, const real *theta,
@@ -190,18 +170,17 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
     }
     stewart_copy(X, state, e.mean);
     stewart_fill(m, (real)NAN, e.outlier);
-    *e.outliers = *e.unseen = *e.partly = 0;
+    *e.outliers = *e.unseen = *e.left_out = 0;
     return 1;
 }
 
-/* Take over mean and root of an attempt. */
 static void accept(int n, int m, const stewart_posterior *found, stewart_posterior *now)
 {
     stewart_copy(n, found->mean, now->mean);
     stewart_copy(n * n, found->root, now->root);
     stewart_fill(m, (real)NAN, now->outlier);
     *now->outliers = *now->unseen = 0;
-    *now->partly = *found->partly;
+    *now->left_out = *found->left_out;
 }
 
 void stewart_filter_advance(const stewart_filter *filter, const stewart_interval *period,
@@ -213,20 +192,24 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
     stewart_posterior now = stewart_posterior_at(estimate, n, m);
     stewart_posterior after = stewart_posterior_at(first, n, m);
     stewart_posterior before = stewart_posterior_at(second, n, m);
-    stewart_linear linear = {.H = stewart_take(&scratch, X * n)};
     const real unseen = *now.unseen + 1, *theta = now.mean + X;
     real outliers = 1;
-    if (attempt(filter, period, &now, values, history, &linear, &after, scratch) && values) {
+    stewart_attempt a = {.filter = filter, .n = n, .period = period, .prior = &now,
+                         .values = values, .history = history, .after = &after};
+    if (values && attempt(&a, scratch)) {
         const int lost = *now.unseen >= STEWART_PATIENCE && !is_known(filter, now.root, LEARNT);
         if (!lost || !stewart_filter_start(filter, values, theta, after.mean, estimate, scratch))
             accept(n, m, &after, &now);
         return;
     }
+    a.prior = &before;
     if (values && *now.outliers > 0
         && stewart_filter_start(filter, now.outlier, theta, now.mean, second, scratch)
-        && attempt(filter, period, &before, values, history, NULL, &after, scratch))
+        && attempt(&a, scratch))
         outliers += *now.outliers;
-    const int alone = linear.exists && go_on(n, &now, &linear, &after, scratch);
+    a.prior = &now;
+    a.values = NULL;
+    const int alone = attempt(&a, scratch);
     if (values && (!alone || outliers >= STEWART_PATIENCE)
         && stewart_filter_start(filter, values, theta, alone ? after.mean : now.mean, estimate,
                                 scratch))
@@ -248,5 +231,5 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques)
     const int step = legs ? legs->scratch(filter, torques) : sample;
     const int within = step + stewart_transitions_scratch(p) + 2 * n * n + n;
     const int start = X * X + m + LEGS * (6 + p) + (legs ? legs->start_scratch(filter) : 0);
-    return 2 * stewart_posterior_size(n, m) + X * n + (within > start ? within : start);
+    return 2 * stewart_posterior_size(n, m) + (within > start ? within : start);
 }

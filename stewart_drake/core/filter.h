@@ -21,9 +21,9 @@ typedef struct {
     real *mean;     /* (n) */
     real *root;     /* L (n, n), covariance L L'; NaN where nothing is estimated */
     real *outlier;  /* (m) the last outlier, NaN without one */
-    real *outliers; /* how many in a row, up to the last measurement, agree with each other */
+    real *outliers; /* number in a row, up to the last measurement, that agree with each other */
     real *unseen;   /* periods since a measurement was last used */
-    real *partly;   /* why values of that were left out, bits as of `stewart_state_fault` */
+    real *left_out;   /* reasons for left-out values of that measurement, bits as of a `fault` */
 } stewart_posterior;
 
 int stewart_posterior_size(int n, int m);
@@ -48,20 +48,20 @@ typedef struct {
     const real *upper;
 } stewart_filter;
 
-/* What acted between two samples, as far as the delay is what it is believed to be. */
+/* Torques between two samples, under the assumed delay. */
 typedef struct {
     stewart_schedule schedule; /* with its substeps */
-    const real *following; /* (6) N m, acts next */
+    const real *following; /* (6) N m, the next torque */
 } stewart_interval;
 
-/* What was known of a sensor before a measurement; encoders look at it. */
+/* State of a sensor before a measurement, for encoders. */
 typedef struct {
     const real *last;  /* (m) the values before, NaN for nothing */
     const real *still; /* (6) periods of each leg without a change of code, with this one */
 } stewart_history;
 
-/* The estimate from values (m) alone, with parameters theta (p) for a guess; `near` (12) or NULL as of
-   `start` of the sensing. Returns 0 where they fix no state; the estimate then stays. */
+/* Estimate from values (m) alone, with first parameters theta (p); `near` (12) or NULL as of `start` of
+   the sensing. Returns 0 if they do not determine a state; the estimate then stays. */
 int stewart_filter_start(const stewart_filter *filter, const real *values, const real *theta,
                          const real *near, real *estimate, stewart_scratch scratch);
 
@@ -74,21 +74,20 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
 
    the iterated filter over one transition; one iteration is the extended Kalman filter.
 
-   A measurement that does not fit (an outlier, iterations that diverge) is left out, and the model
-   goes on alone. The plate may have been moved by hand, though: outliers that follow from one another
-   by the model show a plate, not a broken sensor, and after three of them, or where the model cannot
-   go on, the measurement is believed. So is the first one that fits after three or more periods
-   without any, if little of the parameters was known by then: linearised along a way that is only
-   guessed, the covariance means nothing. */
+   A measurement that does not fit (an outlier, or diverging iterations) is left out, and the model
+   predicts. If the plate was moved by hand, the outliers agree with each other under the model: after
+   three of them, or where the model has no finite prediction, the estimate starts again from the
+   measurement. So it does with the first measurement after three or more periods without any, if the
+   parameters are uncertain: linearised along a guessed path, the covariance is wrong. */
 void stewart_filter_advance(const stewart_filter *filter, const stewart_interval *period,
                             const real *values, const stewart_history *history, real *estimate,
                             stewart_scratch scratch);
 
-/* Numbers that both take at the most, for periods of so many torques. */
+/* Numbers of scratch memory for both, with `torques` in a period at the most. */
 int stewart_filter_scratch(const stewart_filter *filter, int torques);
 
-/* Changes (12) of the last state per s by which one of the changes of torque comes early, their squares
-   summed. To first order: for that time the acceleration differs by B dT, which stays in the rates, and
-   moves the pose for what is left of the period. */
+/* Sum over the changes of torque of the squared changes (12) of the last state, per s that the change
+   comes early. To first order the acceleration differs by B dT for that time; this stays in the rates
+   and moves the pose for the rest of the period. */
 void stewart_kicks(const stewart_machine *machine, const stewart_interval *period, const real *state,
                    const real *theta, real *squares);

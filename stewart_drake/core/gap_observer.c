@@ -1,21 +1,21 @@
-/* An observer whose filter looks back over gaps, see observers.h. Its memory has the estimate before the
-   gap too, and what acted since.
+/* An observer that corrects the estimate before a gap, see observers.h. Its memory has that estimate too,
+   and the torques since.
 
-   A filter that goes on without measurements linearises along a way that is only guessed: as long as
-   little is known of the parameters, its covariance is then worth nothing. So the estimate of the last
-   measurement is kept, and the next one corrects that, over all n periods at once:
+   A filter without measurements linearises along a guessed path: while the parameters are uncertain, its
+   covariance is then wrong. So the estimate of the last measurement is kept, and the next measurement
+   corrects it, over all n periods at once:
 
        y_k = h(f(x_{k-n}, T_{k-n} ... T_{k-1}, theta)) + noise,
 
-   linearised along the way that explains it. With q_p and q_v what one step of the model may be off in
-   pose and rates, n of them are off by
+   linearised along the corrected path. With q_p and q_v the standard deviations of the model's error in
+   pose and rates over one step, n steps have
 
        q_p^2 n + q_v^2 dt^2 (0^2 + 1^2 + ... + (n - 1)^2)   and   q_v^2 n. */
 
 #include "observing.h"
 #include "short.h"
 
-#define LONGEST_GAP 10 /* periods that are worth the time; after more the filter goes on by itself */
+#define LONGEST_GAP 10 /* periods; after more the filter continues from its prediction */
 
 static int estimated(const stewart_law *law) { return law->machine.estimated; }
 

@@ -8,7 +8,7 @@
 /* h(x) (m) of a state (12). */
 void stewart_seen(const stewart_sensing *sensing, const real *state, real *values);
 
-/* dh/dx (m, 12) at a state; nothing where that is the identity. */
+/* dh/dx (m, 12) at a state; not written where the state itself is measured. */
 void stewart_seen_jacobian(const stewart_sensing *sensing, const real *state, real *J);
 
 /* J A' (m, k) of changes A (k, 12) of the state. */
@@ -23,7 +23,7 @@ int stewart_seen_root(const stewart_sensing *sensing, const real *state, int k, 
 /* B (m, n) <- C^-1 B, C (m, m) lower triangular. */
 void stewart_whiten(int m, int n, const real *C, real *B);
 
-/* What is measured at the end of a period that begins in xi (n). */
+/* Measurement at the end of a period that begins in xi (n). */
 typedef struct {
     const stewart_sensing *sensing;
     const real *values; /* (m) */
@@ -39,6 +39,6 @@ typedef struct {
 } stewart_instant;
 
 /* `rows` and `settle` of a `stewart_kalman` whose model begins with a `stewart_instant`. A correction is
-   small if it is so beside the noise: what linearising leaves out is of second order. */
+   small relative to the noise, since the error of linearising is of second order. */
 int stewart_instant_rows(void *model, const real *xi, real *e, real *H, stewart_scratch scratch);
 int stewart_instant_settle(void *model, const real *xi, const real *better, stewart_scratch scratch);

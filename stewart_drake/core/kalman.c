@@ -143,14 +143,14 @@ static real clipped(real x, real lower, real upper)
     return x < lower ? lower : x > upper ? upper : x;
 }
 
-/* Components that are held at a bound. */
+/* Active set: components at a bound. */
 typedef struct {
     int number, at[MAX], upper[MAX];
     real value[MAX], push[MAX];
-} Held;
+} Active;
 
-/* push = P_hh^-1 (mean_h - value_h), after freeing those that are held back from inside their bounds. */
-static int pushed(Held *h, int n, const real *mean, const real *L, real *P)
+/* push = P_hh^-1 (mean_h - value_h), after releasing components that are pushed inwards. */
+static int pushed(Active *h, int n, const real *mean, const real *L, real *P)
 {
     while (h->number) {
         int least = 0;
@@ -189,7 +189,7 @@ int stewart_within_bounds(int n, const real *mean, const real *L, const real *lo
                           const real *upper, real *moved, stewart_scratch scratch)
 {
     real *along = stewart_take(&scratch, n), *P = stewart_take(&scratch, MAX * MAX);
-    Held h = {0};
+    Active h = {0};
     stewart_copy(n, mean, moved);
     for (int round = 0; round < 4 * MAX; round++) {
         int worst = -1, place = 0;

@@ -1,9 +1,9 @@
 /* See kinematics.h. */
 
-#include "dynamics.h"
 #include "kinematics.h"
 #include "short.h"
 
+#define DEAD_CENTRE_SINE ((real)0.01) /* core/layout.py */
 #define NEWTON_STEPS 50
 #define LEAST_STEP ((real)1e-3) /* share of Newton's */
 #define WRONG_BRANCH ((real)1e-5)
@@ -84,6 +84,47 @@ void stewart_crank_angles(const real *geometry, const real *pose, real *angles)
     }
 }
 
+int stewart_within_reach(const real *geometry, const real *pose, int strictly)
+{
+    const Turn turn = turn_of(pose);
+    for (int i = 0; i < LEGS; i++) {
+        const Leg leg = leg_of(geometry, i);
+        real arm[3], q[3];
+        joint_of(&leg, &turn, pose, arm, q);
+        const real rho = REAL(hypot)(q[0], q[1]), shortest = REAL(hypot)(rho - leg.crank, q[2]);
+        const real longest = REAL(hypot)(rho + leg.crank, q[2]);
+        const real margin = REAL(fmin)(leg.rod - shortest, longest - leg.rod);
+        if (!(strictly ? margin > 0 : margin >= 0)) /* or NaN */
+            return 0;
+    }
+    return 1;
+}
+
+real stewart_margin(const real *geometry, const real *pose, real sign, const real *least)
+{
+    real measures[STEWART_MEASURES], margin = (real)HUGE_VAL;
+    stewart_measures(geometry, pose, NULL, measures);
+    measures[6] *= sign;
+    for (int i = 0; i < STEWART_MEASURES; i++) {
+        const real above = measures[i] - least[i];
+        if (above < margin || isnan(above))
+            margin = above;
+    }
+    return margin;
+}
+
+int stewart_is_workable(const real *geometry, const real *pose)
+{
+    real measures[STEWART_MEASURES];
+    if (!stewart_within_reach(geometry, pose, 1))
+        return 0;
+    stewart_measures(geometry, pose, NULL, measures);
+    for (int i = 0; i < LEGS; i++)
+        if (measures[i] < DEAD_CENTRE_SINE)
+            return 0;
+    return 1;
+}
+
 /* row (6) = [(arm x along)' E, along'] / scale. */
 static void row_of(const Turn *turn, const real *arm, const real *along, real scale, real *row)
 {
@@ -119,7 +160,7 @@ int stewart_crank_jacobian(const real *geometry, const real *pose, real *J)
     return 1;
 }
 
-/* What is left of Newton's equations at a pose. */
+/* Residuals of Newton's equations at a pose. */
 typedef struct {
     Turn turn;
     real f[LEGS], arm[LEGS][3], along[LEGS][3]; /* p_TQ */
@@ -182,7 +223,7 @@ static int newton(const real *geometry, const real *angles, real *pose, stewart_
     /* Rounding limits the misfit to a few units in the last place; a failure is orders above. */
     if (!(at.largest <= 100 * TOLERANCE))
         return 0;
-    for (int i = 0; i < LEGS; i++) /* rod.tangent = -branch rho sin(delta) / l tells branches apart */
+    for (int i = 0; i < LEGS; i++) /* rod.tangent = -branch rho sin(delta) / l */
         if (legs[i].branch * dot(at.along[i], tangents[i]) > WRONG_BRANCH * legs[i].rod)
             return 0;
     return 1;

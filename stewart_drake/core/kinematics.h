@@ -2,6 +2,7 @@
 
 #pragma once
 
+#include "dynamics.h"
 #include "matrix.h"
 
 /* Leg i, with q = p_SQ_S from the shaft centre to the plate joint in the motor's frame, crank length u
@@ -15,6 +16,16 @@
 
 /* Crank angles (6) in rad at a pose (6); NaN where a leg does not reach. */
 void stewart_crank_angles(const real *geometry, const real *pose, real *angles);
+
+/* Whether all legs reach a pose; `strictly`: and can still move there. */
+int stewart_within_reach(const real *geometry, const real *pose, int strictly);
+
+/* Least distance of the measures of a pose above `least` (8); NaN if one of them is NaN. `sign` is that
+   of the parallel measure at home. */
+real stewart_margin(const real *geometry, const real *pose, real sign, const real *least);
+
+/* Whether a plate at a pose can be regulated: all legs are within reach, none at a dead centre. */
+int stewart_is_workable(const real *geometry, const real *pose);
 
 /* J (6, 6), rates of the cranks per rates of the pose. The rod keeps its length, so that
 

@@ -11,7 +11,7 @@
 
 #pragma once
 
-#define STEWART_REPORTED 10 /* periods of which a machine reports torques, at the most */
+#define STEWART_REPORTED 10 /* periods in a report of torques, at the most */
 
 #include "design.h"
 #include "observer.h"
@@ -47,7 +47,7 @@ typedef struct {
     stewart_field counts;
 } stewart_layout;
 
-/* Where the next torque acts, and how it comes about; what further ones would be, go on from there. */
+/* Prediction at the instant from which the next torque acts; a channel plans further torques from it. */
 typedef struct {
     real state[STEWART_STATES], error[STEWART_STATES], integral[6];
     real limited[STEWART_MOTORS]; /* the torque, as limited */

@@ -29,7 +29,7 @@ void stewart_link_start(const stewart_link *link, double *memory)
 
 const double *stewart_link_current(const double *memory) { return memory + STEWART_LINK_COMMANDS + 1; }
 
-/* `command` NULL is zero; it may be the one that acts. */
+/* Let a command act, NULL for zero. It may be the current one. */
 static void act(const stewart_link *link, double *memory, const double *command, double time)
 {
     const size_t size = (size_t)link->size * sizeof(double);
@@ -56,8 +56,8 @@ static void drop(const stewart_link *link, double *memory, double *row)
     memmove(row, waiting(link, memory) + width(link) * last, (size_t)width(link) * sizeof(double));
 }
 
-/* Keep a command, in the place of one that can never act any more because of it. Returns 0 where
-   there is no place. */
+/* Keep a command, replacing one that can no longer act because of it. Returns 0 if the memory is
+   full. */
 static int keep(const stewart_link *link, double *memory, double at, double sequence, double arrival,
                 const double *command)
 {
@@ -133,9 +133,8 @@ double stewart_link_next(const stewart_link *link, const double *memory)
     return next;
 }
 
-/* Of the commands whose time has come the newest acts, of those that have arrived by then. In a buffer
-   that is one for this very period. On a wire one that was overtaken never acts. All others of that
-   time are forgotten. */
+/* The newest command that is due and has arrived acts. In a buffer it must be due in this very period.
+   On a wire an overtaken command never acts. All other due commands are dropped. */
 void stewart_link_change(const stewart_link *link, double *memory, double time)
 {
     const double until = time + link->together;

@@ -54,7 +54,7 @@ void stewart_link_begin(const stewart_link *link, double *memory, double first, 
                         const double *commands);
 
 /* A plan (number, size) whose first command shall act at `first`, and the others a period later each.
-   On a wire only the first counts. `sequence` > 0 tells the newer of two plans. It is there from its
+   On a wire only the first counts. `sequence` > 0 orders plans by age. It is there from its
    `arrival` on, infinite for a lost one; commands that are to act before that, or before `now`,
    never do. Returns why it is of no use, or STEWART_LINK_TAKES. */
 int stewart_link_take(const stewart_link *link, double *memory, double now, double sequence,

@@ -9,7 +9,7 @@ from stewart_drake.core.library import core
 from stewart_drake.types import Array
 
 FULL: Final = 1
-"""What `Link.take` returns where too much waits already."""
+"""Result of `Link.take` if the memory is full."""
 
 
 class Link:
@@ -21,8 +21,8 @@ class Link:
         period: of a buffered command, in the unit of all times.
         wire: whether commands act when they arrive.
         holds: whether a dry buffer holds the last command, or puts out zero.
-        history: commands that have acted and are remembered.
-        together: instants so close to each other are one.
+        history: past commands that are kept.
+        together: greatest distance of simultaneous instants.
         limit: of each number of a command.
     """
 
@@ -44,18 +44,18 @@ class Link:
         self.data: Any = c.ffi.new("stewart_link *", values)
 
     def start(self) -> Array:
-        """Return the memory of a link on which nothing is under way."""
+        """Return the memory of an empty link."""
         memory = np.empty(self._lib.stewart_link_memory(self.data))
         self._lib.stewart_link_start(self.data, self._at(memory))
         return memory
 
     def assume(self, memory: Array, time: float, command: Array) -> None:
-        """Let a command (size,) act since a time."""
+        """Set the command (size,) that has acted since a time."""
         command = np.array(command, np.float64)
         self._lib.stewart_link_assume(self.data, self._at(memory), time, self._at(command))
 
     def begin(self, memory: Array, first: float, commands: Array) -> None:
-        """Put commands (n, size) under way that act at `first`, a period later and so on."""
+        """Send commands (n, size) that act at `first`, a period later and so on."""
         commands = np.array(commands, np.float64)
         given = first, len(commands), self._at(commands)
         self._lib.stewart_link_begin(self.data, self._at(memory), *given)
@@ -69,7 +69,7 @@ class Link:
         commands: Array,
         arrival: float = -math.inf,
     ) -> int:
-        """Take a plan (n, size), see core/link.h. Return 0, or why it is of no use."""
+        """Take a plan (n, size), see core/link.h. Return 0, or the reason for its refusal."""
         commands = np.array(commands, np.float64)
         given = now, sequence, arrival, first, len(commands), self._at(commands)
         return int(self._lib.stewart_link_take(self.data, self._at(memory), *given))
@@ -79,18 +79,18 @@ class Link:
         return float(self._lib.stewart_link_next(self.data, self._at(memory)))
 
     def change(self, memory: Array, time: float) -> None:
-        """Let act what acts from a time on."""
+        """Let the command act that is due at a time."""
         self._lib.stewart_link_change(self.data, self._at(memory), time)
 
     def safe(self, memory: Array, time: float, holds: bool) -> None:
-        """Forget what waits, and hold the last command or put out zero."""
+        """Drop waiting commands, and hold the last command or put out zero."""
         self._lib.stewart_link_safe(self.data, self._at(memory), time, holds)
 
     def acted(self, memory: Array) -> Array:
-        """Return a view (h, 1 + size) of what has acted, after its time, the newest first."""
+        """Return a view (h, 1 + size) of past commands, each after its time, the newest first."""
         begin = self._lib.STEWART_LINK_COMMANDS
         return memory[begin : begin + self.history * (1 + self.size)].reshape(self.history, -1)
 
     def number(self, memory: Array, name: str) -> float:
-        """Return a number of the memory by its name in core/link.h, such as `taken`."""
+        """Return a number of the memory by its name in core/link.h, for example `taken`."""
         return float(memory[getattr(self._lib, f"STEWART_LINK_{name.upper()}")])

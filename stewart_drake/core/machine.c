@@ -3,8 +3,7 @@
 #include "machine.h"
 #include "short.h"
 
-#define VIGOROUS 2
-#define DEAD_CENTRE_SINE ((real)0.01) /* dynamics/equations.py */
+#define FINER 2 /* times as many substeps beyond `coarse_torque` */
 
 void stewart_believe(const stewart_machine *machine, const real *theta, stewart_belief *belief)
 {
@@ -36,7 +35,7 @@ int stewart_substeps(const stewart_machine *machine, int number, const real *tor
 {
     for (int i = 0; i < U * number; i++)
         if (REAL(fabs)(torques[i]) > machine->gentle_torque)
-            return VIGOROUS * machine->substeps;
+            return FINER * machine->substeps;
     return machine->substeps;
 }
 
@@ -48,53 +47,7 @@ int stewart_at_limit(const stewart_machine *machine, int number, const real *tor
     return 0;
 }
 
-int stewart_within_reach(const real *geometry, const real *pose, int strictly)
-{
-    real sines[3], cosines[3];
-    for (int i = 0; i < 3; i++) {
-        sines[i] = REAL(sin)(pose[i]);
-        cosines[i] = REAL(cos)(pose[i]);
-    }
-    real cf = cosines[0], ct = cosines[1], cp = cosines[2], sf = sines[0], st = sines[1];
-    real sp = sines[2];
-    real R[3][3] = {{cp * ct, cp * st * sf - sp * cf, cp * st * cf + sp * sf},
-                    {sp * ct, sp * st * sf + cp * cf, sp * st * cf - cp * sf},
-                    {-st, ct * sf, ct * cf}};
-    for (int leg = 0; leg < 6; leg++) {
-        const real *own = geometry + leg;
-        real crank = own[0], rod = own[6], p[3], q[3];
-        for (int i = 0; i < 3; i++) {
-            p[i] = pose[3 + i] - own[6 * (15 + i)];
-            for (int j = 0; j < 3; j++)
-                p[i] += R[i][j] * own[6 * (12 + j)];
-        }
-        for (int j = 0; j < 3; j++) { /* in the motor's frame, whose axes are columns */
-            q[j] = 0;
-            for (int i = 0; i < 3; i++)
-                q[j] += own[6 * (3 + 3 * j + i)] * p[i];
-        }
-        real rho = REAL(hypot)(q[0], q[1]), shortest = REAL(hypot)(rho - crank, q[2]);
-        real longest = REAL(hypot)(rho + crank, q[2]);
-        real margin = rod - shortest < longest - rod ? rod - shortest : longest - rod;
-        if (!(strictly ? margin > 0 : margin >= 0)) /* or NaN */
-            return 0;
-    }
-    return 1;
-}
-
-int stewart_is_workable(const real *geometry, const real *pose)
-{
-    real measures[STEWART_MEASURES];
-    if (!stewart_within_reach(geometry, pose, 1))
-        return 0;
-    stewart_measures(geometry, pose, NULL, measures);
-    for (int i = 0; i < 6; i++)
-        if (measures[i] < DEAD_CENTRE_SINE)
-            return 0;
-    return 1;
-}
-
-/* On by one torque, from a state in its place. */
+/* Advance a state by one torque. */
 static void move(const stewart_belief *belief, const real *torque, real duration, int substeps,
                  real *state)
 {
@@ -130,7 +83,7 @@ void stewart_predict(const stewart_machine *machine, const real *theta, const st
     }
 }
 
-/* -dF/d[state, torque, theta] of the equations, times the inverse mass matrix: (6, 18 + p). */
+/* right (6, 18 + p) <- -M^-1 dF/d[state, torque, theta] of the equations F. */
 static int of_equations(const stewart_machine *machine, const stewart_belief *belief,
                         const real *state, const real *torque, int p, real *right,
                         stewart_scratch scratch)

@@ -1,4 +1,4 @@
-/* What the controller knows of a machine, and the motion of its plate under known torques. */
+/* The controller's model of a machine, and the motion of its plate under known torques. */
 
 #pragma once
 
@@ -16,11 +16,11 @@ typedef struct {
     real parameters[STEWART_PARAMETERS]; /* as they are known beforehand */
     real gravity;                        /* m/s^2 */
     real torque_limit;                   /* of each motor, N m; infinite for none */
-    real gentle_torque;                  /* N m, beyond which twice as many substeps are taken */
+    real gentle_torque;                  /* N m, limit beyond which substeps are twice as many */
     int substeps;                        /* Runge-Kutta steps per torque */
     int estimated;                       /* p */
     int place[STEWART_MAX_ESTIMATED];    /* of each in `parameters`, or -1 */
-    const real *map; /* (6, 6), or NULL: accelerations = map (torque + bias), whatever the pose */
+    const real *map; /* (6, 6), or NULL: accelerations = map (torque + bias) at any pose */
 } stewart_machine;
 
 /* Torque schedule: torques that act one after the other, each for its duration. */
@@ -45,12 +45,6 @@ int stewart_substeps(const stewart_machine *machine, int number, const real *tor
 
 /* Whether any of the torques is at the limit or beyond. */
 int stewart_at_limit(const stewart_machine *machine, int number, const real *torques);
-
-/* Whether every leg can be closed at a pose; `strictly`: and still be moved. */
-int stewart_within_reach(const real *geometry, const real *pose, int strictly);
-
-/* Whether a plate at a pose can be regulated: all legs are within reach, none at a dead centre. */
-int stewart_is_workable(const real *geometry, const real *pose);
 
 /* Second derivative (6) of the pose of a state (12) under torques (6). */
 void stewart_accelerate(const stewart_belief *belief, const real *state, const real *torque,

@@ -1,4 +1,4 @@
-/* A channel of packets: each sample sends a plan, of which the buffer at the machine plays what comes. */
+/* A channel of packets: each sample sends a plan, and the buffer at the machine plays what arrives. */
 
 #include "law.h"
 #include "short.h"
@@ -27,8 +27,8 @@ static void network_update(const stewart_law *law, real *memory, const stewart_r
                            in_flight, scratch);
 }
 
-/* The torques (N, 6) of this sample and of further ones, if all went as predicted: the machine as it is
-   believed to be goes on from where the prediction ended, and is regulated by the same gain. */
+/* Plan the torques (N, 6) of this sample and of further ones: the model continues from the end of the
+   prediction, under feedback with the same gain. */
 static void plan_ahead(const stewart_law *law, const stewart_outlook *outlook, const stewart_ahead *ahead,
                        const real *newest, real *plan, stewart_scratch scratch)
 {

@@ -118,7 +118,7 @@ void stewart_filtered_restart(const stewart_law *law, real *memory)
     stewart_fill(X, (real)NAN, e.mean);
     stewart_fill(n * n, (real)NAN, e.root);
     stewart_fill(law->measured, (real)NAN, e.outlier);
-    *e.outliers = *e.unseen = *e.partly = 0;
+    *e.outliers = *e.unseen = *e.left_out = 0;
     stewart_fill(LEGS, 0, memory + stewart_filtered_memory(law) - LEGS);
 }
 
@@ -200,7 +200,7 @@ int stewart_filtered_observe(const stewart_law *law, real *memory, int number, c
         return STEWART_MEASUREMENT_FROZEN;
     }
     return *e.outliers > 0 ? STEWART_MEASUREMENT_REJECTED
-                           : (fault | (int)*e.partly) << STEWART_CAUSES_AT;
+                           : (fault | (int)*e.left_out) << STEWART_CAUSES_AT;
 }
 
 int stewart_filtered_scratch(const stewart_law *law)

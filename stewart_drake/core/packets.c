@@ -6,8 +6,8 @@
 #include "packets.h"
 #include "short.h"
 
-/* The law changes its mind only for what is so many times as probable as what was decided. A change
-   makes it correct what it thinks has gone wrong, and correct that again if it has not. */
+/* Ratio of probabilities from which a torque in flight is replaced. Each replacement makes the law
+   correct, and a wrong one makes it correct again. */
 #define SURE 2
 /* Probability of a packet that is later than any, so that no report is impossible. */
 #define LEAST ((real)1e-9)
@@ -71,14 +71,14 @@ typedef struct {
     real *evidence;     /* (n) c_i */
     real *absent;       /* (n) probability that it had not arrived by the report if it is not lost */
     real *states;       /* (burst + 1) */
-} course;
+} Evidence;
 
-static int there(const course *c, int i) { return c->newest[-i] > 0; }
+static int there(const Evidence *c, int i) { return c->newest[-i] > 0; }
 
-static course weigh(const stewart_packets *p, int known, const real *arrived, int since, int last,
+static Evidence condition(const stewart_packets *p, int known, const real *arrived, int since, int last,
                     stewart_scratch *scratch)
 {
-    course c = {known, arrived + known - 1, stewart_take(scratch, known), stewart_take(scratch, known),
+    Evidence c = {known, arrived + known - 1, stewart_take(scratch, known), stewart_take(scratch, known),
                 stewart_take(scratch, known), stewart_take(scratch, p->burst + 1)};
     /* An arrived packet ends all bursts: newer packets do not depend on older ones. */
     int relevant = (last + p->torques < known ? last + p->torques : known) - 1;
@@ -112,7 +112,7 @@ static course weigh(const stewart_packets *p, int known, const real *arrived, in
 
 /* Probability that packet i, if it is not lost, is not in time for T_{k-1-d} where it has a row for
    it; else that it had not arrived by the report. */
-static real lateness(const stewart_packets *p, const course *c, int i, int d)
+static real lateness(const stewart_packets *p, const Evidence *c, int i, int d)
 {
     const int row = i - d + p->repeats, has_row = row >= 0 && row < p->repeats + p->torques;
     const real least = there(c, i) ? 0 : LEAST;
@@ -123,7 +123,7 @@ static real lateness(const stewart_packets *p, const course *c, int i, int d)
     return late < c->absent[i] ? late : c->absent[i];
 }
 
-static void sources(const stewart_packets *p, const course *c, int d, real *chances)
+static void sources(const stewart_packets *p, const Evidence *c, int d, real *chances)
 {
     real *newer = c->states, share = begins(p), none = 0;
     for (int a = 0; a <= p->burst; a++)
@@ -145,7 +145,7 @@ static void sources(const stewart_packets *p, const course *c, int d, real *chan
 int stewart_packet_chances(const stewart_packets *p, int known, const real *arrived, int since,
                            int last, int d, real *chances, stewart_scratch scratch)
 {
-    const course c = weigh(p, known, arrived, since, last, &scratch);
+    const Evidence c = condition(p, known, arrived, since, last, &scratch);
     sources(p, &c, d, chances);
     return c.n;
 }
@@ -210,7 +210,7 @@ void stewart_packets_update(const stewart_packets *p, real *memory, const stewar
     last = last < number - 1 ? last : number - 1;
     if (!known)
         return; /* all torques are from before the first sample */
-    const course c = weigh(p, known, arrived + kept - known, since, last, &scratch);
+    const Evidence c = condition(p, known, arrived + kept - known, since, last, &scratch);
     real *chances = stewart_take(&scratch, c.n + 1);
     for (int d = (last < known ? last : known) - 1; d >= 0; d--) {
         real *flying = newest - U * d;

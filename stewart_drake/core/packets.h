@@ -1,4 +1,4 @@
-/* What the controller believes to be in flight over a network. */
+/* The controller's belief about torques in flight over a network. */
 
 #pragma once
 
@@ -19,11 +19,11 @@ typedef struct {
     const real *arrived_by; /* (kept) the same after 0, 1, ... periods */
 } stewart_packets;
 
-/* What came with a measurement. */
+/* Report that came with a measurement. */
 typedef struct {
-    int packets;         /* of which it tells, the newest first */
+    int packets;         /* in the report, the newest first */
     const real *arrived; /* whether the one sent i + 1 samples before has arrived, 1 or 0 */
-    int periods;         /* of which it tells, the newest first */
+    int periods;         /* in the report, the newest first */
     const real *acted;   /* (periods, 6) torque that acted i + 1 periods before, N m */
     int age;             /* periods since that sample */
 } stewart_report;
@@ -55,6 +55,6 @@ void stewart_packets_send(const stewart_packets *packets, real *memory, const re
    known: packets that were sent so far, of those that are remembered.
    arrived: (known) whether each is known to have arrived, the newest last.
    since: periods since the last report.
-   last: number of torques of which a source is asked for, > d. */
+   last: number of torques of the query, > d. */
 int stewart_packet_chances(const stewart_packets *packets, int known, const real *arrived, int since,
                            int last, int d, real *chances, stewart_scratch scratch);

@@ -1,5 +1,6 @@
 /* Plans: see planning.h. */
 
+#include "kinematics.h"
 #include "planning.h"
 #include "reference.h"
 #include "short.h"
@@ -18,11 +19,6 @@
 /* Share of the motion by which a prediction is off, when the delay was just found and else. */
 #define SURPRISE ((real)0.02)
 #define OFF ((real)0.08)
-/* Limits of the measures of the workspace: dynamics/workspace.py. */
-#define DEAD_CENTRE_SINE ((real)0.01)
-#define SINGULARITY_LIMIT ((real)1e-3)
-#define PITCH_LIMIT ((real)1.4835298641951802)
-
 /* ---- the model ---------------------------------------------------------------------------------- */
 
 static void move(const void *about, const real *torque, real h, real *state)
@@ -57,12 +53,10 @@ void stewart_plant_model(const stewart_plant *plant, real sign, stewart_model *m
 
 static int is_inside(const stewart_model *model, const real *pose)
 {
-    real measures[STEWART_MEASURES];
-    stewart_measures(model->geometry, pose, NULL, measures);
-    for (int i = 0; i < 6; i++)
-        if (!(measures[i] > DEAD_CENTRE_SINE)) /* or NaN */
-            return 0;
-    return model->sign * measures[6] > SINGULARITY_LIMIT && measures[7] > -PITCH_LIMIT;
+    static const real least[STEWART_MEASURES] = { /* dynamics/workspace.py */
+        (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)1e-3,
+        (real)-1.4835298641951802};
+    return stewart_margin(model->geometry, pose, model->sign, least) > 0;
 }
 
 /* The longest that a leg reaches, crank and rod in line, m. */

@@ -35,13 +35,12 @@ void stewart_plant_model(const stewart_plant *plant, real sign, stewart_model *m
    after it. */
 void stewart_plan_times(real begin, real period, int periods, real times[3]);
 
-/* Pieces of a plan over so many periods, and scratch memory to make it. */
+/* Pieces of a plan over a number of periods, and scratch memory for it. */
 int stewart_plan_pieces(real period, int periods);
 int stewart_plan_scratch(real period, int periods);
 
-/* Plan over so many periods from a state (12) onto the reference, whose rows (3, 18) are those at
-   `stewart_plan_times`. Returns the number of pieces, 0 where there is no such plan; `peak` is the
-   largest torque. */
+/* Plan from a state (12) onto the reference, with its rows (3, 18) at `stewart_plan_times`. Returns the
+   number of pieces, 0 without a plan; `peak` is the largest torque. */
 int stewart_plan_way(const stewart_model *model, const real *start, real begin, real period, int periods,
                  const real *rows, real *pieces, real *peak, stewart_scratch scratch);
 
@@ -50,8 +49,8 @@ int stewart_plan_way(const stewart_model *model, const real *start, real begin, 
 int stewart_predicted_pieces(const stewart_model *model, const stewart_schedule *schedule,
                              const real *states, real begin, real *pieces);
 
-/* Whether a predicted state (12) is so far off the one that is wanted that a new plan is worth while,
-   for a motion of a size (6), peak to peak; `found`: whether the delay has just been found. */
+/* Whether a predicted state (12) is far enough off the wanted one for a new plan; `size` (6) is that of
+   the motion, peak to peak; `found`: whether the delay has just been found. */
 int stewart_is_off(const real *size, const real *state, const real *wanted, int found);
 
 /* The row of a way at an instant. Before a piece the pose goes on the straight line that its first

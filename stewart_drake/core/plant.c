@@ -13,19 +13,6 @@
 
 const char *stewart_source(void) { return SOURCE; }
 
-double stewart_margin(const double *geometry, const double *pose, double sign, const double *least)
-{
-    double measures[STEWART_MEASURES], margin = HUGE_VAL;
-    stewart_measures(geometry, pose, NULL, measures);
-    measures[6] *= sign;
-    for (int i = 0; i < STEWART_MEASURES; i++) {
-        const double above = measures[i] - least[i];
-        if (above < margin || isnan(above))
-            margin = above;
-    }
-    return margin;
-}
-
 void stewart_steps(const stewart_plant *plant, long number, const double *state,
                    const double *torques, const double *h, double *states)
 {

@@ -6,15 +6,12 @@
 
 #pragma once
 
+#include "kinematics.h"
 #include "link.h"
 #include "tuner.h"
 
 /* Hash of the source that this library was compiled from. */
 const char *stewart_source(void);
-
-/* Least distance of the measures of a pose above `least` (8); NaN if one of them is NaN. `sign` is that
-   of the parallel measure at home. */
-double stewart_margin(const double *geometry, const double *pose, double sign, const double *least);
 
 /* States (number, 12) after Runge-Kutta steps of h (number) seconds under torques (number, 6). */
 void stewart_steps(const stewart_plant *plant, long number, const double *state,
@@ -29,7 +26,7 @@ typedef struct {
     double tolerance, longest, end;       /* error of a step; longest step, s; end of the run, s */
     long number;                          /* instants at which the state is wanted */
     const double *times;                  /* (number) ascending, s */
-    double *states;                       /* (number, 12) result, of which `seen` are known */
+    double *states;                       /* (number, 12) result; the first `seen` are known */
     long seen;
     double time, state[STEWART_STATES];
     long steps, evaluations;

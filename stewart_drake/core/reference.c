@@ -1,10 +1,11 @@
 /* See reference.h. */
 
+#include "kinematics.h"
 #include "reference.h"
 #include "short.h"
 
 #define FURTHER ((real)1.25) /* times as far as to its rest, a continued motion stays within reach */
-#define DOUBLINGS 6          /* of the rate at which it comes to rest, at the most */
+#define DOUBLINGS 6          /* of the rate of coming to rest, at the most */
 #define CATCH_UP ((real)0.3) /* s, of a way back */
 
 void stewart_between(const real *from, const real *to, real h, real s, real *row)
@@ -20,7 +21,7 @@ void stewart_between(const real *from, const real *to, real h, real s, real *row
     }
 }
 
-/* The reference `later` s after a row of it (negative: before). It comes to rest with the rate w:
+/* The reference `later` s after a row of it (negative: before). It decays to rest at the rate w:
    da/dt = -2 w a - w^2 v, of accelerations a and rates v. That is (2 v + a / w) / w away; w doubles
    until the plate could go FURTHER. With b = a + w v:  v(t) = (v + b t) exp(-w t). */
 static void continued(const real *geometry, const real *from, real later, real w, real *row)

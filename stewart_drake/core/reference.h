@@ -33,11 +33,11 @@ void stewart_interpolate(const stewart_preview *reference, real time, real *row)
 void stewart_complete(const real *geometry, real period, real eta, const stewart_preview *given,
                       real since, const stewart_preview *last, real *rows);
 
-/* The way back over so many holds of h seconds and `queue` torques in flight. */
+/* Begin a way back from an offset, with `queue` torques in flight. */
 void stewart_begin_way_back(const real *offset, real period, int queue, stewart_way_back *way);
 
-/* The rest of it, one hold later. */
+/* Advance by one hold. */
 void stewart_go_on_way_back(stewart_way_back *way, real period);
 
-/* Adds the offset `time` s after its beginning to a row. */
+/* Add the offset at `time` s from the beginning to a row. */
 void stewart_add_offset(stewart_way_back way, real period, real time, real *row);

@@ -1,10 +1,9 @@
 /* The way back onto the reference, planned in flight.
 
-   When the prediction is far off the reference, as where the delay has just been found or has jumped,
-   feedback of a large error through a long delay is no good way back. What the torques in flight do
-   cannot be changed; from the instant on from which the next one acts, a plan leads back onto the
-   reference. What is followed is the predicted way, then the plan, then the reference: there is no error
-   left to feed back, and the integral begins anew. */
+   When the prediction is far off the reference, for example after the delay was found or has jumped,
+   feedback of a large error through a long delay responds badly. From the instant at which the next
+   torque acts, a plan leads back onto the reference. The law follows the predicted motion, then the
+   plan, then the reference: the error is zero, and the integral starts again. */
 
 #pragma once
 

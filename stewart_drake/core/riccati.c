@@ -134,7 +134,8 @@ static void solve_upper(int n, const real *L, real *X)
     }
 }
 
-/* (R + B'P B) K = B'P A, with PA = P A and L L' = R + B'P B; returns 0 where there is no K. */
+/* (R + B'P B) K = B'P A, with PA = P A and L L' = R + B'P B; returns 0 if that is not positive
+   definite. */
 static int gain(int n, const real *A, const real *B, const real *P, const real *R, real *PA,
                 real *L, real *K, stewart_scratch scratch)
 {
@@ -194,8 +195,7 @@ static int double_once(int n, const real *A, const real *B, const real *Q, const
     return 1;
 }
 
-/* H from A_1, G_1 and H_1 in the place of A, G and H, of which A and G are lost: the number of
-   doublings, or 0.
+/* H <- its limit, from A_1, G_1 and H_1; A and G are overwritten. Returns the number of doublings, or 0.
 
    P - H_k = A_k' P (I + G_k P)^-1 A_k: no digit of P is missing once |A_k|^2 is that small. */
 static int doubled(int n, real *A, real *G, real *H, stewart_scratch scratch)

@@ -11,7 +11,7 @@
    x'Px, or NULL. A (n, n), B (n, 6), Q (n, n), R (6, 6) by rows; Q and R are symmetric, n is 6, 12,
    18 or 24.
 
-   Returns the number of doublings, or 0 where there is no stabilising solution, or none was found.
+   Returns the number of doublings, or 0 if no stabilising solution was found.
    Scratch: `stewart_lqr_scratch` numbers. */
 int stewart_lqr(int n, const real *A, const real *B, const real *Q, const real *R, real *K, real *P,
                 stewart_scratch scratch);

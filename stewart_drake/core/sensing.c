@@ -1,11 +1,12 @@
 /* See sensing.h. */
 
+#include "kinematics.h"
 #include "sensing.h"
 #include "short.h"
 
-#define MOVED ((real)1e-3)     /* share of the motion that a pose goes within a period to have moved */
-#define NOISY ((real)1048576)  /* noise of so many units in the last place repeats once in a million */
-#define SIGMAS 6               /* by which rates may be off without saying that anything moved */
+#define MOVED ((real)1e-3)     /* share of the motion within a period that counts as moved */
+#define NOISY ((real)1048576)  /* units in the last place; larger noise repeats once in a million */
+#define SIGMAS 6               /* standard deviations of rates that do not prove a motion */
 #define STEEPEST ((real)1.5707963267948966) /* rad; beyond, other angles are the same pose */
 
 static int start_of_state(const stewart_sensing *sensing, const real *values, const real *near,

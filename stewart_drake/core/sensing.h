@@ -1,10 +1,10 @@
-/* What is measured, y = h(x) + noise: its model, how to begin from it, what of it is no use. */
+/* Models of sensors, y = h(x) + noise: prediction, first estimate and faults. */
 
 #pragma once
 
 #include "machine.h"
 
-/* Causes for which the model stands in for a measurement or for a part of it. */
+/* Faults of a measurement or of a part of it. */
 enum { STEWART_MISSING = 1, STEWART_FROZEN = 2, STEWART_REJECTED = 4 };
 
 /* A sensor. Values (m) that are missing are NaN.

@@ -59,7 +59,7 @@ void stewart_servo_start(const stewart_servo *servo, real *memory, const real *c
     take_estimate(servo, memory);
 }
 
-/* The torques that acted over so many periods, from a report; how many, 0 where it does not tell. */
+/* Read the torques of a number of periods from a report. Returns their number, 0 if it lacks them. */
 static int read_report(const stewart_servo *servo, const real *report, int periods, real *torques,
                        int *saturated)
 {
@@ -75,8 +75,8 @@ static int read_report(const stewart_servo *servo, const real *report, int perio
     return servo->law.parts * periods;
 }
 
-/* Moves the observer to a measurement, of which the report tells what acted since the one before. Where
-   that got lost too, the observer begins anew. */
+/* Advance the observer to a measurement, with the reported torques since the one before. Without that
+   report the observer restarts. */
 static int observe(const stewart_servo *servo, real *memory, const stewart_sample *sample,
                    const real *report, int periods, stewart_scratch scratch)
 {

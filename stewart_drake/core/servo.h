@@ -31,7 +31,7 @@ typedef struct {
    a law for torques remembers do not count. */
 typedef struct {
     stewart_law law;
-    int periods; /* rows of a report: so many reports less one may be lost without losing what they said */
+    int periods; /* rows of a report; `periods` - 1 reports in a row may be lost without loss of data */
     int memory;  /* numbers of the memory, and the place of each field: `stewart_servo_prepare` */
     stewart_servo_layout layout;
 } stewart_servo;

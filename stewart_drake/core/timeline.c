@@ -1,4 +1,4 @@
-/* A delay that is known: which torque acts when, and what the motors let through. See law.h. */
+/* Torque schedules under a known delay, and the limit of the motors. See law.h. */
 
 #include "law.h"
 #include "short.h"
@@ -21,8 +21,7 @@ int stewart_limit(const stewart_machine *machine, const real *torque, real *limi
     return saturated;
 }
 
-/* What acts in whole periods that begin with the oldest of `periods` + 1 torques: with a fraction each
-   torque acts for the end of one period and the beginning of the next. */
+/* With a fraction each torque acts for the end of one period and the beginning of the next. */
 stewart_schedule stewart_schedule_of(const stewart_law *law, int periods, const real *torques,
                                  stewart_scratch *scratch)
 {
@@ -42,7 +41,7 @@ void stewart_last_periods(const stewart_law *law, int number, const real *torque
 {
     const int queue = stewart_queue_length(law);
     const real *first = torques + U * (number - queue - periods);
-    if (law->parts > 0) { /* what acts next the motors decide: the last torque stands for it */
+    if (law->parts > 0) { /* the motors decide the next torque; use the last one */
         real *durations = stewart_take(scratch, number);
         stewart_fill(number, law->period / (real)law->parts, durations);
         *schedule = (stewart_schedule){number, torques, durations, 0};
@@ -51,7 +50,7 @@ void stewart_last_periods(const stewart_law *law, int number, const real *torque
         return;
     }
     *schedule = stewart_schedule_of(law, periods, first, scratch);
-    if (following) /* without a delay it is still to be computed: no change is known */
+    if (following) /* without a delay it is not computed yet: assume no change */
         *following = queue > 0 ? first + U * periods : first + U * (periods - 1);
 }
 

@@ -22,7 +22,7 @@
 
 #define N STEWART_WINDOW
 #define MODEL_ERROR ((real)2e-4) /* law/filter_settings.py */
-#define HUGEST ((real)1e6)       /* of what has no limit, in units of what is usual */
+#define HUGEST ((real)1e6)       /* bound of unbounded quantities, in their usual sizes */
 #define SIGNED_LIMIT ((real)1e6)
 #define LOWEST ((real)-6) /* logarithms among the features */
 #define HIGHEST ((real)4)
@@ -40,7 +40,7 @@ enum {
     ERROR, FEEDBACK, CHANGE, SURPRISE, MISSED, LATE, LATE_WEIGHT, EARLY, EARLY_WEIGHT, RATIO, DOUBT,
     ACTED, HEALTH_ROW = ACTED + U
 };
-enum { SURPRISE_PEAK = 11 }; /* place of the feature that the rule goes by */
+enum { SURPRISE_PEAK = 11 }; /* feature of the rule */
 
 static int columns_of(const stewart_tuner *t) { return t->health ? HEALTH_ROW : X + U; }
 
@@ -113,7 +113,7 @@ static real density(const stewart_tuner *t, const real *window, int column)
 
 /* ---- health ----------------------------------------------------------------------------------- */
 
-/* Sum of a column over rows `first` to `last`, counted from the newest, of what is known. */
+/* Sum of the known numbers of a column over rows `first` to `last`, counted from the newest. */
 static real sum_of(const real *window, int column, int first, int last, int *known)
 {
     real sum = 0;
@@ -141,7 +141,7 @@ static real newest(const real *window, int column)
     return isnan(x) ? 0 : x;
 }
 
-/* tau in s over so many rows, 0 where it cannot be outlook from none; `weight` is d's column after n's. */
+/* tau in s over a number of rows, 0 if not significant; the column of d is after that of n. */
 static real timing(const real *window, int column, int number)
 {
     real squares = 0, excess = 0;
@@ -296,7 +296,7 @@ static void innovate(const stewart_law *law, const real *before, const real *aft
     stewart_copy(U, last, acted);
 }
 
-/* x . y, 0 where that is no number. */
+/* x . y, 0 if that is not finite. */
 static real known_product(const real *x, const real *y)
 {
     real sum = 0;
