@@ -21,13 +21,13 @@ import stewart_drake as sd
 from stewart_drake.reporting.document import number
 from stewart_drake.reporting.terminal import count_bar
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.studies.families import Family, disturbed_family, paper_grid, with_gain
 from stewart_drake.studies.jobs import run_jobs
 from stewart_drake.studies.runs import read_outcome, run_scenario
 from stewart_drake.tuner.network import save_network
 from stewart_drake.tuning.data import make_data
+from stewart_drake.tuning.evaluation import HINDSIGHT, TUNER, Evaluation, evaluate
+from stewart_drake.tuning.families import Family, disturbed_family, paper_grid, with_gain
 from stewart_drake.tuning.training import Training, train
-from stewart_drake.tuning.worth import HINDSIGHT, TUNER, Worth, evaluate
 
 WORKERS = 2
 CELLS = size("CELLS", 16)
@@ -89,9 +89,9 @@ def unseen(condition: str) -> Family:
     return disturbed_family(base(condition), SCENARIOS, 0, "evaluation")
 
 
-def evaluations(folder: Path) -> dict[str, dict[str, Worth]]:
+def evaluations(folder: Path) -> dict[str, dict[str, Evaluation]]:
     """By condition, then by network."""
-    found: dict[str, dict[str, Worth]] = {}
+    found: dict[str, dict[str, Evaluation]] = {}
     for condition in BASES:
         for name in NETWORKS:
             with bar(condition) as progress:
@@ -105,7 +105,7 @@ def evaluations(folder: Path) -> dict[str, dict[str, Worth]]:
     return found
 
 
-def beyond(folder: Path, condition: str, grid: Worth) -> list[str]:
+def beyond(folder: Path, condition: str, grid: Evaluation) -> list[str]:
     """What gains outside the grid would add, as lines of text."""
     cells = [one.scenario for one in unseen(condition).conditions.values()]
     jobs = {
@@ -177,7 +177,7 @@ def row(name: str, one: dict[str, Any]) -> list[str]:
     ]
 
 
-def evaluation_section(condition: str, found: dict[str, Worth], extra: list[str]) -> str:
+def evaluation_section(condition: str, found: dict[str, Evaluation], extra: list[str]) -> str:
     """The fixed gains, and each network on the scenarios that it and they complete."""
     first = next(iter(found.values())).summary
     header = ["w_Q / w_R", "failures", "mean E_ac", "95 %", "worst"]

@@ -17,11 +17,11 @@ from _page import RESULTS, size
 
 from stewart_drake.files.versions import versions
 from stewart_drake.scenario.config import AnnTunerConfig, RuleTunerConfig, Scenario
-from stewart_drake.studies.families import FAULTS, fault_of, faulty_family, with_gain
 from stewart_drake.studies.jobs import run_jobs
 from stewart_drake.tuner.source import weights_of
 from stewart_drake.tuning.data import LEAST
-from stewart_drake.tuning.worth import read_told, tuned_run
+from stewart_drake.tuning.evaluation import read_told, tuned_run
+from stewart_drake.tuning.families import FAULTS, fault_of, faulty_family, with_gain
 
 CONDITIONS = size("CONDITIONS", 24)
 SEED = int(os.environ.get("SEED", "20263"))

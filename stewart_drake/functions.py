@@ -35,7 +35,7 @@ from stewart_drake.studies.new_machine import (
 )
 from stewart_drake.studies.options import takes
 from stewart_drake.studies.study_options import Measurements
-from stewart_drake.tuning.options import DataOptions, TrainingOptions, WorthOptions
+from stewart_drake.tuning.options import DataOptions, EvaluationOptions, TrainingOptions
 
 MECHANISM: Final = "mechanism.yaml"
 CALIBRATION: Final = "calibration.yaml"
@@ -343,7 +343,7 @@ def train_tuner(
     return AnalysisResult(found, summary, training_document(summary), Provenance(made))
 
 
-@takes(WorthOptions)
+@takes(EvaluationOptions)
 def evaluate_tuner(
     directory: str | Path,
     networks: Sequence[str | Path] = (),
@@ -351,7 +351,7 @@ def evaluate_tuner(
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
     *,
-    options: WorthOptions,
+    options: EvaluationOptions,
     progress: Progress | None = None,
     command: str = "",
 ) -> AnalysisResult:
@@ -370,13 +370,15 @@ def evaluate_tuner(
     Raises:
         ConfigError: bad input.
     """
-    from stewart_drake.reporting.tuner import worth_document
-    from stewart_drake.tuning.worth import evaluate
+    from stewart_drake.reporting.tuner import evaluation_document
+    from stewart_drake.tuning.evaluation import evaluate
 
     family, started = options.conditions(scenario, controller, settings), time.perf_counter()
-    worth = evaluate(family, networks, directory, progress=progress, **options.jobs)
+    found = evaluate(family, networks, directory, progress=progress, **options.jobs)
     command = command or f"sd.evaluate_tuner({str(directory)!r}, {list(networks)!r})"
-    return _timed(worth, worth.summary, lambda worth, _: worth_document(worth), command, started)
+    return _timed(
+        found, found.summary, lambda found, _: evaluation_document(found), command, started
+    )
 
 
 def _timed(

@@ -28,7 +28,7 @@ from stewart_drake.scenario.signals import NUM_TORQUES, POSE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import CONTROLLERS
 from stewart_drake.studies.delay import loop_margins
-from stewart_drake.studies.verdict import basis
+from stewart_drake.studies.verdict import assess
 from tests.mechanisms import PAPER
 
 HOLD = ("reference.kind=hold", "plant.kind=exact")
@@ -192,7 +192,7 @@ def test_margins_along_the_reference_are_those_of_the_recurrence():
 
 def test_what_is_known_of_the_papers_loops():
     """At the first pose alone 1.6 and 1.9 ms and 3.5 %; the worst along the way is less."""
-    first = next(m for m in loop_margins(basis(scenario("plant.kind=exact")), ()) if m.steps == 8)
+    first = next(m for m in loop_margins(assess(scenario("plant.kind=exact")), ()) if m.steps == 8)
     assert 1e3 * first.later == pytest.approx(1.6, abs=0.05)
     assert first.gain_up - 1 == pytest.approx(0.035, abs=0.001)
     m = judged(scenario("plant.kind=exact")).margins

@@ -16,11 +16,11 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.families import paper_grid
 from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.studies.runs import read_outcome
 from stewart_drake.studies.study_options import RobustnessOptions
 from stewart_drake.tuning.data import assemble, read_condition
+from stewart_drake.tuning.families import paper_grid
 from tests.faults import put, written
 from tests.test_robustness import contents, short
 
@@ -93,7 +93,7 @@ def test_a_sound_outcome_is_read(tmp_path):
     failed |= {"error": None, "peak_torque": None}
     one = read_outcome(written(path, sealed_text({"draw": {}, "outcome": failed})))
     assert one.leg == 3 and np.isnan(one.error) and one.time == 0.5
-    for field, value in (("reason", ""), ("error", 1.0), ("time", None)):
+    for field, value in (("status", "lost"), ("error", -1.0), ("leg", 7)):
         wrong = {"draw": {}, "outcome": failed | {field: value}}
         with pytest.raises(ConfigError, match=field):
             read_outcome(written(path, sealed_text(wrong)))

@@ -18,8 +18,21 @@ from stewart_drake.loop.bulk import run_in_bulk, samples_of
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies import families
-from stewart_drake.studies.families import (
+from stewart_drake.tuner.network import WINDOW, densities
+from stewart_drake.tuner.source import ratio_of, weights_of
+from stewart_drake.tuning import families
+from stewart_drake.tuning.data import (
+    LOST,
+    WATCHED,
+    cost,
+    data_hash,
+    load_data,
+    make_data,
+    run_condition,
+    watched_run,
+    watching,
+)
+from stewart_drake.tuning.families import (
     DELAYS,
     DISTURBED,
     FAMILIES,
@@ -33,19 +46,6 @@ from stewart_drake.studies.families import (
     paper_grid,
     vary,
     with_gain,
-)
-from stewart_drake.tuner.network import WINDOW, densities
-from stewart_drake.tuner.source import ratio_of, weights_of
-from stewart_drake.tuning.data import (
-    LOST,
-    WATCHED,
-    cost,
-    data_hash,
-    load_data,
-    make_data,
-    run_condition,
-    watched_run,
-    watching,
 )
 from stewart_drake.tuning.training import curves_of, labels
 from tests.screen import too_long

@@ -10,7 +10,6 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.bulk import ending_of, run_in_bulk
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.loop.tuner import RULES, health_of, weights_source
-from stewart_drake.studies.families import FAMILIES, SAMPLES
 from stewart_drake.tuner.features import (
     HIGHEST,
     LOWEST,
@@ -32,6 +31,7 @@ from stewart_drake.tuner.source import (
     weights_of,
 )
 from stewart_drake.tuning.data import FixedPolicy, watched_run, watching
+from stewart_drake.tuning.families import FAMILIES, SAMPLES
 
 FOLLOWS = ("plant.kind=exact", "start=on_reference", "queue=reference")
 BLIND = (*FOLLOWS, "controller.estimate=[]")

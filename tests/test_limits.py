@@ -30,14 +30,14 @@ from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.delay import error_floor, loop_margins, simulated_growth
-from stewart_drake.studies.verdict import basis
+from stewart_drake.studies.verdict import assess
 from tests.mechanisms import PAPER
 
 HEAVY = sd.StewartDynamics(PAPER, gravity=True)
 
 
 def found(*settings):
-    return basis(sd.load_scenario("paper", settings=("plant.kind=exact", *settings)))
+    return assess(sd.load_scenario("paper", settings=("plant.kind=exact", *settings)))
 
 
 # ------------------------------------------------------------------ open loop
@@ -233,7 +233,7 @@ def test_margins_of_the_papers_loop():
 def test_the_faithful_controller_is_unstable_on_the_true_plant():
     """Its model has twice the true accelerations, through eight torques in flight."""
     scenario = sd.load_scenario("paper", "delay_lqi", ("plant.kind=exact",))
-    (m,) = loop_margins(basis(scenario), ())
+    (m,) = loop_margins(assess(scenario), ())
     assert m.radius > 1.3
     assert m.later == m.earlier == 0
     assert m.motor is None
@@ -264,5 +264,5 @@ def test_weights_that_hardly_act_keep_the_faithful_controllers_stable(controller
     found = np.abs(np.linalg.eigvals(true.A - true.B @ K)).max()
     assert found == pytest.approx(radius, abs=1e-3)
     settings = ("plant.kind=exact", f"controller.w_Q={weight}")
-    (m,) = loop_margins(basis(sd.load_scenario("paper", controller, settings)), ())
+    (m,) = loop_margins(assess(sd.load_scenario("paper", controller, settings)), ())
     assert m.radius == pytest.approx(found, rel=1e-6)

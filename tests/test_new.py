@@ -95,10 +95,10 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(tmp_path, capsys):
     made(tmp_path)
     before = (tmp_path / "machine.yaml").read_bytes()
     assert main(["new", str(tmp_path), *flags(rod=0.3)]) == 2
-    assert "machine.yaml: is there already" in capsys.readouterr().err
+    assert "machine.yaml: already exists" in capsys.readouterr().err
     # Before anything is asked for.
     assert main(["new", str(tmp_path)]) == 2
-    assert "machine.yaml: is there already" in capsys.readouterr().err
+    assert "machine.yaml: already exists" in capsys.readouterr().err
     assert (tmp_path / "machine.yaml").read_bytes() == before
 
 

@@ -19,7 +19,7 @@ from stewart_drake.cli.common import (
 from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.reporting.terminal import count_bar
-from stewart_drake.tuning.options import DataOptions, TrainingOptions, WorthOptions
+from stewart_drake.tuning.options import DataOptions, EvaluationOptions, TrainingOptions
 
 if TYPE_CHECKING:
     from stewart_drake.tuning.training import Training
@@ -100,7 +100,7 @@ def train(
 
 
 @app.command()
-@with_options(WorthOptions)
+@with_options(EvaluationOptions)
 def evaluate(
     *,
     weights: Annotated[

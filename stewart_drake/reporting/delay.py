@@ -30,13 +30,13 @@ def document(study: DelayStudy) -> Document:
     """Return poles, limits, margins and simulations."""
     loop, verdict, own = study.loop, study.verdict, study.controller
     known = own if own and own.stable and math.isfinite(own.delay_margin) else None
-    stiffness = mean_inertia(study.basis.experiment.nominal) * (2 * math.pi * _BANDWIDTH) ** 2
-    steps = study.basis.experiment.scenario.true_delay.steps
+    stiffness = mean_inertia(study.assessment.experiment.nominal) * (2 * math.pi * _BANDWIDTH) ** 2
+    steps = study.assessment.experiment.scenario.true_delay.steps
     return from_template(
         "delay",
         _tone(study),
         study=study,
-        sc=study.basis.experiment.scenario,
+        sc=study.assessment.experiment.scenario,
         inf=math.inf,
         eta=partial(_eta, study),
         gains=_gains,
@@ -62,7 +62,7 @@ def document(study: DelayStudy) -> Document:
 
 def _tone(study: DelayStudy) -> Tone:
     loop = study.controller
-    if study.verdict is None or study.basis.obstacles or (loop and loop.stable is False):
+    if study.verdict is None or study.assessment.obstacles or (loop and loop.stable is False):
         return "bad"
     tone = _TONES[study.verdict.beatable]
     fragile = loop and (loop.problem or loop.delay_margin < FRAGILE * study.eta)
@@ -70,7 +70,7 @@ def _tone(study: DelayStudy) -> Tone:
 
 
 def _eta(study: DelayStudy, steps: int) -> float:
-    sc = study.basis.experiment.scenario
+    sc = study.assessment.experiment.scenario
     return Delay(steps, sc.true_delay.fraction).eta(sc.controller.period)
 
 
@@ -149,7 +149,7 @@ def loop_figure(study: DelayStudy) -> Figure:
         },
     }
     steps = [loop.steps for loop in loops]
-    own = study.basis.experiment.scenario.true_delay.steps
+    own = study.assessment.experiment.scenario.true_delay.steps
     panels = [
         Panel(
             name,

@@ -20,7 +20,7 @@ _SMALLEST: Final = 1e-18
 
 def document(study: HautusStudy) -> Document:
     """Return the models that matter, what fails, and folded, every model and mode."""
-    sc = study.basis.experiment.scenario
+    sc = study.assessment.experiment.scenario
     chains = [system for name in _CHAINS for system in study.family(name)]
     shown = [s for name in _CHAINS for s in _landmarks(study.family(name), sc.true_delay.steps)]
     error_model = study.family("error model")
@@ -29,11 +29,11 @@ def document(study: HautusStudy) -> Document:
         s.name for s in study.systems if not (s.answers["stabilizable"] and s.answers["detectable"])
     ]
     skipped: dict[str, list[str]] = {}
-    for name, reason in study.skipped:
+    for name, reason in study.skipped.items():
         skipped.setdefault(reason, []).append(name)
     return from_template(
         "hautus",
-        "bad" if useless or not study.systems or study.basis.obstacles else "good",
+        "bad" if useless or not study.systems or study.assessment.obstacles else "good",
         study=study,
         sc=sc,
         useless=useless,
@@ -153,7 +153,7 @@ def _envelope(study: HautusStudy) -> list[Curve]:
     if not chains or not plants:
         return []
     pole = max(mode.eigenvalue.real for mode in plants[0].reach.modes)
-    period = study.basis.experiment.scenario.controller.period
+    period = study.assessment.experiment.scenario.controller.period
     steps = np.array([system.steps for system in chains], dtype=float)
     values = chains[0].margins["controllable"] * np.exp(-pole * period * steps)
     return [Curve(steps, values, "$e^{-pη}$, home under gravity", Line("#888888", "-", 0.9))]

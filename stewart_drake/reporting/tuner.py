@@ -1,4 +1,4 @@
-"""Documents and figures of the tuner: its data, its training and its worth."""
+"""Documents and figures of the tuner: its data, its training and its evaluation."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -23,10 +23,10 @@ from stewart_drake.reporting.document import (
 )
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import REFERENCE, RUN, TRUTH, Line, line, write_figures
-from stewart_drake.studies.families import FAULTS, fault_of
 from stewart_drake.tuner.source import ratio_of
+from stewart_drake.tuning.evaluation import HINDSIGHT, RULE, Evaluation
+from stewart_drake.tuning.families import FAULTS, fault_of
 from stewart_drake.tuning.training import Training
-from stewart_drake.tuning.worth import HINDSIGHT, RULE, Worth
 from stewart_drake.types import Array
 
 _CONSTANT: Final = Line("#888888", ":", 1.4)
@@ -177,34 +177,34 @@ def _answers(ax: Axes, target: Array, output: Array) -> None:
         ax.plot(target, output, ".", ms=2, color=RUN.color, label="answers to the test rows")
 
 
-# ---------------------------------------------------------------- worth
+# ---------------------------------------------------------------- evaluation
 
 
-def worth_document(worth: Worth) -> Document:
+def evaluation_document(found: Evaluation) -> Document:
     """Return tables of the candidates by J and by E_ac, and figures.
 
     A terminal shows those by J of a family with faults, those by E_ac of another one.
     """
-    faulty, name = worth.family.has_faults, worth.family.name
+    faulty, name = found.family.has_faults, found.family.name
     sections = [
-        Section("Candidates", _by_cost(worth), Paragraph(_HOW)),
-        Section("Where all complete", _by_error(worth), Paragraph(_error_text(worth), not faulty)),
+        Section("Candidates", _by_cost(found), Paragraph(_HOW)),
+        Section("Where all complete", _by_error(found), Paragraph(_error_text(found), not faulty)),
     ]
     if faulty:
         sections += [
-            Section("By fault", _faults(worth)),
-            Section("Price where nothing is wrong", _nominal(worth)),
+            Section("By fault", _faults(found)),
+            Section("Price where nothing is wrong", _nominal(found)),
         ]
     shares = "Share of the conditions whose J is at most so much; further left is better."
     shown = "One run for each fault." if faulty else "The first conditions."
     shown += " Grey: the fixed ratio that is best there."
     sections += [
-        Section("Distribution", Picture(partial(distributions, worth), shares)),
-        Section("Weights over time", Picture(partial(weights_over_time, worth), shown)),
+        Section("Distribution", Picture(partial(distributions, found), shares)),
+        Section("Weights over time", Picture(partial(weights_over_time, found), shown)),
     ]
     if not faulty:
         return Document("Evaluation of the tuner", "", sections)
-    s, networks = worth.summary, [name for name in worth.tuners if name != RULE]
+    s, networks = found.summary, [name for name in found.tuners if name != RULE]
     told = [
         f"{one} is {_share(s['gains'][one]['g'])} below the best fixed gain, {s['best_g']}"
         for one in networks
@@ -214,7 +214,7 @@ def worth_document(worth: Worth) -> Document:
     tone: Tone = "good" if all(low > 0 for low, _ in ends) else "fair"
     if any(high < 0 for _, high in ends):
         tone = "bad"
-    return Document(f"Worth of a tuner, family {name}", verdict, sections, tone)
+    return Document(f"Evaluation of a tuner, family {name}", verdict, sections, tone)
 
 
 def _share(gain: Sequence[float]) -> str:
@@ -222,33 +222,33 @@ def _share(gain: Sequence[float]) -> str:
     return f"{value:.0f} % ({low:.0f} to {high:.0f})"
 
 
-def _by_cost(worth: Worth) -> Table:
-    s, rows = worth.summary, []
-    measures = ("g", "m", "rule") if RULE in worth.names else ("g", "m")
-    for name in (*worth.names, HINDSIGHT):
+def _by_cost(found: Evaluation) -> Table:
+    s, rows = found.summary, []
+    measures = ("g", "m", "rule") if RULE in found.names else ("g", "m")
+    for name in (*found.names, HINDSIGHT):
         one, gains = s["candidates"][name], s["gains"].get(name)
         marks = "".join(f" {m}" for m in ("g", "m") if s[f"best_{m}"] == name)
         shares = [_share(gains[key]) if gains else "" for key in measures]
         label = f"{name}{marks and ' best' + marks}"
         rows.append((label, str(one["completed"]), number(one["g"]), number(one["m"]), *shares))
     below = ("g below best", "m below best", "below rule")[: len(measures)]
-    return Table((_head(worth), "completed", "g", "m", *below), rows, brief=worth.family.has_faults)
+    return Table((_head(found), "completed", "g", "m", *below), rows, brief=found.family.has_faults)
 
 
-def _by_error(worth: Worth) -> Table:
-    s, rows = worth.summary, []
-    for name in worth.names:
+def _by_error(found: Evaluation) -> Table:
+    s, rows = found.summary, []
+    for name in found.names:
         one = s["candidates"][name]
         low, high = map(number, one["interval"])
         label = f"{name} *" if name == s["best_fixed"] else name
         mean, worst = number(one["mean"]), number(one["worst"])
         rows.append((label, str(one["failures"]), mean, f"{low} to {high}", worst))
-    columns = (_head(worth), "failures", "mean E_ac", "95 % interval", "worst")
-    return Table(columns, rows, brief=not worth.family.has_faults)
+    columns = (_head(found), "failures", "mean E_ac", "95 % interval", "worst")
+    return Table(columns, rows, brief=not found.family.has_faults)
 
 
-def _error_text(worth: Worth) -> str:
-    s, tuner = worth.summary, worth.names[-1]
+def _error_text(found: Evaluation) -> str:
+    s, tuner = found.summary, found.names[-1]
     low, high = (f"{-100 * x:+.1f}" for x in reversed(s["improvement_interval"]))
     extra = s["candidates"][tuner]["failures"] - s["candidates"][s["best_fixed"]]["failures"]
     return (
@@ -259,76 +259,76 @@ def _error_text(worth: Worth) -> str:
     )
 
 
-def _head(worth: Worth) -> str:
-    return "log10 w_Q/w_R" if worth.family.has_faults else "w_Q / w_R"
+def _head(found: Evaluation) -> str:
+    return "log10 w_Q/w_R" if found.family.has_faults else "w_Q / w_R"
 
 
-def _faults(worth: Worth) -> Table:
-    s = worth.summary
+def _faults(found: Evaluation) -> Table:
+    s = found.summary
     rows = [
         (name, *(_share(s["by_fault"][f][name]) if s["by_fault"][f] else "" for f in FAULTS))
-        for name in (*worth.tuners, HINDSIGHT)
+        for name in (*found.tuners, HINDSIGHT)
     ]
     caption = f"g below that of {s['best_g']}, under the conditions of each fault."
     return Table(("", *FAULTS), rows, caption, brief=True)
 
 
-def _nominal(worth: Worth) -> Table:
+def _nominal(found: Evaluation) -> Table:
     rows = [
         (name, number(one["on_reference"]), number(one["from_rest"]))
-        for name, one in worth.summary["nominal"].items()
+        for name, one in found.summary["nominal"].items()
     ]
     caption = "E_ac in % s of `paper` as it is; default is w_Q = w_R = 1."
     return Table(("", "on the reference", "from rest"), rows, caption, brief=True)
 
 
-def _lines(worth: Worth) -> dict[str, Line]:
+def _lines(found: Evaluation) -> dict[str, Line]:
     # Every second look: the best fixed gain is a solid line.
-    return {name: line(2 * k + 1, marked=False) for k, name in enumerate(worth.tuners)}
+    return {name: line(2 * k + 1, marked=False) for k, name in enumerate(found.tuners)}
 
 
-def _ratios(worth: Worth) -> Array:
+def _ratios(found: Evaluation) -> Array:
     """Return log10(w_Q / w_R) of the fixed gains."""
-    return np.array([ratio_of(np.array(gain)) for gain in worth.family.gains.values()])
+    return np.array([ratio_of(np.array(gain)) for gain in found.family.gains.values()])
 
 
-def distributions(worth: Worth) -> Figure:
+def distributions(found: Evaluation) -> Figure:
     """Draw the share of the conditions below each J: equal weights, the best gain, the tuners."""
-    best, equal = worth.summary["best_g"], worth.names[int(np.argmin(np.abs(_ratios(worth))))]
+    best, equal = found.summary["best_g"], found.names[int(np.argmin(np.abs(_ratios(found))))]
     curves = []
-    for name, look in ({equal: _CONSTANT, best: Line("#000000", "-", 1.4)} | _lines(worth)).items():
-        J = np.sort(worth.cost[worth.names.index(name)])
+    for name, look in ({equal: _CONSTANT, best: Line("#000000", "-", 1.4)} | _lines(found)).items():
+        J = np.sort(found.cost[found.names.index(name)])
         share = 100 * np.arange(1, len(J) + 1) / len(J)
-        label = f"fixed, {name}" if name in worth.family.gains else name
+        label = f"fixed, {name}" if name in found.family.gains else name
         curves.append(Curve(J, share, label, look, steps=True))
     return draw(
         [Panel("conditions  [%]", curves, "J  [% s]", xscale="log", ylim=(0, 100), height=2.8)]
     )
 
 
-def _shown(worth: Worth) -> dict[str, int | None]:
+def _shown(found: Evaluation) -> dict[str, int | None]:
     """Return the condition of each panel: the first of each fault, or the first four."""
-    if not worth.family.has_faults:
-        count = worth.cost.shape[1]
+    if not found.family.has_faults:
+        count = found.cost.shape[1]
         return {f"condition {i + 1}": i if i < count else None for i in range(_PANELS)}
-    kinds = [fault_of(one) for one in worth.family.draws]
+    kinds = [fault_of(one) for one in found.family.draws]
     return {fault: kinds.index(fault) if fault in kinds else None for fault in FAULTS}
 
 
-def weights_over_time(worth: Worth) -> Figure:
+def weights_over_time(found: Evaluation) -> Figure:
     """Draw log10(w_Q / w_R) over the samples in some conditions."""
-    period, ratios, panels = worth.family.base.controller.period, _ratios(worth), []
-    for title, i in _shown(worth).items():
+    period, ratios, panels = found.family.base.controller.period, _ratios(found), []
+    for title, i in _shown(found).items():
         curves = []
         if i is not None:
-            taken = {name: worth.ratios[name][i] for name in worth.tuners}
-            best = ratios[worth.cost[: len(ratios), i].argmin()]
+            taken = {name: found.ratios[name][i] for name in found.tuners}
+            best = ratios[found.cost[: len(ratios), i].argmin()]
             ends = [0.0, period * max(map(len, taken.values()))]
             curves = [
                 Curve(ends, [best] * 2, "best fixed there", REFERENCE),
                 *(
                     Curve(period * np.arange(len(taken[name])), taken[name], name, look, steps=True)
-                    for name, look in _lines(worth).items()
+                    for name, look in _lines(found).items()
                 ),
             ]
         limits = (ratios.min() - 0.2, ratios.max() + 0.2)

@@ -29,11 +29,11 @@ from stewart_drake.scenario.loading import load_comparison, load_compatible, rea
 from stewart_drake.studies.jobs import run_jobs
 
 ADAPTIVE: Final = "adaptive_lqi"
-"""Shown with the others where their delay is not the true one."""
+"""Added if the delay of the others is not the true one."""
 CONTROLLERS: Final = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
 """Shipped names, in the order of tables and legends: the paper's four, and ours."""
 SERVOS: Final = ("servo_preview", "servo_feedforward")
-"""Shown beside the others where the machine has servos."""
+"""Added if the machine has servos."""
 LABELS: Final = {
     "lqr": "LQR, delay-blind",
     "lqi": "LQI, delay-blind",
@@ -45,7 +45,7 @@ LABELS: Final = {
     "servo_feedforward": "servos + torque",
 }
 PAPER_ERRORS: Final = {"lqr": None, "lqi": None, "delay_lqr": 225.0, "delay_lqi": 80.0}
-"""E_ac in % s that the paper reports in its Table II, None where it reports a failure."""
+"""E_ac in % s of the paper's Table II, None for a failure."""
 PAPER_DELAY: Final = 0.8
 """s, of the experiment in that table."""
 
@@ -54,7 +54,7 @@ Progress = Callable[[str, float, float], None]
 
 _NO_KEY: Final = re.compile(r"[^A-Za-z0-9_+-]")
 _POLL = 0.1
-"""s between two looks at the runs."""
+"""Interval of progress reports, s."""
 
 
 def compare(
@@ -68,19 +68,18 @@ def compare(
 ) -> dict[str, SimulationResult]:
     """Run every shipped controller on a scenario, and controllers of your own, on all cores.
 
-    Ctrl-C ends the runs that have begun, with status `interrupted`, and leaves out the others.
-    Give systems of your own as functions that make one, such as their class. Runs are shared out to
-    worker processes; a run whose system no other process can read, such as a class of a script or
-    a notebook that derives from `LeafSystem`, runs in this process. An exception of a run is
-    raised as it is, with a note that names the controller.
+    Ctrl-C ends the runs that have begun, with status `interrupted`, and leaves out the others. Give
+    your own systems as functions that make one, such as their class. Runs go to worker processes; a
+    run with a system that no other process can read, such as a class of a script or a notebook that
+    derives from `LeafSystem`, is done in this process. An exception of a run is raised as it is,
+    with a note that names the controller.
 
     Args:
         scenario_name: a shipped name or a path; its start, plant and tuner stay as they are.
         settings: as `load_scenario` takes them.
-        progress: called for each run that got on, ten times a second.
-        controllers: of your own by name, with the ports that `simulate` tells.
-        reference: for all runs, as of `simulate`.
-        disturbance: likewise.
+        progress: called for each running simulation, ten times a second.
+        controllers: your own by name, with the ports listed at `simulate`.
+        reference, disturbance: for all runs, as of `simulate`.
 
     Returns:
         Results by controller, in the order of `shown`, then your own.
@@ -109,7 +108,7 @@ def compare(
         }
         # Own controllers first: what runs in this process does so while workers do the others.
         jobs = dict(sorted(jobs.items(), key=lambda job: job[1][0] not in controllers))
-        # Ctrl-C reaches this thread alone, which tells the processes by the board.
+        # Ctrl-C reaches this thread only, which notifies the processes by the board.
         run: Callable[..., dict[str, SimulationResult | None]] = run_jobs
         runs = thread.submit(
             run, jobs, _run, folder, settings={}, suffix=".pickle", read=_unpickled
@@ -131,10 +130,10 @@ def compare(
 
 
 def shown(scenario_name: str | Path, settings: Iterable[str] = ()) -> dict[str, Scenario]:
-    """Scenarios of the shipped controllers, then of the rows that the scenario's `compare` adds.
+    """Return scenarios of the shipped controllers, then of the rows in the scenario's `compare`.
 
-    ADAPTIVE is among them where the others' delay is not the true one, or changes, unless the
-    scenario is one that it is not for. SERVOS are where the scenario's motors are servos.
+    ADAPTIVE is added if the others' delay is not the true one, or changes, and the scenario
+    supports it; SERVOS if the scenario's motors are servos.
 
     Raises:
         ConfigError: bad input.
@@ -184,7 +183,7 @@ def _check_makers(
 
 
 def is_papers(scenario: Scenario, *, any_size: bool = False) -> bool:
-    """Whether the paper's numbers are about this scenario: its mechanism, motion and delay.
+    """Return whether a scenario has the mechanism, motion and delay of the paper's numbers.
 
     With `any_size` the motion may be a multiple of the paper's: E_ac is relative to it.
     """
@@ -244,7 +243,7 @@ class _Board:
 def _run(
     name: str, scenario: Scenario, own: dict[str, Any], path: Path, run: int, runs: int
 ) -> bytes:
-    """The run's result, pickled: None if it was stopped before, or why it is refused."""
+    """Return the pickled result: None if it was stopped before, or an error if it is refused."""
     board = _Board(path, runs)
 
     def progress(time: float, error: float) -> None:
@@ -259,7 +258,7 @@ def _run(
 
 
 def _unpickled(path: Path) -> SimulationResult | None:
-    # Written by our own workers a moment ago, into a folder that nobody else can write to.
+    # Written by our own workers into a temporary folder.
     result: SimulationResult | ConfigError | None = pickle.loads(path.read_bytes())
     if isinstance(result, ConfigError):
         raise result

@@ -42,7 +42,7 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.runs import run_scenarios
 from stewart_drake.studies.study_options import DelayOptions
-from stewart_drake.studies.verdict import Basis, Verdict, basis, pole_in_motion
+from stewart_drake.studies.verdict import Assessment, Verdict, assess, pole_in_motion
 from stewart_drake.types import Array
 
 INSTANTS: Final = 62
@@ -163,7 +163,7 @@ class DelayStudy:
     """Result of the analysis of the delay.
 
     Attributes:
-        basis: of the analysis.
+        assessment: of the scenario.
         controller: the scenario's loop along the reference, as far as that can be followed; None if
             it cannot be followed at all.
         eta: total delay, s.
@@ -176,7 +176,7 @@ class DelayStudy:
         interrupted: whether Ctrl-C ended the simulations early.
     """
 
-    basis: Basis
+    assessment: Assessment
     controller: ControllerMargin | None
     eta: float
     poles: list[PolePoint]
@@ -198,13 +198,13 @@ class DelayStudy:
     @property
     def loop(self) -> LoopMargins | None:
         """Closed loop at the scenario's delay."""
-        own = self.basis.experiment.scenario.true_delay.steps
+        own = self.assessment.experiment.scenario.true_delay.steps
         return next((loop for loop in self.loops if loop.steps == own), None)
 
     @property
     def floor_applies(self) -> bool:
         """Whether the scenario waits at rest, an assumption of the floor."""
-        return waits_at_rest(self.basis.experiment.scenario)
+        return waits_at_rest(self.assessment.experiment.scenario)
 
     @property
     def limits(self) -> list[tuple[float, float, float]]:
@@ -220,7 +220,7 @@ class DelayStudy:
         verdict = self.verdict
         return {
             "eta": self.eta,
-            "obstacles": self.basis.obstacles,
+            "obstacles": self.assessment.obstacles,
             "controller_margin": None if self.controller is None else self.controller.summary,
             "verdict": None if verdict is None else str(verdict),
             "beatable": None if verdict is None else verdict.beatable,
@@ -237,7 +237,7 @@ class DelayStudy:
             "largest_delay": [
                 {"amplification": a, "delay": delay, "t": t} for a, delay, t in self.limits
             ],
-            "error_floor": self.floors[self.basis.experiment.scenario.true_delay.steps],
+            "error_floor": self.floors[self.assessment.experiment.scenario.true_delay.steps],
             "error_floor_applies": self.floor_applies,
             "loop": [loop.summary for loop in self.loops],
             "loop_problem": self.loop_problem or None,
@@ -256,10 +256,10 @@ def study_delay(
 
     Raises:
         ConfigError: one line. A motion or a home pose outside the workspace is reported in
-            `Basis.obstacles` instead.
+            `Assessment.obstacles` instead.
     """
     with threadpool_limits(limits=1):
-        found = basis(scenario)
+        found = assess(scenario)
         delay, period = scenario.true_delay, scenario.controller.period
         poles = _poles(found)
         loops, problem = _loops(found)
@@ -270,7 +270,7 @@ def study_delay(
             for steps in {delay.steps, *map_delays(delay.steps)}
         }
         return DelayStudy(
-            basis=found,
+            assessment=found,
             controller=controller_margin(found.experiment, found.followed_until) if poles else None,
             eta=scenario.eta,
             poles=poles,
@@ -286,7 +286,7 @@ def study_delay(
 # ---------------------------------------------------------------- open loop
 
 
-def error_floor(found: Basis, eta: float) -> float:
+def error_floor(found: Assessment, eta: float) -> float:
     """Return E_ac in % s of a plate at rest at the first pose after `eta` s without any torque."""
     reference, duration = found.experiment.reference, found.experiment.scenario.duration
     time: Array = np.linspace(0.0, min(eta, duration), 2001, dtype=np.float64)
@@ -314,7 +314,7 @@ def simulated_growth(
     return expected, float(moved)
 
 
-def _poles(found: Basis) -> list[PolePoint]:
+def _poles(found: Assessment) -> list[PolePoint]:
     experiment, points = found.experiment, []
     end = found.followed_until
     for t in np.linspace(0.0, end, INSTANTS) if end > 0 else ():
@@ -324,7 +324,7 @@ def _poles(found: Basis) -> list[PolePoint]:
     return points
 
 
-def _growths(found: Basis, poles: list[PolePoint], eta: float) -> list[Growth]:
+def _growths(found: Assessment, poles: list[PolePoint], eta: float) -> list[Growth]:
     experiment, growths = found.experiment, []
     for point in poles[:: max(1, len(poles) // _CHECKS)][:_CHECKS]:
         if point.held == 0 or eta == 0:
@@ -340,7 +340,7 @@ def _growths(found: Basis, poles: list[PolePoint], eta: float) -> list[Growth]:
 # ---------------------------------------------------------------- closed loop
 
 
-def _loops(found: Basis) -> tuple[list[LoopMargins], str]:
+def _loops(found: Assessment) -> tuple[list[LoopMargins], str]:
     if found.experiment.scenario.link.kind == "network":
         return [], "its torques come in packets, which analyze link is about"
     pose = found.experiment.reference.value(0.0)[:, 0]
@@ -353,7 +353,7 @@ def _loops(found: Basis) -> tuple[list[LoopMargins], str]:
         return [], f"no gain at the reference's first pose: {error}"
 
 
-def loop_margins(found: Basis, delays: Iterable[int] = DELAYS) -> list[LoopMargins]:
+def loop_margins(found: Assessment, delays: Iterable[int] = DELAYS) -> list[LoopMargins]:
     """Judge the loop over the delay, linearised at the reference's first pose, held still.
 
     The law is designed as the scenario's controller (model, prediction, weights, believed delay)

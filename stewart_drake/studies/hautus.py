@@ -2,8 +2,8 @@
 
 Three families: the paper's error model (20)-(28), continuous; the same sampled and with the torques
 in flight, for every delay, as the minimal chain and as the paper's (37)-(39), which carries one
-torque more; and the true plant, linearised where it is held still. All in units in which the
-motion, and the torques it takes, are of size 1, see `basis`.
+torque more; and the true plant, linearised at rest. All are scaled so that the motion, and the
+torques it takes, have size 1, see `assess`.
 """
 
 from dataclasses import dataclass
@@ -33,12 +33,17 @@ from stewart_drake.law.hautus import TOLERANCE, Hautus, Mode, hautus, scaled
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import COORDINATE_NAMES, NUM_TORQUES
-from stewart_drake.studies.verdict import Basis, basis
+from stewart_drake.studies.verdict import Assessment, assess
 from stewart_drake.types import Array
 
 _TORQUE: Final = "torque "
 _SHOWN: Final = 0.01
 """Share of a direction from which a state is named."""
+LONGEST: Final = 30
+"""Whole periods of delay up to which the delayed models are tested."""
+POSES: Final = 9
+"""Instants at which the plant is linearised along the reference."""
+QUESTIONS: Final = ("controllable", "stabilizable", "observable", "detectable")
 
 
 class Label(NamedTuple):
@@ -60,7 +65,7 @@ def state_labels(n: int) -> list[Label]:
 
 
 def describe(directions: NDArray[np.complex128], labels: list[Label]) -> str:
-    """Directions (n, d) in words: their number, and the states that they consist of."""
+    """Return directions (n, d) in words: their number, and the states that they consist of."""
     d = directions.shape[1]
     share = (np.abs(directions) ** 2).sum(axis=1) / d
     groups: dict[str, list[str]] = {}
@@ -73,18 +78,15 @@ def describe(directions: NDArray[np.complex128], labels: list[Label]) -> str:
         for group, names in groups.items()
         if not group.startswith(_TORQUE)
     ]
-    torques = [group for group in groups if group.startswith(_TORQUE)]
-    if torques:
-        last = torques[-1].removeprefix(_TORQUE)
-        named.append(
-            torques[0]
-            if len(torques) == 1
-            else f"torques {torques[0].removeprefix(_TORQUE)} to {last}"
-        )
+    torques = [group.removeprefix(_TORQUE) for group in groups if group.startswith(_TORQUE)]
+    if len(torques) == 1:
+        named.append(_TORQUE + torques[0])
+    elif torques:
+        named.append(f"torques {torques[0]} to {torques[-1]}")
     return f"{d} direction{'s' if d > 1 else ''} in {' and '.join(named)}"
 
 
-def mode_words(mode: Mode, labels: list[Label]) -> str:
+def _mode_text(mode: Mode, labels: list[Label]) -> str:
     """Return what fails in a mode, and its eigenvalue: `1 direction in pose error (x), mode 0`."""
     value = f"{mode.eigenvalue.real:.3g}"
     if mode.eigenvalue.imag:
@@ -92,27 +94,20 @@ def mode_words(mode: Mode, labels: list[Label]) -> str:
     return f"{describe(mode.directions, labels)}, mode {value}"
 
 
-LONGEST: Final = 30
-"""Whole periods of delay up to which the delayed models are tested."""
-POSES: Final = 9
-"""Instants at which the plant is linearised along the reference."""
-QUESTIONS: Final = ("controllable", "stabilizable", "observable", "detectable")
-
-
 @dataclass(frozen=True)
 class System:
-    """One system and what the tests say of it.
+    """One system and its tests.
 
     Attributes:
         name: unique.
         family: `error model`, `minimal chain`, `paper's chain`, `chain under gravity` or `plant`.
-        steps: of delay, None where there is none.
+        steps: of delay, or None.
         time: s along the reference, None for home.
         n, m: states and inputs.
         reach, view: tests of (A, B), and of (A', C').
         drake: Drake's answers to QUESTIONS.
-        words: what is not reached or not seen, a sentence for each mode that fails.
-        note: why Drake disagrees, empty where it does not.
+        words: a sentence for each mode that fails.
+        note: why Drake disagrees, or empty.
     """
 
     name: str
@@ -134,38 +129,50 @@ class System:
 
     @property
     def margins(self) -> dict[str, float]:
-        """Least relative singular value behind each answer, infinite where no mode is asked."""
+        """Least relative singular value behind each answer, infinite without a relevant mode."""
         tests = (self.reach, self.view)
         values = [margin for test in tests for margin in (test.margin, test.lasting_margin)]
         return dict(zip(QUESTIONS, values, strict=True))
 
+    @property
+    def summary(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "family": self.family,
+            "n": self.n,
+            "m": self.m,
+            "mu": self.steps,
+            "t": self.time,
+            **self.answers,
+            **{f"{word}_margin": margin for word, margin in self.margins.items()},
+            "deficient": list(self.words),
+            "controllable_modes": _modes_summary(self.reach),
+            "observable_modes": _modes_summary(self.view),
+            "drake": self.drake,
+            "note": self.note or None,
+        }
+
 
 @dataclass(frozen=True)
 class HautusStudy:
-    """All systems, and the poses that could not be looked at.
+    """All systems in the order of the families; skipped poses by name, with the reason."""
 
-    Attributes:
-        basis: what was analysed.
-        systems: in the order of the families.
-        skipped: name and reason.
-    """
-
-    basis: Basis
-    systems: tuple[System, ...]
-    skipped: tuple[tuple[str, str], ...]
+    assessment: Assessment
+    systems: list[System]
+    skipped: dict[str, str]
 
     def family(self, name: str) -> list[System]:
-        """The systems of one family."""
+        """Return the systems of one family."""
         return [system for system in self.systems if system.family == name]
 
     @property
     def summary(self) -> dict[str, Any]:
         return {
             "tolerance": TOLERANCE,
-            "units": {"pose": self.basis.motion, "torque": self.basis.torque},
-            "obstacles": self.basis.obstacles,
-            "systems": [_system_summary(system) for system in self.systems],
-            "skipped": [{"name": name, "reason": reason} for name, reason in self.skipped],
+            "units": {"pose": self.assessment.motion, "torque": self.assessment.torque},
+            "obstacles": self.assessment.obstacles,
+            "systems": [system.summary for system in self.systems],
+            "skipped": [{"name": n, "reason": reason} for n, reason in self.skipped.items()],
         }
 
 
@@ -173,25 +180,35 @@ def study_hautus(scenario: Scenario) -> HautusStudy:
     """Test every model of a scenario.
 
     Raises:
-        ConfigError: one line. A motion or a home pose outside the workspace is not an error, see
-            `Basis.obstacles`.
+        ConfigError: one line. A motion or a home pose outside the workspace is reported in
+            `Assessment.obstacles` instead.
     """
     with threadpool_limits(limits=1):
-        found = basis(scenario)
-        systems, skipped = [], []
+        found = assess(scenario)
+        study = HautusStudy(found, [], {})
         home = found.experiment.mechanism.home
         reason = _unusable(found.home_failure)
         if reason is None:
             tau = torque_map(found.experiment.mechanism, home)
-            systems += _error_models(found, double_integrators(tau))
+            study.systems.extend(_error_models(found, double_integrators(tau)))
         else:
-            skipped.append(("error model and delay chains", reason))
-        plants, without = _plants(found)
-        return HautusStudy(found, (*systems, *plants), (*skipped, *without))
+            study.skipped["error model and delay chains"] = reason
+        reference, places = found.experiment.reference, [("home", None, home)]
+        for t in np.linspace(0.0, scenario.duration, POSES):
+            places.append((f"t = {t:.2f} s", float(t), reference.value(t)[:, 0]))
+        for gravity in (False, True):
+            for place, time, pose in places:
+                name = f"plant {'under' if gravity else 'without'} gravity, {place}"
+                model = _linearized(found, gravity, pose)
+                if isinstance(model, str):
+                    study.skipped[name] = model
+                else:
+                    study.systems.append(_test(found, name, "plant", model, time=time))
+        return study
 
 
-def _error_models(found: Basis, model: ContinuousModel) -> list[System]:
-    """The continuous model, and with it, and with the plant under gravity, all delay chains."""
+def _error_models(found: Assessment, model: ContinuousModel) -> list[System]:
+    """Test the continuous model, and delay chains of it and of the plant under gravity."""
     delay, period = found.experiment.scenario.delay, found.experiment.scenario.controller.period
     systems = [_test(found, "error model, continuous", "error model", with_integral(model))]
     heavy = _linearized(found, True, found.experiment.mechanism.home)
@@ -202,7 +219,7 @@ def _error_models(found: Basis, model: ContinuousModel) -> list[System]:
     ]
     for family, continuous, extra in families:
         if isinstance(continuous, str):
-            continue  # the plant's own entry says why
+            continue  # the plant's own entry has the reason
         for steps in range(LONGEST + 1):
             sampled = delayed_model(continuous, period, steps, delay.fraction, integral=True)
             augmented = chain(sampled, always_extra=extra)
@@ -213,29 +230,8 @@ def _error_models(found: Basis, model: ContinuousModel) -> list[System]:
     return systems
 
 
-def _plants(found: Basis) -> tuple[list[System], list[tuple[str, str]]]:
-    sc, reference = found.experiment.scenario, found.experiment.reference
-    places: list[tuple[str, float | None, Array]] = [
-        ("home", None, found.experiment.mechanism.home),
-        *(
-            (f"t = {t:.2f} s", float(t), reference.value(t)[:, 0])
-            for t in np.linspace(0.0, sc.duration, POSES)
-        ),
-    ]
-    systems, skipped = [], []
-    for gravity in (False, True):
-        for place, time, pose in places:
-            name = f"plant {'under' if gravity else 'without'} gravity, {place}"
-            model = _linearized(found, gravity, pose)
-            if isinstance(model, str):
-                skipped.append((name, model))
-            else:
-                systems.append(_test(found, name, "plant", model, time=time))
-    return systems, skipped
-
-
-def _linearized(found: Basis, gravity: bool, pose: Array) -> ContinuousModel | str:
-    """The plant held still at a pose (6,), or why it cannot be."""
+def _linearized(found: Assessment, gravity: bool, pose: Array) -> ContinuousModel | str:
+    """Return the plant held still at a pose (6,), or why it cannot be."""
     mechanism = found.experiment.mechanism
     reason = _unusable(diagnose(mechanism, 0.0, pose))
     if reason is not None:
@@ -244,19 +240,19 @@ def _linearized(found: Basis, gravity: bool, pose: Array) -> ContinuousModel | s
     if not gravity:
         return linear_model(*dynamics.linearize(pose, torque=np.zeros(NUM_TORQUES)))
     if abs(standing(mechanism, pose).parallel) < SINGULARITY_LIMIT:
-        return "next to a parallel singularity there is no bound on torques that hold the plate"
+        return "near a parallel singularity the torques that hold the plate have no bound"
     return linear_model(*dynamics.linearize(pose))
 
 
 def _unusable(failure: Failure | None) -> str | None:
-    """Why nothing can be linearised; next to a parallel singularity something can."""
+    """Return why nothing can be linearised; near a parallel singularity something can."""
     if failure is None or (failure.leg is None and "parallel" in failure.reason):
         return None
     return failure.reason
 
 
 def _test(
-    found: Basis,
+    found: Assessment,
     name: str,
     family: str,
     model: ContinuousModel,
@@ -274,8 +270,10 @@ def _test(
     system = LinearSystem(A, B, C, np.zeros((len(C), m)), period)
     asked = (IsControllable, IsStabilizable, IsObservable, IsDetectable)
     drake = {word: bool(ask(system)) for word, ask in zip(QUESTIONS, asked, strict=True)}
-    words = [f"no torque reaches {mode_words(mode, labels)}" for mode in reach.deficient] + [
-        f"no output shows {mode_words(mode, labels)}" for mode in view.deficient
+    words = [
+        f"no {part} {_mode_text(mode, labels)}"
+        for part, test in (("torque reaches", reach), ("output shows", view))
+        for mode in test.deficient
     ]
     radius = float(np.abs(np.linalg.eigvals(A)).max())
     note = _disagreement(_answers(reach, view), drake, n, radius)
@@ -301,24 +299,6 @@ def _disagreement(ours: dict[str, bool], drake: dict[str, bool], n: int, radius:
     if passed:
         parts.append(f"{' and '.join(passed)}, taking anything above rounding for full rank")
     return f"Drake says {'; '.join(parts)}" if parts else ""
-
-
-def _system_summary(system: System) -> dict[str, Any]:
-    return {
-        "name": system.name,
-        "family": system.family,
-        "n": system.n,
-        "m": system.m,
-        "mu": system.steps,
-        "t": system.time,
-        **system.answers,
-        **{f"{word}_margin": margin for word, margin in system.margins.items()},
-        "deficient": list(system.words),
-        "controllable_modes": _modes_summary(system.reach),
-        "observable_modes": _modes_summary(system.view),
-        "drake": system.drake,
-        "note": system.note or None,
-    }
 
 
 def _modes_summary(test: Hautus) -> list[dict[str, Any]]:

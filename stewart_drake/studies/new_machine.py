@@ -1,4 +1,4 @@
-"""A machine, a scenario and a first look, from a handful of measurements with a ruler and scales.
+"""A machine, a scenario and a first check, from a few measurements with a ruler and scales.
 
 The legs of a machine of threefold symmetry follow from two circles. Shafts that are d apart on a
 circle of radius R are seen from its centre under
@@ -8,7 +8,7 @@ circle of radius R are seen from its centre under
 and so are the joints of the plate. Each of its pairs sits between two pairs of the base, and holds
 one rod of either. The height of home is that at which rods push their crank tips best: the largest
 smallest |r.t| of the six legs, r along the rod and t along the crank tip's circle, which is 0 at a
-dead centre. `check_mechanism` looks at any machine at home: reach, torque, poles and singularity.
+dead centre. `check_mechanism` checks any machine at home: reach, torque, poles and singularity.
 """
 
 import math
@@ -29,7 +29,7 @@ from stewart_drake.loop.controller_margin import ControllerMargin, controller_ma
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import PatternSpec, load_mechanism, pattern_legs
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import Legs, leg_geometry, reachable_heights
+from stewart_drake.mechanism.kinematics import leg_geometry, reachable_heights
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES
@@ -47,18 +47,24 @@ BODIES: Final = ("base", "plate", "crank", "rod")
 
 
 class MechanismCheck(NamedTuple):
-    """A mechanism at its home pose, standing still."""
+    """Check of a mechanism at rest at its home pose.
+
+    Attributes:
+        mechanism: that was checked.
+        failure: why the home pose is unusable, or None; then torque, poles and travel are empty.
+        measures: at home.
+        crank_angles: (6,) rad.
+        torque: (6,) N m that hold the plate under gravity.
+        poles: (12,) of the open loop under gravity, 1/s, the fastest growing first.
+        travel: of each coordinate.
+    """
 
     mechanism: Mechanism
     failure: Failure | None
-    """Why the home pose is unusable, or None; with it torque, poles and travel are empty."""
     measures: Measures
     crank_angles: Array
-    """(6,) rad"""
     torque: Array
-    """(6,) N m that hold the plate under gravity."""
     poles: NDArray[np.complex128]
-    """(12,) of the open loop under gravity, 1/s, the fastest growing first."""
     travel: list[Travel]
 
     @property
@@ -98,7 +104,7 @@ class MechanismCheck(NamedTuple):
 
 
 def check_mechanism(mechanism: Mechanism) -> MechanismCheck:
-    """Look at a mechanism at home; a singular home pose is a finding, not an error."""
+    """Check a mechanism at home; a singular home pose is a finding, not an error."""
     home = mechanism.home
     failure = diagnose(mechanism, 0.0, home)
     torque, poles = np.empty(0), np.empty(0, dtype=np.complex128)
@@ -123,18 +129,17 @@ SCENARIO: Final = "scenario.yaml"
 
 _HEIGHTS: Final = 400
 _SHARE: Final = 0.25
-"""Of the travel of z, what the first motion takes."""
+"""Share of the travel of z that the first motion takes."""
 _PERIODS: Final = 25
 """Periods of delay up to which torques are computed every 20 ms, beyond that every 100 ms."""
 
 
 class NewMachine(NamedTuple):
-    """New machine, with a first check of it."""
+    """New machine with a first check; `peak_torque` in N m is that of the proposed motion."""
 
     check: MechanismCheck
     margin: ControllerMargin
     peak_torque: float
-    """N m that the proposed motion takes."""
 
     @property
     def verdict(self) -> str:
@@ -156,12 +161,11 @@ class NewMachine(NamedTuple):
 
 
 def separation(distance: float, radius: float) -> float:
-    """Degrees under which two points of a circle are seen from its centre; both in m."""
+    """Return the angle in degrees of two points of a circle at its centre; lengths in m."""
     return math.degrees(2 * math.asin(distance / (2 * radius)))
 
 
 def proposed_pattern(m: Measurements) -> PatternSpec:
-    """Return the legs."""
     return PatternSpec(
         rotation_deg=0.0,
         base_radius=m.base_radius,
@@ -177,7 +181,7 @@ def proposed_pattern(m: Measurements) -> PatternSpec:
 
 
 def best_height(pattern: PatternSpec, m: Measurements) -> float:
-    """z of the plate's joints in m at which every rod pushes its crank best, above the base.
+    """Return z in m of the plate's joints at which every rod pushes its crank best.
 
     Raises:
         ConfigError: no height is within reach of all legs.
@@ -186,9 +190,10 @@ def best_height(pattern: PatternSpec, m: Measurements) -> float:
     above = m.shaft_height + m.rod
     found = reachable_heights(legs, np.array([0, 0, 0, 0, 0, above]))
     if found is None:
+        gap = float(np.linalg.norm((legs.p_PQ - legs.p_WS)[:, :2], axis=1).max())
         raise ConfigError(
-            f"rod: got {m.rod:g} m; expected rods that reach the plate, whose joints are "
-            f"{_gap(legs):.3g} m beside the shafts, with cranks of {m.crank:g} m"
+            f"rod: got {m.rod:g} m with cranks of {m.crank:g} m; expected rods that reach the plate, "
+            f"{gap:.3g} m horizontally from shafts to joints"
         )
     low, high = found
     heights = np.linspace(low, high, _HEIGHTS + 2)[1:-1]
@@ -198,13 +203,8 @@ def best_height(pattern: PatternSpec, m: Measurements) -> float:
     return float(heights[int(np.argmax(push))])
 
 
-def _gap(legs: Legs) -> float:
-    """Largest horizontal distance of a shaft from its joint, m."""
-    return float(np.linalg.norm((legs.p_PQ - legs.p_WS)[:, :2], axis=1).max())
-
-
 def machine_text(m: Measurements, name: str) -> str:
-    """The machine's file."""
+    """Return the machine's file."""
     pattern = proposed_pattern(m)
     rows = "\n".join(f"  {field.name}: {getattr(pattern, field.name)}" for field in fields(pattern))
     height = float(f"{best_height(pattern, m):.4g}")
@@ -217,7 +217,7 @@ home: [0, 0, 0, 0, 0, {height}]       # proposed: where the rods push the cranks
 pattern:
 {rows}
 
-base: {{mass: 0}}                  # stands still: nobody needs it
+base: {{mass: 0}}                  # does not move
 plate: {{mass: {m.plate_mass!r}}}
 crank: {{length: {m.crank!r}, mass: {m.crank_mass!r}}}
 rod: {{length: {m.rod!r}, mass: {m.rod_mass!r}}}
@@ -226,7 +226,7 @@ motor: {{effort_limit: {limit}}}
 
 
 def scenario_text(m: Measurements, mechanism: Mechanism) -> str:
-    """A first scenario: up and down, over a quarter of the way that the plate has."""
+    """Return a first scenario: up and down, over a quarter of the travel of the plate."""
     z = next(t for t in travel(mechanism) if t.coordinate == COORDINATES[5])
     amplitude = float(f"{_SHARE * min(-z.low, z.high):.1g}")
     period = 0.02 if m.delay <= 0.02 * _PERIODS else 0.1
@@ -252,22 +252,21 @@ delay: {{steps: {delay.steps}, fraction: {round(delay.fraction, 9)}}}   # of {m.
 
 
 def check_free(folder: Path) -> None:
-    """Whether a folder has room for MACHINE and SCENARIO.
+    """Refuse a folder that has one of MACHINE and SCENARIO.
 
     Raises:
-        ConfigError: one of them is there already.
+        ConfigError: it has.
     """
     for file in (MACHINE, SCENARIO):
         if (folder / file).exists():
-            raise ConfigError(f"{folder / file}: is there already; expected a folder without")
+            raise ConfigError(f"{folder / file}: already exists; expected a folder without it")
 
 
 def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
-    """Write MACHINE and SCENARIO into a folder and look at them; nothing is written of a bad one.
+    """Write MACHINE and SCENARIO into a folder and check them; a bad machine is not written.
 
     Raises:
-        ConfigError: one line; a file is there already, a machine that cannot stand, or not be
-            moved.
+        ConfigError: one line; a file exists already, or the machine cannot stand or move.
     """
     check_free(folder)
     with TemporaryDirectory() as place:

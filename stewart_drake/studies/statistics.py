@@ -4,14 +4,15 @@ Nothing is fitted. For one quantity the failing runs are compared with the other
 
     AUC = P(a failing run has the larger value) + P(equal) / 2 = U / (k m),
 
-U of Mann and Whitney, k failing and m other runs; 1/2 where the quantity says nothing. And in plain
-counts: how many of the failing, and of the others, lie in the third of all runs on that side.
+U of Mann and Whitney, k failing and m other runs; 1/2 for a quantity without influence. Plain
+counts support it: how many of the failing, and of the others, lie in the outer third of all runs on
+that side.
 
-Two quantities may have to come together. Cut at their medians, the runs fall into four corners. A
-pair explains failures where in a corner, or in two opposite ones, failing runs are more frequent
-than either quantity alone makes them: with a on its side b's side still has more of them, and with
-b on its side a's, each by Fisher's exact test; the p-value is the larger of the two. All p-values
-are Holm's, over everything that was asked.
+Two quantities may be needed together. Cut at their medians, the runs fall into four corners. A pair
+explains failures if in a corner, or in two opposite ones, failing runs are more frequent than
+either quantity alone makes them: among the runs on a's side b's side still has more of them, and
+among those on b's side a's, each by Fisher's exact test; the p-value is the larger of the two. All
+p-values are Holm's, over all questions.
 """
 
 from collections.abc import Iterator, Mapping
@@ -28,7 +29,7 @@ from scipy.stats import hypergeom, mannwhitneyu
 from stewart_drake.types import Array
 
 CONFIDENCE: Final = 0.95
-"""Of every interval, unless something else is asked for."""
+"""Default of every interval."""
 
 
 class Interval(NamedTuple):
@@ -40,21 +41,22 @@ class Interval(NamedTuple):
 
 
 class Correlation(NamedTuple):
-    """A rank correlation; all NaN where one of the two never changes or there are under 4 pairs."""
+    """Spearman's rank correlation with its interval and two-sided p-value.
+
+    All are NaN if one of the two never changes, or for fewer than 4 pairs.
+    """
 
     rho: float
-    """Spearman's, -1 to 1."""
     low: float
     high: float
     p_value: float
-    """Two-sided, that |rho| is at least so large by chance."""
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = CONFIDENCE) -> Interval:
-    """Share of successes in independent trials, and Wilson's score interval.
+    """Return the share of successes in independent trials, with Wilson's score interval.
 
-    Unlike s/n -+ z (s/n (1 - s/n) / n)^(1/2) its ends stay in [0, 1] and cover the truth about as
-    often as promised even where all trials succeed.
+    Unlike those of s/n -+ z (s/n (1 - s/n) / n)^(1/2) its ends stay in [0, 1], and the coverage is
+    close to the nominal one even if all trials succeed.
 
     Raises:
         ValueError: no trials, or successes beyond 0 ... trials.
@@ -70,10 +72,10 @@ def wilson_interval(successes: int, trials: int, confidence: float = CONFIDENCE)
 def least_share(successes: int, trials: int, confidence: float = CONFIDENCE) -> float:
     """Return the lower end of the one-sided Clopper-Pearson interval of a share of successes.
 
-    Where all n trials succeed this is (1 - confidence)^(1/n), which is also the distribution-free
-    bound of Wilks: with this confidence at least so large a share of all trials has a value no
-    larger than the largest of the n. Both statements are wrong together in at most 1 - confidence
-    of all samples if the second is made only where all trials succeed.
+    If all n trials succeed this is (1 - confidence)^(1/n), which is also the distribution-free
+    bound of Wilks: with this confidence at least this share of all trials has a value no larger
+    than the largest of the n. Both statements are wrong together in at most 1 - confidence of all
+    samples if the second is made only when all trials succeed.
     """
     if successes == 0:
         return 0.0
@@ -86,8 +88,8 @@ def quantile_interval(
     """Return a quantile of the distribution behind a sample, distribution-free.
 
     The number of values below the true quantile is binomial, which gives the ordered values that
-    enclose it, each tail with at most half of the rest. Infinite values, such as of runs
-    that failed, are values like all others. Where the sample is too small, an end is infinite.
+    enclose it, each tail with at most half of the rest. Infinite values, such as of failed runs,
+    are values like all others. If the sample is too small, an end is infinite.
 
     Args:
         values: (n,) without NaN.
@@ -106,7 +108,7 @@ def quantile_interval(
 
 
 def rank_correlation(x: ArrayLike, y: ArrayLike, confidence: float = CONFIDENCE) -> Correlation:
-    """Spearman's rank correlation of pairs, with interval and p-value.
+    """Return Spearman's rank correlation of pairs, with interval and p-value.
 
     The p-value is of Student's distribution; the interval is Fisher's, atanh rho
     -+ z ((1 + rho^2 / 2) / (n - 3))^(1/2), with the variance of Bonett and Wright (2000).
@@ -129,10 +131,10 @@ def rank_correlation(x: ArrayLike, y: ArrayLike, confidence: float = CONFIDENCE)
 
 
 def holm(p_values: ArrayLike) -> Array:
-    """P-values (k,) as they stand when k questions are asked at once: Holm's step-down rule.
+    """Return p-values (k,) adjusted for k questions at once, by Holm's step-down rule.
 
-    In rising order p_(i) becomes max over j <= i of min(1, (k - j + 1) p_(j)). A NaN, where nothing
-    could be asked, stays and is not counted.
+    In rising order p_(i) becomes max over j <= i of min(1, (k - j + 1) p_(j)). A NaN stays and is
+    not counted.
     """
     p = np.asarray(p_values, dtype=np.float64)
     asked = np.flatnonzero(np.isfinite(p))
@@ -152,51 +154,59 @@ SIGNIFICANT: Final = 0.05
 
 
 class Separation(NamedTuple):
-    """One quantity in the failing runs and in the others."""
+    """One quantity in the failing runs and in the others.
+
+    Attributes:
+        factor: name of the quantity.
+        larger: whether failing runs have the larger values, else the smaller ones.
+        auc: probability that a failing run has the larger value.
+        p: adjusted p-value.
+        bound: begin of the outer third of all runs on that side.
+        failing, others: number of runs in that third.
+    """
 
     factor: str
     larger: bool
-    """Whether failing runs have the larger values, else the smaller ones."""
     auc: Interval
-    """Probability that a failing run has the larger value."""
     p: float
-    """Adjusted."""
     bound: float
-    """Where the outer third of all runs on that side begins."""
     failing: int
-    """Failing runs in that third."""
     others: int
-    """Other runs in it."""
 
 
 class Pair(NamedTuple):
-    """Two quantities that together tell more than each alone."""
+    """Two quantities that together separate failing runs better than each alone.
+
+    Attributes:
+        factors: names of the quantities.
+        sides: `large` or `small`, by their medians; of two opposite corners the first.
+        opposite: whether the opposite corner belongs to it.
+        p: adjusted p-value.
+        failing, others: number of runs there.
+    """
 
     factors: tuple[str, str]
     sides: tuple[str, str]
-    """`large` or `small`, by their medians; of two opposite corners the first."""
     opposite: bool
-    """Whether the opposite corner belongs to it: both large or both small, or just not so."""
     p: float
-    """Adjusted."""
     failing: int
-    """Failing runs there."""
     others: int
-    """Other runs there."""
 
 
 class Explanation(NamedTuple):
-    """Differences of the failing runs; the lists hold everything asked, the clearest first."""
+    """Differences between failing and other runs, the clearest first.
+
+    `singles` has all quantities, `pairs` only those found, with one region each.
+    """
 
     failing: int
     others: int
     singles: list[Separation]
     pairs: list[Pair]
-    """Only those found, one region of each."""
 
     @property
     def found(self) -> list[Separation]:
-        """Quantities that separate the two beyond chance; of one and its size the more telling."""
+        """Quantities that separate the two beyond chance; of one and its size the clearer one."""
         first: dict[str, Separation] = {}
         for one in self.singles:
             if one.p < SIGNIFICANT:
@@ -220,21 +230,17 @@ def explain(values: Mapping[str, Array], failed: Flags) -> Explanation:
     """Compare failing runs with the others.
 
     Args:
-        values: (n,) of every quantity; one that never changes is left out.
+        values: (n,) of every quantity; constant ones are left out.
         failed: (n,).
     """
     k, m = int(failed.sum()), int((~failed).sum())
     asked = {name: x for name, x in values.items() if np.isfinite(x).all() and np.ptp(x) > 0}
     if not (k and m and asked):
         return Explanation(k, m, [], [])
-    singles = [_separation(name, x, failed) for name, x in asked.items()]
-    adjusted = holm([one.p for one in singles])
-    singles = [one._replace(p=float(p)) for one, p in zip(singles, adjusted, strict=True)]
+    singles = _adjusted([_separation(name, x, failed) for name, x in asked.items()])
     singles.sort(key=lambda one: (one.p, -abs(one.auc.value - 0.5)))
-    pairs = list(_pairs(asked, failed))
-    adjusted = holm([one.p for one in pairs])
-    pairs = [one._replace(p=float(p)) for one, p in zip(pairs, adjusted, strict=True)]
-    # Where both opposite corners are found, they say more than the one of the two.
+    pairs = _adjusted(list(_pairs(asked, failed)))
+    # Two opposite corners come before each of them alone.
     best: dict[tuple[str, str], Pair] = {}
     for one in sorted(pairs, key=lambda one: (not one.opposite, one.p)):
         if one.p < SIGNIFICANT:
@@ -242,15 +248,20 @@ def explain(values: Mapping[str, Array], failed: Flags) -> Explanation:
     return Explanation(k, m, singles, sorted(best.values(), key=lambda one: one.p))
 
 
-def auc_interval(auc: float, failing: int, others: int, confidence: float = CONFIDENCE) -> Interval:
-    """AUC with Newcombe's interval (2006, method 5).
+def _adjusted(found: list[Any]) -> list[Any]:
+    p_values = holm([one.p for one in found])
+    return [one._replace(p=float(p)) for one, p in zip(found, p_values, strict=True)]
 
-    The ends are the A for which |auc - A| is z deviations, with the variance that Hanley and McNeil
-    give such an A,
+
+def auc_interval(auc: float, failing: int, others: int, confidence: float = CONFIDENCE) -> Interval:
+    """Return the AUC with Newcombe's interval (2006, method 5).
+
+    The ends are those A for which |auc - A| is z deviations, with the variance of Hanley and McNeil
+    for that A,
 
         A (1 - A) (1 + N (1 - A) / (2 - A) + N A / (1 + A)) / (k m),   N = (k + m) / 2 - 1,
 
-    so that like Wilson's they stay in [0, 1] and tell something where the two are quite apart.
+    so that like Wilson's they stay in [0, 1], also if the two groups do not overlap.
     """
     z, half = float(ndtri((1 + confidence) / 2)), (failing + others) / 2 - 1
 
@@ -276,7 +287,7 @@ def _separation(name: str, x: Array, failed: Flags) -> Separation:
 
 
 def _pairs(values: Mapping[str, Array], failed: Flags) -> Iterator[Pair]:
-    """Every pair of different quantities with every corner, and every two opposite ones."""
+    """Yield every pair of different quantities with every corner, and every two opposite ones."""
     words = {True: "large", False: "small"}
     halves = {name: x > np.median(x) for name, x in values.items()}
     for a, b in combinations(halves, 2):
@@ -299,11 +310,11 @@ def _pairs(values: Mapping[str, Array], failed: Flags) -> Iterator[Pair]:
 
 
 def _both_needed(a: Flags, b: Flags, failed: Flags) -> float:
-    """The larger p-value of: b's side has more failing runs where a holds, and a's where b does."""
+    """Return the larger p-value of: b matters among the runs with a, and a among those with b."""
     return max(_more_often(failed[a], b[a]), _more_often(failed[b], a[b]))
 
 
 def _more_often(failed: Flags, there: Flags) -> float:
-    """Fisher's exact test, one-sided: P(at least this number of failing runs by chance)."""
+    """Return P(at least this number of failing runs by chance), Fisher's exact test, one-sided."""
     together = int(np.sum(failed & there))
     return float(hypergeom.sf(together - 1, len(failed), int(failed.sum()), int(there.sum())))

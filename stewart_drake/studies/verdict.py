@@ -16,23 +16,28 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.types import Array
 
 
-class Basis(NamedTuple):
-    """A scenario made concrete, judged, and measured."""
+class Assessment(NamedTuple):
+    """Assessment of a scenario that need not be possible.
+
+    Attributes:
+        experiment: of the scenario.
+        failure: when and why the reference leaves the workspace, or None.
+        home_failure: why the home pose is outside the workspace, or None.
+        motion: (6,) usual size of the pose, rad and m: half the reference's peak to peak.
+        torque: usual size of a torque, N m: the largest that following the reference takes. If it
+            cannot be followed, that of a median instant, because torques may grow without bound on
+            the way out.
+    """
 
     experiment: Experiment
     failure: Failure | None
-    """Where and why the reference leaves the workspace, or None."""
     home_failure: Failure | None
-    """Why the home pose is no place to work at, or None; its time means nothing."""
     motion: Array
-    """(6,) usual size of the pose, rad and m: half the reference's peak to peak."""
     torque: float
-    """Usual size of a torque, N m: the largest that following the reference takes; where it cannot
-    be followed, that of a median instant, since torques may grow without bound on the way out."""
 
     @property
     def obstacles(self) -> tuple[str, ...]:
-        """What stands in the way, in sentences; none where everything is well."""
+        """Sentences about the home pose and the reference outside the workspace."""
         sentences = []
         if self.home_failure is not None:
             sentences.append(f"At the home pose: {self.home_failure.reason}.")
@@ -47,12 +52,12 @@ class Basis(NamedTuple):
 
     @property
     def followed_until(self) -> float:
-        """s, the last instant at which the reference is known to be in the workspace."""
+        """Last instant at which the reference is known to be in the workspace, s."""
         return _end(self.experiment.scenario.duration, self.failure)
 
 
-def basis(scenario: Scenario) -> Basis:
-    """Make a scenario concrete without insisting that it can be run.
+def assess(scenario: Scenario) -> Assessment:
+    """Assess a scenario.
 
     Raises:
         ConfigError: one line.
@@ -65,7 +70,7 @@ def basis(scenario: Scenario) -> Basis:
     if end > 0:
         torques = reference_torques(experiment.nominal, reference, end)
         torque = float(torques.max() if failure is None else np.median(torques))
-    return Basis(
+    return Assessment(
         experiment=experiment,
         failure=failure,
         home_failure=diagnose(mechanism, 0.0, mechanism.home),
@@ -124,17 +129,24 @@ def loop_verdict(loop: ControllerMargin) -> str:
     """Return one sentence: stability and margins of this controller on this plant."""
     if loop.problem:
         return f"this loop is not judged: {loop.problem}"
-    where = "linearised along the reference"
+    assumptions = []
+    if loop.estimated:
+        found = "payload, friction and delay" if loop.delay_found else "payload and friction"
+        assumptions.append(f"the estimator left out, {found} taken as found")
+    if loop.tuned:
+        assumptions.append("with the weights that the tuner starts from")
+    assumed = f" ({'; '.join(assumptions)})" if assumptions else ""
     if not loop.stable:
         return (
-            f"this loop is unstable: {where}, errors grow {loop.radius:.3g} fold per period of "
-            f"{loop.period:g} s at t = {loop.time:.1f} s{_left_out(loop)}"
+            f"this loop is unstable: linearised along the reference, errors grow {loop.radius:.3g} "
+            f"fold per period of {loop.period:g} s at t = {loop.time:.1f} s{assumed}"
         )
     m = loop.margins
     up = f"{m.gain_up:.4g}" if math.isfinite(m.gain_up) else "any"
     return (
-        f"this loop is stable: {where}, for delay errors from -{milliseconds(m.shorter)} to "
-        f"+{milliseconds(m.longer)} and motor gains from {m.gain_down:.3g} to {up}{_left_out(loop)}"
+        "this loop is stable: linearised along the reference, for delay errors from "
+        f"-{milliseconds(m.shorter)} to +{milliseconds(m.longer)} and motor gains from "
+        f"{m.gain_down:.3g} to {up}{assumed}"
     )
 
 
@@ -163,17 +175,6 @@ def pole_in_motion(experiment: Experiment, time: float) -> float:
 def milliseconds(seconds: float) -> str:
     """Return a time in three digits, or `any time` if it is infinite."""
     return f"{1e3 * seconds:.3g} ms" if math.isfinite(seconds) else "any time"
-
-
-def _left_out(loop: ControllerMargin) -> str:
-    """Return the assumptions of the judgement, in brackets."""
-    supposed = []
-    if loop.estimated:
-        found = "payload, friction and delay" if loop.delay_found else "payload and friction"
-        supposed.append(f"the estimator left out, {found} taken as found")
-    if loop.tuned:
-        supposed.append("with the weights that the tuner starts from")
-    return f" ({'; '.join(supposed)})" if supposed else ""
 
 
 def _power(exponent: float) -> str:

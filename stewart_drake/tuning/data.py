@@ -4,7 +4,7 @@ A row holds a sample [state error (12); commanded torque (6)], its densities (45
 with faults, the features `health`. A row belongs to a run with its delay, frequency, disturbance,
 weights and costs. The rows of a run that ended early stay, empty (NaN) and not valid. A run costs
 
-    J = E_ac up to the end + LOST * seconds that were lost with the plate,
+    J = E_ac up to the end + LOST * seconds without the plate,
 
 so that every run counts, and a plate that leaves early costs more than one that leaves late.
 """
@@ -26,7 +26,6 @@ from stewart_drake.files.arrayio import load_netcdf, load_npz, write_netcdf
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.versions import versions
-from stewart_drake.files.yamlio import brief
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.bulk import Ending, MakeTuner, run_in_bulk
 from stewart_drake.loop.preparation import Experiment
@@ -34,25 +33,24 @@ from stewart_drake.loop.tuner import health_of
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS
-from stewart_drake.studies.families import SAMPLES, Family, with_gain
 from stewart_drake.studies.jobs import Progress, run_jobs
 from stewart_drake.tuner.features import HealthFeatures
 from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Network, densities
 from stewart_drake.tuner.source import Decision, RatioPolicy, WeightsSource
+from stewart_drake.tuning.families import SAMPLES, Family, with_gain
 from stewart_drake.types import Array
 
 LOST: Final = 50.0
 """% s per second."""
 EVERY: Final = 2
-"""Interval of the samples whose `health` is kept; neighbours are alike."""
+"""Interval of the samples with recorded `health`; neighbours are alike."""
 WATCHED: Final = 2
-"""Interval of the gains whose runs are watched; the others run in C alone."""
+"""Interval of the gains with recorded `health`; the other runs are in C alone."""
 LEAST: Final = 1e-3
-"""% s; a smaller J counts as this one, so that a run without error is not worth everything."""
+"""% s; least J in a logarithm, so that a run without error does not outweigh all others."""
 
 _NUMBERS: Final = ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_variation")
-_STATUSES: Final = ("completed", "left_workspace", "solver_failed")
-_EXPECTED: Final = "what `tune dataset --out` has written"
+_EXPECTED: Final = "a data set that `tune dataset --out` has written"
 _SAMPLE: Final = ("run", "sample", "input")
 _VARIABLES: Final[dict[str, tuple[tuple[str, ...], str]]] = {
     "samples": (_SAMPLE, "f"),
@@ -71,7 +69,7 @@ _SINCE_0_3: Final[dict[str, tuple[tuple[str, ...], str]]] = {
     "J": (("run",), "f"),
     "health": (("run", "sample", "feature"), "f"),
 }
-"""The same of those that a file of 0.2 does not have."""
+"""The same of variables that a file of 0.2 lacks."""
 
 Gains = tuple[tuple[float, float], ...]
 """w_Q and w_R of each run of a condition."""
@@ -82,11 +80,7 @@ Gains = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class FixedPolicy:
-    """A tuner with fixed weights.
-
-    Attributes:
-        first: (2,) w_Q and w_R, throughout.
-    """
+    """Policy with fixed weights `first` (2,), w_Q and w_R."""
 
     first: Array
 
@@ -104,7 +98,7 @@ def watching(w_Q: float, w_R: float) -> MakeTuner:
 
 
 def cost(ending: Ending, duration: float) -> float:
-    """Compute J in % s of a run whose scenario lasts `duration` s."""
+    """Return J in % s of a run of a scenario of `duration` s."""
     so_far = ending.error_so_far if np.isfinite(ending.error_so_far) else 0.0
     stopped = ending.stopped
     return so_far if stopped is None else so_far + LOST * (duration - stopped.time)
@@ -132,28 +126,28 @@ def watched_run(scenario: Scenario, tuner: MakeTuner, samples: int) -> tuple[End
 
 
 def run_condition(
-    scenario: Scenario, gains: Gains, samples: int = SAMPLES, watch: bool = False
+    scenario: Scenario, gains: Gains = (), samples: int = SAMPLES, watch: bool = False
 ) -> bytes:
-    """Run a condition with each gain: the bytes of an .npz file.
+    """Run a condition with each gain; return the bytes of an .npz file.
 
     Args:
         scenario: the condition.
-        gains: w_Q and w_R of each run.
+        gains: w_Q and w_R of each run; without any there is one run with the scenario's own tuner.
         samples: number of samples that are kept.
-        watch: whether `health` is computed, for every second gain.
+        watch: whether `health` is recorded, for every second gain.
     """
-    runs = []
+    nothing, runs = np.full((samples, NUM_INPUTS), np.nan), []
     for i, gain in enumerate(gains):
         run = with_gain(scenario, *gain)
         if watch and i % WATCHED == 0:
             runs.append(watched_run(run, watching(*gain), samples))
         else:
-            runs.append((run_in_bulk(run), np.full((samples, NUM_INPUTS), np.nan)))
-    return _file(runs, scenario.duration)
+            runs.append((run_in_bulk(run), nothing))
+    return _file(runs or [(run_in_bulk(scenario), nothing)], scenario.duration)
 
 
 def roll_out(scenario: Scenario, network: Network, samples: int) -> bytes:
-    """Run a condition with a network: the same file of one run."""
+    """Run a condition with a network; return the same file of one run."""
 
     def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
         return WeightsSource(health_of(experiment, law), RatioPolicy(network))
@@ -162,16 +156,21 @@ def roll_out(scenario: Scenario, network: Network, samples: int) -> bytes:
 
 
 def _file(runs: list[tuple[Ending, Array]], duration: float) -> bytes:
-    rows = np.full((len(runs), len(runs[0][1]), NUM_INPUTS), np.nan)
-    for row, (ending, _) in zip(rows, runs, strict=True):
-        row[: len(ending.samples)] = ending.samples[: len(row)]
+    def padded(rows: Array) -> Array:
+        whole = np.full((len(runs[0][1]), rows.shape[1]), np.nan)
+        whole[: len(rows)] = rows[: len(whole)]
+        return whole
+
     endings = [ending for ending, _ in runs]
     arrays: dict[str, Any] = {
-        "samples": rows,
+        "samples": [padded(one.samples) for one in endings],
+        "used": [padded(one.weights) for one in endings],
         "health": np.array([health for _, health in runs], dtype=np.float32),
-        "status": np.array([one.status for one in endings]),
+        "status": [one.status for one in endings],
         "stopped": [np.nan if one.stopped is None else one.stopped.time for one in endings],
         "J": [cost(one, duration) for one in endings],
+        "fallbacks": [one.counts["tuner_fallbacks"] for one in endings],
+        "loop": [one.loop for one in endings],
     }
     arrays |= {name: [getattr(one.figures, name) for one in endings] for name in _NUMBERS}
     buffer = io.BytesIO()
@@ -179,37 +178,21 @@ def _file(runs: list[tuple[Ending, Array]], duration: float) -> bytes:
     return buffer.getvalue()
 
 
-def read_condition(path: Path, runs: int, samples: int = SAMPLES) -> dict[str, NDArray[Any]]:
-    """Read the file of a condition with so many runs.
+def read_condition(path: Path, runs: int = 1, samples: int = SAMPLES) -> dict[str, NDArray[Any]]:
+    """Read the file of a condition with a number of runs.
 
     Raises:
         ConfigError: the file is damaged; one line.
     """
     shapes: dict[str, tuple[str, tuple[int, ...]]] = {
         "samples": ("f", (runs, samples, len(TUNER_INPUTS))),
+        "used": ("f", (runs, samples, len(WEIGHTS))),
         "health": ("f", (runs, samples, NUM_INPUTS)),
-        "status": ("U", (runs,)),
+        **dict.fromkeys(("status", "loop"), ("U", (runs,))),
         **dict.fromkeys(("stopped", "J", *_NUMBERS), ("f", (runs,))),
+        "fallbacks": ("i", (runs,)),
     }
-    found = load_npz(path, shapes, "the file of one condition of `tune dataset`")
-    there = np.isfinite(found["samples"]).all(axis=2)
-    numbers = np.array([found[name] for name in ("stopped", "J", *_NUMBERS)])
-    done, unknown = found["status"] == "completed", ~np.isin(found["status"], _STATUSES)
-    problem = None
-    if unknown.any():
-        got = brief(str(found["status"][unknown][0]))
-        problem = f"status: got {got}; expected one of {', '.join(_STATUSES)}"
-    elif np.isinf(numbers).any() or (numbers < 0).any() or np.isnan(found["J"]).any():
-        problem = "a number of it is infinite or negative; expected NaN or what is measured"
-    elif (np.isnan(found["stopped"]) != done).any() or (
-        np.isnan(found["accumulated_error"]) == done
-    ).any():
-        problem = "stopped and E_ac do not go with the status; expected those of one run"
-    elif not there[done].all() or not np.isnan(found["samples"][~there]).all():
-        problem = "samples: some are missing; expected all of a run that completed"
-    if problem:
-        raise ConfigError(f"{path}: {problem}")
-    return found
+    return load_npz(path, shapes, "the file of one condition of a family")
 
 
 # ---------------------------------------------------------------- the data set
@@ -223,15 +206,15 @@ def make_data(
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> xr.Dataset:
-    """Run all conditions, or go on with them, and write dataset.nc.
+    """Run all conditions, or continue, and write dataset.nc.
 
     Args:
         family: for training.
-        directory: for dataset.nc; the runs are kept in conditions/ there, a file per condition.
+        directory: of dataset.nc; the runs are kept in conditions/, a file per condition.
         workers, scheduler, progress: as `run_jobs` takes them.
 
     Returns:
-        What `load_data` reads back.
+        The data set, as `load_data` reads it.
 
     Raises:
         As `run_jobs`.
@@ -256,15 +239,9 @@ def make_data(
         scheduler=scheduler,
         progress=progress,
     )
-    more = {
-        "draws": family.draws,
-        "family": family.name,
-        "gains": list(family.gains),
-        "seed": family.seed,
-    }
-    data = assemble(family, kept, settings | more)
-    # A summary that is there describes the data set beside it.
-    (directory / "summary.json").unlink(missing_ok=True)
+    settings |= {"draws": family.draws, "family": family.name, "seed": family.seed}
+    data = assemble(family, kept, settings | {"gains": list(family.gains)})
+    (directory / "summary.json").unlink(missing_ok=True)  # that of an earlier data set
     remove_partials(directory)
     write_netcdf(directory / "dataset.nc", data)
     return data
@@ -273,7 +250,7 @@ def make_data(
 def assemble(
     family: Family, kept: Mapping[str, dict[str, NDArray[Any]]], settings: Mapping[str, Any]
 ) -> xr.Dataset:
-    """Join what `read_condition` returns of all conditions into one data set."""
+    """Join the results of `read_condition` of all conditions into one data set."""
     conditions, gains = family.conditions.values(), list(family.gains.values())
 
     def joined(name: str) -> NDArray[Any]:
@@ -283,7 +260,7 @@ def assemble(
     rho = np.array([densities(one) for one in rows]).reshape(rows.shape)
     valid = np.isfinite(rows).all(axis=2)
     rho = np.where(valid[..., None], rho, np.nan)
-    if family.has_faults:  # of which there are many runs
+    if family.has_faults:  # with many runs
         rows, rho = rows.astype(np.float32), rho.astype(np.float32)
     variables: dict[str, Any] = {
         "samples": (_SAMPLE, rows),
@@ -337,26 +314,26 @@ def _problem(data: xr.Dataset) -> str | None:
     known = _VARIABLES | {name: one for name, one in _SINCE_0_3.items() if name in data.data_vars}
     for name, (dimensions, kinds) in known.items():
         if name not in data.data_vars:
-            return f"it has no {name}"
+            return f"{name} is missing"
         if data[name].dims != dimensions or data[name].dtype.kind not in kinds:
             return f"{name} is {data[name].dtype} over {data[name].dims}"
     sizes = data.sizes
     if not (sizes["run"] and sizes["sample"]) or "run" not in data.coords:
-        return "it has no runs"
+        return "there are no runs"
     if (sizes["input"], sizes["weight"]) != (len(TUNER_INPUTS), len(WEIGHTS)):
         return f"a sample has {sizes['input']} values and {sizes['weight']} weights"
     if sizes.get("feature", NUM_INPUTS) != NUM_INPUTS:
         return f"health has {sizes['feature']} values"
     samples, valid, weights = data.samples.values, data.valid.values, data.weights.values
     if not np.array_equal(np.isfinite(samples).all(axis=2), valid) or np.isinf(samples).any():
-        return "valid is not where its samples are finite"
+        return "valid does not match the finite samples"
     if not np.all((weights > 0) & np.isfinite(weights)):
-        return "a weight is no positive number"
+        return "a weight is not a positive number"
     if "J" in data and not np.all(np.isfinite(data.J.values) & (data.J.values >= 0)):
         return "a J is negative or not finite"
     done, error = data.status.values == "completed", data.accumulated_error.values
     if not np.array_equal(np.isfinite(error), done) or np.any(error[done] < 0):
-        return "E_ac is not where its runs are completed"
+        return "E_ac does not match the completed runs"
     try:
         settings = json.loads(data.attrs["settings"])
         return None if isinstance(settings["data"], str) else "its settings are damaged"
@@ -365,7 +342,7 @@ def _problem(data: xr.Dataset) -> str | None:
 
 
 def data_hash(data: xr.Dataset) -> str:
-    """Compute SHA-256 over the values that training sees: samples and what is known of each run."""
+    """Return the SHA-256 of the values that training uses: samples, weights, conditions, costs."""
     digest = hashlib.sha256()
     for name in ("samples", "weights", "delay_steps", "frequency", "disturbance", *_NUMBERS):
         values = np.ascontiguousarray(data[name].values, dtype="<f8")
@@ -374,9 +351,9 @@ def data_hash(data: xr.Dataset) -> str:
     return digest.hexdigest()
 
 
-def log_cost(data: xr.Dataset) -> Array:
-    """Return the natural logarithm of J of each run."""
-    return np.log(np.maximum(np.asarray(data.J.values, dtype=np.float64), LEAST))
+def log_cost(J: Array) -> Array:
+    """Return the natural logarithm of J in % s, which is at least LEAST."""
+    return np.log(np.maximum(np.asarray(J, dtype=np.float64), LEAST))
 
 
 def cells(data: xr.Dataset) -> list[NDArray[np.intp]]:
@@ -389,14 +366,14 @@ def cells(data: xr.Dataset) -> list[NDArray[np.intp]]:
 
 
 def summarize(data: xr.Dataset) -> dict[str, Any]:
-    """Return what `summary.json` of a data set holds.
+    """Return the content of `summary.json` of a data set.
 
     `g` is the geometric mean of J by gain, `completed` the number of conditions that it completes,
     `hindsight` g with the best gain of each condition.
     """
     settings = json.loads(data.attrs["settings"])
     names, status = settings["gains"], data.status.values
-    log_J = log_cost(data).reshape(-1, len(names))
+    log_J = log_cost(data.J.values).reshape(-1, len(names))
     done = (status == "completed").reshape(log_J.shape)
     return {
         "runs": data.sizes["run"],

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Final, Literal
 from stewart_drake.studies.options import JobOptions, Options, option, refuse
 
 if TYPE_CHECKING:
-    from stewart_drake.studies.families import Family
+    from stewart_drake.tuning.families import Family, Purpose
 
 Labels = Literal["as_run", "best_in_cell", "best_in_cell_torque"]
 Split = Literal["sample", "run", "cell"]
@@ -17,7 +17,7 @@ DRAWS: Final = 384
 class FamilyOptions(JobOptions):
     """Options of runs under the conditions of a family."""
 
-    purpose: ClassVar[Literal["training", "evaluation"]]
+    purpose: ClassVar["Purpose"]
     family: Literal["T", "N2"] | None = option(
         None, "Conditions where weights matter: T with the estimator, N2 without."
     )
@@ -34,21 +34,21 @@ class FamilyOptions(JobOptions):
         controller: str | Path | None,
         settings: Iterable[str],
     ) -> "Family":
-        """Draw the conditions, on the exact plant unless a setting says otherwise.
+        """Return the conditions, on the exact plant unless a setting says otherwise.
 
         Raises:
             ConfigError: options that do not go together, or as the families.
         """
         from stewart_drake.scenario.loading import load_scenario
-        from stewart_drake.studies.families import disturbed_family, faulty_family, paper_grid
+        from stewart_drake.tuning.families import disturbed_family, faulty_family, paper_grid
 
         number = self.number
         if self.family is not None:
-            said = {
+            given = {
                 "SCENARIO": None if scenario == "paper" else scenario,
                 "--controller": controller,
             }
-            refuse(said, "with --family, which says it; expected none")
+            refuse(given, "with --family, which sets it; expected none")
             return faulty_family(self.family, number, self.seed, self.purpose, tuple(settings))
         base = load_scenario(scenario, controller, ("plant.kind=exact", *settings))
         if number == 0:
@@ -77,7 +77,7 @@ class DataOptions(FamilyOptions):
         return DRAWS if self.draws is None else self.draws
 
 
-class WorthOptions(FamilyOptions):
+class EvaluationOptions(FamilyOptions):
     """Options of the evaluation of a tuner."""
 
     purpose = "evaluation"
@@ -111,10 +111,9 @@ class TrainingOptions(Options):
         Raises:
             ConfigError: there is one.
         """
-        others: dict[str, object]
+        of_labels = {"labels": self.labels, "split": self.split, "density": self.density}
+        of_regret = {"start": self.start, "workers": self.workers}
         if self.regret:
-            others = {"labels": self.labels, "split": self.split, "density": self.density}
-            refuse(others, "with --regret; expected it without")
+            refuse(of_labels, "with --regret; expected it without")
         else:
-            others = {"start": self.start, "workers": self.workers}
-            refuse(others, "without --regret; expected it with --regret")
+            refuse(of_regret, "without --regret; expected it with --regret")

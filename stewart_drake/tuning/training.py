@@ -1,24 +1,24 @@
-"""Train the tuner's network on a data set, by labels or by regret.
+"""Training of the tuner's network on a data set, with one of two losses.
 
 theta holds W1 (h, 18), b1 (h,), W2 (2, h), b2 (2,) one after the other, and the network is
 
     f(theta, u) = W2 sigmoid(W1 u + b1) + b2.
 
-*Labels* say what to answer; f minimises 1/2 sum |f(theta, u_i) - y_i|^2 by Levenberg and Marquardt,
-as in the paper: (J'J + lambda D^2) step = -J' r, which MINPACK solves through QR.
+*Labels* are the right answers; f minimises 1/2 sum |f(theta, u_i) - y_i|^2 by Levenberg and
+Marquardt, as in the paper: (J'J + lambda D^2) step = -J' r, which MINPACK solves through QR.
 
 K of (43) depends on w_Q / w_R alone, since P of (44) scales with both. Pairs of one ratio are
 therefore one gain, and (0.1, 0.1), (1, 1) and (4, 4) one answer; a best gain has w_Q w_R = 1.
 
-*Regret* says what an answer costs. With R_i(r) = log J_i(r) - min log J_i along
+*Regret* is the cost of an answer. With R_i(r) = log J_i(r) - min log J_i along
 r = log10(w_Q / w_R), known at 13 ratios and linear in between, f minimises by Adam
 
     mean over rows of R_i(r(u; theta)) + OUTSIDE |r - nearest in bounds|^2 + DECAY mean theta^2.
 
-Where any ratio will do, a label is noise, and here nothing is lost. Rows are first those of the
-runs with fixed ratios. A network leads to features that no fixed ratio does: in a second round half
-of the rows are of its own runs. Conditions, and with them motions, that are held out say when to
-stop, and which round was better, in the loop.
+If any ratio will do, a label is noise, but a regret is not. Rows are first those of the runs with
+fixed ratios. A network leads to features that no fixed ratio does: in a second round half of the
+rows are of runs with the network. Held-out conditions, and with them motions, decide when to stop,
+and which round was better, in the loop.
 """
 
 import hashlib
@@ -33,7 +33,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.versions import versions
@@ -41,7 +41,6 @@ from stewart_drake.files.yamlio import validate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.renames import with_new_names
-from stewart_drake.studies.families import FAULTY, RATIOS, vary
 from stewart_drake.studies.jobs import Progress, run_jobs
 from stewart_drake.tuner.network import NUM_INPUTS, NUM_OUTPUTS, Kind, Network, densities
 from stewart_drake.tuner.source import weights_of
@@ -51,9 +50,11 @@ from stewart_drake.tuning.data import (
     WATCHED,
     cells,
     data_hash,
+    log_cost,
     read_condition,
     roll_out,
 )
+from stewart_drake.tuning.families import FAULTY, RATIOS, vary
 from stewart_drake.tuning.options import Labels, Split
 from stewart_drake.types import Array
 
@@ -70,13 +71,13 @@ EVALUATIONS: Final = 60
 HELD_OUT: Final = 0.2
 """Share of the conditions."""
 OWN: Final = 0.5
-"""Share of the conditions trained on that are run with the first round's network."""
+"""Share of the trained conditions that are run with the first round's network."""
 BATCH: Final = 4000
 STEPS: Final = 1500
 PATIENCE: Final = 300
-"""Steps without improvement on the conditions that are held out."""
+"""Steps without improvement on the held-out conditions."""
 LOOK: Final = 25
-"""Steps between two looks at those."""
+"""Steps between two evaluations on those."""
 RATE: Final = 0.02
 OUTSIDE: Final = 0.1
 DECAY: Final = 1e-4
@@ -89,7 +90,7 @@ class Training:
     Attributes:
         network: with its card.
         curve: one row per step. Labels: root mean square errors of training and test rows. Regret:
-            round, step, regret of the rows trained on and of those held out.
+            round, step, regret of the training and of the held-out rows.
         targets: (N, 2) labels of the test rows, as the output layer gives them; empty for regret.
         outputs: (N, 2) of the network there.
     """
@@ -100,7 +101,7 @@ class Training:
     outputs: Array
 
 
-# ---------------------------------------------------------------- the network in torch
+# ---------------------------------------------------------------- the network
 
 
 def require_torch() -> Any:
@@ -143,11 +144,7 @@ def standard(inputs: Array) -> tuple[Array, Array]:
 
 
 class TorchModel:
-    """f and its Jacobian by torch, in double precision.
-
-    Args:
-        inputs: number of inputs.
-        hidden: number of hidden neurons.
+    """f of rows of inputs and its Jacobian by torch, in double precision.
 
     Raises:
         ConfigError: torch is not installed.
@@ -177,24 +174,11 @@ class TorchModel:
         return self._call(self._jacobian, theta, u)
 
 
+def _card(seed: int, **more: Any) -> dict[str, Any]:
+    return more | {"seed": seed, "versions": versions() | {"torch": version("torch")}}
+
+
 # ---------------------------------------------------------------- by labels
-
-
-class Fit(NamedTuple):
-    """A parameter vector that Levenberg-Marquardt has found.
-
-    Attributes:
-        theta: the parameters.
-        curve: (iterations, 2) root mean square errors of the training and the test rows, from the
-            start on.
-        evaluations: of the residuals.
-        converged: whether MINPACK stopped by itself.
-    """
-
-    theta: Array
-    curve: Array
-    evaluations: int
-    converged: bool
 
 
 def fit(
@@ -203,15 +187,19 @@ def fit(
     train: tuple[Array, Array],
     test: tuple[Array, Array],
     evaluations: int,
-) -> Fit:
+) -> OptimizeResult:
     """Minimise the squared errors by Levenberg-Marquardt from `theta` on.
 
     Args:
         model: f.
-        theta: where to start.
+        theta: start.
         train: standardised inputs (N, n) and targets (N, 2).
         test: the same, of rows that training does not see; may be empty.
         evaluations: of the residuals, at most.
+
+    Returns:
+        Of `least_squares`, with `curve` (iterations, 2): root mean square errors of training and
+        test rows, from the start on.
     """
     curve: list[tuple[float, float]] = []
 
@@ -232,7 +220,8 @@ def fit(
         residuals, theta, jac=jacobian, method="lm", max_nfev=evaluations, x_scale=1.0
     )
     curve.append((rms(found.x, train), rms(found.x, test)))
-    return Fit(found.x, np.array(curve), int(found.nfev), found.status > 0)
+    found.curve = np.array(curve)
+    return found
 
 
 def labels(data: xr.Dataset, kind: Labels) -> Array:
@@ -240,13 +229,13 @@ def labels(data: xr.Dataset, kind: Labels) -> Array:
 
     Args:
         data: as `load_data` returns it.
-        kind: `as_run`, the weights that the run used, as the paper has it; `best_in_cell`, those of
-            least E_ac among the runs of the same delay, frequency and disturbance, w_Q w_R = 1;
+        kind: `as_run`, the weights of the run, as the paper has it; `best_in_cell`, those of least
+            E_ac among the runs of the same delay, frequency and disturbance, w_Q w_R = 1;
             `best_in_cell_torque`, the same of least E_ac + rms torque, each relative to its least
             in the cell.
 
     Returns:
-        w_Q and w_R; NaN where no run of the cell completed, so that nothing is best.
+        w_Q and w_R; NaN if no run of the cell completed.
     """
     weights = np.array(data.weights.values, dtype=np.float64)
     if kind == "as_run":
@@ -254,7 +243,7 @@ def labels(data: xr.Dataset, kind: Labels) -> Array:
     result = np.full_like(weights, np.nan)
     ratios = weights[:, 0] / weights[:, 1]
     for members in cells(data):
-        costs = np.array(data.accumulated_error.values[members])  # NaN where a run ended early
+        costs = np.array(data.accumulated_error.values[members])  # NaN for a run that ended early
         if not np.isfinite(costs).any():
             continue
         if kind == "best_in_cell_torque":
@@ -266,7 +255,7 @@ def labels(data: xr.Dataset, kind: Labels) -> Array:
 
 
 class Rows(NamedTuple):
-    """Valid rows of a data set: inputs, targets, and the run and cell that each is of."""
+    """Valid rows of a data set: inputs, targets, and run and cell of each."""
 
     inputs: Array
     targets: Array
@@ -288,7 +277,7 @@ def labelled_rows(data: xr.Dataset, kind: Labels, density: Kind) -> Rows:
 
 
 def split_rows(rows: Rows, split: Split, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Choose the rows to train on, 70 % of the samples, runs or cells."""
+    """Choose the training rows, 70 % of the samples, runs or cells."""
     group = {"sample": np.arange(len(rows.inputs)), "run": rows.runs, "cell": rows.cells}[split]
     groups = rng.permutation(np.unique(group))
     return np.isin(group, groups[: round(TRAIN_SHARE * len(groups))])
@@ -311,16 +300,16 @@ def train(
         data: as `load_data` returns it.
         kind: of labels; with `as_run` the network's outputs are the weights, as the paper has it,
             otherwise their logarithms.
-        split: 70 % of what is drawn for training: of samples, as printed, of runs, whose samples
-            resemble each other, or of cells, whose runs do.
+        split: unit of the 70 % for training: samples, as printed; runs, because the samples of a
+            run resemble each other; or cells, because the runs of a cell do.
         density: kind of the inputs.
         seed: of split, choice of rows and start.
         hidden: number of hidden neurons.
-        max_rows: used for training at most.
+        max_rows: for training at most.
         evaluations: of the residuals at most.
 
     Raises:
-        ConfigError: torch is missing, or too few rows are left to train on or to test with.
+        ConfigError: torch is missing, or there are too few rows to train on or to test with.
     """
     rows, rng = labelled_rows(data, kind, density), np.random.default_rng(seed)
     in_train = split_rows(rows, split, rng)
@@ -333,7 +322,7 @@ def train(
     theta = initial_theta(NUM_INPUTS, hidden, rows.targets[chosen], seed)
     if rows.targets[chosen].size < len(theta):
         raise ConfigError(
-            f"data: {len(chosen)} rows to train on cannot tell the {len(theta)} numbers of a "
+            f"data: {len(chosen)} rows are too few to train the {len(theta)} parameters of a "
             f"network with {hidden} hidden neurons; expected more runs that complete"
         )
     mean, scale = standard(rows.inputs[chosen])
@@ -341,41 +330,35 @@ def train(
     test = (u[~in_train], rows.targets[~in_train])
     found = fit(model, theta, (u[chosen], rows.targets[chosen]), test, evaluations)
     constant = np.sqrt(np.mean((test[1] - rows.targets[chosen].mean(axis=0)) ** 2))
-    card = {
-        "data_sha256": data_hash(data),
-        "data_made_with": json.loads(data.attrs["settings"])["data"],
-        "labels": kind,
-        "split": split,
-        "seed": seed,
-        "rows": {"labelled": len(u), "trained_on": len(chosen), "tested_with": len(test[0])},
-        "evaluations": found.evaluations,
-        "converged": found.converged,
-        "rms_error": {
-            "train": float(found.curve[-1, 0]),
-            "test": float(found.curve[-1, 1]),
-            "test_of_a_constant": float(constant),
-        },
-        "versions": versions() | {"torch": version("torch")},
-    }
-    network = Network(
-        mean,
-        scale,
-        *unpack(found.theta, NUM_INPUTS, hidden),
-        bounds=_bounds(data, kind),
-        output="weights" if kind == "as_run" else "log_weights",
-        density=density,
-        card=card,
-    )
-    return Training(network, found.curve, test[1], model.outputs(found.theta, test[0]))
-
-
-def _bounds(data: xr.Dataset, kind: Labels) -> Array:
-    """Return lower and upper bounds of w_Q and w_R, over all that labels could be."""
     weights = np.asarray(data.weights.values)
     if kind != "as_run":
         root = np.sqrt(weights[:, 0] / weights[:, 1])
         weights = np.column_stack([root, 1 / root])
-    return np.array([weights.min(axis=0), weights.max(axis=0)])
+    card = _card(
+        seed,
+        data_sha256=data_hash(data),
+        data_made_with=json.loads(data.attrs["settings"])["data"],
+        labels=kind,
+        split=split,
+        rows={"labelled": len(u), "trained_on": len(chosen), "tested_with": len(test[0])},
+        evaluations=int(found.nfev),
+        converged=bool(found.status > 0),  # MINPACK stopped by itself
+        rms_error={
+            "train": float(found.curve[-1, 0]),
+            "test": float(found.curve[-1, 1]),
+            "test_of_a_constant": float(constant),
+        },
+    )
+    network = Network(
+        mean,
+        scale,
+        *unpack(found.x, NUM_INPUTS, hidden),
+        bounds=np.array([weights.min(axis=0), weights.max(axis=0)]),
+        output="weights" if kind == "as_run" else "log_weights",
+        density=density,
+        card=card,
+    )
+    return Training(network, found.curve, test[1], model.outputs(found.x, test[0]))
 
 
 # ---------------------------------------------------------------- by regret
@@ -386,7 +369,7 @@ class Curves(NamedTuple):
 
     Attributes:
         J: (n, m) in % s, of m = 13 fixed ratios, or of 1 roll-out.
-        features: (n, m, k, 18) after each of k samples, NaN where they are not known.
+        features: (n, m, k, 18) after each of k samples, NaN if they are not known.
     """
 
     J: Array
@@ -395,7 +378,7 @@ class Curves(NamedTuple):
     @property
     def log_J(self) -> Array:
         """(n, m) natural logarithm."""
-        return np.log(np.maximum(self.J, LEAST))
+        return log_cost(self.J)
 
     @property
     def regret(self) -> Array:
@@ -409,7 +392,7 @@ class Curves(NamedTuple):
 
 
 class FeatureRows(NamedTuple):
-    """Rows to train on: inputs (N, 18), and the number of the condition that each is of."""
+    """Training rows: inputs (N, 18), and the number of the condition of each."""
 
     inputs: Array
     condition: Indices
@@ -431,16 +414,16 @@ def curves_of(data: xr.Dataset, features: FeatureName) -> Curves:
         or not np.allclose(ratios.reshape(-1, len(RATIOS)), RATIOS)
     ):
         raise ConfigError(
-            "data: has no cost curves to train by regret; expected what `tune dataset --family` "
-            "has written since version 0.3"
+            "data: has no cost curves to train by regret; expected a data set of "
+            "`tune dataset --family` since version 0.3"
         )
     shape = (-1, len(RATIOS))
-    seen = data[values].values.astype(np.float32)
-    return Curves(data.J.values.reshape(shape), seen.reshape(*shape, *seen.shape[1:]))
+    recorded = data[values].values.astype(np.float32)
+    return Curves(data.J.values.reshape(shape), recorded.reshape(*shape, *recorded.shape[1:]))
 
 
 def feature_rows(curves: Curves) -> FeatureRows:
-    """Return every second sample of every watched run."""
+    """Return every second sample of every run with recorded features."""
     values = curves.features[:, ::WATCHED, ::EVERY].astype(np.float64)
     known = np.isfinite(values).all(axis=-1)
     return FeatureRows(values[known], np.nonzero(known)[0])
@@ -460,20 +443,21 @@ def train_by_regret(
 
     Args:
         data: of a family with faults, as `load_data` returns it.
-        directory: its own runs are kept there, so that a second start goes on.
+        directory: of the runs with the network, so that a second start continues.
         features: inputs of the network; the second round is for `health` alone.
         seed: of the split, the first theta and the batches.
-        start: log10(w_Q / w_R) at which the network begins in the end, the best fixed one if None.
+        start: log10(w_Q / w_R) at which the network begins in the end; None for the best fixed one.
         workers, progress: as `run_jobs` takes them.
 
     Raises:
-        ConfigError: torch is missing, a start that is no ratio, or other data.
+        ConfigError: torch is missing, a start out of range, or other data.
         As `run_jobs`.
     """
     if start is not None and not RATIOS[0] <= start <= RATIOS[-1]:
         raise ConfigError(f"--start: got {start:g}; expected {RATIOS[0]:g} to {RATIOS[-1]:g}")
     settings = json.loads(data.attrs["settings"])
     curves = curves_of(data, features)
+    begin = curves.best_ratio if start is None else start
     trainer = RegretTrainer(curves, seed)
     theta = trainer.fit(trainer.start, [trainer.rows], 1)
     about = {"family": settings["family"], "conditions": len(curves.J)}
@@ -483,8 +467,9 @@ def train_by_regret(
 
         def own_runs(network: Network, chosen: Indices, number: int) -> Curves:
             folder = Path(directory) / f"round{number}-{_key(network)[:8]}"
-            return roll_outs(settings, data.sizes["sample"], chosen, network, folder, workers,
-                             progress)  # fmt: skip
+            return roll_outs(
+                settings, data.sizes["sample"], chosen, network, folder, workers, progress
+            )
 
         held, some = np.flatnonzero(trainer.held), np.flatnonzero(~trainer.held)[:: round(1 / OWN)]
         chosen = np.sort(np.concatenate([held, some]))
@@ -498,7 +483,7 @@ def train_by_regret(
         ]
         best, fixed = (first, second)[int(np.argmin(scores))], curves.log_J[held]
         more = {
-            "start": curves.best_ratio if start is None else start,
+            "start": begin,
             "round": 1 + int(np.argmin(scores)),
             "held_out_J": {
                 "rounds": np.exp(scores).tolist(),
@@ -506,8 +491,7 @@ def train_by_regret(
                 "hindsight": float(np.exp(fixed.min(axis=1).mean())),
             },
         }
-    begin = weights_of(curves.best_ratio if start is None else start)
-    network = replace(best, start=begin, card=dict(best.card) | more)
+    network = replace(best, start=weights_of(begin), card=dict(best.card) | more)
     nothing = np.empty((0, NUM_OUTPUTS))
     return Training(network, np.array(trainer.curve), nothing, nothing)
 
@@ -521,14 +505,14 @@ def roll_outs(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Curves:
-    """Run some of the conditions with a network, or go on with it.
+    """Run some of the conditions with a network, or continue.
 
     Args:
         settings: of the data set.
         samples: number of samples of a run.
-        chosen: numbers of the conditions that are run.
-        network: what sets the weights.
-        directory: where the runs are kept.
+        chosen: numbers of the conditions.
+        network: sets the weights.
+        directory: of the runs.
         workers, progress: as `run_jobs` takes them.
     """
     base = validate(Scenario, with_new_names(settings["scenario"]), "data")
@@ -543,7 +527,7 @@ def roll_outs(
             "network": _key(network),
         },
         suffix=".npz",
-        read=partial(read_condition, runs=1, samples=samples),
+        read=partial(read_condition, samples=samples),
         workers=workers,
         progress=progress,
     )
@@ -552,7 +536,7 @@ def roll_outs(
 
 
 class RegretTrainer:
-    """What both rounds have in common.
+    """Split, standardisation and loss of both rounds.
 
     Args:
         curves: of the conditions.
@@ -571,9 +555,9 @@ class RegretTrainer:
         self.curve: list[tuple[float, float, float, float]] = []
 
     def fit(self, theta: Array, sources: list[FeatureRows], number: int) -> Array:
-        """Minimise the regret by Adam on batches, as many rows of each source.
+        """Minimise the regret by Adam on batches, with the same number of rows of each source.
 
-        It stops where the conditions that are held out gain no more.
+        It stops when the held-out conditions gain no more.
         """
         torch = self._torch
         generator = torch.Generator().manual_seed(1000 * self._seed + number)
@@ -594,7 +578,7 @@ class RegretTrainer:
             optimizer.step()
             if (step + 1) % LOOK == 0:
                 with torch.no_grad():
-                    # The last source is of the network's own runs, where there are any.
+                    # The last source has the runs with the network, if there are any.
                     held = float(self.loss(x, *parts[-1][1]))
                 self.curve.append((float(number), step + 1.0, float(loss.detach()), held))
                 since += LOOK
@@ -604,21 +588,15 @@ class RegretTrainer:
                     break
         return kept
 
-    def _split(self, rows: FeatureRows) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    def _split(self, rows: FeatureRows) -> list[tuple[Any, Any]]:
         """Return standardised inputs and regrets (N, 13), to train on and held out."""
         held = self.held[rows.condition]
-        regret = self._curves.regret[rows.condition]
-        inputs = (rows.inputs - self.mean) / self.scale
-        parts = [
-            tuple(
-                self._torch.tensor(a[chosen], dtype=self._torch.float32) for a in (inputs, regret)
-            )
-            for chosen in (~held, held)
-        ]
-        return parts[0], parts[1]
+        arrays = (rows.inputs - self.mean) / self.scale, self._curves.regret[rows.condition]
+        u, regret = (self._torch.tensor(a, dtype=self._torch.float32) for a in arrays)
+        return [(u[chosen], regret[chosen]) for chosen in (~held, held)]
 
     def loss(self, theta: Any, inputs: Any, regret: Any) -> Any:
-        """Compute the mean regret of the ratios that the network answers with."""
+        """Return the mean regret of the ratios that the network answers with."""
         W1, b1, W2, b2 = unpack(theta, NUM_INPUTS, HIDDEN)
         y = self._torch.sigmoid(inputs @ W1.T + b1) @ W2.T + b2
         ratio = (y[:, 0] - y[:, 1]) / np.log(10)
@@ -638,13 +616,13 @@ class RegretTrainer:
         half = np.array([[0.5, -0.5], [-0.5, 0.5]])
         ends = np.array([weights_of(RATIOS[0]), weights_of(RATIOS[-1])])
         costs = np.maximum(self._curves.J, LEAST).astype("<f8").tobytes()
-        card = about | {
-            "held_out": int(self.held.sum()),
-            "seed": self._seed,
-            "loss": "regret",
-            "costs_sha256": hashlib.sha256(costs).hexdigest(),
-            "versions": versions() | {"torch": version("torch")},
-        }
+        card = _card(
+            self._seed,
+            **about,
+            held_out=int(self.held.sum()),
+            loss="regret",
+            costs_sha256=hashlib.sha256(costs).hexdigest(),
+        )
         return Network(
             input_mean=self.mean,
             input_scale=self.scale,
@@ -661,7 +639,7 @@ class RegretTrainer:
 
 
 def _key(network: Network) -> str:
-    """Compute SHA-256 of what determines a network's answers."""
+    """Return the SHA-256 of the parameters of a network."""
     digest = hashlib.sha256()
     for name in ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds", "start"):
         digest.update(np.ascontiguousarray(getattr(network, name), "<f8").tobytes())
@@ -669,9 +647,9 @@ def _key(network: Network) -> str:
 
 
 def summarize(training: Training) -> dict[str, Any]:
-    """Return what `summary.json` of a training holds.
+    """Return the content of `summary.json` of a training: the card and further results.
 
-    The card; by labels also the correlation of each output, by regret the curve.
+    By labels these are the correlations of the outputs, by regret the curve.
     """
     network, y, f = training.network, training.targets, training.outputs
     if not len(y):

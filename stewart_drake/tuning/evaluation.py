@@ -1,89 +1,64 @@
-"""What a tuner is worth: compared with every fixed gain on conditions that training did not have.
+"""Evaluation of a tuner against every fixed gain, on conditions that training did not have.
 
-All candidates run the same conditions, so that differences are paired, and the fixed gain that a
-tuner is compared with is the best one *of these very conditions*. Two measures judge them:
+All candidates run the same conditions, so that differences are paired, and a tuner is compared with
+the best fixed gain *of these very conditions*. Two measures judge them:
 
 - E_ac, averaged over the conditions that every candidate completes, with failures counted apart;
-- J (`tuning.data`), in which a lost run counts, over all conditions: g is its geometric mean, in
-  which every condition weighs alike, m its mean, in which bad ones do.
+- J (`tuning.data`), with lost runs, over all conditions: g is its geometric mean, which weighs all
+  conditions alike, m its mean, which bad conditions dominate.
 
 Hindsight has the best fixed gain of each condition. Intervals are of a paired bootstrap.
 """
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass
 from scipy import stats
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import read_bytes
-from stewart_drake.files.jsonio import load_json, sealed_json
 from stewart_drake.files.resources import resolve
-from stewart_drake.files.yamlio import validate
 from stewart_drake.loop.bulk import run_in_bulk
-from stewart_drake.scenario.config import AnnTunerConfig, RuleTunerConfig, Scenario
+from stewart_drake.scenario.config import AnnTunerConfig, RuleTunerConfig
 from stewart_drake.scenario.loading import load_scenario, scenario_to_dict
-from stewart_drake.studies.families import FAMILIES, FAULTS, Family, fault_of, with_gain
-from stewart_drake.studies.jobs import Job, Progress, run_jobs
+from stewart_drake.studies.jobs import Job, Progress, part_of, run_jobs
+from stewart_drake.studies.statistics import CONFIDENCE
 from stewart_drake.tuner.network import DEFAULT, EXPECTED, MAX_BYTES, load_network
 from stewart_drake.tuner.source import ratio_of
-from stewart_drake.tuning.data import LEAST, Gains, cost
+from stewart_drake.tuning.data import log_cost, read_condition, run_condition
+from stewart_drake.tuning.families import FAMILIES, FAULTS, Family, fault_of
 from stewart_drake.types import Array
 
 TUNER: Final = "tuner"
-"""The only network of a family without faults."""
+"""Name of the only network of a family without faults."""
 RULE: Final = "rule"
 HINDSIGHT: Final = "hindsight"
-CONFIDENCE: Final = 0.95
 RESAMPLES: Final = 10_000
 _FIXED: Final = "fixed"
 """Folder of the runs with fixed gains."""
-_ENDS: Final = (2.5, 97.5)
-"""Percentiles of an interval."""
-_MAX_BYTES: Final = 1_000_000
 
-_Cost = Annotated[float, Field(ge=0)]
 Tuner = AnnTunerConfig | RuleTunerConfig
+Runs = dict[str, NDArray[Any]]
+"""Results of `read_condition`, of one condition."""
 
 
-@dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
-class Told:
-    """What is kept of the runs of one condition.
-
-    Attributes:
-        cost: J of each in % s.
-        error: E_ac of each in % s, None for a run that did not complete.
-        ratio: log10(w_Q / w_R) at the samples, of the only run with a tuner, else nothing.
-        fallbacks: samples at which the tuner was passed over.
-        loops: what ran each of them, see `loop.bulk.Ending`.
-    """
-
-    cost: list[_Cost]
-    error: list[_Cost | None]
-    ratio: list[float]
-    fallbacks: Annotated[int, Field(ge=0)]
-    loops: list[str]
-
-
-class Worth(NamedTuple):
-    """What every candidate did under every condition.
+class Evaluation(NamedTuple):
+    """Results of all candidates under all conditions.
 
     Attributes:
         family: with its conditions.
         names: of the candidates: the fixed gains, then the tuners.
         cost: (c, n) J in % s.
         error: (c, n) E_ac in % s, NaN for a run that did not complete.
-        ratios: by tuner, of each condition log10(w_Q / w_R) at the samples.
-        summary: what `summary.json` holds.
+        ratios: by tuner, log10(w_Q / w_R) at the samples of each condition.
+        summary: content of `summary.json`.
     """
 
     family: Family
@@ -102,53 +77,13 @@ class Worth(NamedTuple):
 # ---------------------------------------------------------------- the runs
 
 
-def fixed_runs(scenario: Scenario, gains: Gains) -> bytes:
-    """Run a condition with each gain: the bytes of a JSON file."""
-    return _file([with_gain(scenario, *gain) for gain in gains], tuned=False)
-
-
-def tuned_run(scenario: Scenario) -> bytes:
-    """Run a condition with the scenario's tuner: the same file of one run."""
-    return _file([scenario], tuned=True)
-
-
-def _file(scenarios: list[Scenario], *, tuned: bool) -> bytes:
-    endings = [run_in_bulk(one) for one in scenarios]
-    errors = [one.figures.accumulated_error for one in endings]
-    return sealed_json(
-        {
-            "cost": [cost(one, scenarios[0].duration) for one in endings],
-            "error": [error if np.isfinite(error) else None for error in errors],
-            "ratio": [ratio_of(w) for w in endings[-1].weights] if tuned else [],
-            "fallbacks": endings[-1].counts["tuner_fallbacks"],
-            "loops": [one.loop for one in endings],
-        }
-    )
-
-
-def read_told(path: Path, runs: int = 1) -> Told:
-    """Read the file of a condition of so many runs.
-
-    Raises:
-        ConfigError: it is damaged; one line.
-    """
-    expected = "the file of one condition of `tune evaluate`"
-    told = validate(Told, load_json(path, _MAX_BYTES, expected, sealed=True), str(path))
-    for name in ("cost", "error", "loops"):
-        if len(getattr(told, name)) != runs:
-            raise ConfigError(
-                f"{path}: {name}: got {len(getattr(told, name))} runs; expected {runs}"
-            )
-    return told
-
-
 def tuners_of(
     family: Family, networks: Sequence[str | Path]
 ) -> tuple[dict[str, Tuner], dict[str, dict[str, Any]]]:
-    """Return sections by the name of the candidate, and what is known of the networks' files.
+    """Return sections by the name of the candidate, and name, hash and card of network files.
 
-    A family with faults has the rule and any number of networks, which are called by their files;
-    another one has one network, called TUNER.
+    A family with faults has the rule and any number of networks, named by their files. Another one
+    has one network, called TUNER.
 
     Raises:
         ConfigError: no such network, too many, two of one name, or one of another candidate's.
@@ -164,8 +99,8 @@ def tuners_of(
         name = path.stem if family.has_faults else TUNER
         if name in (*tuners, *family.gains, _FIXED, HINDSIGHT):
             raise ConfigError(
-                f"weights: got {name!r}, which another candidate is called; expected a file of a "
-                "name of its own"
+                f"weights: got {name!r}, the name of another candidate; expected a file with "
+                "another name"
             )
         content = hashlib.sha256(read_bytes(path, MAX_BYTES, EXPECTED)).hexdigest()
         tuners[name] = AnnTunerConfig(weights=str(path))
@@ -181,56 +116,54 @@ def evaluate(
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
-) -> Worth:
-    """Run all candidates under all conditions, or go on with it.
+) -> Evaluation:
+    """Run all candidates under all conditions, or continue.
 
     Args:
         family: drawn for evaluation.
         networks: shipped names or files; none for the shipped one of the family.
-        directory: the runs are kept in fixed/, rule/ and NAME-HASH/ there, so that a second network
-            needs its own runs only.
+        directory: of the runs, in fixed/, rule/ and NAME-HASH/, so that a second network needs its
+            own runs only.
         workers, scheduler, progress: as `run_jobs` takes them.
 
     Raises:
         As `run_jobs` and `load_network`, and ConfigError for fewer than two conditions.
     """
-    cells = {key: one.scenario for key, one in family.conditions.items()}
+    cells, gains = family.conditions, tuple(family.gains.values())
     if len(cells) < 2:
         raise ConfigError(f"--scenarios: got {len(cells)}; expected 2 or more")
     tuners, files = tuners_of(family, networks)
     about = {"family": family.name, "seed": family.seed, "scenario": scenario_to_dict(family.base)}
-    total, table = len(cells) * (1 + len(tuners)), dict[str, list[Told]]()
-
-    def run(name: str, function: Callable[..., bytes], jobs: dict[str, Job], runs: int) -> None:
-        done, file = len(table) * len(cells), files.get(name)
-
-        def counted(number: int, _: int) -> None:
-            if progress is not None:
-                progress(done + number, total)
-
+    candidates: dict[str, dict[str, Job]] = {
+        _FIXED: {key: (one.scenario, gains, family.samples) for key, one in cells.items()}
+    }
+    for name, tuner in tuners.items():
+        candidates[name] = {
+            key: (replace(one.scenario, tuner=tuner), (), family.samples)
+            for key, one in cells.items()
+        }
+    table: dict[str, list[Runs]] = {}
+    for name, jobs in candidates.items():
+        file, number = files.get(name), 1 if name in tuners else len(gains)
         found = run_jobs(
             jobs,
-            function,
+            run_condition,
             Path(directory) / (f"{name}-{file['sha256'][:8]}" if file else name),
             settings=about | ({"network": file["sha256"]} if file else {}),
-            read=partial(read_told, runs=runs),
+            suffix=".npz",
+            read=partial(read_condition, runs=number, samples=family.samples),
             workers=workers,
             scheduler=scheduler,
-            progress=counted,
+            progress=part_of(progress, len(table) * len(cells), len(candidates) * len(cells)),
         )
         table[name] = list(found.values())
-
-    gains = tuple(family.gains.values())
-    run(_FIXED, fixed_runs, {key: (cell, gains) for key, cell in cells.items()}, len(gains))
-    for name, tuner in tuners.items():
-        run(name, tuned_run, {k: (replace(cell, tuner=tuner),) for k, cell in cells.items()}, 1)
-    return judged(family, table, files, nominal_prices(family, tuners))
+    return _judged(family, table, files, _nominal_costs(family, tuners))
 
 
-def nominal_prices(family: Family, tuners: dict[str, Tuner]) -> dict[str, dict[str, float]]:
-    """Compute E_ac in % s of `paper` as it is, by candidate: on the reference and from rest.
+def _nominal_costs(family: Family, tuners: dict[str, Tuner]) -> dict[str, dict[str, float]]:
+    """Return E_ac in % s of the nominal `paper` by candidate, on the reference and from rest.
 
-    Only for a family with faults; of another one the base is what is varied.
+    Only for a family with faults; the base of another one is varied.
     """
     result: dict[str, dict[str, float]] = {}
     if not family.has_faults:
@@ -250,38 +183,37 @@ def nominal_prices(family: Family, tuners: dict[str, Tuner]) -> dict[str, dict[s
 # ---------------------------------------------------------------- the statistics
 
 
-def judged(
+def _judged(
     family: Family,
-    table: dict[str, list[Told]],
+    table: dict[str, list[Runs]],
     files: dict[str, dict[str, Any]],
     nominal: dict[str, dict[str, float]],
-) -> Worth:
+) -> Evaluation:
     """Compare the candidates: the fixed gains, then each tuner."""
-    tuners, names = [name for name in table if name != _FIXED], (*family.gains, *list(table)[1:])
+    tuners = [name for name in table if name != _FIXED]
+    names, fixed = (*family.gains, *tuners), len(family.gains)
 
     def rows(name: str) -> Array:
-        found = [np.array([getattr(told, name) for told in table[one]]).T for one in table]
-        return np.vstack(found).astype(np.float64)  # None becomes NaN
+        return np.vstack([np.array([one[name] for one in runs]).T for runs in table.values()])
 
-    J, error = rows("cost"), rows("error")
+    J, error = rows("J"), rows("accumulated_error")
     faults = [fault_of(one) if family.has_faults else "" for one in family.draws]
-    fixed, completed = len(family.gains), np.isfinite(error)
-    by_error = compare(names, fixed, error, family.seed)
-    by_cost = compared(names, fixed, J, completed, np.array(faults), family.seed)
+    by_error = compare_errors(names, fixed, error, family.seed)
+    done = np.isfinite(error)
+    by_cost = compare_costs(names, fixed, J, done, np.array(faults), family.seed)
     candidates = {
         name: by_error["candidates"].get(name, {}) | one
         for name, one in by_cost["candidates"].items()
     }
+    loops = Counter(str(loop) for loop in np.concatenate(rows("loop")) if loop)
     summary = {
         **by_error,
         **by_cost,
         "candidates": candidates,
-        "fallbacks": {name: sum(one.fallbacks for one in table[name]) for name in tuners},
-        "loops": dict(
-            Counter(
-                loop for told in table.values() for one in told for loop in one.loops if loop
-            ).most_common()
-        ),
+        "fallbacks": {
+            name: sum(int(one["fallbacks"][0]) for one in table[name]) for name in tuners
+        },
+        "loops": dict(loops.most_common()),
         "scenarios": [
             one | {"E_ac": dict(zip(names, error[:, number], strict=True))}
             for number, one in enumerate(family.draws)
@@ -293,11 +225,14 @@ def judged(
         "base": scenario_to_dict(family.base),
         "nominal": nominal,
     }
-    ratios = {name: [one.ratio for one in table[name]] for name in tuners}
-    return Worth(family, names, J, error, ratios, summary)
+    ratios = {
+        name: [[ratio_of(w) for w in one["used"][0] if np.isfinite(w).all()] for one in table[name]]
+        for name in tuners
+    }
+    return Evaluation(family, names, J, error, ratios, summary)
 
 
-def compare(names: Sequence[str], fixed: int, error: Array, seed: int) -> dict[str, Any]:
+def compare_errors(names: Sequence[str], fixed: int, error: Array, seed: int) -> dict[str, Any]:
     """Compare E_ac: means with intervals, failures and worst cases; the last row is the tuner.
 
     Args:
@@ -311,7 +246,7 @@ def compare(names: Sequence[str], fixed: int, error: Array, seed: int) -> dict[s
         Student) and `worst` over the conditions that all complete; `common`, their number;
         `best_fixed`, of fewest failures, then of least mean; `improvement` of the tuner on it,
         1 - ratio of the means, with `improvement_interval` (95 %, bootstrap over conditions,
-        paired); `hindsight`, the same for the best gain of each condition, chosen afterwards.
+        paired); `hindsight`, the same for the best gain of each condition.
     """
     failed = np.isnan(error)
     common = error[:, ~failed.any(axis=0)]
@@ -325,9 +260,9 @@ def compare(names: Sequence[str], fixed: int, error: Array, seed: int) -> dict[s
     def improvement(tuner: Array, other: Array, axis: int = -1) -> Any:
         return 1 - tuner.mean(axis=axis) / other.mean(axis=axis)
 
-    sure: Any = (np.nan, np.nan)
+    ends: Any = (np.nan, np.nan)
     if number > 1:
-        sure = stats.bootstrap(
+        ends = stats.bootstrap(
             (common[-1], common[best]),
             improvement,
             paired=True,
@@ -350,11 +285,11 @@ def compare(names: Sequence[str], fixed: int, error: Array, seed: int) -> dict[s
         "best_fixed": names[best],
         "improvement": improvement(some[-1], some[best]),
         "hindsight": 1 - some[:fixed].min(axis=0).mean() / mean[best],
-        "improvement_interval": list(map(float, sure)),
+        "improvement_interval": list(map(float, ends)),
     }
 
 
-def compared(
+def compare_costs(
     names: Sequence[str],
     fixed: int,
     J: Array,
@@ -369,7 +304,7 @@ def compared(
         fixed: number of the fixed gains, the first rows.
         J: (c, n) % s.
         completed: (c, n).
-        faults: (n,) names of them.
+        faults: (n,) names.
         seed: of the bootstrap.
 
     Returns:
@@ -378,7 +313,7 @@ def compared(
         share by which its g is below that of `best_g`, `m` the same of `best_m`, `rule` of the rule
         by g, each [value, low, high]; `by_fault`: the first of them for each fault alone.
     """
-    log_J = np.log(np.maximum(J, LEAST))
+    log_J = log_cost(J)
     best_g, best_m = int(log_J[:fixed].mean(1).argmin()), int(J[:fixed].mean(1).argmin())
     rule = names.index(RULE) if RULE in names else best_g
     picked, every = log_J[:fixed].argmin(axis=0), np.arange(J.shape[1])
@@ -387,15 +322,24 @@ def compared(
         for x in (J, log_J, completed)
     )
     tuners = [name for name in rows if name not in names[:fixed]]
-    chosen = np.random.default_rng(seed).integers(J.shape[1], size=(RESAMPLES, J.shape[1]))
+
+    def gain(values: Array, others: Array, geometric: bool = True) -> list[float]:
+        """Return 1 - mean / mean of the others, and its interval, by a paired bootstrap."""
+        rng, n = np.random.default_rng(seed), len(values)
+        chosen = rng.integers(n, size=(RESAMPLES, n))
+        if geometric:
+            less = values - others
+            value, ends = np.exp(less.mean()), np.exp(_ends(less[chosen].mean(axis=1)))
+        else:
+            value = values.mean() / others.mean()
+            ends = _ends(values[chosen].mean(axis=1) / others[chosen].mean(axis=1))
+        return [float(1 - value), *(1 - ends).tolist()]
+
     by_fault: dict[str, dict[str, list[float]]] = {}
     for fault in FAULTS:
         here = np.flatnonzero(faults == fault)
-        some = np.random.default_rng(seed).integers(max(1, len(here)), size=(RESAMPLES, len(here)))
         by_fault[fault] = {
-            name: _gain_g(log_rows[name][here], log_J[best_g][here], some)
-            for name in tuners
-            if len(here)
+            name: gain(log_rows[name][here], log_J[best_g][here]) for name in tuners if len(here)
         }
     return {
         "candidates": {
@@ -411,9 +355,9 @@ def compared(
         "best_m": names[best_m],
         "gains": {
             name: {
-                "g": _gain_g(log_rows[name], log_J[best_g], chosen),
-                "m": _gain_m(rows[name], J[best_m], chosen),
-                "rule": _gain_g(log_rows[name], log_J[rule], chosen),
+                "g": gain(log_rows[name], log_J[best_g]),
+                "m": gain(rows[name], J[best_m], geometric=False),
+                "rule": gain(log_rows[name], log_J[rule]),
             }
             for name in tuners
         },
@@ -421,14 +365,5 @@ def compared(
     }
 
 
-def _gain_g(log_J: Array, other: Array, chosen: NDArray[np.intp]) -> list[float]:
-    """Return 1 - g / g of the other, and its interval."""
-    less = log_J - other
-    ends = 1 - np.exp(np.percentile(less[chosen].mean(axis=1), _ENDS[::-1]))
-    return [float(1 - np.exp(less.mean())), *ends.tolist()]
-
-
-def _gain_m(J: Array, other: Array, chosen: NDArray[np.intp]) -> list[float]:
-    """Return 1 - m / m of the other, and its interval."""
-    ratio = J[chosen].mean(axis=1) / other[chosen].mean(axis=1)
-    return [float(1 - J.mean() / other.mean()), *(1 - np.percentile(ratio, _ENDS[::-1])).tolist()]
+def _ends(resampled: Array) -> Array:
+    return np.percentile(resampled, (97.5, 2.5))

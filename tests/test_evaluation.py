@@ -1,4 +1,4 @@
-"""The worth of a tuner: its statistics, the candidates, the command."""
+"""The evaluation of a tuner: its statistics, the candidates, the command."""
 
 import json
 
@@ -9,26 +9,25 @@ from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.families import (
+from stewart_drake.tuner.network import Network, save_network
+from stewart_drake.tuning.data import read_condition, run_condition
+from stewart_drake.tuning.evaluation import (
+    HINDSIGHT,
+    RULE,
+    TUNER,
+    compare_costs,
+    compare_errors,
+    evaluate,
+    tuners_of,
+)
+from stewart_drake.tuning.families import (
     FAULTS,
     GAINS,
     PAIRS,
     disturbed_family,
     faulty_family,
 )
-from stewart_drake.studies.families import FIXED as GAINS_OF_FAMILIES
-from stewart_drake.tuner.network import Network, save_network
-from stewart_drake.tuning.worth import (
-    HINDSIGHT,
-    RULE,
-    TUNER,
-    compare,
-    compared,
-    evaluate,
-    read_told,
-    tuned_run,
-    tuners_of,
-)
+from stewart_drake.tuning.families import FIXED as GAINS_OF_FAMILIES
 from tests.screen import too_long
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -71,7 +70,7 @@ def test_the_candidates_are_one_pair_of_each_ratio():
 def test_means_are_over_the_scenarios_that_all_complete():
     nan = np.nan
     error = np.array([[1.0, 2, 9, 3], [2, 4, 9, nan], [1, 1, nan, 4]])
-    found = compare(NAMES, 2, error, 0)
+    found = compare_errors(NAMES, 2, error, 0)
     assert found["common"] == 2
     assert [found["candidates"][n]["failures"] for n in NAMES] == [0, 1, 1]
     assert [found["candidates"][n]["mean"] for n in NAMES] == [1.5, 3.0, 1.0]
@@ -83,7 +82,7 @@ def test_means_are_over_the_scenarios_that_all_complete():
 
 def test_few_failures_come_before_a_small_mean():
     error = np.array([[5.0, 5, 5], [1, 1, np.nan], [4, 4, 4]])
-    assert compare(NAMES, 2, error, 0)["best_fixed"] == "a"
+    assert compare_errors(NAMES, 2, error, 0)["best_fixed"] == "a"
 
 
 def test_the_interval_of_the_improvement_covers_the_truth():
@@ -92,19 +91,19 @@ def test_the_interval_of_the_improvement_covers_the_truth():
     for trial in range(100):
         base = random.gamma(4.0, size=60)
         error = np.vstack([base, 2 * base, 0.8 * base * (1 + 0.2 * random.standard_normal(60))])
-        low, high = compare(NAMES, 2, error, trial)["improvement_interval"]
+        low, high = compare_errors(NAMES, 2, error, trial)["improvement_interval"]
         inside += low <= 0.2 <= high
     assert 85 <= inside <= 100
 
 
 def test_hindsight_bounds_what_any_choice_of_gain_can_do():
     error = np.array([[1.0, 4], [4, 1], [2.5, 2.5]])
-    found = compare(NAMES, 2, error, 0)
+    found = compare_errors(NAMES, 2, error, 0)
     assert found["hindsight"] == pytest.approx(1 - 1 / 2.5) and found["improvement"] == 0
 
 
 def test_without_common_conditions_there_is_no_mean():
-    found = compare(NAMES, 2, np.array([[np.nan, 1], [1, np.nan], [1, 1]]), 0)
+    found = compare_errors(NAMES, 2, np.array([[np.nan, 1], [1, np.nan], [1, 1]]), 0)
     assert found["common"] == 0 and np.isnan(found["improvement"])
 
 
@@ -115,7 +114,7 @@ def judged(tuner, fixed):
     J = np.vstack([fixed, tuner, 0.5 * tuner])
     faults = np.array(FAULTS)[np.arange(J.shape[1]) % 4]
     names = (*FIXED, RULE, "net")
-    return compared(names, len(FIXED), J, np.ones_like(J, dtype=bool), faults, 0)
+    return compare_costs(names, len(FIXED), J, np.ones_like(J, dtype=bool), faults, 0)
 
 
 def test_a_tuner_that_is_always_a_fifth_below_is_a_fifth_below_for_sure():
@@ -160,16 +159,16 @@ def test_intervals_cover_what_they_should():
 def test_a_network_is_not_called_as_another_candidate(name, tmp_path):
     path = tmp_path / f"{name}.json"
     path.write_bytes(resolve("weights", "health_T").read_bytes())
-    with pytest.raises(ConfigError, match=f"got '{name}', which another candidate is called"):
+    with pytest.raises(ConfigError, match=f"got '{name}', the name of another candidate"):
         tuners_of(faulty_family("T", 0, 0, "evaluation"), [str(path)])
 
 
 def test_a_file_of_too_few_runs_is_damaged(tmp_path):
-    path = tmp_path / "0000.json"
-    path.write_bytes(tuned_run(faulty_family("T", 0, 0, "evaluation", ("duration=0.5",)).base))
-    assert len(read_told(path).cost) == 1
-    with pytest.raises(ConfigError, match="cost: got 1 runs; expected 13"):
-        read_told(path, runs=len(FIXED))
+    path = tmp_path / "0000.npz"
+    path.write_bytes(run_condition(faulty_family("T", 0, 0, "evaluation", ("duration=0.5",)).base))
+    assert len(read_condition(path)["J"]) == 1
+    with pytest.raises(ConfigError, match=r"0000\.npz: is damaged"):
+        read_condition(path, runs=len(FIXED))
 
 
 def test_a_constant_tuner_is_its_fixed_gain(tmp_path):
@@ -216,7 +215,7 @@ def test_the_command_prints_a_table_and_writes_a_summary(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_data_training_and_worth_by_commands(tmp_path):
+def test_data_training_and_evaluation_by_commands(tmp_path):
     pytest.importorskip("torch")
     short = ["--set", "duration=1", "--workers", "1", "--quiet"]
     data, net = tmp_path / "data", tmp_path / "nets" / "mine.json"
@@ -224,7 +223,7 @@ def test_data_training_and_worth_by_commands(tmp_path):
     assert main([*words, *short]) == 0
     train = ["tune", "train", str(data), "--regret", "--out", str(net), "--quiet", "--workers", "1"]
     assert main(train) == 0
-    out = tmp_path / "worth"
+    out = tmp_path / "evaluation"
     words = ["tune", "evaluate", str(net), "--family", "N2", "--scenarios", "4", "--out", str(out)]
     assert main([*words, *short]) == 0
     summary = json.loads((out / "summary.json").read_text())

@@ -1,10 +1,10 @@
-"""Families of conditions for a tuner: the paper's grid, disturbed conditions, and two with faults.
+"""Families of conditions that a tuner is trained and evaluated on.
 
-A family has a base scenario, conditions that vary it, and the fixed gains that every condition is
-run with. Weights hardly matter where the timing is right and nothing rubs (theory.md, section 23),
-so that in T and N2 each draw has one fault: half of the draws have a timing fault that is unknown
-to the controller (an offset of the delay, or jitter), a quarter Coulomb friction, and a quarter ten
-times the noise. Timing faults ask for little feedback, friction for much.
+Each condition is a scenario that is run with every fixed gain of its family:
+
+- `paper`, the paper's grid: 5 delays and 4 frequencies, each with nine pairs of weights;
+- `disturbed`: drawn delays, motions and disturbances of a scenario, with the same pairs;
+- T and N2: drawn motions of the scenario `paper` with one fault each, with 13 ratios of weights.
 """
 
 import itertools
@@ -58,24 +58,22 @@ SAMPLES: Final = 100
 
 RATIOS: Final = np.linspace(-4.0, 2.0, 13)
 """log10(w_Q / w_R) of the fixed gains of T and N2."""
+FIXED: Final[dict[str, tuple[float, float]]] = {
+    f"{ratio:+.1f}": tuple(weights_of(ratio).tolist()) for ratio in RATIOS
+}
+"""The fixed gains of T and N2 by name."""
 FAULTS: Final = ("offset", "jitter", "friction", "noise")
 LEAST_TORQUE: Final = 0.3
 """Least effort of a motion, as a share of the standard torque."""
 NOISE: Final = (1e-4, 1e-3)
 """Share of the amplitudes."""
 NOISY: Final = 10.0
-"""Factor on the noise where noise is the fault."""
+"""Factor on the noise if noise is the fault."""
 BIAS: Final = 0.02
 FRICTION: Final = 0.05
 """Largest bias and friction, as shares of the torque of the motion."""
 PAYLOAD: Final = 0.1
 """Largest payload, added or missing, as a share of the plate's mass."""
-
-
-FIXED: Final[dict[str, tuple[float, float]]] = {
-    f"{ratio:+.1f}": tuple(weights_of(ratio).tolist()) for ratio in RATIOS
-}
-"""The fixed gains of T and N2 by name."""
 
 
 class Condition(NamedTuple):
@@ -113,108 +111,25 @@ class Family:
 
     @property
     def has_faults(self) -> bool:
-        """Whether the family is one of FAMILIES, whose runs are watched."""
+        """Whether the family is one of FAMILIES; its runs record `health`."""
         return self.name in FAMILIES
 
 
 def with_gain(scenario: Scenario, w_Q: float, w_R: float) -> Scenario:
-    """Return a copy of the scenario with these fixed weights."""
+    """Return the scenario with these fixed weights."""
     return replace(scenario, controller=replace(scenario.controller, w_Q=w_Q, w_R=w_R))
 
 
-# ---------------------------------------------------------------- scales and draws
-
-
-class Standard(NamedTuple):
-    """Scales of the scenario's motion at 1 rad/s and full amplitude."""
-
-    torque: float
-    """Largest torque that it takes, N m."""
-    plate_mass: float
-
-
-def sine_of(scenario: Scenario) -> SineConfig:
-    """Return the scenario's reference, which has a frequency and an amplitude.
-
-    Raises:
-        ConfigError: it is not a sine.
-    """
-    if scenario.reference.kind != "sine":
-        raise ConfigError(
-            f"reference.kind: got {scenario.reference.kind!r}; expected 'sine', whose frequency "
-            "and amplitude are varied"
-        )
-    return scenario.reference
-
-
-def standard_of(scenario: Scenario) -> Standard:
-    """Compute the scales that drawn shares refer to.
-
-    Raises:
-        ConfigError: the scenario cannot be prepared, or its reference is not a sine.
-    """
-    slow = replace(sine_of(scenario), frequency=1.0, frequency_unit="rad/s")
-    experiment = prepare(replace(scenario, reference=slow))
-    torque = reference_torque(experiment.nominal, experiment.reference, scenario.duration)
-    return Standard(torque, experiment.mechanism.plate.mass)
-
-
-def logarithmic(low: float, high: float) -> Callable[[Generator, Any], float]:
-    """Return a function that draws a number whose logarithm is uniform."""
-    return lambda rng, _: float(np.exp(rng.uniform(*np.log((low, high)))))
-
-
-def _disturbed_bias(rng: Generator, standard: Standard) -> tuple[float, ...]:
-    return tuple((4e-3 * standard.torque * rng.standard_normal(6)).tolist())
-
-
-def _set_delay(variant: Variant, steps: int) -> None:
-    variant.fields["delay"]["steps"] = steps
-
-
-def _set_believed_delay(variant: Variant, steps: int) -> None:
-    _set_delay(variant, steps)
-    variant.fields["controller"] |= {"delay_steps": steps, "delay_fraction": 0.0}
-
-
-def _set_frequency(variant: Variant, frequency: float) -> None:
-    variant.fields["reference"] |= {"frequency": frequency, "frequency_unit": "rad/s"}
-
-
-def _set_amplitude(variant: Variant, share: float) -> None:
-    reference = variant.fields["reference"]
-    reference["amplitude"] = [share * a for a in reference["amplitude"]]
-
-
-_add_bias: Final = add_to("plant", "torque_bias")
-DISTURBED: Final[Model] = {
-    # Whole periods, 0 and 15 included, which the controller knows.
-    "delay_steps": Quantity(lambda rng, _: int(rng.integers(0, 16)), _set_delay),
-    # rad/s of the sine.
-    "frequency": Quantity(logarithmic(0.5, 3.0), _set_frequency),
-    # Share of the scenario's own amplitudes.
-    "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.3, 1.0)), _set_amplitude),
-    # Of each motor; its standard deviation is a share of the standard torque.
-    "torque_bias": Quantity(_disturbed_bias, _add_bias, sometimes=True),
-    # kg, up to a tenth of the plate's.
-    "payload_mass": Quantity(
-        lambda rng, standard: float(rng.uniform(0.0, 0.1 * standard.plate_mass)),
-        add_payload, sometimes=True,
-    ),
-    # Standard deviation of pose (rates: per second), share of the amplitudes.
-    "noise": Quantity(logarithmic(1e-4, 3e-3), add_noise, sometimes=True),
-    "seed": Quantity(draw_seed, seed_noise),
-}  # fmt: skip
-"""Quantities of a disturbed condition; the order is that of the random numbers."""
+# ---------------------------------------------------------------- drawn quantities
 
 
 class Faults(NamedTuple):
-    """Settings and sizes of a family with faults.
+    """Settings of a family with faults, and sizes of these.
 
     Attributes:
         settings: of the scenario `paper`.
-        offset, jitter: least and most, s.
-        about: in words.
+        offset, jitter: least and largest, s.
+        about: description for a reader.
         network: shipped network that was trained for it.
     """
 
@@ -239,43 +154,87 @@ FAMILIES: Final[dict[str, Faults]] = {
 
 
 class About(NamedTuple):
-    """What the quantities of FAULTY are drawn with."""
+    """Scales of the drawn quantities: those of the motion at 1 rad/s and full amplitude.
 
-    faults: Faults
-    standard: Standard
+    `torque` in N m is the largest that this motion takes; `faults` of a family with faults.
+    """
+
+    torque: float
+    plate_mass: float
+    faults: Faults | None = None
 
 
-def _uniform(low: float, high: float, share: float) -> float:
-    return float(low + (high - low) * share)
+def sine_of(scenario: Scenario) -> SineConfig:
+    """Return the scenario's reference, which has a frequency and an amplitude.
+
+    Raises:
+        ConfigError: it is not a sine.
+    """
+    if scenario.reference.kind != "sine":
+        raise ConfigError(
+            f"reference.kind: got {scenario.reference.kind!r}; expected 'sine', whose frequency "
+            "and amplitude are varied"
+        )
+    return scenario.reference
+
+
+def _about(scenario: Scenario, faults: Faults | None = None) -> About:
+    slow = replace(sine_of(scenario), frequency=1.0, frequency_unit="rad/s")
+    experiment = prepare(replace(scenario, reference=slow))
+    torque = reference_torque(experiment.nominal, experiment.reference, scenario.duration)
+    return About(torque, experiment.mechanism.plate.mass, faults)
+
+
+def _logarithmic(low: float, high: float) -> Callable[[Generator, Any], float]:
+    """Return a draw of a number with a uniform logarithm."""
+    return lambda rng, _: float(np.exp(rng.uniform(*np.log((low, high)))))
 
 
 def _draw_bias(rng: Generator, about: About) -> tuple[float, ...]:
     """Draw a bias of random size for the standard motion."""
-    size, direction = BIAS * about.standard.torque * rng.uniform(), rng.standard_normal(6)
+    size, direction = BIAS * about.torque * rng.uniform(), rng.standard_normal(6)
     return tuple((size * direction / np.sqrt(np.mean(direction**2))).tolist())
 
 
 def _draw_fault(rng: Generator, about: About) -> tuple[float, ...]:
     """Draw one of FAULTS: offset, jitter in s; friction in N m; factor on the noise."""
     kind, sign, size = int(rng.integers(4)), float(rng.choice([-1.0, 1.0])), rng.uniform()
-    sizes = (
-        sign * _uniform(*about.faults.offset, size),
-        _uniform(*about.faults.jitter, size),
-        FRICTION * about.standard.torque * float(size),
-        NOISY,
-    )
+    assert about.faults is not None
+    offset, jitter = (low + (high - low) * size for low, high in about.faults[1:3])
+    sizes = (sign * float(offset), float(jitter), FRICTION * about.torque * float(size), NOISY)
     return tuple(value if i == kind else float(i == 3) for i, value in enumerate(sizes))
 
 
 def _effort(variant: Variant) -> float:
-    """Return the torque of the motion as it is, over that of the standard one."""
+    """Return the torque of the drawn motion over that of the standard one."""
     base, now = variant.scenario.reference, variant.fields["reference"]
     assert base.kind == "sine"
     share = max(abs(a / b) for a, b in zip(now["amplitude"], base.amplitude, strict=True) if b != 0)
     return max(LEAST_TORQUE, share * now["frequency"] ** 2)
 
 
-def _set_bias(variant: Variant, bias: tuple[float, ...]) -> None:
+def _set_delay(variant: Variant, steps: int) -> None:
+    variant.fields["delay"]["steps"] = steps
+
+
+def _set_known_delay(variant: Variant, steps: int) -> None:
+    _set_delay(variant, steps)
+    variant.fields["controller"] |= {"delay_steps": steps, "delay_fraction": 0.0}
+
+
+def _set_frequency(variant: Variant, frequency: float) -> None:
+    variant.fields["reference"] |= {"frequency": frequency, "frequency_unit": "rad/s"}
+
+
+def _set_amplitude(variant: Variant, share: float) -> None:
+    reference = variant.fields["reference"]
+    reference["amplitude"] = [share * a for a in reference["amplitude"]]
+
+
+_add_bias: Final = add_to("plant", "torque_bias")
+
+
+def _add_scaled_bias(variant: Variant, bias: tuple[float, ...]) -> None:
     _add_bias(variant, tuple(_effort(variant) * b for b in bias))
 
 
@@ -293,18 +252,40 @@ def _seed_jitter(variant: Variant, seed: int) -> None:
     variant.fields["delay"]["seed"] = seed
 
 
-FAULTY: Final[Model] = {
-    "delay_steps": Quantity(lambda rng, _: int(rng.integers(4, 13)), _set_believed_delay),
+DISTURBED: Final[Model] = {
+    # Whole periods, 0 and 15 included, known to the controller.
+    "delay_steps": Quantity(lambda rng, _: int(rng.integers(0, 16)), _set_delay),
     # rad/s of the sine.
-    "frequency": Quantity(logarithmic(0.5, 2.0), _set_frequency),
+    "frequency": Quantity(_logarithmic(0.5, 3.0), _set_frequency),
+    # Share of the scenario's own amplitudes.
+    "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.3, 1.0)), _set_amplitude),
+    # Of each motor; the standard deviation is a share of the standard torque.
+    "torque_bias": Quantity(
+        lambda rng, a: tuple((4e-3 * a.torque * rng.standard_normal(6)).tolist()),
+        _add_bias, sometimes=True,
+    ),
+    # kg, up to a tenth of the plate's.
+    "payload_mass": Quantity(
+        lambda rng, a: float(rng.uniform(0.0, 0.1 * a.plate_mass)), add_payload, sometimes=True
+    ),
+    # Standard deviation of pose (rates: per second), share of the amplitudes.
+    "noise": Quantity(_logarithmic(1e-4, 3e-3), add_noise, sometimes=True),
+    "seed": Quantity(draw_seed, seed_noise),
+}  # fmt: skip
+"""Quantities of a disturbed condition; the order is that of the random numbers."""
+
+FAULTY: Final[Model] = {
+    "delay_steps": Quantity(lambda rng, _: int(rng.integers(4, 13)), _set_known_delay),
+    # rad/s of the sine.
+    "frequency": Quantity(_logarithmic(0.5, 2.0), _set_frequency),
     # Share of the scenario's own amplitudes.
     "amplitude": Quantity(lambda rng, _: float(rng.uniform(0.5, 1.0)), _set_amplitude),
-    "torque_bias": Quantity(_draw_bias, _set_bias),
+    "torque_bias": Quantity(_draw_bias, _add_scaled_bias),
     # kg.
     "payload": Quantity(
-        lambda rng, a: float(PAYLOAD * a.standard.plate_mass * rng.uniform(-1, 1)), add_payload
+        lambda rng, a: float(PAYLOAD * a.plate_mass * rng.uniform(-1, 1)), add_payload
     ),
-    "noise": Quantity(logarithmic(*NOISE), add_noise),
+    "noise": Quantity(_logarithmic(*NOISE), add_noise),
     "fault": Quantity(_draw_fault, _set_fault),
     "seed": Quantity(draw_seed, seed_noise),
     "jitter_seed": Quantity(draw_seed, _seed_jitter),
@@ -318,15 +299,8 @@ def fault_of(one: Draw) -> str:
     return FAULTS[0 if offset else 1 if jitter else 2 if friction else 3]
 
 
-def _draws(model: Model, about: Any, number: int, seed: int, stream: int) -> list[Draw]:
-    """Draw a model; the first draws stay the same when more are asked for."""
-    return [
-        draw_from(model, np.random.default_rng([seed, stream, i]), about) for i in range(number)
-    ]
-
-
 def vary(model: Model, base: Scenario, one: Draw) -> Scenario:
-    """Return a copy of a scenario with what was drawn, applied in the order of the model."""
+    """Return a scenario with a draw, applied in the order of the model."""
     in_order = {name: one[name] for name in model}
     return apply_draw(model, base, load_mechanism(base.mechanism), in_order).as_scenario()
 
@@ -360,8 +334,8 @@ def disturbed_family(scenario: Scenario, number: int, seed: int, purpose: Purpos
     """Draw disturbed conditions of a scenario: nine pairs to train on, seven gains to evaluate.
 
     Args:
-        scenario: base, whose machine and motion give the scales.
-        number: of conditions; the first ones stay the same when more are asked for.
+        scenario: base; its machine and motion give the scales.
+        number: of conditions; a larger number keeps the first ones.
         seed: of all draws.
         purpose: see `Purpose`.
 
@@ -371,41 +345,48 @@ def disturbed_family(scenario: Scenario, number: int, seed: int, purpose: Purpos
     for_training = purpose == "training"
     if for_training:
         _check_samples(scenario)
-    draws = _draws(DISTURBED, standard_of(scenario), number, seed, 0 if for_training else 1)
-    conditions = {}
-    for i, one in enumerate(draws):
-        condition = vary(DISTURBED, scenario, one)
-        prepare(condition)
-        conditions[f"disturbed{i:04d}"] = Condition(
-            condition, one["delay_steps"], one["frequency"], i
-        )
-    gains = _pairs() if for_training else GAINS
-    return Family("disturbed", scenario, conditions, gains, seed, draws)
+    draws = _draws(DISTURBED, _about(scenario), number, seed, 0 if for_training else 1)
+    conditions = _conditions("disturbed{:04d}", DISTURBED, scenario, draws)
+    for one in conditions.values():
+        prepare(one.scenario)
+    return Family(
+        "disturbed", scenario, conditions, _pairs() if for_training else GAINS, seed, draws
+    )
 
 
 def faulty_family(
     name: str, number: int, seed: int, purpose: Purpose, settings: tuple[str, ...] = ()
 ) -> Family:
-    """Draw conditions of T or N2, each with a motion and a fault of its own.
+    """Draw conditions of T or N2, each with its own motion and fault.
 
     Args:
         name: of FAMILIES.
-        number: of conditions; the first ones stay the same when more are asked for.
+        number: of conditions; a larger number keeps the first ones.
         seed: of all draws.
         purpose: see `Purpose`.
         settings: further ones of the scenario.
     """
     faults = FAMILIES[name]
     base = load_scenario("paper", None, (*faults.settings, *settings))
-    standard = standard_of(load_scenario("paper", None, faults.settings))
+    about = _about(load_scenario("paper", None, faults.settings), faults)
     stream = 2 * list(FAMILIES).index(name) + (purpose == "evaluation")
-    draws = _draws(FAULTY, About(faults, standard), number, seed, stream)
-    conditions = {
-        f"{i:05d}": Condition(vary(FAULTY, base, one), one["delay_steps"], one["frequency"], i)
-        for i, one in enumerate(draws)
-    }
+    draws = _draws(FAULTY, about, number, seed, stream)
+    conditions = _conditions("{:05d}", FAULTY, base, draws)
     samples = round(base.duration / base.controller.period)
     return Family(name, base, conditions, FIXED, seed, draws, samples, settings)
+
+
+def _draws(model: Model, about: About, number: int, seed: int, stream: int) -> list[Draw]:
+    return [
+        draw_from(model, np.random.default_rng([seed, stream, i]), about) for i in range(number)
+    ]
+
+
+def _conditions(name: str, model: Model, base: Scenario, draws: list[Draw]) -> dict[str, Condition]:
+    return {
+        name.format(i): Condition(vary(model, base, one), one["delay_steps"], one["frequency"], i)
+        for i, one in enumerate(draws)
+    }
 
 
 def _pairs() -> dict[str, tuple[float, float]]:
