@@ -35,8 +35,11 @@ RUN_FILE = {
 }
 RUN_ARRAYS = {
     "samples": np.zeros((1, 100, 18)),
+    "used": np.ones((1, 100, 2)),
     "health": np.zeros((1, 100, 18), dtype=np.float32),
     "status": np.array(["completed"]),
+    "loop": np.array(["native"]),
+    "fallbacks": np.zeros(1, dtype=int),
     "stopped": np.array([np.nan]),
     **dict.fromkeys(("J", "accumulated_error", "cost", "rms_torque"), np.ones(1)),
     **dict.fromkeys(("peak_torque", "torque_variation"), np.full(1, 2.0)),

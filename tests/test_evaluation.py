@@ -167,7 +167,7 @@ def test_a_file_of_too_few_runs_is_damaged(tmp_path):
     path = tmp_path / "0000.npz"
     path.write_bytes(run_condition(faulty_family("T", 0, 0, "evaluation", ("duration=0.5",)).base))
     assert len(read_condition(path)["J"]) == 1
-    with pytest.raises(ConfigError, match=r"0000\.npz: is damaged"):
+    with pytest.raises(ConfigError, match=r"0000\.npz: "):
         read_condition(path, runs=len(FIXED))
 
 

@@ -192,8 +192,8 @@ def best_height(pattern: PatternSpec, m: Measurements) -> float:
     if found is None:
         gap = float(np.linalg.norm((legs.p_PQ - legs.p_WS)[:, :2], axis=1).max())
         raise ConfigError(
-            f"rod: got {m.rod:g} m with cranks of {m.crank:g} m; expected rods that reach the plate, "
-            f"{gap:.3g} m horizontally from shafts to joints"
+            f"rod: got {m.rod:g} m with cranks of {m.crank:g} m; expected rods that reach the "
+            f"plate, whose joints are {gap:.3g} m from the shafts horizontally"
         )
     low, high = found
     heights = np.linspace(low, high, _HEIGHTS + 2)[1:-1]
